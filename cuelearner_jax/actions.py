@@ -1,0 +1,89 @@
+"""Geometry of the action space: directions in the plane as unit vectors (paper, section IV-A).
+
+Angles are radians, counterclockwise positive. Every function works on any leading axes. Angles are wrapped with
+`atan2`, never with a modulo, so that the functions export to other runtimes unchanged.
+"""
+
+from __future__ import annotations
+
+import math
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
+
+Direction = Float[Array, "... 2"]
+Angle = Float[Array, "..."]
+
+
+def from_angle(angle: Angle) -> Direction:
+    """Unit vector that points along `angle` [rad]."""
+    return jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)
+
+
+def to_angle(action: Direction) -> Angle:
+    """Angle of a direction in (-pi, pi] [rad]."""
+    return jnp.arctan2(action[..., 1], action[..., 0])
+
+
+def rotate(action: Direction, angle: Angle) -> Direction:
+    """`action` turned counterclockwise by `angle` [rad]."""
+    cos, sin = jnp.cos(angle), jnp.sin(angle)
+    x, y = action[..., 0], action[..., 1]
+    return jnp.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
+
+
+def difference(start: Direction, end: Direction) -> Angle:
+    """Signed angle from `start` to `end` in (-pi, pi] [rad]; positive: counterclockwise."""
+    cross = start[..., 0] * end[..., 1] - start[..., 1] * end[..., 0]
+    dot = start[..., 0] * end[..., 0] + start[..., 1] * end[..., 1]
+    return jnp.arctan2(cross, dot)
+
+
+def retract(vector: Direction) -> Direction:
+    """The direction nearest to a vector (the vector divided by its length). The zero vector gives the x axis."""
+    length = jnp.linalg.norm(vector, axis=-1, keepdims=True)
+    safe = jnp.where(length > 0, length, 1.0)
+    return jnp.where(length > 0, vector / safe, jnp.array([1.0, 0.0], vector.dtype))
+
+
+def clip_to_ball(action: Direction, base: Direction, radius: Angle) -> Direction:
+    """The direction within `radius` [rad] of `base` that lies nearest to `action` (paper, Eq. 5).
+
+    On the unit circle the L2 ball of radius r round `base` is the arc of half-width 2 asin(r / 2), so the bound is given
+    as an angle. A radius of pi or more leaves every action as it is.
+    """
+    turn = difference(base, action)
+    inside = jnp.abs(turn) <= radius
+    return jnp.where(inside[..., None], action, rotate(base, jnp.clip(turn, -radius, radius)))
+
+
+def evenly_spaced(count: int) -> Float[Array, "count 2"]:
+    """`count` directions, the first along x, the others counterclockwise."""
+    return from_angle(jnp.arange(count) * (2 * math.pi / count))
+
+
+def uniform(key: PRNGKeyArray, shape: tuple[int, ...] = ()) -> Direction:
+    """Directions drawn uniformly (paper, Eq. 6): shape (*shape, 2)."""
+    return from_angle(jax.random.uniform(key, shape, minval=-math.pi, maxval=math.pi))
+
+
+def best_direction(
+    values: Float[Array, " count"], spread: Float[Array, ""] | float, habit: Float[Array, ""] | float
+) -> Float[Array, "2"]:
+    """The best of `evenly_spaced(count)` for a player with an imperfect aim and a habit.
+
+    Args:
+        values: value of each direction, not negative where it matters.
+        spread: standard deviation of the aim [rad]. Values are averaged over it, so a wide window of good directions beats
+            a narrow one and its middle beats its edge. 0: perfect aim.
+        habit: share by which values shrink over a full turn counterclockwise from x. It settles near-ties (a symmetric
+            table has many) always the same way; without it the choice jumps between far-apart directions from state to
+            state and can't be learned from. 0: no habit.
+    """
+    count = values.shape[0]
+    turn = jnp.arange(count) * (2 * math.pi / count)
+    distance = jnp.minimum(turn, 2 * math.pi - turn)
+    kernel = jax.nn.softmax(-0.5 * jnp.square(distance / jnp.maximum(spread, 1e-6)))
+    expected = jnp.fft.irfft(jnp.fft.rfft(values) * jnp.fft.rfft(kernel), n=count)
+    return evenly_spaced(count)[jnp.argmax(expected * (1.0 - habit * turn / (2 * math.pi)))]

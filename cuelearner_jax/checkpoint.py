@@ -1,0 +1,119 @@
+"""Checkpoints: the only file that knows Orbax.
+
+A checkpoint holds three items: `policy` (what acting needs, so that evaluation never reads a replay buffer), `rest` and
+`clock`. Orbax writes to a temporary folder and renames it, so a kill leaves the last complete checkpoint in place.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import orbax.checkpoint as ocp
+
+from cuelearner_jax.errors import UserError
+
+KEPT = 2  # the newest checkpoints of a run
+
+
+def _is_key(leaf: Any) -> bool:
+    return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+
+
+def _flat(tree: Any) -> dict[str, Any]:
+    """Leaves by their path, as Orbax takes them: keys as raw words, leaves without entries left out."""
+    leaves = jax.tree_util.tree_leaves_with_path(tree)
+    return {jax.tree_util.keystr(path): _words(leaf) for path, leaf in leaves if 0 not in leaf.shape}
+
+
+def _words(leaf: Any) -> Any:
+    if not _is_key(leaf):
+        return leaf
+    if isinstance(leaf, jax.ShapeDtypeStruct):
+        return jax.eval_shape(jax.random.key_data, leaf)
+    return jax.random.key_data(leaf)
+
+
+def _unflat(flat: dict[str, Any], like: Any) -> Any:
+    """The inverse of `_flat`."""
+
+    def leaf(path: Any, kind: Any) -> Any:
+        if 0 in kind.shape:
+            return jnp.zeros(kind.shape, kind.dtype)
+        stored = flat[jax.tree_util.keystr(path)]
+        return jax.random.wrap_key_data(stored) if _is_key(kind) else stored
+
+    return jax.tree_util.tree_map_with_path(leaf, like)
+
+
+class Checkpoints:
+    """The checkpoints of one program's run, in one folder; newest last."""
+
+    def __init__(self, folder: Path, read_only: bool = False) -> None:
+        logging.getLogger("absl").setLevel(logging.ERROR)
+        self._folder = folder.resolve()
+        self._manager = ocp.CheckpointManager(
+            self._folder,
+            options=ocp.CheckpointManagerOptions(read_only=True)
+            if read_only
+            else ocp.CheckpointManagerOptions(max_to_keep=KEPT, enable_async_checkpointing=False),
+        )
+
+    def latest(self) -> int | None:
+        """Number of the newest complete checkpoint."""
+        return self._manager.latest_step()
+
+    def save(self, number: int, items: dict[str, Any]) -> None:
+        """Writes a checkpoint; returns once it is complete on disk."""
+        args = {name: ocp.args.StandardSave(_flat(item)) for name, item in items.items()}
+        self._manager.save(number, args=ocp.args.Composite(**args))
+        self._manager.wait_until_finished()
+
+    def restore(self, like: dict[str, Any]) -> dict[str, Any]:
+        """The newest checkpoint's items named in `like` (trees of arrays or shapes), onto the default device.
+
+        Raises:
+            UserError: no checkpoint, one that cannot be read, or one of other shapes.
+        """
+        number = self.latest()
+        if number is None:
+            raise UserError(f"no checkpoint in {self._folder}: the run was stopped before its first one")
+        device = jax.sharding.SingleDeviceSharding(jax.devices()[0])
+        wanted = {
+            name: {
+                path: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=device)
+                for path, leaf in _flat(item).items()
+            }
+            for name, item in like.items()
+        }
+        try:
+            restored = self._manager.restore(
+                number,
+                args=ocp.args.Composite(**{name: ocp.args.StandardRestore(item) for name, item in wanted.items()}),
+            )
+        except Exception as error:  # Orbax and TensorStore raise many kinds for one cause: the files do not fit
+            reason = str(error).strip().splitlines()[0][:160] if str(error).strip() else type(error).__name__
+            raise UserError(
+                f"checkpoint {number} in {self._folder} cannot be read ({reason}): it is damaged or of another program; "
+                "delete that checkpoint's folder to go back to the one before, or start the run anew"
+            ) from error
+        return {name: _unflat(restored[name], like[name]) for name in like}
+
+    def close(self) -> None:
+        """Releases Orbax's threads."""
+        self._manager.close()
+
+
+@contextmanager
+def checkpoints(folder: Path, read_only: bool = False) -> Iterator[Checkpoints]:
+    """`Checkpoints` that close by themselves. `read_only` changes nothing on disk."""
+    manager = Checkpoints(folder, read_only)
+    try:
+        yield manager
+    finally:
+        manager.close()

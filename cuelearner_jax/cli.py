@@ -1,0 +1,386 @@
+"""The command `cuelearner`: reads arguments, calls one function, turns errors into one line and an exit status.
+
+Exit status: 0 done; 2 bad input, nothing changed; 130 stopped by Ctrl-C, everything saved.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import re
+import shlex
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Generic, TypeVar
+
+# Before JAX starts: warnings of its start-up are not the user's.
+os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
+
+import jax  # noqa: E402
+import tyro  # noqa: E402
+from rich.console import Console  # noqa: E402
+from rich.table import Table  # noqa: E402
+
+from cuelearner_jax import play, runs, sweep, teaching  # noqa: E402
+from cuelearner_jax.config import RunConfig  # noqa: E402
+from cuelearner_jax.errors import UserError, closest  # noqa: E402
+from cuelearner_jax.evaluate import VALIDATION  # noqa: E402
+from cuelearner_jax.report import report  # noqa: E402
+from cuelearner_jax.statistics import interval  # noqa: E402
+from cuelearner_jax.tasks import TASKS, Task  # noqa: E402
+from cuelearner_jax.teacher import TeacherConfig  # noqa: E402
+
+TaskT = TypeVar("TaskT")
+Flag = tyro.conf.FlagCreatePairsOff
+out = Console(highlight=False, soft_wrap=True)
+
+ABOUT = {
+    "train": "Train one seed under one kind of guidance.",
+    "sweep": "Train seeds x label budgets x kinds of guidance in one process.",
+    "evaluate": "Validate a run's newest checkpoints, or a task's teacher, heuristic or chance; in any changed world.",
+    "report": "Curves and tables with intervals from recorded results.",
+    "render": "A still and a film of a policy at work.",
+    "teacher": "teacher train: train a teacher from exhaustive tries in parallel.",
+}
+
+
+@dataclass(frozen=True)
+class Common(Generic[TaskT]):
+    """What train and sweep share."""
+
+    run: Annotated[RunConfig[TaskT], tyro.conf.arg(name="")]
+    out: Path
+    """Folder for results and checkpoints."""
+    resume: Flag[bool] = False
+    """Go on with an interrupted run."""
+    overwrite: Flag[bool] = False
+    """Delete what an earlier run left in the folder."""
+    labels_from: Path | None = None
+    """Use the labels of this file instead of asking the teacher."""
+
+
+@dataclass(frozen=True)
+class Train(Common[TaskT], Generic[TaskT]):
+    """Train one seed under one kind of guidance."""
+
+    guidance: str = "relative"
+    """none, relative or heuristic."""
+    labels: int = 500
+    """Labels that the teacher is asked for."""
+    seed: int = 0
+    """Seed."""
+
+
+@dataclass(frozen=True)
+class Sweep(Common[TaskT], Generic[TaskT]):
+    """Train seeds x label budgets x kinds of guidance in one process."""
+
+    guidance: tuple[str, ...] = ("none", "relative", "heuristic")
+    """Any of none, relative, heuristic."""
+    labels: tuple[int, ...] = (500,)
+    """Label budgets; guidance without labels runs once a seed."""
+    seeds: int = 5
+    """Number of seeds."""
+    first_seed: int = 0
+    """The first seed; the others follow."""
+
+
+@dataclass(frozen=True)
+class Evaluate(Generic[TaskT]):
+    """Validate policies."""
+
+    task: TaskT
+    policy: str = "agent"
+    """Of a run: agent, guide (guidance of uniform actions) or guided (guidance of the agent's); of a run or a task alone:
+    teacher, heuristic or uniform."""
+    guidance: tuple[str, ...] = ()
+    """Only these kinds of guidance of the run (default: all)."""
+    steps: int = 10_000
+    """Environment steps for each lane."""
+    envs: int = 100
+    """Environments that share them."""
+    out: Path | None = None
+    """Also write the measurements to this JSON file."""
+
+
+@dataclass(frozen=True)
+class Render(Generic[TaskT]):
+    """A still and a film."""
+
+    task: TaskT
+    out: Path
+    """Folder for the pictures; films and stills of the same name are not overwritten."""
+    policy: str = "agent"
+    """As for evaluate."""
+    guidance: str = ""
+    """Kind of guidance of the run (default: its last)."""
+    labels: int = 0
+    """Label budget of the lane (default: the largest)."""
+    seed: int = 0
+    """Seed of the lane."""
+    steps: int = 4
+    """Steps to film; a new episode follows the end of one."""
+    episode: int = 0
+    """Which random start."""
+    film: str = "gif"
+    """gif or mp4."""
+    overwrite: Flag[bool] = False
+    """Replace pictures of the same name."""
+
+
+@dataclass(frozen=True)
+class Report:
+    """Curves and tables."""
+
+    folders: tyro.conf.Positional[tuple[Path, ...]]
+    """Run folders, or folders above them."""
+    out: Path
+    """Folder for the report."""
+    metric: str = "reward"
+    """Column of the results."""
+    overwrite: Flag[bool] = False
+    """Replace an earlier report."""
+
+
+@dataclass(frozen=True)
+class TeacherTrain(Generic[TaskT]):
+    """Train a teacher."""
+
+    task: TaskT
+    out: Path
+    """Folder for the teacher."""
+    teacher: TeacherConfig = field(default_factory=TeacherConfig)
+    seed: int = 0
+    """Seed."""
+    eval_steps: int = 10_000
+    """Validation steps at the end."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point. Returns the exit status."""
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    try:
+        return _dispatch(arguments)
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    except sweep.Interrupted as error:
+        print(str(error), file=sys.stderr)
+        return 130
+    except KeyboardInterrupt:
+        print("stopped at once; what the last checkpoint holds is safe, go on with --resume", file=sys.stderr)
+        return 130
+
+
+def _dispatch(arguments: list[str]) -> int:
+    commands: dict[str, Callable[[list[str]], None]] = {
+        "train": _train,
+        "sweep": _sweep,
+        "evaluate": _evaluate,
+        "report": _report,
+        "render": _render,
+        "teacher": _teacher,
+    }
+    if not arguments or arguments[0] in ("-h", "--help"):
+        _overview()
+        return 0 if arguments else 2
+    command = arguments[0]
+    if command not in commands:
+        raise UserError(f"unknown command {command!r}{closest(command, commands)}; see cuelearner --help")
+    commands[command](arguments[1:])
+    return 0
+
+
+def _overview() -> None:
+    print("usage: cuelearner COMMAND ...\n\nLearning from relative feedback with off-policy deep RL.\n\ncommands:")
+    for name, about in ABOUT.items():
+        print(f"  {name:<10}{about}")
+    print(f"\ntasks: {', '.join(TASKS)}. Each command has --help, for instance: cuelearner sweep billiards --help")
+
+
+def _parse(kind: Any, arguments: list[str], program: str, default: Any = None) -> Any:
+    """Arguments as a dataclass. Raises UserError with tyro's message in one line."""
+    errors = io.StringIO()
+    keywords = {} if default is None else {"default": default}
+    try:
+        with contextlib.redirect_stderr(errors):
+            return tyro.cli(kind, args=arguments, prog=f"cuelearner {program}", **keywords)
+    except SystemExit as stop:
+        if not stop.code:
+            raise
+        lines = [re.sub(r"^[│╭╰─\s]+|[│╮╯─\s]+$", "", line) for line in errors.getvalue().splitlines()]
+        told = " ".join(line for line in lines[1:] if line)
+        told = re.split(r"For full helptext|Argument helptext", told)[0].strip()
+        told = told.replace("Perhaps you meant:", "; perhaps you meant")
+        told = re.sub(r"\s+", " ", told).replace(" ;", ";")[:400]
+        raise UserError(f"{told}; see cuelearner {program} --help") from None
+
+
+def _task(arguments: list[str], command: str) -> tuple[Task, list[str]]:
+    """The task named first."""
+    if not arguments or arguments[0] in ("-h", "--help"):
+        print(f"usage: cuelearner {command} TASK [--preset NAME] [OPTIONS]\n\n{ABOUT[command.split()[0]]}\n")
+        for task in TASKS.values():
+            print(f"task {task.name}, presets:")
+            for name, preset in task.presets.items():
+                print(f"  {name:<12}{preset.about}")
+        print(f"\noptions and their defaults: cuelearner {command} TASK --help")
+        raise SystemExit(0 if arguments else 2)
+    name = arguments[0]
+    if name not in TASKS:
+        raise UserError(f"unknown task {name!r}{closest(name, TASKS)}")
+    return TASKS[name], arguments[1:]
+
+
+def _preset(task: Task, arguments: list[str]) -> tuple[str, list[str]]:
+    """The preset's name, taken out of the arguments; `paper` if none is given."""
+    rest, name = list(arguments), "paper"
+    for index, argument in enumerate(arguments):
+        if argument == "--preset" or argument.startswith("--preset="):
+            if argument == "--preset" and index + 1 == len(arguments):
+                raise UserError(f"--preset needs a name: choose one of {', '.join(task.presets)}")
+            name = argument.partition("=")[2] if "=" in argument else arguments[index + 1]
+            del rest[index : index + (1 if "=" in argument else 2)]
+            break
+    if name not in task.presets:
+        raise UserError(f"unknown preset {name!r}{closest(name, task.presets)}")
+    return name, rest
+
+
+def _train(arguments: list[str]) -> None:
+    task, rest = _task(arguments, "train")
+    name, rest = _preset(task, rest)
+    preset = task.presets[name]
+    kind = Train[task.config]  # pyright: ignore[reportInvalidTypeArguments]
+    default = kind(preset.config, out=Path("runs") / f"{task.name}-{name}", labels=preset.labels[0])
+    asked = _parse(kind, rest, f"train {task.name}", default)
+    grid = runs.Grid((asked.guidance,), (asked.seed,), (asked.labels,))
+    _run(task, asked, grid)
+
+
+def _sweep(arguments: list[str]) -> None:
+    task, rest = _task(arguments, "sweep")
+    name, rest = _preset(task, rest)
+    preset = task.presets[name]
+    kind = Sweep[task.config]  # pyright: ignore[reportInvalidTypeArguments]
+    folder = Path("runs") / f"{task.name}-{name}"
+    default = kind(preset.config, out=folder, guidance=preset.guidance, labels=preset.labels, seeds=preset.seeds)
+    asked = _parse(kind, rest, f"sweep {task.name}", default)
+    seeds = tuple(range(asked.first_seed, asked.first_seed + asked.seeds))
+    _run(task, asked, runs.Grid(asked.guidance, seeds, asked.labels))
+
+
+def _run(task: Task, asked: Common, grid: runs.Grid) -> None:
+    sweep.run(
+        task,
+        asked.run,
+        grid,
+        asked.out,
+        resume=asked.resume,
+        overwrite=asked.overwrite,
+        labels_from=asked.labels_from,
+    )
+    out.print(f"done: {asked.out} (see it with: cuelearner report {asked.out} --out {asked.out}/report)")
+
+
+def _subject(arguments: list[str], command: str) -> tuple[play.Subject, list[str]]:
+    """The run folder or task named first."""
+    if not arguments or arguments[0] in ("-h", "--help"):
+        print(f"usage: cuelearner {command} RUN_FOLDER|TASK [OPTIONS]\n\n{ABOUT[command]}\n")
+        print(f"options and their defaults: cuelearner {command} {next(iter(TASKS))} --help")
+        raise SystemExit(0 if arguments else 2)
+    name, rest = arguments[0], arguments[1:]
+    if name in TASKS and not Path(name, "config.json").exists():
+        task = TASKS[name]
+        preset, rest = _preset(task, rest)
+        return play.Subject(task, task.presets[preset].config, None, Path(name)), rest
+    if not Path(name).exists():
+        raise UserError(f"{name!r} is neither a run folder nor a task ({', '.join(TASKS)})")
+    task, config, grid = runs.load(Path(name), TASKS)
+    return play.Subject(task, config, grid, Path(name)), rest
+
+
+def _evaluate(arguments: list[str]) -> None:
+    subject, rest = _subject(arguments, "evaluate")
+    kind = Evaluate[subject.task.config]  # pyright: ignore[reportInvalidTypeArguments]
+    default = kind(subject.config.task, policy="agent" if subject.grid else "heuristic")
+    asked = _parse(kind, rest, f"evaluate {subject.folder}", default)
+    subject.check(asked.policy, asked.task)
+    if asked.steps < 1 or asked.envs < 1 or asked.steps % asked.envs:
+        raise UserError(f"--steps is {asked.steps}: give a positive multiple of --envs ({asked.envs})")
+    if asked.out and asked.out.exists():
+        raise UserError(f"{asked.out} exists: give another --out")
+    measured = play.evaluate(subject, asked.task, asked.policy, asked.guidance, asked.envs, asked.steps)
+    out.print(_measurements(measured, f"{asked.policy}, {asked.steps} steps a lane"))
+    if asked.out:
+        play.write(asked.out, subject, asked.task, asked.policy, asked.envs, asked.steps, measured)
+        out.print(f"wrote {asked.out}")
+
+
+def _measurements(measured: list[play.Measured], title: str) -> Table:
+    """Interquartile means over seeds with their intervals, a row for each guidance and budget."""
+    names = list(measured[0].metrics)
+    table = Table("guidance", "labels", "seeds", "trained steps", *names, title=title)
+    for row in measured:
+        cells = []
+        for name in names:
+            values = row.metrics[name]
+            found = interval(values)
+            spread = f" [{float(found.lower):.3f}, {float(found.upper):.3f}]" if len(values) > 1 else ""
+            cells.append(f"{float(found.estimate):.3f}{spread}")
+        table.add_row(row.guidance, str(row.labels), str(len(row.seeds)), str(row.step), *cells)
+    return table
+
+
+def _report(arguments: list[str]) -> None:
+    asked = _parse(Report, arguments, "report")
+    command = shlex.join(["cuelearner", "report", *arguments])
+    written = report(asked.folders, asked.out, asked.metric, overwrite=asked.overwrite, command=command)
+    out.print(f"wrote {written}")
+
+
+def _render(arguments: list[str]) -> None:
+    subject, rest = _subject(arguments, "render")
+    kind = Render[subject.task.config]  # pyright: ignore[reportInvalidTypeArguments]
+    default = kind(subject.config.task, Path("pictures"), policy="agent" if subject.grid else "heuristic")
+    asked = _parse(kind, rest, f"render {subject.folder}", default)
+    subject.check(asked.policy, asked.task)
+    if asked.film not in ("gif", "mp4"):
+        raise UserError(f"--film is {asked.film!r}: choose gif or mp4")
+    if asked.steps < 1:
+        raise UserError(f"--steps is {asked.steps}: give a positive number")
+    film, still = (asked.out / f"{subject.folder.name}-{asked.policy}{end}" for end in (f".{asked.film}", ".png"))
+    taken = [str(file) for file in (film, still) if file.exists()]
+    if taken and not asked.overwrite:
+        raise UserError(f"{taken[0]} exists: give --overwrite to replace it, or another --out")
+    env = subject.task.environment(asked.task)
+    policy = play.one_policy(subject, env, asked.task, asked.policy, asked.guidance, asked.labels, asked.seed)
+    key = jax.random.fold_in(jax.random.fold_in(jax.random.key(0), VALIDATION), asked.episode)
+    frames, rewards = subject.task.record(env, policy, key, asked.steps)
+    asked.out.mkdir(parents=True, exist_ok=True)
+    subject.task.still(env, frames[0], still)
+    subject.task.animate(env, frames, film)
+    out.print(f"rewards {' '.join(f'{reward:g}' for reward in rewards)}; wrote {film} and {still}")
+
+
+def _teacher(arguments: list[str]) -> None:
+    if not arguments or arguments[0] in ("-h", "--help"):
+        print(f"usage: cuelearner teacher train TASK [OPTIONS]\n\n{ABOUT['teacher']}")
+        raise SystemExit(0 if arguments else 2)
+    if arguments[0] != "train":
+        raise UserError(f"unknown command 'teacher {arguments[0]}': it is cuelearner teacher train TASK")
+    task, rest = _task(arguments[1:], "teacher train")
+    kind = TeacherTrain[task.config]  # pyright: ignore[reportInvalidTypeArguments]
+    name, rest = _preset(task, rest)
+    default = kind(task.presets[name].config.task, Path("runs") / f"{task.name}-teacher")
+    asked = _parse(kind, rest, f"teacher train {task.name}", default)
+    command = shlex.join(["cuelearner", "teacher", *arguments])
+    reward = teaching.train(task, asked.task, asked.teacher, asked.out, asked.seed, asked.eval_steps, command)
+    out.print(f"reward a step over {asked.eval_steps} validation steps: {reward:.4f}; wrote {asked.out}")
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,197 @@
+"""Configuration of the method: frozen dataclasses, one line of help beside each field.
+
+Three kinds of number, kept apart: `Sizes` shape the compiled program (another value compiles again), `Scalars` are traced
+(another value costs nothing), `Schedule` counts steps on the host and the shared clock. The defaults are the billiards
+hyper-parameters of the paper (appendix) and of its public code.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from dataclasses import dataclass
+from typing import Any, Generic, Literal, TypeVar
+
+import jax
+import jax.numpy as jnp
+
+from cuelearner_jax.errors import UserError
+
+TaskT = TypeVar("TaskT")
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """Static sizes: changing one compiles the program again."""
+
+    q_layers: tuple[int, ...] = (400, 400, 400, 300, 300, 300)
+    """Hidden layers of the action-value network."""
+    feedback_layers: tuple[int, ...] = (400, 400, 300, 300)
+    """Hidden layers of the guidance model."""
+    directions: int = 3600
+    """Directions over which the agent takes its argmax (3600: every 0.1 deg)."""
+    target_directions: int = 720
+    """Directions of the argmax inside bootstrapped targets (unused at discount 0)."""
+    num_envs: int = 1
+    """Environments of one seed that step together before as many gradient steps follow."""
+    batch_size: int = 100
+    """Transitions in a gradient step."""
+    replay_capacity: int = 10_000_000
+    """Transitions kept (a multiple of num_envs)."""
+    optimizer: Literal["sgd", "adam"] = "sgd"
+    """Optimiser of the action-value network."""
+    updates_per_step: int = 1
+    """Gradient steps for each environment step."""
+    labels_per_round: int = 10
+    """New labels after which the guidance model is fitted again from scratch."""
+    fit_steps: int = 2000
+    """Adam steps of one fit (a fixed number, so that all seeds take equally long)."""
+    fit_batch_size: int = 100
+    """Labels in one step of a fit."""
+    validate_every: int = 20
+    """Adam steps between two looks at the validation labels (every fifth label); the best parameters are kept."""
+    lanes_per_block: int = 0
+    """Seeds trained in one vmapped block (0: 8 on a CPU, where weights then stay in cache; all of them on an accelerator)."""
+
+
+@dataclass(frozen=True)
+class Scalars:
+    """Traced scalars: changing one needs no new compile."""
+
+    learning_rate: float = 0.1
+    """Step size of the action-value network."""
+    discount: float = 0.0
+    """Discount factor; at 0 no target network exists."""
+    max_grad_norm: float = 0.5
+    """Gradients are clipped to this global norm."""
+    polyak: float = 0.005
+    """Rate at which the target network follows."""
+    feedback_learning_rate: float = 1e-3
+    """Adam's step size of the guidance model."""
+    eps_deg: float = 5.0
+    """Strength of one relative label: by how much the teacher turns an action [deg]."""
+    tau_deg: float = 0.1
+    """Refinement stops once a pass turns the action by less [deg]."""
+    tau_max_deg: float = 180.0
+    """Refinement never leaves this distance from the first action [deg]; 180: no bound."""
+    k_max: int = 50
+    """Largest number of refinement passes."""
+    refined_fraction: float = 1.0
+    """Share of the labels after the first fit that are asked about refined actions (DAgger); the rest about base actions."""
+    guided_probability: float = 0.5
+    """Probability that an episode is guided."""
+    mistake_probability: float = 0.0
+    """Teacher's fault: a turn is told the wrong way round with this probability."""
+    silence_probability: float = 0.0
+    """Teacher's fault: no answer with this probability (the question still counts as a label)."""
+    indifference_deg: float = 0.0
+    """Teacher's fault: errors up to this pass for right (relative feedback alone implies eps / 2) [deg]."""
+    teacher_bias_deg: float = 0.0
+    """Teacher's fault: constant error of what it takes for the best action, counterclockwise [deg]."""
+
+    def radians(self, name: str) -> jax.Array:
+        """The field `name` + `_deg`, in radians; traced where the field is."""
+        return jnp.deg2rad(jnp.asarray(getattr(self, name + "_deg"), jnp.float32))
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """Counts of environment steps of one seed."""
+
+    total_steps: int = 10_000_000
+    """Environment steps of each seed."""
+    random_steps: int = 10_000
+    """First steps, with uniform actions."""
+    learn_after: int = 1_000
+    """Steps before the first gradient step."""
+    guidance_until: int = 500_000
+    """Step at which guidance is cut off."""
+    target_every: int = 2
+    """Gradient steps between two moves of the target network."""
+    eval_every: int = 10_000
+    """Steps between two evaluations."""
+    eval_steps: int = 10_000
+    """Environment steps of one evaluation."""
+    eval_envs: int = 100
+    """Environments that share an evaluation's steps."""
+    checkpoint_every: int = 1_000_000
+    """Steps between two checkpoints, which is what a killed run may lose."""
+
+
+for _traced in (Scalars, Schedule):
+    jax.tree_util.register_dataclass(_traced, [field.name for field in dataclasses.fields(_traced)], [])
+
+
+@dataclass(frozen=True)
+class RunConfig(Generic[TaskT]):
+    """Everything that determines a run but its lanes (seeds, label budgets) and its kind of guidance."""
+
+    task: TaskT
+    sizes: Sizes = dataclasses.field(default_factory=Sizes)
+    scalars: Scalars = dataclasses.field(default_factory=Scalars)
+    schedule: Schedule = dataclasses.field(default_factory=Schedule)
+
+    @property
+    def bootstraps(self) -> bool:
+        """Do targets look at the next observation?"""
+        return self.scalars.discount > 0
+
+
+def check(config: RunConfig) -> None:
+    """Raises UserError with one line for the first value that cannot work."""
+    sizes, scalars, schedule = config.sizes, config.scalars, config.schedule
+    positive = ("directions", "target_directions", "num_envs", "batch_size", "replay_capacity", "updates_per_step")
+    positive += ("labels_per_round", "fit_steps", "fit_batch_size", "validate_every")
+    for name in positive:
+        if getattr(sizes, name) < 1:
+            raise UserError(f"sizes.{name} is {getattr(sizes, name)}: give a positive number")
+    if not sizes.q_layers or not sizes.feedback_layers or min(sizes.q_layers + sizes.feedback_layers) < 1:
+        raise UserError("sizes.q_layers and sizes.feedback_layers each need at least one layer of positive width")
+    for name, value in dataclasses.asdict(scalars).items():
+        if name.endswith(("probability", "fraction")) and not 0 <= value <= 1:
+            raise UserError(f"scalars.{name} is {value}: give a number from 0 to 1")
+        if name != "teacher_bias_deg" and value < 0:
+            raise UserError(f"scalars.{name} is {value}: give a number that is not negative")
+    if scalars.eps_deg <= 0:
+        raise UserError("scalars.eps_deg is 0: a relative label needs a strength; give a positive number of degrees")
+    if scalars.discount >= 1:
+        raise UserError(f"scalars.discount is {scalars.discount}: give a number below 1")
+    for name in ("total_steps", "eval_every", "eval_steps", "eval_envs", "checkpoint_every", "target_every"):
+        if getattr(schedule, name) < 1:
+            raise UserError(f"schedule.{name} is {getattr(schedule, name)}: give a positive number")
+    _check_multiple(schedule.eval_every, sizes.num_envs, "schedule.eval_every", "sizes.num_envs")
+    _check_multiple(sizes.replay_capacity, sizes.num_envs, "sizes.replay_capacity", "sizes.num_envs")
+    _check_multiple(schedule.total_steps, schedule.eval_every, "schedule.total_steps", "schedule.eval_every")
+    _check_multiple(schedule.checkpoint_every, schedule.eval_every, "schedule.checkpoint_every", "schedule.eval_every")
+    _check_multiple(schedule.eval_steps, schedule.eval_envs, "schedule.eval_steps", "schedule.eval_envs")
+    _check_multiple(sizes.fit_steps, sizes.validate_every, "sizes.fit_steps", "sizes.validate_every")
+
+
+def _check_multiple(value: int, unit: int, name: str, unit_name: str) -> None:
+    if value % unit:
+        raise UserError(f"{name} is {value}: give a multiple of {unit_name} ({unit})")
+
+
+def to_json(config: Any) -> dict[str, Any]:
+    """A configuration as plain JSON values."""
+    return json.loads(json.dumps(dataclasses.asdict(config)))
+
+
+def from_json(kind: type, values: dict[str, Any]) -> Any:
+    """A flat configuration dataclass (Sizes, Scalars, Schedule, a task's) from JSON values; lists become tuples.
+
+    Raises UserError for an unknown field.
+    """
+    known = {field.name for field in dataclasses.fields(kind)}
+    unknown = sorted(set(values) - known)
+    if unknown:
+        raise UserError(
+            f"unknown field {unknown[0]!r} for {kind.__name__}: the file was written by another version of cuelearner"
+        )
+    return kind(**{name: tuple(value) if isinstance(value, list) else value for name, value in values.items()})
+
+
+def digest(values: dict[str, Any]) -> str:
+    """Short hash of JSON values: equal configurations have equal hashes."""
+    return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:12]

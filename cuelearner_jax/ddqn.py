@@ -1,0 +1,68 @@
+"""Double DQN over a finite set of directions: targets, loss and greedy choice, pure and unbatched.
+
+Source: van Hasselt, Guez, Silver, "Deep reinforcement learning with double Q-learning", Eq. 4.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Float
+
+from cuelearner_jax.types import Params, Transition
+
+# (params, obs (..., obs), actions (..., 2)) -> (..., 1)
+ValueFunction = Callable[[Params, jax.Array, jax.Array], jax.Array]
+
+
+def greedy(
+    q: ValueFunction, params: Params, obs: Float[Array, " obs"], directions: Float[Array, "n 2"]
+) -> Float[Array, "2"]:
+    """The direction of the set with the largest value."""
+    return directions[jnp.argmax(q(params, obs, directions)[:, 0])]
+
+
+def target(
+    q: ValueFunction,
+    params: Params,
+    target_params: Params,
+    transition: Transition,
+    directions: Float[Array, "n 2"],
+    discount: Float[Array, ""],
+) -> Float[Array, ""]:
+    """r + discount * Q'(s', argmax_a Q(s', a)): the online network chooses, the target network values.
+
+    `target_params` None means that nothing bootstraps (a discount of 0): the target is the reward.
+    """
+    if target_params is None:
+        return transition.reward
+    choice = greedy(q, params, transition.next_obs, directions)
+    value = q(target_params, transition.next_obs, choice)[0]
+    return transition.reward + discount * transition.discount * value
+
+
+def loss(
+    q: ValueFunction, params: Params, transitions: Transition, targets: Float[Array, " batch"]
+) -> Float[Array, ""]:
+    """Mean squared error of the values of the actions taken, over a batch."""
+    values = q(params, transitions.obs, transitions.action)[..., 0]
+    return jnp.mean(jnp.square(values - targets))
+
+
+def optimizer(name: str, learning_rate: Float[Array, ""], max_norm: Float[Array, ""]) -> optax.GradientTransformation:
+    """Gradients clipped to a global norm, then SGD or Adam. Both scalars may be traced.
+
+    Raises ValueError for another name.
+    """
+    makers = {"sgd": optax.sgd, "adam": optax.adam}
+    if name not in makers:
+        raise ValueError(f"unknown optimizer {name!r}: choose one of {sorted(makers)}")
+    return optax.chain(optax.clip_by_global_norm(max_norm), makers[name](learning_rate))
+
+
+def polyak(params: Params, target_params: Params, rate: Float[Array, ""]) -> Params:
+    """The target network moved toward the online one by `rate`."""
+    return optax.incremental_update(params, target_params, rate)

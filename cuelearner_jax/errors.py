@@ -1,0 +1,18 @@
+"""The one exception that a user is meant to read."""
+
+import difflib
+from collections.abc import Iterable
+
+
+class UserError(Exception):
+    """Bad input: its message is one clear line that says what is wrong and what to do.
+
+    The command line prints the message alone, without a traceback, and exits with status 2.
+    """
+
+
+def closest(word: str, known: Iterable[str]) -> str:
+    """The end of a message about an unknown word: the one that was probably meant, or all there are."""
+    known = list(known)
+    found = difflib.get_close_matches(word, known, n=1)
+    return f", did you mean {found[0]!r}?" if found else f": choose one of {', '.join(known)}"

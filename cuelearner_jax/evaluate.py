@@ -1,0 +1,112 @@
+"""Validation: fixed-length roll-outs of any policy on episodes that nothing was trained or tuned on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from cuelearner_jax import actions as geometry
+from cuelearner_jax import ddqn
+from cuelearner_jax.config import Scalars, Sizes
+from cuelearner_jax.networks import q_network
+from cuelearner_jax.types import Environment, Guidance, GuidanceModel, Params, Teacher
+
+# (key, environment states (n, ...), observations (n, obs)) -> directions (n, 2)
+Policy = Callable[[PRNGKeyArray, Any, jax.Array], jax.Array]
+
+# Folded into the root key: episodes for choosing settings, and episodes for reported figures only.
+TUNING, VALIDATION = 1_000_001, 1_000_002
+
+ACTIONS_AT_ONCE = 8192  # state-action pairs in one forward pass of an argmax: bounds its memory
+
+
+def rollout(
+    policy: Policy, env: Environment, key: PRNGKeyArray, num_envs: int, steps: int
+) -> dict[str, Float[Array, ""]]:
+    """Means over `steps` environment steps, shared by `num_envs` environments that reset by themselves.
+
+    Returns:
+        "reward" a step, and every metric of the environment's.
+    """
+    k_reset, k_run = jax.random.split(key)
+    state, obs = jax.vmap(env.reset)(jax.random.split(k_reset, num_envs))
+
+    def one_step(carry: tuple, index: jax.Array) -> tuple[tuple, dict[str, jax.Array]]:
+        state, obs = carry
+        k_act, k_env = jax.random.split(jax.random.fold_in(k_run, index))
+        action = policy(k_act, state, obs)
+        state, step = jax.vmap(env.step)(jax.random.split(k_env, num_envs), state, action)
+        means = {name: value.mean() for name, value in step.metrics.items()}
+        return (state, step.obs), {"reward": step.reward.mean(), **means}
+
+    _, metrics = jax.lax.scan(one_step, (state, obs), jnp.arange(steps // num_envs))
+    return jax.tree.map(jnp.mean, metrics)
+
+
+def agent_policy(sizes: Sizes, params: Params) -> Policy:
+    """The greedy choice of an action-value network."""
+    network, options = q_network(sizes.q_layers), geometry.evenly_spaced(sizes.directions)
+
+    def policy(key: PRNGKeyArray, state: Any, obs: jax.Array) -> jax.Array:
+        choose = partial(ddqn.greedy, network.apply, params, directions=options)  # pyright: ignore[reportArgumentType]
+        return jax.lax.map(choose, obs, batch_size=max(1, ACTIONS_AT_ONCE // sizes.directions))
+
+    return policy
+
+
+def uniform_policy() -> Policy:
+    """Uniform directions."""
+    return lambda key, state, obs: geometry.uniform(key, (obs.shape[0],))
+
+
+def teacher_policy(teacher: Teacher) -> Policy:
+    """What a teacher holds for best."""
+    # One state after another: a teacher by search simulates hundreds of actions of each.
+    return lambda key, state, obs: jax.lax.map(lambda pair: teacher.best_action(*pair), (state, obs))
+
+
+def heuristic_policy(env: Environment) -> Policy:
+    """The environment's own heuristic."""
+    return lambda key, state, obs: jax.vmap(env.heuristic)(obs)
+
+
+def guided_policy(base: Policy, guidance: Guidance, model: GuidanceModel, env: Environment, scalars: Scalars) -> Policy:
+    """Another policy's actions, every one of them under guidance."""
+
+    def policy(key: PRNGKeyArray, state: Any, obs: jax.Array) -> jax.Array:
+        everywhere = jnp.ones(obs.shape[0], bool)
+        return guidance.act(model, env, obs, base(key, state, obs), everywhere, scalars)[0]
+
+    return policy
+
+
+@partial(jax.jit, static_argnames=("sizes", "num_envs", "steps"))
+def evaluate_agents(
+    env: Environment, params: Params, key: PRNGKeyArray, *, sizes: Sizes, num_envs: int, steps: int
+) -> dict[str, Float[Array, " lanes"]]:
+    """Validation of a block of agents (leading axis of `params`), all on the same episodes."""
+    return jax.lax.map(lambda lane: rollout(agent_policy(sizes, lane), env, key, num_envs, steps), params)
+
+
+@partial(jax.jit, static_argnames=("guidance", "num_envs", "steps"))
+def evaluate_guides(
+    env: Environment,
+    models: GuidanceModel,
+    key: PRNGKeyArray,
+    scalars: Scalars,
+    *,
+    guidance: Guidance,
+    num_envs: int,
+    steps: int,
+) -> dict[str, Float[Array, " lanes"]]:
+    """How good guidance is by itself: uniform actions under it, for a block of lanes on the same episodes."""
+
+    def one(model: GuidanceModel) -> dict[str, jax.Array]:
+        return rollout(guided_policy(uniform_policy(), guidance, model, env, scalars), env, key, num_envs, steps)
+
+    return jax.vmap(one)(models)

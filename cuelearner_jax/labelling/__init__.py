@@ -1,0 +1,1 @@
+"""Labels from people and programs: the files they are kept in."""

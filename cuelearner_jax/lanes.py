@@ -1,0 +1,129 @@
+"""The lanes of one kind of guidance: their blocks, the memory they need, and what of them is kept in a checkpoint."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from cuelearner_jax.checkpoint import checkpoints
+from cuelearner_jax.config import RunConfig
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.runs import Grid
+from cuelearner_jax.train import Program, label_slots, make_program, start_clock
+from cuelearner_jax.types import Clock, Guidance, TrainState
+
+CPU_LANES_PER_BLOCK = 8  # lanes whose weights stay in a CPU's cache together
+
+
+class Group:
+    """The lanes of one kind of guidance: one compiled program, its lanes cut into equal blocks."""
+
+    def __init__(self, config: RunConfig, env: Any, guidance: Guidance, grid: Grid) -> None:
+        self.config, self.env, self.guidance = config, env, guidance
+        self.seeds, self.budgets = grid.lanes(guidance)
+        self.largest_budget = int(self.budgets.max())
+        self.program: Program = make_program(config, guidance, env, self.largest_budget)
+
+    @property
+    def rounds(self) -> int:
+        """Label rounds of the largest lane."""
+        return label_slots(self.largest_budget, self.config.sizes) // self.config.sizes.labels_per_round
+
+    def blocks(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        """(seeds, budgets) of each block; the last is filled up with repeats, whose results are dropped."""
+        limit = self.config.sizes.lanes_per_block
+        if limit == 0:
+            limit = CPU_LANES_PER_BLOCK if jax.default_backend() == "cpu" else len(self.seeds)
+        count = -(-len(self.seeds) // limit)
+        size = -(-len(self.seeds) // count)
+        index = np.minimum(np.arange(count * size), len(self.seeds) - 1).reshape(count, size)
+        return [(self.seeds[rows], self.budgets[rows]) for rows in index]
+
+    def start(self) -> list[TrainState]:
+        """Fresh blocks."""
+        root = jax.random.key(0)
+        return [self.program.init(self.env, jnp.asarray(s), jnp.asarray(b), root) for s, b in self.blocks()]
+
+    def shapes(self) -> list[TrainState]:
+        """Shapes of the blocks, without making them."""
+        root = jax.random.key(0)
+        return [
+            jax.eval_shape(self.program.init, self.env, jnp.asarray(s), jnp.asarray(b), root) for s, b in self.blocks()
+        ]
+
+    def lanes(self, blocks: list[Any]) -> dict[str, np.ndarray]:
+        """Columns of one row a lane from per-block dictionaries of (lanes,) arrays."""
+        return {
+            name: np.concatenate([np.asarray(block[name]) for block in blocks])[: len(self.seeds)] for name in blocks[0]
+        }
+
+
+def state_bytes(tree: Any) -> int:
+    """Memory of a tree of arrays or shapes [bytes]."""
+    return sum(int(np.prod(leaf.shape)) * leaf.dtype.itemsize for leaf in jax.tree.leaves(tree))
+
+
+def memory_report(group: Group) -> str:
+    """One line on the memory that the lanes need. Raises UserError if it is more than there is."""
+    shapes = group.shapes()
+    sizes, lanes = group.config.sizes, len(group.seeds)
+    padded = sum(len(seeds) for seeds, _ in group.blocks())
+    kept = sum(state_bytes(block) for block in shapes)
+    # Two layers' activations of the widest pass: the argmax while acting, or a batch with its gradient.
+    widest = max(*sizes.q_layers, *sizes.feedback_layers)
+    rows = max(sizes.num_envs * sizes.directions, 3 * sizes.batch_size * len(sizes.q_layers))
+    if group.config.bootstraps:
+        rows = max(rows, sizes.batch_size * sizes.target_directions)
+    working = 2 * 4 * widest * rows * (padded // len(shapes))
+    available = _available_bytes()
+    limit = f", {available / 1e9:.1f} GB are free" if available else ""
+    if available and kept + working > available:
+        fitting = max(int((available - working) // (kept / padded)), 0)
+        raise UserError(
+            f"{lanes} lanes need {(kept + working) / 1e9:.1f} GB, {available / 1e9:.1f} GB are free: "
+            f"train at most {fitting} at once, or lower --sizes.replay-capacity"
+        )
+    return (
+        f"{group.guidance.name}: {lanes} lanes, {kept / padded / 1e6:.1f} MB a seed at rest, "
+        f"{(kept + working) / 1e9:.2f} GB in all while training{limit}"
+    )
+
+
+def _available_bytes() -> int | None:
+    """Free memory of the device that trains, where it can be known."""
+    device = jax.devices()[0]
+    if device.platform != "cpu":
+        stats = device.memory_stats() or {}
+        return stats["bytes_limit"] - stats.get("bytes_in_use", 0) if "bytes_limit" in stats else None
+    try:
+        lines = Path("/proc/meminfo").read_text().splitlines()
+    except OSError:
+        return None
+    return next((int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:")), None)
+
+
+def items(blocks: list[TrainState], clock: Clock, wall: float) -> dict[str, Any]:
+    """A run's state as the items of a checkpoint: acting needs the first alone."""
+    return {
+        "policy": [{"params": block.params, "guidance": block.guidance} for block in blocks],
+        "rest": [block.replace(params=None, guidance=None) for block in blocks],
+        "clock": {"clock": clock, "wall_s": np.float32(wall)},
+    }
+
+
+def restore_policies(group: Group, folder: Path) -> tuple[dict[str, Any], int]:
+    """What the lanes of a run's folder act with: ({"params": ..., "guidance": ...}, leading axis: lanes; their step).
+
+    Raises UserError if there is no readable checkpoint.
+    """
+    if not (folder / "checkpoints").is_dir():
+        raise UserError(f"no checkpoint in {folder}: train first, or give a run folder that has one")
+    with checkpoints(folder / "checkpoints", read_only=True) as saved:
+        like = items(group.shapes(), jax.eval_shape(start_clock), 0.0)
+        found = saved.restore({name: like[name] for name in ("policy", "clock")})
+    policies = jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[: len(group.seeds)], *found["policy"])
+    return policies, int(found["clock"]["clock"].step)

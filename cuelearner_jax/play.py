@@ -1,0 +1,187 @@
+"""Policies by name: of a trained run's lanes, or of a task alone; evaluated and recorded."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from cuelearner_jax import guidance as guidances
+from cuelearner_jax import results
+from cuelearner_jax.config import RunConfig, to_json
+from cuelearner_jax.errors import UserError, closest
+from cuelearner_jax.evaluate import (
+    VALIDATION,
+    Policy,
+    agent_policy,
+    guided_policy,
+    heuristic_policy,
+    rollout,
+    teacher_policy,
+    uniform_policy,
+)
+from cuelearner_jax.lanes import Group, restore_policies
+from cuelearner_jax.runs import Grid
+from cuelearner_jax.tasks import Task
+from cuelearner_jax.types import Environment, Guidance
+
+TRAINED = ("agent", "guide", "guided")  # the agent; guidance of uniform actions; guidance of the agent's actions
+UNTRAINED = ("teacher", "heuristic", "uniform")
+
+
+@dataclass(frozen=True)
+class Subject:
+    """What evaluate and render work on: a run folder, or a task alone."""
+
+    task: Task
+    config: RunConfig
+    grid: Grid | None
+    folder: Path
+
+    def check(self, policy: str, changed: Any) -> None:
+        """Raises UserError unless the policy can be had and acts in the changed world."""
+        known = (TRAINED if self.grid else ()) + UNTRAINED
+        if policy not in TRAINED + UNTRAINED:
+            raise UserError(f"unknown policy {policy!r}{closest(policy, TRAINED + UNTRAINED)}")
+        if policy not in known:
+            raise UserError(f"policy {policy!r} needs a trained run: give a run folder, or one of {', '.join(known)}")
+        before, after = (self.task.environment(c).obs_size for c in (self.config.task, changed))
+        if before != after:
+            raise UserError(f"the run's observations have {before} entries, this world's {after}: keep its structure")
+
+
+@dataclass(frozen=True)
+class Trained:
+    """The lanes of one kind of guidance, as their newest checkpoint has them."""
+
+    guidance: Guidance
+    seeds: np.ndarray  # (lanes,)
+    budgets: np.ndarray  # (lanes,)
+    policies: Any  # {"params", "guidance"}, leading axis: lanes
+    step: int
+
+
+def load_lanes(subject: Subject, kinds: tuple[str, ...]) -> list[Trained]:
+    """The lanes of a run's kinds of guidance (none named: all). Raises UserError for a kind that the run does not have."""
+    assert subject.grid is not None  # Subject.check has seen to it
+    env = subject.task.environment(subject.config.task)
+    loaded = []
+    for kind in kinds or subject.grid.guidance:
+        if kind not in subject.grid.guidance:
+            raise UserError(
+                f"{subject.folder} has no guidance {kind!r}: choose among {', '.join(subject.grid.guidance)}"
+            )
+        made = guidances.make(kind, subject.config.sizes, env.obs_size)
+        group = Group(subject.config, env, made, subject.grid)
+        policies, step = restore_policies(group, subject.folder / kind)
+        loaded.append(Trained(group.guidance, group.seeds, group.budgets, policies, step))
+    return loaded
+
+
+def trained_policy(name: str, lanes: Trained, lane: Any, config: RunConfig, env: Environment) -> Policy:
+    """One lane's policy. `lane` is its entry of `lanes.policies`."""
+    agent = agent_policy(config.sizes, lane["params"])
+    if name == "agent":
+        return agent
+    base = uniform_policy() if name == "guide" else agent
+    return guided_policy(base, lanes.guidance, lane["guidance"], env, config.scalars)
+
+
+def untrained_policy(name: str, task: Task, world: Any, env: Environment) -> Policy:
+    """A policy that needs no run: the task's teacher or heuristic, or chance."""
+    if name == "teacher":
+        return teacher_policy(task.teacher(world, env))
+    return heuristic_policy(env) if name == "heuristic" else uniform_policy()
+
+
+class Measured(NamedTuple):
+    """A policy's metrics under one guidance and budget."""
+
+    guidance: str
+    labels: int
+    step: int
+    seeds: np.ndarray  # (seeds,)
+    metrics: dict[str, np.ndarray]  # each (seeds,)
+
+
+def evaluate(
+    subject: Subject, world: Any, name: str, kinds: tuple[str, ...], num_envs: int, steps: int
+) -> list[Measured]:
+    """Metrics of a policy on validation episodes of a world (a task configuration), for each guidance and budget."""
+    env = subject.task.environment(world)
+    key = jax.random.fold_in(jax.random.key(0), VALIDATION)
+    if name in UNTRAINED:
+        policy = untrained_policy(name, subject.task, world, env)
+        found = jax.jit(lambda env: rollout(policy, env, key, num_envs, steps))(env)
+        metrics = {metric: np.asarray(value)[None] for metric, value in found.items()}
+        return [Measured("-", 0, 0, np.zeros(1, int), metrics)]
+    rows = []
+    for lanes in load_lanes(subject, kinds):
+
+        @jax.jit
+        def measure(env: Environment, policies: Any, lanes: Trained = lanes) -> dict[str, jax.Array]:
+            def one(lane: Any) -> dict[str, jax.Array]:
+                return rollout(trained_policy(name, lanes, lane, subject.config, env), env, key, num_envs, steps)
+
+            return jax.lax.map(one, policies)
+
+        found = {metric: np.asarray(values) for metric, values in measure(env, lanes.policies).items()}
+        for budget in np.unique(lanes.budgets):
+            own = lanes.budgets == budget
+            metrics = {metric: values[own] for metric, values in found.items()}
+            rows.append(Measured(lanes.guidance.name, int(budget), lanes.step, lanes.seeds[own], metrics))
+    return rows
+
+
+def one_policy(
+    subject: Subject, env: Environment, world: Any, name: str, kind: str, labels: int, seed: int
+) -> Policy:
+    """A single policy: of one lane of a run, or of the task. Raises UserError if the run has no such lane."""
+    if name in UNTRAINED:
+        return untrained_policy(name, subject.task, world, env)
+    assert subject.grid is not None  # Subject.check has seen to it
+    lanes = load_lanes(subject, (kind or subject.grid.guidance[-1],))[0]
+    budget = labels or int(lanes.budgets.max())
+    index = np.flatnonzero((lanes.seeds == seed) & (lanes.budgets == budget))
+    if not len(index):
+        raise UserError(
+            f"no lane with seed {seed} and {budget} labels: the run has seeds {_listed(lanes.seeds)} "
+            f"and labels {_listed(lanes.budgets)}"
+        )
+    lane = jax.tree.map(lambda leaf: leaf[index[0]], lanes.policies)
+    return trained_policy(name, lanes, lane, subject.config, env)
+
+
+def _listed(values: np.ndarray) -> str:
+    return ", ".join(str(value) for value in np.unique(values))
+
+
+def write(
+    path: Path, subject: Subject, world: Any, policy: str, num_envs: int, steps: int, measured: list[Measured]
+) -> None:
+    """Measurements as JSON, with the world and where the numbers come from."""
+    rows = [
+        {
+            "guidance": row.guidance,
+            "labels": row.labels,
+            "trained_steps": row.step,
+            "seeds": row.seeds.tolist(),
+            **{metric: values.tolist() for metric, values in row.metrics.items()},
+        }
+        for row in measured
+    ]
+    contents = {
+        "subject": subject.folder.name,
+        "world": {"name": subject.task.name, **to_json(world)},
+        "policy": policy,
+        "envs": num_envs,
+        "steps": steps,
+        **results.provenance(),
+        "rows": rows,
+    }
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(contents, indent=1) + "\n")

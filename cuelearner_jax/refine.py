@@ -1,0 +1,67 @@
+"""The refinement loop (paper, Eqs. 3-5): a <- a + phi(s, a) until it settles, never leaving a ball round the first action.
+
+Batch-native: a mask says which rows are done, so one `lax.while_loop` serves any number of actions, compiles with
+everything round it and exports. No randomness.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from cuelearner_jax import actions as geometry
+
+
+class Refined(NamedTuple):
+    """Result of a refinement."""
+
+    actions: Float[Array, "batch 2"]
+    passes: Int[Array, " batch"]  # how often each row was moved
+
+
+def untouched(actions: Float[Array, "batch 2"]) -> Refined:
+    """Actions that nothing refined."""
+    return Refined(actions, jnp.zeros(actions.shape[0], jnp.int32))
+
+
+def refine(
+    residual: Callable[[Float[Array, "batch 2"]], Float[Array, "batch 2"]],
+    first: Float[Array, "batch 2"],
+    active: Bool[Array, " batch"],
+    *,
+    tau: Float[Array, ""] | float,
+    tau_max: Float[Array, ""] | float,
+    k_max: Int[Array, ""] | int,
+) -> Refined:
+    """Refines a batch of directions.
+
+    Args:
+        residual: phi(s, .) of the rows' own observations: directions -> residuals.
+        first: a_0, unit vectors.
+        active: rows to refine; the others come back untouched.
+        tau: a row stops once a pass turns it by less than this [rad].
+        tau_max: bound on the turn away from `first` [rad]; every iterate is clipped to it.
+        k_max: largest number of passes.
+    """
+
+    def unfinished(carry: tuple[jax.Array, jax.Array, jax.Array, jax.Array]) -> jax.Array:
+        _, done, _, k = carry
+        return (k < k_max) & ~jnp.all(done)
+
+    def one_pass(
+        carry: tuple[jax.Array, jax.Array, jax.Array, jax.Array],
+    ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+        current, done, passes, k = carry
+        proposal = geometry.retract(current + residual(current))
+        proposal = geometry.clip_to_ball(proposal, first, tau_max)
+        settled = jnp.abs(geometry.difference(current, proposal)) < tau
+        moved = jnp.where(done[:, None], current, proposal)
+        return moved, done | settled, passes + ~done, k + 1
+
+    start = (first, ~active, jnp.zeros(first.shape[0], jnp.int32), jnp.zeros((), jnp.int32))
+    refined, _, passes, _ = jax.lax.while_loop(unfinished, one_pass, start)
+    return Refined(refined, passes)

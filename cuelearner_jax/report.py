@@ -1,0 +1,438 @@
+"""Figures and tables from recorded results: what `cuelearner report` writes.
+
+A report is a folder: `report.md` (table, figures, what is missing, where the numbers come from), `summary.csv` (the
+table), `curves.csv` (what the curves show), `curves.png/.svg` and, where there are several label budgets,
+`label_efficiency.png/.svg`. The same results always give the same bytes.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import matplotlib
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import scipy.optimize
+from jaxtyping import Float, Int
+from matplotlib import ticker
+from matplotlib.axes import Axes
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+
+from cuelearner_jax import results
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.statistics import Curve, Interval, curve, interval, mean_over_curve, steps_to_reach, stretches_apart
+
+# Okabe and Ito's palette: one hue for each guidance, told apart with any colour vision.
+COLOURS = {"none": "#4d4d4d", "relative": "#0072B2", "heuristic": "#D55E00", "demonstration": "#009E73"}
+COLOURS |= {"scalar": "#CC79A7"}
+OTHER_COLOURS = ("#E69F00", "#56B4E9", "#B8A600", "#000000")
+AXIS_NAMES = {"reward": "reward a step", "success": "success rate", "collision": "collision rate"}
+STYLE: dict[Any, Any] = {
+    "svg.hashsalt": "cuelearner",  # together with no date: the same figure gives the same bytes
+    "font.size": 10,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.titlelocation": "left",
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": "#e6e6e6",
+    "legend.frameon": False,
+}
+
+
+class Group(NamedTuple):
+    """All seeds under one kind of guidance with one label budget, at the steps that all of them have reached."""
+
+    guidance: str
+    labels: int
+    seeds: Int[np.ndarray, "seeds"]
+    values: Float[np.ndarray, "seeds steps"]
+    curve: Curve
+    mean: Interval  # of the mean over the curve, up to the last step that all groups share
+
+    @property
+    def name(self) -> str:
+        name = _guidance_name(self.guidance)
+        return f"{name}, {self.labels:,} labels" if self.labels else name
+
+
+def report(
+    folders: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
+    out: str | os.PathLike[str],
+    metric: str = "reward",
+    *,
+    split: str = "validation",
+    task: str | None = None,
+    overwrite: bool = False,
+    command: str = "",
+) -> Path:
+    """Writes the report of any number of runs, done or still going.
+
+    Args:
+        folders: folders of runs, or folders above them.
+        out: folder of the report.
+        metric: metric column to report.
+        split: "validation" or "training".
+        task: keeps the runs of this task only; needed where there are several.
+        overwrite: write over a report that is there already.
+        command: command line that makes this report, noted in it.
+
+    Returns:
+        The path of `report.md`.
+
+    Raises:
+        UserError: if `out` is there already, or the results are missing, corrupt, of several tasks, lack the metric or
+            the split, or hold a seed twice.
+    """
+    folders = [folders] if isinstance(folders, str | os.PathLike) else list(folders)
+    out = Path(out)
+    if out.exists() and (not out.is_dir() or any(out.iterdir())) and not overwrite:
+        raise UserError(f"{out} exists already: choose another folder for the report, or allow it to be overwritten")
+    table, invalid = _select(results.read(folders, task), metric, split)
+    groups = _groups(table, metric)
+    missing = _missing(folders, table, groups)
+    if invalid:
+        missing.append(f"{invalid:,} {split} rows have no finite {metric}; the steps of these rows are left out")
+    rows = summary(groups)
+    title = f"{table['task'][0].as_py()}: {split} {metric.replace('_', ' ')}, {_seed_count(groups)}"
+    figures = {"curves": draw_curves(groups, title, _axis_name(metric))}
+    if len({group.labels for group in groups if group.labels}) > 1:
+        figures["label_efficiency"] = draw_label_efficiency(groups, title, _axis_name(metric))
+
+    out.mkdir(parents=True, exist_ok=True)
+    for name in ("curves", "label_efficiency"):  # a figure of an earlier report that this one lacks must not stay
+        for suffix in ("png", "svg"):
+            (out / f"{name}.{suffix}").unlink(missing_ok=True)
+    for name, figure in figures.items():
+        save_figure(figure, out / name)
+    _write_csv(out / "summary.csv", rows)
+    _write_csv(out / "curves.csv", _curve_rows(groups))
+    text = _markdown(title, rows, list(figures), missing, _provenance(table, command))
+    (out / "report.md").write_text(text, encoding="utf-8")
+    return out / "report.md"
+
+
+# --- from rows to groups ---------------------------------------------------------------------------------------------
+
+
+def _select(table: pa.Table, metric: str, split: str) -> tuple[pa.Table, int]:
+    """The rows to report, and how many rows of the split were left out because the metric is not finite."""
+    if metric not in results.metrics(table):
+        raise UserError(f"no metric {metric!r} in the results: there are {', '.join(results.metrics(table))}")
+    splits = sorted(set(table["split"].to_pylist()))
+    if split not in splits:
+        raise UserError(f"no {split} rows in the results: there are {', '.join(splits)} rows")
+    rows = table.filter(pc.field("split") == split)
+    table = rows.filter(pc.field(metric).is_valid())
+    if table.num_rows == 0:
+        raise UserError(f"the metric {metric!r} has no finite value in the {split} rows: choose another metric")
+    return table, rows.num_rows - table.num_rows
+
+
+def _groups(table: pa.Table, metric: str) -> list[Group]:
+    """The groups in the order of the legend: unguided, then by guidance and label budget."""
+    guidance, labels = np.array(table["guidance"].to_pylist()), table["labels"].to_numpy()
+    keys = set(zip(guidance.tolist(), labels.tolist(), strict=True))
+    raw = {}
+    for key in sorted(keys, key=lambda key: (key[0] != "none", key[0], key[1])):
+        raw[key] = _matrix(table.filter(pa.array((guidance == key[0]) & (labels == key[1]))), metric, key)
+    shared = min(steps[-1] for _, steps, _ in raw.values())
+    groups = []
+    for (kind, budget), (seeds, steps, values) in raw.items():
+        until = max(1, int(np.searchsorted(steps, shared, side="right")))
+        mean = interval(mean_over_curve(steps[:until], values[:, :until]))
+        groups.append(Group(kind, budget, seeds, values, curve(steps, values), mean))
+    return groups
+
+
+def _matrix(table: pa.Table, metric: str, key: tuple[str, int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Seeds (seeds,), steps (steps,) and values (seeds, steps) of one group, at the steps that all seeds have."""
+    seeds, row = np.unique(table["seed"].to_numpy(), return_inverse=True)
+    steps, column = np.unique(table["step"].to_numpy(), return_inverse=True)
+    count = np.zeros((len(seeds), len(steps)), int)
+    np.add.at(count, (row, column), 1)
+    if count.max() > 1:
+        twice = seeds[(count > 1).any(axis=1)][0]
+        where = sorted(set(table.filter(pc.field("seed") == int(twice))["folder"].to_pylist()))
+        raise UserError(
+            f"seed {twice} of {key[0]} guidance with {key[1]} labels occurs twice, in {' and '.join(where)}: "
+            "leave one of them out"
+        )
+    values = np.full(count.shape, np.nan)
+    values[row, column] = table[metric].to_numpy()
+    whole = (count == 1).all(axis=0)
+    if not whole.any():
+        raise UserError(
+            f"the seeds of {key[0]} guidance with {key[1]} labels have no step in common: wait for all of them, or "
+            "leave out the run that was evaluated at other steps"
+        )
+    return seeds, steps[whole], values[:, whole]
+
+
+def _missing(folders: Sequence[str | os.PathLike[str]], table: pa.Table, groups: Sequence[Group]) -> list[str]:
+    """One line for everything that a reader of the report would otherwise take to be there."""
+    lines = []
+    names, reached = np.array(table["folder"].to_pylist()), table["step"].to_numpy()
+    guidance, labels = np.array(table["guidance"].to_pylist()), table["labels"].to_numpy()
+    for folder in dict.fromkeys(names.tolist()):
+        # A run's config.json stands above the folders of its kinds of guidance.
+        config = _config(Path(folder)) or _config(Path(folder).parent)
+        last, total = int(reached[names == folder].max()), config.get("total_steps")
+        if total is not None and last < total:
+            lines.append(f"{folder}: at step {last:,} of {total:,} ({last / total:.0%})")
+        elif total is None and not (Path(folder) / results.PARQUET).exists():
+            lines.append(f"{folder}: not finished, at step {last:,}")
+    for path in sorted({file.parent for folder in folders for file in Path(folder).rglob("config.json")}):
+        found = {str(kind) for name, kind in zip(names, guidance, strict=True) if Path(name).is_relative_to(path)}
+        planned = _config(path).get("grid", {}).get("guidance", [])
+        lines += [f"{path.as_posix()}: no results of {kind} guidance" for kind in planned if kind not in found]
+        if not found and not planned:
+            lines.append(f"{path.as_posix()}: no results")
+    for group in groups:
+        furthest = int(reached[(guidance == group.guidance) & (labels == group.labels)].max())
+        if furthest > group.curve.steps[-1]:
+            lines.append(
+                f"{group.name}: some seeds have reached step {furthest:,}; shown to {group.curve.steps[-1]:,}, where "
+                "all of them are"
+            )
+        if len(group.seeds) == 1:
+            lines.append(f"{group.name}: one seed, so no interval")
+    if len({int(group.curve.steps[-1]) for group in groups}) > 1:
+        shared = min(int(group.curve.steps[-1]) for group in groups)
+        lines.append(f"curves end at different steps; means over the curve are taken to step {shared:,}, shared by all")
+    hashes = sorted(set(table["config_hash"].to_pylist()))
+    if len(hashes) > 1:
+        lines.append(f"the runs differ in more than guidance, labels and seed: configurations {', '.join(hashes)}")
+    return lines
+
+
+def _config(folder: Path) -> dict[str, Any]:
+    try:
+        config = json.loads((folder / "config.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return config if isinstance(config, dict) else {}
+
+
+# --- tables ----------------------------------------------------------------------------------------------------------
+
+
+def summary(groups: Sequence[Group]) -> list[dict[str, str | int | float]]:
+    """One row for each group, numbers unrounded; the columns are those of `summary.csv`.
+
+    `reaches_unguided_final` is the first step at which the group's interquartile mean is at least the unguided one's
+    at its last step. The stretches `above_unguided` and `below_unguided` are those of `stretches_apart`.
+    """
+    unguided = next((group for group in groups if group.guidance == "none"), None)
+    rows = []
+    for group in groups:
+        steps, best = group.curve.steps, int(group.curve.estimate.argmax())
+        row: dict[str, str | int | float] = {"guidance": group.guidance, "labels": group.labels}
+        row |= {"seeds": len(group.seeds), "last_step": int(steps[-1])}
+        row |= {"final": group.curve.estimate[-1], "final_lower": group.curve.lower[-1]}
+        row |= {"final_upper": group.curve.upper[-1], "mean": float(group.mean.estimate)}
+        row |= {"mean_lower": float(group.mean.lower), "mean_upper": float(group.mean.upper)}
+        row |= {"best_step": int(steps[best]), "best": group.curve.estimate[best]}
+        row |= {"reaches_unguided_final": "", "above_unguided": "", "below_unguided": ""}
+        if unguided is not None:
+            reached = steps_to_reach(steps, group.curve.estimate[None], unguided.curve.estimate[-1])[0]
+            row["reaches_unguided_final"] = int(reached) if np.isfinite(reached) else "never"
+            for column, apart in (
+                ("above_unguided", stretches_apart(group.curve, unguided.curve)),
+                ("below_unguided", stretches_apart(unguided.curve, group.curve)),
+            ):
+                row[column] = "; ".join(f"{start}-{end}" for start, end in apart) if group is not unguided else ""
+        rows.append({name: value.item() if isinstance(value, np.generic) else value for name, value in row.items()})
+    return rows
+
+
+def _curve_rows(groups: Sequence[Group]) -> list[dict[str, str | int | float]]:
+    return [
+        {"guidance": group.guidance, "labels": group.labels, "seeds": len(group.seeds), "step": int(step)}
+        | {"iqm": float(estimate), "lower": float(lower), "upper": float(upper)}
+        for group in groups
+        for step, estimate, lower, upper in zip(*group.curve, strict=True)
+    ]
+
+
+def _write_csv(path: Path, rows: Sequence[dict[str, str | int | float]]) -> None:
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def _provenance(table: pa.Table, command: str) -> list[str]:
+    lines = [f"report made by: `{command}`"] if command else []
+    names = {"command": "runs made by", "config_hash": "configuration", "commit": "commit"}
+    for column, name in (names | {"versions": "versions", "hardware": "hardware"}).items():
+        values = set(table[column].to_pylist()) if column in table.column_names else set()
+        known = sorted(value for value in values if value)
+        quote = "`" if column in ("command", "config_hash", "commit") else ""
+        lines += [f"{name}: {quote}{value}{quote}" for value in known] or [f"{name}: not recorded"]
+    return lines
+
+
+def _markdown(
+    title: str,
+    rows: Sequence[dict[str, str | int | float]],
+    figures: Sequence[str],
+    missing: Sequence[str],
+    provenance: Sequence[str],
+) -> str:
+    header = ["guidance", "labels", "seeds", "last step", "final", "mean over the curve", "best (at step)"]
+    header += ["reaches the unguided final", "interval above the unguided", "interval below the unguided"]
+    lines = [f"# {title}", "", *(f"![{name.replace('_', ' ')}]({name}.png)\n" for name in figures)]
+    lines += [f"| {' | '.join(header)} |", "|" + "---|" * len(header)]
+    for row in rows:
+        reached = row["reaches_unguided_final"]
+        cells = [row["guidance"], f"{row['labels']:,}", row["seeds"], f"{row['last_step']:,}"]
+        for key in ("final", "mean"):
+            bounds = f" [{row[f'{key}_lower']:.3f}, {row[f'{key}_upper']:.3f}]" if int(row["seeds"]) > 1 else ""
+            cells.append(f"{row[key]:.3f}{bounds}")
+        cells += [f"{row['best']:.3f} ({row['best_step']:,})", f"{reached:,}" if isinstance(reached, int) else reached]
+        for column in ("above_unguided", "below_unguided"):
+            apart = [stretch.split("-") for stretch in str(row[column]).split("; ") if stretch]
+            spans = [f"{int(start):,} to {int(end):,}" if start != end else f"{int(start):,}" for start, end in apart]
+            cells.append("; ".join(spans))
+        lines.append(f"| {' | '.join(str(cell) for cell in cells)} |")
+    lines += [
+        "",
+        "Interquartile means over seeds with their 95% percentile bootstrap intervals in brackets; with fewer than 10 "
+        "seeds such intervals are too narrow. Steps are environment steps of one seed. Intervals are compared at each "
+        "evaluation by itself, so a short stretch may be chance.",
+    ]
+    lines += ["", "## Missing", "", *(f"- {line}" for line in missing or ["nothing: all runs are complete"])]
+    lines += ["", "## Where the numbers come from", "", *(f"- {line}" for line in provenance), ""]
+    return "\n".join(lines)
+
+
+# --- figures ---------------------------------------------------------------------------------------------------------
+
+
+def draw_curves(groups: Sequence[Group], title: str, metric_name: str) -> Figure:
+    """Learning curves: interquartile means with their intervals as bands, each named at its right end."""
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(8, 4.5), layout="constrained")
+        axes = figure.add_subplot()
+        colours = _colours(groups)
+        for group, colour in zip(groups, colours, strict=True):
+            steps, estimate, lower, upper = group.curve
+            marker = "o" if len(steps) == 1 else ""
+            axes.fill_between(steps, lower, upper, color=colour, alpha=0.18 if len(groups) < 6 else 0.12, linewidth=0)
+            axes.plot(steps, estimate, color=colour, linewidth=1.8, marker=marker, solid_capstyle="round")
+        end = max(int(group.curve.steps[-1]) for group in groups)
+        axes.set_xlim(0, max(end, 1))
+        axes.set_xlabel("environment steps of a seed")
+        axes.set_ylabel(metric_name)
+        axes.xaxis.set_major_formatter(ticker.EngFormatter(sep=""))
+        axes.set_title(title, fontweight="bold", fontsize=11, pad=20)
+        note = "interquartile mean over seeds, band: its 95% bootstrap interval"
+        axes.text(0, 1.025, note, transform=axes.transAxes, color="#595959", fontsize=9)
+        _name_ends(axes, groups, colours)
+    return figure
+
+
+def draw_label_efficiency(groups: Sequence[Group], title: str, metric_name: str) -> Figure:
+    """Interquartile means against the label budget; what takes no labels is a level with a band."""
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(8, 4.2), layout="constrained")
+        left, right = figure.subplots(1, 2, sharey=True)
+        last = [Interval(*(values[-1] for values in group.curve[1:])) for group in groups]
+        _draw_budgets(left, groups, last, "last evaluation")
+        _draw_budgets(right, groups, [group.mean for group in groups], "mean over the curve")
+        left.set_ylabel(metric_name)
+        handles, names = left.get_legend_handles_labels()
+        figure.legend(handles, names, loc="outside lower center", ncols=len(names))
+        figure.suptitle(title, x=0.01, ha="left", fontweight="bold", fontsize=11)
+    return figure
+
+
+def _draw_budgets(axes: Axes, groups: Sequence[Group], intervals: Sequence[Interval], panel: str) -> None:
+    kinds = list(dict.fromkeys(group.guidance for group in groups))
+    for place, kind in enumerate(kinds):
+        colour, name = _colour(kind), _guidance_name(kind)
+        points = [(group.labels, *at) for group, at in zip(groups, intervals, strict=True) if group.guidance == kind]
+        for _, estimate, lower, upper in (point for point in points if not point[0]):
+            axes.axhspan(float(lower), float(upper), color=colour, alpha=0.12, linewidth=0)
+            axes.axhline(float(estimate), color=colour, label=name, linewidth=1.5, linestyle="--")
+        if any(point[0] for point in points):
+            labels, estimate, lower, upper = np.array([point for point in points if point[0]], float).T
+            # A little beside one another, so that no interval hides another's.
+            beside = 1.04 ** (place - (len(kinds) - 1) / 2)
+            bars = np.nan_to_num([estimate - lower, upper - estimate])
+            axes.errorbar(labels * beside, estimate, bars, color=colour, label=name, marker="o", capsize=3)
+    budgets = sorted({group.labels for group in groups if group.labels})
+    axes.set_xscale("log")
+    axes.set_xticks(budgets, [f"{budget:,}" for budget in budgets])
+    axes.minorticks_off()
+    axes.set_xlabel("labels")
+    axes.set_title(panel, fontsize=10)
+
+
+def save_figure(figure: Figure, stem: Path) -> None:
+    """Writes `stem.png` and `stem.svg`, without a date or a version in either."""
+    with matplotlib.rc_context(STYLE):
+        figure.savefig(stem.with_name(stem.name + ".png"), dpi=200, metadata={"Software": None})
+        figure.savefig(stem.with_name(stem.name + ".svg"), metadata={"Date": None, "Creator": None})
+
+
+def _guidance_name(guidance: str) -> str:
+    return "no guidance" if guidance == "none" else guidance
+
+
+def _colour(guidance: str) -> str:
+    return COLOURS.get(guidance) or OTHER_COLOURS[sum(guidance.encode()) % len(OTHER_COLOURS)]
+
+
+def _colours(groups: Sequence[Group]) -> list[tuple[float, ...]]:
+    """The hue of the guidance, the paler the smaller the label budget is among those of its guidance."""
+    colours = []
+    for group in groups:
+        budgets = [other.labels for other in groups if other.guidance == group.guidance]
+        pale = 0.6 * (1 - (budgets.index(group.labels) + 1) / len(budgets))
+        colours.append(tuple((1 - pale) * channel + pale for channel in to_rgb(_colour(group.guidance))))
+    return colours
+
+
+def _name_ends(axes: Axes, groups: Sequence[Group], colours: Sequence[tuple[float, ...]]) -> None:
+    """Writes each curve's name right of the axes, at the height of its end, moved apart where names would overlap."""
+    low, high = axes.get_ylim()
+    axes.set_ylim(low, high)
+    ends = np.array([group.curve.estimate[-1] for group in groups])
+    gap = min((high - low) / len(groups), 0.055 * (high - low))
+    order, rank = np.argsort(ends, kind="stable"), gap * np.arange(len(groups))
+    # Heights that keep the order, lie a gap apart and move least are an isotonic regression of the ends less the gaps.
+    heights = scipy.optimize.isotonic_regression(ends[order] - rank).x
+    heights = np.clip(heights, low, high - rank[-1]) + rank
+    for place, height in zip(order, heights, strict=True):
+        group, colour = groups[place], colours[place]
+        axes.annotate(
+            group.name,
+            xy=(float(group.curve.steps[-1]), ends[place]),
+            xytext=(1.03, height),
+            textcoords=axes.get_yaxis_transform(),
+            color=tuple(0.85 * channel for channel in colour),
+            va="center",
+            annotation_clip=False,
+            # Dotted: what leads from the end of a curve is no data.
+            arrowprops={"arrowstyle": "-", "color": colour, "linewidth": 1, "linestyle": ":", "relpos": (0, 0.5)},
+        )
+
+
+def _axis_name(metric: str) -> str:
+    return AXIS_NAMES.get(metric, metric.replace("_", " "))
+
+
+def _seed_count(groups: Sequence[Group]) -> str:
+    counts = sorted({len(group.seeds) for group in groups})
+    return (
+        f"{counts[0]} seed{'s' if counts[0] > 1 else ''}" if len(counts) == 1 else f"{counts[0]} to {counts[-1]} seeds"
+    )

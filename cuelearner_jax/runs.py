@@ -1,0 +1,136 @@
+"""What a run is and the folder it lives in: the grid of lanes, config.json, and what may be done to a folder.
+
+Folder of a run:
+
+    config.json                  everything that determines the results
+    <guidance>/checkpoints/      the newest states
+    <guidance>/labels.parquet    what the teacher answered
+    <guidance>/results.jsonl     one row a seed and evaluation; results.parquet once done
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cuelearner_jax import config as configuration
+from cuelearner_jax import guidance as guidances
+from cuelearner_jax.config import RunConfig
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.evaluate import TUNING
+from cuelearner_jax.tasks import Task
+from cuelearner_jax.types import Guidance
+
+
+@dataclass(frozen=True)
+class Grid:
+    """What is varied. Guidance without labels is run once a seed, whatever the budgets."""
+
+    guidance: tuple[str, ...]
+    seeds: tuple[int, ...]
+    labels: tuple[int, ...]
+
+    def lanes(self, guidance: Guidance) -> tuple[np.ndarray, np.ndarray]:
+        """(seeds, budgets) of one kind's lanes, each (lanes,)."""
+        budgets = self.labels if guidance.asks else (0,)
+        pairs = [(seed, budget) for budget in budgets for seed in self.seeds]
+        return np.array([p[0] for p in pairs], np.int32), np.array([p[1] for p in pairs], np.int32)
+
+
+def check_grid(grid: Grid) -> None:
+    """Raises UserError for a grid that makes no sense."""
+    for kind in grid.guidance:
+        if kind not in guidances.KINDS:
+            raise UserError(f"unknown guidance {kind!r}: choose among {', '.join(guidances.KINDS)}")
+    if not grid.guidance or len(set(grid.guidance)) < len(grid.guidance):
+        raise UserError("--guidance: give each kind once, and at least one")
+    if not grid.seeds or len(set(grid.seeds)) < len(grid.seeds) or not all(0 <= s < TUNING for s in grid.seeds):
+        raise UserError(f"seeds must be different numbers from 0 to {TUNING - 1}: give --seeds and --first-seed")
+    if "relative" in grid.guidance:
+        if not grid.labels or len(set(grid.labels)) < len(grid.labels):
+            raise UserError("--labels: give each budget once, and at least one")
+        if min(grid.labels) < 1:
+            raise UserError(
+                f"a label budget of {min(grid.labels)} teaches nothing: give --labels of at least 1, "
+                "and --guidance none for the unguided agent"
+            )
+
+
+def describe(task: Task, config: RunConfig, grid: Grid) -> dict[str, Any]:
+    """The contents of config.json."""
+    return {
+        "task": {"name": task.name, **configuration.to_json(config.task)},
+        "sizes": configuration.to_json(config.sizes),
+        "scalars": configuration.to_json(config.scalars),
+        "schedule": configuration.to_json(config.schedule),
+        "grid": {"guidance": list(grid.guidance), "seeds": list(grid.seeds), "labels": list(grid.labels)},
+        "total_steps": config.schedule.total_steps,
+    }
+
+
+def load(folder: Path, tasks: dict[str, Task]) -> tuple[Task, RunConfig, Grid]:
+    """What a run folder's config.json says. Raises UserError if it is no run folder."""
+    path = folder / "config.json"
+    if not path.is_file():
+        raise UserError(f"{folder} is no run folder (it has no config.json): give the --out of a train or sweep")
+    try:
+        values = json.loads(path.read_text())
+        task = tasks[values["task"].pop("name")]
+        config = RunConfig(
+            configuration.from_json(task.config, values["task"]),
+            configuration.from_json(configuration.Sizes, values["sizes"]),
+            configuration.from_json(configuration.Scalars, values["scalars"]),
+            configuration.from_json(configuration.Schedule, values["schedule"]),
+        )
+        grid = Grid(*(tuple(values["grid"][name]) for name in ("guidance", "seeds", "labels")))
+    except (json.JSONDecodeError, KeyError, TypeError, AttributeError) as error:
+        raise UserError(f"{path} is damaged or of another program: restore it or train anew") from error
+    return task, config, grid
+
+
+def check_folder(out: Path, described: dict[str, Any], resume: bool, overwrite: bool) -> None:
+    """Raises UserError unless `out` may be used as asked."""
+    if resume and overwrite:
+        raise UserError("--resume continues a run and --overwrite deletes it: give one of them")
+    used = out.exists() and (not out.is_dir() or any(out.iterdir()))
+    ours = (out / "config.json").is_file()
+    if resume:
+        if not ours:
+            raise UserError(f"nothing to resume in {out}: give the --out of an interrupted run, or leave out --resume")
+        try:
+            before = json.loads((out / "config.json").read_text())
+        except json.JSONDecodeError as error:
+            raise UserError(f"{out / 'config.json'} is damaged: restore it or start anew with --overwrite") from error
+        differing = sorted(_differences(before, described))
+        if differing:
+            raise UserError(
+                f"{out} was run with another {', '.join(differing[:4])}: give the same options, or another --out"
+            )
+    elif used and not overwrite:
+        raise UserError(f"{out} is not empty: give --resume to go on, --overwrite to delete it, or another --out")
+    elif used and not ours:
+        raise UserError(f"{out} is not a run folder, so --overwrite will not delete it: give another --out")
+
+
+def _differences(before: dict[str, Any], now: dict[str, Any], prefix: str = "") -> Iterator[str]:
+    for name in {**before, **now}:
+        old, new = before.get(name), now.get(name)
+        if isinstance(old, dict) and isinstance(new, dict):
+            yield from _differences(old, new, f"{prefix}{name}.")
+        elif old != new:
+            yield prefix + name
+
+
+def prepare_folder(out: Path, described: dict[str, Any], clean: bool) -> None:
+    """Makes the folder and writes config.json, if it is not there."""
+    if clean and out.exists():
+        shutil.rmtree(out)
+    out.mkdir(parents=True, exist_ok=True)
+    if not (out / "config.json").exists():
+        (out / "config.json").write_text(json.dumps(described, indent=1) + "\n")

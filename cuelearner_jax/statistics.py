@@ -1,0 +1,143 @@
+"""Statistics over seeds: interquartile means with bootstrap intervals, and what can be read off their curves.
+
+Everything here is NumPy on results that are already recorded; the first axis is always the seeds.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import scipy.stats
+from jaxtyping import Float, Int
+from numpy.typing import ArrayLike
+
+RESAMPLES = 2000
+_BATCH_ELEMENTS = 4_000_000  # numbers held at a time while resampling: 32 MB
+
+
+class Interval(NamedTuple):
+    """An estimate with its confidence interval; the bounds are NaN where there are too few seeds for one."""
+
+    estimate: Float[np.ndarray, "*steps"]
+    lower: Float[np.ndarray, "*steps"]
+    upper: Float[np.ndarray, "*steps"]
+
+
+class Curve(NamedTuple):
+    """An interval at each evaluation."""
+
+    steps: Int[np.ndarray, "steps"]  # environment steps of a seed, ascending
+    estimate: Float[np.ndarray, "steps"]
+    lower: Float[np.ndarray, "steps"]
+    upper: Float[np.ndarray, "steps"]
+
+
+def interquartile_mean(values: ArrayLike, axis: int = 0) -> Float[np.ndarray, "*rest"]:
+    """The mean of what is left when the lowest and the highest quarter are cut off: the 25% trimmed mean.
+
+    The definition is that of `scipy.stats.trim_mean(values, 0.25)`: of n values, floor(n / 4) are dropped at each end,
+    never a fraction of one. So up to 3 values give the plain mean, 4 to 7 drop one at each end (5 average the middle
+    three), 8 to 11 drop two.
+
+    Args:
+        values: array of any shape; `axis` is the seeds.
+
+    Returns:
+        Array of that shape without `axis`.
+    """
+    return np.asarray(scipy.stats.trim_mean(np.asarray(values, dtype=float), 0.25, axis=axis))
+
+
+def interval(
+    *strata: Float[np.ndarray, "seeds *steps"], confidence: float = 0.95, resamples: int = RESAMPLES, seed: int = 0
+) -> Interval:
+    """The interquartile mean over all seeds with its stratified percentile bootstrap interval.
+
+    Seeds are drawn with replacement, whole curves at a time, inside each stratum (for instance each task) separately;
+    the interquartile mean is taken over the seeds of all strata together. One stratum gives the ordinary bootstrap.
+    With few seeds the interval is too narrow: on normal data a nominal 95% covered the truth in 75% of 4,000 trials
+    with 3 seeds, in 90% with 5 and in 94% with 10 or more.
+
+    Args:
+        strata: arrays of shape (seeds, *steps); the number of seeds may differ, the rest not.
+        confidence: nominal coverage of the interval.
+        resamples: number of bootstrap samples.
+        seed: seed of the resampling, so that the same data always gives the same interval.
+
+    Returns:
+        Arrays of shape (*steps); the bounds are NaN if a stratum has a single seed.
+
+    Raises:
+        ValueError: if there are no seeds or a value is NaN.
+    """
+    data = tuple(np.moveaxis(np.asarray(stratum, dtype=float), 0, -1) for stratum in strata)
+    if not data or min(stratum.shape[-1] for stratum in data) == 0:
+        raise ValueError("an interval needs at least one seed in each stratum")
+    if any(np.isnan(stratum).any() for stratum in data):
+        raise ValueError("values are NaN: leave out evaluations that are missing")
+    estimate = interquartile_mean(np.concatenate(data, axis=-1), axis=-1)
+    if min(stratum.shape[-1] for stratum in data) == 1:
+        return Interval(estimate, np.full_like(estimate, np.nan), np.full_like(estimate, np.nan))
+    size = max(1, sum(stratum.size for stratum in data))
+    result = scipy.stats.bootstrap(
+        data,
+        lambda *samples, axis: interquartile_mean(np.concatenate(samples, axis=axis), axis=axis),
+        n_resamples=resamples,
+        batch=min(resamples, max(1, _BATCH_ELEMENTS // size)),
+        vectorized=True,
+        axis=-1,
+        confidence_level=confidence,
+        method="percentile",
+        rng=np.random.default_rng(seed),
+    )
+    bounds = result.confidence_interval
+    return Interval(estimate, np.asarray(bounds.low), np.asarray(bounds.high))
+
+
+def curve(
+    steps: Int[np.ndarray, "steps"], *strata: Float[np.ndarray, "seeds steps"], confidence: float = 0.95, seed: int = 0
+) -> Curve:
+    """The interval (see there) at each evaluation."""
+    return Curve(np.asarray(steps), *interval(*strata, confidence=confidence, seed=seed))
+
+
+def stretches_apart(curve_a: Curve, curve_b: Curve) -> list[tuple[int, int]]:
+    """Where the interval of `curve_a` lies wholly above that of `curve_b`.
+
+    The intervals hold at each evaluation by itself: of many evaluations, a few may come apart by chance, so trust a
+    long stretch more than a short one.
+
+    Returns:
+        (first step, last step) of each unbroken stretch of the steps that both curves have; empty if there is none.
+    """
+    steps, a, b = np.intersect1d(curve_a.steps, curve_b.steps, return_indices=True)
+    above = curve_a.lower[a] > curve_b.upper[b]  # False where a bound is NaN
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], above, [False]]).astype(int)))
+    return [(int(steps[start]), int(steps[end - 1])) for start, end in edges.reshape(-1, 2)]
+
+
+def area_under_curve(
+    steps: Int[np.ndarray, "steps"], values: Float[np.ndarray, "seeds steps"]
+) -> Float[np.ndarray, "seeds"]:
+    """The area under each seed's curve by the trapezoidal rule, in units of the metric times environment steps."""
+    return np.trapezoid(values, np.asarray(steps, dtype=float), axis=-1)
+
+
+def mean_over_curve(
+    steps: Int[np.ndarray, "steps"], values: Float[np.ndarray, "seeds steps"]
+) -> Float[np.ndarray, "seeds"]:
+    """The mean of each seed's curve over its steps: the area over the span, so uneven steps weigh what they should.
+
+    A curve of one evaluation has that value as its mean.
+    """
+    span = float(steps[-1] - steps[0])
+    return area_under_curve(steps, values) / span if span > 0 else np.asarray(values, dtype=float)[..., 0]
+
+
+def steps_to_reach(
+    steps: Int[np.ndarray, "steps"], values: Float[np.ndarray, "seeds steps"], threshold: float
+) -> Float[np.ndarray, "seeds"]:
+    """The step of the first evaluation at which each seed is at or above `threshold`; infinity if it never is."""
+    reached = np.asarray(values) >= threshold
+    return np.where(reached.any(axis=-1), np.asarray(steps, dtype=float)[reached.argmax(axis=-1)], np.inf)

@@ -1,0 +1,119 @@
+"""The tasks that the command line offers: the one place where the method meets the environments.
+
+A task is its configuration, its environment and teacher, its presets and its pictures. Add one here and every command
+knows it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+
+from cuelearner_envs import billiards
+from cuelearner_envs.billiards import drawing
+from cuelearner_envs.billiards.config import BilliardsConfig, make_environment
+from cuelearner_envs.billiards.environment import Billiards
+from cuelearner_envs.billiards.recording import record
+from cuelearner_envs.billiards.teacher import SearchTeacher
+from cuelearner_jax import teacher as learned
+from cuelearner_jax.config import RunConfig, Scalars, Schedule, Sizes
+from cuelearner_jax.types import Environment, Teacher
+
+
+@dataclass(frozen=True)
+class Preset:
+    """A named starting point: a configuration and the lanes that a sweep runs by default."""
+
+    about: str
+    config: RunConfig
+    guidance: tuple[str, ...] = ("none", "relative", "heuristic")
+    labels: tuple[int, ...] = (500, 1000)
+    seeds: int = 5
+
+
+@dataclass(frozen=True)
+class Task:
+    """One task as the command line sees it."""
+
+    name: str
+    config: type  # its configuration dataclass
+    environment: Callable[[Any], Environment]
+    teacher: Callable[[Any, Environment], Teacher]
+    presets: dict[str, Preset]
+    record: Callable[..., tuple[list[Any], list[float]]]  # (env, policy, key, steps) -> frames for the two below, rewards
+    still: Callable[[Any, Any, Path], None]  # (env, one frame of a record, file)
+    animate: Callable[[Any, list[Any], Path], None]  # (env, the frames, file)
+
+
+def billiards_teacher(config: BilliardsConfig, env: Billiards) -> Teacher:
+    """The teacher that a configuration names. Raises UserError if the table has no shipped one."""
+    aim_error = jnp.deg2rad(jnp.array(config.aim_error_deg, jnp.float32))
+    habit = jnp.array(config.habit, jnp.float32)
+    if config.teacher == "search":
+        return SearchTeacher(env, aim_error, habit, config.search_directions)
+    return learned.load(SHIPPED_TEACHERS / config.table, env, aim_error, habit)
+
+
+SHIPPED_TEACHERS = Path(billiards.__file__).parent / "teachers"
+
+BILLIARDS = Task(
+    name="billiards",
+    config=BilliardsConfig,
+    environment=make_environment,
+    teacher=billiards_teacher,
+    record=record,
+    still=lambda env, path, file: drawing.still(env.table, path, file),
+    animate=lambda env, paths, file: drawing.animate(env.table, paths, file),
+    presets={
+        "paper": Preset(
+            "the paper's figure: regulation table, its networks, 10 million steps a seed",
+            RunConfig(BilliardsConfig("regulation", aim_error_deg=0.25)),
+            labels=(500, 1000),
+        ),
+        "easy": Preset(
+            "larger balls and pockets, the paper's networks, 1 million steps a seed",
+            RunConfig(
+                BilliardsConfig("easy", teacher="learned"),
+                Sizes(directions=720, num_envs=100, replay_capacity=1_000_000),
+                Scalars(),
+                Schedule(total_steps=1_000_000, guidance_until=500_000, checkpoint_every=100_000),
+            ),
+        ),
+        "quickstart": Preset(
+            "one ball, small networks: minutes on two CPU cores",
+            RunConfig(
+                BilliardsConfig("one_ball"),
+                Sizes(
+                    q_layers=(128, 128),
+                    feedback_layers=(128, 128),
+                    directions=360,
+                    num_envs=10,
+                    replay_capacity=20_000,
+                    fit_steps=400,
+                    fit_batch_size=64,
+                    lanes_per_block=16,
+                ),
+                Scalars(),
+                Schedule(
+                    total_steps=4_000,
+                    random_steps=200,
+                    learn_after=200,
+                    guidance_until=2_000,
+                    eval_every=100,
+                    eval_steps=400,
+                    eval_envs=100,
+                    checkpoint_every=1_000,
+                ),
+            ),
+            guidance=("none", "relative"),
+            labels=(100,),
+            seeds=16,
+        ),
+    },
+)
+
+TASKS = {task.name: task for task in (BILLIARDS,)}

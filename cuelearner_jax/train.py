@@ -1,0 +1,272 @@
+"""The one training loop, whatever the guidance: policy -> guidance.act -> environment -> replay -> update.
+
+Written for one lane (one seed with one label budget); `vmap` over lanes happens once, in `make_program`. Random numbers
+come from the lane's own key folded with the shared counters, so a lane's result does not depend on its neighbours.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Int, PRNGKeyArray
+
+from cuelearner_jax import actions as geometry
+from cuelearner_jax import ddqn
+from cuelearner_jax.config import RunConfig, Scalars, Schedule, Sizes
+from cuelearner_jax.feedback import empty_labels
+from cuelearner_jax.networks import q_network
+from cuelearner_jax.refine import Refined, untouched
+from cuelearner_jax.replay import RingBuffer, ring_buffer
+from cuelearner_jax.types import Asking, Clock, Environment, Guidance, Label, Teacher, TrainState, Transition
+
+# Streams of random numbers of one lane, each folded into the lane's key before a counter is.
+INIT, ASK, FIT, TRAIN = range(4)
+
+
+class Program(NamedTuple):
+    """Jitted functions over a block of lanes (leading axis of `state`). All donate the state they are given."""
+
+    init: Any  # (env, seeds (lanes,), budgets (lanes,), root key) -> TrainState
+    label_round: Any  # (env, teacher, scalars, clock, state) -> (clock, state)
+    take_labels: Any  # (env, scalars, labels (lanes, slots, ...), state) -> state: labels that were given elsewhere
+    train: Any  # (env, scalars, schedule, clock, state, iterations) -> (clock, state, metrics (lanes,))
+
+
+def start_clock() -> Clock:
+    """All counters at zero."""
+    # Distinct buffers: programs donate the clock leaf by leaf.
+    return Clock(jnp.zeros((), jnp.int32), jnp.zeros((), jnp.int32), jnp.zeros((), jnp.int32))
+
+
+def directions(sizes: Sizes) -> jax.Array:
+    """The agent's set of directions (directions, 2)."""
+    return geometry.evenly_spaced(sizes.directions)
+
+
+def label_slots(budget: int, sizes: Sizes) -> int:
+    """Rows that a label set needs: the budget rounded up to whole rounds."""
+    return -(-budget // sizes.labels_per_round) * sizes.labels_per_round
+
+
+def make_program(config: RunConfig, guidance: Guidance, env: Environment, largest_budget: int) -> Program:
+    """Compiles (on first use) the loop for one kind of guidance.
+
+    Args:
+        config: sizes and whether targets bootstrap are taken from here; scalars and schedule are passed at each call.
+        env: gives shapes; any environment of the same structure may be passed at the calls.
+        largest_budget: labels that the largest lane may use.
+    """
+    lane = Lane(config.sizes, guidance, config.bootstraps, env.obs_size, largest_budget)
+
+    def init(env, seeds, budgets, root):
+        keys = jax.vmap(lambda seed: jax.random.fold_in(root, seed))(seeds)
+        return jax.vmap(partial(lane.init, env))(keys, budgets)
+
+    def label_round(env, teacher, scalars, clock, state):
+        state = jax.vmap(partial(lane.label_round, env, teacher, scalars, clock))(state)
+        return clock.replace(round=clock.round + 1), state
+
+    def take_labels(env, scalars, labels, state):
+        return jax.vmap(partial(lane.take_labels, env, scalars))(labels, state)
+
+    def train(env, scalars, schedule, clock, state, iterations):
+        def iteration(carry, _):
+            clock, state = carry
+            state, metrics = jax.vmap(partial(lane.iterate, env, scalars, schedule, clock))(state)
+            return (lane.advance(clock, schedule), state), metrics
+
+        (clock, state), metrics = jax.lax.scan(iteration, (clock, state), length=iterations)
+        return clock, state, jax.tree.map(lambda leaf: leaf.mean(0), metrics)
+
+    return Program(
+        init=jax.jit(init),
+        label_round=jax.jit(label_round, donate_argnames="state"),
+        take_labels=jax.jit(take_labels, donate_argnames="state"),
+        train=jax.jit(train, donate_argnames="state", static_argnames="iterations"),
+    )
+
+
+class Lane(NamedTuple):
+    """The loop of one lane."""
+
+    sizes: Sizes
+    guidance: Guidance
+    bootstraps: bool
+    obs_size: int
+    largest_budget: int
+
+    @property
+    def buffer(self) -> RingBuffer:
+        """The replay of transitions of this observation size."""
+        obs, scalar = jax.ShapeDtypeStruct((self.obs_size,), jnp.float32), jax.ShapeDtypeStruct((), jnp.float32)
+        next_obs = jax.ShapeDtypeStruct((self.obs_size if self.bootstraps else 0,), jnp.float32)
+        return ring_buffer(Transition(obs, jax.ShapeDtypeStruct((2,), jnp.float32), scalar, scalar, next_obs))
+
+    def q(self, params: Any, obs: jax.Array, actions: jax.Array) -> jax.Array:
+        """Action values (..., 1)."""
+        return q_network(self.sizes.q_layers).apply(params, obs, actions)  # pyright: ignore[reportReturnType]
+
+    def init(self, env: Environment, key: PRNGKeyArray, budget: Int[Array, ""]) -> TrainState:
+        """A fresh lane. Budgets do not touch the random numbers: lanes of one seed start alike."""
+        k_q, k_guidance, k_ask, k_env = jax.random.split(jax.random.fold_in(key, INIT), 4)
+        params = q_network(self.sizes.q_layers).init(k_q, jnp.zeros(self.obs_size), jnp.zeros(2))
+        asking_env, asking_obs = env.reset(k_ask)
+        env_state, obs = jax.vmap(env.reset)(jax.random.split(k_env, self.sizes.num_envs))
+        labels = empty_labels(label_slots(self.largest_budget, self.sizes), self.obs_size)
+        return TrainState(
+            params=params,
+            target_params=jax.tree.map(jnp.copy, params) if self.bootstraps else None,
+            opt_state=self.optimizer(Scalars()).init(params),
+            replay=self.buffer.empty(self.sizes.replay_capacity),
+            guidance=self.guidance.init(k_guidance),
+            asking=Asking(asking_env, asking_obs, labels, jnp.asarray(budget, jnp.int32)),
+            env=env_state,
+            obs=obs,
+            guided=jnp.zeros(self.sizes.num_envs, bool),
+            key=key,
+        )
+
+    def optimizer(self, scalars: Scalars) -> optax.GradientTransformation:
+        """The optimiser of the action values."""
+        return ddqn.optimizer(self.sizes.optimizer, scalars.learning_rate, scalars.max_grad_norm)  # pyright: ignore
+
+    def label_round(
+        self, env: Environment, teacher: Teacher, scalars: Scalars, clock: Clock, state: TrainState
+    ) -> TrainState:
+        """Asks for one round of labels, about refined actions once a model exists (DAgger), and fits from scratch."""
+
+        def ask(asking: Asking, offset: jax.Array) -> tuple[Asking, None]:
+            position = clock.round * self.sizes.labels_per_round + offset
+            key = jax.random.fold_in(jax.random.fold_in(state.key, ASK), position)
+            k_base, k_refine, k_answer, k_env = jax.random.split(key, 4)
+            base = geometry.uniform(k_base)
+            refine = jax.random.bernoulli(k_refine, scalars.refined_fraction)
+            action, _ = self.guidance.act(state.guidance, env, asking.obs[None], base[None], refine[None], scalars)
+            best = teacher.best_action(asking.env, asking.obs)
+            target, answered = self.guidance.label(k_answer, action[0], best, scalars)
+            label = Label(asking.obs, action[0], target, answered & (position < asking.budget))
+            labels = jax.tree.map(
+                lambda rows, row: jax.lax.dynamic_update_index_in_dim(rows, row, position, 0), asking.labels, label
+            )
+            env_state, step = env.step(k_env, asking.env, action[0])
+            return asking.replace(env=env_state, obs=step.obs, labels=labels), None
+
+        asked, _ = jax.lax.scan(ask, state.asking, jnp.arange(self.sizes.labels_per_round))
+        k_fit = jax.random.fold_in(jax.random.fold_in(state.key, FIT), clock.round)
+        model = self.guidance.fit(k_fit, env, asked.labels, scalars)
+        # A lane whose budget is spent stays as it is while others go on.
+        going = clock.round * self.sizes.labels_per_round < state.asking.budget
+        return jax.tree.map(
+            lambda new, old: jnp.where(going, new, old), state.replace(asking=asked, guidance=model), state
+        )
+
+    def take_labels(self, env: Environment, scalars: Scalars, labels: Label, state: TrainState) -> TrainState:
+        """Labels that were given elsewhere, in place of questions, and the model fitted to them."""
+        model = self.guidance.fit(jax.random.fold_in(state.key, FIT), env, labels, scalars)
+        return state.replace(asking=state.asking.replace(labels=labels), guidance=model)
+
+    def advance(self, clock: Clock, schedule: Schedule) -> Clock:
+        """The clock after one iteration."""
+        steps = self.sizes.num_envs
+        updates = jnp.where(clock.step + steps >= schedule.learn_after, steps * self.sizes.updates_per_step, 0)
+        return clock.replace(step=clock.step + steps, update=clock.update + updates)
+
+    def iterate(
+        self, env: Environment, scalars: Scalars, schedule: Schedule, clock: Clock, state: TrainState
+    ) -> tuple[TrainState, dict[str, jax.Array]]:
+        """One step in each of the lane's environments, then as many gradient steps."""
+        key = jax.random.fold_in(jax.random.fold_in(state.key, TRAIN), clock.step)
+        k_act, k_env, k_guided, k_learn = jax.random.split(key, 4)
+        action, passes = self.act(env, scalars, schedule, clock, state, k_act)
+        env_state, step = jax.vmap(env.step)(jax.random.split(k_env, self.sizes.num_envs), state.env, action)
+        done = step.terminated | step.truncated
+        transition = Transition(
+            obs=state.obs,
+            action=action,
+            reward=step.reward,
+            discount=1.0 - step.terminated.astype(jnp.float32),
+            next_obs=step.final_obs if self.bootstraps else step.final_obs[:, :0],
+        )
+        redrawn = jax.random.bernoulli(k_guided, scalars.guided_probability, done.shape)
+        state = state.replace(
+            replay=self.buffer.add(state.replay, clock.step, transition),
+            env=env_state,
+            obs=step.obs,
+            guided=jnp.where(done, redrawn, state.guided),
+        )
+        state, loss = jax.lax.cond(
+            clock.step + self.sizes.num_envs >= schedule.learn_after,
+            lambda state: self.learn(env, scalars, schedule, clock, state, k_learn),
+            lambda state: (state, jnp.zeros(())),
+            state,
+        )
+        return state, {"reward": step.reward.mean(), "loss": loss, "passes": passes.astype(jnp.float32).mean()}
+
+    def act(
+        self, env: Environment, scalars: Scalars, schedule: Schedule, clock: Clock, state: TrainState, key: PRNGKeyArray
+    ) -> Refined:
+        """Directions to execute (num_envs, 2), and how often guidance moved each.
+
+        Uniform at first, then greedy; in guided episodes refined by the guidance until the cut-off. The branches hang on
+        the shared clock alone, so they stay branches under vmap.
+        """
+        options = directions(self.sizes)
+        base = jax.lax.cond(
+            clock.step < schedule.random_steps,
+            lambda: geometry.uniform(key, (self.sizes.num_envs,)),
+            lambda: jax.vmap(lambda obs: ddqn.greedy(self.q, state.params, obs, options))(state.obs),
+        )
+        guides = (clock.step >= schedule.random_steps) & (clock.step < schedule.guidance_until)
+        return jax.lax.cond(
+            guides,
+            lambda: self.guidance.act(state.guidance, env, state.obs, base, state.guided, scalars),
+            lambda: untouched(base),
+        )
+
+    def learn(
+        self, env: Environment, scalars: Scalars, schedule: Schedule, clock: Clock, state: TrainState, key: PRNGKeyArray
+    ) -> tuple[TrainState, jax.Array]:
+        """One gradient step for each of the environment steps just made (times `updates_per_step`)."""
+        steps = self.sizes.num_envs * self.sizes.updates_per_step
+        filled = clock.step + self.sizes.num_envs
+        options = geometry.evenly_spaced(self.sizes.target_directions)
+        optimizer = self.optimizer(scalars)
+
+        def update(carry: tuple, index: jax.Array) -> tuple[tuple, jax.Array]:
+            params, target_params, opt_state = carry
+            k_sample, k_mirror = jax.random.split(jax.random.fold_in(key, index))
+            batch = self.buffer.sample(k_sample, state.replay, filled, self.sizes.batch_size)
+            batch = mirrored(k_mirror, env, batch)
+            targets = jax.vmap(
+                lambda item: ddqn.target(self.q, params, target_params, item, options, scalars.discount)  # pyright: ignore
+            )(batch)
+            loss, gradient = jax.value_and_grad(lambda p: ddqn.loss(self.q, p, batch, targets))(params)
+            change, opt_state = optimizer.update(gradient, opt_state, params)
+            params = optax.apply_updates(params, change)
+            if self.bootstraps:
+                target_params = jax.lax.cond(
+                    (clock.update + index + 1) % schedule.target_every == 0,
+                    lambda: ddqn.polyak(params, target_params, scalars.polyak),  # pyright: ignore
+                    lambda: target_params,
+                )
+            return (params, target_params, opt_state), loss
+
+        start = (state.params, state.target_params, state.opt_state)
+        (params, target_params, opt_state), losses = jax.lax.scan(update, start, jnp.arange(steps))
+        return state.replace(params=params, target_params=target_params, opt_state=opt_state), losses.mean()
+
+
+def mirrored(key: PRNGKeyArray, env: Environment, batch: Transition) -> Transition:
+    """Each transition under a random symmetry of the environment; the batch itself where there is none."""
+    if env.symmetries == 1:
+        return batch
+    which = jax.random.randint(key, batch.reward.shape, 0, env.symmetries)
+    obs, action = jax.vmap(env.mirror)(which, batch.obs, batch.action)
+    if batch.next_obs.shape[-1]:
+        next_obs, _ = jax.vmap(env.mirror)(which, batch.next_obs, batch.action)
+        batch = batch.replace(next_obs=next_obs)
+    return batch.replace(obs=obs, action=action)

@@ -1,0 +1,1 @@
+"""The tasks of CueLearner: environments, teachers and drawings. They know no agent."""

@@ -1,0 +1,49 @@
+"""Configuration of the billiards task: which table, which changes of the world, which teacher."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import jax.numpy as jnp
+
+from cuelearner_envs.billiards.environment import Billiards
+from cuelearner_envs.billiards.table import Table
+
+SHOTS = {"one_ball": 1, "easy": 10, "regulation": 10}  # of an episode
+
+
+@dataclass(frozen=True)
+class BilliardsConfig:
+    """A billiards world and its teacher."""
+
+    table: Literal["one_ball", "easy", "regulation"] = "regulation"
+    """one_ball: one large target, one shot. easy: three large targets. regulation: the paper's table."""
+    mirrors: bool = False
+    """Multiply labels and transitions by the table's mirror symmetries (for every form of guidance alike)."""
+    action_turn_deg: float = 0.0
+    """Changed world: every strike is turned by this, counterclockwise [deg] (paper: 0.8)."""
+    observation_bias: tuple[float, float] = (0.0, 0.0)
+    """Changed world: added to every observed position, x and y [m] (paper: 0.0071 0.0071)."""
+    acceleration: tuple[float, float] = (0.0, 0.0)
+    """Changed world: constant acceleration of the balls on a tilted table, x and y [m/s^2] (paper: 0 0.005)."""
+    teacher: Literal["learned", "search"] = "search"
+    """Who labels: a learned teacher (shipped for easy), or exhaustive search over directions."""
+    aim_error_deg: float = 0.5
+    """The teacher values directions for a player whose aim has this standard deviation [deg]."""
+    habit: float = 0.2
+    """The teacher shrinks values by this share over a full turn counterclockwise from x: settles ties the same way."""
+    search_directions: int = 1440
+    """Search teacher: directions that it tries in every state."""
+
+
+def make_environment(config: BilliardsConfig) -> Billiards:
+    """The world that a configuration describes."""
+    table: Table = getattr(Table, config.table)()
+    return Billiards(
+        table=table.replace(acceleration=jnp.array(config.acceleration, jnp.float32)),
+        action_turn=jnp.deg2rad(jnp.array(config.action_turn_deg, jnp.float32)),
+        observation_bias=jnp.array(config.observation_bias, jnp.float32),
+        max_shots=SHOTS[config.table],
+        mirrors=config.mirrors,
+    )

@@ -1,0 +1,112 @@
+"""When discs in straight flight next touch something, and what they touch.
+
+Everything here is geometry of uniform motion: x(s) = x + u s. All quantities are components, so that the same
+lines serve one ball or an array of them. Times never come out negative: an overlap left by rounding counts as a
+contact now, so nothing can tunnel.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from cuelearner_envs.billiards.table import Scalar, Table, corner_gap
+
+
+class Flight(NamedTuple):
+    """What a single ball meets next, apart from other balls."""
+
+    time: Float[Array, "*any"]  # until then; infinite if nothing
+    centre_x: Float[Array, "*any"]  # point of the cushion's centre line that it touches [m]
+    centre_y: Float[Array, "*any"]  # [m]
+    falls: Bool[Array, "*any"]  # it drops into a pocket instead of touching a cushion
+
+
+def time_to_circle(
+    dx: Float[Array, "*any"],
+    dy: Float[Array, "*any"],
+    ux: Float[Array, "*any"],
+    uy: Float[Array, "*any"],
+    radius: Scalar,
+) -> Float[Array, "*any"]:
+    """Time until a point, displaced by d from a circle's centre and moving with u, enters the circle.
+
+    The smaller root of |d + u t| = radius, in the form c / (-b + sqrt(disc)) that does not cancel; the discriminant
+    is written with the cross product for the same reason. Only an approaching point (d.u < 0) can hit.
+    """
+    toward = -(dx * ux + dy * uy)
+    missed_by = dx * uy - dy * ux
+    discriminant = (ux * ux + uy * uy) * radius * radius - missed_by * missed_by
+    gap = jnp.maximum(dx * dx + dy * dy - radius * radius, 0.0)
+    hits = (toward > 0.0) & (discriminant > 0.0)
+    time = gap / jnp.where(hits, toward + jnp.sqrt(jnp.maximum(discriminant, 0.0)), 1.0)
+    return jnp.where(hits, time, jnp.inf)
+
+
+def time_to_line(distance: Float[Array, "*any"], speed: Float[Array, "*any"]) -> Float[Array, "*any"]:
+    """Time to cover a distance at a speed >= 0: at once if already beyond, never if at rest."""
+    return jnp.where(speed > 0.0, jnp.maximum(distance, 0.0) / jnp.where(speed > 0.0, speed, 1.0), jnp.inf)
+
+
+def jaws(
+    table: Table, x: Float[Array, "*any"], y: Float[Array, "*any"]
+) -> tuple[tuple[Float[Array, "*any"], Float[Array, "*any"]], tuple[Float[Array, "*any"], Float[Array, "*any"]]]:
+    """The two cushion ends beside the pocket nearest to a place close to the table's edge [m]."""
+    half_x, half_y, gap = table.width / 2, table.height / 2, corner_gap(table)
+    sign_x, sign_y = jnp.where(x < 0.0, -1.0, 1.0), jnp.where(y < 0.0, -1.0, 1.0)
+    first = sign_x * (half_x - gap), sign_y * half_y
+    second = sign_x * half_x, sign_y * (half_y - gap)
+    if table.side_pockets:
+        at_side = jnp.abs(x) < (half_x - gap + table.hole_width) / 2  # halfway along the cushion between the pockets
+        first = jnp.where(at_side, table.hole_width, first[0]), first[1]
+        second = jnp.where(at_side, -table.hole_width, second[0]), jnp.where(at_side, first[1], second[1])
+    return first, second
+
+
+def next_on_edge(
+    table: Table,
+    x: Float[Array, "*any"],
+    y: Float[Array, "*any"],
+    ux: Float[Array, "*any"],
+    uy: Float[Array, "*any"],
+) -> Flight:
+    """What a ball at (x, y) moving with (ux, uy) meets on the table's edge.
+
+    A straight flight leaves the inner rectangle (the edge less ball and cushion radius) exactly once. Where it does, it
+    touches a cushion's straight part or enters a pocket's mouth, where only that pocket's two jaws can be in the way. A
+    ball that already is in a mouth can meet the jaws there first. So four circles stand for all eight or twelve jaws.
+    """
+    half_x, half_y, gap = table.width / 2, table.height / 2, corner_gap(table)
+    reach = table.ball_radius + table.cushion_radius
+    sign_x, sign_y = jnp.where(ux < 0.0, -1.0, 1.0), jnp.where(uy < 0.0, -1.0, 1.0)
+    out_x, out_y = sign_x * x, sign_y * y  # how far out in the direction of motion
+    speed_x, speed_y = jnp.abs(ux), jnp.abs(uy)
+
+    time_x = time_to_line(half_x - reach - out_x, speed_x)
+    time_y = time_to_line(half_y - reach - out_y, speed_y)
+    by_end = time_x <= time_y
+    leaves = jnp.minimum(time_x, time_y)
+    wait = jnp.where(jnp.isinf(leaves), 0.0, leaves)
+    exit_x, exit_y = x + ux * wait, y + uy * wait
+    straight = jnp.where(by_end, jnp.abs(exit_y) <= half_y - gap, jnp.abs(exit_x) <= half_x - gap)
+    if table.side_pockets:
+        straight &= by_end | (jnp.abs(exit_x) >= table.hole_width)
+
+    best = jnp.where(straight, leaves, jnp.inf)
+    best_x = jnp.where(by_end, sign_x * half_x, exit_x)
+    best_y = jnp.where(by_end, exit_y, sign_y * half_y)
+    for jaw_x, jaw_y in (*jaws(table, exit_x, exit_y), *jaws(table, x, y)):
+        time = time_to_circle(x - jaw_x, y - jaw_y, ux, uy, reach)
+        sooner = time < best
+        best, best_x, best_y = (
+            jnp.where(sooner, time, best),
+            jnp.where(sooner, jaw_x, best_x),
+            jnp.where(sooner, jaw_y, best_y),
+        )
+
+    pocket = jnp.minimum(
+        time_to_line(half_x + table.pocket_margin - out_x, speed_x),
+        time_to_line(half_y + table.pocket_margin - out_y, speed_y),
+    )
+    falls = pocket < best
+    return Flight(jnp.minimum(best, pocket), best_x, best_y, falls)

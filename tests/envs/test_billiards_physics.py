@@ -1,0 +1,348 @@
+"""Billiards obeys the laws it claims: impulses, energy, drag, symmetry, tilt, and its own bookkeeping."""
+
+import functools
+import math
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from cuelearner_envs.billiards import Table, physics, positions_at, simulate, simulate_many, trace
+from cuelearner_envs.billiards.impacts import normal_impulse, tangential_impulse
+from cuelearner_envs.billiards.table import cushions, parking, pockets, rack
+
+RATE = -math.log(0.7)  # of the drag, lambda [1/s]
+REACH = (0.5 - 0.05) / RATE  # how far a free ball rolls until a shot is over [m]
+DURATION = math.log(0.5 / 0.05) / RATE  # [s]
+
+shoot = jax.jit(simulate)
+shoot_many = jax.jit(jax.vmap(simulate, (None, 0, 0, 0)))
+draw = jax.jit(trace)
+
+
+@functools.partial(jax.jit, static_argnames="events")
+@functools.partial(jax.vmap, in_axes=(None, 0, 0, None))
+def history(table, positions, angle, events):
+    """Every state of a shot, spin included: what `simulate` steps through."""
+    table = physics.as_arrays(table, positions.dtype)
+    start = physics.strike(table, positions, jnp.zeros(table.balls, bool), angle)
+    return jax.lax.scan(lambda m, _: (physics.step(table, m), m), start, None, length=events)[1]
+
+
+def scattered(table, shots, seed=0):
+    """Random places of all balls inside the cushions, none overlapping; every second shot is aimed at ball 1."""
+    rng = np.random.default_rng(seed)
+    half = np.array([table.width / 2, table.height / 2]) - table.ball_radius - table.cushion_radius
+    places = rng.uniform(-half, half, (40 * shots, table.balls, 2))
+    apart = np.linalg.norm(places[:, :, None] - places[:, None], axis=-1) + np.eye(table.balls)
+    places = places[apart.min((1, 2)) > 2 * table.ball_radius][:shots]
+    assert len(places) == shots
+    angles = rng.uniform(-np.pi, np.pi, shots)
+    aim = np.arctan2(*(places[:, 1] - places[:, 0]).T[::-1]) + rng.uniform(-0.05, 0.05, shots)
+    return places, np.where(np.arange(shots) % 2, aim, angles)
+
+
+def play(table, places, angles, dtype=jnp.float32):
+    """Outcome of many shots, as numpy arrays."""
+    shot = shoot_many(table, jnp.asarray(places, dtype), jnp.zeros(places.shape[:2], bool), jnp.asarray(angles, dtype))
+    return jax.tree.map(np.asarray, shot)
+
+
+def play_one(table, places, angle):
+    """Outcome of one shot with every ball on the table."""
+    return jax.tree.map(np.asarray, shoot(table, jnp.asarray(places), jnp.zeros(len(places), bool), jnp.asarray(angle)))
+
+
+def far(balls):
+    """Places on a large table where balls are in nobody's way."""
+    return [[-0.5 + 0.2 * i, 0.9] for i in range(balls)]
+
+
+LARGE = Table.one_ball().replace(width=6.0, height=3.0)
+
+
+# ------------------------------------------------------------------------------------------------------------- impulses
+
+
+def random_collisions(table, count, seed=0):
+    """Two touching balls in random motion and spin, and the contact between them."""
+    rng = np.random.default_rng(seed)
+    normal, r = rng.uniform(-np.pi, np.pi, count), float(table.ball_radius)
+    a, n = rng.uniform(-0.1, 0.1, (count, 2)), np.stack([np.cos(normal), np.sin(normal)], -1)
+    u = rng.normal(0, 0.4, (count, 2, 2))
+    closing = ((u[:, 0] - u[:, 1]) * n).sum(-1)
+    u = np.where((closing < 0)[:, None, None], u[:, ::-1], u)  # ball a approaches b
+    x = np.stack([a, a + 2 * r * n], 1)
+    zero = jnp.zeros(count)
+    motion = physics.Motion(
+        *(jnp.asarray(v) for v in (x[..., 0], x[..., 1], u[..., 0], u[..., 1], rng.normal(0, 0.2, (count, 2)))),
+        pocketed=jnp.zeros((count, 2), bool), warped=zero, kicks=zero, events=zero, done=zero > 0,
+    )  # fmt: skip
+    one, two = (jnp.broadcast_to(jnp.arange(2) == i, (count, 2)) for i in (0, 1))
+    return motion, physics.Contact(zero, one, two, zero, zero, zero > 0), n
+
+
+def totals(motion, radius):
+    """Momentum (count, 2), angular momentum about the origin and energy of discs of mass 1."""
+    x, y, ux, uy, rim = (np.asarray(v, float) for v in motion[:5])
+    momentum = np.stack([ux.sum(-1), uy.sum(-1)], -1)
+    angular = (x * uy - y * ux + 0.5 * radius * rim).sum(-1)
+    return momentum, angular, (0.5 * (ux**2 + uy**2) + 0.25 * rim**2).sum(-1)
+
+
+@pytest.mark.parametrize(("friction", "restitution"), [(0.0, 1.0), (0.25, 1.0), (0.25, 0.8), (50.0, 1.0)])
+def test_collision_keeps_momentum_and_reverses_the_normal_speed(friction, restitution):
+    table = Table.one_ball().replace(friction=friction, restitution=restitution)
+    before, contact, n = random_collisions(table, 500)
+    after = jax.vmap(physics.impact, (None, 0, 0, None))(table, before, contact, 0.0)
+    (p0, l0, e0), (p1, l1, e1) = totals(before, table.ball_radius), totals(after, table.ball_radius)
+    np.testing.assert_allclose(p1, p0, atol=1e-6)
+    np.testing.assert_allclose(l1, l0, atol=1e-7)
+    closing = [
+        ((np.stack([m.ux, m.uy], -1)[:, 0] - np.stack([m.ux, m.uy], -1)[:, 1]) * n).sum(-1) for m in (before, after)
+    ]
+    firm = closing[0] > 2e-3  # softer impacts are elastic, whatever the restitution
+    np.testing.assert_allclose(closing[1][firm], -restitution * closing[0][firm], atol=3e-6)
+    if friction == 0.0:
+        np.testing.assert_allclose(e1, e0, rtol=1e-5)
+        np.testing.assert_array_equal(after.rim, before.rim)
+    else:
+        assert (e1 < e0 + 1e-7).all()
+        assert (e1 < 0.99 * e0).mean() > 0.2
+    if friction == 50.0:  # enough to end the slip: both rims move together at the contact
+        along = n[:, 1] * (after.ux[:, 0] - after.ux[:, 1]) - n[:, 0] * (after.uy[:, 0] - after.uy[:, 1])
+        assert (np.abs(along - after.rim.sum(-1)) < 2e-6).mean() > 0.9
+
+
+def test_impulses_by_hand():
+    # A disc against a wall: (1 + e) v; two equal discs share it. Slip 0.3 needs 0.1 at a wall, 0.05 between discs.
+    assert float(normal_impulse(0.4, 0.0, 0.5, 1.0)) == pytest.approx(0.6)
+    assert float(normal_impulse(0.4, 0.0, 0.5, 2.0)) == pytest.approx(0.3)
+    assert float(tangential_impulse(0.3, 1.0, 0.25, 1.0)) == pytest.approx(-0.1)
+    assert float(tangential_impulse(-0.3, 1.0, 0.25, 2.0)) == pytest.approx(0.05)
+    assert float(tangential_impulse(0.3, 0.2, 0.25, 1.0)) == pytest.approx(-0.05)
+
+
+@pytest.mark.parametrize("friction", [0.0, 0.25])
+def test_energy_without_drag(friction):
+    table = Table.regulation().replace(friction=friction, speed_kept=1.0)
+    places, angles = scattered(table, 200)
+    motions = jax.tree.map(
+        np.asarray, history(table, jnp.asarray(places, jnp.float32), jnp.asarray(angles, jnp.float32), 40)
+    )
+    energy = totals(motions, table.ball_radius)[2]
+    all_there = ~motions.pocketed.any(-1)
+    assert all_there[:, 10].mean() > 0.3  # else the test says little
+    assert (np.diff(energy, axis=1) < 1e-6).all()
+    if friction == 0.0:
+        np.testing.assert_allclose(energy[all_there], 0.5 * 0.5**2, rtol=2e-5)
+    else:
+        assert energy[:, 10].mean() < 0.12
+
+
+# ------------------------------------------------------------------------------------------------ single shots, by hand
+
+
+def test_free_ball_rolls_as_far_and_as_long_as_linear_drag_says():
+    shot = play_one(LARGE, [[-1.0, 0.1], [0.0, 0.9]], 0.3)
+    np.testing.assert_allclose(shot.positions[0], [-1 + REACH * math.cos(0.3), 0.1 + REACH * math.sin(0.3)], atol=2e-6)
+    np.testing.assert_allclose(shot.positions[1], [0.0, 0.9])
+    assert shot.duration == pytest.approx(DURATION, abs=1e-5)
+    assert int(shot.events) == 1
+
+
+def test_head_on_hit_hands_over_all_speed():
+    shot = play_one(LARGE, [[-1.0, 0.0], [-0.5, 0.0]], 0.0)
+    np.testing.assert_allclose(shot.positions[0], [-0.5 - 2 * 0.02, 0.0], atol=2e-6)
+    np.testing.assert_allclose(shot.positions[1], [-1.0 + REACH + 2 * 0.02, 0.0], atol=5e-6)
+
+
+def test_frictionless_cushion_mirrors_the_flight():
+    table = LARGE.replace(friction=0.0)
+    shot = play_one(table, [[-1.0, -1.0], [2.0, 0.9]], -0.9)
+    wall = -1.5 + 0.024  # lowest place of the ball's centre
+    y = -1.0 - REACH * math.sin(0.9)
+    np.testing.assert_allclose(shot.positions[0], [-1.0 + REACH * math.cos(0.9), 2 * wall - y], atol=3e-6)
+
+
+def test_cushion_friction_bends_the_flight():
+    shot = play_one(LARGE, [[-1.0, -1.2], [2.0, 0.9]], -math.pi / 4)
+    before = (1.2 - (1.5 - 0.024)) * math.sqrt(2)  # negative of the way to the cushion
+    way = -before
+    # u_t falls by min(mu (1 + e) u_n, u_t / 3) = u / 3 at 45 degrees, u_n turns round.
+    u = 0.5 / math.sqrt(2)
+    warped = (1.0 - 0.05 / (math.hypot(u, u * 2 / 3))) / RATE - way / 0.5
+    np.testing.assert_allclose(
+        shot.positions[0], [-1.0 + way / math.sqrt(2) + u * 2 / 3 * warped, -1.476 + u * warped], atol=5e-6
+    )
+
+
+@pytest.mark.parametrize("pocket", range(6))
+def test_ball_sent_to_a_pocket_falls(pocket):
+    table = Table.regulation()
+    place = np.asarray(pockets(table))[pocket]
+    start = place - 0.1 * np.sign(place) * ([1, 1] if place[0] else [0, 1])
+    others = [[0.1 * i, -0.05 * np.sign(place[1])] for i in (1, 2, 3)]
+    shot = play_one(table, [start, *others], np.arctan2(*(place - start)[::-1]))
+    np.testing.assert_array_equal(shot.pocketed, [True, False, False, False])
+    np.testing.assert_allclose(shot.positions[0], np.asarray(parking(table))[0])
+    assert shot.duration < 1.0
+
+
+def test_pocketed_balls_take_no_part():
+    table = Table.one_ball()
+    places = jnp.array([[-0.2, 0.0], [0.0, 0.0]])
+    shot = shoot(table, places, jnp.array([False, True]), jnp.array(0.1))
+    alone = shoot(table, places.at[1].set([-0.3, 0.15]), jnp.array([False, False]), jnp.array(0.1))
+    np.testing.assert_array_equal(shot.positions[0], alone.positions[0])
+    assert bool(shot.pocketed[1])
+    nothing = shoot(table, places, jnp.array([True, False]), jnp.array(0.0))
+    assert float(nothing.duration) == 0.0
+    np.testing.assert_array_equal(nothing.positions[1], places[1])
+
+
+# ---------------------------------------------------------------------------------------------------------- many shots
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_mirrored_scene_gives_mirrored_outcome(axis):
+    table, flip = Table.regulation(), np.where(np.arange(2) == axis, -1.0, 1.0)
+    with jax.enable_x64(True):  # in double precision chance amplified by impacts stays far below the tolerance
+        places, angles = scattered(table, 1000)
+        ours = play(table, places, angles, jnp.float64)
+        theirs = play(table, places * flip, (np.pi - angles) if axis == 0 else -angles, jnp.float64)
+    np.testing.assert_array_equal(ours.pocketed, theirs.pocketed)
+    on = ~ours.pocketed
+    assert on.mean() < 0.99
+    np.testing.assert_allclose(theirs.positions[on], (ours.positions * flip)[on], atol=1e-8)
+    np.testing.assert_allclose(theirs.duration, ours.duration, atol=1e-8)
+
+
+def distance_to_segments(points, segments):
+    """From each point (..., 2) to the nearest of the segments (n, 2, 2)."""
+    start, along = segments[:, 0], segments[:, 1] - segments[:, 0]
+    share = ((points[..., None, :] - start) * along).sum(-1) / (along**2).sum(-1)
+    foot = start + np.clip(share, 0, 1)[..., None] * along
+    return np.linalg.norm(points[..., None, :] - foot, axis=-1).min(-1)
+
+
+@pytest.mark.parametrize("tilt", [0.0, 0.005])
+def test_nothing_overlaps_at_rest_and_no_shot_runs_out_of_events(tilt):
+    table = Table.regulation().replace(acceleration=(0.0, tilt))
+    places, angles = scattered(table, 1000)
+    places[::4] = np.asarray(rack(table))
+    shot = play(table, places, angles)
+    assert not shot.exhausted.any()
+    assert np.isfinite(shot.positions).all()
+    apart = np.linalg.norm(shot.positions[:, :, None] - shot.positions[:, None], axis=-1) + np.eye(4)
+    assert apart.min() > 2 * table.ball_radius - 2e-6
+    on = shot.positions[~shot.pocketed]
+    reach = table.ball_radius + table.cushion_radius
+    assert distance_to_segments(on, np.asarray(cushions(table), float)).min() > reach - 2e-6
+    assert (np.abs(on) <= np.array([table.width / 2, table.height / 2]) + table.pocket_margin).all()
+    moved = np.linalg.norm(shot.positions - places, axis=-1) > 1e-4
+    assert moved[:, 1:].any(1).mean() > 0.5
+
+
+# ----------------------------------------------------------------------------------------------------------------- tilt
+
+
+def integrate(start, velocity, gravity, ceiling, until):
+    """A ball under drag and acceleration that bounces off a cushion at y = ceiling, by a general integrator."""
+    state, now, gravity = np.array([*start, *velocity], float), 0.0, np.asarray(gravity)
+
+    def hits(_, s):
+        return ceiling - s[1]
+
+    hits.terminal, hits.direction = True, -1
+    while True:
+        motion = solve_ivp(
+            lambda _, s: np.concatenate([s[2:], gravity - RATE * s[2:]]),
+            (now, until), state, events=hits, rtol=1e-10, atol=1e-12,
+        )  # fmt: skip
+        state, now = motion.y[:, -1], motion.t[-1]
+        if motion.status == 0:
+            return state
+        state[1], state[3] = ceiling - 1e-12, -state[3]
+
+
+def test_tilted_flight_and_bounce_against_an_integrator():
+    gravity, start = (0.002, 0.005), [[-1.0, 0.9], [1.0, 0.0]]
+    table = LARGE.replace(friction=0.0, acceleration=gravity)
+    shot = play_one(table, start, 0.8)
+    ceiling, until = 1.5 - 0.024, float(shot.duration)
+    cue = integrate(start[0], [0.5 * math.cos(0.8), 0.5 * math.sin(0.8)], gravity, ceiling, until)
+    target = integrate(start[1], [0.0, 0.0], gravity, ceiling, until)
+    assert cue[3] < 0.03  # it has bounced
+    assert math.hypot(*cue[2:]) == pytest.approx(table.stop_speed, abs=1e-5)
+    np.testing.assert_allclose(shot.positions, [cue[:2], target[:2]], atol=5e-5)
+    assert target[1] > 0.05  # a ball at rest feels the tilt too
+
+
+def test_ball_resting_on_a_cushion_stays_there():
+    table = LARGE.replace(acceleration=(0.0, 0.005))
+    shot = play_one(table, [[-1.0, 0.0], [1.0, 1.5 - 0.024]], 0.0)
+    np.testing.assert_allclose(shot.positions[1], [1.0, 1.476], atol=1e-4)
+    assert int(shot.events) < 150
+
+
+# ---------------------------------------------------------------------------------------------------------- bookkeeping
+
+
+def test_event_bound_sets_the_flag():
+    table = Table.one_ball()
+    places, pocketed, angle = jnp.array([[-0.2, 0.0], [0.1, 0.1]]), jnp.zeros(2, bool), jnp.array(1.0)
+    assert not bool(shoot(table, places, pocketed, angle).exhausted)
+    cut = shoot(table.replace(max_events=2), places, pocketed, angle)
+    assert bool(cut.exhausted)
+    assert int(cut.events) == 2
+
+
+def test_changed_values_need_no_new_trace():
+    chex.clear_trace_counter()
+    counted = jax.jit(chex.assert_max_traces(simulate, n=1))
+    places, table = jnp.array([[-0.2, 0.0], [0.1, 0.1]]), Table.one_ball()
+    changes = [{}, {"friction": 0.0}, {"acceleration": (0.0, 0.005)}, {"speed_kept": 1.0, "stop_speed": 0.6}]
+    outcomes = [counted(table.replace(**change), places, jnp.zeros(2, bool), jnp.array(1.0)) for change in changes]
+    assert len({float(outcome.positions[0, 0]) for outcome in outcomes}) == len(changes)
+
+
+def test_simulate_many_is_vmap_of_simulate():
+    table = Table.regulation()
+    places, angles = scattered(table, 13)
+    frictions = np.linspace(0.0, 0.5, 13, dtype="f4")  # the shots' own; every other field is shared
+    blocks = jax.jit(simulate_many, static_argnames="block")
+    scene = jnp.asarray(places, jnp.float32), jnp.zeros((13, 4), bool), jnp.asarray(angles, jnp.float32)
+    ours = blocks(table.replace(friction=frictions), *scene, block=5)
+    for i in (0, 6, 12):
+        theirs = play(table.replace(friction=float(frictions[i])), places, angles)
+        row = functools.partial(jnp.take, indices=i, axis=0)
+        chex.assert_trees_all_close(jax.tree.map(row, ours), jax.tree.map(row, theirs), atol=1e-5)
+
+
+def test_trace_follows_simulate():
+    table = Table.regulation().replace(acceleration=(0.0, 0.005))
+    places, angles = scattered(table, 6, seed=3)
+    for place, angle in zip(places, angles, strict=True):
+        scene = jnp.asarray(place, jnp.float32), jnp.zeros(4, bool), jnp.asarray(angle, jnp.float32)
+        shot, path = shoot(table, *scene), draw(table, *scene)
+        assert path.times.shape == (table.max_events + 1,)
+        assert (np.diff(path.times) >= 0).all()
+        np.testing.assert_allclose(path.positions[-1], shot.positions, atol=1e-5)
+        times = jnp.linspace(0.0, shot.duration + 1.0, 400)
+        where, gone = positions_at(table, path, times)
+        np.testing.assert_allclose(where[0], place, atol=1e-6)
+        np.testing.assert_allclose(where[-1], shot.positions, atol=1e-5)
+        np.testing.assert_array_equal(gone[-1], shot.pocketed)
+        strides = np.linalg.norm(np.diff(where, axis=0), axis=-1)[~np.diff(gone, axis=0)]
+        assert strides.max() <= 0.55 * float(times[1] - times[0])  # no ball jumps, except into its parking place
+
+
+def test_gradual_slowing_along_the_path():
+    path = draw(LARGE, jnp.array([[-1.0, 0.1], [0.0, 0.9]]), jnp.zeros(2, bool), jnp.array(0.0))
+    times = jnp.array([0.0, 1.0, 2.0])
+    x = positions_at(LARGE, path, times)[0][:, 0, 0]
+    np.testing.assert_allclose(x, -1.0 + 0.5 * (1 - 0.7**times) / RATE, atol=1e-5)

@@ -1,0 +1,100 @@
+"""Statistics against hand-computed values, scipy's own trimmed mean and known coverage."""
+
+import numpy as np
+import pytest
+
+from cuelearner_jax import statistics
+from cuelearner_jax.statistics import Curve
+
+
+def flat(steps, lower, upper):
+    lower, upper = np.asarray(lower, float), np.asarray(upper, float)
+    return Curve(np.asarray(steps), (lower + upper) / 2, lower, upper)
+
+
+@pytest.mark.parametrize(
+    ("values", "expected"),
+    [
+        ([5.0], 5.0),
+        ([1.0, 2.0, 9.0], 4.0),  # up to 3: the plain mean
+        ([0.0, 1.0, 3.0, 100.0], 2.0),  # 4: one dropped at each end
+        ([7.0, -50.0, 1.0, 4.0, 1000.0], 4.0),  # 5: the middle three
+        ([0.0, 0.0, 1.0, 2.0, 3.0, 4.0, 99.0, 99.0], 2.5),  # 8: two dropped at each end
+    ],
+)
+def test_interquartile_mean_by_hand(values, expected):
+    assert statistics.interquartile_mean(values) == pytest.approx(expected)
+
+
+def test_interquartile_mean_takes_each_column_by_itself():
+    values = np.array([[0.0, 10.0], [1.0, 30.0], [3.0, -90.0], [100.0, 20.0]])
+    np.testing.assert_allclose(statistics.interquartile_mean(values), [2.0, 15.0])
+    np.testing.assert_allclose(statistics.interquartile_mean(values.T, axis=1), [2.0, 15.0])
+
+
+def test_intervals_of_normal_data_cover_the_truth_as_often_as_the_docstring_says():
+    rng = np.random.default_rng(0)
+    for seeds, expected in ((5, 0.90), (20, 0.945)):
+        found = statistics.interval(rng.normal(size=(seeds, 1500)), resamples=1000)
+        covered = np.mean((found.lower <= 0) & (found.upper >= 0))
+        assert covered == pytest.approx(expected, abs=0.03)
+
+
+def test_interval_brackets_the_estimate_and_repeats():
+    values = np.random.default_rng(1).normal(size=(9, 4))
+    first, second = statistics.interval(values), statistics.interval(values)
+    assert np.all((first.lower < first.estimate) & (first.estimate < first.upper))
+    np.testing.assert_array_equal(first, second)
+    wider = statistics.interval(values, confidence=0.99)
+    assert np.all(wider.upper - wider.lower > first.upper - first.lower)
+
+
+def test_interval_of_a_column_does_not_depend_on_the_others():
+    values = np.random.default_rng(2).normal(size=(7, 5))
+    np.testing.assert_allclose(np.array(statistics.interval(values))[:, 3], statistics.interval(values[:, 3]))
+
+
+def test_strata_keep_their_share():
+    """Two constant strata: resampling inside each leaves nothing to vary; resampling across them would."""
+    low, high = np.zeros((6, 1)), np.ones((6, 1))
+    stratified, pooled = statistics.interval(low, high), statistics.interval(np.concatenate([low, high]))
+    np.testing.assert_allclose(np.array(stratified)[:, 0], [0.5, 0.5, 0.5])
+    assert pooled.upper[0] - pooled.lower[0] > 0.5
+
+
+def test_equal_seeds_have_no_width_and_a_single_seed_no_interval():
+    np.testing.assert_array_equal(np.array(statistics.interval(np.full((5, 2), 0.25))), 0.25)
+    single = statistics.interval(np.array([[1.0, 2.0]]))
+    np.testing.assert_array_equal(single.estimate, [1.0, 2.0])
+    assert np.isnan(single.lower).all()
+    assert np.isnan(single.upper).all()
+
+
+def test_missing_values_are_refused():
+    with pytest.raises(ValueError, match="NaN"):
+        statistics.interval(np.array([[1.0], [np.nan]]))
+    with pytest.raises(ValueError, match="at least one seed"):
+        statistics.interval(np.empty((0, 3)))
+
+
+def test_stretches_apart_are_the_unbroken_ones_on_common_steps():
+    a = flat([0, 10, 20, 30, 40, 50], [0, 2, 2, 0, 2, np.nan], [9, 9, 9, 9, 9, np.nan])
+    b = flat([0, 10, 20, 30, 40, 50, 60], [0] * 7, [1] * 7)
+    assert statistics.stretches_apart(a, b) == [(10, 20), (40, 40)]
+    assert statistics.stretches_apart(b, a) == []
+    # Step 20 is unknown for this one: 10 and 30 are neighbours among the steps that both have.
+    assert statistics.stretches_apart(a, flat([0, 10, 30], [0, 0, -2], [1, 1, -1])) == [(10, 30)]
+    assert statistics.stretches_apart(flat([0], [1], [1]), flat([0], [1], [1])) == []
+
+
+def test_area_and_mean_over_uneven_steps_by_hand():
+    steps, values = np.array([0, 10, 40]), np.array([[0.0, 1.0, 1.0], [2.0, 2.0, 2.0]])
+    np.testing.assert_allclose(statistics.area_under_curve(steps, values), [35.0, 80.0])
+    np.testing.assert_allclose(statistics.mean_over_curve(steps, values), [0.875, 2.0])
+    np.testing.assert_allclose(statistics.mean_over_curve(np.array([5]), values[:, :1]), [0.0, 2.0])
+
+
+def test_steps_to_reach_is_the_first_crossing_or_infinity():
+    values = np.array([[0.0, 0.5, 0.4, 0.6], [0.9, 0.0, 0.0, 0.0], [0.1, 0.2, 0.3, 0.4]])
+    found = statistics.steps_to_reach(np.array([0, 10, 20, 30]), values, 0.5)
+    np.testing.assert_array_equal(found, [10.0, 0.0, np.inf])
