@@ -157,6 +157,8 @@ class TeacherTrain(Generic[TaskT]):
     """Seed."""
     eval_steps: int = 10_000
     """Validation steps at the end."""
+    resume: Flag[bool] = False
+    """Go on with an interrupted training."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -378,7 +380,7 @@ def _teacher(arguments: list[str]) -> None:
     default = kind(task.presets[name].config.task, Path("runs") / f"{task.name}-teacher")
     asked = _parse(kind, rest, f"teacher train {task.name}", default)
     command = shlex.join(["cuelearner", "teacher", *arguments])
-    reward = teaching.train(task, asked.task, asked.teacher, asked.out, asked.seed, asked.eval_steps, command)
+    reward = teaching.train(task, asked.task, asked.teacher, asked.out, asked.seed, asked.eval_steps, command, asked.resume)
     out.print(f"reward a step over {asked.eval_steps} validation steps: {reward:.4f}; wrote {asked.out}")
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -240,19 +240,16 @@ class _Training(NamedTuple):
         return state, {"reward": reward.mean(), "loss": error.mean()}
 
 
-def save(folder: Path, teacher: LearnedTeacher, config: TeacherConfig, about: dict[str, Any]) -> None:
-    """Writes a teacher: teacher.json (what it is, how it was made) and its network in half precision.
+def save(folder: Path, teacher: LearnedTeacher, about: dict[str, Any]) -> None:
+    """Writes a teacher: its network in half precision, and teacher.json: what it is and how it was made.
 
-    Raises:
-        UserError: the folder is not empty.
+    `about` must hold the `config` (a TeacherConfig's fields) under that name.
     """
-    if folder.exists() and any(folder.iterdir()):
-        raise UserError(f"{folder} is not empty: give another --out")
     folder.mkdir(parents=True, exist_ok=True)
     params = jax.tree.map(lambda leaf: leaf.astype(jnp.float16), teacher.params)
     with checkpoints(folder / "network") as saved:
         saved.save(0, {"params": params})
-    (folder / "teacher.json").write_text(json.dumps({"config": asdict(config), **about}, indent=1) + "\n")
+    (folder / "teacher.json").write_text(json.dumps(about, indent=1) + "\n")
 
 
 def load(folder: Path, env: Any, aim_error: Any, habit: Any) -> LearnedTeacher:
