@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 Direction = Float[Array, "... 2"]
-Angle = Float[Array, "..."]
+Angle = Float[Array, "..."] | float
 
 
 def from_angle(angle: Angle) -> Direction:
@@ -21,7 +21,7 @@ def from_angle(angle: Angle) -> Direction:
     return jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)
 
 
-def to_angle(action: Direction) -> Angle:
+def to_angle(action: Direction) -> Float[Array, "..."]:
     """Angle of a direction in (-pi, pi] [rad]."""
     return jnp.arctan2(action[..., 1], action[..., 0])
 
@@ -33,7 +33,7 @@ def rotate(action: Direction, angle: Angle) -> Direction:
     return jnp.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
 
 
-def difference(start: Direction, end: Direction) -> Angle:
+def difference(start: Direction, end: Direction) -> Float[Array, "..."]:
     """Signed angle from `start` to `end` in (-pi, pi] [rad]; positive: counterclockwise."""
     cross = start[..., 0] * end[..., 1] - start[..., 1] * end[..., 0]
     dot = start[..., 0] * end[..., 0] + start[..., 1] * end[..., 1]
@@ -50,8 +50,8 @@ def retract(vector: Direction) -> Direction:
 def clip_to_ball(action: Direction, base: Direction, radius: Angle) -> Direction:
     """The direction within `radius` [rad] of `base` that lies nearest to `action` (paper, Eq. 5).
 
-    On the unit circle the L2 ball of radius r round `base` is the arc of half-width 2 asin(r / 2), so the bound is given
-    as an angle. A radius of pi or more leaves every action as it is.
+    On the unit circle the L2 ball of radius r round `base` is the arc of half-width 2 asin(r / 2), so the bound is an
+    angle. A radius of pi or more leaves every action as it is.
     """
     turn = difference(base, action)
     inside = jnp.abs(turn) <= radius
@@ -75,8 +75,8 @@ def best_direction(
 
     Args:
         values: value of each direction, not negative where it matters.
-        spread: standard deviation of the aim [rad]. Values are averaged over it, so a wide window of good directions beats
-            a narrow one and its middle beats its edge. 0: perfect aim.
+        spread: standard deviation of the aim [rad]. Values are averaged over it, so a wide window of good directions
+            beats a narrow one and its middle beats its edge. 0: perfect aim.
         habit: share by which values shrink over a full turn counterclockwise from x. It settles near-ties (a symmetric
             table has many) always the same way; without it the choice jumps between far-apart directions from state to
             state and can't be learned from. 0: no habit.

@@ -99,8 +99,8 @@ class Checkpoints:
         except Exception as error:  # Orbax and TensorStore raise many kinds for one cause: the files do not fit
             reason = str(error).strip().splitlines()[0][:160] if str(error).strip() else type(error).__name__
             raise UserError(
-                f"checkpoint {number} in {self._folder} cannot be read ({reason}): it is damaged or of another program; "
-                "delete that checkpoint's folder to go back to the one before, or start the run anew"
+                f"checkpoint {number} in {self._folder} cannot be read ({reason}): it is damaged or of another "
+                "program; delete that checkpoint's folder to go back to the one before, or start the run anew"
             ) from error
         return {name: _unflat(restored[name], like[name]) for name in like}
 

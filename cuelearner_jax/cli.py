@@ -19,19 +19,19 @@ from typing import Annotated, Any, Generic, TypeVar
 # Before JAX starts: warnings of its start-up are not the user's.
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
 
-import jax  # noqa: E402
-import tyro  # noqa: E402
-from rich.console import Console  # noqa: E402
-from rich.table import Table  # noqa: E402
+import jax
+import tyro
+from rich.console import Console
+from rich.table import Table
 
-from cuelearner_jax import play, runs, sweep, teaching  # noqa: E402
-from cuelearner_jax.config import RunConfig  # noqa: E402
-from cuelearner_jax.errors import UserError, closest  # noqa: E402
-from cuelearner_jax.evaluate import VALIDATION  # noqa: E402
-from cuelearner_jax.report import report  # noqa: E402
-from cuelearner_jax.statistics import interval  # noqa: E402
-from cuelearner_jax.tasks import TASKS, Task  # noqa: E402
-from cuelearner_jax.teacher import TeacherConfig  # noqa: E402
+from cuelearner_jax import play, runs, sweep, teaching
+from cuelearner_jax.config import RunConfig
+from cuelearner_jax.errors import UserError, closest
+from cuelearner_jax.evaluate import VALIDATION
+from cuelearner_jax.report import report
+from cuelearner_jax.statistics import interval
+from cuelearner_jax.tasks import TASKS, Task
+from cuelearner_jax.teacher import TeacherConfig
 
 TaskT = TypeVar("TaskT")
 Flag = tyro.conf.FlagCreatePairsOff
@@ -94,8 +94,8 @@ class Evaluate(Generic[TaskT]):
 
     task: TaskT
     policy: str = "agent"
-    """Of a run: agent, guide (guidance of uniform actions) or guided (guidance of the agent's); of a run or a task alone:
-    teacher, heuristic or uniform."""
+    """Of a run: agent, guide (guidance of uniform actions) or guided (guidance of the agent's); of a run or a task
+    alone: teacher, heuristic or uniform."""
     guidance: tuple[str, ...] = ()
     """Only these kinds of guidance of the run (default: all)."""
     steps: int = 10_000
@@ -224,7 +224,7 @@ def _parse(kind: Any, arguments: list[str], program: str, default: Any = None) -
 def _task(arguments: list[str], command: str) -> tuple[Task, list[str]]:
     """The task named first."""
     if not arguments or arguments[0] in ("-h", "--help"):
-        print(f"usage: cuelearner {command} TASK [--preset NAME] [OPTIONS]\n\n{ABOUT[command.split()[0]]}\n")
+        print(f"usage: cuelearner {command} TASK [--preset NAME] [OPTIONS]\n\n{ABOUT[command.split(maxsplit=1)[0]]}\n")
         for task in TASKS.values():
             print(f"task {task.name}, presets:")
             for name, preset in task.presets.items():
@@ -380,7 +380,9 @@ def _teacher(arguments: list[str]) -> None:
     default = kind(task.presets[name].config.task, Path("runs") / f"{task.name}-teacher")
     asked = _parse(kind, rest, f"teacher train {task.name}", default)
     command = shlex.join(["cuelearner", "teacher", *arguments])
-    reward = teaching.train(task, asked.task, asked.teacher, asked.out, asked.seed, asked.eval_steps, command, asked.resume)
+    reward = teaching.train(
+        task, asked.task, asked.teacher, asked.out, asked.seed, asked.eval_steps, command, asked.resume
+    )
     out.print(f"reward a step over {asked.eval_steps} validation steps: {reward:.4f}; wrote {asked.out}")
 
 

@@ -1,8 +1,8 @@
 """Configuration of the method: frozen dataclasses, one line of help beside each field.
 
-Three kinds of number, kept apart: `Sizes` shape the compiled program (another value compiles again), `Scalars` are traced
-(another value costs nothing), `Schedule` counts steps on the host and the shared clock. The defaults are the billiards
-hyper-parameters of the paper (appendix) and of its public code.
+Three kinds of number, kept apart: `Sizes` shape the compiled program (another value compiles again), `Scalars` are
+traced (another value costs nothing), `Schedule` counts steps on the host and the shared clock. The defaults are the
+billiards hyper-parameters of the paper (appendix) and of its public code.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class Sizes:
     validate_every: int = 20
     """Adam steps between two looks at the validation labels (every fifth label); the best parameters are kept."""
     lanes_per_block: int = 0
-    """Seeds trained in one vmapped block (0: 8 on a CPU, where weights then stay in cache; all of them on an accelerator)."""
+    """Seeds trained in one vmapped block (0: 8 on a CPU, whose cache holds their weights; all on an accelerator)."""
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ class Scalars:
     k_max: int = 50
     """Largest number of refinement passes."""
     refined_fraction: float = 1.0
-    """Share of the labels after the first fit that are asked about refined actions (DAgger); the rest about base actions."""
+    """Share of the labels after the first fit asked about refined actions (DAgger); the rest about base actions."""
     guided_probability: float = 0.5
     """Probability that an episode is guided."""
     mistake_probability: float = 0.0

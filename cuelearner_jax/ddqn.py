@@ -31,7 +31,7 @@ def target(
     target_params: Params,
     transition: Transition,
     directions: Float[Array, "n 2"],
-    discount: Float[Array, ""],
+    discount: Float[Array, ""] | float,
 ) -> Float[Array, ""]:
     """r + discount * Q'(s', argmax_a Q(s', a)): the online network chooses, the target network values.
 
@@ -52,7 +52,9 @@ def loss(
     return jnp.mean(jnp.square(values - targets))
 
 
-def optimizer(name: str, learning_rate: Float[Array, ""], max_norm: Float[Array, ""]) -> optax.GradientTransformation:
+def optimizer(
+    name: str, learning_rate: Float[Array, ""] | float, max_norm: Float[Array, ""] | float
+) -> optax.GradientTransformation:
     """Gradients clipped to a global norm, then SGD or Adam. Both scalars may be traced.
 
     Raises ValueError for another name.
@@ -63,6 +65,6 @@ def optimizer(name: str, learning_rate: Float[Array, ""], max_norm: Float[Array,
     return optax.chain(optax.clip_by_global_norm(max_norm), makers[name](learning_rate))
 
 
-def polyak(params: Params, target_params: Params, rate: Float[Array, ""]) -> Params:
+def polyak(params: Params, target_params: Params, rate: Float[Array, ""] | float) -> Params:
     """The target network moved toward the online one by `rate`."""
     return optax.incremental_update(params, target_params, rate)

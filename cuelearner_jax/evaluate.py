@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from cuelearner_jax import actions as geometry
 from cuelearner_jax import ddqn
 from cuelearner_jax.config import Scalars, Sizes
-from cuelearner_jax.networks import q_network
+from cuelearner_jax.networks import applied, q_network
 from cuelearner_jax.types import Environment, Guidance, GuidanceModel, Params, Teacher
 
 # (key, environment states (n, ...), observations (n, obs)) -> directions (n, 2)
@@ -50,10 +50,10 @@ def rollout(
 
 def agent_policy(sizes: Sizes, params: Params) -> Policy:
     """The greedy choice of an action-value network."""
-    network, options = q_network(sizes.q_layers), geometry.evenly_spaced(sizes.directions)
+    q, options = applied(q_network(sizes.q_layers)), geometry.evenly_spaced(sizes.directions)
 
     def policy(key: PRNGKeyArray, state: Any, obs: jax.Array) -> jax.Array:
-        choose = partial(ddqn.greedy, network.apply, params, directions=options)  # pyright: ignore[reportArgumentType]
+        choose = partial(ddqn.greedy, q, params, directions=options)
         return jax.lax.map(choose, obs, batch_size=max(1, ACTIONS_AT_ONCE // sizes.directions))
 
     return policy

@@ -1,7 +1,7 @@
 """Relative feedback: the teacher's answer, and fitting a model to labels (paper, section IV-A).
 
-Whatever the form of guidance, a label is (obs, action, target) and its model is fitted by least squares to the target, so
-`fit` serves all of them.
+Whatever the form of guidance, a label is (obs, action, target) and its model is fitted by least squares to the target,
+so `fit` serves all of them.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ def fit(
     """Fits a model to labels from scratch by least squares (paper, Eq. 3) and keeps the parameters that validated best.
 
     A fixed number of Adam steps, so that vmapped seeds take equally long. Labels are multiplied by the environment's
-    symmetries where it offers them. Fewer than five valid labels have no validation label: the last parameters are kept.
+    symmetries where it offers them. With fewer than five labels nothing validates: the last parameters are kept.
 
     Args:
         labels: rows (labels, ...), of which the valid ones count.
@@ -96,7 +96,9 @@ def fit(
     validation = (labels.valid & held_out).astype(jnp.float32)
     draw = _subset(labels.valid & ~held_out)
     key_init, key_steps = jax.random.split(key)
-    optimizer = optax.chain(optax.clip_by_global_norm(scalars.max_grad_norm), optax.adam(scalars.feedback_learning_rate))
+    optimizer = optax.chain(
+        optax.clip_by_global_norm(scalars.max_grad_norm), optax.adam(scalars.feedback_learning_rate)
+    )
 
     def loss(params: Params, batch: Label) -> jax.Array:
         error = apply(params, batch.obs, batch.action) - batch.target

@@ -1,6 +1,7 @@
 """The forms of guidance, each one bundle of pure functions: none, heuristic, relative.
 
-`act` receives a batch of base actions and returns what is to be executed; it leaves rows that are not active as they are.
+`act` receives a batch of base actions and returns what is to be executed; it leaves rows that are not active as they
+are.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 from cuelearner_jax import feedback
 from cuelearner_jax.config import Scalars, Sizes
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.networks import feedback_network
+from cuelearner_jax.networks import applied, feedback_network
 from cuelearner_jax.refine import Refined, refine, untouched
 from cuelearner_jax.types import Environment, Guidance, GuidanceModel, Label
 
@@ -72,6 +73,7 @@ def _unlabelled(name: str, act) -> Guidance:
 def _relative(sizes: Sizes, obs_size: int) -> Guidance:
     """The paper's method: a model of relative feedback that refines the agent's actions."""
     network = feedback_network(sizes.feedback_layers)
+    phi = applied(network)
 
     def init_params(key: PRNGKeyArray):
         return network.init(key, jnp.zeros(obs_size), jnp.zeros(2))
@@ -92,7 +94,7 @@ def _relative(sizes: Sizes, obs_size: int) -> Guidance:
         scalars: Scalars,
     ) -> Refined:
         return refine(
-            lambda current: network.apply(model.params, obs, current),  # pyright: ignore[reportArgumentType]
+            lambda current: phi(model.params, obs, current),
             actions,
             active & model.fitted,
             tau=scalars.radians("tau"),
@@ -100,5 +102,5 @@ def _relative(sizes: Sizes, obs_size: int) -> Guidance:
             k_max=scalars.k_max,
         )
 
-    fit = partial(feedback.fit, init=init_params, apply=network.apply, sizes=sizes)
+    fit = partial(feedback.fit, init=init_params, apply=phi, sizes=sizes)
     return Guidance("relative", True, init, label, fit, act)

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import flax.linen as nn
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from cuelearner_jax.types import Params
+
 
 class MLP(nn.Module):
-    """ReLU layers on the concatenation of observation and action; Xavier-uniform weights, zero biases (paper, appendix)."""
+    """ReLU layers on the concatenation of observation and action; Xavier-uniform weights, zero biases."""
 
     layers: Sequence[int]
     outputs: int
@@ -36,3 +39,8 @@ def q_network(layers: Sequence[int]) -> MLP:
 def feedback_network(layers: Sequence[int]) -> MLP:
     """phi(s, a): a residual in the plane."""
     return MLP(tuple(layers), 2)
+
+
+def applied(network: MLP) -> Callable[[Params, jax.Array, jax.Array], jax.Array]:
+    """A network as a function: (params, obs (..., obs), actions (..., 2)) -> outputs (..., outputs)."""
+    return lambda params, obs, actions: jnp.asarray(network.apply(params, obs, actions))

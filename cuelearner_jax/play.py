@@ -66,7 +66,7 @@ class Trained:
 
 
 def load_lanes(subject: Subject, kinds: tuple[str, ...]) -> list[Trained]:
-    """The lanes of a run's kinds of guidance (none named: all). Raises UserError for a kind that the run does not have."""
+    """The lanes of a run's kinds of guidance (none named: all). Raises UserError for a kind the run does not have."""
     assert subject.grid is not None  # Subject.check has seen to it
     env = subject.task.environment(subject.config.task)
     loaded = []
@@ -137,9 +137,7 @@ def evaluate(
     return rows
 
 
-def one_policy(
-    subject: Subject, env: Environment, world: Any, name: str, kind: str, labels: int, seed: int
-) -> Policy:
+def one_policy(subject: Subject, env: Environment, world: Any, name: str, kind: str, labels: int, seed: int) -> Policy:
     """A single policy: of one lane of a run, or of the task. Raises UserError if the run has no such lane."""
     if name in UNTRAINED:
         return untrained_policy(name, subject.task, world, env)

@@ -1,4 +1,4 @@
-"""The refinement loop (paper, Eqs. 3-5): a <- a + phi(s, a) until it settles, never leaving a ball round the first action.
+"""The refinement loop (paper, Eqs. 3-5): a <- a + phi(s, a) until it settles, within a ball round the first action.
 
 Batch-native: a mask says which rows are done, so one `lax.while_loop` serves any number of actions, compiles with
 everything round it and exports. No randomness.

@@ -27,12 +27,11 @@ class RingBuffer(NamedTuple):
 
 
 def ring_buffer(example: Transition) -> RingBuffer:
-    """Builds the buffer for transitions shaped like `example` (arrays or ShapeDtypeStructs).
+    """Builds the buffer for transitions shaped like `example`.
 
     `add` requires the capacity to be a multiple of the number of transitions added at once.
     """
-    zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), example)
-    row, unravel = ravel_pytree(zeros)
+    row, unravel = ravel_pytree(example)
     width = row.shape[0]
 
     def empty(capacity: int) -> Float[Array, "capacity width"]:

@@ -1,4 +1,4 @@
-"""A grid of runs in one process: kinds of guidance one after another, their lanes (seeds x label budgets) vmapped, resumable."""
+"""A grid of runs in one process: kinds of guidance in turn, their lanes (seeds x label budgets) vmapped, resumable."""
 
 from __future__ import annotations
 
@@ -171,9 +171,7 @@ class _Runner:
             results.truncate_after(self.folder, -1)
             return
         found = saved.restore(items(self.group.shapes(), jax.eval_shape(start_clock), 0.0))
-        self.blocks = [
-            rest.replace(**policy) for policy, rest in zip(found["policy"], found["rest"], strict=True)
-        ]
+        self.blocks = [rest.replace(**policy) for policy, rest in zip(found["policy"], found["rest"], strict=True)]
         self.clock, self.wall = found["clock"]["clock"], float(found["clock"]["wall_s"])
         # A checkpoint of the labels alone comes before the rows of step 0.
         results.truncate_after(self.folder, int(self.clock.step) if int(self.clock.step) else -1)
@@ -185,17 +183,18 @@ class _Runner:
         if self.stopping.is_set():
             self._save(saved)
             raise Interrupted(
-                f"stopped at step {int(self.clock.step)} of {self.group.guidance.name}; go on with the same command and --resume"
+                f"stopped at step {int(self.clock.step)} of {self.group.guidance.name}; "
+                "go on with the same command and --resume"
             )
 
-    def _label(
-        self, saved: Checkpoints, teacher: Teacher | None, labels: label_files.LabelFile | None
-    ) -> None:
+    def _label(self, saved: Checkpoints, teacher: Teacher | None, labels: label_files.LabelFile | None) -> None:
         """Asks the teacher, or takes the labels of a file."""
         group, rounds = self.group, self.group.rounds
         if not group.guidance.asks or int(self.clock.round) >= rounds:
             return
-        bar = self.bars.add_task(f"{group.guidance.name}: labels", total=rounds, note="", completed=int(self.clock.round))
+        bar = self.bars.add_task(
+            f"{group.guidance.name}: labels", total=rounds, note="", completed=int(self.clock.round)
+        )
         if labels is not None:
             self._take(labels)
         while int(self.clock.round) < rounds:
@@ -221,9 +220,7 @@ class _Runner:
         slots = label_slots(group.largest_budget, group.config.sizes)
         for index, (seeds, budgets) in enumerate(group.blocks()):
             rows = jax.tree.map(jnp.asarray, label_files.for_lanes(file, seeds, budgets, slots))
-            self.blocks[index] = group.program.take_labels(
-                group.env, group.config.scalars, rows, self.blocks[index]
-            )
+            self.blocks[index] = group.program.take_labels(group.env, group.config.scalars, rows, self.blocks[index])
         self.clock = self.clock.replace(round=jnp.asarray(group.rounds, jnp.int32))
 
     def _write_labels(self) -> None:
@@ -237,7 +234,9 @@ class _Runner:
 
     def _train(self, saved: Checkpoints, writer: results.ResultsWriter) -> None:
         group, schedule = self.group, self.group.config.schedule
-        bar = self.bars.add_task(group.guidance.name, total=schedule.total_steps, note="", completed=int(self.clock.step))
+        bar = self.bars.add_task(
+            group.guidance.name, total=schedule.total_steps, note="", completed=int(self.clock.step)
+        )
         if int(self.clock.step) == 0:
             writer.append(**self._row({}), **self._guide_alone())
         iterations = schedule.eval_every // group.config.sizes.num_envs

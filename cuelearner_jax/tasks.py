@@ -16,7 +16,6 @@ import jax.numpy as jnp
 from cuelearner_envs import billiards
 from cuelearner_envs.billiards import drawing
 from cuelearner_envs.billiards.config import BilliardsConfig, make_environment
-from cuelearner_envs.billiards.environment import Billiards
 from cuelearner_envs.billiards.recording import record
 from cuelearner_envs.billiards.teacher import SearchTeacher
 from cuelearner_jax import teacher as learned
@@ -44,12 +43,14 @@ class Task:
     environment: Callable[[Any], Environment]
     teacher: Callable[[Any, Environment], Teacher]
     presets: dict[str, Preset]
-    record: Callable[..., tuple[list[Any], list[float]]]  # (env, policy, key, steps) -> frames for the two below, rewards
+    record: Callable[
+        ..., tuple[list[Any], list[float]]
+    ]  # (env, policy, key, steps) -> frames for the two below, rewards
     still: Callable[[Any, Any, Path], None]  # (env, one frame of a record, file)
     animate: Callable[[Any, list[Any], Path], None]  # (env, the frames, file)
 
 
-def billiards_teacher(config: BilliardsConfig, env: Billiards) -> Teacher:
+def billiards_teacher(config: BilliardsConfig, env: Any) -> Teacher:
     """The teacher that a configuration names. Raises UserError if the table has no shipped one."""
     aim_error = jnp.deg2rad(jnp.array(config.aim_error_deg, jnp.float32))
     habit = jnp.array(config.habit, jnp.float32)
@@ -95,23 +96,23 @@ BILLIARDS = Task(
                     replay_capacity=20_000,
                     fit_steps=400,
                     fit_batch_size=64,
-                    lanes_per_block=16,
+                    lanes_per_block=24,
                 ),
-                Scalars(),
+                Scalars(learning_rate=0.03),
                 Schedule(
-                    total_steps=4_000,
+                    total_steps=3_000,
                     random_steps=200,
                     learn_after=200,
-                    guidance_until=2_000,
+                    guidance_until=1_500,
                     eval_every=100,
-                    eval_steps=400,
-                    eval_envs=100,
-                    checkpoint_every=1_000,
+                    eval_steps=100,
+                    eval_envs=50,
+                    checkpoint_every=500,
                 ),
             ),
             guidance=("none", "relative"),
             labels=(100,),
-            seeds=16,
+            seeds=24,
         ),
     },
 )

@@ -1,8 +1,8 @@
 """A learned teacher: action values fitted far from the 1:1 recipe of the compared agents.
 
-Many environments in parallel, states visited by the teacher's own play, many directions tried in each, large batches. It
-serves tasks whose value of an action is its immediate reward (discount 0), because then any number of actions may be tried
-in one state.
+Many environments in parallel, states visited by the teacher's own play, many directions tried in each, large batches.
+It serves tasks whose value of an action is its immediate reward (discount 0), because then any number of actions may be
+tried in one state.
 """
 
 from __future__ import annotations
@@ -73,8 +73,7 @@ class ValueNetwork(nn.Module):
         return nn.Dense(1)(x)[..., 0]
 
 
-@struct.dataclass
-class LearnedTeacher:
+class LearnedTeacher(struct.PyTreeNode):
     """The best direction by a network's values (`cuelearner_jax.types.Teacher`). Looks at the observation alone."""
 
     env: Any  # gives the features
@@ -86,7 +85,7 @@ class LearnedTeacher:
 
     def values(self, obs: Float[Array, " obs"], options: Float[Array, "n 2"]) -> Float[Array, " n"]:
         """Expected reward of each direction."""
-        return ValueNetwork(self.layers).apply(self.params, self.env.features(obs, options))  # pyright: ignore
+        return jnp.asarray(ValueNetwork(self.layers).apply(self.params, self.env.features(obs, options)))
 
     def best_action(self, state: Any, obs: Float[Array, " obs"]) -> Float[Array, "2"]:
         """The direction with the largest value."""
@@ -94,8 +93,7 @@ class LearnedTeacher:
         return geometry.best_direction(values, self.aim_error, self.habit)
 
 
-@struct.dataclass
-class TeacherState:
+class TeacherState(struct.PyTreeNode):
     """Everything of a teacher's training."""
 
     params: Params
@@ -143,7 +141,7 @@ class _Training(NamedTuple):
         return optax.chain(optax.clip_by_global_norm(1.0), optax.adam(schedule))
 
     def value(self, env: Any, params: Params, obs: jax.Array, actions: jax.Array) -> jax.Array:
-        return ValueNetwork(self.config.layers).apply(params, env.features(obs, actions))  # pyright: ignore
+        return jnp.asarray(ValueNetwork(self.config.layers).apply(params, env.features(obs, actions)))
 
     def init(self, env: Any, key: PRNGKeyArray) -> TeacherState:
         c = self.config

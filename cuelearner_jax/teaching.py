@@ -32,13 +32,22 @@ def check(config: TeacherConfig) -> None:
         if getattr(config, name) < 1:
             raise UserError(f"teacher.{name} is {getattr(config, name)}: give a positive number")
     if config.tries < 4:
-        raise UserError(f"teacher.tries is {config.tries}: give at least 4 (the best, a promising one, two uniform ones)")
+        raise UserError(
+            f"teacher.tries is {config.tries}: give at least 4 (the best, a promising one, two uniform ones)"
+        )
     if not config.layers:
         raise UserError("teacher.layers: give at least one layer")
 
 
 def train(
-    task: Task, world: Any, config: TeacherConfig, out: Path, seed: int, eval_steps: int, command: str, resume: bool = False
+    task: Task,
+    world: Any,
+    config: TeacherConfig,
+    out: Path,
+    seed: int,
+    eval_steps: int,
+    command: str,
+    resume: bool = False,
 ) -> float:
     """Trains a teacher for a world (a task configuration), validates it and writes it.
 
@@ -78,9 +87,7 @@ def train(
     return reward
 
 
-def _learn(
-    program: teacher.TeacherProgram, env: Any, config: TeacherConfig, out: Path, seed: int
-) -> list[list[float]]:
+def _learn(program: teacher.TeacherProgram, env: Any, config: TeacherConfig, out: Path, seed: int) -> list[list[float]]:
     """All rounds, from wherever the folder's newest checkpoint is. Returns (round, wall_s, reward, loss) a stretch."""
     file = out / HISTORY
     with checkpoints(out / TRAINING) as saved, interruptible() as stopping, progress_bars() as bars:

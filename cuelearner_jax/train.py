@@ -18,7 +18,7 @@ from cuelearner_jax import actions as geometry
 from cuelearner_jax import ddqn
 from cuelearner_jax.config import RunConfig, Scalars, Schedule, Sizes
 from cuelearner_jax.feedback import empty_labels
-from cuelearner_jax.networks import q_network
+from cuelearner_jax.networks import applied, q_network
 from cuelearner_jax.refine import Refined, untouched
 from cuelearner_jax.replay import RingBuffer, ring_buffer
 from cuelearner_jax.types import Asking, Clock, Environment, Guidance, Label, Teacher, TrainState, Transition
@@ -102,13 +102,12 @@ class Lane(NamedTuple):
     @property
     def buffer(self) -> RingBuffer:
         """The replay of transitions of this observation size."""
-        obs, scalar = jax.ShapeDtypeStruct((self.obs_size,), jnp.float32), jax.ShapeDtypeStruct((), jnp.float32)
-        next_obs = jax.ShapeDtypeStruct((self.obs_size if self.bootstraps else 0,), jnp.float32)
-        return ring_buffer(Transition(obs, jax.ShapeDtypeStruct((2,), jnp.float32), scalar, scalar, next_obs))
+        obs, scalar = jnp.zeros(self.obs_size), jnp.zeros(())
+        return ring_buffer(Transition(obs, jnp.zeros(2), scalar, scalar, obs if self.bootstraps else obs[:0]))
 
     def q(self, params: Any, obs: jax.Array, actions: jax.Array) -> jax.Array:
         """Action values (..., 1)."""
-        return q_network(self.sizes.q_layers).apply(params, obs, actions)  # pyright: ignore[reportReturnType]
+        return applied(q_network(self.sizes.q_layers))(params, obs, actions)
 
     def init(self, env: Environment, key: PRNGKeyArray, budget: Int[Array, ""]) -> TrainState:
         """A fresh lane. Budgets do not touch the random numbers: lanes of one seed start alike."""
@@ -132,7 +131,7 @@ class Lane(NamedTuple):
 
     def optimizer(self, scalars: Scalars) -> optax.GradientTransformation:
         """The optimiser of the action values."""
-        return ddqn.optimizer(self.sizes.optimizer, scalars.learning_rate, scalars.max_grad_norm)  # pyright: ignore
+        return ddqn.optimizer(self.sizes.optimizer, scalars.learning_rate, scalars.max_grad_norm)
 
     def label_round(
         self, env: Environment, teacher: Teacher, scalars: Scalars, clock: Clock, state: TrainState
@@ -211,8 +210,8 @@ class Lane(NamedTuple):
     ) -> Refined:
         """Directions to execute (num_envs, 2), and how often guidance moved each.
 
-        Uniform at first, then greedy; in guided episodes refined by the guidance until the cut-off. The branches hang on
-        the shared clock alone, so they stay branches under vmap.
+        Uniform at first, then greedy; in guided episodes refined by the guidance until the cut-off. The branches hang
+        on the shared clock alone, so they stay branches under vmap.
         """
         options = directions(self.sizes)
         base = jax.lax.cond(
@@ -242,7 +241,7 @@ class Lane(NamedTuple):
             batch = self.buffer.sample(k_sample, state.replay, filled, self.sizes.batch_size)
             batch = mirrored(k_mirror, env, batch)
             targets = jax.vmap(
-                lambda item: ddqn.target(self.q, params, target_params, item, options, scalars.discount)  # pyright: ignore
+                lambda item: ddqn.target(self.q, params, target_params, item, options, scalars.discount)
             )(batch)
             loss, gradient = jax.value_and_grad(lambda p: ddqn.loss(self.q, p, batch, targets))(params)
             change, opt_state = optimizer.update(gradient, opt_state, params)
@@ -250,7 +249,7 @@ class Lane(NamedTuple):
             if self.bootstraps:
                 target_params = jax.lax.cond(
                     (clock.update + index + 1) % schedule.target_every == 0,
-                    lambda: ddqn.polyak(params, target_params, scalars.polyak),  # pyright: ignore
+                    lambda: ddqn.polyak(params, target_params, scalars.polyak),
                     lambda: target_params,
                 )
             return (params, target_params, opt_state), loss

@@ -16,8 +16,7 @@ Params = Any  # a Flax parameter pytree
 EnvState = Any  # whatever pytree an environment carries from step to step
 
 
-@struct.dataclass
-class Step:
+class Step(struct.PyTreeNode):
     """What one environment step returns."""
 
     obs: Float[Array, " obs"]  # to act on next: after the automatic reset where the episode ended
@@ -45,9 +44,7 @@ class Environment(Protocol):
         """Starts an episode."""
         ...
 
-    def step(
-        self, key: PRNGKeyArray, state: EnvState, action: Float[Array, "2"]
-    ) -> tuple[EnvState, Step]:
+    def step(self, key: PRNGKeyArray, state: EnvState, action: Float[Array, "2"]) -> tuple[EnvState, Step]:
         """Executes a direction; resets automatically when the episode ends."""
         ...
 
@@ -70,8 +67,7 @@ class Teacher(Protocol):
         ...
 
 
-@struct.dataclass
-class Transition:
+class Transition(struct.PyTreeNode):
     """One stored step. `next_obs` has no entries where nothing bootstraps from it (discount 0)."""
 
     obs: Float[Array, " obs"]
@@ -81,8 +77,7 @@ class Transition:
     next_obs: Float[Array, " obs_or_0"]
 
 
-@struct.dataclass
-class Label:
+class Label(struct.PyTreeNode):
     """One answer of a teacher."""
 
     obs: Float[Array, " obs"]
@@ -91,16 +86,14 @@ class Label:
     valid: Bool[Array, ""]  # False: padding, past this lane's budget, or no answer
 
 
-@struct.dataclass
-class GuidanceModel:
+class GuidanceModel(struct.PyTreeNode):
     """A guidance's learned part."""
 
     params: Params
     fitted: Bool[Array, ""]  # False until labels have been fitted: the model then leaves actions alone
 
 
-@struct.dataclass
-class Asking:
+class Asking(struct.PyTreeNode):
     """The table at which the teacher is asked, and its answers so far."""
 
     env: EnvState
@@ -109,8 +102,7 @@ class Asking:
     budget: Int[Array, ""]  # labels that this lane may use
 
 
-@struct.dataclass
-class TrainState:
+class TrainState(struct.PyTreeNode):
     """One lane's everything: a lane is one seed with one label budget."""
 
     params: Params
@@ -125,8 +117,7 @@ class TrainState:
     key: PRNGKeyArray
 
 
-@struct.dataclass
-class Clock:
+class Clock(struct.PyTreeNode):
     """Counters shared by all lanes: never vmapped, so that branches on them stay branches."""
 
     step: Int[Array, ""]  # environment steps of each lane

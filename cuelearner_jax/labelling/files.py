@@ -71,7 +71,7 @@ def read(path: Path) -> LabelFile:
 def for_lanes(file: LabelFile, seeds: np.ndarray, budgets: np.ndarray, slots: int) -> Label:
     """Label sets of lanes, padded: rows (lanes, slots, ...).
 
-    A file with one set serves every seed; with several, each lane gets its own seed's. A lane uses its budget's first labels.
+    A file with one set serves every seed; with several, each lane gets its own seed's, up to its budget.
 
     Raises:
         UserError: a seed's labels are missing, or there are fewer than a lane's budget.

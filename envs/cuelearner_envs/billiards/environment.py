@@ -1,7 +1,7 @@
 """Billiards as a task: observation, rules and reward of the CueLearner paper (section V-A) round the exact physics.
 
-One step is one shot in a chosen direction. Reward: target balls pocketed by the shot. A foul (the cue ball pocketed) gives
-nothing and puts every ball back, the cue ball at a free place in the left quarter.
+One step is one shot in a chosen direction. Reward: target balls pocketed by the shot. A foul (the cue ball pocketed)
+gives nothing and puts every ball back, the cue ball at a free place in the left quarter.
 """
 
 from __future__ import annotations
@@ -20,8 +20,7 @@ PLACEMENTS = 16  # places tried for a ball that must not touch another
 FLAG = 0.5  # third entry of a ball's observation: +0.5 once pocketed, -0.5 before
 
 
-@struct.dataclass
-class Balls:
+class Balls(struct.PyTreeNode):
     """State between shots."""
 
     positions: Float[Array, "balls 2"]  # [m]; ball 0 is the cue ball
@@ -29,8 +28,7 @@ class Balls:
     shots: Int[Array, ""]  # taken in this episode
 
 
-@struct.dataclass
-class Billiards:
+class Billiards(struct.PyTreeNode):
     """The environment (`cuelearner_jax.types.Environment`). Everything but the last two fields is traced."""
 
     table: Table
@@ -126,7 +124,7 @@ class Billiards:
         return jnp.concatenate([image[0], self._sorted(image[1:]).ravel()]), vector * signs
 
     def features(self, obs: Float[Array, " obs"], action: Float[Array, "... 2"]) -> Float[Array, "... features"]:
-        """A shot as the player sees it: every ball relative to the cue ball, along and across the direction of the strike.
+        """A shot as the player sees it: balls relative to the cue ball, along and across the direction of the strike.
 
         Scaled to the order of one; the offset across is also given in ball diameters, squashed, for it decides the cut.
         Shape (..., 8 + 6 * targets): cue ball and direction first, then each target.
@@ -142,9 +140,7 @@ class Billiards:
         place = jnp.broadcast_to(targets[:, :2] / scale, (*leading, targets.shape[0], 2))
         seen = jnp.concatenate([offsets / scale, cut, place], axis=-1) * on_table
         each = jnp.concatenate([seen, on_table], axis=-1).reshape(*leading, -1)
-        own = jnp.concatenate(
-            [jnp.broadcast_to(cue, (*leading, 2)), action, cue * action, cue[::-1] * action], axis=-1
-        )
+        own = jnp.concatenate([jnp.broadcast_to(cue, (*leading, 2)), action, cue * action, cue[::-1] * action], axis=-1)
         return jnp.concatenate([own, each], axis=-1)
 
 

@@ -1,4 +1,4 @@
-"""The billiards teacher by exhaustive search: it tries every direction and prefers those that forgive a player's error."""
+"""The billiards teacher by exhaustive search: tries every direction and prefers those that forgive an error of aim."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ from cuelearner_envs.billiards.environment import Balls, Billiards
 from cuelearner_jax.actions import best_direction, evenly_spaced
 
 
-@struct.dataclass
-class SearchTeacher:
+class SearchTeacher(struct.PyTreeNode):
     """Knows the table and its state exactly (`cuelearner_jax.types.Teacher`)."""
 
     env: Billiards
