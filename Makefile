@@ -1,31 +1,37 @@
-# make quickstart | test | lint | bench | constraints. Set-up happens by itself; it needs Python 3.11 or newer and git.
+# `make help` lists the targets. Set-up happens by itself; it needs Python 3.11 or newer and git.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 UV := $(BIN)/python -m uv
 UV_VERSION := $(shell sed -n 's/^uv==\([0-9.]*\).*/\1/p' constraints.txt)
 
-.PHONY: help quickstart test lint format bench constraints clean
+.PHONY: help setup quickstart test lint format bench constraints clean
 help:
 	@echo "make quickstart   train, report and film the small billiards example (two to three minutes)"
 	@echo "make test         run the tests"
 	@echo "make lint         ruff and pyright"
+	@echo "make format       what ruff can put right by itself"
 	@echo "make bench        the benchmarks of this machine (some minutes)"
+	@echo "make setup        only the set-up of all of these, in $(VENV)"
 	@echo "make constraints  resolve the pinned versions anew"
+	@echo "make clean        remove $(VENV) and the caches"
+	@echo "Another Python:   make PYTHON=python3.12 ..."
 
 $(BIN)/uv: constraints.txt
-	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "cuelearner needs Python 3.11 or newer: make PYTHON=python3.11")'
-	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet "uv==$(UV_VERSION)"
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "cuelearner needs Python 3.11 or newer: make PYTHON=python3.11")'
+	test -x $(BIN)/pip || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --disable-pip-version-check "uv==$(UV_VERSION)"
 	@touch $@
 
 $(VENV)/.installed: $(BIN)/uv pyproject.toml constraints.txt
-	$(UV) pip install --quiet --python $(BIN)/python --constraints constraints.txt --editable .
+	$(UV) pip install --python $(BIN)/python --constraints constraints.txt --editable .
 	@touch $@
 
 $(VENV)/.tested: $(VENV)/.installed
-	$(UV) pip install --quiet --python $(BIN)/python --constraints constraints.txt --group dev
+	$(UV) pip install --python $(BIN)/python --constraints constraints.txt --group dev
 	@touch $@
+
+setup: $(VENV)/.tested
 
 quickstart: $(VENV)/.installed
 	$(BIN)/python experiments/quickstart.py
@@ -48,7 +54,7 @@ bench: $(VENV)/.tested
 	$(BIN)/python benchmarks/guidance_overhead.py
 
 constraints: $(BIN)/uv
-	$(UV) pip compile --quiet --universal --python-version 3.11 --all-extras --group dev --no-annotate --no-header \
+	$(UV) pip compile --quiet --upgrade --universal --python-version 3.11 --all-extras --group dev --no-annotate --no-header \
 		--no-emit-index-url --no-emit-find-links pyproject.toml --output-file constraints.txt
 
 clean:

@@ -52,7 +52,7 @@ class Sizes:
     validate_every: int = 20
     """Adam steps between two looks at the validation labels (every fifth label); the best parameters are kept."""
     lanes_per_block: int = 0
-    """Seeds trained in one vmapped block (0: 8 on a CPU, whose cache holds their weights; all on an accelerator)."""
+    """Seeds trained in one vmapped block (0: on a CPU as many as its cache holds, on an accelerator all)."""
 
 
 @dataclass(frozen=True)

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +20,10 @@ from cuelearner_jax.runs import Grid
 from cuelearner_jax.train import Program, label_slots, make_program, start_clock
 from cuelearner_jax.types import Clock, Guidance, TrainState
 
-CPU_LANES_PER_BLOCK = 8  # lanes whose weights stay in a CPU's cache together
+CACHE_BYTES = 6_000_000  # of the action-value weights of a CPU's block: beyond, they leave the cache between two steps
+CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+T = TypeVar("T")
 
 
 class Group:
@@ -35,13 +42,26 @@ class Group:
 
     def blocks(self) -> list[tuple[np.ndarray, np.ndarray]]:
         """(seeds, budgets) of each block; the last is filled up with repeats, whose results are dropped."""
-        limit = self.config.sizes.lanes_per_block
-        if limit == 0:
-            limit = CPU_LANES_PER_BLOCK if jax.default_backend() == "cpu" else len(self.seeds)
+        limit = self.config.sizes.lanes_per_block or self._fitting_lanes()
         count = -(-len(self.seeds) // limit)
         size = -(-len(self.seeds) // count)
         index = np.minimum(np.arange(count * size), len(self.seeds) - 1).reshape(count, size)
         return [(self.seeds[rows], self.budgets[rows]) for rows in index]
+
+    def _fitting_lanes(self) -> int:
+        """Lanes of a block: on an accelerator all; on a CPU what fits its cache, and a block for each core."""
+        if jax.default_backend() != "cpu":
+            return len(self.seeds)
+        widths = [self.env.obs_size + 2, *self.config.sizes.q_layers, 1]
+        weights = 4 * sum(a * b for a, b in pairwise(widths))
+        return max(1, min(CACHE_BYTES // weights, -(-len(self.seeds) // CORES)))
+
+    def each(self, work: Callable[..., T], *blocks: list[Any]) -> list[T]:
+        """`work` of every block. A CPU takes as many at once as it has cores, which then seldom wait for each other."""
+        if jax.default_backend() != "cpu" or len(blocks[0]) == 1:
+            return [work(*entries) for entries in zip(*blocks, strict=True)]
+        with ThreadPoolExecutor(CORES) as pool:
+            return list(pool.map(lambda *entries: jax.block_until_ready(work(*entries)), *blocks))
 
     def start(self) -> list[TrainState]:
         """Fresh blocks."""

@@ -199,13 +199,11 @@ class _Runner:
             self._take(labels)
         while int(self.clock.round) < rounds:
             started = time.perf_counter()
-            clocks = [self.clock]
-            for index, block in enumerate(self.blocks):
-                clock, self.blocks[index] = group.program.label_round(
-                    group.env, teacher, group.config.scalars, self.clock, block
-                )
-                clocks.append(clock)
-            self.clock = jax.block_until_ready(clocks[-1])
+            done = group.each(
+                lambda block: group.program.label_round(group.env, teacher, group.config.scalars, self.clock, block),
+                self.blocks,
+            )
+            self.clock, self.blocks = jax.block_until_ready(done[0][0]), [block for _, block in done]
             self.wall += time.perf_counter() - started
             self.bars.update(bar, completed=int(self.clock.round))
             if int(self.clock.round) % ROUNDS_A_CHUNK == 0:
@@ -242,13 +240,14 @@ class _Runner:
         iterations = schedule.eval_every // group.config.sizes.num_envs
         while int(self.clock.step) < schedule.total_steps:
             started = time.perf_counter()
-            clock, metrics = self.clock, []
-            for index, block in enumerate(self.blocks):
-                clock, self.blocks[index], measured = group.program.train(
+            done = group.each(
+                lambda block: group.program.train(
                     group.env, group.config.scalars, schedule, self.clock, block, iterations
-                )
-                metrics.append(measured)
-            self.clock = jax.block_until_ready(clock)
+                ),
+                self.blocks,
+            )
+            self.clock, self.blocks = jax.block_until_ready(done[0][0]), [block for _, block, _ in done]
+            metrics = [measured for _, _, measured in done]
             self.wall += time.perf_counter() - started
             row = self._row(group.lanes([{f"train_{k}": v for k, v in block.items()} for block in metrics]))
             writer.append(**row)
@@ -260,25 +259,25 @@ class _Runner:
     def _row(self, extra: dict[str, np.ndarray]) -> dict[str, Any]:
         """The columns of one evaluation of all lanes."""
         group, schedule = self.group, self.group.config.schedule
-        measured = [
-            evaluate_agents(
+        measured = group.each(
+            lambda block: evaluate_agents(
                 group.env,
                 block.params,
                 self.validation,
                 sizes=group.config.sizes,
                 num_envs=schedule.eval_envs,
                 steps=schedule.eval_steps,
-            )
-            for block in self.blocks
-        ]
+            ),
+            self.blocks,
+        )
         own = {"seed": group.seeds, "labels": group.budgets, "step": int(self.clock.step), "wall_s": self.wall}
         return {**own, **group.lanes(measured), **extra}
 
     def _guide_alone(self) -> dict[str, np.ndarray]:
         """Reward of uniform actions under guidance; for unguided lanes that is chance."""
         group, schedule = self.group, self.group.config.schedule
-        measured = [
-            evaluate_guides(
+        measured = group.each(
+            lambda block: evaluate_guides(
                 group.env,
                 block.guidance,
                 self.validation,
@@ -286,7 +285,7 @@ class _Runner:
                 guidance=group.guidance,
                 num_envs=schedule.eval_envs,
                 steps=schedule.eval_steps,
-            )
-            for block in self.blocks
-        ]
+            ),
+            self.blocks,
+        )
         return {"guide_reward": group.lanes(measured)["reward"]}

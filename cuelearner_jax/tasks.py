@@ -96,9 +96,8 @@ BILLIARDS = Task(
                     replay_capacity=20_000,
                     fit_steps=400,
                     fit_batch_size=64,
-                    lanes_per_block=24,
                 ),
-                Scalars(learning_rate=0.03),
+                Scalars(learning_rate=0.01),
                 Schedule(
                     total_steps=3_000,
                     random_steps=200,

@@ -36,12 +36,18 @@ def main(arguments: list[str]) -> int:
     with (out / "report" / "summary.csv").open() as file:
         for row in csv.DictReader(file):
             if row["guidance"] != "none":
-                where = row["above_unguided"].replace("-", " to ").replace(";", ",") or "nowhere"
+                where = ", ".join(_span(stretch) for stretch in row["above_unguided"].split("; ")) or "nowhere"
                 print(
-                    f"  {row['guidance']} ({row['labels']} labels) above unguided, 95% intervals apart: steps {where}"
+                    f"  {row['guidance']}, {row['labels']} labels: above unguided, 95% intervals apart, at steps {where}"
                 )
     print(f"  curves and table: {out / 'report'} (report.md, curves.png)\n  a film of the agent: {out / 'pictures'}")
     return 0
+
+
+def _span(stretch: str) -> str:
+    """`300-1800` as words; a stretch of one evaluation as its step."""
+    first, _, last = stretch.partition("-")
+    return first if first == last else f"{first} to {last}"
 
 
 def _out(arguments: list[str]) -> tuple[Path, list[str]]:

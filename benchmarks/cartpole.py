@@ -1,0 +1,59 @@
+"""Cart and pole as an environment with a planar action: the task of the peers' speed comparison.
+
+Source: Barto, Sutton, Anderson, "Neuronlike adaptive elements that can solve difficult learning control problems"
+(1983); constants as in common benchmarks: force 10 N, steps of 0.02 s, ends at 2.4 m or 12 degrees, 500 steps.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from cuelearner_jax.types import Step
+
+GRAVITY, CART, POLE, HALF_LENGTH, FORCE, SECONDS = 9.8, 1.0, 0.1, 0.5, 10.0, 0.02
+
+
+class CartState(struct.PyTreeNode):
+    """Position [m], velocity [m/s], angle [rad], angular velocity [rad/s], and steps taken."""
+
+    obs: jax.Array
+    steps: jax.Array
+
+
+class CartPole(struct.PyTreeNode):
+    """The force points along x with the sign of the direction's first entry."""
+
+    force: float = FORCE
+    obs_size: int = struct.field(pytree_node=False, default=4)
+    symmetries: int = struct.field(pytree_node=False, default=1)
+
+    def reset(self, key: jax.Array) -> tuple[CartState, jax.Array]:
+        """All four entries uniform in +-0.05."""
+        obs = jax.random.uniform(key, (4,), minval=-0.05, maxval=0.05)
+        return CartState(obs, jnp.zeros((), jnp.int32)), obs
+
+    def step(self, key: jax.Array, state: CartState, action: jax.Array) -> tuple[CartState, Step]:
+        """One Euler step; reward 1."""
+        _, speed, angle, turning = state.obs
+        push = self.force * jnp.sign(action[0])
+        total, sin, cos = CART + POLE, jnp.sin(angle), jnp.cos(angle)
+        pushed = (push + POLE * HALF_LENGTH * turning**2 * sin) / total
+        angular = (GRAVITY * sin - cos * pushed) / (HALF_LENGTH * (4.0 / 3.0 - POLE * cos**2 / total))
+        linear = pushed - POLE * HALF_LENGTH * angular * cos / total
+        final = state.obs + SECONDS * jnp.stack([speed, linear, turning, angular])
+        terminated = (jnp.abs(final[0]) > 2.4) | (jnp.abs(final[2]) > jnp.deg2rad(12.0))
+        truncated = (state.steps >= 499) & ~terminated
+        fresh, _ = self.reset(key)
+        after = CartState(final, state.steps + 1)
+        after = jax.tree.map(lambda new, old: jnp.where(terminated | truncated, new, old), fresh, after)
+        return after, Step(after.obs, final, jnp.ones(()), terminated, truncated, {})
+
+    def heuristic(self, obs: jax.Array) -> jax.Array:
+        """Toward the side to which the pole falls."""
+        return jnp.stack([jnp.sign(obs[2] + obs[3]), 0.0])
+
+    def mirror(self, which: jax.Array, obs: jax.Array, vector: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """No symmetry is offered."""
+        return obs, vector

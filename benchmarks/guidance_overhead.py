@@ -1,0 +1,112 @@
+"""Wall time of a guided training run over an unguided one: same loop, networks, seeds and steps.
+
+    python benchmarks/guidance_overhead.py --out overhead.json
+
+Guided: relative feedback, half of the episodes refined during all of the stretch (no cut-off), after labels have been
+collected and fitted; what collecting and fitting took is given apart, and as part of a whole run of the preset. Rounds
+of both kinds are interleaved; medians over rounds, compile time apart.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from cuelearner_jax import guidance
+from cuelearner_jax.lanes import Group
+from cuelearner_jax.runs import Grid
+from cuelearner_jax.tasks import BILLIARDS
+from cuelearner_jax.train import start_clock
+
+
+class Run:
+    """One kind of guidance, ready to train."""
+
+    def __init__(self, kind: str, config: Any, seeds: int, labels: int) -> None:
+        env = BILLIARDS.environment(config.task)
+        made = guidance.make(kind, config.sizes, env.obs_size)
+        self.group = Group(config, env, made, Grid((kind,), tuple(range(seeds)), (labels,)))
+        self.clock, self.blocks, self.rounds = start_clock(), self.group.start(), []
+        if made.asks:
+            teacher = BILLIARDS.teacher(config.task, env)
+            for _ in range(self.group.rounds):
+                began = time.perf_counter()
+                program, scalars, clock = self.group.program, config.scalars, self.clock
+                done = self.group.each(
+                    lambda block, p=program, s=scalars, c=clock: p.label_round(env, teacher, s, c, block), self.blocks
+                )
+                self.clock, self.blocks = jax.block_until_ready((done[0][0], [entry[1] for entry in done]))
+                self.rounds.append(time.perf_counter() - began)
+
+    def train(self, iterations: int) -> float:
+        """Seconds of a stretch."""
+        config = self.group.config
+        began = time.perf_counter()
+        done = self.group.each(
+            lambda block: self.group.program.train(
+                self.group.env, config.scalars, config.schedule, self.clock, block, iterations
+            ),
+            self.blocks,
+        )
+        self.clock, self.blocks = jax.block_until_ready((done[0][0], [entry[1] for entry in done]))
+        return time.perf_counter() - began
+
+
+def main() -> None:
+    """Measure the presets and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--presets", nargs="+", default=["quickstart", "paper"], choices=sorted(BILLIARDS.presets))
+    parser.add_argument("--seeds", type=int, default=4)
+    parser.add_argument("--steps", type=int, default=0, help="in a timed stretch (0: 1000 for small networks, else 20)")
+    parser.add_argument("--rounds", type=int, default=7)
+    parser.add_argument("--out", type=Path, help="write the figures to this JSON file")
+    arguments = parser.parse_args()
+
+    rows = []
+    for name in arguments.presets:
+        config = BILLIARDS.presets[name].config
+        labels = 2 * config.sizes.labels_per_round  # enough for a fitted model; the time of a round is scaled up below
+        schedule = dataclasses.replace(config.schedule, random_steps=0, learn_after=0, guidance_until=2**30)
+        sizes = dataclasses.replace(config.sizes, replay_capacity=min(config.sizes.replay_capacity, 100_000))
+        measured = dataclasses.replace(config, schedule=schedule, sizes=sizes)
+        runs = {kind: Run(kind, measured, arguments.seeds, labels) for kind in ("none", "relative")}
+        steps = arguments.steps or (1000 if name == "quickstart" else 20)
+        iterations = -(-steps // sizes.num_envs)
+        times = {kind: [run.train(iterations) for _ in range(arguments.rounds + 1)][1:] for kind, run in runs.items()}
+        none, relative = (np.median(times[kind]) / (iterations * sizes.num_envs) for kind in ("none", "relative"))
+        budget = BILLIARDS.presets[name].labels[-1]
+        labelling = runs["relative"].rounds[-1] * budget / config.sizes.labels_per_round
+        guided_steps = min(config.schedule.guidance_until, config.schedule.total_steps)
+        whole = none * config.schedule.total_steps
+        guided = whole + (relative - none) * guided_steps + labelling
+        rows.append(
+            {
+                "preset": name,
+                "seeds": arguments.seeds,
+                "unguided_ms_a_step": 1e3 * float(none),
+                "guided_ms_a_step": 1e3 * float(relative),
+                "ratio_while_guided": float(relative / none),
+                "labels": budget,
+                "labelling_s": float(labelling),
+                "ratio_whole_run": float(guided / whole),
+            }
+        )
+    print("preset      ms a step: unguided  guided  ratio while guided  labelling [s]  ratio of a whole run")
+    for row in rows:
+        print(
+            f"{row['preset']:<10}  {row['unguided_ms_a_step']:19.3f}  {row['guided_ms_a_step']:6.3f}  "
+            f"{row['ratio_while_guided']:18.3f}  {row['labelling_s']:13.1f}  {row['ratio_whole_run']:20.3f}"
+        )
+    if arguments.out:
+        arguments.out.write_text(json.dumps({"device": jax.devices()[0].device_kind, "rows": rows}, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,124 @@
+"""How much of the machine's matmul rate training reaches, on the work of the peers' comparison.
+
+    python benchmarks/training_speed.py --seeds 8 32 --out speed.json
+
+Cart and pole, the paper's six hidden layers, batch 256, one gradient step an environment step, double DQN with two
+directions. The whole loop is timed: acting, environment, replay, targets, gradient, optimiser, target network. Floating
+point operations are counted from the layers (multiply and add: 2), not taken from the compiler; the peak is a large
+float32 matrix product measured between the timed stretches of the same run. Medians over rounds, compile time apart.
+Peers measured on another day on the same kind of machine (purejaxrl, rejax): 54 to 56% at 8 and 32 seeds.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from functools import partial
+from itertools import pairwise
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from cartpole import CartPole
+
+from cuelearner_jax import guidance
+from cuelearner_jax.config import RunConfig, Scalars, Schedule, Sizes
+from cuelearner_jax.lanes import Group
+from cuelearner_jax.runs import Grid
+from cuelearner_jax.train import start_clock
+
+BATCH, ENVS, DIRECTIONS = 256, 8, 2
+
+
+def operations_a_step(sizes: Sizes, obs_size: int) -> int:
+    """Floating point operations of one environment step with its gradient step.
+
+    Forward: 2 a weight and row. Backward: 4 (gradients of weights and of inputs), the first layer's inputs excepted.
+    """
+    widths = [obs_size + 2, *sizes.q_layers, 1]
+    weights = [a * b for a, b in pairwise(widths)]
+    total = sum(weights)
+    gradient = BATCH * (6 * total - 2 * weights[0])
+    targets = BATCH * 2 * total * (DIRECTIONS + 1)
+    acting = 2 * total * DIRECTIONS
+    return gradient + targets + acting
+
+
+def matmul_rate(size: int = 2048, repeats: int = 5) -> float:
+    """Float32 matrix products: operations a second, best of `repeats`."""
+    a, b = (jax.random.normal(jax.random.key(k), (size, size)) for k in (0, 1))
+    product = jax.jit(jnp.matmul)
+    product(a, b).block_until_ready()
+    best = np.inf
+    for _ in range(repeats):
+        began = time.perf_counter()
+        product(a, b).block_until_ready()
+        best = min(best, time.perf_counter() - began)
+    return 2 * size**3 / best
+
+
+def measure(config: RunConfig, env: CartPole, seeds: int, steps: int, rounds: int) -> dict[str, float]:
+    """Medians over rounds of one number of seeds."""
+    operations = operations_a_step(config.sizes, env.obs_size)
+    unguided = guidance.make("none", config.sizes, env.obs_size)
+    group = Group(config, env, unguided, Grid(("none",), tuple(range(seeds)), ()))
+    clock, blocks, shares, rates, peaks = start_clock(), group.start(), [], [], []
+    for round_ in range(rounds + 1):
+        peak = matmul_rate()
+        began = time.perf_counter()
+        train = partial(group.program.train, env, config.scalars, config.schedule, clock, iterations=steps // ENVS)
+        done = group.each(train, blocks)
+        clock, blocks = jax.block_until_ready(done[0][0]), jax.block_until_ready([entry[1] for entry in done])
+        rate = steps * seeds / (time.perf_counter() - began)
+        if round_:  # the first one compiles
+            peak = max(peak, matmul_rate())
+            shares.append(rate * operations / peak)
+            rates.append(rate)
+            peaks.append(peak)
+    return {
+        "seeds": seeds,
+        "steps_a_second": float(np.median(rates)),
+        "gflop_a_step": operations / 1e9,
+        "matmul_gflops": float(np.median(peaks)) / 1e9,
+        "share": float(np.median(shares)),
+    }
+
+
+def main() -> None:
+    """Time the loop at each number of seeds and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seeds", type=int, nargs="+", default=[8, 32])
+    parser.add_argument("--steps", type=int, default=64, help="of each seed in a timed stretch")
+    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--lanes-per-block", type=int, default=0, help="0: the default of the machine")
+    parser.add_argument("--out", type=Path, help="write the figures to this JSON file")
+    arguments = parser.parse_args()
+
+    env = CartPole()
+    sizes = Sizes(
+        directions=DIRECTIONS,
+        target_directions=DIRECTIONS,
+        num_envs=ENVS,
+        batch_size=BATCH,
+        replay_capacity=10_000 // ENVS * ENVS,
+        optimizer="adam",
+        lanes_per_block=arguments.lanes_per_block,
+    )
+    scalars = Scalars(discount=0.99, learning_rate=2.5e-4, polyak=0.005)
+    schedule = Schedule(random_steps=0, learn_after=0, guidance_until=0)
+    config = RunConfig(None, sizes, scalars, schedule)
+    rows = [measure(config, env, seeds, arguments.steps, arguments.rounds) for seeds in arguments.seeds]
+    print("seeds  steps/s (all)  GFLOP a step  matmul GFLOP/s  share of it")
+    for row in rows:
+        print(
+            f"{row['seeds']:5d}  {row['steps_a_second']:13.1f}  {row['gflop_a_step']:12.3f}  "
+            f"{row['matmul_gflops']:14.0f}  {row['share']:11.1%}"
+        )
+    if arguments.out:
+        arguments.out.write_text(json.dumps({"device": jax.devices()[0].device_kind, "rows": rows}, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
