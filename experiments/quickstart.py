@@ -37,9 +37,7 @@ def main(arguments: list[str]) -> int:
         for row in csv.DictReader(file):
             if row["guidance"] != "none":
                 where = ", ".join(_span(stretch) for stretch in row["above_unguided"].split("; ")) or "nowhere"
-                print(
-                    f"  {row['guidance']}, {row['labels']} labels: above unguided, 95% intervals apart, at steps {where}"
-                )
+                print(f"  {row['guidance']}, {row['labels']} labels: above unguided, intervals apart, at steps {where}")
     print(f"  curves and table: {out / 'report'} (report.md, curves.png)\n  a film of the agent: {out / 'pictures'}")
     return 0
 

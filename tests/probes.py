@@ -1,0 +1,212 @@
+"""Probe environments whose values are known by hand, their teacher and task, and small configurations to train on them.
+
+In the manner of bsuite's and rejax's probes: each isolates one thing that a learner can get wrong.
+"""
+
+import dataclasses
+import json
+import math
+from dataclasses import dataclass
+from functools import cache, partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from cuelearner_jax import guidance as guidances
+from cuelearner_jax.actions import difference, from_angle, rotate
+from cuelearner_jax.config import RunConfig, Scalars, Schedule, Sizes
+from cuelearner_jax.tasks import Task
+from cuelearner_jax.train import directions, make_program
+from cuelearner_jax.types import Step
+
+
+class Window(struct.PyTreeNode):
+    """A bandit: one shot an episode, reward 1 within `half_width` of the best direction, which the observation tells.
+
+    The observation is one of `contexts` evenly spaced unit vectors; the best direction is the observation turned by
+    `offset`. Exactly symmetric under quarter turns, which `mirrors` offers.
+    """
+
+    half_width: jax.Array | float = 0.5  # [rad]
+    offset: jax.Array | float = 0.6  # [rad]
+    contexts: int = struct.field(pytree_node=False, default=4)
+    mirrors: bool = struct.field(pytree_node=False, default=False)
+
+    obs_size = 2
+
+    @property
+    def symmetries(self):
+        return 4 if self.mirrors else 1
+
+    def reset(self, key):
+        obs = from_angle(jax.random.randint(key, (), 0, self.contexts) * (2 * math.pi / self.contexts))
+        return obs, obs
+
+    def best(self, obs):
+        return rotate(obs, self.offset)
+
+    def step(self, key, state, action):
+        reward = (jnp.abs(difference(self.best(state), action)) <= self.half_width).astype(jnp.float32)
+        following, obs = self.reset(key)
+        return following, Step(obs, state, reward, jnp.array(True), jnp.array(False), {"hit": reward})
+
+    def heuristic(self, obs):
+        return rotate(obs, -1.0)  # wrong, and none of the evenly spaced directions
+
+    def mirror(self, which, obs, vector):
+        return rotate(obs, which * (math.pi / 2)), rotate(vector, which * (math.pi / 2))
+
+    def features(self, obs, action):
+        return jnp.concatenate([jnp.broadcast_to(obs, action.shape), action], axis=-1)
+
+
+class Chain(struct.PyTreeNode):
+    """Two steps: place 0 pays half the action's y and leads to place 1, which pays the action's x and ends the episode.
+
+    Ends by truncation (the last observation is then place 1's own) or by termination; either way place 0 follows.
+    Values at discount g: Q(1, a) = a_x, plus g / (1 - g) if truncated; Q(0, a) = a_y / 2 + g max Q(1, .).
+    """
+
+    truncates: jax.Array | bool = False
+
+    obs_size = 2
+    symmetries = 1
+
+    def reset(self, key):
+        return jnp.zeros((), jnp.int32), self.observe(0)
+
+    def observe(self, place):
+        return jnp.where(jnp.asarray(place) == 0, jnp.array([1.0, 0.0]), jnp.array([0.0, 1.0]))
+
+    def step(self, key, state, action):
+        ends = state == 1
+        after = jnp.where(ends, 0, 1)
+        reward = jnp.where(ends, action[0], 0.5 * action[1])
+        step = Step(self.observe(after), self.observe(1), reward, ends & ~self.truncates, ends & self.truncates, {})
+        return after, step
+
+    def heuristic(self, obs):
+        return from_angle(jnp.array(2.0))
+
+    def mirror(self, which, obs, vector):
+        return obs, vector
+
+
+class Expert(struct.PyTreeNode):
+    """Knows a window's best direction exactly."""
+
+    env: Window
+
+    def best_action(self, state, obs):
+        return self.env.best(obs)
+
+
+@dataclass(frozen=True)
+class WindowConfig:
+    """The bandit as a task's configuration."""
+
+    half_width_deg: float = 28.0
+    """Half the width of the winning window [deg]."""
+
+
+def make_task(name="window"):
+    """The bandit as a task; the pictures are never asked for."""
+    known = {
+        "name": name,
+        "config": WindowConfig,
+        "environment": lambda config: Window(jnp.deg2rad(jnp.array(config.half_width_deg))),
+        "teacher": lambda config, env: Expert(env),
+        "presets": {},
+    }
+    fields = [field.name for field in dataclasses.fields(Task)]
+    return Task(**{field: known.get(field) for field in fields})
+
+
+SIZES = Sizes(
+    q_layers=(32, 32),
+    feedback_layers=(32, 32),
+    directions=16,
+    target_directions=16,
+    num_envs=4,
+    batch_size=32,
+    replay_capacity=4000,
+    optimizer="adam",
+    labels_per_round=10,
+    fit_steps=200,
+    fit_batch_size=32,
+)
+SCALARS = Scalars(learning_rate=3e-3, max_grad_norm=10.0, eps_deg=20.0, tau_deg=1.0, feedback_learning_rate=5e-3)
+SCHEDULE = Schedule(
+    total_steps=48,
+    random_steps=8,
+    learn_after=4,
+    guidance_until=24,
+    eval_every=16,
+    eval_steps=20,
+    eval_envs=10,
+    checkpoint_every=16,
+)
+CONFIG = RunConfig(WindowConfig(), SIZES, SCALARS, SCHEDULE)
+
+
+def config(sizes=None, scalars=None, schedule=None):
+    """`CONFIG` with other values."""
+    return RunConfig(
+        WindowConfig(),
+        dataclasses.replace(SIZES, **(sizes or {})),
+        dataclasses.replace(SCALARS, **(scalars or {})),
+        dataclasses.replace(SCHEDULE, **(schedule or {})),
+    )
+
+
+@cache
+def window_program(kind, largest_budget=0):
+    """One compiled loop on the bandit for all tests."""
+    return make_program(CONFIG, guidances.make(kind, SIZES, 2), Window(), largest_budget)
+
+
+def start(program, seeds, budgets, env=None):
+    """Fresh lanes; the arrays of another call are never the same, for programs donate what they are given."""
+    seeds, budgets = jnp.array(seeds, jnp.int32), jnp.array(budgets, jnp.int32)
+    return program.init(Window() if env is None else env, seeds, budgets, jax.random.key(0))
+
+
+def stored(state, lane, steps):
+    """What a lane's environments met: columns (steps, ...) of its replay in the order of time."""
+    rows = np.asarray(state.replay[lane, :steps])
+    names = {"obs": slice(0, 2), "action": slice(2, 4), "reward": 4, "discount": 5, "next_obs": slice(6, None)}
+    return {name: rows[:, columns] for name, columns in names.items()}
+
+
+def greedy_actions(q, params, obs, sizes=SIZES):
+    """The argmax of one lane's values over the agent's directions, for observations (n, 2)."""
+    options = directions(sizes)
+    values = jax.vmap(lambda one: q(params, one, options)[:, 0])(jnp.asarray(obs))
+    return np.asarray(options[jnp.argmax(values, -1)])
+
+
+def lane(tree, index):
+    """One lane of a block, as NumPy."""
+    raw = partial(jax.tree.map, lambda leaf: _words(leaf)[index])
+    return jax.tree.map(np.asarray, raw(tree))
+
+
+def _words(leaf):
+    return jax.random.key_data(leaf) if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf
+
+
+def files_of(folder):
+    """Every file at or below a folder with its bytes and time: equal before and after if nothing was changed."""
+    return {
+        path.relative_to(folder): (path.stat().st_mtime_ns, path.read_bytes() if path.is_file() else None)
+        for path in sorted(folder.rglob("*"))
+    }
+
+
+def edit_json(path, change):
+    """Rewrites a JSON file by a function of its values."""
+    values = json.loads(path.read_text())
+    change(values)
+    path.write_text(json.dumps(values))
