@@ -27,7 +27,7 @@ from rich.table import Table
 from cuelearner_jax import play, runs, sweep, teaching
 from cuelearner_jax.config import RunConfig
 from cuelearner_jax.errors import UserError, closest
-from cuelearner_jax.evaluate import VALIDATION
+from cuelearner_jax.evaluate import episodes
 from cuelearner_jax.report import report
 from cuelearner_jax.statistics import interval
 from cuelearner_jax.tasks import TASKS, Task
@@ -60,6 +60,8 @@ class Common(Generic[TaskT]):
     """Delete what an earlier run left in the folder."""
     labels_from: Path | None = None
     """Use the labels of this file instead of asking the teacher."""
+    tuning: Flag[bool] = False
+    """Evaluate on episodes set aside for choosing settings, not on those of reported figures."""
 
 
 @dataclass(frozen=True)
@@ -115,12 +117,12 @@ class Render(Generic[TaskT]):
     """Folder for the pictures; films and stills of the same name are not overwritten."""
     policy: str = "agent"
     """As for evaluate."""
-    guidance: str = ""
+    guidance: str | None = None
     """Kind of guidance of the run (default: its last)."""
-    labels: int = 0
+    labels: int | None = None
     """Label budget of the lane (default: the largest)."""
-    seed: int = 0
-    """Seed of the lane."""
+    seed: int | None = None
+    """Seed of the lane (default: the first)."""
     steps: int = 4
     """Steps to film; a new episode follows the end of one."""
     episode: int = 0
@@ -141,6 +143,8 @@ class Report:
     """Folder for the report."""
     metric: str = "reward"
     """Column of the results."""
+    split: str = "validation"
+    """Episodes of the results: validation, or tuning."""
     overwrite: Flag[bool] = False
     """Replace an earlier report."""
 
@@ -269,7 +273,14 @@ def _sweep(arguments: list[str]) -> None:
     preset = task.presets[name]
     kind = Sweep[task.config]  # pyright: ignore[reportInvalidTypeArguments]
     folder = Path("runs") / f"{task.name}-{name}"
-    default = kind(preset.config, out=folder, guidance=preset.guidance, labels=preset.labels, seeds=preset.seeds)
+    default = kind(
+        preset.config,
+        out=folder,
+        guidance=preset.guidance,
+        labels=preset.labels,
+        seeds=preset.seeds,
+        first_seed=preset.first_seed,
+    )
     asked = _parse(kind, rest, f"sweep {task.name}", default)
     seeds = tuple(range(asked.first_seed, asked.first_seed + asked.seeds))
     _run(task, asked, runs.Grid(asked.guidance, seeds, asked.labels))
@@ -284,6 +295,7 @@ def _run(task: Task, asked: Common, grid: runs.Grid) -> None:
         resume=asked.resume,
         overwrite=asked.overwrite,
         labels_from=asked.labels_from,
+        split="tuning" if asked.tuning else "validation",
     )
     out.print(f"done: {asked.out} (see it with: cuelearner report {asked.out} --out {asked.out}/report)")
 
@@ -340,7 +352,9 @@ def _measurements(measured: list[play.Measured], title: str) -> Table:
 def _report(arguments: list[str]) -> None:
     asked = _parse(Report, arguments, "report")
     command = shlex.join(["cuelearner", "report", *arguments])
-    written = report(asked.folders, asked.out, asked.metric, overwrite=asked.overwrite, command=command)
+    written = report(
+        asked.folders, asked.out, asked.metric, split=asked.split, overwrite=asked.overwrite, command=command
+    )
     out.print(f"wrote {written}")
 
 
@@ -360,7 +374,7 @@ def _render(arguments: list[str]) -> None:
         raise UserError(f"{taken[0]} exists: give --overwrite to replace it, or another --out")
     env = subject.task.environment(asked.task)
     policy = play.one_policy(subject, env, asked.task, asked.policy, asked.guidance, asked.labels, asked.seed)
-    key = jax.random.fold_in(jax.random.fold_in(jax.random.key(0), VALIDATION), asked.episode)
+    key = jax.random.fold_in(episodes(), asked.episode)
     frames, rewards = subject.task.record(env, policy, key, asked.steps)
     asked.out.mkdir(parents=True, exist_ok=True)
     subject.task.still(env, frames[0], still)

@@ -19,10 +19,15 @@ from cuelearner_jax.types import Environment, Guidance, GuidanceModel, Params, T
 # (key, environment states (n, ...), observations (n, obs)) -> directions (n, 2)
 Policy = Callable[[PRNGKeyArray, Any, jax.Array], jax.Array]
 
-# Folded into the root key: episodes for choosing settings, and episodes for reported figures only.
-TUNING, VALIDATION = 1_000_001, 1_000_002
+# Folded into the root key: episodes for reported figures only, and episodes for choosing settings.
+SPLITS = {"validation": 1_000_003, "tuning": 1_000_001}
 
 ACTIONS_AT_ONCE = 8192  # state-action pairs in one forward pass of an argmax: bounds its memory
+
+
+def episodes(split: str = "validation") -> PRNGKeyArray:
+    """Key of the episodes of a split; the same for every policy, seed and time."""
+    return jax.random.fold_in(jax.random.key(0), SPLITS[split])
 
 
 def rollout(

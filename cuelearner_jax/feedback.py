@@ -90,11 +90,12 @@ def fit(
         apply: (params, obs (n, obs), actions (n, 2)) -> predictions (n, 2).
 
     Returns:
-        The model; its `fitted` is False if no label was valid.
+        The model; its `fitted` is False if there was no valid label to train on.
     """
     held_out = (jnp.arange(labels.valid.shape[0]) % VALIDATION_STRIDE) == VALIDATION_STRIDE - 1
     validation = (labels.valid & held_out).astype(jnp.float32)
-    draw = _subset(labels.valid & ~held_out)
+    training = labels.valid & ~held_out
+    draw = _subset(training)
     key_init, key_steps = jax.random.split(key)
     optimizer = optax.chain(
         optax.clip_by_global_norm(scalars.max_grad_norm), optax.adam(scalars.feedback_learning_rate)
@@ -117,18 +118,18 @@ def fit(
         return jnp.sum(jnp.sum(jnp.square(error), -1) * validation)
 
     def stretch(carry: tuple, keys: PRNGKeyArray) -> tuple[tuple, None]:
-        training, best, best_loss = carry
-        training, _ = jax.lax.scan(step, training, keys)
-        score = validate(training[0])
+        running, best, best_loss = carry
+        running, _ = jax.lax.scan(step, running, keys)
+        score = validate(running[0])
         better = (score < best_loss) | (validation.sum() == 0)
-        best = jax.tree.map(lambda new, old: jnp.where(better, new, old), training[0], best)
-        return (training, best, jnp.where(better, score, best_loss)), None
+        best = jax.tree.map(lambda new, old: jnp.where(better, new, old), running[0], best)
+        return (running, best, jnp.where(better, score, best_loss)), None
 
     params = init(key_init)
     keys = jax.random.split(key_steps, (sizes.fit_steps // sizes.validate_every, sizes.validate_every))
     start = ((params, optimizer.init(params)), params, jnp.inf)
     (_, best, _), _ = jax.lax.scan(stretch, start, keys)
-    return GuidanceModel(best, labels.valid.any())
+    return GuidanceModel(best, training.any())
 
 
 def mirrored(key: PRNGKeyArray, env: Environment, batch: Label) -> Label:

@@ -15,9 +15,9 @@ from cuelearner_jax import results
 from cuelearner_jax.config import RunConfig, to_json
 from cuelearner_jax.errors import UserError, closest
 from cuelearner_jax.evaluate import (
-    VALIDATION,
     Policy,
     agent_policy,
+    episodes,
     guided_policy,
     heuristic_policy,
     rollout,
@@ -113,7 +113,7 @@ def evaluate(
 ) -> list[Measured]:
     """Metrics of a policy on validation episodes of a world (a task configuration), for each guidance and budget."""
     env = subject.task.environment(world)
-    key = jax.random.fold_in(jax.random.key(0), VALIDATION)
+    key = episodes()
     if name in UNTRAINED:
         policy = untrained_policy(name, subject.task, world, env)
         found = jax.jit(lambda env: rollout(policy, env, key, num_envs, steps))(env)
@@ -137,13 +137,16 @@ def evaluate(
     return rows
 
 
-def one_policy(subject: Subject, env: Environment, world: Any, name: str, kind: str, labels: int, seed: int) -> Policy:
+def one_policy(
+    subject: Subject, env: Environment, world: Any, name: str, kind: str | None, labels: int | None, seed: int | None
+) -> Policy:
     """A single policy: of one lane of a run, or of the task. Raises UserError if the run has no such lane."""
     if name in UNTRAINED:
         return untrained_policy(name, subject.task, world, env)
     assert subject.grid is not None  # Subject.check has seen to it
     lanes = load_lanes(subject, (kind or subject.grid.guidance[-1],))[0]
-    budget = labels or int(lanes.budgets.max())
+    budget = int(lanes.budgets.max()) if labels is None else labels
+    seed = int(lanes.seeds[0]) if seed is None else seed
     index = np.flatnonzero((lanes.seeds == seed) & (lanes.budgets == budget))
     if not len(index):
         raise UserError(
@@ -155,7 +158,10 @@ def one_policy(subject: Subject, env: Environment, world: Any, name: str, kind: 
 
 
 def _listed(values: np.ndarray) -> str:
-    return ", ".join(str(value) for value in np.unique(values))
+    known = np.unique(values)
+    if len(known) > 4 and known[-1] - known[0] == len(known) - 1:
+        return f"{known[0]} to {known[-1]}"
+    return ", ".join(str(value) for value in known)
 
 
 def write(

@@ -23,9 +23,11 @@ from cuelearner_jax import config as configuration
 from cuelearner_jax import guidance as guidances
 from cuelearner_jax.config import RunConfig
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.evaluate import TUNING
+from cuelearner_jax.evaluate import SPLITS
 from cuelearner_jax.tasks import Task
 from cuelearner_jax.types import Guidance
+
+LARGEST_SEED = min(SPLITS.values())  # seeds and splits are folded into one key
 
 
 @dataclass(frozen=True)
@@ -50,8 +52,8 @@ def check_grid(grid: Grid) -> None:
             raise UserError(f"unknown guidance {kind!r}: choose among {', '.join(guidances.KINDS)}")
     if not grid.guidance or len(set(grid.guidance)) < len(grid.guidance):
         raise UserError("--guidance: give each kind once, and at least one")
-    if not grid.seeds or len(set(grid.seeds)) < len(grid.seeds) or not all(0 <= s < TUNING for s in grid.seeds):
-        raise UserError(f"seeds must be different numbers from 0 to {TUNING - 1}: give --seeds and --first-seed")
+    if not grid.seeds or len(set(grid.seeds)) < len(grid.seeds) or not all(0 <= s < LARGEST_SEED for s in grid.seeds):
+        raise UserError(f"seeds must be different numbers from 0 to {LARGEST_SEED - 1}: give --seeds and --first-seed")
     if "relative" in grid.guidance:
         if not grid.labels or len(set(grid.labels)) < len(grid.labels):
             raise UserError("--labels: give each budget once, and at least one")
@@ -62,7 +64,7 @@ def check_grid(grid: Grid) -> None:
             )
 
 
-def describe(task: Task, config: RunConfig, grid: Grid) -> dict[str, Any]:
+def describe(task: Task, config: RunConfig, grid: Grid, split: str) -> dict[str, Any]:
     """The contents of config.json."""
     return {
         "task": {"name": task.name, **configuration.to_json(config.task)},
@@ -70,6 +72,7 @@ def describe(task: Task, config: RunConfig, grid: Grid) -> dict[str, Any]:
         "scalars": configuration.to_json(config.scalars),
         "schedule": configuration.to_json(config.schedule),
         "grid": {"guidance": list(grid.guidance), "seeds": list(grid.seeds), "labels": list(grid.labels)},
+        "split": split,
         "total_steps": config.schedule.total_steps,
     }
 

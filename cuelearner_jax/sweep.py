@@ -23,7 +23,7 @@ from cuelearner_jax import results
 from cuelearner_jax.checkpoint import Checkpoints, checkpoints
 from cuelearner_jax.config import RunConfig
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.evaluate import VALIDATION, evaluate_agents, evaluate_guides
+from cuelearner_jax.evaluate import episodes, evaluate_agents, evaluate_guides
 from cuelearner_jax.labelling import files as label_files
 from cuelearner_jax.lanes import Group, items, memory_report
 from cuelearner_jax.runs import Grid, check_folder, check_grid, describe, prepare_folder
@@ -49,8 +49,9 @@ def run(
     resume: bool = False,
     overwrite: bool = False,
     labels_from: Path | None = None,
+    split: str = "validation",
 ) -> None:
-    """Trains every lane of the grid and leaves the results in `out`.
+    """Trains every lane of the grid and leaves the results in `out`, measured on the episodes of `split`.
 
     Raises:
         UserError: bad configuration, a folder in use, too little memory; nothing has been changed then.
@@ -61,7 +62,7 @@ def run(
     env = task.environment(config.task)
     labels = read_labels(labels_from, task, config, grid) if labels_from else None
     kinds = [guidances.make(kind, config.sizes, env.obs_size) for kind in grid.guidance]
-    described = describe(task, config, grid)
+    described = describe(task, config, grid, split)
     check_folder(out, described, resume, overwrite)
     for kind in kinds:
         console.print(memory_report(Group(config, env, kind, grid)))
@@ -134,7 +135,7 @@ class _Runner:
         self.group, self.task, self.stopping, self.bars = group, task, stopping, bars
         self.out = out
         self.folder = out / group.guidance.name
-        self.validation = jax.random.fold_in(jax.random.key(0), VALIDATION)
+        self.split = json.loads((out / "config.json").read_text())["split"]
         self.clock, self.blocks, self.wall = start_clock(), [], 0.0
 
     def run(self, teacher: Teacher | None, labels: label_files.LabelFile | None) -> None:
@@ -156,7 +157,7 @@ class _Runner:
             "run": self.out.name,
             "task": self.task.name,
             "guidance": self.group.guidance.name,
-            "split": "validation",
+            "split": self.split,
             "config_hash": configuration.digest(config),
             **results.provenance(),
         }
@@ -263,7 +264,7 @@ class _Runner:
             lambda block: evaluate_agents(
                 group.env,
                 block.params,
-                self.validation,
+                episodes(self.split),
                 sizes=group.config.sizes,
                 num_envs=schedule.eval_envs,
                 steps=schedule.eval_steps,
@@ -280,7 +281,7 @@ class _Runner:
             lambda block: evaluate_guides(
                 group.env,
                 block.guidance,
-                self.validation,
+                episodes(self.split),
                 group.config.scalars,
                 guidance=group.guidance,
                 num_envs=schedule.eval_envs,

@@ -15,7 +15,7 @@ from cuelearner_jax import config as configuration
 from cuelearner_jax import results, teacher
 from cuelearner_jax.checkpoint import checkpoints
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.evaluate import VALIDATION, rollout, teacher_policy
+from cuelearner_jax.evaluate import episodes, rollout, teacher_policy
 from cuelearner_jax.runs import check_folder, prepare_folder
 from cuelearner_jax.sweep import Interrupted, interruptible, progress_bars
 from cuelearner_jax.tasks import Task
@@ -115,7 +115,7 @@ def _learn(program: teacher.TeacherProgram, env: Any, config: TeacherConfig, out
 
 def validate(made: LearnedTeacher, env: Any, steps: int) -> float:
     """Reward a step of a teacher's own choices on validation episodes."""
-    key = jax.random.fold_in(jax.random.key(0), VALIDATION)
+    key = episodes()
     envs = min(100, steps)
     measure = jax.jit(lambda made, env: rollout(teacher_policy(made), env, key, envs, steps))
     return float(np.asarray(measure(made, env)["reward"]))

@@ -1,0 +1,83 @@
+"""The ring buffer: order, wrap-around, and what may be drawn."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from cuelearner_jax.replay import ring_buffer
+from cuelearner_jax.types import Transition
+
+EXAMPLE = Transition(jnp.zeros(3), jnp.zeros(2), jnp.zeros(()), jnp.zeros(()), jnp.zeros(3))
+
+
+def numbered(first, count, next_size=3):
+    """Transitions whose every entry is their own number, apart from its place."""
+    numbers = jnp.arange(first, first + count, dtype=jnp.float32)
+    return Transition(
+        obs=numbers[:, None] + jnp.array([0.0, 0.1, 0.2]),
+        action=numbers[:, None] + jnp.array([0.3, 0.4]),
+        reward=numbers + 0.5,
+        discount=numbers + 0.6,
+        next_obs=numbers[:, None] + jnp.array([0.7, 0.8, 0.9])[:next_size],
+    )
+
+
+def filled(buffer, capacity, at_once, steps, next_size=3):
+    rows, add = buffer.empty(capacity), jax.jit(buffer.add)
+    for step in range(0, steps, at_once):
+        rows = add(rows, jnp.array(step), numbered(step, at_once, next_size))
+    return rows
+
+
+def test_rows_lie_in_the_order_of_time_with_every_field():
+    buffer = ring_buffer(EXAMPLE)
+    assert buffer.width == 10
+    rows = np.asarray(filled(buffer, capacity=6, at_once=2, steps=4))
+    assert rows.shape == (6, 10)
+    np.testing.assert_allclose(rows[:4], np.arange(4)[:, None] + np.arange(10) / 10, rtol=1e-6)
+    np.testing.assert_array_equal(rows[4:], 0)
+
+
+def test_the_oldest_rows_are_written_over():
+    rows = filled(ring_buffer(EXAMPLE), capacity=6, at_once=2, steps=10)
+    np.testing.assert_array_equal(np.asarray(rows)[:, 0], [6, 7, 8, 9, 4, 5])
+
+
+def test_samples_are_whole_transitions():
+    buffer = ring_buffer(EXAMPLE)
+    drawn = buffer.sample(jax.random.key(0), filled(buffer, 6, 2, 6), jnp.array(6), 50)
+    number = np.asarray(drawn.reward) - 0.5
+    np.testing.assert_allclose(drawn.obs, number[:, None] + [0.0, 0.1, 0.2], rtol=1e-5)
+    np.testing.assert_allclose(drawn.action, number[:, None] + [0.3, 0.4], rtol=1e-5)
+    np.testing.assert_allclose(drawn.discount, number + 0.6, rtol=1e-5)
+    np.testing.assert_allclose(drawn.next_obs, number[:, None] + [0.7, 0.8, 0.9], rtol=1e-5)
+
+
+@pytest.mark.parametrize(("steps", "numbers"), [(1, {0}), (4, {0, 1, 2, 3}), (8, set(range(8))), (14, set(range(6, 14)))])
+def test_only_filled_rows_are_drawn_and_all_of_them(steps, numbers):
+    buffer = ring_buffer(EXAMPLE)
+    drawn = buffer.sample(jax.random.key(1), filled(buffer, 8, 1, steps), jnp.array(steps), 500)
+    assert set(np.round(np.asarray(drawn.reward) - 0.5).astype(int).tolist()) == numbers
+
+
+def test_draws_are_uniform():
+    buffer = ring_buffer(EXAMPLE)
+    drawn = buffer.sample(jax.random.key(2), filled(buffer, 8, 1, 8), jnp.array(8), 8000)
+    counts = np.bincount(np.asarray(drawn.obs[:, 0]).astype(int), minlength=8)
+    assert counts.min() > 850  # 1000 each, standard deviation 30
+    assert counts.max() < 1150
+
+
+def test_where_nothing_bootstraps_no_next_observation_is_stored():
+    buffer = ring_buffer(EXAMPLE.replace(next_obs=jnp.zeros(0)))
+    assert buffer.width == 7
+    drawn = buffer.sample(jax.random.key(0), filled(buffer, 4, 2, 4, next_size=0), jnp.array(4), 5)
+    assert drawn.next_obs.shape == (5, 0)
+    np.testing.assert_allclose(drawn.discount, drawn.reward + 0.1, rtol=1e-5)
+
+
+def test_a_capacity_that_is_no_multiple_is_refused():
+    buffer = ring_buffer(EXAMPLE)
+    with pytest.raises(ValueError, match="no multiple"):
+        buffer.add(buffer.empty(7), jnp.array(0), numbered(0, 2))
