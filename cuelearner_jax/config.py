@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import math
 from dataclasses import dataclass
 from typing import Any, Generic, Literal, TypeVar
 
@@ -146,15 +147,23 @@ def check(config: RunConfig) -> None:
     for name in positive:
         if getattr(sizes, name) < 1:
             raise UserError(f"sizes.{name} is {getattr(sizes, name)}: give a positive number")
+    if sizes.lanes_per_block < 0:
+        raise UserError(
+            f"sizes.lanes_per_block is {sizes.lanes_per_block}: give a positive number, or 0 to leave it open"
+        )
     if not sizes.q_layers or not sizes.feedback_layers or min(sizes.q_layers + sizes.feedback_layers) < 1:
         raise UserError("sizes.q_layers and sizes.feedback_layers each need at least one layer of positive width")
     for name, value in dataclasses.asdict(scalars).items():
         if name.endswith(("probability", "fraction")) and not 0 <= value <= 1:
             raise UserError(f"scalars.{name} is {value}: give a number from 0 to 1")
+        if math.isnan(value):
+            raise UserError(f"scalars.{name} is {value}: give a number")
         if name != "teacher_bias_deg" and value < 0:
             raise UserError(f"scalars.{name} is {value}: give a number that is not negative")
-    if scalars.eps_deg <= 0:
-        raise UserError("scalars.eps_deg is 0: a relative label needs a strength; give a positive number of degrees")
+    if not 0 < scalars.eps_deg <= 180:
+        raise UserError(
+            f"scalars.eps_deg is {scalars.eps_deg}: a relative label is a turn of more than 0 and up to 180"
+        )
     if scalars.discount >= 1:
         raise UserError(f"scalars.discount is {scalars.discount}: give a number below 1")
     for name in ("total_steps", "eval_every", "eval_steps", "eval_envs", "checkpoint_every", "target_every"):

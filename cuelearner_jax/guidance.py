@@ -6,8 +6,6 @@ are.
 
 from __future__ import annotations
 
-from functools import partial
-
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
@@ -71,9 +69,12 @@ def _unlabelled(name: str, act) -> Guidance:
 
 
 def _relative(sizes: Sizes, obs_size: int) -> Guidance:
-    """The paper's method: a model of relative feedback that refines the agent's actions."""
+    """The paper's method: a model of relative feedback that refines the agent's actions.
+
+    The network predicts in units of eps, so that a small eps fits as easily as a large one: phi = eps * network.
+    """
     network = feedback_network(sizes.feedback_layers)
-    phi = applied(network)
+    predict = applied(network)
 
     def init_params(key: PRNGKeyArray):
         return network.init(key, jnp.zeros(obs_size), jnp.zeros(2))
@@ -94,7 +95,7 @@ def _relative(sizes: Sizes, obs_size: int) -> Guidance:
         scalars: Scalars,
     ) -> Refined:
         return refine(
-            lambda current: phi(model.params, obs, current),
+            lambda current: scalars.radians("eps") * predict(model.params, obs, current),
             actions,
             active & model.fitted,
             tau=scalars.radians("tau"),
@@ -102,5 +103,8 @@ def _relative(sizes: Sizes, obs_size: int) -> Guidance:
             k_max=scalars.k_max,
         )
 
-    fit = partial(feedback.fit, init=init_params, apply=phi, sizes=sizes)
+    def fit(key: PRNGKeyArray, env: Environment, labels: Label, scalars: Scalars) -> GuidanceModel:
+        scaled = labels.replace(target=labels.target / scalars.radians("eps"))
+        return feedback.fit(key, env, scaled, scalars, init=init_params, apply=predict, sizes=sizes)
+
     return Guidance("relative", True, init, label, fit, act)

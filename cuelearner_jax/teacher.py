@@ -8,6 +8,7 @@ tried in one state.
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -244,6 +245,8 @@ def save(folder: Path, teacher: LearnedTeacher, about: dict[str, Any]) -> None:
     `about` must hold the `config` (a TeacherConfig's fields) under that name.
     """
     folder.mkdir(parents=True, exist_ok=True)
+    if (folder / "network").exists():  # an earlier teacher's, which would be kept
+        shutil.rmtree(folder / "network")
     params = jax.tree.map(lambda leaf: leaf.astype(jnp.float16), teacher.params)
     with checkpoints(folder / "network") as saved:
         saved.save(0, {"params": params})
@@ -254,7 +257,10 @@ def load(folder: Path, env: Any, aim_error: Any, habit: Any) -> LearnedTeacher:
     """A teacher that `save` wrote. Raises UserError if there is none, or one of another task."""
     if not (folder / "teacher.json").is_file():
         raise UserError(f"no teacher in {folder}: train one with `cuelearner teacher train`, or use the search teacher")
-    config = from_json(TeacherConfig, json.loads((folder / "teacher.json").read_text())["config"])
+    try:
+        config = from_json(TeacherConfig, json.loads((folder / "teacher.json").read_text())["config"])
+    except (ValueError, KeyError, TypeError) as error:
+        raise UserError(f"{folder / 'teacher.json'} is damaged: restore it, or train the teacher anew") from error
     template = jax.eval_shape(_Training(config).init, env, jax.random.key(0)).params
     halves = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, jnp.float16), template)
     with checkpoints(folder / "network", read_only=True) as saved:

@@ -28,7 +28,10 @@ INIT, ASK, FIT, TRAIN = range(4)
 
 
 class Program(NamedTuple):
-    """Jitted functions over a block of lanes (leading axis of `state`). All donate the state they are given."""
+    """Jitted functions over a block of lanes (leading axis of `state`). They donate the state they are given.
+
+    The clock is not donated: blocks share it.
+    """
 
     init: Any  # (env, seeds (lanes,), budgets (lanes,), root key) -> TrainState
     label_round: Any  # (env, teacher, scalars, clock, state) -> (clock, state)
@@ -38,7 +41,6 @@ class Program(NamedTuple):
 
 def start_clock() -> Clock:
     """All counters at zero."""
-    # Distinct buffers: programs donate the clock leaf by leaf.
     return Clock(jnp.zeros((), jnp.int32), jnp.zeros((), jnp.int32), jnp.zeros((), jnp.int32))
 
 

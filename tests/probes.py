@@ -189,11 +189,12 @@ def greedy_actions(q, params, obs, sizes=SIZES):
 
 def lane(tree, index):
     """One lane of a block, as NumPy."""
-    raw = partial(jax.tree.map, lambda leaf: _words(leaf)[index])
+    raw = partial(jax.tree.map, lambda leaf: words(leaf)[index])
     return jax.tree.map(np.asarray, raw(tree))
 
 
-def _words(leaf):
+def words(leaf):
+    """A leaf whose entries can be compared: the words of a key, anything else as it is."""
     return jax.random.key_data(leaf) if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf
 
 

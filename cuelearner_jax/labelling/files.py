@@ -60,12 +60,13 @@ def read(path: Path) -> LabelFile:
         meta = json.loads((table.schema.metadata or {})[META])
         columns = {name: np.array(table[name].to_pylist(), np.float32) for name in ("obs", "action", "target")}
         seeds = np.array(table["seed"].to_pylist(), np.int64)
-    except (pa.ArrowInvalid, KeyError, ValueError) as error:
+        labels = Label(**columns, valid=np.ones(len(seeds), bool))  # pyright: ignore[reportArgumentType]
+        file = LabelFile(meta["task"], meta["guidance"], seeds, labels)
+    except (OSError, pa.ArrowException, KeyError, TypeError, ValueError) as error:
         raise UserError(f"{path} is not a label file of cuelearner, or it is damaged: write it anew") from error
     if not len(seeds):
         raise UserError(f"{path} holds no labels: collect some first")
-    labels = Label(**columns, valid=np.ones(len(seeds), bool))  # pyright: ignore[reportArgumentType]
-    return LabelFile(meta["task"], meta["guidance"], seeds, labels)
+    return file
 
 
 def for_lanes(file: LabelFile, seeds: np.ndarray, budgets: np.ndarray, slots: int) -> Label:

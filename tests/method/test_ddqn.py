@@ -21,9 +21,7 @@ ONLINE, TARGET = jnp.array([1.0, 0.5]), jnp.array([0.2, 5.0])  # online prefers 
 
 
 def transition(reward=1.0, discount=1.0):
-    return Transition(
-        jnp.array([9.0]), jnp.array([0.0, 1.0]), jnp.array(reward), jnp.array(discount), jnp.array([2.0])
-    )
+    return Transition(jnp.array([9.0]), jnp.array([0.0, 1.0]), jnp.array(reward), jnp.array(discount), jnp.array([2.0]))
 
 
 def test_greedy_is_the_argmax_over_the_directions():

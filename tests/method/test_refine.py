@@ -104,7 +104,7 @@ def test_rows_that_are_not_active_come_back_bitwise():
 
 
 def told(goal, eps):
-    """What a perfect model of relative feedback answers: a turn by eps toward the goal unless that is within eps / 2."""
+    """What a perfect model of relative feedback answers: a turn by eps toward a goal that is not within eps / 2."""
 
     def residual(action):
         error = actions.difference(action, goal)
@@ -159,9 +159,7 @@ def test_under_vmap_each_lane_has_its_own_number_of_passes():
     first = actions.from_angle(jnp.array([[47.0], [3.0]]) * DEG)
 
     def one(start):
-        return refine(
-            told(goal, 10.0 * DEG), start, jnp.ones(1, bool), tau=0.1 * DEG, tau_max=math.pi, k_max=50
-        )
+        return refine(told(goal, 10.0 * DEG), start, jnp.ones(1, bool), tau=0.1 * DEG, tau_max=math.pi, k_max=50)
 
     assert jax.vmap(one)(first).passes.tolist() == [[6], [1]]
 

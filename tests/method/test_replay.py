@@ -54,7 +54,9 @@ def test_samples_are_whole_transitions():
     np.testing.assert_allclose(drawn.next_obs, number[:, None] + [0.7, 0.8, 0.9], rtol=1e-5)
 
 
-@pytest.mark.parametrize(("steps", "numbers"), [(1, {0}), (4, {0, 1, 2, 3}), (8, set(range(8))), (14, set(range(6, 14)))])
+@pytest.mark.parametrize(
+    ("steps", "numbers"), [(1, {0}), (4, {0, 1, 2, 3}), (8, set(range(8))), (14, set(range(6, 14)))]
+)
 def test_only_filled_rows_are_drawn_and_all_of_them(steps, numbers):
     buffer = ring_buffer(EXAMPLE)
     drawn = buffer.sample(jax.random.key(1), filled(buffer, 8, 1, steps), jnp.array(steps), 500)

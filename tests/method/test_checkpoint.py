@@ -1,0 +1,170 @@
+"""Checkpoints: what was saved comes back bit by bit, and what cannot be read is said in one line."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import probes
+import pytest
+
+from cuelearner_jax.checkpoint import KEPT, checkpoints
+from cuelearner_jax.errors import UserError
+
+
+def state(seed=0):
+    """Everything that a lane may hold: keys, empty leaves, missing subtrees, all kinds of numbers."""
+    rng = np.random.default_rng(seed)
+    return {
+        "block": [
+            {"weights": jnp.array(rng.normal(size=(3, 400)), jnp.float32), "flags": jnp.array([True, False, True])},
+            {"keys": jax.random.split(jax.random.key(seed), 3), "empty": jnp.zeros((3, 0)), "none": None, "bare": {}},
+        ],
+        "numbers": (jnp.array(7 + seed, jnp.int32), np.float32(0.1 + seed), jnp.array(rng.normal(size=2), jnp.float16)),
+    }
+
+
+def shapes(tree):
+    return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype), tree)
+
+
+def assert_bitwise(mine, theirs):
+    assert jax.tree.structure(mine) == jax.tree.structure(theirs)
+    for one, other in zip(jax.tree.leaves(mine), jax.tree.leaves(theirs), strict=True):
+        assert (one.shape, one.dtype) == (other.shape, other.dtype)
+        one, other = (probes.words(leaf) for leaf in (one, other))  # noqa: PLW2901
+        np.testing.assert_array_equal(np.asarray(one), np.asarray(other))
+
+
+def save(folder, *numbers):
+    with checkpoints(folder) as saved:
+        for number in numbers:
+            saved.save(number, {"policy": state(number), "rest": state(number + 100)})
+
+
+def restore(folder, like=None, read_only=True):
+    with checkpoints(folder, read_only) as saved:
+        return saved.restore({"policy": shapes(state())} if like is None else like)
+
+
+@pytest.mark.parametrize("like", [lambda item: item, shapes])
+def test_everything_comes_back_bit_by_bit(tmp_path, like):
+    save(tmp_path, 3)
+    found = restore(tmp_path, {"policy": like(state()), "rest": like(state())}, read_only=False)
+    assert_bitwise(found, {"policy": state(3), "rest": state(103)})
+    # A key that came back draws what it would have drawn.
+    drawn = jax.random.uniform(found["policy"]["block"][1]["keys"][1])
+    assert drawn == jax.random.uniform(state(3)["block"][1]["keys"][1])
+
+
+def test_numbers_that_are_not_finite_come_back(tmp_path):
+    odd = {"a": jnp.array([jnp.nan, jnp.inf, -jnp.inf, -0.0, 1e-42])}
+    with checkpoints(tmp_path) as saved:
+        saved.save(0, {"odd": odd})
+    found = np.asarray(restore(tmp_path, {"odd": odd})["odd"]["a"])
+    np.testing.assert_array_equal(found.view(np.int32), np.asarray(odd["a"]).view(np.int32))
+
+
+def test_a_part_can_be_read_without_the_rest(tmp_path):
+    save(tmp_path, 3)
+    for path in (tmp_path / "3" / "rest").rglob("*"):
+        if path.is_file():
+            path.unlink()
+    assert_bitwise(restore(tmp_path), {"policy": state(3)})
+
+
+def test_the_newest_two_are_kept_and_the_newest_is_read(tmp_path):
+    save(tmp_path, 1, 5, 12)
+    assert KEPT == 2
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["12", "5"]
+    with checkpoints(tmp_path) as saved:
+        assert saved.latest() == 12
+    assert_bitwise(restore(tmp_path), {"policy": state(12)})
+
+
+def test_a_deleted_newest_leads_back_to_the_one_before(tmp_path):
+    save(tmp_path, 1, 5)
+    (tmp_path / "5").rename(tmp_path.parent / "elsewhere")
+    assert_bitwise(restore(tmp_path), {"policy": state(1)})
+    save(tmp_path, 7)
+    assert_bitwise(restore(tmp_path), {"policy": state(7)})
+
+
+def test_a_save_that_was_killed_does_not_count(tmp_path):
+    save(tmp_path, 1, 5)
+    (tmp_path / "5").rename(tmp_path / "5.orbax-checkpoint-tmp-0")
+    assert_bitwise(restore(tmp_path), {"policy": state(1)})
+
+
+def test_no_checkpoint_is_said_so(tmp_path):
+    with checkpoints(tmp_path) as saved:
+        assert saved.latest() is None
+    with pytest.raises(UserError, match="stopped before its first one"):
+        restore(tmp_path)
+
+
+def spoil(path):
+    path.write_bytes(b"\0" * (path.stat().st_size // 2))
+
+
+@pytest.mark.parametrize("change", [spoil, lambda path: path.unlink()], ids=["spoilt", "missing"])
+def test_a_damaged_checkpoint_is_refused(tmp_path, change):
+    save(tmp_path, 5)
+    policy = tmp_path / "5" / "policy"
+    whole = {path: path.read_bytes() for path in sorted(policy.rglob("*")) if path.is_file()}
+    refused = []
+    for path, content in whole.items():
+        change(path)
+        try:
+            assert_bitwise(restore(tmp_path), {"policy": state(5)})  # Orbax writes some files that it never reads
+        except UserError as refusal:
+            assert "checkpoint 5 in" in str(refusal)
+            assert "cannot be read" in str(refusal)
+            assert "\n" not in str(refusal)
+            refused.append(path)
+        path.write_bytes(content)
+    sizes = {path: len(content) for path, content in whole.items()}
+    assert max(sizes, key=sizes.__getitem__) in refused  # the numbers themselves
+    assert policy / "manifest.ocdbt" in refused
+    for path in whole:
+        change(path)
+    with pytest.raises(UserError, match=r"checkpoint 5 in .* cannot be read"):
+        restore(tmp_path)
+
+
+def other(change):
+    like = shapes(state())
+    change(like["block"][0])
+    return {"policy": like}
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda item: item.update(weights=jax.ShapeDtypeStruct((3, 401), jnp.float32)),
+        lambda item: item.update(weights=jax.ShapeDtypeStruct((2, 400), jnp.float32)),
+        lambda item: item.update(weights=jax.ShapeDtypeStruct((1200,), jnp.float32)),
+        lambda item: item.update(more=jax.ShapeDtypeStruct((2,), jnp.float32)),
+        lambda item: item.pop("weights"),
+    ],
+    ids=["wider", "fewer lanes", "flat", "one more", "one fewer"],
+)
+def test_a_checkpoint_of_other_shapes_is_refused(tmp_path, change):
+    save(tmp_path, 5)
+    with pytest.raises(UserError, match="damaged or of another program"):
+        restore(tmp_path, other(change))
+
+
+def test_an_item_that_was_never_saved_is_refused(tmp_path):
+    save(tmp_path, 5)
+    with pytest.raises(UserError, match="cannot be read"):
+        restore(tmp_path, {"clock": shapes(state())})
+
+
+def test_reading_changes_nothing_on_disk(tmp_path):
+    save(tmp_path, 1, 5)
+    (tmp_path / "6.orbax-checkpoint-tmp-0").mkdir()
+    before = probes.files_of(tmp_path)
+    assert before
+    restore(tmp_path)
+    with checkpoints(tmp_path, read_only=True) as saved:
+        assert saved.latest() == 5
+    assert probes.files_of(tmp_path) == before

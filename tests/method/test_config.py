@@ -1,0 +1,113 @@
+"""Configuration: what cannot work is refused with its name, hashes are stable, JSON comes back as it was."""
+
+import dataclasses
+import json
+import math
+
+import jax
+import probes
+import pytest
+
+from cuelearner_jax import config
+from cuelearner_jax.config import RunConfig, Scalars, Schedule, Sizes
+from cuelearner_jax.errors import UserError
+
+
+@pytest.mark.parametrize(
+    ("group", "values", "message"),
+    [
+        ("sizes", {"directions": 0}, "sizes.directions is 0"),
+        ("sizes", {"target_directions": -1}, "sizes.target_directions is -1"),
+        ("sizes", {"num_envs": 0}, "sizes.num_envs is 0"),
+        ("sizes", {"batch_size": 0}, "sizes.batch_size is 0"),
+        ("sizes", {"replay_capacity": 0}, "sizes.replay_capacity is 0"),
+        ("sizes", {"updates_per_step": 0}, "sizes.updates_per_step is 0"),
+        ("sizes", {"labels_per_round": 0}, "sizes.labels_per_round is 0"),
+        ("sizes", {"fit_steps": 0}, "sizes.fit_steps is 0"),
+        ("sizes", {"fit_batch_size": 0}, "sizes.fit_batch_size is 0"),
+        ("sizes", {"validate_every": 0}, "sizes.validate_every is 0"),
+        ("sizes", {"lanes_per_block": -1}, "sizes.lanes_per_block is -1"),
+        ("sizes", {"q_layers": ()}, "at least one layer"),
+        ("sizes", {"feedback_layers": ()}, "at least one layer"),
+        ("sizes", {"q_layers": (32, 0)}, "positive width"),
+        ("sizes", {"replay_capacity": 4001}, "sizes.replay_capacity is 4001: give a multiple of sizes.num_envs"),
+        ("sizes", {"fit_steps": 210}, "sizes.fit_steps is 210: give a multiple of sizes.validate_every"),
+        ("scalars", {"learning_rate": -0.1}, "scalars.learning_rate is -0.1"),
+        ("scalars", {"max_grad_norm": -1.0}, "scalars.max_grad_norm is -1.0"),
+        ("scalars", {"k_max": -1}, "scalars.k_max is -1"),
+        ("scalars", {"tau_deg": -1.0}, "scalars.tau_deg is -1.0"),
+        ("scalars", {"eps_deg": 0.0}, "scalars.eps_deg is 0"),
+        ("scalars", {"eps_deg": 181.0}, "scalars.eps_deg is 181.0"),
+        ("scalars", {"discount": 1.0}, "scalars.discount is 1.0"),
+        ("scalars", {"discount": -0.5}, "scalars.discount is -0.5"),
+        ("scalars", {"guided_probability": 1.5}, "scalars.guided_probability is 1.5: give a number from 0 to 1"),
+        ("scalars", {"mistake_probability": -0.1}, "scalars.mistake_probability is -0.1"),
+        ("scalars", {"silence_probability": 2.0}, "scalars.silence_probability is 2.0"),
+        ("scalars", {"refined_fraction": 1.1}, "scalars.refined_fraction is 1.1"),
+        ("scalars", {"learning_rate": math.nan}, "scalars.learning_rate is nan"),
+        ("schedule", {"total_steps": 0}, "schedule.total_steps is 0"),
+        ("schedule", {"eval_every": 0}, "schedule.eval_every is 0"),
+        ("schedule", {"eval_steps": 0}, "schedule.eval_steps is 0"),
+        ("schedule", {"eval_envs": 0}, "schedule.eval_envs is 0"),
+        ("schedule", {"checkpoint_every": 0}, "schedule.checkpoint_every is 0"),
+        ("schedule", {"target_every": 0}, "schedule.target_every is 0"),
+        ("schedule", {"eval_every": 18}, "schedule.eval_every is 18: give a multiple of sizes.num_envs"),
+        ("schedule", {"total_steps": 50}, "schedule.total_steps is 50: give a multiple of schedule.eval_every"),
+        ("schedule", {"checkpoint_every": 24}, "schedule.checkpoint_every is 24: give a multiple"),
+        ("schedule", {"eval_steps": 25}, "schedule.eval_steps is 25: give a multiple of schedule.eval_envs"),
+    ],
+)
+def test_values_that_cannot_work_are_refused(group, values, message):
+    with pytest.raises(UserError) as error:
+        config.check(probes.config(**{group: values}))
+    assert message in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_defaults_and_probes_can_work():
+    config.check(RunConfig(probes.WindowConfig()))
+    config.check(probes.CONFIG)
+    config.check(probes.config(scalars={"teacher_bias_deg": -3.0, "eps_deg": 180.0, "k_max": 0}))
+
+
+def test_bootstraps_with_a_discount():
+    assert not probes.config(scalars={"discount": 0.0}).bootstraps
+    assert probes.config(scalars={"discount": 0.1}).bootstraps
+
+
+def test_radians():
+    assert float(Scalars(eps_deg=90.0).radians("eps")) == pytest.approx(math.pi / 2)
+    assert float(Scalars(tau_max_deg=1.0).radians("tau_max")) == pytest.approx(math.pi / 180)
+
+
+def test_scalars_and_schedule_are_trees_of_their_numbers_and_sizes_are_not():
+    assert len(jax.tree.leaves(Scalars())) == len(dataclasses.fields(Scalars))
+    assert len(jax.tree.leaves(Schedule())) == len(dataclasses.fields(Schedule))
+    assert hash(Sizes()) == hash(Sizes())
+
+
+def test_the_digest_does_not_change_from_version_to_version():
+    # Hashes stand in published results: if this fails, old results can no longer be told to be of one configuration.
+    assert config.digest({"a": 1, "b": [1.5, "x"]}) == "d7aa7c69cbeb"
+
+
+def test_the_digest_depends_on_values_and_not_on_order():
+    values = config.to_json(probes.SIZES)
+    assert config.digest(values) == config.digest(dict(reversed(values.items())))
+    assert config.digest(values) != config.digest(values | {"directions": 17})
+    assert len(config.digest(values)) == 12
+
+
+@pytest.mark.parametrize("group", [probes.SIZES, probes.SCALARS, probes.SCHEDULE, probes.WindowConfig(3.5)])
+def test_json_comes_back_as_it_was(group):
+    text = json.dumps(config.to_json(group))
+    assert config.from_json(type(group), json.loads(text)) == group
+
+
+def test_an_unknown_field_is_named():
+    with pytest.raises(UserError, match=r"unknown field 'learning_rat' for Scalars"):
+        config.from_json(Scalars, {"learning_rat": 0.1})
+
+
+def test_fields_that_a_file_lacks_get_their_defaults():
+    assert config.from_json(Scalars, {"eps_deg": 7.0}) == Scalars(eps_deg=7.0)
