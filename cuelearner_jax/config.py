@@ -154,16 +154,18 @@ def check(config: RunConfig) -> None:
     if not sizes.q_layers or not sizes.feedback_layers or min(sizes.q_layers + sizes.feedback_layers) < 1:
         raise UserError("sizes.q_layers and sizes.feedback_layers each need at least one layer of positive width")
     for name, value in dataclasses.asdict(scalars).items():
-        if name.endswith(("probability", "fraction")) and not 0 <= value <= 1:
+        if name.endswith(("probability", "fraction", "polyak")) and not 0 <= value <= 1:
             raise UserError(f"scalars.{name} is {value}: give a number from 0 to 1")
-        if math.isnan(value):
-            raise UserError(f"scalars.{name} is {value}: give a number")
+        if not math.isfinite(value):
+            raise UserError(f"scalars.{name} is {value}: give a finite number")
         if name != "teacher_bias_deg" and value < 0:
             raise UserError(f"scalars.{name} is {value}: give a number that is not negative")
     if not 0 < scalars.eps_deg <= 180:
         raise UserError(
             f"scalars.eps_deg is {scalars.eps_deg}: a relative label is a turn of more than 0 and up to 180"
         )
+    if scalars.max_grad_norm <= 0:  # a zero gradient would be scaled by 0 / 0
+        raise UserError(f"scalars.max_grad_norm is {scalars.max_grad_norm}: give a positive number")
     if scalars.discount >= 1:
         raise UserError(f"scalars.discount is {scalars.discount}: give a number below 1")
     for name in ("total_steps", "eval_every", "eval_steps", "eval_envs", "checkpoint_every", "target_every"):

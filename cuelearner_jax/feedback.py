@@ -93,7 +93,7 @@ def fit(
         The model; its `fitted` is False if there was no valid label to train on.
     """
     held_out = (jnp.arange(labels.valid.shape[0]) % VALIDATION_STRIDE) == VALIDATION_STRIDE - 1
-    validation = (labels.valid & held_out).astype(jnp.float32)
+    validation = labels.valid & held_out
     training = labels.valid & ~held_out
     draw = _subset(training)
     key_init, key_steps = jax.random.split(key)
@@ -115,13 +115,13 @@ def fit(
 
     def validate(params: Params) -> jax.Array:
         error = apply(params, labels.obs, labels.action) - labels.target
-        return jnp.sum(jnp.sum(jnp.square(error), -1) * validation)
+        return jnp.sum(jnp.sum(jnp.square(error), -1), where=validation)
 
     def stretch(carry: tuple, keys: PRNGKeyArray) -> tuple[tuple, None]:
         running, best, best_loss = carry
         running, _ = jax.lax.scan(step, running, keys)
         score = validate(running[0])
-        better = (score < best_loss) | (validation.sum() == 0)
+        better = (score < best_loss) | ~validation.any()
         best = jax.tree.map(lambda new, old: jnp.where(better, new, old), running[0], best)
         return (running, best, jnp.where(better, score, best_loss)), None
 

@@ -191,12 +191,13 @@ class _Runner:
     def _label(self, saved: Checkpoints, teacher: Teacher | None, labels: label_files.LabelFile | None) -> None:
         """Asks the teacher, or takes the labels of a file."""
         group, rounds = self.group, self.group.rounds
-        if not group.guidance.asks or int(self.clock.round) >= rounds:
+        labelled = int(self.clock.round) >= rounds
+        if not group.guidance.asks or (labelled and (self.folder / "labels.parquet").exists()):
             return
         bar = self.bars.add_task(
             f"{group.guidance.name}: labels", total=rounds, note="", completed=int(self.clock.round)
         )
-        if labels is not None:
+        if labels is not None and not labelled:
             self._take(labels)
         while int(self.clock.round) < rounds:
             started = time.perf_counter()

@@ -44,7 +44,10 @@ from cuelearner_jax.errors import UserError
         ("scalars", {"mistake_probability": -0.1}, "scalars.mistake_probability is -0.1"),
         ("scalars", {"silence_probability": 2.0}, "scalars.silence_probability is 2.0"),
         ("scalars", {"refined_fraction": 1.1}, "scalars.refined_fraction is 1.1"),
-        ("scalars", {"learning_rate": math.nan}, "scalars.learning_rate is nan"),
+        ("scalars", {"polyak": 1.5}, "scalars.polyak is 1.5: give a number from 0 to 1"),
+        ("scalars", {"learning_rate": math.nan}, "scalars.learning_rate is nan: give a finite number"),
+        ("scalars", {"teacher_bias_deg": -math.inf}, "scalars.teacher_bias_deg is -inf: give a finite number"),
+        ("scalars", {"max_grad_norm": 0.0}, "scalars.max_grad_norm is 0.0: give a positive number"),
         ("schedule", {"total_steps": 0}, "schedule.total_steps is 0"),
         ("schedule", {"eval_every": 0}, "schedule.eval_every is 0"),
         ("schedule", {"eval_steps": 0}, "schedule.eval_steps is 0"),
@@ -86,6 +89,24 @@ def test_scalars_and_schedule_are_trees_of_their_numbers_and_sizes_are_not():
     assert hash(Sizes()) == hash(Sizes())
 
 
+@pytest.mark.parametrize("group", [Scalars(), Schedule()])
+def test_other_scalars_and_schedules_compile_nothing_again(group):
+    traced = []
+
+    @jax.jit
+    def total(group):
+        traced.append(group)
+        return sum(jax.tree.leaves(group))
+
+    values = dataclasses.asdict(group)
+    assert float(total(group)) == pytest.approx(sum(values.values()))
+    for name, value in values.items():
+        other = dataclasses.replace(group, **{name: 2 * value + type(value)(1000)})
+        assert float(total(other)) == pytest.approx(sum(values.values()) + value + 1000)
+    assert len(traced) == 1
+    assert type(traced[0]) is type(group)
+
+
 def test_the_digest_does_not_change_from_version_to_version():
     # Hashes stand in published results: if this fails, old results can no longer be told to be of one configuration.
     assert config.digest({"a": 1, "b": [1.5, "x"]}) == "d7aa7c69cbeb"
@@ -96,6 +117,13 @@ def test_the_digest_depends_on_values_and_not_on_order():
     assert config.digest(values) == config.digest(dict(reversed(values.items())))
     assert config.digest(values) != config.digest(values | {"directions": 17})
     assert len(config.digest(values)) == 12
+
+
+@pytest.mark.parametrize("group", [probes.SIZES, probes.SCALARS, probes.SCHEDULE])
+def test_the_digest_depends_on_every_field(group):
+    values = config.to_json(group)
+    changed = {name: config.digest(values | {name: [value, "another"]}) for name, value in values.items()}
+    assert len(set(changed.values()) | {config.digest(values)}) == len(values) + 1
 
 
 @pytest.mark.parametrize("group", [probes.SIZES, probes.SCALARS, probes.SCHEDULE, probes.WindowConfig(3.5)])

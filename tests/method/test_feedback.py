@@ -143,8 +143,8 @@ predict = applied(NETWORK)
 
 
 @jax.jit
-def fit(key, labels, scalars=SCALARS):
-    return feedback.fit(key, probes.Window(), labels, scalars, init=fresh, apply=predict, sizes=SIZES)
+def fit(key, labels, scalars=SCALARS, env=probes.Window()):  # noqa: B008
+    return feedback.fit(key, env, labels, scalars, init=fresh, apply=predict, sizes=SIZES)
 
 
 def label_set(seed, noise=0.0, valid=ROWS, dtype=np.float32):
@@ -175,10 +175,11 @@ def test_fit_learns_a_function_also_where_it_was_not_shown():
     assert mean_error(model, labels, HELD_OUT) < 0.3 * zero
 
 
-def test_what_stands_in_rows_that_are_not_valid_changes_nothing():
+@pytest.mark.parametrize("garbage_values", [(1e3, -7.0, 55.0), (math.nan, math.inf, math.nan)])
+def test_what_stands_in_rows_that_are_not_valid_changes_nothing(garbage_values):
     labels = label_set(1, valid=53)
     garbage = jax.tree.map(np.copy, labels)
-    for name, value in (("obs", 1e3), ("action", -7.0), ("target", 55.0)):
+    for name, value in zip(("obs", "action", "target"), garbage_values, strict=True):
         getattr(garbage, name)[53:] = value
     assert_same(fit(jax.random.key(0), labels), fit(jax.random.key(0), garbage))
 
@@ -235,6 +236,25 @@ def test_mirrored_labels_are_turned_as_a_whole():
     for name in ("action", "target"):
         expected = actions.rotate(getattr(labels, name), jnp.array(quarters * math.pi / 2))
         np.testing.assert_allclose(getattr(image, name), expected, atol=1e-5)
+
+
+def test_every_fit_starts_from_its_key_and_from_no_earlier_model():
+    still = dataclasses.replace(SCALARS, feedback_learning_rate=0.0)
+    model = fit(jax.random.key(7), label_set(0), still)
+    assert_same(model.params, fresh(jax.random.split(jax.random.key(7))[0]))
+
+
+def test_symmetries_teach_what_no_label_showed():
+    labels = label_set(5)
+    angle = np.random.default_rng(5).uniform(-0.5, 0.5, ROWS)
+    labels = labels.replace(obs=np.stack([np.cos(angle), np.sin(angle)], -1).astype(np.float32))
+    labels = labels.replace(target=(0.5 * labels.obs - 0.3 * labels.action).astype(np.float32))
+    opposite = jax.tree.map(np.copy, labels).replace(obs=-labels.obs, action=-labels.action, target=-labels.target)
+    zero = float(np.square(labels.target).sum(-1).mean())
+    taught = fit(jax.random.key(0), labels, SCALARS, probes.Window(mirrors=True))
+    ignorant = fit(jax.random.key(0), labels)
+    assert mean_error(taught, opposite, slice(None)) < 0.05 * zero
+    assert mean_error(ignorant, opposite, slice(None)) > 0.5 * zero
 
 
 def test_without_symmetries_labels_stay_as_they_are():

@@ -9,8 +9,9 @@ import numpy as np
 import probes
 import pytest
 
-from cuelearner_jax import actions, guidance
+from cuelearner_jax import actions, feedback, guidance
 from cuelearner_jax.errors import UserError
+from cuelearner_jax.types import Label
 
 ENV = probes.Window()
 OBS = actions.evenly_spaced(6)
@@ -69,6 +70,31 @@ def test_a_relative_label_is_the_vector_of_a_turn_by_eps():
         target, valid = bundle.label(jax.random.key(0), base, actions.from_angle(jnp.array(best)), probes.SCALARS)
         np.testing.assert_allclose(base + target, actions.from_angle(h * math.radians(20)), atol=1e-6)
         assert bool(valid)
+
+
+def test_a_relative_label_comes_from_the_teacher_with_its_faults():
+    bundle, _ = made("relative")
+    base, best = actions.from_angle(jnp.array(0.0)), actions.from_angle(jnp.array(1.0))
+    mistaken = dataclasses.replace(probes.SCALARS, mistake_probability=1.0)
+    target, _ = bundle.label(jax.random.key(0), base, best, mistaken)
+    np.testing.assert_allclose(base + target, actions.from_angle(-math.radians(20)), atol=1e-6)
+    silent = dataclasses.replace(probes.SCALARS, silence_probability=1.0)
+    assert not bool(bundle.label(jax.random.key(0), base, best, silent)[1])
+
+
+def test_a_fitted_model_turns_actions_by_what_was_told_whatever_its_strength():
+    bundle, _ = made("relative")
+    rng = np.random.default_rng(0)
+    obs, base = (actions.from_angle(jnp.array(rng.uniform(-math.pi, math.pi, 100))) for _ in range(2))
+    fit = jax.jit(bundle.fit)
+    for eps_deg, h in ((20.0, 1.0), (1.0, -1.0)):
+        scalars = dataclasses.replace(probes.SCALARS, eps_deg=eps_deg, tau_deg=0.0, k_max=1)
+        target = feedback.relative_target(base, jnp.array(h), scalars.radians("eps"))
+        model = fit(jax.random.key(0), ENV, Label(obs, base, target, jnp.ones(100, bool)), scalars)
+        assert bool(model.fitted)
+        turned = actions.difference(base, bundle.act(model, ENV, obs, base, jnp.ones(100, bool), scalars).actions)
+        assert np.mean(np.degrees(turned)) == pytest.approx(h * eps_deg, rel=0.15)
+        assert np.std(np.degrees(turned)) < 0.3 * eps_deg
 
 
 @pytest.mark.parametrize("kind", ["none", "heuristic"])

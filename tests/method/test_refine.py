@@ -92,6 +92,21 @@ def test_never_leaves_the_ball(seed):
     np.testing.assert_allclose(np.linalg.norm(result.actions, axis=-1), 1, atol=1e-6)
 
 
+@pytest.mark.parametrize("scale", [0.1, 1.0, 30.0, 1e4])
+@pytest.mark.parametrize("radius", [0.0, 1 * DEG, 30 * DEG, 90 * DEG, 179 * DEG])
+def test_no_iterate_leaves_the_ball(scale, radius):
+    weights, first = network(int(scale), scale), starts(2)
+    farthest = 0.0
+    for k_max in range(1, 9):
+        result = refined_by_network(weights, first, np.ones(ROWS, bool), 0.0, radius, k_max)
+        assert result.passes.tolist() == [k_max] * ROWS
+        away = np.abs(turn(first, np.asarray(result.actions, np.float64)))
+        assert away.max() <= radius + 1e-5
+        farthest = max(farthest, away.max())
+    if scale >= 1:
+        assert farthest > 0.99 * radius  # the bound was met
+
+
 def test_rows_that_are_not_active_come_back_bitwise():
     first = jnp.asarray(starts(3), jnp.float32)
     active = np.arange(ROWS) % 3 == 0
@@ -162,6 +177,23 @@ def test_under_vmap_each_lane_has_its_own_number_of_passes():
         return refine(told(goal, 10.0 * DEG), start, jnp.ones(1, bool), tau=0.1 * DEG, tau_max=math.pi, k_max=50)
 
     assert jax.vmap(one)(first).passes.tolist() == [[6], [1]]
+
+
+def test_one_row_a_batch_jit_and_vmap_agree():
+    weights, first = network(5, 0.3), jnp.asarray(starts(5, 5), jnp.float32)
+    active = jnp.array([True, True, False, True, True])
+
+    def refined(first, active):
+        residual = residual_of(weights, jnp.tanh, lambda x: jnp.asarray(x, jnp.float32))
+        return refine(residual, first, active, tau=0.5 * DEG, tau_max=1.0, k_max=20)
+
+    alone = [refined(first[row : row + 1], active[row : row + 1]) for row in range(5)]
+    passes = [int(result.passes[0]) for result in alone]
+    assert len(set(passes)) > 2
+    lanes = jax.vmap(refined)(first[:, None], active[:, None])
+    for together in (refined(first, active), jax.jit(refined)(first, active), jax.tree.map(lambda x: x[:, 0], lanes)):
+        assert together.passes.tolist() == passes
+        np.testing.assert_allclose(together.actions, [result.actions[0] for result in alone], atol=1e-6)
 
 
 def test_untouched_made_no_pass():

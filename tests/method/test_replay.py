@@ -79,6 +79,19 @@ def test_where_nothing_bootstraps_no_next_observation_is_stored():
     np.testing.assert_allclose(drawn.discount, drawn.reward + 0.1, rtol=1e-5)
 
 
+def test_in_lanes_the_write_stays_one_slice_update():
+    buffer = ring_buffer(EXAMPLE)
+    rows = jnp.stack([buffer.empty(6), buffer.empty(6)])
+    lanes = jax.tree.map(lambda *leaves: jnp.stack(leaves), numbered(10, 2), numbered(20, 2))
+    add = jax.vmap(buffer.add, (0, None, 0))
+    np.testing.assert_array_equal(
+        add(rows, jnp.array(10), lanes)[:, :, 0], [[0, 0, 0, 0, 10, 11], [0, 0, 0, 0, 20, 21]]
+    )
+    program = str(jax.make_jaxpr(add)(rows, jnp.array(10), lanes))
+    assert "dynamic_update_slice" in program
+    assert "scatter" not in program
+
+
 def test_a_capacity_that_is_no_multiple_is_refused():
     buffer = ring_buffer(EXAMPLE)
     with pytest.raises(ValueError, match="no multiple"):
