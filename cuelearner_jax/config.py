@@ -141,7 +141,21 @@ class RunConfig(Generic[TaskT]):
 
 def check(config: RunConfig) -> None:
     """Raises UserError with one line for the first value that cannot work."""
-    sizes, scalars, schedule = config.sizes, config.scalars, config.schedule
+    sizes, schedule = config.sizes, config.schedule
+    _check_sizes(sizes)
+    _check_scalars(config.scalars)
+    for name in ("total_steps", "eval_every", "eval_steps", "eval_envs", "checkpoint_every", "target_every"):
+        if getattr(schedule, name) < 1:
+            raise UserError(f"schedule.{name} is {getattr(schedule, name)}: give a positive number")
+    _check_multiple(schedule.eval_every, sizes.num_envs, "schedule.eval_every", "sizes.num_envs")
+    _check_multiple(sizes.replay_capacity, sizes.num_envs, "sizes.replay_capacity", "sizes.num_envs")
+    _check_multiple(schedule.total_steps, schedule.eval_every, "schedule.total_steps", "schedule.eval_every")
+    _check_multiple(schedule.checkpoint_every, schedule.eval_every, "schedule.checkpoint_every", "schedule.eval_every")
+    _check_multiple(schedule.eval_steps, schedule.eval_envs, "schedule.eval_steps", "schedule.eval_envs")
+    _check_multiple(sizes.fit_steps, sizes.validate_every, "sizes.fit_steps", "sizes.validate_every")
+
+
+def _check_sizes(sizes: Sizes) -> None:
     positive = ("directions", "target_directions", "num_envs", "batch_size", "replay_capacity", "updates_per_step")
     positive += ("labels_per_round", "fit_steps", "fit_batch_size", "validate_every")
     for name in positive:
@@ -153,6 +167,9 @@ def check(config: RunConfig) -> None:
         )
     if not sizes.q_layers or not sizes.feedback_layers or min(sizes.q_layers + sizes.feedback_layers) < 1:
         raise UserError("sizes.q_layers and sizes.feedback_layers each need at least one layer of positive width")
+
+
+def _check_scalars(scalars: Scalars) -> None:
     for name, value in dataclasses.asdict(scalars).items():
         if name.endswith(("probability", "fraction", "polyak")) and not 0 <= value <= 1:
             raise UserError(f"scalars.{name} is {value}: give a number from 0 to 1")
@@ -168,15 +185,6 @@ def check(config: RunConfig) -> None:
         raise UserError(f"scalars.max_grad_norm is {scalars.max_grad_norm}: give a positive number")
     if scalars.discount >= 1:
         raise UserError(f"scalars.discount is {scalars.discount}: give a number below 1")
-    for name in ("total_steps", "eval_every", "eval_steps", "eval_envs", "checkpoint_every", "target_every"):
-        if getattr(schedule, name) < 1:
-            raise UserError(f"schedule.{name} is {getattr(schedule, name)}: give a positive number")
-    _check_multiple(schedule.eval_every, sizes.num_envs, "schedule.eval_every", "sizes.num_envs")
-    _check_multiple(sizes.replay_capacity, sizes.num_envs, "sizes.replay_capacity", "sizes.num_envs")
-    _check_multiple(schedule.total_steps, schedule.eval_every, "schedule.total_steps", "schedule.eval_every")
-    _check_multiple(schedule.checkpoint_every, schedule.eval_every, "schedule.checkpoint_every", "schedule.eval_every")
-    _check_multiple(schedule.eval_steps, schedule.eval_envs, "schedule.eval_steps", "schedule.eval_envs")
-    _check_multiple(sizes.fit_steps, sizes.validate_every, "sizes.fit_steps", "sizes.validate_every")
 
 
 def _check_multiple(value: int, unit: int, name: str, unit_name: str) -> None:

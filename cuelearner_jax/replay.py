@@ -10,6 +10,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
+import jax.custom_batching
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int, PRNGKeyArray
@@ -24,6 +25,23 @@ class RingBuffer(NamedTuple):
     empty: Callable[[int], Float[Array, "capacity width"]]
     add: Callable[..., Float[Array, "capacity width"]]  # (rows, step, transitions (n, ...)) -> rows
     sample: Callable[..., Transition]  # (key, rows, step, batch_size) -> transitions (batch_size, ...)
+
+
+@jax.custom_batching.custom_vmap
+def _write(
+    rows: Float[Array, "*lanes capacity width"], packed: Float[Array, "*lanes n width"], start: Int[Array, ""]
+) -> Float[Array, "*lanes capacity width"]:
+    """`packed` in place of the rows from `start` on."""
+    zero = jnp.zeros_like(start)
+    return jax.lax.dynamic_update_slice(rows, packed, (*[zero] * (rows.ndim - 2), start, zero))
+
+
+@_write.def_vmap
+def _write_lanes(axis_size: int, batched: list[bool], rows: Array, packed: Array, start: Array) -> tuple[Array, bool]:
+    """One slice update for all lanes; JAX's own rule would make it a scatter."""
+    if batched != [True, True, False]:
+        raise ValueError("lanes have rows of their own and one step counter: vmap over rows and transitions alone")
+    return _write(rows, packed, start), True
 
 
 def ring_buffer(example: Transition) -> RingBuffer:
@@ -43,8 +61,7 @@ def ring_buffer(example: Transition) -> RingBuffer:
         packed = jax.vmap(lambda item: ravel_pytree(item)[0])(transitions)
         if rows.shape[0] % packed.shape[0]:
             raise ValueError(f"capacity {rows.shape[0]} is no multiple of the {packed.shape[0]} transitions added")
-        start = jnp.mod(step, rows.shape[0])
-        return jax.lax.dynamic_update_slice(rows, packed.astype(rows.dtype), (start, jnp.zeros_like(start)))
+        return _write(rows, packed.astype(rows.dtype), jnp.mod(step, rows.shape[0]))
 
     def sample(
         key: PRNGKeyArray, rows: Float[Array, "capacity width"], step: Int[Array, ""], batch_size: int

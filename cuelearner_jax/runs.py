@@ -92,7 +92,7 @@ def load(folder: Path, tasks: dict[str, Task]) -> tuple[Task, RunConfig, Grid]:
             configuration.from_json(configuration.Schedule, values["schedule"]),
         )
         grid = Grid(*(tuple(values["grid"][name]) for name in ("guidance", "seeds", "labels")))
-    except (json.JSONDecodeError, KeyError, TypeError, AttributeError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise UserError(f"{path} is damaged or of another program: restore it or train anew") from error
     return task, config, grid
 
@@ -108,9 +108,9 @@ def check_folder(out: Path, described: dict[str, Any], resume: bool, overwrite: 
             raise UserError(f"nothing to resume in {out}: give the --out of an interrupted run, or leave out --resume")
         try:
             before = json.loads((out / "config.json").read_text())
-        except json.JSONDecodeError as error:
+            differing = sorted(_differences(before, described))
+        except (ValueError, TypeError) as error:  # no JSON, or JSON of something else
             raise UserError(f"{out / 'config.json'} is damaged: restore it or start anew with --overwrite") from error
-        differing = sorted(_differences(before, described))
         if differing:
             raise UserError(
                 f"{out} was run with another {', '.join(differing[:4])}: give the same options, or another --out"

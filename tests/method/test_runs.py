@@ -163,7 +163,7 @@ def test_a_damaged_description_is_not_loaded(out, content):
         (lambda values: values.update(grid=[1]), "damaged or of another program"),
         (lambda values: values["grid"].update(seeds=3), "damaged or of another program"),
         (lambda values: values.pop("schedule"), "damaged or of another program"),
-        (lambda values: values.update(sizes=[1]), "damaged or of another program"),
+        (lambda values: values.update(sizes=3), "damaged or of another program"),
         (lambda values: values["task"].pop("name"), "damaged or of another program"),
         (lambda values: values["task"].update(name="tennis"), "damaged or of another program"),
         (lambda values: values["scalars"].update(colour=1), "unknown field 'colour' for Scalars"),
