@@ -8,6 +8,7 @@ import json
 import math
 from dataclasses import dataclass
 from functools import cache, partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +20,7 @@ from cuelearner_jax.actions import difference, from_angle, rotate
 from cuelearner_jax.config import RunConfig, Scalars, Schedule, Sizes
 from cuelearner_jax.tasks import Task
 from cuelearner_jax.train import directions, make_program
-from cuelearner_jax.types import Step
+from cuelearner_jax.types import Label, Step
 
 
 class Window(struct.PyTreeNode):
@@ -113,15 +114,15 @@ class WindowConfig:
 
 def make_task(name="window"):
     """The bandit as a task; the pictures are never asked for."""
-    known = {
+    known: dict[str, Any] = {
         "name": name,
         "config": WindowConfig,
         "environment": lambda config: Window(jnp.deg2rad(jnp.array(config.half_width_deg))),
         "teacher": lambda config, env: Expert(env),
         "presets": {},
     }
-    fields = [field.name for field in dataclasses.fields(Task)]
-    return Task(**{field: known.get(field) for field in fields})
+    values: dict[str, Any] = {field.name: known.get(field.name) for field in dataclasses.fields(Task)}
+    return Task(**values)
 
 
 SIZES = Sizes(
@@ -185,6 +186,16 @@ def greedy_actions(q, params, obs, sizes=SIZES):
     options = directions(sizes)
     values = jax.vmap(lambda one: q(params, one, options)[:, 0])(jnp.asarray(obs))
     return np.asarray(options[jnp.argmax(values, -1)])
+
+
+def label_set(obs, action, target, valid):
+    """Labels as NumPy arrays."""
+    return Label(obs, action, target, valid)
+
+
+def compilations(*functions):
+    """How often each jitted function has been compiled."""
+    return [function._cache_size() for function in functions]
 
 
 def lane(tree, index):

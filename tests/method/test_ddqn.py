@@ -1,5 +1,7 @@
 """Double DQN: targets, loss, clipping and averaging with numbers worked out by hand."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -63,30 +65,33 @@ def test_polyak_moves_the_target_by_the_rate():
     np.testing.assert_allclose(moved["w"], [0.25, 3.5])
 
 
+def change_by(optimizer, gradient, params) -> Any:
+    """The first step of an optimiser."""
+    return optimizer.update(gradient, optimizer.init(params), params)[0]
+
+
 def test_sgd_steps_along_a_gradient_clipped_to_the_global_norm():
     params = {"a": jnp.array([1.0]), "b": jnp.array([1.0])}
     gradient = {"a": jnp.array([3.0]), "b": jnp.array([4.0])}  # of norm 5
     optimizer = ddqn.optimizer("sgd", 0.1, 0.5)
-    change, _ = optimizer.update(gradient, optimizer.init(params), params)
+    change = change_by(optimizer, gradient, params)
     assert float(change["a"][0]) == pytest.approx(-0.1 * 0.3)
     assert float(change["b"][0]) == pytest.approx(-0.1 * 0.4)
     short = {"a": jnp.array([0.3]), "b": jnp.array([0.0])}
-    assert float(optimizer.update(short, optimizer.init(params), params)[0]["a"][0]) == pytest.approx(-0.03)
+    assert float(change_by(optimizer, short, params)["a"][0]) == pytest.approx(-0.03)
 
 
 def test_adam_starts_with_a_step_of_the_learning_rate_against_the_sign():
     params = jnp.array([1.0, 1.0])
     optimizer = ddqn.optimizer("adam", 0.01, 100.0)
-    change, _ = optimizer.update(jnp.array([2.0, -0.3]), optimizer.init(params), params)
+    change = change_by(optimizer, jnp.array([2.0, -0.3]), params)
     np.testing.assert_allclose(change, [-0.01, 0.01], rtol=1e-4)
 
 
 @pytest.mark.parametrize("name", ["sgd", "adam"])
 def test_learning_rate_and_norm_may_be_traced(name):
     def change(rate, norm):
-        optimizer = ddqn.optimizer(name, rate, norm)
-        params = jnp.array([1.0, 1.0])
-        return optimizer.update(jnp.array([3.0, 4.0]), optimizer.init(params), params)[0]
+        return change_by(ddqn.optimizer(name, rate, norm), jnp.array([3.0, 4.0]), jnp.array([1.0, 1.0]))
 
     traced = jax.jit(change)
     np.testing.assert_allclose(traced(0.1, 0.5), change(0.1, 0.5), rtol=1e-5)

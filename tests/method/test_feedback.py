@@ -13,7 +13,6 @@ import pytest
 from cuelearner_jax import actions, feedback
 from cuelearner_jax.config import Scalars, Sizes
 from cuelearner_jax.networks import applied, feedback_network
-from cuelearner_jax.types import Label
 
 DEG = math.pi / 180
 
@@ -153,7 +152,7 @@ def label_set(seed, noise=0.0, valid=ROWS, dtype=np.float32):
     obs, action = rng.uniform(-1, 1, (2, ROWS, 2)).astype(dtype)
     action /= np.linalg.norm(action, axis=-1, keepdims=True)
     target = 0.3 * action[:, ::-1] * obs + noise * rng.normal(size=(ROWS, 2))
-    return Label(obs, action, target.astype(dtype), np.arange(ROWS) < valid)
+    return probes.label_set(obs, action, target.astype(dtype), np.arange(ROWS) < valid)
 
 
 def mean_error(model, labels, rows):

@@ -12,7 +12,6 @@ from cuelearner_jax import sweep
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.labelling import files
 from cuelearner_jax.runs import Grid
-from cuelearner_jax.types import Label
 
 TASK = {"name": "window", "half_width_deg": 28.0}
 
@@ -21,7 +20,7 @@ def label_sets(lanes=2, slots=20, obs_size=2, seed=0):
     rng = np.random.default_rng(seed)
     draw = lambda size: rng.normal(size=(lanes, slots, size)).astype(np.float32)  # noqa: E731
     valid = np.ones((lanes, slots), bool)
-    return Label(draw(obs_size), draw(2), draw(2), valid)
+    return probes.label_set(draw(obs_size), draw(2), draw(2), valid)
 
 
 @pytest.fixture

@@ -60,7 +60,7 @@ def test_samples_are_whole_transitions():
 def test_only_filled_rows_are_drawn_and_all_of_them(steps, numbers):
     buffer = ring_buffer(EXAMPLE)
     drawn = buffer.sample(jax.random.key(1), filled(buffer, 8, 1, steps), jnp.array(steps), 500)
-    assert set(np.round(np.asarray(drawn.reward) - 0.5).astype(int).tolist()) == numbers
+    assert set((np.asarray(drawn.reward) - 0.5).tolist()) == numbers  # an empty row would be -0.5
 
 
 def test_draws_are_uniform():

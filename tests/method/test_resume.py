@@ -257,7 +257,7 @@ def test_labels_of_a_file_are_used_exactly(tmp_path):
     angle = rng.uniform(-np.pi, np.pi, (2, 2, 60))
     obs, action = np.stack([np.cos(angle), np.sin(angle)], -1).astype(np.float32)
     target = rng.normal(scale=0.1, size=(2, 60, 2)).astype(np.float32)
-    given = label_files.Label(obs, action, target, np.ones((2, 60), bool))
+    given = probes.label_set(obs, action, target, np.ones((2, 60), bool))
     path = tmp_path / "given.parquet"
     label_files.write(path, {"name": "window"}, "relative", np.array([3, 5]), given)
     grid = Grid(("relative",), seeds=(5, 3), labels=(35, 60))

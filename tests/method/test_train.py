@@ -397,7 +397,7 @@ def test_one_stretch_of_steps_is_two_of_half_the_length():
 def test_other_scalars_schedules_worlds_and_times_compile_nothing(grid):
     program = probes.window_program("relative", LARGEST)
     functions = (program.init, program.label_round, program.train)
-    before = [function._cache_size() for function in functions]
+    before = probes.compilations(*functions)
     clock, state = train.start_clock(), probes.start(program, [7, 8, 9, 10], [1, 11, 33, LARGEST])
     for index in range(3):
         env = probes.Window(0.1 * index, 0.2 * index)
@@ -407,16 +407,16 @@ def test_other_scalars_schedules_worlds_and_times_compile_nothing(grid):
         schedule = replaced(random_steps=index, learn_after=4 * index, guidance_until=20 + index)
         clock, state = program.label_round(env, probes.Expert(env), scalars, clock, state)
         clock, state, _ = program.train(env, scalars, schedule, clock, state, STRETCH)
-    assert [function._cache_size() for function in functions] == before
+    assert probes.compilations(*functions) == before
 
 
 def test_evaluation_compiles_once_for_all_parameters_and_worlds():
-    before = evaluate.evaluate_agents._cache_size()
+    before = probes.compilations(evaluate.evaluate_agents)[0]
     for index in range(3):
         params = probes.start(probes.window_program("none"), [index], [0]).params
         env = probes.Window(0.1 * index, 0.6)
         evaluate.evaluate_agents(env, params, jax.random.key(index), sizes=probes.SIZES, num_envs=3, steps=6)
-    assert evaluate.evaluate_agents._cache_size() == before + 1
+    assert probes.compilations(evaluate.evaluate_agents) == [before + 1]
 
 
 def test_transitions_are_mirrored_as_a_whole():

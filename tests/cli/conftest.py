@@ -1,0 +1,31 @@
+"""One tiny run that the tests of the command line share."""
+
+from pathlib import Path
+
+import pytest
+from small_runs import SWEEP, listing
+
+from cuelearner_jax.cli import main
+
+
+@pytest.fixture(scope="session")
+def run_folder(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("runs") / "small"
+    assert main([*SWEEP, "--out", str(folder)]) == 0
+    return folder
+
+
+@pytest.fixture
+def refused(capsys):
+    """Runs a command that must be refused: status 2, one line that names the remedy, nothing changed in a folder."""
+
+    def run(command: list[str], says: str, folder: Path) -> None:
+        before = listing(folder)
+        assert main([str(part) for part in command]) == 2
+        told = [line for line in capsys.readouterr().err.splitlines() if " lanes, " not in line]
+        assert len(told) == 1, told
+        assert told[0].startswith("error: ")
+        assert says in told[0], told[0]
+        assert listing(folder) == before
+
+    return run

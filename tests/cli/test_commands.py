@@ -1,0 +1,142 @@
+import json
+import subprocess
+import sys
+from pathlib import Path
+from xml.etree import ElementTree
+
+import imageio.v2 as imageio
+import pytest
+from small_runs import SMALL
+
+from cuelearner_jax import results
+from cuelearner_jax.cli import main
+
+ENTRY = [str(Path(sys.executable).with_name("cuelearner"))]
+
+
+def test_a_sweep_says_its_memory_first_and_leaves_a_complete_folder(run_folder, capsys):
+    described = json.loads((run_folder / "config.json").read_text())
+    assert described["task"]["name"] == "billiards"
+    assert described["grid"] == {
+        "guidance": ["none", "relative", "heuristic"],
+        "seeds": [2000, 2001],
+        "labels": [10, 20],
+    }
+    for kind, lanes in (("none", 2), ("relative", 4), ("heuristic", 2)):
+        rows = results.read(run_folder / kind).to_pylist()
+        assert (run_folder / kind / "results.parquet").exists()
+        assert len(rows) == lanes * 3  # steps 0, 100 and 200
+        assert {row["step"] for row in rows} == {0, 100, 200}
+    assert (run_folder / "relative" / "labels.parquet").exists()
+    out = run_folder.parent / "memory"
+    assert main(["train", "billiards", "--preset", "quickstart", *SMALL, "--guidance", "none", "--out", str(out)]) == 0
+    assert "MB a seed at rest" in capsys.readouterr().err
+
+
+def test_the_same_seed_gives_the_same_rewards_in_another_run(run_folder, tmp_path):
+    out = tmp_path / "one"
+    command = ["train", "billiards", "--preset", "quickstart", *SMALL, "--seed", "2001", "--labels", "20"]
+    assert main([*command, "--out", str(out)]) == 0
+    alone = [(row["step"], row["reward"]) for row in results.read(out).to_pylist()]
+    beside = [
+        (row["step"], row["reward"])
+        for row in results.read(run_folder / "relative").to_pylist()
+        if row["seed"] == 2001 and row["labels"] == 20
+    ]
+    assert alone == beside
+
+
+@pytest.mark.parametrize("policy", ["agent", "guide", "guided", "teacher", "heuristic", "uniform"])
+def test_every_policy_is_evaluated(run_folder, tmp_path, capsys, policy):
+    out = tmp_path / "measured.json"
+    command = ["evaluate", str(run_folder), "--policy", policy, "--steps", "20", "--envs", "10", "--out", str(out)]
+    assert main(command) == 0
+    assert "reward" in capsys.readouterr().out
+    rows = json.loads(out.read_text())["rows"]
+    lanes = {("none", 0), ("relative", 10), ("relative", 20), ("heuristic", 0)}
+    trained = policy in ("agent", "guide", "guided")
+    assert {(row["guidance"], row["labels"]) for row in rows} == (lanes if trained else {("-", 0)})
+
+
+def test_a_changed_world_changes_the_measurement(run_folder, tmp_path):
+    rewards = []
+    for turn in ("0", "90"):
+        out = tmp_path / f"{turn}.json"
+        command = ["evaluate", str(run_folder), "--policy", "teacher", "--task.action-turn-deg", turn]
+        assert (
+            main([*command, "--task.search-directions", "1440", "--steps", "20", "--out", str(out), "--envs", "10"])
+            == 0
+        )
+        rewards.append(json.loads(out.read_text())["rows"][0]["reward"][0])
+    assert json.loads(out.read_text())["world"]["action_turn_deg"] == 90.0
+    assert rewards[0] > 0.8  # the teacher searches in the changed world, so it does as well there
+    assert rewards[1] > 0.8
+
+
+def test_a_report_has_curves_and_tables(run_folder, tmp_path):
+    out = tmp_path / "report"
+    assert main(["report", str(run_folder), "--out", str(out)]) == 0
+    assert ElementTree.parse(out / "curves.svg").getroot().tag.endswith("svg")
+    assert imageio.imread(out / "curves.png").std() > 1
+    table = (out / "report.md").read_text()
+    assert "| relative | 20 | 2 |" in table
+    assert (out / "label_efficiency.png").exists()
+
+
+@pytest.mark.parametrize("film", ["gif", "mp4"])
+def test_render_makes_a_film_and_a_still(run_folder, tmp_path, film):
+    command = ["render", str(run_folder), "--guidance", "relative", "--labels", "10", "--seed", "2001", "--film", film]
+    assert main([*command, "--steps", "1", "--out", str(tmp_path)]) == 0
+    still, filmed = (tmp_path / f"small-agent.{end}" for end in ("png", film))
+    assert imageio.imread(still).std() > 1
+    assert filmed.stat().st_size > 1000
+
+
+def test_labels_of_a_run_train_another(run_folder, tmp_path):
+    out = tmp_path / "again"
+    command = ["sweep", "billiards", "--preset", "quickstart", *SMALL, "--seeds", "2", "--guidance", "relative"]
+    given = ["--labels-from", str(run_folder / "relative" / "labels.parquet"), "--labels", "20"]
+    assert main([*command, *given, "--out", str(out)]) == 0
+    assert len(results.read(out).to_pylist()) == 6
+
+
+def test_tuning_episodes_are_others_and_stay_out_of_reports(run_folder, tmp_path, capsys):
+    out = tmp_path / "tuned"
+    command = ["train", "billiards", "--preset", "quickstart", *SMALL, "--guidance", "none", "--seed", "2000"]
+    assert main([*command, "--tuning", "--out", str(out)]) == 0
+    assert {row["split"] for row in results.read(out).to_pylist()} == {"tuning"}
+    assert main(["report", str(out), "--out", str(tmp_path / "report")]) == 2
+    assert main(["report", str(out), "--split", "tuning", "--out", str(tmp_path / "report")]) == 0
+
+
+def test_a_tiny_teacher_is_trained(tmp_path):
+    out = tmp_path / "teacher"
+    command = ["teacher", "train", "billiards", "--preset", "quickstart", "--out", str(out), "--eval-steps", "20"]
+    sizes = ["--teacher.layers", "16", "--teacher.tables", "8", "--teacher.rounds", "20", "--teacher.batch-size", "64"]
+    assert main([*command, *sizes, "--teacher.search", "36", "--teacher.directions", "36"]) == 0
+    told = json.loads((out / "teacher.json").read_text())
+    assert told["command"].startswith("cuelearner teacher train billiards")
+    assert sorted(path.name for path in out.iterdir()) == ["network", "teacher.json"]
+
+
+@pytest.mark.parametrize("command", ["train", "sweep", "evaluate", "report", "render", "teacher"])
+def test_the_installed_command_explains_itself(command):
+    task = {"teacher": ["train", "billiards"], "report": []}.get(command, ["billiards"])
+    done = subprocess.run([*ENTRY, command, *task, "--help"], check=False, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0
+    assert "--out" in done.stdout
+    assert done.stderr == ""
+
+
+def test_the_installed_command_fails_in_one_line(tmp_path):
+    done = subprocess.run(
+        [*ENTRY, "sweep", "billiards", "--seedz", "3", "--out", str(tmp_path / "x")],
+        check=False,
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert done.returncode == 2
+    assert done.stderr.count("\n") == 1
+    assert "perhaps you meant --seeds" in done.stderr
+    assert not (tmp_path / "x").exists()

@@ -1,0 +1,159 @@
+import json
+import shutil
+
+import pytest
+from small_runs import SMALL, SWEEP, listing
+
+from cuelearner_jax.cli import main
+
+QUICK = ["sweep", "billiards", "--preset", "quickstart", *SMALL]
+
+ARGUMENTS = [
+    (["evalute"], "did you mean 'evaluate'"),
+    (["sweep", "billards"], "did you mean 'billiards'"),
+    (["sweep", "billiards", "--preset", "papr"], "did you mean 'paper'"),
+    (["sweep", "billiards", "--preset"], "--preset needs a name"),
+    ([*QUICK, "--seedz", "3"], "perhaps you meant --seeds"),
+    ([*QUICK, "--seeds", "three"], "--seeds"),
+    ([*QUICK, "--task.table", "snooker"], "'one_ball', 'easy', 'regulation'"),
+    ([*QUICK, "--guidance", "relativ"], "choose among none, relative, heuristic"),
+    ([*QUICK, "--guidance", "none", "none"], "give each kind once"),
+    ([*QUICK, "--labels", "0"], "teaches nothing"),
+    ([*QUICK, "--labels", "10", "10"], "give each budget once"),
+    ([*QUICK, "--seeds", "0"], "give --seeds"),
+    ([*QUICK, "--sizes.replay-capacity", "1000000000000"], "train at most"),
+    ([*QUICK, "--sizes.replay-capacity", "1001"], "give a multiple of sizes.num_envs"),
+    ([*QUICK, "--schedule.total-steps", "150"], "give a multiple of schedule.eval_every"),
+    ([*QUICK, "--resume"], "nothing to resume"),
+    ([*QUICK, "--resume", "--overwrite"], "give one of them"),
+    ([*QUICK, "--labels-from", "nowhere.parquet", "--guidance", "relative"], "no label file"),
+    (["train", "billiards", "--preset", "quickstart", "--guidance", "all"], "unknown guidance 'all'"),
+    (["train", "billiards", "--task.teacher", "learned", "--guidance", "relative"], "cuelearner teacher train"),
+    (["evaluate", "nowhere"], "neither a run folder nor a task"),
+    (["evaluate", "billiards", "--policy", "agent"], "needs a trained run"),
+    (["evaluate", "billiards", "--policy", "agnt"], "did you mean 'agent'"),
+    (["evaluate", "billiards", "--steps", "150"], "multiple of --envs"),
+    (["render", "billiards", "--film", "avi"], "gif or mp4"),
+    (["render", "billiards", "--steps", "0"], "positive"),
+    (["teacher", "trian"], "cuelearner teacher train"),
+    (["teacher", "train", "billiards", "--teacher.tries", "2"], "at least 4"),
+]
+
+
+@pytest.mark.parametrize(("command", "says"), ARGUMENTS, ids=[" ".join(c)[-40:] for c, _ in ARGUMENTS])
+def test_bad_arguments_are_refused(refused, tmp_path, command, says):
+    takes_out = command[0] in ("sweep", "train", "teacher", "render") and len(command) > 2 and command[-1] != "--preset"
+    refused([*command, *(["--out", tmp_path / "new"] if takes_out else [])], says, tmp_path)
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_folder_in_use_is_left_alone(refused, run_folder, tmp_path):
+    refused([*SWEEP, "--out", run_folder], "--resume to go on, --overwrite", run_folder)
+    (tmp_path / "thesis.txt").write_text("mine")
+    refused([*SWEEP, "--out", tmp_path, "--overwrite"], "will not delete it", tmp_path)
+    refused([*SWEEP, "--out", tmp_path, "--resume"], "nothing to resume", tmp_path)
+    refused(["teacher", "train", "billiards", "--out", tmp_path], "not empty", tmp_path)
+
+
+def test_resume_with_other_options_names_them(refused, run_folder):
+    changed = [*SWEEP, "--scalars.eps-deg", "3", "--out", run_folder, "--resume"]
+    refused(changed, "another scalars.eps_deg", run_folder)
+
+
+def test_a_finished_run_is_resumed_to_no_effect(run_folder):
+    before = listing(run_folder)
+    assert main([*SWEEP, "--out", str(run_folder), "--resume"]) == 0
+    assert listing(run_folder) == before
+
+
+def test_overwrite_deletes_an_earlier_run(run_folder, tmp_path):
+    folder = tmp_path / "run"
+    shutil.copytree(run_folder, folder)
+    assert main([*QUICK, "--guidance", "none", "--seeds", "2", "--out", str(folder), "--overwrite"]) == 0
+    assert not (folder / "relative").exists()
+
+
+@pytest.fixture
+def copy(run_folder, tmp_path):
+    return shutil.copytree(run_folder, tmp_path / "copy")
+
+
+@pytest.mark.parametrize("command", ["evaluate", "render"])
+def test_what_is_no_run_is_refused(refused, copy, tmp_path, command):
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    out = ["--out", tmp_path / "new"]
+    refused([command, empty, *out], "no config.json", tmp_path)
+    refused([command, copy, "--policy", "expert", *out], "unknown policy", tmp_path)
+    refused([command, copy, "--task.table", "easy", *out], "keep its structure", tmp_path)
+    refused([command, copy, "--guidance", "scalar", *out], "choose among none, relative, heuristic", tmp_path)
+    (copy / "config.json").write_text("{")
+    refused([command, copy, *out], "damaged", tmp_path)
+
+
+def test_a_lane_that_is_not_there_is_refused(refused, copy, tmp_path):
+    refused(["render", copy, "--seed", "7", "--out", tmp_path / "new"], "the run has seeds 2000, 2001", tmp_path)
+    refused(["render", copy, "--labels", "7", "--guidance", "relative"], "labels 10, 20", tmp_path)
+
+
+def test_a_damaged_checkpoint_is_refused(refused, copy):
+    for file in (copy / "none" / "checkpoints").rglob("*"):
+        if file.is_file() and file.stat().st_size > 200:
+            file.write_bytes(b"\x00" * 10)
+    refused(["evaluate", copy, "--guidance", "none"], "cannot be read", copy)
+
+
+def test_a_checkpoint_of_another_run_is_refused(refused, copy, tmp_path):
+    other = tmp_path / "other"
+    sizes = ["--sizes.q-layers", "24", "--guidance", "none", "--seeds", "2"]
+    assert main([*QUICK, *sizes, "--out", str(other)]) == 0
+    shutil.rmtree(copy / "none" / "checkpoints")
+    shutil.copytree(other / "none" / "checkpoints", copy / "none" / "checkpoints")
+    refused(["evaluate", copy, "--guidance", "none"], "cannot be read", copy)
+
+
+def test_a_run_without_checkpoints_is_refused(refused, copy):
+    shutil.rmtree(copy / "none" / "checkpoints")
+    refused(["evaluate", copy, "--guidance", "none"], "no checkpoint", copy)
+
+
+def test_labels_that_do_not_fit_are_refused(refused, copy, tmp_path):
+    file = copy / "relative" / "labels.parquet"
+    new = ["--out", tmp_path / "new"]
+    relative = [*QUICK, "--guidance", "relative", "--labels-from", file]
+    refused(
+        [*relative, "--labels", "20", "--seeds", "2", "--task.table", "easy", *new], "labels of the same task", copy
+    )
+    refused([*relative, "--labels", "500", "--seeds", "2", *new], "lower --labels or collect more", copy)
+    refused([*relative, "--labels", "20", "--seeds", "3", *new], "for seed 2002", copy)
+    refused([*QUICK, "--guidance", "none", "--labels-from", file, *new], "add --guidance relative", copy)
+    file.write_bytes(b"PAR1 no more")
+    refused([*relative, "--labels", "20", "--seeds", "2", *new], "not a label file", copy)
+    assert not (tmp_path / "new").exists()
+
+
+def test_reports_that_cannot_be_made_are_refused(refused, copy, tmp_path):
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    out = ["--out", tmp_path / "report"]
+    refused(["report", tmp_path / "nowhere", *out], "does not exist", tmp_path)
+    refused(["report", empty, *out], "no results", tmp_path)
+    refused(["report", copy, "--metric", "success", *out], "success", tmp_path)
+    assert main(["report", str(copy), "--out", str(tmp_path / "report")]) == 0
+    refused(["report", copy, *out], "overwrite", tmp_path)
+
+
+def test_pictures_and_measurements_are_not_replaced_unasked(refused, copy, tmp_path):
+    render = ["render", str(copy), "--steps", "1", "--policy", "heuristic", "--out", str(tmp_path / "pictures")]
+    assert main(render) == 0
+    refused(render, "--overwrite", tmp_path)
+    assert main([*render, "--overwrite"]) == 0
+    (tmp_path / "measured.json").write_text("{}")
+    refused(["evaluate", copy, "--out", tmp_path / "measured.json"], "exists", tmp_path)
+
+
+def test_a_config_of_another_version_is_refused(refused, copy):
+    described = json.loads((copy / "config.json").read_text())
+    described["sizes"]["hidden"] = 3
+    (copy / "config.json").write_text(json.dumps(described))
+    refused(["evaluate", copy], "another version", copy)

@@ -1,0 +1,17 @@
+"""The arguments of tiny runs, and what lies in a folder."""
+
+from pathlib import Path
+
+SMALL = [
+    *("--sizes.q-layers", "16", "--sizes.feedback-layers", "16", "--sizes.directions", "36"),
+    *("--sizes.fit-steps", "20", "--task.search-directions", "90"),
+    *("--schedule.total-steps", "200", "--schedule.eval-every", "100", "--schedule.checkpoint-every", "100"),
+]
+SWEEP = ["sweep", "billiards", "--preset", "quickstart", *SMALL, "--seeds", "2", "--labels", "10", "20"]
+SWEEP += ["--guidance", "none", "relative", "heuristic"]
+
+
+def listing(folder: Path) -> dict[str, tuple[int, int]]:
+    """Every file below a folder with its size and time of change."""
+    files = [path for path in sorted(folder.rglob("*")) if path.is_file()] if folder.exists() else []
+    return {str(path): (path.stat().st_size, path.stat().st_mtime_ns) for path in files}
