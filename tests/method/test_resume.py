@@ -15,12 +15,12 @@ from cuelearner_jax.checkpoint import checkpoints
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.labelling import files as label_files
 from cuelearner_jax.runs import Grid
-from cuelearner_jax.train import make_program, start_clock
+from cuelearner_jax.train import label_slots, make_program, start_clock
 
 # Bootstraps, so that target network, next observations and Adam's moments are in the checkpoint as well.
 CONFIG = probes.config(
-    sizes={"lanes_per_block": 2, "fit_steps": 100, "replay_capacity": 40},
-    scalars={"discount": 0.5, "silence_probability": 0.2},
+    sizes={"q_layers": (16,), "feedback_layers": (16,), "lanes_per_block": 2, "fit_steps": 100, "replay_capacity": 40},
+    scalars={"discount": 0.5, "silence_probability": 0.05},
     schedule={"total_steps": 96, "guidance_until": 64, "eval_every": 16, "checkpoint_every": 32},
 )
 GRID = Grid(("relative", "none"), seeds=(3, 5), labels=(35, 60))  # 6 rounds; 4 lanes in 2 blocks of 2
@@ -38,7 +38,7 @@ def compiled_once():
     programs = {}
 
     def made(config, guidance, env, largest_budget):
-        known = (config.sizes, config.bootstraps, guidance, largest_budget)
+        known = (config.sizes, config.bootstraps, guidance, label_slots(largest_budget, config.sizes))
         if known not in programs:
             programs[known] = make_program(config, guidance, env, largest_budget)
         return programs[known]
@@ -287,7 +287,7 @@ def test_the_labels_that_a_run_wrote_give_its_guidance_again(whole, tmp_path):
     # Silent answers are not written, so budgets are of what was answered.
     written = label_files.read(whole / "relative" / "labels.parquet")
     counts = [int((written.seeds == seed).sum()) for seed in GRID.seeds]
-    assert all(30 < count < 60 for count in counts)
+    assert all(50 < count < 60 for count in counts)
     grid = Grid(("relative",), GRID.seeds, (min(counts),))
     sweep.run(TASK, CONFIG, grid, tmp_path / "run", labels_from=whole / "relative" / "labels.parquet")
     again = label_files.read(tmp_path / "run" / "relative" / "labels.parquet")
