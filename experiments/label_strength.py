@@ -2,8 +2,9 @@
 
     python experiments/label_strength.py --out FOLDER
 
-For each eps: 24 seeds of the preset `quickstart`, 100 labels, then uniform actions under guidance on validation episodes
-(the column guide_reward of the results). Refinement passes are enough to cross half a turn.
+For each eps: 24 seeds of the preset `quickstart`, 100 labels, then uniform actions under guidance on validation
+episodes (the column guide_reward of the results). Refinement passes are enough to cross half a turn. Called again, it
+goes on where it was interrupted.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from cuelearner_jax import results
 from cuelearner_jax.cli import main as cuelearner
 from cuelearner_jax.statistics import interval
 
-STRENGTHS_DEG = (1, 2, 5, 10)
+STRENGTHS_DEG = (1, 2, 5)
 
 
 def main() -> int:
@@ -31,7 +32,8 @@ def main() -> int:
         out = arguments.out / f"eps_{strength}"
         scalars = ["--scalars.eps-deg", str(strength), "--scalars.k-max", str(180 // strength + 10)]
         short = ["--schedule.total-steps", "100", "--guidance", "relative", "--out", str(out)]
-        status = cuelearner(["sweep", "billiards", "--preset", "quickstart", *scalars, *short])
+        resume = ["--resume"] if (out / "config.json").exists() else []
+        status = cuelearner(["sweep", "billiards", "--preset", "quickstart", *scalars, *short, *resume])
         if status:
             return status
         table = results.read(out).to_pylist()
@@ -50,9 +52,8 @@ def main() -> int:
     print("eps [deg]  guide's reward: IQM and 95% interval   mean   worst seed")
     for row in rows:
         low, high = row["interval"]
-        print(
-            f"{row['eps_deg']:9d}  {row['iqm']:.3f} [{low:.3f}, {high:.3f}] {row['mean']:20.3f} {row['rewards'][0]:12.3f}"
-        )
+        spread = f"{row['iqm']:.3f} [{low:.3f}, {high:.3f}]"
+        print(f"{row['eps_deg']:9d}  {spread} {row['mean']:20.3f} {row['rewards'][0]:12.3f}")
     contents = {**results.provenance(), "command": "python experiments/label_strength.py", "rows": rows}
     (arguments.out / "label_strength.json").write_text(json.dumps(contents, indent=1) + "\n")
     return 0

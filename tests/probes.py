@@ -42,7 +42,8 @@ class Window(struct.PyTreeNode):
         return 4 if self.mirrors else 1
 
     def reset(self, key):
-        obs = from_angle(jax.random.randint(key, (), 0, self.contexts) * (2 * math.pi / self.contexts))
+        context = jax.random.randint(key, (), 0, self.contexts).astype(jnp.float32)
+        obs = from_angle(context * (2 * math.pi / self.contexts))
         return obs, obs
 
     def best(self, obs):

@@ -200,6 +200,21 @@ def test_validation_keeps_the_best_parameters_when_the_last_ones_overfit():
     assert mean_error(last, labels, labels.valid & ~HELD_OUT) < 0.9 * mean_error(kept, labels, labels.valid & ~HELD_OUT)
 
 
+def test_of_all_looks_the_one_nearest_to_the_validation_labels_is_kept():
+    # A model of one vector, which walks from 0 by 0.01 a step toward (1, 0): 0.2, 0.4, 0.6, 0.8 at the looks.
+    labels = label_set(0).replace(target=np.stack([np.where(HELD_OUT, 0.45, 1.0), np.zeros(ROWS)], -1))
+    model = feedback.fit(
+        jax.random.key(0),
+        probes.Window(),
+        jax.tree.map(jnp.asarray, labels),
+        Scalars(feedback_learning_rate=0.01, max_grad_norm=0.1),
+        init=lambda key: jnp.zeros(2),
+        apply=lambda params, obs, action: jnp.broadcast_to(params, action.shape),
+        sizes=dataclasses.replace(SIZES, fit_steps=80),
+    )
+    np.testing.assert_allclose(model.params, [0.4, 0.0], atol=1e-3)
+
+
 def test_validation_labels_are_never_trained_on():
     labels = label_set(3)
     opposite = labels.replace(target=np.where(HELD_OUT[:, None], -labels.target, labels.target))

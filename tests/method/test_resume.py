@@ -43,7 +43,13 @@ def compiled_once():
             programs[known] = make_program(config, guidance, env, largest_budget)
         return programs[known]
 
+    def committed(make):
+        # As arrays from a checkpoint are: JAX compiles separately for those that are tied to no device.
+        return lambda *arguments: jax.device_put(make(*arguments), jax.devices()[0])
+
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(lanes.Group, "start", committed(lanes.Group.start))
+        patch.setattr(sweep, "start_clock", committed(start_clock))
         patch.setattr(sweep.guidances, "make", cache(guidances.make))
         patch.setattr(lanes, "make_program", made)
         patch.setattr(sweep, "ROUNDS_A_CHUNK", 2)
