@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -21,6 +22,7 @@ from cuelearner_jax.train import Program, label_slots, make_program, start_clock
 from cuelearner_jax.types import Clock, Guidance, TrainState
 
 CACHE_BYTES = 6_000_000  # of the action-value weights of a CPU's block: beyond, they leave the cache between two steps
+BLOCKS = "blocks.json"  # beside the checkpoints whose shapes it determines
 CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 T = TypeVar("T")
@@ -34,6 +36,7 @@ class Group:
         self.seeds, self.budgets = grid.lanes(guidance)
         self.largest_budget = int(self.budgets.max())
         self.program: Program = make_program(config, guidance, env, self.largest_budget)
+        self.lanes_per_block = config.sizes.lanes_per_block or self._fitting_lanes()
 
     @property
     def rounds(self) -> int:
@@ -42,11 +45,23 @@ class Group:
 
     def blocks(self) -> list[tuple[np.ndarray, np.ndarray]]:
         """(seeds, budgets) of each block; the last is filled up with repeats, whose results are dropped."""
-        limit = self.config.sizes.lanes_per_block or self._fitting_lanes()
-        count = -(-len(self.seeds) // limit)
+        count = -(-len(self.seeds) // self.lanes_per_block)
         size = -(-len(self.seeds) // count)
         index = np.minimum(np.arange(count * size), len(self.seeds) - 1).reshape(count, size)
         return [(self.seeds[rows], self.budgets[rows]) for rows in index]
+
+    def take_blocks_of(self, folder: Path) -> None:
+        """Cuts the lanes as the checkpoints below `folder` do, which another machine may have written."""
+        if (folder / BLOCKS).is_file():
+            try:
+                self.lanes_per_block = int(json.loads((folder / BLOCKS).read_text())["lanes_per_block"])
+            except (ValueError, KeyError, TypeError) as error:
+                raise UserError(f"{folder / BLOCKS} is damaged: restore it or start anew with --overwrite") from error
+
+    def write_blocks(self, folder: Path) -> None:
+        """Notes how the lanes are cut, for `take_blocks_of`."""
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / BLOCKS).write_text(json.dumps({"lanes_per_block": self.lanes_per_block}) + "\n")
 
     def _fitting_lanes(self) -> int:
         """Lanes of a block: on an accelerator all; on a CPU what fits its cache, and a block for each core."""
@@ -142,6 +157,7 @@ def restore_policies(group: Group, folder: Path) -> tuple[dict[str, Any], int]:
     """
     if not (folder / "checkpoints").is_dir():
         raise UserError(f"no checkpoint in {folder}: train first, or give a run folder that has one")
+    group.take_blocks_of(folder)
     with checkpoints(folder / "checkpoints", read_only=True) as saved:
         like = items(group.shapes(), jax.eval_shape(start_clock), 0.0)
         found = saved.restore({name: like[name] for name in ("policy", "clock")})

@@ -4,6 +4,7 @@ Folder of a run:
 
     config.json                  everything that determines the results
     <guidance>/checkpoints/      the newest states
+    <guidance>/blocks.json       how the lanes are cut in them
     <guidance>/labels.parquet    what the teacher answered
     <guidance>/results.jsonl     one row a seed and evaluation; results.parquet once done
 """
@@ -64,7 +65,7 @@ def check_grid(grid: Grid) -> None:
             )
 
 
-def describe(task: Task, config: RunConfig, grid: Grid, split: str) -> dict[str, Any]:
+def describe(task: Task, config: RunConfig, grid: Grid, split: str, labels_from: Path | None = None) -> dict[str, Any]:
     """The contents of config.json."""
     return {
         "task": {"name": task.name, **configuration.to_json(config.task)},
@@ -73,6 +74,7 @@ def describe(task: Task, config: RunConfig, grid: Grid, split: str) -> dict[str,
         "schedule": configuration.to_json(config.schedule),
         "grid": {"guidance": list(grid.guidance), "seeds": list(grid.seeds), "labels": list(grid.labels)},
         "split": split,
+        "labels_from": labels_from.name if labels_from else None,
         "total_steps": config.schedule.total_steps,
     }
 

@@ -62,7 +62,7 @@ def run(
     env = task.environment(config.task)
     labels = read_labels(labels_from, task, config, grid) if labels_from else None
     kinds = [guidances.make(kind, config.sizes, env.obs_size) for kind in grid.guidance]
-    described = describe(task, config, grid, split)
+    described = describe(task, config, grid, split, labels_from)
     check_folder(out, described, resume, overwrite)
     for kind in kinds:
         console.print(memory_report(Group(config, env, kind, grid)))
@@ -168,9 +168,11 @@ class _Runner:
     def _restore(self, saved: Checkpoints) -> None:
         """The newest checkpoint, or a fresh start; rows past it are dropped."""
         if saved.latest() is None:
+            self.group.write_blocks(self.folder)
             self.blocks = self.group.start()
             results.truncate_after(self.folder, -1)
             return
+        self.group.take_blocks_of(self.folder)
         found = saved.restore(items(self.group.shapes(), jax.eval_shape(start_clock), 0.0))
         self.blocks = [rest.replace(**policy) for policy, rest in zip(found["policy"], found["rest"], strict=True)]
         self.clock, self.wall = found["clock"]["clock"], float(found["clock"]["wall_s"])

@@ -63,7 +63,10 @@ def train(
     if not hasattr(env, "features"):
         raise UserError(f"{task.name} gives a teacher no features to learn from")
     described = {"config": configuration.to_json(config), "task": {"name": task.name, **configuration.to_json(world)}}
-    check_folder(out, {**described, "seed": seed}, resume, overwrite=False)
+    if not resume and out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise UserError(f"{out} is not empty: give --resume to go on with an interrupted training, or another --out")
+    if resume:
+        check_folder(out, {**described, "seed": seed}, resume=True, overwrite=False)
     prepare_folder(out, {**described, "seed": seed}, clean=False)
     history = _learn(teacher.make_program(config), env, config, out, seed)
     with checkpoints(out / TRAINING, read_only=True) as saved:

@@ -1,1 +1,55 @@
-"""(In work by a helper that found these files missing at 05:47: being written right now; please leave to it.)"""
+"""Blocks of lanes: how they are cut, what memory they need, and what a checkpoint says of the cut."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from probes import CONFIG, SIZES, Window
+
+from cuelearner_jax import guidance, lanes
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.runs import Grid
+
+
+def group_of(seeds, kind="none", **sizes):
+    config = dataclasses.replace(CONFIG, sizes=dataclasses.replace(SIZES, **sizes))
+    env = Window()
+    made = guidance.make(kind, config.sizes, env.obs_size)
+    return lanes.Group(config, env, made, Grid((kind,), tuple(range(seeds)), (10, 20)))
+
+
+def test_blocks_are_equal_and_the_last_is_filled_with_repeats():
+    group = group_of(5, lanes_per_block=2)
+    assert [list(seeds) for seeds, _ in group.blocks()] == [[0, 1], [2, 3], [4, 4]]
+    columns = group.lanes([{"reward": seeds * 1.0} for seeds, _ in group.blocks()])
+    np.testing.assert_array_equal(columns["reward"], [0.0, 1.0, 2.0, 3.0, 4.0])
+
+
+def test_lanes_are_seeds_for_each_budget_where_labels_are_asked_for():
+    asking = group_of(2, "relative")
+    assert list(zip(asking.seeds.tolist(), asking.budgets.tolist(), strict=True)) == [
+        (0, 10),
+        (1, 10),
+        (0, 20),
+        (1, 20),
+    ]
+    assert group_of(2, "heuristic").budgets.tolist() == [0, 0]
+
+
+def test_memory_is_told_before_and_too_much_is_refused():
+    assert "3 lanes" in lanes.memory_report(group_of(3))
+    with pytest.raises(UserError, match="train at most 0 at once"):
+        lanes.memory_report(group_of(3, replay_capacity=10**12))
+
+
+def test_a_run_is_read_with_the_blocks_it_was_written_with(tmp_path, monkeypatch):
+    group = group_of(5, lanes_per_block=2)
+    group.write_blocks(tmp_path)
+    monkeypatch.setattr(lanes, "CORES", 1)
+    elsewhere = group_of(5)
+    assert len(elsewhere.blocks()) == 1
+    elsewhere.take_blocks_of(tmp_path)
+    assert [len(seeds) for seeds, _ in elsewhere.blocks()] == [2, 2, 2]
+    (tmp_path / lanes.BLOCKS).write_text("{")
+    with pytest.raises(UserError, match="damaged"):
+        elsewhere.take_blocks_of(tmp_path)
