@@ -55,7 +55,9 @@ def report(
     folders = [folders] if isinstance(folders, str | os.PathLike) else list(folders)
     out = Path(out)
     if out.exists() and (not out.is_dir() or any(out.iterdir())) and not overwrite:
-        raise UserError(f"{out} exists already: choose another folder for the report, or allow it to be overwritten")
+        raise UserError(
+            f"{out} exists already: choose another folder (--out), or allow it to be overwritten (--overwrite)"
+        )
     table, invalid = _select(results.read(folders, task), metric, split)
     groups = _groups(table, metric)
     missing = _missing(folders, table, groups)

@@ -20,6 +20,7 @@ def refused(capsys):
     """Runs a command that must be refused: status 2, one line that names the remedy, nothing changed in a folder."""
 
     def run(command: list[str], says: str, folder: Path) -> None:
+        capsys.readouterr()  # what earlier commands of the test have told
         before = listing(folder)
         assert main([str(part) for part in command]) == 2
         told = [line for line in capsys.readouterr().err.splitlines() if " lanes, " not in line]

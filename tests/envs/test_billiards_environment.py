@@ -1,3 +1,4 @@
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,213 +9,416 @@ from cuelearner_envs.billiards.config import BilliardsConfig, make_environment
 from cuelearner_envs.billiards.environment import Balls, Billiards
 from cuelearner_envs.billiards.recording import record
 from cuelearner_envs.billiards.table import Table, rack
+from cuelearner_envs.billiards.teacher import SearchTeacher
 from cuelearner_jax import actions
+from cuelearner_jax.types import Environment
 
+TABLES = ["one_ball", "easy", "regulation"]
 EASY = make_environment(BilliardsConfig("easy"))
+MIRRORED = make_environment(BilliardsConfig("easy", mirrors=True))
+ONE = make_environment(BilliardsConfig("one_ball"))
 KEY = jax.random.key(0)
+BATCH = 600  # of every call to a batched function, so that each compiles once
+
 step = jax.jit(lambda env, key, state, action: env.step(key, state, action))
+step_many = jax.jit(lambda env, keys, states, actions: jax.vmap(env.step)(keys, states, actions))
 reset_many = jax.jit(lambda env, keys: jax.vmap(env.reset)(keys))
 observe = jax.jit(lambda env, balls: env.observe(balls))
+observe_many = jax.jit(lambda env, balls: jax.vmap(env.observe)(balls))
+mirror = jax.jit(lambda which, obs, vector: MIRRORED.mirror(which, obs, vector))
+mirror_many = jax.jit(lambda which, obs, vectors: jax.vmap(MIRRORED.mirror, (None, 0, 0))(which, obs, vectors))
+features = jax.jit(lambda obs, action: EASY.features(obs, action))
+heuristic = jax.jit(lambda obs: EASY.heuristic(obs))
 
 
 def balls(positions, pocketed=(False, False, False, False), shots=0):
     return Balls(jnp.array(positions, jnp.float32), jnp.array(pocketed), jnp.array(shots, jnp.int32))
 
 
+def repeated(state):
+    return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (BATCH, *leaf.shape)), state)
+
+
+def toward(degrees):
+    return actions.from_angle(jnp.deg2rad(jnp.array(degrees, jnp.float32)))
+
+
 SCENE = balls([(-0.2, 0.0), (0.1, -0.1), (0.3, 0.1), (0.0, 0.1)])
 CORNER = balls([(0.2, 0.0), (0.35, 0.15), (-0.3, 0.1), (-0.3, -0.1)])  # ball 1 lies between the cue ball and a corner
-INTO_CORNER = actions.from_angle(jnp.array(jnp.pi / 4))
+FOUL = balls([(0.3, 0.1), (-0.2, 0.0), (-0.3, 0.1), (-0.3, -0.1)])  # nothing lies between the cue ball and a corner
+CORNERWARDS, NOWHERE = toward(45.0), toward(90.0)  # NOWHERE: in all these scenes the cue ball stays on a line across
+PARKED = [
+    (-0.32, 0.26),
+    (-0.26, 0.26),
+    (-0.20, 0.26),
+]  # beside the easy table: 1.5 diameters apart, as far above the edge
+
+
+# --------------------------------------------------------------------------------------------------------- observation
 
 
 def test_the_observation_lists_the_cue_ball_then_targets_from_the_top_and_from_the_left():
     expected = [-0.2, 0.0, -0.5, 0.0, 0.1, -0.5, 0.3, 0.1, -0.5, 0.1, -0.1, -0.5]
     np.testing.assert_allclose(observe(EASY, SCENE), expected, atol=1e-7)
-    assert EASY.obs_size == 12
 
 
-def test_equal_positions_look_equal_whichever_ball_fell():
+def test_pocketed_balls_come_first_and_stand_in_a_row_beside_the_table():
+    seen = observe(EASY, balls([(-0.2, 0.0), (0.1, -0.1), (9.0, -9.0), (9.0, 9.0)], (False, False, True, True)))
+    expected = [(-0.2, 0.0, -0.5), (*PARKED[0], 0.5), (*PARKED[1], 0.5), (0.1, -0.1, -0.5)]
+    np.testing.assert_allclose(seen, np.ravel(expected), atol=1e-7)
+
+
+def test_equal_positions_look_equal_whichever_balls_fell():
     places = np.array([(-0.2, 0.0), (0.1, -0.1), (0.3, 0.1), (9.0, 9.0)])
     first = observe(EASY, balls(places, (False, False, False, True)))
-    second = observe(EASY, balls(places[[0, 3, 1, 2]], (False, True, False, False)))
-    np.testing.assert_array_equal(first, second)
-    assert first[5] == 0.5  # the pocketed one comes first
-    assert float(first[4]) > float(EASY.table.height) / 2  # beside the table
+    for order in ([0, 3, 1, 2], [0, 1, 3, 2], [0, 2, 3, 1]):
+        fallen = tuple(number == 3 for number in order)
+        np.testing.assert_array_equal(first, observe(EASY, balls(places[order], fallen)))
+    two = [
+        observe(EASY, balls(places[[0, *order]], (False, *(n != 1 for n in order)))) for order in ([1, 2, 3], [3, 2, 1])
+    ]
+    np.testing.assert_array_equal(*two)
 
 
-def test_a_sensor_bias_shifts_what_is_seen_and_not_what_happens():
-    biased = EASY.replace(observation_bias=jnp.array([0.0071, 0.0071]))
-    seen = np.asarray(observe(biased, SCENE) - observe(EASY, SCENE)).reshape(4, 3)
-    np.testing.assert_allclose(seen, np.tile([0.0071, 0.0071, 0.0], (4, 1)), atol=1e-7)
-    after, _ = step(EASY, KEY, SCENE, INTO_CORNER)
-    after_biased, _ = step(biased, KEY, SCENE, INTO_CORNER)
-    np.testing.assert_array_equal(after.positions, after_biased.positions)
+def test_a_sensor_bias_shifts_the_balls_on_the_table_and_not_those_beside_it():
+    biased = make_environment(BilliardsConfig("easy", observation_bias=(0.0071, 0.003)))
+    state = balls(SCENE.positions, (False, False, False, True))
+    seen = np.asarray(observe(biased, state) - observe(EASY, state)).reshape(4, 3)
+    shifted = [0.0071, 0.003, 0.0]
+    np.testing.assert_allclose(seen, [shifted, [0.0, 0.0, 0.0], shifted, shifted], atol=1e-7)
+
+
+# --------------------------------------------------------------------------------------------------------------- rules
 
 
 def test_a_ball_shot_into_a_corner_is_worth_one():
-    after, result = step(EASY, KEY, CORNER, INTO_CORNER)
+    after, result = step(EASY, KEY, CORNER, CORNERWARDS)
     assert float(result.reward) == 1.0
     assert after.pocketed.tolist() == [False, True, False, False]
-    assert float(result.metrics["scored"]) == 1.0
+    assert {name: float(value) for name, value in result.metrics.items()} == {"scored": 1, "foul": 0, "exhausted": 0}
+    assert (bool(result.terminated), bool(result.truncated), int(after.shots)) == (False, False, 1)
+
+
+def test_the_reward_counts_the_balls_of_this_shot_alone():
+    behind = balls([(-0.38, 0.15), (0.37, 0.17), (-0.37, -0.17), (0.35, 0.15)], (False, True, False, False))
+    _, result = step(EASY, KEY, balls(CORNER.positions, (False, False, True, True)), CORNERWARDS)
+    assert float(result.reward) == 1.0  # two have fallen before
+    scene = balls([(0.25, 0.05), (0.33, 0.13), (0.36, 0.16), (-0.3, -0.1)])  # two in a row before the corner
+    after, result = step(EASY, KEY, scene, CORNERWARDS)
+    assert float(result.reward) == 2.0
+    assert after.pocketed.tolist() == [False, True, True, False]
+    after, result = step(EASY, KEY, behind, NOWHERE)
+    assert float(result.reward) == 0.0
+    assert after.pocketed.tolist() == [False, True, False, False]
 
 
 def test_a_shot_that_pockets_nothing_is_worth_nothing():
-    _, result = step(EASY, KEY, CORNER, actions.from_angle(jnp.array(-1.6)))
+    after, result = step(EASY, KEY, CORNER, NOWHERE)
     assert float(result.reward) == 0.0
+    assert float(result.metrics["foul"]) == float(result.metrics["scored"]) == 0.0
+    np.testing.assert_array_equal(after.positions[1:], CORNER.positions[1:])
 
 
 def test_a_foul_puts_every_ball_back_and_the_cue_ball_somewhere_free_on_the_left():
-    scene = balls([(0.3, 0.1), (-0.2, 0.0), (-0.3, 0.1), (-0.3, -0.1)])
-    keys = jax.random.split(KEY, 200)
-    after, result = jax.vmap(lambda key: step(EASY, key, scene, INTO_CORNER))(keys)
+    after, result = step_many(EASY, jax.random.split(KEY, BATCH), repeated(FOUL), jnp.tile(CORNERWARDS, (BATCH, 1)))
     assert (result.metrics["foul"] == 1).all()
     assert (result.reward == 0).all()
-    np.testing.assert_array_equal(after.positions[:, 1:], jnp.tile(scene.positions[1:], (200, 1, 1)))
-    cue = np.asarray(after.positions[:, 0])
-    assert (cue[:, 0] <= -0.2).all()
-    assert (cue[:, 0] >= -0.4 + 0.024 - 1e-6).all()
-    assert (np.abs(cue[:, 1]) <= 0.2 - 0.024 + 1e-6).all()
-    gaps = np.linalg.norm(cue[:, None] - np.asarray(scene.positions[1:]), axis=-1)
+    assert (after.shots == 1).all()
+    np.testing.assert_array_equal(after.positions[:, 1:], jnp.tile(FOUL.positions[1:], (BATCH, 1, 1)))
+    cue, edge = np.asarray(after.positions[:, 0]), 0.02 + 0.004  # a ball's and a cushion's radius
+    assert (cue >= [-0.4 + edge - 1e-6, -0.2 + edge - 1e-6]).all()
+    assert (cue <= [-0.2, 0.2 - edge + 1e-6]).all()
+    gaps = np.linalg.norm(cue[:, None] - np.asarray(FOUL.positions[1:]), axis=-1)
     assert gaps.min() >= 2 * 0.02 - 1e-6
-    assert np.std(cue, axis=0).min() > 0.02  # not always the same place
+    assert (cue.max(0) - cue.min(0) > [0.16, 0.33]).all()  # all over the quarter of 0.176 m x 0.352 m
 
 
 def test_a_foul_takes_back_what_the_same_shot_pocketed():
     scene = balls([(0.28, 0.1), (0.355, 0.15), (-0.3, 0.1), (-0.3, -0.1)])  # both can fall into the same corner
-    directions = actions.evenly_spaced(1440)
+    directions = actions.evenly_spaced(BATCH)
     shots = jax.vmap(lambda angle: simulate(EASY.table, scene.positions, scene.pocketed, angle).pocketed)
     both = np.asarray(jax.jit(shots)(actions.to_angle(directions)))[:, :2].all(-1)
     assert both.any()
-    after, result = jax.vmap(lambda action: step(EASY, KEY, scene, action))(directions[both])
-    fouls = np.asarray(result.metrics["foul"]) == 1
-    assert fouls.all()
-    assert (np.asarray(result.reward)[fouls] == 0).all()
-    assert not np.asarray(after.pocketed)[fouls].any()
+    after, result = step_many(EASY, jax.random.split(KEY, BATCH), repeated(scene), directions)
+    assert (result.metrics["foul"][both] == 1).all()
+    assert (result.reward[both] == 0).all()
+    assert not after.pocketed[both].any()
+    np.testing.assert_array_equal(after.positions[both][:, 1:], jnp.tile(scene.positions[1:], (both.sum(), 1, 1)))
 
 
-def test_an_episode_terminates_when_cleared_and_truncates_after_its_shots():
-    cleared = balls(CORNER.positions, (False, False, True, True))
-    after, result = step(EASY, KEY, cleared, INTO_CORNER)
-    assert (bool(result.terminated), bool(result.truncated)) == (True, False)
-    late = balls(CORNER.positions, shots=9)
-    after, result = step(EASY, KEY, late, actions.from_angle(jnp.array(-1.6)))
-    assert (bool(result.terminated), bool(result.truncated)) == (False, True)
-    assert int(after.shots) == 0
-    np.testing.assert_allclose(after.positions[0], [-0.2, 0.0], atol=1e-6)  # a new rack ...
-    np.testing.assert_array_equal(result.obs, observe(EASY, after))
-    assert not np.array_equal(result.final_obs, result.obs)  # ... while the shot led elsewhere
-    assert make_environment(BilliardsConfig("one_ball")).max_shots == 1
-    assert make_environment(BilliardsConfig("regulation")).max_shots == 10
+# ------------------------------------------------------------------------------------------------------------ episodes
+
+
+def test_a_cleared_table_terminates_and_a_new_rack_follows():
+    for shots in (3, 9):  # 9: also the last shot of the episode
+        last = balls(CORNER.positions, (False, False, True, True), shots)
+        after, result = step(EASY, KEY, last, CORNERWARDS)
+        assert float(result.reward) == 1.0
+        assert (bool(result.terminated), bool(result.truncated)) == (True, False)
+        final = np.asarray(result.final_obs).reshape(4, 3)
+        np.testing.assert_allclose(final[1:], [(*place, 0.5) for place in PARKED], atol=1e-7)
+        assert not after.pocketed.any()
+        assert int(after.shots) == 0
+        np.testing.assert_allclose(after.positions, rack(EASY.table), atol=0.01)
+        np.testing.assert_array_equal(result.obs, observe(EASY, after))
+
+
+def test_an_episode_is_truncated_after_its_last_shot():
+    (states, obs), ends = reset_many(EASY, jax.random.split(KEY, BATCH)), []
+    state = jax.tree.map(lambda leaf: leaf[0], states)
+    np.testing.assert_array_equal(obs[0], observe(EASY, state))
+    for number in range(11):
+        before = state
+        state, result = step(EASY, jax.random.fold_in(KEY, number), state, NOWHERE)
+        ends.append((bool(result.terminated), bool(result.truncated)))
+        if number == 9:
+            np.testing.assert_allclose(state.positions[0], [-0.2, 0.0], atol=1e-6)  # a new rack ...
+            assert int(state.shots) == 0
+            np.testing.assert_array_equal(result.obs, observe(EASY, state))
+            left = np.asarray(result.final_obs).reshape(4, 3)  # ... while the shot led elsewhere
+            assert abs(left[0, 1]) > 0.01
+            np.testing.assert_array_equal(left[1:], observe(EASY, before).reshape(4, 3)[1:])
+        else:
+            np.testing.assert_array_equal(result.obs, result.final_obs)
+    assert ends == [(False, number == 9) for number in range(11)]
+
+
+def test_one_shot_is_an_episode_with_one_ball_and_ten_elsewhere():
+    assert [make_environment(BilliardsConfig(name)).max_shots for name in TABLES] == [1, 10, 10]
+    states, _ = reset_many(ONE, jax.random.split(KEY, BATCH))
+    after, result = step_many(ONE, jax.random.split(KEY, BATCH), states, actions.uniform(KEY, (BATCH,)))
+    np.testing.assert_array_equal(result.terminated, result.reward == 1)
+    np.testing.assert_array_equal(result.truncated, result.reward == 0)
+    assert 0 < result.reward.sum() < BATCH / 10
+    np.testing.assert_array_equal(result.obs, observe_many(ONE, after))
+    assert (after.shots == 0).all()
+
+
+# ---------------------------------------------------------------------------------------------------------------- rack
 
 
 def test_the_rack_is_a_triangle_a_quarter_from_either_end():
     spacing = 1.05 * 2 * 0.01125
-    expected = [
-        (-0.22, 0.0),
-        (0.22, 0.0),
-        (0.22 + spacing * np.sqrt(3) / 2, -spacing / 2),
-        (0.22 + spacing * np.sqrt(3) / 2, spacing / 2),
-    ]
-    np.testing.assert_allclose(np.asarray(rack(Table.regulation())), expected, atol=1e-7)
+    deep = 0.22 + spacing * np.sqrt(3) / 2
+    expected = [(-0.22, 0.0), (0.22, 0.0), (deep, -spacing / 2), (deep, spacing / 2)]
+    state, _ = Billiards(Table.regulation().replace(rack_jitter=0.0)).reset(KEY)
+    np.testing.assert_allclose(state.positions, expected, atol=1e-7)
+    state, _ = Billiards(Table.one_ball().replace(rack_jitter=0.0)).reset(KEY)
+    np.testing.assert_allclose(state.positions, [(-0.2, 0.0), (0.2, 0.0)], atol=1e-7)
 
 
-@pytest.mark.parametrize("name", ["one_ball", "easy", "regulation"])
+def smallest_gap(places):
+    apart = np.linalg.norm(places[:, :, None] - places[:, None], axis=-1)
+    return (apart + np.eye(places.shape[1])).min((1, 2))
+
+
+@pytest.mark.parametrize("name", TABLES)
 def test_racked_balls_are_displaced_a_little_and_never_overlap(name):
     env = make_environment(BilliardsConfig(name))
+    standing, jitter, diameter = np.asarray(rack(env.table)), float(env.table.rack_jitter), 2 * env.table.ball_radius
     states, _ = reset_many(env, jax.random.split(KEY, 2000))
-    moved = np.asarray(states.positions - rack(env.table))
-    assert (moved[:, 0] == 0).all()  # the cue ball stands still
-    jitter = float(env.table.rack_jitter)
-    assert 0.8 * jitter < moved[:, 1:].std() < 1.2 * jitter
     places = np.asarray(states.positions)
-    gaps = np.linalg.norm(places[:, :, None] - places[:, None], axis=-1) + np.eye(env.table.balls)
-    assert gaps.min() >= 2 * float(env.table.ball_radius)
+    assert smallest_gap(places).min() >= diameter
+    moved = places - standing
+    assert (moved[:, 0] == 0).all()  # the cue ball stands still
+    # Displacements are Gaussian but for the overlapping ones, which are drawn again: 6% narrower with three targets.
+    draws = (
+        np.random.default_rng(0).normal(0.0, jitter, (20_000, *standing.shape))
+        * (np.arange(len(standing)) > 0)[:, None]
+    )
+    expected = draws[smallest_gap(standing + draws) > diameter][:, 1:]
+    np.testing.assert_allclose(moved[:, 1:].std((0, 1)), expected.std((0, 1)), rtol=0.04)
+    np.testing.assert_allclose(moved[:, 1:].mean(0), expected.mean(0), atol=0.1 * jitter)
+
+
+# ------------------------------------------------------------------------------------------------------ changed worlds
 
 
 def test_a_turned_strike_is_the_turned_action():
-    turned = EASY.replace(action_turn=jnp.deg2rad(0.8))
-    after, _ = step(turned, KEY, SCENE, actions.from_angle(jnp.array(0.3)))
-    same, _ = step(EASY, KEY, SCENE, actions.from_angle(0.3 + jnp.deg2rad(0.8)))
-    np.testing.assert_allclose(after.positions, same.positions, atol=1e-5)
+    turned = make_environment(BilliardsConfig("easy", action_turn_deg=0.8))
+    for degrees in (17.0, -100.0, 179.8):
+        after, _ = step(turned, KEY, SCENE, toward(degrees))
+        same, _ = step(EASY, KEY, SCENE, toward(degrees + 0.8))
+        other, _ = step(EASY, KEY, SCENE, toward(degrees))
+        np.testing.assert_allclose(after.positions, same.positions, atol=1e-4)
+        assert float(jnp.abs(after.positions - other.positions).max()) > 1e-3
+
+
+def test_a_tilt_moves_resting_balls_along_it():
+    tilted = make_environment(BilliardsConfig("easy", acceleration=(0.0, 0.005)))
+    after, _ = step(tilted, KEY, SCENE, toward(-160.0))
+    moved = np.asarray(after.positions - SCENE.positions)[1:]
+    np.testing.assert_allclose(moved[:, 0], 0.0, atol=1e-6)
+    assert (moved[:, 1] > 0.02).all()
+    level, _ = step(EASY, KEY, SCENE, toward(-160.0))
+    np.testing.assert_array_equal(level.positions[1:], SCENE.positions[1:])
+
+
+def test_a_sensor_bias_leaves_the_world_as_it_is():
+    biased = make_environment(BilliardsConfig("easy", observation_bias=(0.0071, 0.0071)))
+    states, strikes = random_states()
+    plain = step_many(EASY, jax.random.split(KEY, BATCH), states, strikes)
+    seen = step_many(biased, jax.random.split(KEY, BATCH), states, strikes)
+    chex.assert_trees_all_equal(plain[0], seen[0])
+    np.testing.assert_array_equal(plain[1].reward, seen[1].reward)
+    assert (plain[1].obs != seen[1].obs).any(-1).all()
 
 
 def test_changed_worlds_compile_nothing_new():
-    before = step._cache_size()
-    tilted = EASY.replace(table=EASY.table.replace(acceleration=jnp.array([0.0, 0.005]), friction=jnp.array(0.1)))
-    compiled = []
-    for world in (tilted, tilted.replace(table=tilted.table.replace(friction=jnp.array(0.2)))):
-        after, _ = step(world, KEY, SCENE, actions.from_angle(jnp.array(-2.8)))
-        compiled.append(step._cache_size())
-    assert compiled[0] == compiled[1] <= before + 1  # a friction given as an array instead of a number compiles once
-    assert float(after.positions[2, 1]) > float(SCENE.positions[2, 1]) + 1e-3  # a resting ball rolls down
+    counted = jax.jit(chex.assert_max_traces(lambda env, state, action: env.step(KEY, state, action), n=1))
+    worlds = [
+        EASY,
+        make_environment(BilliardsConfig("easy", action_turn_deg=0.8)),
+        make_environment(BilliardsConfig("easy", observation_bias=(0.0071, 0.0))),
+        make_environment(BilliardsConfig("easy", acceleration=(0.0, 0.005))),
+        EASY.replace(table=EASY.table.replace(friction=0.0)),
+        EASY.replace(table=EASY.table.replace(speed_kept=0.5, strike_speed=0.6, ball_radius=0.021, hole_width=0.06)),
+    ]
+    seen = [tuple(np.asarray(counted(world, SCENE, toward(26.0))[1].obs).tolist()) for world in worlds]
+    assert len(set(seen)) == len(worlds)  # each changed value has its effect
+    with pytest.raises(AssertionError, match="traced"):
+        counted(ONE, balls(SCENE.positions[:2], (False, False)), CORNERWARDS)
 
 
-MIRRORED = EASY.replace(mirrors=True)
+# ------------------------------------------------------------------------------------------------------------- mirrors
 
 
-def random_states(count):
-    keys = jax.random.split(jax.random.key(5), count)
+def random_states():
+    """States of play, in three of four one target (of any number) has been taken off; half the strikes hit a ball."""
+    keys = jax.random.split(jax.random.key(5), BATCH)
     states, _ = reset_many(EASY, keys)
-    play = jax.jit(jax.vmap(lambda key, state, action: EASY.step(key, state, action)[0]))
-    for number in range(4):
-        states = play(jax.vmap(jax.random.fold_in, (0, None))(keys, number), states, actions.uniform(keys[0], (count,)))
-    return states
+    for number in range(3):
+        key = jax.random.fold_in(KEY, number)
+        states, _ = step_many(EASY, jax.random.split(key, BATCH), states, actions.uniform(key, (BATCH,)))
+    taken = (jnp.arange(BATCH)[:, None] % 4 == jnp.arange(4)) & (jnp.arange(4) > 0)
+    states = states.replace(pocketed=states.pocketed | taken)
+    closest = jax.jit(jax.vmap(EASY.heuristic))(observe_many(EASY, states))
+    strikes = jnp.where(jnp.arange(BATCH)[:, None] % 8 < 4, closest, actions.uniform(jax.random.key(6), (BATCH,)))
+    return states, strikes
 
 
 def test_mirrored_shots_have_mirrored_results():
-    states = random_states(300)
-    fallen = jnp.arange(300)[:, None] % 4 == jnp.arange(4)
-    states = states.replace(pocketed=states.pocketed | (fallen & (jnp.arange(4) > 0)))
-    strikes = actions.uniform(jax.random.key(6), (300,))
-    closest = jax.vmap(EASY.heuristic)(jax.vmap(EASY.observe)(states))
-    strikes = jnp.where(jnp.arange(300)[:, None] % 2 == 0, closest, strikes)
-    play = jax.jit(jax.vmap(lambda state, action: EASY.step(KEY, state, action)[1].reward))
-    plain = np.asarray(play(states, strikes))
-    assert plain.sum() > 10
-    for which, signs in ((1, (-1, 1)), (2, (1, -1)), (3, (-1, -1))):
-        image = play(states.replace(positions=states.positions * jnp.array(signs)), strikes * jnp.array(signs))
-        assert (np.asarray(image) != plain).sum() <= 2  # float32 decides grazing contacts either way
-        obs = jax.vmap(EASY.observe)(states)
-        seen, vector = jax.vmap(MIRRORED.mirror, (None, 0, 0))(jnp.array(which), obs, strikes)
-        mirrored_states = states.replace(positions=states.positions * jnp.array(signs))
-        np.testing.assert_allclose(seen, jax.vmap(EASY.observe)(mirrored_states), atol=1e-6)
-        np.testing.assert_allclose(vector, strikes * jnp.array(signs))
-        back, _ = jax.vmap(MIRRORED.mirror, (None, 0, 0))(jnp.array(which), seen, vector)
-        np.testing.assert_allclose(back, obs, atol=1e-6)
+    states, strikes = random_states()
+    keys = jax.random.split(KEY, BATCH)
+    obs = observe_many(EASY, states)
+    plain = np.asarray(step_many(EASY, keys, states, strikes)[1].reward)
+    assert plain[np.asarray(states.pocketed).any(1)].sum() > 20
+    for which, signs in enumerate([(1, 1), (-1, 1), (1, -1), (-1, -1)]):
+        image = states.replace(positions=states.positions * jnp.array(signs))
+        mirrored_obs, mirrored_strikes = mirror_many(jnp.array(which), obs, strikes)
+        np.testing.assert_allclose(mirrored_obs, observe_many(EASY, image), atol=1e-7)
+        np.testing.assert_array_equal(mirrored_strikes, strikes * jnp.array(signs))
+        rewards = np.asarray(step_many(EASY, keys, image, mirrored_strikes)[1].reward)
+        # The angle of the mirrored strike is rounded elsewhere in float32, which may decide a grazing contact: allow 2
+        # of 600. None differed in 48,000 shots; a wrong mirror changes dozens.
+        assert (rewards != plain).sum() <= 2
+        back, vector = mirror_many(jnp.array(which), mirrored_obs, mirrored_strikes)
+        np.testing.assert_allclose(back, obs, atol=1e-7)
+        np.testing.assert_array_equal(vector, strikes)
 
 
 def test_the_identity_comes_first_and_symmetries_are_an_option():
-    obs, vector = MIRRORED.mirror(jnp.array(0), observe(EASY, SCENE), jnp.array([0.6, 0.8]))
-    np.testing.assert_array_equal(obs, observe(EASY, SCENE))
-    np.testing.assert_allclose(vector, [0.6, 0.8])
-    assert (MIRRORED.symmetries, EASY.symmetries) == (4, 1)
+    obs = observe(EASY, balls(SCENE.positions, (False, True, False, False)))
+    same, vector = mirror(jnp.array(0), obs, jnp.array([0.6, 0.8]))
+    np.testing.assert_array_equal(same, obs)
+    np.testing.assert_array_equal(vector, np.array([0.6, 0.8], np.float32))
+    images = {tuple(np.asarray(mirror(jnp.array(n), obs, jnp.array([0.6, 0.8]))[0]).tolist()) for n in range(4)}
+    assert len(images) == MIRRORED.symmetries == 4
+    assert EASY.symmetries == 1
+
+
+# ---------------------------------------------------------------------------------------------- heuristic and features
 
 
 def test_the_heuristic_points_at_the_closest_ball_that_is_left():
-    closest = EASY.heuristic(observe(EASY, SCENE))
+    closest = heuristic(observe(EASY, SCENE))
     np.testing.assert_allclose(closest, np.array([0.2, 0.1]) / np.hypot(0.2, 0.1), atol=1e-6)
-    left = EASY.heuristic(observe(EASY, balls(SCENE.positions, (False, False, False, True))))
+    left = heuristic(observe(EASY, balls(SCENE.positions, (False, False, False, True))))
     np.testing.assert_allclose(left, np.array([0.3, -0.1]) / np.hypot(0.3, 0.1), atol=1e-6)
+    beside = balls([(-0.3, 0.17), (0.3, -0.1), (0.0, 0.0), (0.0, 0.0)], (False, False, True, True))
+    last = heuristic(observe(EASY, beside))  # the parked balls stand closer
+    np.testing.assert_allclose(last, np.array([0.6, -0.27]) / np.hypot(0.6, 0.27), atol=1e-6)
+
+
+PLAYED = balls([(0.1, 0.05), (0.1, 0.15), (0.3, 0.05), (0.0, 0.0)], (False, False, False, True))
 
 
 def test_features_give_the_balls_along_and_across_the_strike():
-    scene = balls([(0.1, 0.0), (0.1, 0.1), (0.3, 0.0), (0.0, 0.0)], (False, False, False, True))
-    seen = np.asarray(EASY.features(observe(EASY, scene), jnp.array([0.0, 1.0])))
+    seen = np.asarray(features(observe(EASY, PLAYED), jnp.array([0.0, 1.0])))
     assert seen.shape == (8 + 6 * 3,)
-    np.testing.assert_allclose(seen[:4], [0.25, 0.0, 0.0, 1.0], atol=1e-6)
+    np.testing.assert_allclose(seen[:8], [0.25, 0.125, 0.0, 1.0, 0.0, 0.125, 0.0, 0.25], atol=1e-6)
     pocketed, ahead, aside = seen[8:].reshape(3, 6)  # in the observation's order
     np.testing.assert_array_equal(pocketed, np.zeros(6))
-    np.testing.assert_allclose(ahead, [0.25, 0.0, 0.0, 0.25, 0.25, 1.0], atol=1e-6)
-    np.testing.assert_allclose(aside, [0.0, -0.5, np.arctan(-0.2 / 0.04), 0.75, 0.0, 1.0], atol=1e-6)
+    np.testing.assert_allclose(ahead, [0.25, 0.0, 0.0, 0.25, 0.375, 1.0], atol=1e-6)
+    np.testing.assert_allclose(aside, [0.0, -0.5, np.arctan(-0.2 / 0.04), 0.75, 0.125, 1.0], atol=1e-6)
 
 
-def test_a_record_holds_a_path_and_a_reward_for_each_shot():
-    paths, rewards = record(EASY, lambda key, state, obs: jax.vmap(EASY.heuristic)(obs), KEY, 3)
-    assert len(paths) == len(rewards) == 3
-    fallen = [bool(path.pocketed[-1][1:].sum() > path.pocketed[0][1:].sum()) for path in paths]
-    assert fallen == [reward > 0 for reward in rewards]
+def test_features_of_many_directions_are_those_of_each():
+    directions = actions.evenly_spaced(6).reshape(3, 2, 2)
+    obs = observe(EASY, PLAYED)
+    many = features(obs, directions)
+    assert many.shape == (3, 2, 26)
+    for place in np.ndindex(3, 2):
+        np.testing.assert_allclose(many[place], features(obs, directions[place]), atol=1e-6)
 
 
-def test_the_environment_is_a_pytree_of_its_world():
-    assert isinstance(EASY, Billiards)
-    again = jax.tree.map(lambda leaf: leaf, EASY)
-    assert again.table.balls == 4
+def test_a_mirror_reverses_what_lies_across_and_keeps_what_lies_along():
+    obs, strike = observe(EASY, PLAYED), toward(25.0)
+    targets = features(obs, strike)[8:].reshape(3, 6)
+    for which, flipped, order in ((1, [-1, 1], [0, 1, 2]), (2, [1, -1], [0, 2, 1])):  # upside down: from the top again
+        image = features(*mirror(jnp.array(which), obs, strike))[8:].reshape(3, 6)
+        signs = np.array([1, -1, -1, *flipped, 1])  # along, across, cut, place, on the table
+        np.testing.assert_allclose(image, targets[np.array(order)] * signs, atol=1e-6)
+
+
+# ----------------------------------------------------------------------------------------------- interface, recordings
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_the_environment_fulfils_the_protocol(name):
+    env: Environment = make_environment(BilliardsConfig(name))
+    action = jax.ShapeDtypeStruct((2,), jnp.float32)
+    state, obs = jax.eval_shape(env.reset, KEY)
+    after, result = jax.eval_shape(env.step, KEY, state, action)
+    assert obs.shape == result.obs.shape == result.final_obs.shape == (env.obs_size,)
+    chex.assert_trees_all_equal_shapes_and_dtypes(state, after)  # a step can be scanned
+    assert result.reward.shape == result.terminated.shape == result.truncated.shape == ()
+    assert (obs.dtype, result.reward.dtype) == (jnp.float32, jnp.float32)
+    assert (result.terminated.dtype, result.truncated.dtype) == (bool, bool)
+    assert all((value.shape, value.dtype) == ((), jnp.float32) for value in result.metrics.values())
+    assert jax.eval_shape(env.heuristic, obs).shape == (2,)
+    chex.assert_trees_all_equal_shapes_and_dtypes(
+        jax.eval_shape(env.mirror, jax.ShapeDtypeStruct((), jnp.int32), obs, action), (obs, action)
+    )
+
+
+def test_a_batch_plays_as_one_table_does():
+    states, strikes = random_states()
+    keys = jax.random.split(jax.random.key(7), BATCH)
+    after, result = step_many(EASY, keys, states, strikes)
+    for number in (0, 5, 10):
+        alone = step(EASY, keys[number], jax.tree.map(lambda leaf, n=number: leaf[n], states), strikes[number])
+        one_of_many = jax.tree.map(lambda leaf, n=number: leaf[n], (after, result))
+        chex.assert_trees_all_close(alone, one_of_many, atol=1e-5)
+
+
+def test_records_hold_the_path_of_every_shot_and_what_the_environment_paid():
+    paths, rewards = record(EASY, lambda key, state, obs: jax.vmap(EASY.heuristic)(obs), jax.random.key(2), 12)
+    assert len(paths) == len(rewards) == 12
+    assert sum(rewards) > 0
+    for number, (path, reward) in enumerate(zip(paths, rewards, strict=True)):
+        state = balls(path.positions[0], tuple(path.pocketed[0].tolist()))
+        _, result = step(EASY, KEY, state, actions.retract(jnp.asarray(path.velocities[0, 0])))
+        assert float(result.reward) == reward
+        fallen = path.pocketed[-1] & ~path.pocketed[0]
+        assert reward == (0 if fallen[0] else fallen.sum())
+        if number > 0 and not paths[number - 1].pocketed[-1][0] and path.pocketed[0].any():
+            np.testing.assert_allclose(path.positions[0], paths[number - 1].positions[-1], atol=1e-6)
+
+
+def test_a_recorded_policy_sees_the_state_and_its_strikes_are_turned():
+    turned = make_environment(BilliardsConfig("one_ball", action_turn_deg=30.0))
+    teacher = SearchTeacher(turned, jnp.deg2rad(0.5), jnp.array(0.2), 720)
+    paths, rewards = record(turned, lambda key, states, obs: jax.vmap(teacher.best_action)(states, obs), KEY, 3)
+    assert rewards == [1.0, 1.0, 1.0]
+    assert all(path.pocketed[-1].tolist() == [False, True] for path in paths)
