@@ -124,5 +124,5 @@ def test_the_shipped_teacher_tells_how_it_was_made():
 @pytest.mark.parametrize("table", ["one_ball", "regulation"])
 def test_a_table_without_a_shipped_teacher_says_what_to_do(table):
     config = BilliardsConfig(table, teacher="learned")
-    with pytest.raises(UserError, match="cuelearner teacher train.*search teacher"):
+    with pytest.raises(UserError, match=r"cuelearner teacher train.*search teacher"):
         billiards_teacher(config, make_environment(config))

@@ -20,11 +20,11 @@ class BilliardsConfig:
     table: Literal["one_ball", "easy", "regulation"] = "regulation"
     """one_ball: one large target, one shot. easy: three large targets. regulation: the paper's table."""
     mirrors: bool = False
-    """Multiply labels and transitions by the table's mirror symmetries (for every form of guidance alike)."""
+    """Multiply labels and transitions by the mirror images of an unchanged table, whatever the guidance."""
     action_turn_deg: float = 0.0
     """Changed world: every strike is turned by this, counterclockwise [deg] (paper: 0.8)."""
     observation_bias: tuple[float, float] = (0.0, 0.0)
-    """Changed world: added to every observed position, x and y [m] (paper: 0.0071 0.0071)."""
+    """Changed world: added to the observed positions of balls on the table, x and y [m] (paper: 0.0071 0.0071)."""
     acceleration: tuple[float, float] = (0.0, 0.0)
     """Changed world: constant acceleration of the balls on a tilted table, x and y [m/s^2] (paper: 0 0.005)."""
     teacher: Literal["learned", "search"] = "search"

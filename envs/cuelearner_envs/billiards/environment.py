@@ -33,7 +33,7 @@ class Billiards(struct.PyTreeNode):
 
     table: Table
     action_turn: Float[Array, ""] | float = 0.0  # embodiment shift: every strike is turned by this [rad]
-    observation_bias: Float[Array, "2"] | tuple[float, float] = (0.0, 0.0)  # sensor shift: added to positions seen [m]
+    observation_bias: Float[Array, "2"] | tuple[float, float] = (0.0, 0.0)  # sensor shift of balls on the table [m]
     max_shots: int = struct.field(pytree_node=False, default=10)  # an episode is truncated after this many
     mirrors: bool = struct.field(pytree_node=False, default=False)  # offer the table's symmetries as data?
 
@@ -90,7 +90,7 @@ class Billiards(struct.PyTreeNode):
         """x [m], y [m] and a flag for the cue ball, then for the targets from the highest y down, then by x.
 
         Pocketed targets come first: they stand beside the table, in the order of their row and not of their number, so
-        that equal positions look equal.
+        that equal positions look equal. No sensor looks there: their places have no bias.
         """
         seen = balls.positions + jnp.asarray(self.observation_bias)
         entries = jnp.concatenate([seen, jnp.where(balls.pocketed, FLAG, -FLAG)[:, None]], axis=-1)
@@ -114,9 +114,10 @@ class Billiards(struct.PyTreeNode):
     def mirror(
         self, which: Int[Array, ""], obs: Float[Array, " obs"], vector: Float[Array, "2"]
     ) -> tuple[Float[Array, " obs"], Float[Array, "2"]]:
-        """0: as it is; 1: x reversed; 2: y reversed; 3: both. Exact for the shot's result on a level table.
+        """0: as it is; 1: x reversed; 2: y reversed; 3: both. Exact for the shot's result in the unchanged world.
 
-        What follows an episode's end or a foul (rack, left quarter) is not symmetric in x: use it at discount 0.
+        A turned strike, a sensor's bias and a tilt are not mirrored with the table. What follows an episode's end or a
+        foul (rack, left quarter) is not symmetric in x: use it at discount 0.
         """
         signs = jnp.stack([1.0 - 2.0 * (which % 2), 1.0 - 2.0 * (which // 2)])
         balls = obs.reshape(-1, 3)
