@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from cuelearner_jax.types import Step
+from cuelearner_jax.types import Step, WholeObservations
 
 GRAVITY, CART, POLE, HALF_LENGTH, FORCE, SECONDS = 9.8, 1.0, 0.1, 0.5, 10.0, 0.02
 
@@ -22,7 +22,7 @@ class CartState(struct.PyTreeNode):
     steps: jax.Array
 
 
-class CartPole(struct.PyTreeNode):
+class CartPole(WholeObservations, struct.PyTreeNode):
     """The force points along x with the sign of the direction's first entry."""
 
     force: float = FORCE
@@ -48,7 +48,7 @@ class CartPole(struct.PyTreeNode):
         fresh, _ = self.reset(key)
         after = CartState(final, state.steps + 1)
         after = jax.tree.map(lambda new, old: jnp.where(terminated | truncated, new, old), fresh, after)
-        return after, Step(after.obs, final, jnp.ones(()), terminated, truncated, {})
+        return after, Step(after.obs, final, final, jnp.ones(()), terminated, truncated, {}, {})
 
     def heuristic(self, obs: jax.Array) -> jax.Array:
         """Toward the side to which the pole falls."""

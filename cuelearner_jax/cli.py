@@ -372,12 +372,12 @@ def _render(arguments: list[str]) -> None:
     taken = [str(file) for file in (film, still) if file.exists()]
     if taken and not asked.overwrite:
         raise UserError(f"{taken[0]} exists: give --overwrite to replace it, or another --out")
-    env = subject.task.environment(asked.task)
+    env = subject.task.environment(asked.task, "validation")
     policy = play.one_policy(subject, env, asked.task, asked.policy, asked.guidance, asked.labels, asked.seed)
     key = jax.random.fold_in(episodes(), asked.episode)
     frames, rewards = subject.task.record(env, policy, key, asked.steps)
     asked.out.mkdir(parents=True, exist_ok=True)
-    subject.task.still(env, frames[0], still)
+    subject.task.still(env, frames, still)
     subject.task.animate(env, frames, film)
     out.print(f"rewards {' '.join(f'{reward:g}' for reward in rewards)}; wrote {film} and {still}")
 

@@ -34,6 +34,8 @@ class Sizes:
     """Directions over which the agent takes its argmax (3600: every 0.1 deg)."""
     target_directions: int = 720
     """Directions of the argmax inside bootstrapped targets (unused at discount 0)."""
+    target_dtype: Literal["float32", "bfloat16"] = "float32"
+    """Arithmetic of that argmax (bfloat16 is twice as fast on an accelerator); values are float32 either way."""
     num_envs: int = 1
     """Environments of one seed that step together before as many gradient steps follow."""
     batch_size: int = 100
@@ -42,6 +44,8 @@ class Sizes:
     """Transitions kept (a multiple of num_envs)."""
     optimizer: Literal["sgd", "adam"] = "sgd"
     """Optimiser of the action-value network."""
+    n_step: int = 1
+    """Steps of the n-step return that is averaged with the one-step return (1: the one-step return alone)."""
     updates_per_step: int = 1
     """Gradient steps for each environment step."""
     labels_per_round: int = 10
@@ -64,6 +68,8 @@ class Scalars:
     """Step size of the action-value network."""
     discount: float = 0.0
     """Discount factor; at 0 no target network exists."""
+    n_step_weight: float = 0.5
+    """Share of the n-step return in a target; the rest is the one-step return."""
     max_grad_norm: float = 0.5
     """Gradients are clipped to this global norm."""
     polyak: float = 0.005
@@ -147,6 +153,8 @@ def check(config: RunConfig) -> None:
     for name in ("total_steps", "eval_every", "eval_steps", "eval_envs", "checkpoint_every", "target_every"):
         if getattr(schedule, name) < 1:
             raise UserError(f"schedule.{name} is {getattr(schedule, name)}: give a positive number")
+    if sizes.n_step > 1 and not config.bootstraps:
+        raise UserError(f"sizes.n_step is {sizes.n_step}: n-step returns need a scalars.discount above 0")
     _check_multiple(schedule.eval_every, sizes.num_envs, "schedule.eval_every", "sizes.num_envs")
     _check_multiple(sizes.replay_capacity, sizes.num_envs, "sizes.replay_capacity", "sizes.num_envs")
     _check_multiple(schedule.total_steps, schedule.eval_every, "schedule.total_steps", "schedule.eval_every")
@@ -157,7 +165,7 @@ def check(config: RunConfig) -> None:
 
 def _check_sizes(sizes: Sizes) -> None:
     positive = ("directions", "target_directions", "num_envs", "batch_size", "replay_capacity", "updates_per_step")
-    positive += ("labels_per_round", "fit_steps", "fit_batch_size", "validate_every")
+    positive += ("n_step", "labels_per_round", "fit_steps", "fit_batch_size", "validate_every")
     for name in positive:
         if getattr(sizes, name) < 1:
             raise UserError(f"sizes.{name} is {getattr(sizes, name)}: give a positive number")
@@ -171,7 +179,7 @@ def _check_sizes(sizes: Sizes) -> None:
 
 def _check_scalars(scalars: Scalars) -> None:
     for name, value in dataclasses.asdict(scalars).items():
-        if name.endswith(("probability", "fraction", "polyak")) and not 0 <= value <= 1:
+        if name.endswith(("probability", "fraction", "polyak", "weight")) and not 0 <= value <= 1:
             raise UserError(f"scalars.{name} is {value}: give a number from 0 to 1")
         if not math.isfinite(value):
             raise UserError(f"scalars.{name} is {value}: give a finite number")

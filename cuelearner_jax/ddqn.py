@@ -10,7 +10,7 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 import optax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from cuelearner_jax.types import Params, Transition
 
@@ -32,16 +32,45 @@ def target(
     transition: Transition,
     directions: Float[Array, "n 2"],
     discount: Float[Array, ""] | float,
+    chooser: ValueFunction | None = None,
 ) -> Float[Array, ""]:
     """r + discount * Q'(s', argmax_a Q(s', a)): the online network chooses, the target network values.
 
-    `target_params` None means that nothing bootstraps (a discount of 0): the target is the reward.
+    `target_params` None means that nothing bootstraps (a discount of 0): the target is the reward. `chooser` computes the
+    values among which is chosen, where that is done less precisely than by `q`.
     """
     if target_params is None:
         return transition.reward
-    choice = greedy(q, params, transition.next_obs, directions)
+    choice = greedy(chooser or q, params, transition.next_obs, directions)
     value = q(target_params, transition.next_obs, choice)[0]
     return transition.reward + discount * transition.discount * value
+
+
+def n_step_return(
+    rewards: Float[Array, " n"],
+    discounts: Float[Array, " n"],
+    ended: Float[Array, " n"],
+    known: Bool[Array, " n"],
+    discount: Float[Array, ""] | float,
+) -> tuple[Float[Array, ""], Float[Array, ""], Int[Array, ""]]:
+    """Discounted rewards of up to n steps of one episode (Sutton and Barto, "Reinforcement learning", Eq. 7.1).
+
+    The sum stops with the episode's last step, or with the last step that is known.
+
+    Args:
+        rewards, discounts, ended: of consecutive steps; `discounts` is 0 at termination, else 1.
+        known: which of them have been made already; the first is.
+        discount: discount factor.
+
+    Returns:
+        The sum; the factor of the value of the last step's next observation, short of one `discount`, as
+        `Transition.discount` has it; the last step's index.
+    """
+    before_end = jnp.cumprod(jnp.concatenate([jnp.ones(1), 1.0 - ended[:-1]]))
+    counts = before_end * known
+    powers = jnp.power(jnp.asarray(discount, rewards.dtype), jnp.arange(rewards.shape[0]))
+    last = counts.sum().astype(jnp.int32) - 1
+    return jnp.sum(counts * powers * rewards), powers[last] * discounts[last], last
 
 
 def loss(

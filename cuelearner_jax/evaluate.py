@@ -35,22 +35,35 @@ def rollout(
 ) -> dict[str, Float[Array, ""]]:
     """Means over `steps` environment steps, shared by `num_envs` environments that reset by themselves.
 
+    Outcomes are those of each environment's first episode: the same episodes whatever the policy, and as many long ones
+    as there are. Give steps enough for the longest; "finished" is the share of first episodes that did end.
+
     Returns:
-        "reward" a step, and every metric of the environment's.
+        "reward" a step, every metric of the environment's, and, where it has outcomes, these and "finished".
     """
     k_reset, k_run = jax.random.split(key)
     state, obs = jax.vmap(env.reset)(jax.random.split(k_reset, num_envs))
 
-    def one_step(carry: tuple, index: jax.Array) -> tuple[tuple, dict[str, jax.Array]]:
-        state, obs = carry
+    def one_step(carry: tuple, index: jax.Array) -> tuple[tuple, tuple[dict, dict]]:
+        state, obs, first = carry
         k_act, k_env = jax.random.split(jax.random.fold_in(k_run, index))
         action = policy(k_act, state, obs)
         state, step = jax.vmap(env.step)(jax.random.split(k_env, num_envs), state, action)
-        means = {name: value.mean() for name, value in step.metrics.items()}
-        return (state, step.obs), {"reward": step.reward.mean(), **means}
+        done = step.terminated | step.truncated
+        means = {"reward": step.reward.mean(), **{name: value.mean() for name, value in step.metrics.items()}}
+        ends = {name: jnp.sum(value, where=first & done) for name, value in step.outcome.items()}
+        if ends:
+            ends["finished"] = jnp.sum(first & done)
+        return (state, step.obs, first & ~done), (means, ends)
 
-    _, metrics = jax.lax.scan(one_step, (state, obs), jnp.arange(steps // num_envs))
-    return jax.tree.map(jnp.mean, metrics)
+    start = (state, obs, jnp.ones(num_envs, bool))
+    _, (means, ends) = jax.lax.scan(one_step, start, jnp.arange(steps // num_envs))
+    metrics = {name: value.mean() for name, value in means.items()}
+    if ends:
+        finished = ends.pop("finished").sum()
+        metrics |= {name: value.sum() / jnp.maximum(finished, 1) for name, value in ends.items()}
+        metrics["finished"] = finished / num_envs
+    return metrics
 
 
 def agent_policy(sizes: Sizes, params: Params) -> Policy:

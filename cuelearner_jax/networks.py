@@ -7,9 +7,29 @@ from collections.abc import Callable, Sequence
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
 from cuelearner_jax.types import Params
+
+
+class Joined(nn.Module):
+    """A dense layer on the concatenation of observation and action, which is never built.
+
+    Of many actions in one state, the observation's share is computed once.
+    """
+
+    width: int
+    dtype: DTypeLike = jnp.float32
+
+    @nn.compact
+    def __call__(self, obs: Float[Array, "... obs"], action: Float[Array, "... 2"]) -> Float[Array, "... width"]:
+        """Leading axes of `obs` and `action` must broadcast."""
+        shape = (obs.shape[-1] + action.shape[-1], self.width)
+        kernel = self.param("kernel", nn.initializers.xavier_uniform(), shape)
+        bias = self.param("bias", nn.initializers.zeros, (self.width,))
+        obs, action, kernel, bias = (jnp.asarray(x, self.dtype) for x in (obs, action, kernel, bias))
+        return (obs @ kernel[: obs.shape[-1]] + bias) + action @ kernel[obs.shape[-1] :]
 
 
 class MLP(nn.Module):
@@ -17,23 +37,23 @@ class MLP(nn.Module):
 
     layers: Sequence[int]
     outputs: int
+    dtype: DTypeLike = jnp.float32  # of the hidden layers' arithmetic; parameters and outputs are float32
 
     @nn.compact
     def __call__(self, obs: Float[Array, "... obs"], action: Float[Array, "... 2"]) -> Float[Array, "... outputs"]:
         """Leading axes of `obs` and `action` must broadcast."""
-        leading = jnp.broadcast_shapes(obs.shape[:-1], action.shape[:-1])
-        x = jnp.concatenate(
-            [jnp.broadcast_to(obs, (*leading, obs.shape[-1])), jnp.broadcast_to(action, (*leading, action.shape[-1]))],
-            axis=-1,
-        )
-        for width in self.layers:
-            x = nn.relu(nn.Dense(width, kernel_init=nn.initializers.xavier_uniform())(x))
-        return nn.Dense(self.outputs, kernel_init=nn.initializers.xavier_uniform())(x)
+        x = nn.relu(Joined(self.layers[0], self.dtype, name="Dense_0")(obs, action))
+        for place, width in enumerate(self.layers[1:], start=1):
+            x = nn.relu(self._dense(width, place, self.dtype)(x))
+        return self._dense(self.outputs, len(self.layers), jnp.float32)(x)
+
+    def _dense(self, width: int, place: int, dtype: DTypeLike) -> nn.Dense:
+        return nn.Dense(width, dtype=dtype, kernel_init=nn.initializers.xavier_uniform(), name=f"Dense_{place}")
 
 
-def q_network(layers: Sequence[int]) -> MLP:
+def q_network(layers: Sequence[int], dtype: DTypeLike = jnp.float32) -> MLP:
     """Q(s, a): one output."""
-    return MLP(tuple(layers), 1)
+    return MLP(tuple(layers), 1, dtype)
 
 
 def feedback_network(layers: Sequence[int]) -> MLP:

@@ -26,8 +26,8 @@ from cuelearner_jax.evaluate import (
 )
 from cuelearner_jax.lanes import Group, restore_policies
 from cuelearner_jax.runs import Grid
-from cuelearner_jax.tasks import Task
-from cuelearner_jax.types import Environment, Guidance
+from cuelearner_jax.tasks import Task, shape_of
+from cuelearner_jax.types import Environment, Guidance, Teacher
 
 TRAINED = ("agent", "guide", "guided")  # the agent; guidance of uniform actions; guidance of the agent's actions
 UNTRAINED = ("teacher", "heuristic", "uniform")
@@ -49,7 +49,7 @@ class Subject:
             raise UserError(f"unknown policy {policy!r}{closest(policy, TRAINED + UNTRAINED)}")
         if policy not in known:
             raise UserError(f"policy {policy!r} needs a trained run: give a run folder, or one of {', '.join(known)}")
-        before, after = (self.task.environment(c).obs_size for c in (self.config.task, changed))
+        before, after = (shape_of(self.task, world).obs_size for world in (self.config.task, changed))
         if before != after:
             raise UserError(f"the run's observations have {before} entries, this world's {after}: keep its structure")
 
@@ -68,7 +68,7 @@ class Trained:
 def load_lanes(subject: Subject, kinds: tuple[str, ...]) -> list[Trained]:
     """The lanes of a run's kinds of guidance (none named: all). Raises UserError for a kind the run does not have."""
     assert subject.grid is not None  # Subject.check has seen to it
-    env = subject.task.environment(subject.config.task)
+    env = shape_of(subject.task, subject.config.task)
     loaded = []
     for kind in kinds or subject.grid.guidance:
         if kind not in subject.grid.guidance:
@@ -91,10 +91,10 @@ def trained_policy(name: str, lanes: Trained, lane: Any, config: RunConfig, env:
     return guided_policy(base, lanes.guidance, lane["guidance"], env, config.scalars)
 
 
-def untrained_policy(name: str, task: Task, world: Any, env: Environment) -> Policy:
+def untrained_policy(name: str, env: Environment, teacher: Teacher | None) -> Policy:
     """A policy that needs no run: the task's teacher or heuristic, or chance."""
-    if name == "teacher":
-        return teacher_policy(task.teacher(world, env))
+    if teacher is not None:
+        return teacher_policy(teacher)
     return heuristic_policy(env) if name == "heuristic" else uniform_policy()
 
 
@@ -112,11 +112,13 @@ def evaluate(
     subject: Subject, world: Any, name: str, kinds: tuple[str, ...], num_envs: int, steps: int
 ) -> list[Measured]:
     """Metrics of a policy on validation episodes of a world (a task configuration), for each guidance and budget."""
-    env = subject.task.environment(world)
+    env = subject.task.environment(world, "validation")
     key = episodes()
     if name in UNTRAINED:
-        policy = untrained_policy(name, subject.task, world, env)
-        found = jax.jit(lambda env: rollout(policy, env, key, num_envs, steps))(env)
+        teacher = subject.task.teacher(world, env) if name == "teacher" else None
+        # As arguments: what is closed over becomes a constant of the program.
+        measure = jax.jit(lambda env, teacher: rollout(untrained_policy(name, env, teacher), env, key, num_envs, steps))
+        found = measure(env, teacher)
         metrics = {metric: np.asarray(value)[None] for metric, value in found.items()}
         return [Measured("-", 0, 0, np.zeros(1, int), metrics)]
     rows = []
@@ -142,7 +144,7 @@ def one_policy(
 ) -> Policy:
     """A single policy: of one lane of a run, or of the task. Raises UserError if the run has no such lane."""
     if name in UNTRAINED:
-        return untrained_policy(name, subject.task, world, env)
+        return untrained_policy(name, env, subject.task.teacher(world, env) if name == "teacher" else None)
     assert subject.grid is not None  # Subject.check has seen to it
     lanes = load_lanes(subject, (kind or subject.grid.guidance[-1],))[0]
     budget = int(lanes.budgets.max()) if labels is None else labels

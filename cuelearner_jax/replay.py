@@ -1,4 +1,4 @@
-"""One ring buffer: transitions as packed float32 rows, so that sampling is a single gather.
+"""One ring buffer: steps as packed float32 rows, so that sampling is a single gather.
 
 The write position follows from the shared step counter and is therefore no part of the (vmapped) state: under vmap the
 write stays one in-place slice update.
@@ -13,18 +13,29 @@ import jax
 import jax.custom_batching
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from cuelearner_jax.types import Transition
+from cuelearner_jax.types import Memory
+
+
+class Following(NamedTuple):
+    """A stored step and those that came after it in the same environment, some of them perhaps of a later episode."""
+
+    rewards: Float[Array, "batch n"]
+    discounts: Float[Array, "batch n"]
+    ended: Float[Array, "batch n"]
+    known: Bool[Array, "batch n"]  # False past the newest step
 
 
 class RingBuffer(NamedTuple):
-    """Pure functions over rows (capacity, width)."""
+    """Pure functions over rows (capacity, width). `step`: rows written so far, also those written over since."""
 
     width: int
     empty: Callable[[int], Float[Array, "capacity width"]]
-    add: Callable[..., Float[Array, "capacity width"]]  # (rows, step, transitions (n, ...)) -> rows
-    sample: Callable[..., Transition]  # (key, rows, step, batch_size) -> transitions (batch_size, ...)
+    add: Callable[..., Float[Array, "capacity width"]]  # (rows, step, steps (n, ...)) -> rows
+    draw: Callable[..., Int[Array, " batch"]]  # (key, rows, step, batch_size) -> rows' numbers
+    read: Callable[..., Memory]  # (rows, numbers (batch,)) -> steps (batch, ...)
+    follow: Callable[..., Following]  # (rows, step, numbers (batch,), n, num_envs) -> Following
 
 
 @jax.custom_batching.custom_vmap
@@ -44,30 +55,44 @@ def _write_lanes(axis_size: int, batched: list[bool], rows: Array, packed: Array
     return _write(rows, packed, start), True
 
 
-def ring_buffer(example: Transition) -> RingBuffer:
-    """Builds the buffer for transitions shaped like `example`.
+def ring_buffer(example: Memory) -> RingBuffer:
+    """Builds the buffer for steps shaped like `example`.
 
-    `add` requires the capacity to be a multiple of the number of transitions added at once.
+    `add` requires the capacity to be a multiple of the number of steps added at once: one of each environment. So the
+    next step of an environment lies that many rows further.
     """
     row, unravel = ravel_pytree(example)
     width = row.shape[0]
+    reward_column = example.obs.size + example.action.size  # the fields lie in the order of their declaration
 
     def empty(capacity: int) -> Float[Array, "capacity width"]:
         return jnp.zeros((capacity, width), jnp.float32)
 
     def add(
-        rows: Float[Array, "capacity width"], step: Int[Array, ""], transitions: Transition
+        rows: Float[Array, "capacity width"], step: Int[Array, ""], steps: Memory
     ) -> Float[Array, "capacity width"]:
-        packed = jax.vmap(lambda item: ravel_pytree(item)[0])(transitions)
+        packed = jax.vmap(lambda item: ravel_pytree(item)[0])(steps)
         if rows.shape[0] % packed.shape[0]:
-            raise ValueError(f"capacity {rows.shape[0]} is no multiple of the {packed.shape[0]} transitions added")
+            raise ValueError(f"capacity {rows.shape[0]} is no multiple of the {packed.shape[0]} steps added")
         return _write(rows, packed.astype(rows.dtype), jnp.mod(step, rows.shape[0]))
 
-    def sample(
+    def draw(
         key: PRNGKeyArray, rows: Float[Array, "capacity width"], step: Int[Array, ""], batch_size: int
-    ) -> Transition:
-        filled = jnp.clip(step, 1, rows.shape[0])
-        index = jax.random.randint(key, (batch_size,), 0, filled)
-        return jax.vmap(unravel)(rows[index])
+    ) -> Int[Array, " batch"]:
+        return jax.random.randint(key, (batch_size,), 0, jnp.clip(step, 1, rows.shape[0]))
 
-    return RingBuffer(width, empty, add, sample)
+    def read(rows: Float[Array, "capacity width"], numbers: Int[Array, " batch"]) -> Memory:
+        return jax.vmap(unravel)(rows[numbers])
+
+    def follow(
+        rows: Float[Array, "capacity width"], step: Int[Array, ""], numbers: Int[Array, " batch"], n: int, num_envs: int
+    ) -> Following:
+        capacity = rows.shape[0]
+        further = jnp.arange(n) * num_envs
+        newer = jnp.mod(step - 1 - numbers, capacity)  # rows written after each
+        places = jnp.mod(numbers[:, None] + further, capacity)
+        # Three neighbouring numbers of each row, not the row.
+        found = rows[places[..., None], reward_column + jnp.arange(3)]
+        return Following(*jnp.moveaxis(found, -1, 0), known=further <= newer[:, None])
+
+    return RingBuffer(width, empty, add, draw, read, follow)

@@ -27,9 +27,9 @@ from cuelearner_jax.evaluate import episodes, evaluate_agents, evaluate_guides
 from cuelearner_jax.labelling import files as label_files
 from cuelearner_jax.lanes import Group, items, memory_report
 from cuelearner_jax.runs import Grid, check_folder, check_grid, describe, prepare_folder
-from cuelearner_jax.tasks import Task
+from cuelearner_jax.tasks import Task, shape_of
 from cuelearner_jax.train import label_slots, start_clock
-from cuelearner_jax.types import Teacher
+from cuelearner_jax.types import Environment, Teacher
 
 ROUNDS_A_CHUNK = 10  # label rounds between two checkpoints
 
@@ -59,24 +59,26 @@ def run(
     """
     configuration.check(config)
     check_grid(grid)
-    env = task.environment(config.task)
+    obs_size = shape_of(task, config.task).obs_size
     labels = read_labels(labels_from, task, config, grid) if labels_from else None
-    kinds = [guidances.make(kind, config.sizes, env.obs_size) for kind in grid.guidance]
+    kinds = [guidances.make(kind, config.sizes, obs_size) for kind in grid.guidance]
     described = describe(task, config, grid, split, labels_from)
     check_folder(out, described, resume, overwrite)
+    env = task.environment(config.task)
     for kind in kinds:
         console.print(memory_report(Group(config, env, kind, grid)))
     teacher = task.teacher(config.task, env) if any(kind.asks for kind in kinds) and labels is None else None
+    examined = task.environment(config.task, split)
     prepare_folder(out, described, overwrite and not resume)
     with interruptible() as stopping, progress_bars() as bars:
         for kind in kinds:
-            _Runner(Group(config, env, kind, grid), task, out, stopping, bars).run(teacher, labels)
+            _Runner(Group(config, env, kind, grid), examined, task, out, stopping, bars).run(teacher, labels)
 
 
 def read_labels(path: Path, task: Task, config: RunConfig, grid: Grid) -> label_files.LabelFile:
     """A label file that fits the task and the grid. Raises UserError if it does not."""
     file = label_files.read(path)
-    env = task.environment(config.task)
+    env = shape_of(task, config.task)
     if file.task.get("name") != task.name or file.labels.obs.shape[1] != env.obs_size:
         raise UserError(
             f"{path} holds labels of {file.task.get('name')} with {file.labels.obs.shape[1]} observations, "
@@ -131,8 +133,11 @@ def progress_bars() -> Iterator[Progress]:
 class _Runner:
     """Runs one group: labels, then training, with evaluation, rows and checkpoints between jitted stretches."""
 
-    def __init__(self, group: Group, task: Task, out: Path, stopping: threading.Event, bars: Progress) -> None:
+    def __init__(
+        self, group: Group, examined: Environment, task: Task, out: Path, stopping: threading.Event, bars: Progress
+    ) -> None:
         self.group, self.task, self.stopping, self.bars = group, task, stopping, bars
+        self.examined = examined  # the environment of evaluations
         self.out = out
         self.folder = out / group.guidance.name
         self.split = json.loads((out / "config.json").read_text())["split"]
@@ -265,7 +270,7 @@ class _Runner:
         group, schedule = self.group, self.group.config.schedule
         measured = group.each(
             lambda block: evaluate_agents(
-                group.env,
+                self.examined,
                 block.params,
                 episodes(self.split),
                 sizes=group.config.sizes,
@@ -278,11 +283,11 @@ class _Runner:
         return {**own, **group.lanes(measured), **extra}
 
     def _guide_alone(self) -> dict[str, np.ndarray]:
-        """Reward of uniform actions under guidance; for unguided lanes that is chance."""
+        """Metrics of uniform actions under guidance; for unguided lanes that is chance."""
         group, schedule = self.group, self.group.config.schedule
         measured = group.each(
             lambda block: evaluate_guides(
-                group.env,
+                self.examined,
                 block.guidance,
                 episodes(self.split),
                 group.config.scalars,
@@ -292,4 +297,4 @@ class _Runner:
             ),
             self.blocks,
         )
-        return {"guide_reward": group.lanes(measured)["reward"]}
+        return {f"guide_{name}": values for name, values in group.lanes(measured).items()}

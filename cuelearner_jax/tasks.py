@@ -6,11 +6,13 @@ knows it.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 
 from cuelearner_envs import billiards
@@ -18,6 +20,11 @@ from cuelearner_envs.billiards import drawing
 from cuelearner_envs.billiards.config import BilliardsConfig, make_environment
 from cuelearner_envs.billiards.recording import record
 from cuelearner_envs.billiards.teacher import SearchTeacher
+from cuelearner_envs.navigation import drawing as navigation_drawing
+from cuelearner_envs.navigation.config import NavigationConfig
+from cuelearner_envs.navigation.config import make_environment as make_navigation
+from cuelearner_envs.navigation.recording import record as navigation_record
+from cuelearner_envs.navigation.roadmap import make_teacher
 from cuelearner_jax import teacher as learned
 from cuelearner_jax.config import RunConfig, Scalars, Schedule, Sizes
 from cuelearner_jax.types import Environment, Teacher
@@ -41,14 +48,19 @@ class Task:
 
     name: str
     config: type  # its configuration dataclass
-    environment: Callable[[Any], Environment]
+    environment: Callable[..., Environment]  # (configuration, split="training"); for the splits see `evaluate.SPLITS`
     teacher: Callable[[Any, Environment], Teacher]
     presets: dict[str, Preset]
     record: Callable[
         ..., tuple[list[Any], list[float]]
     ]  # (env, policy, key, steps) -> frames for the two below, rewards
-    still: Callable[[Any, Any, Path], None]  # (env, one frame of a record, file)
+    still: Callable[[Any, list[Any], Path], None]  # (env, the frames of a record, file)
     animate: Callable[[Any, list[Any], Path], None]  # (env, the frames, file)
+
+
+def shape_of(task: Task, config: Any) -> Any:
+    """The environment of a configuration with shapes in place of arrays: costs next to nothing."""
+    return jax.eval_shape(lambda: task.environment(config))
 
 
 def billiards_teacher(config: BilliardsConfig, env: Any) -> Teacher:
@@ -65,10 +77,10 @@ SHIPPED_TEACHERS = Path(billiards.__file__).parent / "teachers"
 BILLIARDS = Task(
     name="billiards",
     config=BilliardsConfig,
-    environment=make_environment,
+    environment=lambda config, split="training": make_environment(config),  # racks alone differ, and they by the key
     teacher=billiards_teacher,
     record=record,
-    still=lambda env, path, file: drawing.still(env.table, path, file),
+    still=lambda env, paths, file: drawing.still(env.table, paths[0], file),
     animate=lambda env, paths, file: drawing.animate(env.table, paths, file),
     presets={
         "paper": Preset(
@@ -118,4 +130,77 @@ BILLIARDS = Task(
     },
 )
 
-TASKS = {task.name: task for task in (BILLIARDS,)}
+NAVIGATION_SIZES = Sizes(
+    directions=360,
+    target_directions=18,
+    n_step=30,
+    num_envs=10,
+    replay_capacity=100_000,
+)
+
+# The paper's step size, discount and eps. Its bound on the gradient's norm for billiards (0.5) and target network (0.005)
+# also reach these success rates, many times slower; see docs/results.md.
+NAVIGATION_SCALARS = Scalars(learning_rate=0.001, discount=0.995, eps_deg=20.0, max_grad_norm=10.0, polyak=0.05)
+
+NAVIGATION = Task(
+    name="navigation",
+    config=NavigationConfig,
+    environment=make_navigation,
+    teacher=lambda config, env: make_teacher(env),
+    record=navigation_record,
+    still=lambda env, frames, file: navigation_drawing.still(env.robot, frames, file),
+    animate=lambda env, frames, file: navigation_drawing.animate(env.robot, frames, file),
+    presets={
+        "paper": Preset(
+            "the paper's figure: cluttered halls, its networks, 1 million steps a seed",
+            RunConfig(
+                NavigationConfig(),
+                NAVIGATION_SIZES,
+                NAVIGATION_SCALARS,
+                Schedule(
+                    total_steps=1_000_000,
+                    random_steps=1_000,
+                    learn_after=1_000,
+                    guidance_until=500_000,
+                    eval_every=50_000,
+                    eval_steps=50_000,
+                    eval_envs=250,
+                    checkpoint_every=100_000,
+                ),
+            ),
+            labels=(100, 350, 500),
+            seeds=16,
+        ),
+        "quickstart": Preset(
+            "few worlds, small networks: minutes on two CPU cores",
+            RunConfig(
+                NavigationConfig(worlds=128),
+                dataclasses.replace(
+                    NAVIGATION_SIZES,
+                    q_layers=(128, 128, 128),
+                    feedback_layers=(128, 128),
+                    directions=72,
+                    replay_capacity=50_000,
+                    fit_steps=400,
+                    fit_batch_size=64,
+                ),
+                NAVIGATION_SCALARS,
+                Schedule(
+                    total_steps=20_000,
+                    random_steps=1_000,
+                    learn_after=1_000,
+                    guidance_until=20_000,
+                    eval_every=2_000,
+                    eval_steps=20_000,
+                    eval_envs=100,
+                    checkpoint_every=10_000,
+                ),
+            ),
+            guidance=("none", "relative"),
+            labels=(350,),
+            seeds=4,
+        ),
+    },
+)
+
+TASKS = {task.name: task for task in (BILLIARDS, NAVIGATION)}

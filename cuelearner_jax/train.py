@@ -21,7 +21,19 @@ from cuelearner_jax.feedback import empty_labels
 from cuelearner_jax.networks import applied, q_network
 from cuelearner_jax.refine import Refined, untouched
 from cuelearner_jax.replay import RingBuffer, ring_buffer
-from cuelearner_jax.types import Asking, Clock, Environment, Guidance, Label, Teacher, TrainState, Transition
+from cuelearner_jax.types import (
+    Asking,
+    Clock,
+    Environment,
+    Guidance,
+    Label,
+    Memory,
+    Params,
+    Step,
+    Teacher,
+    TrainState,
+    Transition,
+)
 
 # Streams of random numbers of one lane, each folded into the lane's key before a counter is.
 INIT, ASK, FIT, TRAIN = range(4)
@@ -101,11 +113,28 @@ class Lane(NamedTuple):
     obs_size: int
     largest_budget: int
 
-    @property
-    def buffer(self) -> RingBuffer:
-        """The replay of transitions of this observation size."""
-        obs, scalar = jnp.zeros(self.obs_size), jnp.zeros(())
-        return ring_buffer(Transition(obs, jnp.zeros(2), scalar, scalar, obs if self.bootstraps else obs[:0]))
+    def buffer(self, env: Environment) -> RingBuffer:
+        """The replay of an environment's steps."""
+
+        def one_step(key: PRNGKeyArray) -> Memory:
+            state, obs = env.reset(key)
+            action = jnp.zeros(2)
+            return self.memory(env.remember(state, obs), action, env.step(key, state, action)[1])
+
+        shapes = jax.eval_shape(one_step, jax.random.key(0))
+        return ring_buffer(jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes))
+
+    def memory(self, obs: jax.Array, action: jax.Array, step: Step) -> Memory:
+        """What replay keeps of one step from the remembered observation `obs`."""
+        kept = slice(None) if self.bootstraps else slice(0)
+        return Memory(
+            obs=obs,
+            action=action,
+            reward=step.reward,
+            discount=1.0 - step.terminated[None].astype(jnp.float32)[kept],
+            ended=(step.terminated | step.truncated)[None].astype(jnp.float32)[kept],
+            aftermath=step.aftermath[kept],
+        )
 
     def q(self, params: Any, obs: jax.Array, actions: jax.Array) -> jax.Array:
         """Action values (..., 1)."""
@@ -122,7 +151,7 @@ class Lane(NamedTuple):
             params=params,
             target_params=jax.tree.map(jnp.copy, params) if self.bootstraps else None,
             opt_state=self.optimizer(Scalars()).init(params),
-            replay=self.buffer.empty(self.sizes.replay_capacity),
+            replay=self.buffer(env).empty(self.sizes.replay_capacity),
             guidance=self.guidance.init(k_guidance),
             asking=Asking(asking_env, asking_obs, labels, jnp.asarray(budget, jnp.int32)),
             env=env_state,
@@ -183,18 +212,12 @@ class Lane(NamedTuple):
         key = jax.random.fold_in(jax.random.fold_in(state.key, TRAIN), clock.step)
         k_act, k_env, k_guided, k_learn = jax.random.split(key, 4)
         action, passes = self.act(env, scalars, schedule, clock, state, k_act)
+        remembered = jax.vmap(env.remember)(state.env, state.obs)
         env_state, step = jax.vmap(env.step)(jax.random.split(k_env, self.sizes.num_envs), state.env, action)
         done = step.terminated | step.truncated
-        transition = Transition(
-            obs=state.obs,
-            action=action,
-            reward=step.reward,
-            discount=1.0 - step.terminated.astype(jnp.float32),
-            next_obs=step.final_obs if self.bootstraps else step.final_obs[:, :0],
-        )
         redrawn = jax.random.bernoulli(k_guided, scalars.guided_probability, done.shape)
         state = state.replace(
-            replay=self.buffer.add(state.replay, clock.step, transition),
+            replay=self.buffer(env).add(state.replay, clock.step, jax.vmap(self.memory)(remembered, action, step)),
             env=env_state,
             obs=step.obs,
             guided=jnp.where(done, redrawn, state.guided),
@@ -234,17 +257,20 @@ class Lane(NamedTuple):
         """One gradient step for each of the environment steps just made (times `updates_per_step`)."""
         steps = self.sizes.num_envs * self.sizes.updates_per_step
         filled = clock.step + self.sizes.num_envs
-        options = geometry.evenly_spaced(self.sizes.target_directions)
+        buffer = self.buffer(env)
         optimizer = self.optimizer(scalars)
 
         def update(carry: tuple, index: jax.Array) -> tuple[tuple, jax.Array]:
             params, target_params, opt_state = carry
             k_sample, k_mirror = jax.random.split(jax.random.fold_in(key, index))
-            batch = self.buffer.sample(k_sample, state.replay, filled, self.sizes.batch_size)
-            batch = mirrored(k_mirror, env, batch)
-            targets = jax.vmap(
-                lambda item: ddqn.target(self.q, params, target_params, item, options, scalars.discount)
-            )(batch)
+            numbers = buffer.draw(k_sample, state.replay, filled, self.sizes.batch_size)
+            memory = buffer.read(state.replay, numbers)
+            batch = mirrored(k_mirror, env, self.one_step(env, memory))
+            targets = self.targets(params, target_params, batch, scalars)
+            if self.sizes.n_step > 1:
+                further = mirrored(k_mirror, env, self.n_step(env, buffer, state.replay, filled, numbers, scalars))
+                distant = self.targets(params, target_params, further, scalars)
+                targets += scalars.n_step_weight * (distant - targets)
             loss, gradient = jax.value_and_grad(lambda p: ddqn.loss(self.q, p, batch, targets))(params)
             change, opt_state = optimizer.update(gradient, opt_state, params)
             params = optax.apply_updates(params, change)
@@ -259,6 +285,44 @@ class Lane(NamedTuple):
         start = (state.params, state.target_params, state.opt_state)
         (params, target_params, opt_state), losses = jax.lax.scan(update, start, jnp.arange(steps))
         return state.replace(params=params, target_params=target_params, opt_state=opt_state), losses.mean()
+
+
+    def one_step(self, env: Environment, memory: Memory) -> Transition:
+        """Remembered steps (batch, ...) as transitions, their observations rebuilt."""
+        if self.bootstraps:
+            next_obs = jax.vmap(env.recall_next)(memory.obs, memory.action, memory.aftermath)
+            discount = memory.discount[:, 0]
+        else:
+            next_obs, discount = jnp.zeros((memory.reward.shape[0], 0)), jnp.zeros_like(memory.reward)
+        return Transition(jax.vmap(env.recall)(memory.obs), memory.action, memory.reward, discount, next_obs)
+
+    def n_step(
+        self,
+        env: Environment,
+        buffer: RingBuffer,
+        rows: jax.Array,
+        filled: Int[Array, ""],
+        numbers: Int[Array, " batch"],
+        scalars: Scalars,
+    ) -> Transition:
+        """The transitions that begin at rows `numbers` and span up to `n_step` steps of one episode."""
+        after = buffer.follow(rows, filled, numbers, self.sizes.n_step, self.sizes.num_envs)
+        summed = jax.vmap(partial(ddqn.n_step_return, discount=scalars.discount))
+        reward, discount, last = summed(after.rewards, after.discounts, after.ended, after.known)
+        first = buffer.read(rows, numbers)
+        end = buffer.read(rows, jnp.mod(numbers + last * self.sizes.num_envs, rows.shape[0]))
+        next_obs = jax.vmap(env.recall_next)(end.obs, end.action, end.aftermath)
+        return Transition(jax.vmap(env.recall)(first.obs), first.action, reward, discount, next_obs)
+
+    def targets(self, params: Params, target_params: Params, batch: Transition, scalars: Scalars) -> jax.Array:
+        """What the values of a batch are fitted to (batch,)."""
+        options = geometry.evenly_spaced(self.sizes.target_directions)
+        chooser = applied(q_network(self.sizes.q_layers, self.sizes.target_dtype))
+
+        def one(item: Transition) -> jax.Array:
+            return ddqn.target(self.q, params, target_params, item, options, scalars.discount, chooser)
+
+        return jax.vmap(one)(batch)
 
 
 def mirrored(key: PRNGKeyArray, env: Environment, batch: Transition) -> Transition:

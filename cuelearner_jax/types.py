@@ -21,10 +21,12 @@ class Step(struct.PyTreeNode):
 
     obs: Float[Array, " obs"]  # to act on next: after the automatic reset where the episode ended
     final_obs: Float[Array, " obs"]  # what the action led to: before the automatic reset
+    aftermath: Float[Array, " aftermath"]  # what replay keeps of `final_obs`, see `Environment.recall_next`
     reward: Float[Array, ""]
     terminated: Bool[Array, ""]  # the task ended: nothing follows
     truncated: Bool[Array, ""]  # time ran out: something would have followed
     metrics: Mapping[str, Float[Array, ""]]  # averaged over steps in every report
+    outcome: Mapping[str, Float[Array, ""]]  # averaged over episodes: counts where an episode ends
 
 
 class Environment(Protocol):
@@ -58,6 +60,41 @@ class Environment(Protocol):
         """Image of an observation and of a planar vector (action, label) under symmetry `which`; 0 is the identity."""
         ...
 
+    def remember(self, state: EnvState, obs: Float[Array, " obs"]) -> Float[Array, " memory"]:
+        """What replay keeps of an observation: as little as `recall` needs."""
+        ...
+
+    def recall(self, memory: Float[Array, " memory"]) -> Float[Array, " obs"]:
+        """The observation that was acted on."""
+        ...
+
+    def recall_next(
+        self, memory: Float[Array, " memory"], action: Float[Array, "2"], aftermath: Float[Array, " aftermath"]
+    ) -> Float[Array, " obs"]:
+        """`Step.final_obs` of the step that `action` led to from there."""
+        ...
+
+
+class WholeObservations:
+    """Mixed into an environment whose observations are small: replay keeps them as they are.
+
+    `Step.aftermath` is then `Step.final_obs`.
+    """
+
+    def remember(self, state: EnvState, obs: Float[Array, " obs"]) -> Float[Array, " obs"]:
+        """The observation."""
+        return obs
+
+    def recall(self, memory: Float[Array, " obs"]) -> Float[Array, " obs"]:
+        """The observation."""
+        return memory
+
+    def recall_next(
+        self, memory: Float[Array, " obs"], action: Float[Array, "2"], aftermath: Float[Array, " obs"]
+    ) -> Float[Array, " obs"]:
+        """The next observation."""
+        return aftermath
+
 
 class Teacher(Protocol):
     """Knows (or believes it knows) the best action. A pytree, like an environment."""
@@ -67,13 +104,24 @@ class Teacher(Protocol):
         ...
 
 
+class Memory(struct.PyTreeNode):
+    """One stored step, as small as the environment can make it."""
+
+    obs: Float[Array, " memory"]  # see `Environment.remember`
+    action: Float[Array, "2"]  # as executed
+    reward: Float[Array, ""]
+    discount: Float[Array, " 1_or_0"]  # this and the next two have no entries where nothing bootstraps
+    ended: Float[Array, " 1_or_0"]  # 1 where the episode ended, terminated or truncated
+    aftermath: Float[Array, " aftermath_or_0"]  # see `Environment.recall_next`
+
+
 class Transition(struct.PyTreeNode):
-    """One stored step. `next_obs` has no entries where nothing bootstraps from it (discount 0)."""
+    """One step to learn from. `next_obs` has no entries where nothing bootstraps from it (discount 0)."""
 
     obs: Float[Array, " obs"]
     action: Float[Array, "2"]  # as executed
     reward: Float[Array, ""]
-    discount: Float[Array, ""]  # 0 at termination, never at truncation; 1 otherwise
+    discount: Float[Array, ""]  # of `next_obs`: 0 at termination, never at truncation; 1 after one step
     next_obs: Float[Array, " obs_or_0"]
 
 

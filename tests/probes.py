@@ -20,10 +20,10 @@ from cuelearner_jax.actions import difference, from_angle, rotate
 from cuelearner_jax.config import RunConfig, Scalars, Schedule, Sizes
 from cuelearner_jax.tasks import Task
 from cuelearner_jax.train import directions, make_program
-from cuelearner_jax.types import Label, Step
+from cuelearner_jax.types import Label, Step, WholeObservations
 
 
-class Window(struct.PyTreeNode):
+class Window(WholeObservations, struct.PyTreeNode):
     """A bandit: one shot an episode, reward 1 within `half_width` of the best direction, which the observation tells.
 
     The observation is one of `contexts` evenly spaced unit vectors; the best direction is the observation turned by
@@ -52,7 +52,7 @@ class Window(struct.PyTreeNode):
     def step(self, key, state, action):
         reward = (jnp.abs(difference(self.best(state), action)) <= self.half_width).astype(jnp.float32)
         following, obs = self.reset(key)
-        return following, Step(obs, state, reward, jnp.array(True), jnp.array(False), {"hit": reward})
+        return following, Step(obs, state, state, reward, jnp.array(True), jnp.array(False), {"hit": reward}, {})
 
     def heuristic(self, obs):
         return rotate(obs, -1.0)  # wrong, and none of the evenly spaced directions
@@ -64,7 +64,7 @@ class Window(struct.PyTreeNode):
         return jnp.concatenate([jnp.broadcast_to(obs, action.shape), action], axis=-1)
 
 
-class Chain(struct.PyTreeNode):
+class Chain(WholeObservations, struct.PyTreeNode):
     """Two steps: place 0 pays half the action's y and leads to place 1, which pays the action's x and ends the episode.
 
     Ends by truncation (the last observation is then place 1's own) or by termination; either way place 0 follows.
@@ -86,7 +86,8 @@ class Chain(struct.PyTreeNode):
         ends = state == 1
         after = jnp.where(ends, 0, 1)
         reward = jnp.where(ends, action[0], 0.5 * action[1])
-        step = Step(self.observe(after), self.observe(1), reward, ends & ~self.truncates, ends & self.truncates, {})
+        final = self.observe(1)
+        step = Step(self.observe(after), final, final, reward, ends & ~self.truncates, ends & self.truncates, {}, {})
         return after, step
 
     def heuristic(self, obs):
@@ -118,7 +119,7 @@ def make_task(name="window"):
     known: dict[str, Any] = {
         "name": name,
         "config": WindowConfig,
-        "environment": lambda config: Window(jnp.deg2rad(jnp.array(config.half_width_deg))),
+        "environment": lambda config, split="training": Window(jnp.deg2rad(jnp.array(config.half_width_deg))),
         "teacher": lambda config, env: Expert(env),
         "presets": {},
     }
@@ -178,7 +179,9 @@ def start(program, seeds, budgets, env=None):
 def stored(state, lane, steps):
     """What a lane's environments met: columns (steps, ...) of its replay in the order of time."""
     rows = np.asarray(state.replay[lane, :steps])
-    names = {"obs": slice(0, 2), "action": slice(2, 4), "reward": 4, "discount": 5, "next_obs": slice(6, None)}
+    names = {"obs": slice(0, 2), "action": slice(2, 4), "reward": 4}
+    if rows.shape[1] > 5:  # something bootstraps
+        names |= {"discount": 5, "ended": 6, "next_obs": slice(7, None)}
     return {name: rows[:, columns] for name, columns in names.items()}
 
 

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from cuelearner_envs.billiards.physics import simulate
 from cuelearner_envs.billiards.table import Table, parking, rack
 from cuelearner_jax.actions import retract, rotate, to_angle
-from cuelearner_jax.types import Step
+from cuelearner_jax.types import Step, WholeObservations
 
 PLACEMENTS = 16  # places tried for a ball that must not touch another
 FLAG = 0.5  # third entry of a ball's observation: +0.5 once pocketed, -0.5 before
@@ -28,7 +28,7 @@ class Balls(struct.PyTreeNode):
     shots: Int[Array, ""]  # taken in this episode
 
 
-class Billiards(struct.PyTreeNode):
+class Billiards(WholeObservations, struct.PyTreeNode):
     """The environment (`cuelearner_jax.types.Environment`). Everything but the last two fields is traced."""
 
     table: Table
@@ -75,6 +75,7 @@ class Billiards(struct.PyTreeNode):
         step = Step(
             obs=jnp.where(ended, racked_obs, final_obs),
             final_obs=final_obs,
+            aftermath=final_obs,
             reward=reward,
             terminated=cleared,
             truncated=ended & ~cleared,
@@ -83,6 +84,7 @@ class Billiards(struct.PyTreeNode):
                 "foul": foul.astype(jnp.float32),
                 "exhausted": shot.exhausted.astype(jnp.float32),
             },
+            outcome={},
         )
         return jax.tree.map(lambda new, old: jnp.where(ended, new, old), racked, after), step
 

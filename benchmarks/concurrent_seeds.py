@@ -1,0 +1,89 @@
+"""Training seeds at once on one device: navigation with the paper's networks and a replay of 100,000 steps for each.
+
+    python benchmarks/concurrent_seeds.py --seeds 1 16 1000
+
+For each number of seeds: memory at its peak, time of one gradient step of all of them, environment steps a second in
+all. Unguided lanes; guidance adds its forward passes. Writes benchmarks/results/concurrent_seeds.json with --write.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import statistics
+import time
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from cuelearner_jax import guidance, results
+from cuelearner_jax.lanes import Group, state_bytes
+from cuelearner_jax.runs import Grid
+from cuelearner_jax.tasks import NAVIGATION
+from cuelearner_jax.train import start_clock
+
+RESULTS = Path(__file__).parent / "results" / "concurrent_seeds.json"
+
+
+def measure(config: Any, env: Any, seeds: int, iterations: int, repeats: int) -> dict[str, float]:
+    """Trains `seeds` lanes past their random steps and times stretches of `iterations`."""
+    kind = guidance.make("none", config.sizes, env.obs_size)
+    group = Group(config, env, kind, Grid(("none",), tuple(range(seeds)), (0,)))
+    clock, (block,) = start_clock(), group.start()
+    at_rest = state_bytes(block)
+    times = []
+    for _ in range(repeats + 1):  # the first compiles
+        began = time.perf_counter()
+        clock, block, _ = jax.block_until_ready(
+            group.program.train(env, config.scalars, config.schedule, clock, block, iterations)
+        )
+        times.append(time.perf_counter() - began)
+    stats = jax.devices()[0].memory_stats() or {}
+    steps = iterations * config.sizes.num_envs
+    second = statistics.median(times[1:]) / steps
+    return {
+        "seeds": seeds,
+        "ms_per_update": 1e3 * second,
+        "steps_per_second": seeds / second,
+        "replay_gb": seeds * config.sizes.replay_capacity * block.replay.shape[-1] * 4 / 1e9,
+        "at_rest_gb": at_rest / 1e9,
+        "peak_gb": stats.get("peak_bytes_in_use", 0) / 1e9,
+    }
+
+
+def main() -> None:
+    """Measures, prints a table, writes JSON."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seeds", type=int, nargs="+", default=[1, 16, 1000])
+    parser.add_argument("--iterations", type=int, default=20, help="iterations of num_envs steps in a timed stretch")
+    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--worlds", type=int, default=256)
+    parser.add_argument("--target-dtype", choices=("float32", "bfloat16"), default="bfloat16")
+    parser.add_argument("--layers", type=int, nargs="+", help="hidden layers (default: the paper's)")
+    parser.add_argument("--write", action="store_true", help=f"write {RESULTS.name}")
+    asked = parser.parse_args()
+    config = NAVIGATION.presets["paper"].config
+    sizes = dataclasses.replace(config.sizes, target_dtype=asked.target_dtype)
+    if asked.layers:
+        sizes = dataclasses.replace(sizes, q_layers=tuple(asked.layers))
+    # Learning from the first iteration on: the first stretch, which compiles, also fills the replay a little.
+    config = dataclasses.replace(
+        config,
+        task=dataclasses.replace(config.task, worlds=asked.worlds),
+        sizes=dataclasses.replace(sizes, lanes_per_block=max(asked.seeds)),
+        schedule=dataclasses.replace(config.schedule, random_steps=sizes.num_envs, learn_after=sizes.num_envs),
+    )
+    env = NAVIGATION.environment(config.task)
+    rows = [measure(config, env, seeds, asked.iterations, asked.repeats) for seeds in asked.seeds]
+    names = list(rows[0])
+    print("  ".join(f"{name:>17}" for name in names))
+    for row in rows:
+        print("  ".join(f"{row[name]:>17,.3f}" for name in names))
+    if asked.write:
+        RESULTS.write_text(json.dumps({**results.provenance(), "rows": rows}, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

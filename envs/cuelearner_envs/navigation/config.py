@@ -1,0 +1,59 @@
+"""Configuration of the navigation task: which worlds, which sensor, which robot."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+
+from cuelearner_envs.navigation.environment import Navigation
+from cuelearner_envs.navigation.lidar import Lidar
+from cuelearner_envs.navigation.worlds import generate_many
+
+# Folded into the key of the worlds: what is trained in is never validated in.
+SPLITS = {"training": 0, "validation": 1, "tuning": 2}
+
+
+@dataclass(frozen=True)
+class NavigationConfig:
+    """A family of worlds and the robot in it."""
+
+    style: Literal["clutter", "rooms", "corridor"] = "clutter"
+    """clutter: a hall full of boxes and columns. rooms: rooms, doorways, thin obstacles. corridor: pass left or right."""
+    worlds: int = 1024
+    """Number of worlds, each with 16 routes; training and validation have different ones."""
+    world_seed: int = 0
+    """Decides the worlds."""
+    max_steps: int = 200
+    """Steps of 0.2 s after which an episode is truncated."""
+    goal_radius: float = 0.5
+    """The goal is reached within this distance [m]."""
+    max_range: float = 10.0
+    """Range of the lidar [m]."""
+    lidar_rotation_deg: float = 0.0
+    """Changed world: the lidar is mounted turned by this, counterclockwise [deg] (paper: 15)."""
+    lidar_noise: float = 0.0
+    """Changed world: standard deviation of a beam's error [m]."""
+    lidar_dropout: float = 0.0
+    """Changed world: probability that a beam reads the full range."""
+    mirrors: bool = False
+    """Multiply labels and transitions by their mirror images, whatever the guidance."""
+
+
+def make_environment(config: NavigationConfig, split: str = "training") -> Navigation:
+    """The environment that a configuration describes, with the worlds of a split."""
+    key = jax.random.fold_in(jax.random.key(config.world_seed), SPLITS[split])
+    return Navigation(
+        worlds=generate_many(key, config.worlds, config.style),
+        lidar=Lidar(
+            max_range=jnp.float32(config.max_range),
+            rotation=jnp.deg2rad(jnp.float32(config.lidar_rotation_deg)),
+            noise=jnp.float32(config.lidar_noise),
+            dropout=jnp.float32(config.lidar_dropout),
+        ),
+        max_steps=jnp.int32(config.max_steps),
+        goal_radius=jnp.float32(config.goal_radius),
+        mirrors=config.mirrors,
+    )

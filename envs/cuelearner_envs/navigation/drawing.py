@@ -1,0 +1,435 @@
+"""Drawing navigation from above with matplotlib: worlds, an episode, an animation. Needs no display.
+
+Lengths are metres; the axes of every drawing are the world's own coordinates.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import os
+import warnings
+from collections.abc import Iterator, Sequence
+from pathlib import Path as FilePath
+from typing import Any
+
+import imageio.v2 as imageio
+import matplotlib
+import numpy as np
+from jaxtyping import Float, UInt8
+from matplotlib import patheffects
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_hex, to_rgb
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Circle, FancyArrowPatch, Polygon, Rectangle
+from PIL import Image
+from scipy.spatial import KDTree
+
+from cuelearner_envs.navigation.lidar import BEAM_ANGLES
+from cuelearner_envs.navigation.recording import Frame
+from cuelearner_envs.navigation.robot import Robot
+from cuelearner_envs.navigation.world import FAR_AWAY, World
+
+# Okabe and Ito's palette, as in the figures of results: told apart with any colour vision.
+BODY, GOAL, ARROW, BEAMS, HITS, START = "#0072B2", "#009E73", "#D55E00", "#56B4E9", "#B37A00", "#000000"
+OUTCOMES = {"success": GOAL, "collision": ARROW, "timeout": "#4d4d4d"}
+WORDS = {"success": "reached the goal after", "collision": "collision after", "timeout": "out of time after"}
+FLOOR, LOW, TALL = "#fbfaf7", "#c9ccd1", "#5d636b"
+LOWEST, TALLEST = 0.6, 1.5  # heights that have the colours `LOW` and `TALL` [m]
+WIDTH_INCHES, STRIP_INCHES, MARGIN = 7.0, 0.4, 0.35  # the strip below the floor is for words; margin in [m]
+ARROW_LENGTH = 1.3  # [m]
+GHOSTS_APART = 1.4  # between the bodies of a still [m]
+HOLD_AFTER = 1.2  # at the end of an animated episode [s]
+
+
+def draw_world(axes: Axes, world: World) -> None:
+    """Draws the floor and the solids of a world from above, the taller the darker, filling the axes.
+
+    Args:
+        axes: matplotlib axes; their limits and aspect are set and their frame is hidden.
+        world: one world (no batch).
+    """
+    half = np.asarray(world.extent, float) / 2
+    axes.set(xlim=(-half[0] - MARGIN, half[0] + MARGIN), ylim=(-half[1] - MARGIN, half[1] + MARGIN), aspect="equal")
+    axes.axis("off")
+    axes.add_patch(Rectangle((-half[0], -half[1]), *(2 * half), facecolor=FLOOR, edgecolor="none", zorder=0))
+    solids = [(height, _box(row)) for row, height in _used(world.boxes, world.box_heights)]
+    solids += [(height, Circle((row[0], row[1]), row[2])) for row, height in _used(world.circles, world.circle_heights)]
+    for height, patch in sorted(solids, key=lambda solid: solid[0]):  # from above, the tall covers the low
+        patch.set(facecolor=shade(height), edgecolor="none", zorder=1)
+        axes.add_patch(patch)
+
+
+def still(robot: Robot, frames: Sequence[Frame], file: str | os.PathLike[str], dpi: int = 160) -> None:
+    """Writes a picture of the first episode: its way, bodies along it, and halfway what the lidar saw and what was chosen.
+
+    Args:
+        robot: gives the outline of the body.
+        frames: from `recording.record`; those after the first episode are left out.
+        file: a name that ends in .png, .svg or .pdf.
+        dpi: dots per inch of a .png; the picture is 7 inches wide.
+
+    Raises:
+        ValueError: if there are no frames.
+    """
+    if not frames:
+        raise ValueError("a picture needs at least one frame")
+    episode = [frame for frame in frames if frame.episode == frames[0].episode]
+    first, middle, last = episode[0], episode[len(episode) // 2], episode[-1]
+    figure, axes, strip = _figure(np.asarray(first.world.extent), dpi)
+    _draw_course(axes, first)
+    _draw_strip(strip, first.world)
+    _Lidar(axes).place(middle)
+    way = _way(episode)
+    axes.plot(*way[:, :2].T, color=BODY, linewidth=1.8, zorder=4)
+    for pose in _spread(way, middle.pose):
+        _Body(axes, robot, alpha=0.35).place(pose)
+    _Body(axes, robot).place(middle.pose)
+    _Body(axes, robot, colour=ARROW if last.outcome == "collision" else BODY).place(last.next_pose)
+    _arrow(axes).set_positions(*_arrow_ends(robot, middle))
+    words = WORDS.get(last.outcome, "still walking after")
+    length = np.linalg.norm(np.diff(way[:, :2], axis=0), axis=-1).sum()
+    _caption(strip).set(text=f"{words} {last.seconds:.1f} s, {length:.1f} m", color=_outcome_colour(last))
+    with matplotlib.rc_context({"svg.hashsalt": "cuelearner"}):  # with no date: the same episode, the same bytes
+        figure.savefig(file, dpi=dpi, metadata={"Date": None} if str(file).endswith(".svg") else None)
+
+
+def animate(robot: Robot, frames: Sequence[Frame], file: str | os.PathLike[str], fps: float = 10.0) -> None:
+    """Writes an animation of all episodes, one picture a step; the end of an episode stands for a moment.
+
+    Args:
+        robot: gives the outline of the body.
+        frames: from `recording.record`.
+        file: a name that ends in .gif or .mp4.
+        fps: steps in a second of the film (with steps of 0.2 s, 10 shows twice the speed of life); a GIF counts in
+            hundredths of a second and takes the nearest rate it can have.
+
+    Raises:
+        ValueError: if the name of the file ends otherwise, there are no frames, or the rate is not positive.
+    """
+    suffix = FilePath(file).suffix.lower()
+    if suffix not in (".gif", ".mp4"):
+        raise ValueError(f"cannot animate to {file}: give a name that ends in .gif or .mp4")
+    if not frames or fps <= 0:
+        raise ValueError("an animation needs at least one frame and a positive fps")
+    if suffix == ".gif":
+        delay = max(2, round(100 / fps))  # [1/100 s]; viewers slow down what is faster
+        pictures = _pictures(robot, frames, round(HOLD_AFTER * 100 / delay))
+        _write_gif(file, pictures, 10 * delay, _specimen(robot, frames))
+    else:
+        _write_mp4(file, _pictures(robot, frames, round(HOLD_AFTER * fps)), fps)
+
+
+def overview(
+    worlds: Sequence[World],
+    file: str | os.PathLike[str],
+    titles: Sequence[str] | None = None,
+    columns: int = 3,
+    routes: int = 4,
+) -> None:
+    """Writes worlds side by side from above, some routes of each as straight lines from start to goal.
+
+    Args:
+        worlds: worlds (no batch), drawn from the left to the right and from the top to the bottom.
+        file: a name that ends in .png, .svg or .pdf.
+        titles: one for each world, written above it.
+        columns: worlds in a row.
+        routes: how many of a world's routes are drawn, the first ones.
+    """
+    if not worlds:
+        raise ValueError("an overview needs at least one world")
+    columns = min(columns, len(worlds))
+    rows = [worlds[start : start + columns] for start in range(0, len(worlds), columns)]
+    sides = [np.stack([np.asarray(world.extent) for world in row]) + 2 * MARGIN for row in rows]
+    panel = (WIDTH_INCHES + 1.0) / columns  # [inch]
+    title = 0.3 if titles else 0.0  # [inch]
+    heights = [panel * float((side[:, 1] / side[:, 0]).max()) + title for side in sides]
+    figure = Figure(figsize=(panel * columns, sum(heights)))
+    FigureCanvasAgg(figure)
+    for number, world in enumerate(worlds):
+        row, column = divmod(number, columns)
+        bottom, height = sum(heights[row + 1 :]), heights[row] - title
+        axes = figure.add_axes((column / columns, bottom / sum(heights), 1 / columns, height / sum(heights)))
+        draw_world(axes, world)
+        for start, goal in zip(np.asarray(world.starts)[:routes], np.asarray(world.goals)[:routes], strict=True):
+            axes.plot(*np.stack([start, goal]).T, color=BODY, linewidth=0.8, alpha=0.7, zorder=2)
+            axes.plot(*start, marker="o", markersize=3, color=START, zorder=3)
+            axes.plot(*goal, marker="*", markersize=7, color=GOAL, markeredgewidth=0, zorder=3)
+        if titles:
+            axes.set_title(titles[number], fontsize=10, pad=3)
+    with matplotlib.rc_context({"svg.hashsalt": "cuelearner"}):
+        figure.savefig(file, dpi=160, metadata={"Date": None} if str(file).endswith(".svg") else None)
+
+
+def shade(height: float) -> str:
+    """Colour of a solid of some height [m], a hexadecimal code."""
+    share = np.clip((height - LOWEST) / (TALLEST - LOWEST), 0.0, 1.0)
+    return to_hex((1 - share) * np.array(to_rgb(LOW)) + share * np.array(to_rgb(TALL)))
+
+
+def outline(robot: Robot, pose: Float[np.ndarray, "3"]) -> Float[np.ndarray, "points 2"]:
+    """The rounded outline of the body at a pose [m]: what its three discs span."""
+    bend = np.linspace(-math.pi / 2, math.pi / 2, 13)
+    front = np.stack([np.cos(bend), np.sin(bend)], axis=-1) * float(robot.disc_radius) + [float(robot.disc_offset), 0.0]
+    return _to_world(pose, np.concatenate([front, -front]))
+
+
+def hits(frame: Frame) -> Float[np.ndarray, "271 2"]:
+    """Where the robot takes the lidar's beams to end [m]; a sensor mounted askew is mistaken."""
+    angles = np.asarray(BEAM_ANGLES, float)
+    beams = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+    return _to_world(frame.pose, np.asarray(frame.ranges)[:, None] * beams)
+
+
+# --- the parts of a drawing ------------------------------------------------------------------------------------------
+
+
+def _to_world(pose: np.ndarray, points: Float[np.ndarray, "points 2"]) -> Float[np.ndarray, "points 2"]:
+    """Points in the frame of the body as points of the world [m]."""
+    x, y, yaw = np.asarray(pose, float)
+    cos, sin = math.cos(yaw), math.sin(yaw)
+    return points @ np.array([[cos, sin], [-sin, cos]]) + [x, y]
+
+
+def _used(rows: Any, heights: Any) -> list[tuple[np.ndarray, float]]:
+    """Solids with their heights, without those that only fill the arrays."""
+    pairs = zip(np.asarray(rows, float), np.asarray(heights, float), strict=True)
+    return [(row, float(height)) for row, height in pairs if abs(row[0]) < FAR_AWAY / 2]
+
+
+def _box(row: Float[np.ndarray, "5"]) -> Polygon:
+    corners = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * row[3:]
+    return Polygon(_to_world(row[:3], corners), closed=True)
+
+
+def _figure(extent: Float[np.ndarray, "2"], dpi: float) -> tuple[Figure, Axes, Axes]:
+    """A figure of axes for a floor and of a strip for words below, in its length the same metres; sides of even dots."""
+    length, width = np.asarray(extent, float) + 2 * MARGIN
+    across = 2 * round(WIDTH_INCHES * dpi / 2)
+    floor = across * width / length
+    down = 2 * math.ceil((floor + STRIP_INCHES * dpi) / 2)
+    figure = Figure(figsize=(across / dpi, down / dpi), dpi=dpi)
+    FigureCanvasAgg(figure)
+    axes = figure.add_axes((0, 1 - floor / down, 1, floor / down))
+    strip = figure.add_axes((0, 0, 1, 1 - floor / down))
+    strip.set(xlim=(-length / 2, length / 2), ylim=(0, 1))
+    strip.axis("off")
+    return figure, axes, strip
+
+
+def _draw_course(axes: Axes, frame: Frame) -> None:
+    """Everything that stays as it is in an episode: the world, the goal, and the start, which is the frame's pose."""
+    draw_world(axes, frame.world)
+    x, y = np.asarray(frame.goal, float)
+    axes.add_patch(Circle((x, y), frame.goal_radius, facecolor=GOAL + "33", edgecolor=GOAL, linewidth=1.2, zorder=2))
+    axes.plot(x, y, marker="*", markersize=11, color=GOAL, markeredgewidth=0, zorder=3)
+    axes.plot(*frame.pose[:2], marker="o", markersize=6, color="white", markeredgecolor=START, zorder=3)
+
+
+def _draw_strip(strip: Axes, world: World) -> None:
+    """The key to the signs, and a scale."""
+    length = 5.0 if float(world.extent[0]) > 12.0 else 1.0
+    right = float(world.extent[0]) / 2
+    strip.plot([right - length, right], [0.3, 0.3], color="#333333", linewidth=2, solid_capstyle="butt")
+    strip.text(right - length / 2, 0.42, f"{length:g} m", ha="center", va="bottom", fontsize=8, color="#333333")
+    signs = {
+        "start": {"marker": "o", "color": "white", "markeredgecolor": START, "markersize": 6},
+        "goal": {"marker": "*", "color": GOAL, "markeredgewidth": 0, "markersize": 11},
+        "lidar": {"marker": "o", "color": HITS, "markersize": 3},
+        "direction chosen": {"marker": r"$\rightarrow$", "color": ARROW, "markersize": 13, "markeredgewidth": 0},
+    }
+    handles = [Line2D([], [], linestyle="none", label=name, **look) for name, look in signs.items()]
+    place = 0.98 - (length + MARGIN) / (float(world.extent[0]) + 2 * MARGIN)
+    look: dict[str, Any] = {"frameon": False, "borderpad": 0, "handletextpad": 0.1, "columnspacing": 0.9}
+    strip.legend(handles=handles, loc="center right", bbox_to_anchor=(place, 0.5), ncols=4, fontsize=8, **look)
+
+
+def _caption(strip: Axes, animated: bool = False) -> Any:
+    left = strip.get_xlim()[0] + MARGIN
+    return strip.text(left, 0.5, "", va="center_baseline", fontsize=9.5, animated=animated)
+
+
+def _outcome_colour(frame: Frame) -> str:
+    return OUTCOMES.get(frame.outcome, "#333333")
+
+
+class _Body:
+    """The artists of the robot, which can be moved: its outline, and a chevron that points ahead."""
+
+    def __init__(
+        self, axes: Axes, robot: Robot, *, colour: str = BODY, alpha: float = 1.0, animated: bool = False
+    ) -> None:
+        self.robot = robot
+        look: dict[str, Any] = {"animated": animated, "alpha": alpha, "closed": True, "zorder": 6 if alpha == 1 else 5}
+        self.hull = Polygon(np.zeros((3, 2)), facecolor=colour, edgecolor="white", linewidth=0.8, **look)
+        self.head = Polygon(np.zeros((3, 2)), facecolor="white", edgecolor="none", **look)
+        axes.add_patch(self.hull)
+        axes.add_patch(self.head)
+
+    def place(self, pose: Float[np.ndarray, "3"]) -> None:
+        """Moves it to a pose [m, rad]."""
+        radius, tip = float(self.robot.disc_radius), float(self.robot.disc_offset) + 0.6 * float(self.robot.disc_radius)
+        chevron = np.array([[tip, 0.0], [tip - 1.1 * radius, 0.6 * radius], [tip - 1.1 * radius, -0.6 * radius]])
+        self.hull.set_xy(outline(self.robot, pose))
+        self.head.set_xy(_to_world(pose, chevron))
+
+    def draw(self, renderer: Any) -> None:
+        """Draws it alone, over what is there."""
+        self.hull.draw(renderer)
+        self.head.draw(renderer)
+
+
+class _Lidar:
+    """The artists of one scan, which can be moved: the space that it found free, and dots where beams met something."""
+
+    def __init__(self, axes: Axes, *, animated: bool = False) -> None:
+        self.free = Polygon(np.zeros((3, 2)), facecolor=BEAMS, alpha=0.22, edgecolor="none", zorder=2)
+        axes.add_patch(self.free)
+        (self.dots,) = axes.plot([], [], linestyle="none", marker="o", markersize=1.8, color=HITS, zorder=4)
+        self.free.set_animated(animated)
+        self.dots.set_animated(animated)
+
+    def place(self, frame: Frame) -> None:
+        """Moves it to what a frame saw."""
+        ends = hits(frame)
+        met = np.asarray(frame.ranges) < 0.999 * frame.max_range
+        self.free.set_xy(np.concatenate([[frame.pose[:2]], ends]))
+        self.dots.set_data(*ends[met].T)
+
+    def draw(self, renderer: Any) -> None:
+        """Draws it alone, over what is there."""
+        self.free.draw(renderer)
+        self.dots.draw(renderer)
+
+
+def _arrow(axes: Axes, animated: bool = False) -> FancyArrowPatch:
+    arrow = FancyArrowPatch((0, 0), (1, 1), arrowstyle="-|>", mutation_scale=13, shrinkA=0, shrinkB=0, color=ARROW)
+    edge = patheffects.withStroke(linewidth=4, foreground="#ffffffcc")
+    arrow.set(linewidth=2.2, zorder=7, path_effects=[edge], animated=animated)
+    axes.add_patch(arrow)
+    return arrow
+
+
+def _arrow_ends(robot: Robot, frame: Frame) -> tuple[tuple[float, float], tuple[float, float]]:
+    """From the middle of the body along the direction that was chosen [m]."""
+    (x0, y0), (x1, y1) = _to_world(frame.pose, np.stack([np.zeros(2), ARROW_LENGTH * np.asarray(frame.action)]))
+    return (x0, y0), (x1, y1)
+
+
+def _way(episode: Sequence[Frame]) -> Float[np.ndarray, "poses 3"]:
+    """The poses of an episode, those before its steps and the last one's end [m, rad]."""
+    return np.stack([frame.pose for frame in episode] + [episode[-1].next_pose])
+
+
+def _spread(way: Float[np.ndarray, "poses 3"], middle: Float[np.ndarray, "3"]) -> list[np.ndarray]:
+    """Poses to show as ghosts: apart from each other, from the one in the middle and from the last."""
+    chosen: list[np.ndarray] = []
+    for pose in way:
+        others = np.stack([*chosen, middle, way[-1]])
+        if np.linalg.norm(others[:, :2] - pose[:2], axis=-1).min() >= GHOSTS_APART:
+            chosen.append(pose)
+    return chosen
+
+
+# --- films -----------------------------------------------------------------------------------------------------------
+
+
+class _Stage:
+    """One episode's figure. What stands still is drawn once; each picture draws only what moves over it."""
+
+    def __init__(self, robot: Robot, first: Frame, extent: Float[np.ndarray, "2"]) -> None:
+        self.robot = robot
+        self.figure, axes, strip = _figure(extent, dpi=100)
+        _draw_course(axes, first)
+        _draw_strip(strip, first.world)
+        self.lidar, self.arrow = _Lidar(axes, animated=True), _arrow(axes, animated=True)
+        self.body, self.crashed = (_Body(axes, robot, colour=colour, animated=True) for colour in (BODY, ARROW))
+        (self.trail,) = axes.plot([], [], color=BODY, linewidth=1.6, zorder=4, animated=True)
+        self.caption = _caption(strip, animated=True)
+        self.canvas: Any = self.figure.canvas
+        self.canvas.draw()
+        self.empty = self.canvas.copy_from_bbox(self.figure.bbox)
+
+    def step(self, frame: Frame, way: Float[np.ndarray, "poses 3"], words: str) -> UInt8[np.ndarray, "height width 3"]:
+        """What the robot sees and chooses before a step, and the way so far."""
+        self.lidar.place(frame)
+        self.body.place(frame.pose)
+        self.arrow.set_positions(*_arrow_ends(self.robot, frame))
+        return self._picture(way, words, "#333333", self.lidar, self.trail, self.body, self.arrow)
+
+    def end(self, last: Frame, way: Float[np.ndarray, "poses 3"]) -> UInt8[np.ndarray, "height width 3"]:
+        """Where an episode ended, and how."""
+        body = self.crashed if last.outcome == "collision" else self.body
+        body.place(last.next_pose)
+        words = f"{WORDS[last.outcome]} {last.seconds:.1f} s"
+        return self._picture(way, words, _outcome_colour(last), self.trail, body)
+
+    def _picture(self, way: np.ndarray, words: str, colour: str, *artists: Any) -> UInt8[np.ndarray, "height width 3"]:
+        self.trail.set_data(*way[:, :2].T)
+        self.caption.set(text=words, color=colour)
+        self.canvas.restore_region(self.empty)
+        for artist in (*artists, self.caption):
+            artist.draw(self.canvas.renderer)
+        return np.asarray(self.canvas.buffer_rgba())[..., :3].copy()
+
+
+def _extent(frames: Sequence[Frame]) -> Float[np.ndarray, "2"]:
+    """Of the largest world [m]."""
+    return np.max([np.asarray(frame.world.extent) for frame in frames], axis=0)
+
+
+def _pictures(robot: Robot, frames: Sequence[Frame], hold: int) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
+    """One picture of each step, and `hold` of the end of each episode that ends."""
+    extent = _extent(frames)
+    for number, group in itertools.groupby(frames, key=lambda frame: frame.episode):
+        episode = list(group)
+        stage, way = _Stage(robot, episode[0], extent), _way(episode)
+        seconds = 0.0
+        for taken, frame in enumerate(episode):
+            yield stage.step(frame, way[: taken + 1], f"episode {number + 1}: {seconds:.1f} s")
+            seconds = frame.seconds
+        if episode[-1].outcome:
+            yield from itertools.repeat(stage.end(episode[-1], way), hold)
+
+
+def _specimen(robot: Robot, frames: Sequence[Frame]) -> UInt8[np.ndarray, "height width 3"]:
+    """A picture that has every colour of a film: a step, and each end, one below the other."""
+    first = frames[0]
+    stage, way = _Stage(robot, first, _extent(frames)), _way(frames[:1])
+    ends = [stage.end(first._replace(outcome=outcome), way) for outcome in OUTCOMES]
+    return np.concatenate([stage.step(first, way, ""), *ends])
+
+
+def _write_mp4(file: str | os.PathLike[str], pictures: Iterator[np.ndarray], fps: float) -> None:
+    # Codecs want even sides, which `_figure` gives; imageio would otherwise scale to multiples of 16.
+    writer: Any = imageio.get_writer(file, format="FFMPEG", fps=fps, macro_block_size=2, quality=8)  # pyright: ignore
+    with writer, warnings.catch_warnings():
+        # JAX warns of any fork; this one becomes ffmpeg at once.
+        warnings.filterwarnings("ignore", message=r"os\.fork", category=RuntimeWarning)
+        for picture in pictures:
+            writer.append_data(picture)
+
+
+def _write_gif(
+    file: str | os.PathLike[str], pictures: Iterator[np.ndarray], milliseconds: int, specimen: np.ndarray
+) -> None:
+    """Writes a GIF of one palette, the specimen's."""
+    colours = Image.fromarray(specimen).quantize(colors=255, kmeans=1, dither=Image.Dither.NONE).getpalette() or []
+    tree = KDTree(np.reshape(colours, (-1, 3)))
+    nearest = np.full(1 << 24, -1, np.int16)  # place in the palette, for each colour that was met so far
+
+    def indexed(picture: np.ndarray) -> Image.Image:
+        # Pillow's own search is quicker still, but inexact: white turns grey.
+        keys = picture.astype(np.uint32) @ np.array([1 << 16, 1 << 8, 1], np.uint32)
+        new = np.unique(keys[nearest[keys] < 0])
+        if len(new):
+            nearest[new] = tree.query(np.stack([new >> 16, new >> 8 & 255, new & 255], axis=-1))[1]
+        image = Image.fromarray(nearest[keys].astype(np.uint8))
+        image.putpalette(colours)
+        return image
+
+    rest = (indexed(picture) for picture in pictures)
+    options: dict[str, Any] = {"duration": milliseconds, "loop": 0, "optimize": False}
+    next(rest).save(file, save_all=True, append_images=rest, **options)

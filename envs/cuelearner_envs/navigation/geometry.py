@@ -1,0 +1,62 @@
+"""Distances from points and straight lines to the solids of a world, seen from above. Closed form, one at a time."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from cuelearner_envs.navigation.world import World
+
+
+def in_frame(boxes: Float[Array, "boxes 5"], point: Float[Array, "2"]) -> Float[Array, "boxes 2"]:
+    """A point in the frame of each box [m]."""
+    offset = point - boxes[:, :2]
+    cos, sin = jnp.cos(boxes[:, 2]), jnp.sin(boxes[:, 2])
+    return jnp.stack([cos * offset[:, 0] + sin * offset[:, 1], cos * offset[:, 1] - sin * offset[:, 0]], axis=-1)
+
+
+def clearance(world: World, point: Float[Array, "2"]) -> Float[Array, ""]:
+    """Distance from a point to the nearest solid [m]; negative inside one."""
+    beyond = jnp.abs(in_frame(world.boxes, point)) - world.boxes[:, 3:]
+    outside = jnp.sqrt(jnp.sum(jnp.square(jnp.maximum(beyond, 0.0)), -1))
+    to_boxes = outside + jnp.minimum(beyond.max(-1), 0.0)
+    to_circles = jnp.sqrt(jnp.sum(jnp.square(point - world.circles[:, :2]), -1)) - world.circles[:, 2]
+    return jnp.minimum(to_boxes.min(), to_circles.min())
+
+
+def line_clearance(world: World, start: Float[Array, "2"], end: Float[Array, "2"]) -> Float[Array, ""]:
+    """Smallest distance between the line from `start` to `end` and any solid [m]; 0 where the line meets a box's inside.
+
+    A circle that the line enters gives a negative number: minus how deep.
+    """
+    to_circles = jax.vmap(lambda circle: _point_to_line(circle[:2], start, end) - circle[2])(world.circles)
+    sizes = world.boxes[:, 3:]
+    to_boxes = jax.vmap(_box_to_line)(sizes, in_frame(world.boxes, start), in_frame(world.boxes, end))
+    return jnp.minimum(to_circles.min(), to_boxes.min())
+
+
+def _point_to_line(point: Float[Array, "2"], start: Float[Array, "2"], end: Float[Array, "2"]) -> Float[Array, ""]:
+    along, offset = end - start, point - start
+    share = jnp.clip(jnp.vdot(offset, along) / jnp.maximum(jnp.vdot(along, along), 1e-12), 0.0, 1.0)
+    return jnp.sqrt(jnp.sum(jnp.square(offset - share * along)))
+
+
+def _box_to_line(half: Float[Array, "2"], start: Float[Array, "2"], end: Float[Array, "2"]) -> Float[Array, ""]:
+    """Distance between a line and the box |x| <= half in the box's own frame.
+
+    Where they are apart, the closest two points include a corner of the box or an end of the line.
+    """
+    signs = jnp.array([[1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]])
+    corners = jax.vmap(lambda sign: _point_to_line(sign * half, start, end))(signs).min()
+    beyond = jnp.maximum(jnp.abs(jnp.stack([start, end])) - half, 0.0)
+    ends = jnp.sqrt(jnp.sum(jnp.square(beyond), -1)).min()
+    return jnp.where(_meets(half, start, end), 0.0, jnp.minimum(corners, ends))
+
+
+def _meets(half: Float[Array, "2"], start: Float[Array, "2"], end: Float[Array, "2"]) -> Bool[Array, ""]:
+    """Does the line pass through the box? Separating axes: the box's two and the line's normal."""
+    middle, reach = (start + end) / 2, (end - start) / 2
+    apart = (jnp.abs(middle) > half + jnp.abs(reach)).any()
+    cross = jnp.abs(middle[0] * reach[1] - middle[1] * reach[0])
+    return ~apart & (cross <= half[0] * jnp.abs(reach[1]) + half[1] * jnp.abs(reach[0]))

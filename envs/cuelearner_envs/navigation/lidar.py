@@ -1,0 +1,123 @@
+"""The lidar: distances along beams to boxes and circles, in closed form.
+
+Everything is computed in inverse distances. Seen from a point, "1 / distance to a line along a beam" is linear in the
+beam's direction, so that a beam against a box is six products and a few comparisons: no division, no branch.
+"""
+
+from __future__ import annotations
+
+import math
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Float
+
+from cuelearner_envs.navigation.geometry import in_frame
+from cuelearner_envs.navigation.world import World
+from cuelearner_jax.actions import from_angle, rotate
+
+BEAMS = 271
+FIELD_OF_VIEW = math.radians(270.0)
+MAX_RANGE = 10.0  # [m]
+BEAM_ANGLES = (jnp.arange(BEAMS) - (BEAMS - 1) / 2) * (FIELD_OF_VIEW / (BEAMS - 1))  # from straight ahead [rad]
+NO_BOUND = 1e9  # an inverse distance that bounds nothing [1/m]
+
+Scalar = float | Float[Array, ""]
+
+
+class Lidar(struct.PyTreeNode):
+    """The sensor and its faults, all of them traced."""
+
+    max_range: Scalar = MAX_RANGE  # a beam that meets nothing reads this [m]
+    rotation: Scalar = 0.0  # miscalibration: the sensor is mounted turned by this, counterclockwise [rad]
+    noise: Scalar = 0.0  # standard deviation of a beam's error [m]
+    dropout: Scalar = 0.0  # probability that a beam reads `max_range` whatever it meets
+
+    def read(self, world: World, pose: Float[Array, "3"]) -> Float[Array, "271"]:
+        """Distances that the robot perceives at a pose [m]; without faults they are `scan`'s.
+
+        Noise and drop-outs are drawn from the pose's bits, so that the same reading can be made again.
+        """
+        pose = jnp.asarray(pose)
+        ranges = scan(world, pose.at[2].add(self.rotation), self.max_range)
+
+        def faulty() -> jax.Array:
+            key = jax.random.key(0)
+            for bits in jax.lax.bitcast_convert_type(pose, jnp.uint32):
+                key = jax.random.fold_in(key, bits)
+            k_noise, k_drop = jax.random.split(key)
+            noisy = jnp.clip(ranges + self.noise * jax.random.normal(k_noise, ranges.shape), 0.0, self.max_range)
+            return jnp.where(jax.random.bernoulli(k_drop, self.dropout, ranges.shape), self.max_range, noisy)
+
+        has_faults = (jnp.asarray(self.noise) > 0) | (jnp.asarray(self.dropout) > 0)
+        return jax.lax.cond(has_faults, faulty, lambda: ranges)
+
+
+def scan(world: World, pose: Float[Array, "3"], max_range: Scalar = MAX_RANGE) -> Float[Array, "271"]:
+    """Distance along each beam to the first surface [m], from -135 deg to +135 deg, counterclockwise.
+
+    The sensor sits at the robot's centre, below the top of every solid. From inside a solid a beam reads the way out,
+    as MuJoCo's rays do.
+
+    Args:
+        world: one world.
+        pose: x, y, yaw [m, rad].
+        max_range: what a beam reads that meets nothing nearer [m].
+    """
+    pose = jnp.asarray(pose)
+    beams = rotate(from_angle(BEAM_ANGLES), pose[2])
+    nearest = jnp.maximum(_boxes(world.boxes, pose[:2], beams), _circles(world.circles, pose[:2], beams))
+    return 1.0 / jnp.maximum(nearest, 1.0 / max_range)
+
+
+def _boxes(
+    boxes: Float[Array, "boxes 5"], origin: Float[Array, "2"], beams: Float[Array, "beams 2"]
+) -> Float[Array, " beams"]:
+    """Inverse distance to the nearest box along each beam; 0 or less where there is none.
+
+    The slab method: a beam is inside a box from where it has entered both of its slabs to where it leaves either.
+    """
+    place, half = in_frame(boxes, origin), boxes[:, 3:]  # (boxes, 2): along the box's two axes
+    axes = jnp.stack([from_angle(boxes[:, 2]), rotate(from_angle(boxes[:, 2]), math.pi / 2)], axis=1)
+    gap = jnp.abs(place) - half
+    outside = gap > 0
+    side = jnp.where(place < 0, -1.0, 1.0)
+    enter = jnp.where(outside, -side / jnp.where(outside, gap, 1.0), 0.0)
+    unbounded = jnp.where(outside, 0.0, NO_BOUND)
+    leave_behind = -side / (jnp.abs(place) + half)  # through the far side
+    leave_ahead = jnp.where(outside, leave_behind, side / jnp.where(outside, 1.0, jnp.maximum(-gap, 1e-9)))
+    within = ~outside.any(-1)
+
+    def products(factor: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Both axes' inverse distances along every beam: (boxes, beams) each."""
+        normals = factor[..., None] * axes
+        along = normals[:, :, 0, None] * beams[:, 0] + normals[:, :, 1, None] * beams[:, 1]
+        return along[:, 0], along[:, 1]
+
+    in_x, in_y = products(enter)
+    entered = jnp.minimum(in_x + unbounded[:, 0, None], in_y + unbounded[:, 1, None])
+    left = jnp.maximum(
+        jnp.maximum(*products(leave_behind)),
+        jnp.maximum(*products(leave_ahead)),
+    )
+    seen = jnp.where(within[:, None], left, entered)
+    return jnp.where(entered >= left, seen, 0.0).max(0)
+
+
+def _circles(
+    circles: Float[Array, "circles 3"], origin: Float[Array, "2"], beams: Float[Array, "beams 2"]
+) -> Float[Array, " beams"]:
+    """Inverse distance to the nearest circle along each beam; 0 or less where there is none.
+
+    The two crossings multiply to |centre|^2 - radius^2, which turns the division into one for each circle.
+    """
+    centre, radius = circles[:, :2] - origin, circles[:, 2]
+    power = jnp.sum(jnp.square(centre), -1) - jnp.square(radius)
+    power = jnp.where(jnp.abs(power) < 1e-9, 1e-9, power)
+    other = jnp.where(power > 0, 1.0, -1.0)
+    along = centre[:, 0, None] * beams[:, 0] + centre[:, 1, None] * beams[:, 1]
+    across = centre[:, 0, None] * beams[:, 1] - centre[:, 1, None] * beams[:, 0]
+    depth = jnp.square(radius)[:, None] - jnp.square(across)
+    seen = (along + other[:, None] * jnp.sqrt(jnp.maximum(depth, 0.0))) / power[:, None]
+    return jnp.where(depth >= 0, seen, 0.0).max(0)

@@ -1,0 +1,81 @@
+"""Walking step after step and keeping what a picture needs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, PRNGKeyArray
+
+from cuelearner_envs.navigation.environment import Navigation
+from cuelearner_envs.navigation.world import World
+
+ENDS = ("success", "collision", "timeout")
+
+
+class Frame(NamedTuple):
+    """One step of an episode, in arrays of numpy."""
+
+    world: World  # the one walked in, no batch
+    goal: Float[np.ndarray, "2"]  # [m]
+    goal_radius: float  # nearer than this, the goal is reached [m]
+    pose: Float[np.ndarray, "3"]  # before the step: x, y, yaw [m, rad]
+    ranges: Float[np.ndarray, "271"]  # what the lidar perceives there [m]
+    max_range: float  # what a beam reads that meets nothing [m]
+    action: Float[np.ndarray, "2"]  # direction chosen there, unit vector in the body's frame
+    next_pose: Float[np.ndarray, "3"]  # where the step led, before any reset [m, rad]
+    seconds: float  # since the episode began, at the end of the step [s]
+    outcome: str  # one of `ENDS` if the episode ended with this step, otherwise empty
+    episode: int  # counted from 0
+
+
+def record(
+    env: Navigation, policy: Callable[[PRNGKeyArray, Any, jax.Array], jax.Array], key: PRNGKeyArray, steps: int
+) -> tuple[list[Frame], list[float]]:
+    """Frames and rewards of `steps` steps of a policy; a new episode follows the end of one.
+
+    Args:
+        policy: (key, states (n, ...), observations (n, obs)) -> directions (n, 2).
+    """
+
+    @jax.jit
+    def play(env: Navigation, key: PRNGKeyArray) -> Any:
+        k_reset, k_play = jax.random.split(key)
+
+        def advance(carry: Any, number: jax.Array) -> Any:
+            state, obs = carry
+            k_act, k_step = jax.random.split(jax.random.fold_in(k_play, number))
+            states = jax.tree.map(lambda leaf: leaf[None], state)
+            action = policy(k_act, states, obs[None])[0]
+            moved = env.moved(state, action)
+            following, step = env.step(k_step, state, action)
+            seconds = moved.steps * jnp.asarray(env.period)
+            ends = jnp.stack([step.outcome[name] for name in ENDS])
+            seen = (state, env.ranges(state), action, moved.pose, seconds, ends, step.reward)
+            return (following, step.obs), seen
+
+        return jax.lax.scan(advance, env.reset(k_reset), jnp.arange(steps))[1]
+
+    states, ranges, actions, next_poses, seconds, ends, rewards = jax.device_get(play(env, key))
+    worlds = jax.device_get(env.world(states.world))
+    finished = np.cumsum(ends.any(-1))
+    frames = [
+        Frame(
+            world=jax.tree.map(lambda leaf, number=number: leaf[number], worlds),
+            goal=states.goal[number],
+            goal_radius=float(env.goal_radius),
+            pose=states.pose[number],
+            ranges=ranges[number],
+            max_range=float(env.lidar.max_range),
+            action=actions[number],
+            next_pose=next_poses[number],
+            seconds=float(seconds[number]),
+            outcome="".join(name for name, ended in zip(ENDS, ends[number], strict=True) if ended),
+            episode=int(finished[number - 1]) if number else 0,
+        )
+        for number in range(steps)
+    ]
+    return frames, [float(reward) for reward in rewards]

@@ -1,0 +1,160 @@
+"""The navigation teacher: a probabilistic road map of each world, and the direction of the shortest way over it.
+
+Source: Kavraki, Svestka, Latombe, Overmars, "Probabilistic roadmaps for path planning in high-dimensional configuration
+spaces" (1996). Nodes are drawn at random, most of them close round the solids, where shortest paths bend (Amato et al.,
+"OBPRM", 1998). Every two nodes are joined that the body can walk between in a straight line however it is turned.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from cuelearner_envs.navigation.environment import Navigation, Walker
+from cuelearner_envs.navigation.geometry import clearance, line_clearance
+from cuelearner_envs.navigation.robot import Robot
+from cuelearner_envs.navigation.world import World
+from cuelearner_jax.actions import from_angle, retract, rotate
+
+NODES = 160
+UNIFORM = 64  # candidates drawn anywhere
+ROUND = 6  # candidates round a circle
+NODE_MARGIN = 0.13  # a node keeps this much more than the body's reach from every solid [m]
+LINE_MARGIN = 0.08  # and a line this much
+YIELD = 0.001  # a line may be this much closer to a solid than the place it begins at already is [m]
+BLOCKED = 1e4  # added to the length of a way that begins with a blocked line [m]
+
+
+class RoadMap(struct.PyTreeNode):
+    """One world's graph."""
+
+    nodes: Float[Array, "nodes 2"]  # [m]
+    lengths: Float[Array, "nodes nodes"]  # of the line between two nodes [m]; infinite where it is blocked
+
+
+def build(key: PRNGKeyArray, world: World, robot: Robot) -> RoadMap:
+    """The road map of a world for a robot's footprint."""
+    k_place, k_order = jax.random.split(key)
+    candidates, rank = _candidates(k_place, world, robot.reach + NODE_MARGIN)
+    free = jax.vmap(partial(clearance, world))(candidates) >= robot.reach + NODE_MARGIN - 1e-4
+    inside = (jnp.abs(candidates) < world.extent / 2).all(-1)
+    order = jnp.argsort(jnp.where(free & inside, rank + jax.random.uniform(k_order, rank.shape), jnp.inf))[:NODES]
+    nodes, useful = candidates[order], (free & inside)[order]
+    clear = jax.vmap(lambda a: jax.vmap(lambda b: line_clearance(world, a, b))(nodes))(nodes)
+    joined = (clear >= robot.reach + LINE_MARGIN) & useful[:, None] & useful
+    apart = jnp.linalg.norm(nodes[:, None] - nodes, axis=-1)
+    return RoadMap(nodes, jnp.where(joined, apart, jnp.inf))
+
+
+def distances(roadmap: RoadMap, world: World, robot: Robot, goal: Float[Array, "2"]) -> Float[Array, " nodes"]:
+    """Length of the shortest way from each node to a goal [m]; infinite where there is none. Bellman and Ford's method."""
+    direct = jnp.linalg.norm(roadmap.nodes - goal, axis=-1)
+    useful = jnp.isfinite(roadmap.lengths).any(-1)
+    start = jnp.where(useful & (_view(roadmap, world, robot, goal) >= 0), direct, jnp.inf)
+
+    def relax(length: jax.Array) -> jax.Array:
+        return jnp.minimum(length, (roadmap.lengths + length).min(-1))
+
+    def more(carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        return carry[1], relax(carry[1])
+
+    return jax.lax.while_loop(lambda carry: (carry[0] != carry[1]).any(), more, (start, relax(start)))[1]
+
+
+def way(
+    roadmap: RoadMap,
+    world: World,
+    robot: Robot,
+    to_goal: Float[Array, " nodes"],
+    position: Float[Array, "2"],
+    goal: Float[Array, "2"],
+) -> tuple[Float[Array, "2"], Float[Array, ""]]:
+    """Where to walk next from a place, and how long the whole way is.
+
+    Args:
+        to_goal: `distances` of the same goal.
+        position: any place, also one too close to a solid for the map: the line from there may then be as close.
+
+    Returns:
+        The next place to walk to in a straight line (the goal, if it is in view) [m]; the way's length [m], more than
+        `BLOCKED` if no line from here is clear: the place is then at the end of the clearest.
+    """
+    places = jnp.concatenate([roadmap.nodes, goal[None]])
+    rest = jnp.append(to_goal, 0.0)
+    room = jnp.append(_view(roadmap, world, robot, position), _room(world, robot, position, goal))
+    penalty = jnp.where(room >= 0, 0.0, BLOCKED * (1.0 - room))
+    lengths = jnp.linalg.norm(places - position, axis=-1) + rest + penalty
+    best = jnp.argmin(lengths)
+    return places[best], lengths[best]
+
+
+def _view(roadmap: RoadMap, world: World, robot: Robot, position: Float[Array, "2"]) -> Float[Array, " nodes"]:
+    return jax.vmap(partial(_room, world, robot, position))(roadmap.nodes)
+
+
+def _room(world: World, robot: Robot, position: Float[Array, "2"], place: Float[Array, "2"]) -> Float[Array, ""]:
+    """Clearance of a line beyond what it must have [m]: the map's, or that of its worse end."""
+    ends = jnp.minimum(clearance(world, position), clearance(world, place))
+    needed = jnp.minimum(robot.reach + LINE_MARGIN, ends - YIELD)
+    return line_clearance(world, position, place) - needed
+
+
+def _candidates(
+    key: PRNGKeyArray, world: World, away: Float[Array, ""] | float
+) -> tuple[Float[Array, "many 2"], Float[Array, " many"]]:
+    """Places for nodes, and their ranks: corners of boxes first, then round circles, beside boxes, anywhere."""
+    signs = jnp.array([[1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]])
+    sides = jnp.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
+
+    def of_box(box: Float[Array, "5"]) -> tuple[jax.Array, jax.Array]:
+        corners = signs * (box[3:] + away / 2**0.5)
+        beside = sides * (box[3:] + away)
+        return tuple(box[:2] + rotate(points, box[2]) for points in (corners, beside))  # pyright: ignore
+
+    def of_circle(circle: Float[Array, "3"], turn: Float[Array, ""]) -> jax.Array:
+        # A polygon round the circle whose sides keep the distance, not only its corners.
+        radius = (circle[2] + away) / jnp.cos(jnp.pi / ROUND)
+        return circle[:2] + radius * from_angle(turn + jnp.arange(ROUND) * (2 * jnp.pi / ROUND))
+
+    k_turn, k_anywhere = jax.random.split(key)
+    corners, beside = jax.vmap(of_box)(world.boxes)
+    turns = jax.random.uniform(k_turn, (world.circles.shape[0],), maxval=2 * jnp.pi)
+    rounds = jax.vmap(of_circle)(world.circles, turns)
+    anywhere = jax.random.uniform(k_anywhere, (UNIFORM, 2), minval=-0.5, maxval=0.5) * world.extent
+    kinds = [corners.reshape(-1, 2), rounds.reshape(-1, 2), beside.reshape(-1, 2), anywhere]
+    ranks = [jnp.full(len(kind), rank) for kind, rank in zip(kinds, (0.0, 0.4, 0.8, 1.0), strict=True)]
+    return jnp.concatenate(kinds), jnp.concatenate(ranks)
+
+
+class RoadMapTeacher(struct.PyTreeNode):
+    """Knows every world of an environment (`cuelearner_jax.types.Teacher`)."""
+
+    env: Navigation
+    maps: RoadMap  # leading axis: worlds
+    to_goals: Float[Array, "worlds routes nodes"]  # `distances` of each route's goal
+
+    def best_action(self, state: Walker, obs: Float[Array, " obs"]) -> Float[Array, "2"]:
+        """The direction of the shortest way to the goal, in the body's frame. Looks at the true state."""
+        world = self.env.world(state.world)
+        roadmap = jax.tree.map(lambda leaf: leaf[state.world], self.maps)
+        to_goal = self.to_goals[state.world, state.route]
+        place, _ = way(roadmap, world, self.env.robot, to_goal, state.pose[:2], state.goal)
+        return rotate(retract(place - state.pose[:2]), -state.pose[2])
+
+
+@jax.jit
+def make_teacher(env: Navigation) -> RoadMapTeacher:
+    """Road maps of all worlds of an environment."""
+
+    def of_world(pair: tuple[PRNGKeyArray, World]) -> tuple[RoadMap, jax.Array]:
+        roadmap = build(pair[0], pair[1], env.robot)
+        return roadmap, jax.vmap(partial(distances, roadmap, pair[1], env.robot))(pair[1].goals)
+
+    count = env.worlds.starts.shape[0]
+    keys = jax.random.split(jax.random.key(0), count)
+    maps, to_goals = jax.lax.map(of_world, (keys, env.worlds), batch_size=min(count, 16))
+    return RoadMapTeacher(env, maps, to_goals)

@@ -1,0 +1,69 @@
+"""How the quadruped moves when told a direction, and the room that its body takes.
+
+A stand-in for a legged robot with its walking controller (which MuJoCo simulates elsewhere): ANYmal's body (0.93 m by
+0.53 m) as three discs along its axis; its velocity follows the command with a first-order lag; it turns toward where it
+is told to go at a bounded rate. Everything is solved in closed form over a control step.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Bool, Float
+
+from cuelearner_envs.navigation.geometry import clearance
+from cuelearner_envs.navigation.world import World
+from cuelearner_jax.actions import from_angle, rotate, to_angle
+
+Scalar = float | Float[Array, ""]
+
+
+class Robot(struct.PyTreeNode):
+    """Parameters of the motion, all of them traced."""
+
+    speed: Scalar = 1.0  # at which it is told to walk [m/s]
+    lag: Scalar = 0.1  # time constant of its velocity [s]
+    turn_rate: Scalar = 1.5  # largest [rad/s]
+    disc_radius: Scalar = 0.265  # [m]
+    disc_offset: Scalar = 0.2  # of the front and rear discs from the centre, along the body [m]
+
+    @property
+    def reach(self) -> Scalar:
+        """Distance from the centre to the body's farthest point [m]: clear of this, it may turn as it likes."""
+        return self.disc_radius + self.disc_offset
+
+
+class Motion(struct.PyTreeNode):
+    """Where a robot is and how it moves."""
+
+    pose: Float[Array, "3"]  # x, y, yaw [m, rad]
+    velocity: Float[Array, "2"]  # in the world's frame [m/s]
+
+
+def walk(robot: Robot, motion: Motion, direction: Float[Array, "2"], duration: Scalar) -> Motion:
+    """The motion after `duration` [s] of being told to walk in `direction` (unit vector in the body's frame).
+
+    The command is held in the world's frame meanwhile: the body turns under it.
+    """
+    position, yaw = motion.pose[:2], motion.pose[2]
+    wanted = robot.speed * rotate(direction, yaw)
+    fading = jnp.exp(-duration / robot.lag)
+    velocity = wanted + (motion.velocity - wanted) * fading
+    position = position + wanted * duration + (motion.velocity - wanted) * robot.lag * (1.0 - fading)
+    limit = robot.turn_rate * duration
+    turned = yaw + jnp.clip(to_angle(direction), -limit, limit)
+    return Motion(jnp.concatenate([position, to_angle(from_angle(turned))[None]]), velocity)
+
+
+def discs(robot: Robot, pose: Float[Array, "3"]) -> Float[Array, "3 2"]:
+    """Centres of the body's discs: rear, middle, front [m]."""
+    along = jnp.array([-1.0, 0.0, 1.0]) * robot.disc_offset
+    return pose[:2] + along[:, None] * from_angle(pose[2])
+
+
+def collides(robot: Robot, world: World, pose: Float[Array, "3"]) -> Bool[Array, ""]:
+    """Does the body touch a solid, or stand outside the walls?"""
+    centres = discs(robot, pose)
+    touching = jax.vmap(lambda centre: clearance(world, centre))(centres) < robot.disc_radius
+    return touching.any() | (jnp.abs(pose[:2]) > world.extent / 2).any()

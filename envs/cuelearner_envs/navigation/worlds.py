@@ -1,0 +1,118 @@
+"""Procedurally generated worlds: a layout, and routes that the robot is sure to be able to walk.
+
+Reachability is proved on a grid. A cell is passable if its middle keeps the body's reach and half a cell from every
+solid; then so does the straight line between the middles of two passable neighbours (distance changes no faster than
+place), however the body is turned.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
+
+from cuelearner_envs.navigation.geometry import clearance
+from cuelearner_envs.navigation.layouts import STYLES, Layout
+from cuelearner_envs.navigation.robot import Robot
+from cuelearner_envs.navigation.world import World
+
+CELL = 0.2  # side of a grid cell [m]
+CELLS = 100  # along either side: the largest world is 20 m
+NEAREST, FARTHEST = 5.0, 15.0  # from start to goal [m]
+JITTER = 0.1  # starts and goals lie this far from a cell's middle at most, along x and y [m]
+ROUTES = 16
+WORLDS_AT_ONCE = 64  # generated together: bounds the memory of their grids
+
+
+def generate(key: PRNGKeyArray, style: str = "clutter", routes: int = ROUTES) -> World:
+    """A random world whose every start reaches its goal, 5 to 15 m away.
+
+    Args:
+        key: decides everything.
+        style: "clutter", "rooms" or "corridor", see `layouts`.
+        routes: number of (start, goal) pairs.
+
+    Raises:
+        ValueError: for another style.
+    """
+    if style not in STYLES:
+        raise ValueError(f"unknown style {style!r}: choose one of {', '.join(STYLES)}")
+
+    def attempt(key: PRNGKeyArray) -> tuple[World, Bool[Array, ""]]:
+        k_layout, k_routes = jax.random.split(key)
+        return _with_routes(k_routes, STYLES[style](k_layout), routes)
+
+    def again(carry: tuple[PRNGKeyArray, World, Bool[Array, ""]]) -> tuple[PRNGKeyArray, World, Bool[Array, ""]]:
+        key, next_key = jax.random.split(carry[0])
+        return next_key, *attempt(key)
+
+    _, world, _ = jax.lax.while_loop(lambda carry: ~carry[2], again, again((key, None, None)))  # pyright: ignore
+    return world
+
+
+@partial(jax.jit, static_argnames=("count", "style", "routes"))
+def generate_many(key: PRNGKeyArray, count: int, style: str = "clutter", routes: int = ROUTES) -> World:
+    """`count` worlds (leading axis). World i does not depend on how many there are."""
+    keys = jax.vmap(partial(jax.random.fold_in, key))(jnp.arange(count))
+    return jax.lax.map(lambda k: generate(k, style, routes), keys, batch_size=min(count, WORLDS_AT_ONCE))
+
+
+def cell_centres() -> Float[Array, "cells cells 2"]:
+    """Middles of the grid's cells [m]; the first axis runs along x."""
+    along = (jnp.arange(CELLS) - (CELLS - 1) / 2) * CELL
+    return jnp.stack(jnp.meshgrid(along, along, indexing="ij"), axis=-1)
+
+
+def free_space(world: World) -> Float[Array, "cells cells"]:
+    """Distance from each cell's middle to the nearest solid [m]; negative outside the walls."""
+    centres = cell_centres()
+    distance = jax.vmap(jax.vmap(lambda centre: clearance(world, centre)))(centres)
+    return jnp.where((jnp.abs(centres) < world.extent / 2).all(-1), distance, -1.0)
+
+
+def flood(passable: Bool[Array, "cells cells"], seed: Bool[Array, "cells cells"]) -> Bool[Array, "cells cells"]:
+    """The passable cells that can be reached from `seed` over the sides of cells."""
+
+    def spread(reached: Bool[Array, "cells cells"]) -> Bool[Array, "cells cells"]:
+        padded = jnp.pad(reached, 1)
+        sides = padded[2:, 1:-1] | padded[:-2, 1:-1] | padded[1:-1, 2:] | padded[1:-1, :-2]
+        return (reached | sides) & passable
+
+    def more(carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        return carry[1], spread(spread(carry[1]))
+
+    start = seed & passable
+    return jax.lax.while_loop(lambda carry: (carry[0] != carry[1]).any(), more, (start, spread(start)))[1]
+
+
+def _with_routes(key: PRNGKeyArray, layout: Layout, routes: int) -> tuple[World, Bool[Array, ""]]:
+    """The world of a layout, and whether all its routes are as they should be."""
+    nowhere = jnp.zeros((routes, 2))
+    world = World(*layout, starts=nowhere, goals=nowhere)
+    distance = free_space(world)
+    passable = distance >= Robot().reach + CELL / 2
+    # Off its middle by `JITTER` a place still keeps the reach, and so does the line to the middle.
+    roomy = distance >= Robot().reach + CELL / 2 + JITTER * 2**0.5
+    k_seed, k_routes = jax.random.split(key)
+    seed = jax.random.categorical(k_seed, jnp.where(roomy, 0.0, -jnp.inf).ravel())
+    reached = flood(passable, jnp.zeros(roomy.size, bool).at[seed].set(True).reshape(roomy.shape))
+    usable = (roomy & reached).ravel()
+    # A seed in a corner that is cut off from the rest makes no world.
+    connected = (passable & reached).sum() >= 0.8 * passable.sum()
+    starts, goals, found = jax.vmap(partial(_route, usable))(jax.random.split(k_routes, routes))
+    return world.replace(starts=starts, goals=goals), connected & found.all()
+
+
+def _route(usable: Bool[Array, " all"], key: PRNGKeyArray) -> tuple[jax.Array, jax.Array, Bool[Array, ""]]:
+    """A random start and goal in usable cells at a distance in bounds, and whether there is one."""
+    k_goal, k_start, k_jitter = jax.random.split(key, 3)
+    centres = cell_centres().reshape(-1, 2)
+    goal = jax.random.categorical(k_goal, jnp.where(usable, 0.0, -jnp.inf))
+    distance = jnp.linalg.norm(centres - centres[goal], axis=-1)
+    slack = 2 * JITTER * 2**0.5
+    partners = usable & (distance >= NEAREST + slack) & (distance <= FARTHEST - slack)
+    start = jax.random.categorical(k_start, jnp.where(partners, 0.0, -jnp.inf))
+    jitter = jax.random.uniform(k_jitter, (2, 2), minval=-JITTER, maxval=JITTER)
+    return centres[start] + jitter[0], centres[goal] + jitter[1], partners.any()
