@@ -96,8 +96,8 @@ class Evaluate(Generic[TaskT]):
 
     task: TaskT
     policy: str = "agent"
-    """Of a run: agent, guide (guidance of uniform actions) or guided (guidance of the agent's); of a run or a task
-    alone: teacher, heuristic or uniform."""
+    """Of a run: agent, guide (guidance of uniform actions), guided (guidance of the agent's), corrected (the teacher's
+    own feedback on the agent's); of a run or a task alone: teacher, heuristic or uniform."""
     guidance: tuple[str, ...] = ()
     """Only these kinds of guidance of the run (default: all)."""
     steps: int = 10_000

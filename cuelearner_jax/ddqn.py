@@ -36,8 +36,8 @@ def target(
 ) -> Float[Array, ""]:
     """r + discount * Q'(s', argmax_a Q(s', a)): the online network chooses, the target network values.
 
-    `target_params` None means that nothing bootstraps (a discount of 0): the target is the reward. `chooser` computes the
-    values among which is chosen, where that is done less precisely than by `q`.
+    `target_params` None means that nothing bootstraps (a discount of 0): the target is the reward. `chooser` computes
+    the values among which is chosen, where that is done less precisely than by `q`.
     """
     if target_params is None:
         return transition.reward

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +13,9 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from cuelearner_jax import actions as geometry
 from cuelearner_jax import ddqn
 from cuelearner_jax.config import Scalars, Sizes
+from cuelearner_jax.feedback import relative_feedback, relative_target
 from cuelearner_jax.networks import applied, q_network
+from cuelearner_jax.refine import refine
 from cuelearner_jax.types import Environment, Guidance, GuidanceModel, Params, Teacher
 
 # (key, environment states (n, ...), observations (n, obs)) -> directions (n, 2)
@@ -22,7 +24,18 @@ Policy = Callable[[PRNGKeyArray, Any, jax.Array], jax.Array]
 # Folded into the root key: episodes for reported figures only, and episodes for choosing settings.
 SPLITS = {"validation": 1_000_003, "tuning": 1_000_001}
 
-ACTIONS_AT_ONCE = 8192  # state-action pairs in one forward pass of an argmax: bounds its memory
+
+class Portions(NamedTuple):
+    """How much is worked on at once: what a core's cache holds, or what keeps an accelerator busy within its memory."""
+
+    actions: int  # state-action pairs in one forward pass of an argmax
+    agents: int  # evaluated side by side
+    states: int  # that a teacher looks at together
+
+
+def portions() -> Portions:
+    """Those of the device that computes."""
+    return Portions(8192, 1, 16) if jax.default_backend() == "cpu" else Portions(1 << 18, 16, 256)
 
 
 def episodes(split: str = "validation") -> PRNGKeyArray:
@@ -72,7 +85,7 @@ def agent_policy(sizes: Sizes, params: Params) -> Policy:
 
     def policy(key: PRNGKeyArray, state: Any, obs: jax.Array) -> jax.Array:
         choose = partial(ddqn.greedy, q, params, directions=options)
-        return jax.lax.map(choose, obs, batch_size=max(1, ACTIONS_AT_ONCE // sizes.directions))
+        return jax.lax.map(choose, obs, batch_size=max(1, min(len(obs), portions().actions // sizes.directions)))
 
     return policy
 
@@ -84,8 +97,13 @@ def uniform_policy() -> Policy:
 
 def teacher_policy(teacher: Teacher) -> Policy:
     """What a teacher holds for best."""
-    # One state after another: a teacher by search simulates hundreds of actions of each.
-    return lambda key, state, obs: jax.lax.map(lambda pair: teacher.best_action(*pair), (state, obs))
+    return lambda key, state, obs: _best_actions(teacher, state, obs)
+
+
+def _best_actions(teacher: Teacher, state: Any, obs: jax.Array) -> jax.Array:
+    # Few states at a time: a teacher by search simulates hundreds of actions of each.
+    ask = lambda pair: teacher.best_action(*pair)  # noqa: E731
+    return jax.lax.map(ask, (state, obs), batch_size=min(len(obs), portions().states))
 
 
 def heuristic_policy(env: Environment) -> Policy:
@@ -103,12 +121,36 @@ def guided_policy(base: Policy, guidance: Guidance, model: GuidanceModel, env: E
     return policy
 
 
+def corrected_policy(base: Policy, teacher: Teacher, scalars: Scalars) -> Policy:
+    """Another policy's actions, refined by the teacher's own relative feedback instead of a model of it."""
+
+    def policy(key: PRNGKeyArray, state: Any, obs: jax.Array) -> jax.Array:
+        best, eps = _best_actions(teacher, state, obs), scalars.radians("eps")
+        told = jax.vmap(lambda action, best: relative_target(action, relative_feedback(action, best, eps), eps))
+        return refine(
+            lambda actions: told(actions, best),
+            base(key, state, obs),
+            jnp.ones(obs.shape[0], bool),
+            tau=scalars.radians("tau"),
+            tau_max=scalars.radians("tau_max"),
+            k_max=scalars.k_max,
+        ).actions
+
+    return policy
+
+
 @partial(jax.jit, static_argnames=("sizes", "num_envs", "steps"))
 def evaluate_agents(
     env: Environment, params: Params, key: PRNGKeyArray, *, sizes: Sizes, num_envs: int, steps: int
 ) -> dict[str, Float[Array, " lanes"]]:
     """Validation of a block of agents (leading axis of `params`), all on the same episodes."""
-    return jax.lax.map(lambda lane: rollout(agent_policy(sizes, lane), env, key, num_envs, steps), params)
+    return each_lane(lambda lane: rollout(agent_policy(sizes, lane), env, key, num_envs, steps), params)
+
+
+def each_lane(measure: Callable[[Any], dict[str, jax.Array]], lanes: Any) -> dict[str, Float[Array, " lanes"]]:
+    """`measure` of every lane (leading axis), as many at once as the device takes well."""
+    count = jax.tree.leaves(lanes)[0].shape[0]
+    return jax.lax.map(measure, lanes, batch_size=min(count, portions().agents))
 
 
 @partial(jax.jit, static_argnames=("guidance", "num_envs", "steps"))

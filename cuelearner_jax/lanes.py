@@ -108,12 +108,12 @@ def memory_report(group: Group) -> str:
     sizes, lanes = group.config.sizes, len(group.seeds)
     padded = sum(len(seeds) for seeds, _ in group.blocks())
     kept = sum(state_bytes(block) for block in shapes)
-    # Two layers' activations of the widest pass: the argmax while acting, or a batch with its gradient.
+    # Layers' activations of the widest pass: the argmax while acting, that inside targets, or a batch with its gradient.
     widest = max(*sizes.q_layers, *sizes.feedback_layers)
     rows = max(sizes.num_envs * sizes.directions, 3 * sizes.batch_size * len(sizes.q_layers))
     if group.config.bootstraps:
-        rows = max(rows, sizes.batch_size * sizes.target_directions)
-    working = 2 * 4 * widest * rows * (padded // len(shapes))
+        rows = max(rows, sizes.batch_size * sizes.target_directions * (2 if sizes.n_step > 1 else 1))
+    working = 4 * 4 * widest * rows * (padded // len(shapes))
     available = _available_bytes()
     limit = f", {available / 1e9:.1f} GB are free" if available else ""
     if available and kept + working > available:

@@ -17,6 +17,8 @@ from cuelearner_jax.errors import UserError, closest
 from cuelearner_jax.evaluate import (
     Policy,
     agent_policy,
+    corrected_policy,
+    each_lane,
     episodes,
     guided_policy,
     heuristic_policy,
@@ -29,8 +31,10 @@ from cuelearner_jax.runs import Grid
 from cuelearner_jax.tasks import Task, shape_of
 from cuelearner_jax.types import Environment, Guidance, Teacher
 
-TRAINED = ("agent", "guide", "guided")  # the agent; guidance of uniform actions; guidance of the agent's actions
+# The agent; guidance of uniform actions; guidance of the agent's actions; the teacher's own corrections of them.
+TRAINED = ("agent", "guide", "guided", "corrected")
 UNTRAINED = ("teacher", "heuristic", "uniform")
+TAUGHT = ("teacher", "corrected")  # these ask the teacher
 
 
 @dataclass(frozen=True)
@@ -82,11 +86,15 @@ def load_lanes(subject: Subject, kinds: tuple[str, ...]) -> list[Trained]:
     return loaded
 
 
-def trained_policy(name: str, lanes: Trained, lane: Any, config: RunConfig, env: Environment) -> Policy:
+def trained_policy(
+    name: str, lanes: Trained, lane: Any, config: RunConfig, env: Environment, teacher: Teacher | None
+) -> Policy:
     """One lane's policy. `lane` is its entry of `lanes.policies`."""
     agent = agent_policy(config.sizes, lane["params"])
     if name == "agent":
         return agent
+    if teacher is not None:
+        return corrected_policy(agent, teacher, config.scalars)
     base = uniform_policy() if name == "guide" else agent
     return guided_policy(base, lanes.guidance, lane["guidance"], env, config.scalars)
 
@@ -114,8 +122,8 @@ def evaluate(
     """Metrics of a policy on validation episodes of a world (a task configuration), for each guidance and budget."""
     env = subject.task.environment(world, "validation")
     key = episodes()
+    teacher = subject.task.teacher(world, env) if name in TAUGHT else None
     if name in UNTRAINED:
-        teacher = subject.task.teacher(world, env) if name == "teacher" else None
         # As arguments: what is closed over becomes a constant of the program.
         measure = jax.jit(lambda env, teacher: rollout(untrained_policy(name, env, teacher), env, key, num_envs, steps))
         found = measure(env, teacher)
@@ -125,13 +133,14 @@ def evaluate(
     for lanes in load_lanes(subject, kinds):
 
         @jax.jit
-        def measure(env: Environment, policies: Any, lanes: Trained = lanes) -> dict[str, jax.Array]:
+        def measure(env: Environment, teacher: Teacher | None, policies: Any, lanes: Trained = lanes) -> Any:
             def one(lane: Any) -> dict[str, jax.Array]:
-                return rollout(trained_policy(name, lanes, lane, subject.config, env), env, key, num_envs, steps)
+                policy = trained_policy(name, lanes, lane, subject.config, env, teacher)
+                return rollout(policy, env, key, num_envs, steps)
 
-            return jax.lax.map(one, policies)
+            return each_lane(one, policies)
 
-        found = {metric: np.asarray(values) for metric, values in measure(env, lanes.policies).items()}
+        found = {metric: np.asarray(values) for metric, values in measure(env, teacher, lanes.policies).items()}
         for budget in np.unique(lanes.budgets):
             own = lanes.budgets == budget
             metrics = {metric: values[own] for metric, values in found.items()}
@@ -143,8 +152,9 @@ def one_policy(
     subject: Subject, env: Environment, world: Any, name: str, kind: str | None, labels: int | None, seed: int | None
 ) -> Policy:
     """A single policy: of one lane of a run, or of the task. Raises UserError if the run has no such lane."""
+    teacher = subject.task.teacher(world, env) if name in TAUGHT else None
     if name in UNTRAINED:
-        return untrained_policy(name, env, subject.task.teacher(world, env) if name == "teacher" else None)
+        return untrained_policy(name, env, teacher)
     assert subject.grid is not None  # Subject.check has seen to it
     lanes = load_lanes(subject, (kind or subject.grid.guidance[-1],))[0]
     budget = int(lanes.budgets.max()) if labels is None else labels
@@ -156,7 +166,7 @@ def one_policy(
             f"and labels {_listed(lanes.budgets)}"
         )
     lane = jax.tree.map(lambda leaf: leaf[index[0]], lanes.policies)
-    return trained_policy(name, lanes, lane, subject.config, env)
+    return trained_policy(name, lanes, lane, subject.config, env, teacher)
 
 
 def _listed(values: np.ndarray) -> str:

@@ -138,8 +138,8 @@ NAVIGATION_SIZES = Sizes(
     replay_capacity=100_000,
 )
 
-# The paper's step size, discount and eps. Its bound on the gradient's norm for billiards (0.5) and target network (0.005)
-# also reach these success rates, many times slower; see docs/results.md.
+# The paper's step size, discount and eps. The bound on the gradient's norm (0.5) and the target network's rate (0.005)
+# of its billiards code learn more slowly here, see docs/results.md.
 NAVIGATION_SCALARS = Scalars(learning_rate=0.001, discount=0.995, eps_deg=20.0, max_grad_norm=10.0, polyak=0.05)
 
 NAVIGATION = Task(

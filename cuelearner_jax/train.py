@@ -264,13 +264,12 @@ class Lane(NamedTuple):
             params, target_params, opt_state = carry
             k_sample, k_mirror = jax.random.split(jax.random.fold_in(key, index))
             numbers = buffer.draw(k_sample, state.replay, filled, self.sizes.batch_size)
-            memory = buffer.read(state.replay, numbers)
-            batch = mirrored(k_mirror, env, self.one_step(env, memory))
-            targets = self.targets(params, target_params, batch, scalars)
+            batches = [self.one_step(env, buffer.read(state.replay, numbers))]
             if self.sizes.n_step > 1:
-                further = mirrored(k_mirror, env, self.n_step(env, buffer, state.replay, filled, numbers, scalars))
-                distant = self.targets(params, target_params, further, scalars)
-                targets += scalars.n_step_weight * (distant - targets)
+                batches.append(self.n_step(env, buffer, state.replay, filled, numbers, scalars))
+            batches = [mirrored(k_mirror, env, batch) for batch in batches]
+            targets = self.targets(params, target_params, batches, scalars)
+            batch = batches[0]
             loss, gradient = jax.value_and_grad(lambda p: ddqn.loss(self.q, p, batch, targets))(params)
             change, opt_state = optimizer.update(gradient, opt_state, params)
             params = optax.apply_updates(params, change)
@@ -285,7 +284,6 @@ class Lane(NamedTuple):
         start = (state.params, state.target_params, state.opt_state)
         (params, target_params, opt_state), losses = jax.lax.scan(update, start, jnp.arange(steps))
         return state.replace(params=params, target_params=target_params, opt_state=opt_state), losses.mean()
-
 
     def one_step(self, env: Environment, memory: Memory) -> Transition:
         """Remembered steps (batch, ...) as transitions, their observations rebuilt."""
@@ -314,15 +312,18 @@ class Lane(NamedTuple):
         next_obs = jax.vmap(env.recall_next)(end.obs, end.action, end.aftermath)
         return Transition(jax.vmap(env.recall)(first.obs), first.action, reward, discount, next_obs)
 
-    def targets(self, params: Params, target_params: Params, batch: Transition, scalars: Scalars) -> jax.Array:
-        """What the values of a batch are fitted to (batch,)."""
+    def targets(self, params: Params, target_params: Params, batches: list[Transition], scalars: Scalars) -> jax.Array:
+        """What the values of a batch are fitted to (batch,): of one-step and, if there are, n-step transitions."""
         options = geometry.evenly_spaced(self.sizes.target_directions)
         chooser = applied(q_network(self.sizes.q_layers, self.sizes.target_dtype))
 
         def one(item: Transition) -> jax.Array:
             return ddqn.target(self.q, params, target_params, item, options, scalars.discount, chooser)
 
-        return jax.vmap(one)(batch)
+        # One pass through the networks for both: their weights are what has to be read.
+        joined = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *batches)
+        near, *far = jnp.split(jax.vmap(one)(joined), len(batches))
+        return near + scalars.n_step_weight * (far[0] - near) if far else near
 
 
 def mirrored(key: PRNGKeyArray, env: Environment, batch: Transition) -> Transition:

@@ -1,4 +1,4 @@
-"""Map-less navigation of a quadruped with a lidar: worlds, sensor, motion, environment and a teacher that has the map."""
+"""Map-less navigation of a quadruped with a lidar: worlds, sensor, motion, environment and a teacher with a map."""
 
 from cuelearner_envs.navigation.lidar import BEAM_ANGLES, scan
 from cuelearner_envs.navigation.world import World

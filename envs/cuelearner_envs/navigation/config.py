@@ -21,7 +21,7 @@ class NavigationConfig:
     """A family of worlds and the robot in it."""
 
     style: Literal["clutter", "rooms", "corridor"] = "clutter"
-    """clutter: a hall full of boxes and columns. rooms: rooms, doorways, thin obstacles. corridor: pass left or right."""
+    """clutter: a hall of boxes and columns. rooms: rooms, doorways, thin obstacles. corridor: pass left or right."""
     worlds: int = 1024
     """Number of worlds, each with 16 routes; training and validation have different ones."""
     world_seed: int = 0

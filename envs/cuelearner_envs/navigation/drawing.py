@@ -33,13 +33,14 @@ from cuelearner_envs.navigation.robot import Robot
 from cuelearner_envs.navigation.world import FAR_AWAY, World
 
 # Okabe and Ito's palette, as in the figures of results: told apart with any colour vision.
-BODY, GOAL, ARROW, BEAMS, HITS, START = "#0072B2", "#009E73", "#D55E00", "#56B4E9", "#B37A00", "#000000"
-OUTCOMES = {"success": GOAL, "collision": ARROW, "timeout": "#4d4d4d"}
+BODY, GOAL, CRASH, ARROW, BEAMS, HITS = "#0072B2", "#009E73", "#D55E00", "#E69F00", "#56B4E9", "#CC79A7"
+START, INK = "#000000", "#333333"
+OUTCOMES = {"success": GOAL, "collision": CRASH, "timeout": INK}
 WORDS = {"success": "reached the goal after", "collision": "collision after", "timeout": "out of time after"}
 FLOOR, LOW, TALL = "#fbfaf7", "#c9ccd1", "#5d636b"
 LOWEST, TALLEST = 0.6, 1.5  # heights that have the colours `LOW` and `TALL` [m]
 WIDTH_INCHES, STRIP_INCHES, MARGIN = 7.0, 0.4, 0.35  # the strip below the floor is for words; margin in [m]
-ARROW_LENGTH = 1.3  # [m]
+ARROW_REACH = (0.55, 1.6)  # beginning and end of an arrow, from the middle of the body [m]
 GHOSTS_APART = 1.4  # between the bodies of a still [m]
 HOLD_AFTER = 1.2  # at the end of an animated episode [s]
 
@@ -63,7 +64,7 @@ def draw_world(axes: Axes, world: World) -> None:
 
 
 def still(robot: Robot, frames: Sequence[Frame], file: str | os.PathLike[str], dpi: int = 160) -> None:
-    """Writes a picture of the first episode: its way, bodies along it, and halfway what the lidar saw and what was chosen.
+    """Writes a picture of the first episode: its way, and halfway what the lidar saw and what was chosen.
 
     Args:
         robot: gives the outline of the body.
@@ -87,8 +88,8 @@ def still(robot: Robot, frames: Sequence[Frame], file: str | os.PathLike[str], d
     for pose in _spread(way, middle.pose):
         _Body(axes, robot, alpha=0.35).place(pose)
     _Body(axes, robot).place(middle.pose)
-    _Body(axes, robot, colour=ARROW if last.outcome == "collision" else BODY).place(last.next_pose)
-    _arrow(axes).set_positions(*_arrow_ends(robot, middle))
+    _Body(axes, robot, colour=CRASH if last.outcome == "collision" else BODY).place(last.next_pose)
+    _arrow(axes).set_positions(*_arrow_ends(middle))
     words = WORDS.get(last.outcome, "still walking after")
     length = np.linalg.norm(np.diff(way[:, :2], axis=0), axis=-1).sum()
     _caption(strip).set(text=f"{words} {last.seconds:.1f} s, {length:.1f} m", color=_outcome_colour(last))
@@ -205,7 +206,7 @@ def _box(row: Float[np.ndarray, "5"]) -> Polygon:
 
 
 def _figure(extent: Float[np.ndarray, "2"], dpi: float) -> tuple[Figure, Axes, Axes]:
-    """A figure of axes for a floor and of a strip for words below, in its length the same metres; sides of even dots."""
+    """A figure of axes for a floor and of a strip for words below, as many metres long; its sides are even dots."""
     length, width = np.asarray(extent, float) + 2 * MARGIN
     across = 2 * round(WIDTH_INCHES * dpi / 2)
     floor = across * width / length
@@ -230,10 +231,10 @@ def _draw_course(axes: Axes, frame: Frame) -> None:
 
 def _draw_strip(strip: Axes, world: World) -> None:
     """The key to the signs, and a scale."""
-    length = 5.0 if float(world.extent[0]) > 12.0 else 1.0
+    length = 2.0 if float(world.extent[0]) > 12.0 else 1.0
     right = float(world.extent[0]) / 2
-    strip.plot([right - length, right], [0.3, 0.3], color="#333333", linewidth=2, solid_capstyle="butt")
-    strip.text(right - length / 2, 0.42, f"{length:g} m", ha="center", va="bottom", fontsize=8, color="#333333")
+    strip.plot([right - length, right], [0.3, 0.3], color=INK, linewidth=2, solid_capstyle="butt")
+    strip.text(right - length / 2, 0.42, f"{length:g} m", ha="center", va="bottom", fontsize=8, color=INK)
     signs = {
         "start": {"marker": "o", "color": "white", "markeredgecolor": START, "markersize": 6},
         "goal": {"marker": "*", "color": GOAL, "markeredgewidth": 0, "markersize": 11},
@@ -243,16 +244,16 @@ def _draw_strip(strip: Axes, world: World) -> None:
     handles = [Line2D([], [], linestyle="none", label=name, **look) for name, look in signs.items()]
     place = 0.98 - (length + MARGIN) / (float(world.extent[0]) + 2 * MARGIN)
     look: dict[str, Any] = {"frameon": False, "borderpad": 0, "handletextpad": 0.1, "columnspacing": 0.9}
-    strip.legend(handles=handles, loc="center right", bbox_to_anchor=(place, 0.5), ncols=4, fontsize=8, **look)
+    strip.legend(handles=handles, loc="center right", bbox_to_anchor=(place, 0.5), ncols=4, fontsize=7.5, **look)
 
 
 def _caption(strip: Axes, animated: bool = False) -> Any:
     left = strip.get_xlim()[0] + MARGIN
-    return strip.text(left, 0.5, "", va="center_baseline", fontsize=9.5, animated=animated)
+    return strip.text(left, 0.5, "", va="center_baseline", fontsize=9, animated=animated)
 
 
 def _outcome_colour(frame: Frame) -> str:
-    return OUTCOMES.get(frame.outcome, "#333333")
+    return OUTCOMES.get(frame.outcome, INK)
 
 
 class _Body:
@@ -306,15 +307,15 @@ class _Lidar:
 
 def _arrow(axes: Axes, animated: bool = False) -> FancyArrowPatch:
     arrow = FancyArrowPatch((0, 0), (1, 1), arrowstyle="-|>", mutation_scale=13, shrinkA=0, shrinkB=0, color=ARROW)
-    edge = patheffects.withStroke(linewidth=4, foreground="#ffffffcc")
+    edge = patheffects.withStroke(linewidth=3.6, foreground="#000000aa")
     arrow.set(linewidth=2.2, zorder=7, path_effects=[edge], animated=animated)
     axes.add_patch(arrow)
     return arrow
 
 
-def _arrow_ends(robot: Robot, frame: Frame) -> tuple[tuple[float, float], tuple[float, float]]:
-    """From the middle of the body along the direction that was chosen [m]."""
-    (x0, y0), (x1, y1) = _to_world(frame.pose, np.stack([np.zeros(2), ARROW_LENGTH * np.asarray(frame.action)]))
+def _arrow_ends(frame: Frame) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Beside the body, along the direction that was chosen [m]."""
+    (x0, y0), (x1, y1) = _to_world(frame.pose, np.outer(ARROW_REACH, frame.action))
     return (x0, y0), (x1, y1)
 
 
@@ -340,12 +341,11 @@ class _Stage:
     """One episode's figure. What stands still is drawn once; each picture draws only what moves over it."""
 
     def __init__(self, robot: Robot, first: Frame, extent: Float[np.ndarray, "2"]) -> None:
-        self.robot = robot
         self.figure, axes, strip = _figure(extent, dpi=100)
         _draw_course(axes, first)
         _draw_strip(strip, first.world)
         self.lidar, self.arrow = _Lidar(axes, animated=True), _arrow(axes, animated=True)
-        self.body, self.crashed = (_Body(axes, robot, colour=colour, animated=True) for colour in (BODY, ARROW))
+        self.body, self.crashed = (_Body(axes, robot, colour=colour, animated=True) for colour in (BODY, CRASH))
         (self.trail,) = axes.plot([], [], color=BODY, linewidth=1.6, zorder=4, animated=True)
         self.caption = _caption(strip, animated=True)
         self.canvas: Any = self.figure.canvas
@@ -356,8 +356,8 @@ class _Stage:
         """What the robot sees and chooses before a step, and the way so far."""
         self.lidar.place(frame)
         self.body.place(frame.pose)
-        self.arrow.set_positions(*_arrow_ends(self.robot, frame))
-        return self._picture(way, words, "#333333", self.lidar, self.trail, self.body, self.arrow)
+        self.arrow.set_positions(*_arrow_ends(frame))
+        return self._picture(way, words, INK, self.lidar, self.trail, self.body, self.arrow)
 
     def end(self, last: Frame, way: Float[np.ndarray, "poses 3"]) -> UInt8[np.ndarray, "height width 3"]:
         """Where an episode ended, and how."""
@@ -415,8 +415,10 @@ def _write_mp4(file: str | os.PathLike[str], pictures: Iterator[np.ndarray], fps
 def _write_gif(
     file: str | os.PathLike[str], pictures: Iterator[np.ndarray], milliseconds: int, specimen: np.ndarray
 ) -> None:
-    """Writes a GIF of one palette, the specimen's."""
-    colours = Image.fromarray(specimen).quantize(colors=255, kmeans=1, dither=Image.Dither.NONE).getpalette() or []
+    """Writes a GIF of one palette, the specimen's. Few colours: fewer shades at the edges, a smaller file."""
+    shades = Image.fromarray(specimen).quantize(colors=88, kmeans=1, dither=Image.Dither.NONE).getpalette() or []
+    named = [BODY, GOAL, CRASH, ARROW, HITS, FLOOR, "#ffffff"]  # exactly; quantizing merges what is rare
+    colours = [round(255 * part) for name in named for part in to_rgb(name)] + shades
     tree = KDTree(np.reshape(colours, (-1, 3)))
     nearest = np.full(1 << 24, -1, np.int16)  # place in the palette, for each colour that was met so far
 

@@ -1,4 +1,4 @@
-"""Navigation as a task: what the robot perceives, when an episode ends and what it pays (CueLearner paper, section V-B).
+"""Navigation as a task: what the robot perceives, when an episode ends, what it pays (CueLearner paper, section V-B).
 
 One step is one control step of walking in a chosen direction. Reward: +10 at the goal, -10 for touching anything.
 """

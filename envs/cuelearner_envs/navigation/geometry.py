@@ -26,7 +26,7 @@ def clearance(world: World, point: Float[Array, "2"]) -> Float[Array, ""]:
 
 
 def line_clearance(world: World, start: Float[Array, "2"], end: Float[Array, "2"]) -> Float[Array, ""]:
-    """Smallest distance between the line from `start` to `end` and any solid [m]; 0 where the line meets a box's inside.
+    """Smallest distance between the line from `start` to `end` and any solid [m]; 0 where the line meets a box.
 
     A circle that the line enters gives a negative number: minus how deep.
     """

@@ -51,7 +51,7 @@ def build(key: PRNGKeyArray, world: World, robot: Robot) -> RoadMap:
 
 
 def distances(roadmap: RoadMap, world: World, robot: Robot, goal: Float[Array, "2"]) -> Float[Array, " nodes"]:
-    """Length of the shortest way from each node to a goal [m]; infinite where there is none. Bellman and Ford's method."""
+    """Length of the shortest way from each node to a goal [m]; infinite where there is none (Bellman and Ford)."""
     direct = jnp.linalg.norm(roadmap.nodes - goal, axis=-1)
     useful = jnp.isfinite(roadmap.lengths).any(-1)
     start = jnp.where(useful & (_view(roadmap, world, robot, goal) >= 0), direct, jnp.inf)
