@@ -336,16 +336,15 @@ def _evaluate(arguments: list[str]) -> None:
 
 def _measurements(measured: list[play.Measured], title: str) -> Table:
     """Interquartile means over seeds with their intervals, a row for each guidance and budget."""
-    names = list(measured[0].metrics)
-    table = Table("guidance", "labels", "seeds", "trained steps", *names, title=title)
+    table = Table("guidance", "labels", "seeds", "trained steps", "metric", "mean", "95% interval", title=title)
     for row in measured:
-        cells = []
-        for name in names:
-            values = row.metrics[name]
+        own = [row.guidance, str(row.labels), str(len(row.seeds)), str(row.step)]
+        for name, values in row.metrics.items():
             found = interval(values)
-            spread = f" [{float(found.lower):.3f}, {float(found.upper):.3f}]" if len(values) > 1 else ""
-            cells.append(f"{float(found.estimate):.3f}{spread}")
-        table.add_row(row.guidance, str(row.labels), str(len(row.seeds)), str(row.step), *cells)
+            spread = f"{float(found.lower):.3f} to {float(found.upper):.3f}" if len(values) > 1 else ""
+            table.add_row(*own, name, f"{float(found.estimate):.3f}", spread)
+            own = [""] * len(own)
+        table.add_section()
     return table
 
 

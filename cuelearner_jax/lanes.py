@@ -108,7 +108,7 @@ def memory_report(group: Group) -> str:
     sizes, lanes = group.config.sizes, len(group.seeds)
     padded = sum(len(seeds) for seeds, _ in group.blocks())
     kept = sum(state_bytes(block) for block in shapes)
-    # Layers' activations of the widest pass: the argmax while acting, that inside targets, or a batch with its gradient.
+    # Activations of the widest pass: the argmax while acting, that inside targets, or a batch with its gradient.
     widest = max(*sizes.q_layers, *sizes.feedback_layers)
     rows = max(sizes.num_envs * sizes.directions, 3 * sizes.batch_size * len(sizes.q_layers))
     if group.config.bootstraps:

@@ -1,4 +1,4 @@
-"""Success and collisions of navigation under each form of guidance, as in the paper's figure. About 20 minutes on a GPU.
+"""Success and collisions of navigation under each form of guidance, as in the paper's figure (20 minutes on a GPU).
 
     python experiments/navigation.py --out FOLDER [--dtype bfloat16]
 
