@@ -1,9 +1,11 @@
-"""Success and collisions of navigation under each form of guidance, as in the paper's figure (20 minutes on a GPU).
+"""Success and collisions of navigation under each form of guidance, as in the paper's figure (25 minutes on a GPU).
 
-    python experiments/navigation.py --out FOLDER [--dtype bfloat16]
+    python experiments/navigation.py --out FOLDER [--parts relative-350 relative-500] [--dtype bfloat16]
 
-Sixteen seeds that no setting was chosen on, 200,000 steps each, labels by the road-map teacher; validation in worlds of
-their own. Then 2,000 validation episodes of every agent. The sweep is resumed if it was interrupted.
+Sixteen seeds that no setting was chosen on, 150,000 steps each, labels by the road-map teacher; validation in worlds of
+their own. Then 2,000 validation episodes of every agent, 500 in each of two styles of worlds that it never saw, and the
+curves. A part is one kind of guidance with one budget; with several devices, give each process its parts and device
+(CUDA_VISIBLE_DEVICES) and the same FOLDER. Interrupted parts are resumed, finished ones left as they are.
 """
 
 from __future__ import annotations
@@ -13,35 +15,44 @@ from pathlib import Path
 
 from cuelearner_jax.cli import main as cuelearner
 
-SWEEP = {
-    "--seeds": ("16",),
-    "--first-seed": ("1000",),
-    "--guidance": ("relative", "none", "heuristic"),
-    "--labels": ("100", "350", "500"),
-    "--schedule.total-steps": ("200000",),
-    "--schedule.guidance-until": ("100000",),
-    "--schedule.eval-every": ("10000",),
-    "--schedule.eval-envs": ("200",),
-    "--schedule.eval-steps": ("40000",),
-    "--schedule.checkpoint-every": ("50000",),
+PARTS = {
+    "relative-500": ("relative", "500"),
+    "relative-350": ("relative", "350"),
+    "relative-100": ("relative", "100"),
+    "none": ("none", "100"),
+    "heuristic": ("heuristic", "100"),
 }
-EPISODES, LONGEST = 2000, 200  # of the evaluation at the end; steps of an episode
+SWEEP = {
+    "--seeds": "16",
+    "--first-seed": "1000",
+    "--schedule.total-steps": "150000",
+    "--schedule.guidance-until": "100000",
+    "--schedule.eval-every": "10000",
+    "--schedule.eval-envs": "200",
+    "--schedule.eval-steps": "40000",
+    "--schedule.checkpoint-every": "50000",
+}
+LONGEST = 200  # steps of an episode
+EVALUATIONS = {  # name: policy, style, episodes
+    "agent": ("agent", "clutter", 2000),
+    "guide": ("guide", "clutter", 500),
+    "agent-rooms": ("agent", "rooms", 500),
+    "agent-corridor": ("agent", "corridor", 500),
+}
 
 
-def commands(out: Path, dtype: str, extra: list[str]) -> list[list[str]]:
-    """The command lines that make the figures, in their order."""
-    run = out / "run"
+def commands(out: Path, part: str, dtype: str, extra: list[str]) -> list[list[str]]:
+    """The command lines of one part, in their order."""
+    run = out / part
+    guidance, labels = PARTS[part]
+    options = [text for pair in {"--guidance": guidance, "--labels": labels, **SWEEP}.items() for text in pair]
     resume = ["--resume"] if (run / "config.json").exists() else []
-    sweep = [part for option, values in SWEEP.items() for part in (option, *values)]
-    steps = str(EPISODES * LONGEST)
-    made = [["sweep", "navigation", *sweep, "--sizes.target-dtype", dtype, "--out", str(run), *extra, *resume]]
-    for metric in ("success", "collision"):
-        made.append(["report", str(run), "--metric", metric, "--out", str(out / metric), "--overwrite"])
-    for policy in ("agent", "guide"):
-        measured = out / f"{policy}.json"
-        if not measured.exists():
-            asked = ["--policy", policy, "--envs", str(EPISODES), "--steps", steps]
-            made.append(["evaluate", str(run), *asked, "--out", str(measured)])
+    made = [["sweep", "navigation", *options, "--sizes.target-dtype", dtype, "--out", str(run), *extra, *resume]]
+    for name, (policy, style, episodes) in EVALUATIONS.items():
+        measured = out / "evaluations" / f"{part}-{name}.json"
+        if not measured.exists() and (policy == "agent" or guidance != "none"):
+            asked = ["--policy", policy, "--envs", str(episodes), "--steps", str(episodes * LONGEST)]
+            made.append(["evaluate", str(run), *asked, "--task.style", style, "--out", str(measured)])
     return made
 
 
@@ -49,13 +60,15 @@ def main() -> int:
     """Runs the commands; stops at the first that fails."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("runs/navigation"))
+    parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS), help="these alone")
     parser.add_argument("--dtype", choices=("float32", "bfloat16"), default="float32", help="of the targets' argmax")
     arguments, extra = parser.parse_known_args()
-    for command in commands(arguments.out, arguments.dtype, extra):
-        status = cuelearner(command)
-        if status:
-            return status
-    return 0
+    asked = [line for part in arguments.parts for line in commands(arguments.out, part, arguments.dtype, extra)]
+    if arguments.parts == list(PARTS):
+        runs = [str(arguments.out / part) for part in PARTS]
+        for metric in ("success", "collision"):
+            asked.append(["report", *runs, "--metric", metric, "--out", str(arguments.out / metric), "--overwrite"])
+    return next((status for command in asked if (status := cuelearner(command))), 0)
 
 
 if __name__ == "__main__":

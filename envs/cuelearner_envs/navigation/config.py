@@ -12,6 +12,8 @@ from cuelearner_envs.navigation.environment import Navigation
 from cuelearner_envs.navigation.lidar import Lidar
 from cuelearner_envs.navigation.worlds import generate_many
 
+Style = Literal["clutter", "rooms", "corridor"]
+
 # Folded into the key of the worlds: what is trained in is never validated in.
 SPLITS = {"training": 0, "validation": 1, "tuning": 2}
 
@@ -20,7 +22,7 @@ SPLITS = {"training": 0, "validation": 1, "tuning": 2}
 class NavigationConfig:
     """A family of worlds and the robot in it."""
 
-    style: Literal["clutter", "rooms", "corridor"] = "clutter"
+    style: Style = "clutter"
     """clutter: a hall of boxes and columns. rooms: rooms, doorways, thin obstacles. corridor: pass left or right."""
     worlds: int = 1024
     """Number of worlds, each with 16 routes; training and validation have different ones."""

@@ -1,0 +1,69 @@
+"""One lane of a trained run as a run folder of its own, without replay: small enough to keep and to render.
+
+python experiments/keep_policy.py runs/navigation/relative-500 --seed 1000 --out runs/walker
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from cuelearner_jax.checkpoint import checkpoints
+from cuelearner_jax.config import RunConfig
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.lanes import Group
+from cuelearner_jax.play import Subject, Trained, load_lanes
+from cuelearner_jax.runs import Grid, load
+from cuelearner_jax.tasks import TASKS, shape_of
+from cuelearner_jax.train import start_clock
+
+
+def keep(run: Path, out: Path, seed: int, kind: str | None, labels: int | None) -> None:
+    """Writes the run folder `out`. Raises UserError if the run has no such lane or `out` is in use."""
+    if out.exists():
+        raise UserError(f"{out} exists: give another --out")
+    task, config, grid = load(run, TASKS)
+    lanes = load_lanes(Subject(task, config, grid, run), (kind or grid.guidance[-1],))[0]
+    budget = int(lanes.budgets.max()) if labels is None else labels
+    found = np.flatnonzero((lanes.seeds == seed) & (lanes.budgets == budget))
+    if not len(found):
+        raise UserError(f"{run} has no lane of seed {seed} with {budget} labels")
+    described = json.loads((run / "config.json").read_text())
+    described["grid"] = {"guidance": [lanes.guidance.name], "seeds": [seed], "labels": [budget]}
+    out.mkdir(parents=True)
+    (out / "config.json").write_text(json.dumps(described, indent=1) + "\n")
+    write(out / lanes.guidance.name, config, shape_of(task, config.task), lanes, int(found[0]))
+
+
+def write(folder: Path, config: RunConfig, env: object, lanes: Trained, index: int) -> None:
+    """The checkpoint of one lane's policy."""
+    seed, budget = int(lanes.seeds[index]), max(int(lanes.budgets[index]), 1)
+    Group(config, env, lanes.guidance, Grid((lanes.guidance.name,), (seed,), (budget,))).write_blocks(folder)
+    policy = jax.tree.map(lambda leaf: leaf[index : index + 1], lanes.policies)
+    clock = {"clock": start_clock().replace(step=np.int32(lanes.step)), "wall_s": np.float32(0)}
+    with checkpoints(folder / "checkpoints") as saved:
+        saved.save(lanes.step, {"policy": [policy], "clock": clock})
+
+
+def main() -> int:
+    """Reads the arguments."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("run", type=Path)
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--seed", type=int, required=True)
+    parser.add_argument("--guidance", help="kind (default: the run's last)")
+    parser.add_argument("--labels", type=int, help="budget (default: the largest)")
+    asked = parser.parse_args()
+    try:
+        keep(asked.run, asked.out, asked.seed, asked.guidance, asked.labels)
+    except UserError as error:
+        parser.error(str(error))
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
