@@ -74,7 +74,7 @@ def jaxnav(automatic_reset: bool = True, **options: Any) -> System:
         from jaxmarl.environments.jaxnav import JaxNav  # pyright: ignore[reportMissingImports]
 
         nav = JaxNav(num_agents=1, **{"lidar_num_beams": 270, "lidar_angle_factor": 0.75, **options})
-    space = nav.action_space(AGENT)
+    space: Any = nav.action_space(AGENT)
 
     def reset(_: None, key: jax.Array) -> Any:
         obs, state = nav.reset(key)
