@@ -7,12 +7,9 @@ from __future__ import annotations
 
 import math
 import os
-import warnings
 from collections.abc import Iterator, Sequence
-from pathlib import Path as FilePath
 from typing import Any
 
-import imageio.v2 as imageio
 import jax
 import jax.numpy as jnp
 import matplotlib
@@ -23,9 +20,8 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, FancyArrowPatch, FancyBboxPatch, Rectangle
-from PIL import Image
-from scipy.spatial import KDTree
 
+from cuelearner_envs import film
 from cuelearner_envs.billiards.physics import Path, positions_at
 from cuelearner_envs.billiards.table import Table, corner_gap, cushions, pockets
 
@@ -99,22 +95,12 @@ def animate(
     Raises:
         ValueError: if the name of the file ends otherwise, there are no shots, or a rate is not positive.
     """
-    suffix = FilePath(file).suffix.lower()
-    if suffix not in (".gif", ".mp4"):
-        raise ValueError(f"cannot animate to {file}: give a name that ends in .gif or .mp4")
-    if not shots or fps <= 0 or speed <= 0:
-        raise ValueError("an animation needs at least one shot and positive fps and speed")
-    if suffix == ".gif":
-        delay = max(2, round(100 / fps))  # [1/100 s]; viewers slow down what is faster
-        _write_gif(file, _frames(table, shots, 100 / delay, speed), 10 * delay)
-        return
-    # Codecs want even sides, which `_figure` gives; imageio would otherwise scale to multiples of 16.
-    writer: Any = imageio.get_writer(file, format="FFMPEG", fps=fps, macro_block_size=2, quality=8)  # pyright: ignore
-    with writer, warnings.catch_warnings():
-        # JAX warns of any fork; this one becomes ffmpeg at once.
-        warnings.filterwarnings("ignore", message=r"os\.fork", category=RuntimeWarning)
-        for frame in _frames(table, shots, fps, speed):
-            writer.append_data(frame)
+    film.check(file, fps)
+    if not shots or speed <= 0:
+        raise ValueError("an animation needs at least one shot and a positive speed")
+    # The first picture shows every ball and the arrow.
+    palette = film.palette_of(next(_frames(table, shots, fps, speed)), 255)
+    film.write(file, fps, lambda rate: _frames(table, shots, rate, speed), palette)
 
 
 # --- the parts of a drawing ------------------------------------------------------------------------------------------
@@ -296,25 +282,3 @@ def _film(
     times = np.maximum(np.arange(padded) - held, 0) * speed / fps
     positions, pocketed = _positions_at(table, path, jnp.asarray(times, path.times.dtype))
     return np.asarray(positions)[:frames], np.asarray(pocketed)[:frames], held
-
-
-def _write_gif(file: str | os.PathLike[str], frames: Iterator[np.ndarray], milliseconds: int) -> None:
-    """Writes a GIF of one palette, taken from the first frame, which shows every ball and the arrow."""
-    first = next(frames)
-    colours = Image.fromarray(first).quantize(colors=255, kmeans=1, dither=Image.Dither.NONE).getpalette() or []
-    tree = KDTree(np.reshape(colours, (-1, 3)))
-    nearest = np.full(1 << 24, -1, np.int16)  # place in the palette, for each colour that was met so far
-
-    def indexed(frame: np.ndarray) -> Image.Image:
-        # Pillow's own search is quicker still, but inexact: white turns grey.
-        keys = frame.astype(np.uint32) @ np.array([1 << 16, 1 << 8, 1], np.uint32)
-        new = np.unique(keys[nearest[keys] < 0])
-        if len(new):
-            nearest[new] = tree.query(np.stack([new >> 16, new >> 8 & 255, new & 255], axis=-1))[1]
-        image = Image.fromarray(nearest[keys].astype(np.uint8))
-        image.putpalette(colours)
-        return image
-
-    rest = (indexed(frame) for frame in frames)
-    options: dict[str, Any] = {"duration": milliseconds, "loop": 0, "optimize": False}
-    indexed(first).save(file, save_all=True, append_images=rest, **options)

@@ -8,12 +8,9 @@ from __future__ import annotations
 import itertools
 import math
 import os
-import warnings
 from collections.abc import Iterator, Sequence
-from pathlib import Path as FilePath
 from typing import Any
 
-import imageio.v2 as imageio
 import matplotlib
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -24,9 +21,8 @@ from matplotlib.colors import to_hex, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, FancyArrowPatch, Polygon, Rectangle
-from PIL import Image
-from scipy.spatial import KDTree
 
+from cuelearner_envs import film
 from cuelearner_envs.navigation.lidar import BEAM_ANGLES
 from cuelearner_envs.navigation.recording import Frame
 from cuelearner_envs.navigation.robot import Robot
@@ -110,17 +106,12 @@ def animate(robot: Robot, frames: Sequence[Frame], file: str | os.PathLike[str],
     Raises:
         ValueError: if the name of the file ends otherwise, there are no frames, or the rate is not positive.
     """
-    suffix = FilePath(file).suffix.lower()
-    if suffix not in (".gif", ".mp4"):
-        raise ValueError(f"cannot animate to {file}: give a name that ends in .gif or .mp4")
-    if not frames or fps <= 0:
-        raise ValueError("an animation needs at least one frame and a positive fps")
-    if suffix == ".gif":
-        delay = max(2, round(100 / fps))  # [1/100 s]; viewers slow down what is faster
-        pictures = _pictures(robot, frames, round(HOLD_AFTER * 100 / delay))
-        _write_gif(file, pictures, 10 * delay, _specimen(robot, frames))
-    else:
-        _write_mp4(file, _pictures(robot, frames, round(HOLD_AFTER * fps)), fps)
+    film.check(file, fps)
+    if not frames:
+        raise ValueError("an animation needs at least one frame")
+    exactly = (BODY, GOAL, CRASH, ARROW, HITS, FLOOR, "#ffffff")
+    palette = film.palette_of(_specimen(robot, frames), 88, exactly)
+    film.write(file, fps, lambda rate: _pictures(robot, frames, round(HOLD_AFTER * rate)), palette)
 
 
 def overview(
@@ -400,38 +391,3 @@ def _specimen(robot: Robot, frames: Sequence[Frame]) -> UInt8[np.ndarray, "heigh
     stage, way = _Stage(robot, first, _extent(frames)), _way(frames[:1])
     ends = [stage.end(first._replace(outcome=outcome), way) for outcome in OUTCOMES]
     return np.concatenate([stage.step(first, way, ""), *ends])
-
-
-def _write_mp4(file: str | os.PathLike[str], pictures: Iterator[np.ndarray], fps: float) -> None:
-    # Codecs want even sides, which `_figure` gives; imageio would otherwise scale to multiples of 16.
-    writer: Any = imageio.get_writer(file, format="FFMPEG", fps=fps, macro_block_size=2, quality=8)  # pyright: ignore
-    with writer, warnings.catch_warnings():
-        # JAX warns of any fork; this one becomes ffmpeg at once.
-        warnings.filterwarnings("ignore", message=r"os\.fork", category=RuntimeWarning)
-        for picture in pictures:
-            writer.append_data(picture)
-
-
-def _write_gif(
-    file: str | os.PathLike[str], pictures: Iterator[np.ndarray], milliseconds: int, specimen: np.ndarray
-) -> None:
-    """Writes a GIF of one palette, the specimen's. Few colours: fewer shades at the edges, a smaller file."""
-    shades = Image.fromarray(specimen).quantize(colors=88, kmeans=1, dither=Image.Dither.NONE).getpalette() or []
-    named = [BODY, GOAL, CRASH, ARROW, HITS, FLOOR, "#ffffff"]  # exactly; quantizing merges what is rare
-    colours = [round(255 * part) for name in named for part in to_rgb(name)] + shades
-    tree = KDTree(np.reshape(colours, (-1, 3)))
-    nearest = np.full(1 << 24, -1, np.int16)  # place in the palette, for each colour that was met so far
-
-    def indexed(picture: np.ndarray) -> Image.Image:
-        # Pillow's own search is quicker still, but inexact: white turns grey.
-        keys = picture.astype(np.uint32) @ np.array([1 << 16, 1 << 8, 1], np.uint32)
-        new = np.unique(keys[nearest[keys] < 0])
-        if len(new):
-            nearest[new] = tree.query(np.stack([new >> 16, new >> 8 & 255, new & 255], axis=-1))[1]
-        image = Image.fromarray(nearest[keys].astype(np.uint8))
-        image.putpalette(colours)
-        return image
-
-    rest = (indexed(picture) for picture in pictures)
-    options: dict[str, Any] = {"duration": milliseconds, "loop": 0, "optimize": False}
-    next(rest).save(file, save_all=True, append_images=rest, **options)
