@@ -1,0 +1,305 @@
+"""Generated worlds keep their promises, in a thousand of each style: NumPy and SciPy look at every one."""
+
+import itertools
+import math
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from cuelearner_envs.navigation import generate
+from cuelearner_envs.navigation.robot import Robot
+from cuelearner_envs.navigation.world import FAR_AWAY
+from cuelearner_envs.navigation.worlds import generate_many
+
+KEYS = 1000
+STYLES = ("clutter", "rooms", "corridor")
+EXTENTS = {"clutter": (20.0, 20.0), "rooms": (18.0, 14.0), "corridor": (20.0, 4.6)}
+REACH = 0.2 + 0.265  # of the body: its front disc's offset and radius [m]
+GRID = 0.1  # between nodes [m]
+# Where two neighbouring nodes keep this, every point of the line between them keeps the reach: from any point p, the
+# squared distance to the line's middle is the mean of those to its ends less (GRID / 2)^2.
+NEEDED = math.hypot(REACH, GRID / 2)
+
+
+generate_one = jax.jit(generate, static_argnames=("style", "routes"))
+
+
+@pytest.fixture(scope="module", params=STYLES)
+def sample(request):
+    """A thousand worlds of a style, as numpy arrays: those of `generate_many`, one at a time on two threads."""
+    keys = list(jax.vmap(partial(jax.random.fold_in, jax.random.key(3)))(jnp.arange(KEYS)))
+    generate_one(keys[0], style=request.param)
+    with ThreadPoolExecutor(2) as threads:
+        worlds = list(threads.map(lambda key: jax.device_get(generate_one(key, style=request.param)), keys))
+    return request.param, jax.tree.map(lambda *leaves: np.stack(leaves).astype(float), *worlds)
+
+
+def used(rows):
+    return rows[np.abs(rows[:, 0]) < FAR_AWAY / 2]
+
+
+def to_box(points, box):
+    """Distance from points (..., 2) to a box; 0 inside."""
+    cos, sin = math.cos(box[2]), math.sin(box[2])
+    offset = points - box[:2]
+    own = np.abs(offset @ np.array([[cos, -sin], [sin, cos]]))
+    return np.linalg.norm(np.maximum(own - box[3:], 0.0), axis=-1)
+
+
+def to_circle(points, circle):
+    return np.maximum(np.linalg.norm(points - circle[:2], axis=-1) - circle[2], 0.0)
+
+
+def distance(points, boxes, circles):
+    """From each point to the nearest solid; 0 inside one."""
+    each = [to_box(points, box) for box in boxes] + [to_circle(points, circle) for circle in circles]
+    return np.min(each, axis=0)
+
+
+def walkable(boxes, circles, extent):
+    """The nodes from which every solid is at least `NEEDED` away, and the first node's place."""
+    count = np.ceil(extent / GRID).astype(int) + 1
+    first = -(count - 1) / 2 * GRID
+    axes = [first[k] + np.arange(count[k]) * GRID for k in (0, 1)]
+    free = np.ones(count, bool)
+    solids = [(box, math.hypot(box[3], box[4]), to_box) for box in boxes]
+    solids += [(circle, circle[2], to_circle) for circle in circles]
+    for solid, radius, to_solid in solids:
+        low = np.clip(np.floor((solid[:2] - radius - NEEDED - first) / GRID).astype(int), 0, count)
+        high = np.clip(np.ceil((solid[:2] + radius + NEEDED - first) / GRID).astype(int) + 1, 0, count)
+        nearby = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
+        places = np.stack(np.meshgrid(axes[0][nearby[0]], axes[1][nearby[1]], indexing="ij"), axis=-1)
+        free[nearby] &= to_solid(places, solid) >= NEEDED
+    inside = [np.abs(axis) < side / 2 for axis, side in zip(axes, extent, strict=True)]
+    return free & inside[0][:, None] & inside[1], first
+
+
+def joined(free, first, starts, goals):
+    """Whether the nodes nearest to each start and its goal are free and in one piece."""
+    pieces, _ = ndimage.label(free)  # over the sides of cells, not their corners
+    ends = [pieces[tuple(np.round((places - first) / GRID).astype(int).T)] for places in (starts, goals)]
+    return (ends[0] == ends[1]) & (ends[0] > 0)
+
+
+def each(many):
+    """Used boxes, used circles, starts, goals and extent, world by world."""
+    for boxes, circles, starts, goals, extent in zip(
+        many.boxes, many.circles, many.starts, many.goals, many.extent, strict=True
+    ):
+        yield used(boxes), used(circles), starts, goals, extent
+
+
+# ------------------------------------------------------------------------------------------------------- every style
+
+
+def test_the_judge_of_reachability_tells_a_doorway_from_a_gap_too_narrow():
+    walls = [[5.1, 0, 0, 0.1, 3.2], [-5.1, 0, 0, 0.1, 3.2], [0, 3.1, 0, 5.2, 0.1], [0, -3.1, 0, 5.2, 0.1]]
+    ends = np.array([[-3.0, 0.5]]), np.array([[3.0, -0.5]])
+    for gap, expected in ((0.0, False), (0.9, False), (1.2, True)):
+        parts = [[0.0, sign * (gap / 2 + 1.6), 0.0, 0.05, 1.6] for sign in (1, -1)]
+        boxes, circles = np.array(walls + parts), np.zeros((0, 3))
+        assert joined(*walkable(boxes, circles, np.array([10.0, 6.0])), *ends).tolist() == [expected]
+
+
+def test_the_body_reaches_as_far_as_these_tests_say():
+    assert float(Robot().reach) == pytest.approx(REACH)
+
+
+def test_every_goal_can_be_reached_by_the_body_however_it_is_turned(sample):
+    _, many = sample
+    for number, (boxes, circles, starts, goals, extent) in enumerate(each(many)):
+        reached = joined(*walkable(boxes, circles, extent), starts, goals)
+        assert reached.all(), f"world {number}, routes {np.flatnonzero(~reached)}"
+
+
+def test_starts_and_goals_are_clear_of_solids_and_inside_the_walls(sample):
+    _, many = sample
+    for boxes, circles, starts, goals, extent in each(many):
+        places = np.concatenate([starts, goals])
+        assert distance(places, boxes, circles).min() >= REACH
+        assert (np.abs(places) < extent / 2 - REACH).all()
+
+
+def test_goals_lie_5_to_15_m_from_their_starts(sample):
+    _, many = sample
+    apart = np.linalg.norm(many.goals - many.starts, axis=-1)
+    assert apart.shape == (KEYS, 16)
+    assert apart.min() >= 5.0
+    assert apart.max() <= 15.0
+    assert apart.min() < 5.5
+    assert apart.max() > 14.5
+
+
+def test_starts_and_goals_are_spread_over_the_hall(sample):
+    style, many = sample
+    for places in (many.starts, many.goals):
+        share = places.reshape(-1, 2) / np.array(EXTENTS[style])
+        for signs in itertools.product((-1, 1), repeat=2):
+            assert (share * signs > 0).all(-1).mean() > 0.15  # of each quarter; a quarter if all were alike
+
+
+def test_walls_stand_all_around(sample):
+    style, many = sample
+    np.testing.assert_allclose(many.extent, np.broadcast_to(EXTENTS[style], (KEYS, 2)), rtol=1e-6)
+    np.testing.assert_array_equal(many.boxes[:, :4], np.broadcast_to(many.boxes[0, :4], (KEYS, 4, 5)))
+    half = many.extent[0] / 2
+    turns = np.linspace(-1.0, 1.0, 401)
+    rims = []
+    for beyond in (0.05, -0.05):
+        across = half + beyond
+        rims.append([[s * across[0], t * across[1]] for s in (1, -1) for t in turns])
+        rims[-1] += [[t * across[0], s * across[1]] for s in (1, -1) for t in turns]
+    walls = many.boxes[0, :4]
+    np.testing.assert_array_equal(distance(np.array(rims[0]), walls, []), 0.0)
+    np.testing.assert_allclose(distance(np.array(rims[1]), walls, []), 0.05, atol=1e-5)
+
+
+def test_solids_lie_inside_and_unused_rows_far_away(sample):
+    _, many = sample
+    assert many.boxes.shape == (KEYS, 24, 5)
+    assert many.circles.shape == (KEYS, 12, 3)
+    for leaf in jax.tree.leaves(many):
+        assert np.isfinite(leaf).all()
+    for rows in (many.boxes[:, 4:], many.circles):
+        inside = (np.abs(rows[..., :2]) <= many.extent[:, None] / 2).all(-1)
+        far = (np.abs(rows[..., :2]) >= FAR_AWAY / 2).all(-1)
+        assert (inside | far).all()
+        assert inside.any()
+    assert (many.boxes[..., 3:] > 0).all()
+    assert (many.circles[..., 2] > 0).all()
+
+
+def test_every_solid_is_taller_than_the_lidar(sample):
+    _, many = sample
+    assert many.box_heights.shape == (KEYS, 24)
+    assert many.circle_heights.shape == (KEYS, 12)
+    np.testing.assert_allclose(many.box_heights[:, :4], 1.5)
+    for heights in (many.box_heights[:, 4:], many.circle_heights):
+        assert heights.min() >= 0.8
+        assert heights.max() <= 1.4
+        assert heights.std() > 0.1
+
+
+# -------------------------------------------------------------------------------------------------- what a style says
+
+
+@pytest.fixture(scope="module")
+def sizes(sample):
+    """Used obstacles of all worlds: boxes (without the outer walls), circles, and how many of each a world has."""
+    style, many = sample
+    boxes, circles = many.boxes[:, 4:], many.circles
+    seen = [np.abs(rows[..., 0]) < FAR_AWAY / 2 for rows in (boxes, circles)]
+    return style, boxes[seen[0]], circles[seen[1]], seen[0].sum(1), seen[1].sum(1)
+
+
+def test_obstacles_are_as_many_and_as_large_as_the_style_says(sizes):
+    style, boxes, circles, box_counts, circle_counts = sizes
+    if style == "clutter":
+        assert set(box_counts) == set(range(8, 17))
+        assert set(circle_counts) == set(range(6, 13))
+        assert boxes[:, 3:].min() >= 0.2
+        assert boxes[:, 3:].max() <= 0.9
+        assert circles[:, 2].min() >= 0.15
+        assert circles[:, 2].max() <= 0.6
+    elif style == "rooms":
+        assert boxes[:, 4].max() <= 0.08  # walls and thin obstacles, 4 to 16 cm thick: nothing as thick as in clutter
+        assert boxes[:, 4].min() >= 0.02
+        assert (circle_counts == 8).all()
+        assert circles[:, 2].min() >= 0.05
+        assert circles[:, 2].max() <= 0.12
+    else:
+        assert (box_counts + circle_counts == 4).all()
+        assert set(box_counts) == set(range(5))
+
+
+def doorways(boxes):
+    """Width of the gap between the two pieces of each inner wall that has both: (worlds, 7), else not a number."""
+    pieces = boxes[:, 4:18].reshape(-1, 7, 2, 5)
+    gap = np.linalg.norm(pieces[:, :, 0, :2] - pieces[:, :, 1, :2], axis=-1) - pieces[..., 3].sum(-1)
+    return np.where((np.abs(pieces[..., 0]) < FAR_AWAY / 2).all(-1), gap, np.nan)
+
+
+@pytest.mark.parametrize("sample", ["rooms"], indirect=True)
+def test_rooms_have_doorways_and_a_narrow_passage(sample):
+    _, many = sample
+    widths = doorways(many.boxes)
+    assert np.nanmin(widths) >= 1.3 - 1e-5
+    assert np.nanmax(widths) <= 1.7 + 1e-5
+    assert np.isfinite(widths).mean() > 0.8
+    for boxes in many.boxes:
+        upright = used(boxes[4:18])
+        upright = upright[np.abs(np.cos(upright[:, 2])) < 0.1]  # the pieces of the two walls along y
+        left, right = (upright[np.isclose(upright[:, 0], x, atol=1e-4)] for x in np.unique(upright[:, 0].round(4)))
+        passage = (right[:, 0] - right[:, 4]).min() - (left[:, 0] + left[:, 4]).max()
+        assert 1.46 - 1e-4 <= passage <= 1.94 + 1e-4  # 1.62 to 2.02 m between the middles of walls 8 to 16 cm thick
+        assert passage > 2 * REACH
+
+
+@pytest.mark.parametrize("sample", ["rooms"], indirect=True)
+def test_some_rooms_routes_have_no_straight_way(sample):
+    _, many = sample
+    along = np.linspace(0.0, 1.0, 200)[:, None]
+    blocked = []
+    for boxes, circles, starts, goals, _ in itertools.islice(each(many), 50):
+        lines = starts[:, None] + (goals - starts)[:, None] * along
+        blocked.append(distance(lines, boxes, circles).min(-1) < REACH)
+    assert np.mean(blocked) > 0.5
+
+
+@pytest.mark.parametrize("sample", ["corridor"], indirect=True)
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_every_obstacle_of_a_corridor_can_be_passed_on_either_side(sample, side):
+    _, many = sample
+    ends = np.array([[-9.0, 0.0]]), np.array([[9.0, 0.0]])
+    for boxes, circles, _, _, extent in each(many):
+        centres = np.concatenate([boxes[4:, :2], circles[:, :2]])
+        assert (np.abs(centres[:, 1]) <= 0.15 + 1e-6).all()
+        assert np.diff(np.sort(centres[:, 0])).min() > 2.9  # nobody has to pass between two at once
+        # From each centre a wall to one side closes that side.
+        closed = [[x, y - side * 2.0, 0.0, 0.01, 2.0] for x, y in centres]
+        assert joined(*walkable(np.concatenate([boxes, closed]), circles, extent), *ends).all()
+
+
+# --------------------------------------------------------------------------------------------------------------- keys
+
+
+def test_the_same_key_gives_the_same_world(sample):
+    style, many = sample
+    for number in (0, KEYS - 1):
+        again = generate_one(jax.random.fold_in(jax.random.key(3), number), style=style)
+        jax.tree.map(lambda a, b, n=number: np.testing.assert_array_equal(a, b[n]), again, many)
+
+
+def test_another_key_gives_another_world(sample):
+    _, many = sample
+    solids = np.concatenate([many.boxes[:, 4:].reshape(KEYS, -1), many.circles.reshape(KEYS, -1)], axis=-1)
+    assert len(np.unique(solids, axis=0)) == KEYS
+    assert len(np.unique(many.starts.reshape(KEYS, -1), axis=0)) == KEYS
+
+
+@pytest.mark.parametrize("sample", ["rooms"], indirect=True)
+def test_worlds_generated_together_are_those_generated_alone(sample):
+    style, many = sample
+    together = generate_many(jax.random.key(3), 8, style)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b[:8], atol=1e-5), together, many)
+
+
+def test_an_unknown_style_is_refused_by_name():
+    with pytest.raises(ValueError, match="maze"):
+        generate(jax.random.key(0), "maze")
+
+
+def test_worlds_of_all_styles_have_arrays_of_one_size():
+    shapes = [
+        jax.tree.map(lambda leaf: leaf.shape, jax.eval_shape(lambda style=style: generate(jax.random.key(0), style)))
+        for style in STYLES
+    ]
+    assert shapes[0] == shapes[1] == shapes[2]
+    assert jax.eval_shape(lambda: generate(jax.random.key(0), routes=5)).starts == jax.ShapeDtypeStruct(
+        (5, 2), jnp.float32
+    )
