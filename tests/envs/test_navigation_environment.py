@@ -1,6 +1,7 @@
 """Navigation as a task: what is seen, what is paid, how episodes end and begin, and what replay makes of it."""
 
 import math
+import re
 
 import chex
 import jax
@@ -18,6 +19,7 @@ from cuelearner_envs.navigation.world import FAR_AWAY
 from cuelearner_envs.navigation.worlds import generate_many
 from cuelearner_jax import actions, train
 from cuelearner_jax import guidance as guidances
+from cuelearner_jax.errors import UserError
 from cuelearner_jax.types import Environment
 
 KEY = jax.random.key(0)
@@ -492,9 +494,24 @@ def test_a_configuration_reaches_the_environment():
     np.testing.assert_allclose(found, [0.7, 6.0, math.radians(15), 0.02, 0.1], rtol=1e-6)
 
 
-def test_an_unknown_style_is_named():
-    with pytest.raises(ValueError, match="maze"):
-        make_environment(NavigationConfig(style="maze"))  # pyright: ignore
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        ("style", "maze", "task.style is 'maze': choose one of clutter, rooms, corridor"),
+        ("worlds", 0, "task.worlds is 0: give a positive number"),
+        ("worlds", 1 << 25, "give at most 16777216"),
+        ("max_steps", 0, "task.max_steps is 0: give a positive number"),
+        ("goal_radius", -1.0, "task.goal_radius is -1.0: give a positive number"),
+        ("max_range", math.inf, "task.max_range is inf: give a positive number"),
+        ("lidar_dropout", 2.0, "task.lidar_dropout is 2.0: give a probability from 0 to 1"),
+        ("lidar_noise", -0.1, "task.lidar_noise is -0.1: give a number of metres"),
+        ("lidar_rotation_deg", math.nan, "task.lidar_rotation_deg is nan: give a finite number"),
+    ],
+)
+def test_what_makes_no_world_is_refused_in_one_line(name, value, words):
+    with pytest.raises(UserError, match=re.escape(words)) as refused:
+        make_environment(NavigationConfig(**{name: value}))
+    assert "\n" not in str(refused.value)
 
 
 def test_changed_worlds_compile_nothing_new():

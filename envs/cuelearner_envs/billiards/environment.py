@@ -137,7 +137,9 @@ class Billiards(WholeObservations, struct.PyTreeNode):
         cue, targets = balls[0, :2] / scale, balls[1:]
         leading = action.shape[:-1]
         frame = jnp.stack([action, rotate(action, jnp.asarray(jnp.pi / 2))], axis=-2)  # (..., 2, 2): along, across
-        offsets = jnp.einsum("...ij,tj->...ti", frame, targets[:, :2] - balls[0, :2])
+        # Precise on accelerators too: they round the factors of a matrix product.
+        apart = targets[:, :2] - balls[0, :2]
+        offsets = jnp.einsum("...ij,tj->...ti", frame, apart, precision=jax.lax.Precision.HIGHEST)
         cut = jnp.arctan(offsets[..., 1:] / (2.0 * self.table.ball_radius))
         on_table = jnp.broadcast_to(targets[:, 2:] < 0, (*leading, targets.shape[0], 1)).astype(jnp.float32)
         place = jnp.broadcast_to(targets[:, :2] / scale, (*leading, targets.shape[0], 2))

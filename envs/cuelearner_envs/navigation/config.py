@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -9,10 +10,14 @@ import jax
 import jax.numpy as jnp
 
 from cuelearner_envs.navigation.environment import Navigation
+from cuelearner_envs.navigation.layouts import STYLES
 from cuelearner_envs.navigation.lidar import Lidar
 from cuelearner_envs.navigation.worlds import generate_many
+from cuelearner_jax.errors import UserError, closest
 
 Style = Literal["clutter", "rooms", "corridor"]
+
+MOST_WORLDS = 1 << 24  # replay keeps a world's number in single precision, which is exact up to here
 
 # Folded into the key of the worlds: what is trained in is never validated in.
 SPLITS = {"training": 0, "validation": 1, "tuning": 2}
@@ -44,8 +49,26 @@ class NavigationConfig:
     """Multiply labels and transitions by their mirror images, whatever the guidance."""
 
 
+def check(config: NavigationConfig) -> None:
+    """Raises UserError with one line for the first value that cannot work."""
+    if config.style not in STYLES:
+        raise UserError(f"task.style is {config.style!r}{closest(config.style, STYLES)}")
+    for name in ("worlds", "max_steps", "goal_radius", "max_range"):
+        if not 0 < getattr(config, name) < math.inf:
+            raise UserError(f"task.{name} is {getattr(config, name)}: give a positive number")
+    if config.worlds > MOST_WORLDS:
+        raise UserError(f"task.worlds is {config.worlds}: give at most {MOST_WORLDS}")
+    if not 0 <= config.lidar_dropout <= 1:
+        raise UserError(f"task.lidar_dropout is {config.lidar_dropout}: give a probability from 0 to 1")
+    if not 0 <= config.lidar_noise < math.inf:
+        raise UserError(f"task.lidar_noise is {config.lidar_noise}: give a number of metres that is not negative")
+    if not math.isfinite(config.lidar_rotation_deg):
+        raise UserError(f"task.lidar_rotation_deg is {config.lidar_rotation_deg}: give a finite number")
+
+
 def make_environment(config: NavigationConfig, split: str = "training") -> Navigation:
-    """The environment that a configuration describes, with the worlds of a split."""
+    """The environment that a configuration describes, with the worlds of a split. Raises UserError if it can't be."""
+    check(config)
     key = jax.random.fold_in(jax.random.key(config.world_seed), SPLITS[split])
     return Navigation(
         worlds=generate_many(key, config.worlds, config.style),

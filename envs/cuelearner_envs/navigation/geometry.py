@@ -38,7 +38,8 @@ def line_clearance(world: World, start: Float[Array, "2"], end: Float[Array, "2"
 
 def _point_to_line(point: Float[Array, "2"], start: Float[Array, "2"], end: Float[Array, "2"]) -> Float[Array, ""]:
     along, offset = end - start, point - start
-    share = jnp.clip(jnp.vdot(offset, along) / jnp.maximum(jnp.vdot(along, along), 1e-12), 0.0, 1.0)
+    # Sums, not `vdot`: an accelerator rounds the factors of what it takes for a matrix product.
+    share = jnp.clip(jnp.sum(offset * along) / jnp.maximum(jnp.sum(jnp.square(along)), 1e-12), 0.0, 1.0)
     return jnp.sqrt(jnp.sum(jnp.square(offset - share * along)))
 
 

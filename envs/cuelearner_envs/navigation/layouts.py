@@ -55,7 +55,7 @@ def clutter(key: PRNGKeyArray) -> Layout:
 def rooms(key: PRNGKeyArray) -> Layout:
     """An office of 18 m by 14 m: two rows of three rooms, doorways of 1.3 to 1.7 m, a narrow passage, thin obstacles.
 
-    One of the four inner walls' neighbours lies close to it, so that a passage of 1.5 to 1.9 m runs between the two.
+    The middle room of each row is a passage about 1.5 to 1.9 m wide, left or right of the office's middle.
     """
     extent = jnp.array([18.0, 14.0])
     k_walls, k_doors, k_thin, k_poles, k_tall = jax.random.split(key, 5)
@@ -120,7 +120,7 @@ def _wall_with_door(key: PRNGKeyArray, ends: Float[Array, "4"]) -> Float[Array, 
     thickness = jax.random.uniform(k_thick, (), minval=0.04, maxval=0.08)
     room = jnp.maximum(length - width, 0.0)
     before = room * jax.random.uniform(k_place, (), minval=0.2, maxval=0.8)
-    pieces = jnp.array([[0.0, 1.0], [1.0, 0.0]]) @ jnp.stack([room - before, before])
+    pieces = jnp.stack([before, room - before])
     direction = (end - start) / length
     centres = jnp.stack([start + direction * pieces[0] / 2, end - direction * pieces[1] / 2])
     yaw = jnp.arctan2(direction[1], direction[0])
