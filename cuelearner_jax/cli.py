@@ -1,6 +1,7 @@
 """The command `cuelearner`: reads arguments, calls one function, turns errors into one line and an exit status.
 
-Exit status: 0 done; 2 bad input, nothing changed; 130 stopped by Ctrl-C, everything saved.
+Exit status: 0 done; 2 bad input, nothing changed; 130 stopped by Ctrl-C, everything saved;
+141 nobody reads the output any more.
 """
 
 from __future__ import annotations
@@ -12,9 +13,8 @@ import re
 import shlex
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Generic, TypeVar
+from typing import Any
 
 # Before JAX starts: warnings of its start-up are not the user's.
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
@@ -25,16 +25,13 @@ from rich.console import Console
 from rich.table import Table
 
 from cuelearner_jax import play, runs, sweep, teaching
-from cuelearner_jax.config import RunConfig
 from cuelearner_jax.errors import UserError, closest
 from cuelearner_jax.evaluate import episodes
+from cuelearner_jax.options import Common, Evaluate, Render, Report, Sweep, TeacherTrain, Train
 from cuelearner_jax.report import report
 from cuelearner_jax.statistics import interval
 from cuelearner_jax.tasks import TASKS, Task
-from cuelearner_jax.teacher import TeacherConfig
 
-TaskT = TypeVar("TaskT")
-Flag = tyro.conf.FlagCreatePairsOff
 out = Console(highlight=False, soft_wrap=True)
 
 ABOUT = {
@@ -45,124 +42,6 @@ ABOUT = {
     "render": "A still and a film of a policy at work.",
     "teacher": "teacher train: train a teacher from exhaustive tries in parallel.",
 }
-
-
-@dataclass(frozen=True)
-class Common(Generic[TaskT]):
-    """What train and sweep share."""
-
-    run: Annotated[RunConfig[TaskT], tyro.conf.arg(name="")]
-    out: Path
-    """Folder for results and checkpoints."""
-    resume: Flag[bool] = False
-    """Go on with an interrupted run."""
-    overwrite: Flag[bool] = False
-    """Delete what an earlier run left in the folder."""
-    labels_from: Path | None = None
-    """Use the labels of this file instead of asking the teacher."""
-    tuning: Flag[bool] = False
-    """Evaluate on episodes set aside for choosing settings, not on those of reported figures."""
-
-
-@dataclass(frozen=True)
-class Train(Common[TaskT], Generic[TaskT]):
-    """Train one seed under one kind of guidance."""
-
-    guidance: str = "relative"
-    """none, relative or heuristic."""
-    labels: int = 500
-    """Labels that the teacher is asked for."""
-    seed: int = 0
-    """Seed."""
-
-
-@dataclass(frozen=True)
-class Sweep(Common[TaskT], Generic[TaskT]):
-    """Train seeds x label budgets x kinds of guidance in one process."""
-
-    guidance: tuple[str, ...] = ("none", "relative", "heuristic")
-    """Any of none, relative, heuristic."""
-    labels: tuple[int, ...] = (500,)
-    """Label budgets; guidance without labels runs once a seed."""
-    seeds: int = 5
-    """Number of seeds."""
-    first_seed: int = 0
-    """The first seed; the others follow."""
-
-
-@dataclass(frozen=True)
-class Evaluate(Generic[TaskT]):
-    """Validate policies."""
-
-    task: TaskT
-    policy: str = "agent"
-    """Of a run: agent, guide (guidance of uniform actions), guided (guidance of the agent's), corrected (the teacher's
-    own feedback on the agent's); of a run or a task alone: teacher, heuristic or uniform."""
-    guidance: tuple[str, ...] = ()
-    """Only these kinds of guidance of the run (default: all)."""
-    steps: int = 10_000
-    """Environment steps for each lane."""
-    envs: int = 100
-    """Environments that share them."""
-    out: Path | None = None
-    """Also write the measurements to this JSON file."""
-
-
-@dataclass(frozen=True)
-class Render(Generic[TaskT]):
-    """A still and a film."""
-
-    task: TaskT
-    out: Path
-    """Folder for the pictures; films and stills of the same name are not overwritten."""
-    policy: str = "agent"
-    """As for evaluate."""
-    guidance: str | None = None
-    """Kind of guidance of the run (default: its last)."""
-    labels: int | None = None
-    """Label budget of the lane (default: the largest)."""
-    seed: int | None = None
-    """Seed of the lane (default: the first)."""
-    steps: int = 4
-    """Steps to film; a new episode follows the end of one."""
-    episode: int = 0
-    """Which random start."""
-    film: str = "gif"
-    """gif or mp4."""
-    overwrite: Flag[bool] = False
-    """Replace pictures of the same name."""
-
-
-@dataclass(frozen=True)
-class Report:
-    """Curves and tables."""
-
-    folders: tyro.conf.Positional[tuple[Path, ...]]
-    """Run folders, or folders above them."""
-    out: Path
-    """Folder for the report."""
-    metric: str = "reward"
-    """Column of the results."""
-    split: str = "validation"
-    """Episodes of the results: validation, or tuning."""
-    overwrite: Flag[bool] = False
-    """Replace an earlier report."""
-
-
-@dataclass(frozen=True)
-class TeacherTrain(Generic[TaskT]):
-    """Train a teacher."""
-
-    task: TaskT
-    out: Path
-    """Folder for the teacher."""
-    teacher: TeacherConfig = field(default_factory=TeacherConfig)
-    seed: int = 0
-    """Seed."""
-    eval_steps: int = 10_000
-    """Validation steps at the end."""
-    resume: Flag[bool] = False
-    """Go on with an interrupted training."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -176,6 +55,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except sweep.Interrupted as error:
         print(str(error), file=sys.stderr)
         return 130
+    except BrokenPipeError:  # whoever read our output has gone, as `head` does
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 141
     except KeyboardInterrupt:
         print("stopped at once; what the last checkpoint holds is safe, go on with --resume", file=sys.stderr)
         return 130
@@ -352,7 +234,13 @@ def _report(arguments: list[str]) -> None:
     asked = _parse(Report, arguments, "report")
     command = shlex.join(["cuelearner", "report", *arguments])
     written = report(
-        asked.folders, asked.out, asked.metric, split=asked.split, overwrite=asked.overwrite, command=command
+        asked.folders,
+        asked.out,
+        asked.metric,
+        split=asked.split,
+        lower_is_better=asked.lower_is_better,
+        overwrite=asked.overwrite,
+        command=command,
     )
     out.print(f"wrote {written}")
 

@@ -31,6 +31,7 @@ def report(
     *,
     split: str = "validation",
     task: str | None = None,
+    lower_is_better: bool = False,
     overwrite: bool = False,
     command: str = "",
 ) -> Path:
@@ -42,6 +43,7 @@ def report(
         metric: metric column to report.
         split: "validation" or "training".
         task: keeps the runs of this task only; needed where there are several.
+        lower_is_better: small values of the metric are good ones: what is best, and when a value is reached.
         overwrite: write over a report that is there already.
         command: command line that makes this report, noted in it.
 
@@ -63,7 +65,7 @@ def report(
     missing = _missing(folders, table, groups)
     if invalid:
         missing.append(f"{invalid:,} {split} rows have no finite {metric}; the steps of these rows are left out")
-    rows = summary(groups)
+    rows = summary(groups, lower_is_better)
     title = f"{table['task'][0].as_py()}: {split} {metric.replace('_', ' ')}, {_seed_count(groups)}"
     figures = {"curves": draw_curves(groups, title, metric)}
     if len({group.labels for group in groups if group.labels}) > 1:
@@ -194,16 +196,18 @@ def _config(folder: Path) -> dict[str, Any]:
 # --- tables ----------------------------------------------------------------------------------------------------------
 
 
-def summary(groups: Sequence[Group]) -> list[dict[str, str | int | float]]:
+def summary(groups: Sequence[Group], lower_is_better: bool = False) -> list[dict[str, str | int | float]]:
     """One row for each group, numbers unrounded; the columns are those of `summary.csv`.
 
-    `reaches_unguided_final` is the first step at which the group's interquartile mean is at least the unguided one's
+    `reaches_unguided_final` is the first step at which the group's interquartile mean is as good as the unguided one's
     at its last step. The stretches `above_unguided` and `below_unguided` are those of `stretches_apart`.
     """
     unguided = next((group for group in groups if group.guidance == "none"), None)
+    sign = -1.0 if lower_is_better else 1.0
     rows = []
     for group in groups:
-        steps, best = group.curve.steps, int(group.curve.estimate.argmax())
+        goodness = sign * group.curve.estimate
+        steps, best = group.curve.steps, int(goodness.argmax())
         row: dict[str, str | int | float] = {"guidance": group.guidance, "labels": group.labels}
         row |= {"seeds": len(group.seeds), "last_step": int(steps[-1])}
         row |= {"final": group.curve.estimate[-1], "final_lower": group.curve.lower[-1]}
@@ -212,7 +216,7 @@ def summary(groups: Sequence[Group]) -> list[dict[str, str | int | float]]:
         row |= {"best_step": int(steps[best]), "best": group.curve.estimate[best]}
         row |= {"reaches_unguided_final": "", "above_unguided": "", "below_unguided": ""}
         if unguided is not None:
-            reached = steps_to_reach(steps, group.curve.estimate[None], unguided.curve.estimate[-1])[0]
+            reached = steps_to_reach(steps, goodness[None], sign * unguided.curve.estimate[-1])[0]
             row["reaches_unguided_final"] = int(reached) if np.isfinite(reached) else "never"
             for column, apart in (
                 ("above_unguided", stretches_apart(group.curve, unguided.curve)),

@@ -66,8 +66,9 @@ def main() -> int:
     asked = [line for part in arguments.parts for line in commands(arguments.out, part, arguments.dtype, extra)]
     if arguments.parts == list(PARTS):
         runs = [str(arguments.out / part) for part in PARTS]
-        for metric in ("success", "collision"):
-            asked.append(["report", *runs, "--metric", metric, "--out", str(arguments.out / metric), "--overwrite"])
+        for metric, sense in (("success", []), ("collision", ["--lower-is-better"])):
+            folder = str(arguments.out / metric)
+            asked.append(["report", *runs, "--metric", metric, *sense, "--out", folder, "--overwrite"])
     return next((status for command in asked if (status := cuelearner(command))), 0)
 
 

@@ -106,6 +106,20 @@ def test_refuses_to_overwrite_and_leaves_what_is_there(runs, tmp_path):
     assert (out / "notes.txt").read_text() == "mine"
 
 
+def test_of_collisions_the_fewest_are_best(tmp_path):
+    for kind, values in (("none", (0.8, 0.5, 0.4)), ("heuristic", (0.8, 0.3, 0.35))):
+        constants = {"run": kind, "task": "hall", "guidance": kind, "config_hash": "0f", "labels": 0}
+        with results.ResultsWriter(tmp_path / "runs" / kind, **constants) as writer:
+            for step, value in zip((0, 10, 20), values, strict=True):
+                writer.append(step=step, split="validation", seed=[0, 1], collision=[value, value])
+    found = {}
+    for lower in (True, False):
+        report(tmp_path / "runs", tmp_path / str(lower), "collision", lower_is_better=lower)
+        row = summary(tmp_path / str(lower))["heuristic", 0]
+        found[lower] = (float(row["best"]), int(row["best_step"]), row["reaches_unguided_final"])
+    assert found == {True: (0.3, 10, "10"), False: (0.8, 0, "0")}
+
+
 def test_says_what_is_missing(runs, tmp_path):
     write(runs / "scalar-a", "scalar", 0.2, 100, seeds=[0, 1], steps=STEPS[:6])
     write(runs / "scalar-b", "scalar", 0.2, 100, seeds=[2], steps=STEPS)
