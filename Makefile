@@ -37,7 +37,7 @@ quickstart: $(VENV)/.installed
 	$(BIN)/python experiments/quickstart.py
 
 test: $(VENV)/.tested
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n 2 --dist loadfile
 
 lint: $(VENV)/.tested
 	$(BIN)/ruff check .
