@@ -25,6 +25,7 @@ from cuelearner_jax import guidance as guidances
 from cuelearner_jax.config import RunConfig
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import SPLITS
+from cuelearner_jax.labelling import files as label_files
 from cuelearner_jax.tasks import Task
 from cuelearner_jax.types import Guidance
 
@@ -74,7 +75,7 @@ def describe(task: Task, config: RunConfig, grid: Grid, split: str, labels_from:
         "schedule": configuration.to_json(config.schedule),
         "grid": {"guidance": list(grid.guidance), "seeds": list(grid.seeds), "labels": list(grid.labels)},
         "split": split,
-        "labels_from": labels_from.name if labels_from else None,
+        "labels_from": f"{labels_from.name} {label_files.digest(labels_from)}" if labels_from else None,
         "total_steps": config.schedule.total_steps,
     }
 
@@ -138,4 +139,6 @@ def prepare_folder(out: Path, described: dict[str, Any], clean: bool) -> None:
         shutil.rmtree(out)
     out.mkdir(parents=True, exist_ok=True)
     if not (out / "config.json").exists():
-        (out / "config.json").write_text(json.dumps(described, indent=1) + "\n")
+        temporary = out / "config.tmp"  # in one step, so that a crash leaves no half of it
+        temporary.write_text(json.dumps(described, indent=1) + "\n")
+        temporary.replace(out / "config.json")

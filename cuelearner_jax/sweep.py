@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import signal
 import threading
 import time
@@ -89,6 +90,11 @@ def read_labels(path: Path, task: Task, config: RunConfig, grid: Grid) -> label_
         raise UserError("--labels-from needs a guidance that uses labels: add --guidance relative")
     if asking != [file.guidance]:
         raise UserError(f"{path} holds {file.guidance} labels, the run uses {', '.join(asking)}: give fitting labels")
+    if not math.isclose(file.eps_deg, config.scalars.eps_deg, rel_tol=1e-6):
+        raise UserError(
+            f"{path} holds labels of {file.eps_deg:g} degrees, the run's are of {config.scalars.eps_deg:g}: "
+            f"give --scalars.eps-deg {file.eps_deg:g}, or other labels"
+        )
     for kind in asking:
         seeds, budgets = grid.lanes(guidances.make(kind, config.sizes, env.obs_size))
         label_files.for_lanes(file, seeds, budgets, label_slots(int(budgets.max()), config.sizes))
@@ -237,7 +243,8 @@ class _Runner:
         largest = group.budgets == group.largest_budget  # the other lanes hold the first of these
         rows = jax.tree.map(lambda leaf: leaf[largest], rows)
         task = {"name": self.task.name, **configuration.to_json(group.config.task)}
-        label_files.write(self.folder / "labels.parquet", task, group.guidance.name, group.seeds[largest], rows)
+        eps, seeds = group.config.scalars.eps_deg, group.seeds[largest]
+        label_files.write(self.folder / "labels.parquet", task, group.guidance.name, eps, seeds, rows)
 
     def _train(self, saved: Checkpoints, writer: results.ResultsWriter) -> None:
         group, schedule = self.group, self.group.config.schedule

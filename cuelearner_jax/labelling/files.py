@@ -5,6 +5,7 @@ A file holds one set of labels, or one for each seed of a run.
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 from pathlib import Path
@@ -32,11 +33,12 @@ class LabelFile(NamedTuple):
 
     task: dict[str, Any]  # {"name": ..., configuration of the task}
     guidance: str
+    eps_deg: float  # strength of the labels [deg]
     seeds: np.ndarray  # (labels,)
     labels: Label  # rows (labels, ...), in the order they were given
 
 
-def write(path: Path, task: dict[str, Any], guidance: str, seeds: np.ndarray, labels: Label) -> None:
+def write(path: Path, task: dict[str, Any], guidance: str, eps_deg: float, seeds: np.ndarray, labels: Label) -> None:
     """Writes the labels that count. `seeds` (lanes,), `labels` (lanes, slots, ...). Replaces `path` in one step."""
     valid = np.asarray(labels.valid)
     rows = jax.tree.map(lambda leaf: np.asarray(leaf)[valid], labels)
@@ -44,7 +46,7 @@ def write(path: Path, task: dict[str, Any], guidance: str, seeds: np.ndarray, la
     columns = {"seed": pa.array(seed.astype(np.int64))}
     for name in ("obs", "action", "target"):
         columns[name] = pa.array(list(getattr(rows, name)), pa.list_(pa.float32()))
-    meta = {"task": task, "guidance": guidance, "conventions": CONVENTIONS}
+    meta = {"task": task, "guidance": guidance, "eps_deg": float(eps_deg), "conventions": CONVENTIONS}
     table = pa.table(columns).replace_schema_metadata({META: json.dumps(meta).encode()})
     temporary = path.with_suffix(".tmp")
     pq.write_table(table, temporary)
@@ -61,12 +63,17 @@ def read(path: Path) -> LabelFile:
         columns = {name: np.array(table[name].to_pylist(), np.float32) for name in ("obs", "action", "target")}
         seeds = np.array(table["seed"].to_pylist(), np.int64)
         labels = Label(**columns, valid=np.ones(len(seeds), bool))  # pyright: ignore[reportArgumentType]
-        file = LabelFile(meta["task"], meta["guidance"], seeds, labels)
+        file = LabelFile(meta["task"], meta["guidance"], float(meta["eps_deg"]), seeds, labels)
     except (OSError, pa.ArrowException, KeyError, TypeError, ValueError) as error:
         raise UserError(f"{path} is not a label file of cuelearner, or it is damaged: write it anew") from error
     if not len(seeds):
         raise UserError(f"{path} holds no labels: collect some first")
     return file
+
+
+def digest(path: Path) -> str:
+    """What tells a file's contents from others of the same name."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()[:12]
 
 
 def for_lanes(file: LabelFile, seeds: np.ndarray, budgets: np.ndarray, slots: int) -> Label:

@@ -14,6 +14,7 @@ from cuelearner_jax.labelling import files
 from cuelearner_jax.runs import Grid
 
 TASK = {"name": "window", "half_width_deg": 28.0}
+EPS = probes.CONFIG.scalars.eps_deg
 
 
 def label_sets(lanes=2, slots=20, obs_size=2, seed=0):
@@ -28,9 +29,9 @@ def path(tmp_path):
     return tmp_path / "labels.parquet"
 
 
-def written(path, seeds=(4, 9), task=None, guidance="relative", **kinds):
+def written(path, seeds=(4, 9), task=None, guidance="relative", eps_deg=EPS, **kinds):
     labels = label_sets(lanes=len(seeds), **kinds)
-    files.write(path, task or TASK, guidance, np.array(seeds), labels)
+    files.write(path, task or TASK, guidance, eps_deg, np.array(seeds), labels)
     return labels
 
 
@@ -38,7 +39,7 @@ def test_labels_come_back_as_they_were(path):
     labels = written(path)
     file = files.read(path)
     assert file.task == TASK
-    assert file.guidance == "relative"
+    assert (file.guidance, file.eps_deg) == ("relative", EPS)
     assert file.seeds.tolist() == [4] * 20 + [9] * 20
     for name in ("obs", "action", "target"):
         np.testing.assert_array_equal(getattr(file.labels, name), getattr(labels, name).reshape(40, 2))
@@ -49,7 +50,7 @@ def test_labels_come_back_as_they_were(path):
 def test_only_labels_that_count_are_written(path):
     labels = label_sets()
     labels = labels.replace(valid=np.arange(20)[None] < np.array([[3], [0]]))
-    files.write(path, TASK, "relative", np.array([4, 9]), labels)
+    files.write(path, TASK, "relative", EPS, np.array([4, 9]), labels)
     file = files.read(path)
     assert file.seeds.tolist() == [4] * 3
     np.testing.assert_array_equal(file.labels.obs, labels.obs[0, :3])
@@ -96,7 +97,7 @@ def test_a_missing_file_is_refused(path):
 
 def test_a_file_without_labels_is_refused(path):
     labels = label_sets()
-    files.write(path, TASK, "relative", np.array([4, 9]), labels.replace(valid=np.zeros((2, 20), bool)))
+    files.write(path, TASK, "relative", EPS, np.array([4, 9]), labels.replace(valid=np.zeros((2, 20), bool)))
     with pytest.raises(UserError, match="holds no labels"):
         files.read(path)
 
@@ -135,7 +136,7 @@ def test_text_and_foreign_tables_are_refused(path):
         files.read(path)
 
 
-@pytest.mark.parametrize("missing", ["task", "guidance"])
+@pytest.mark.parametrize("missing", ["task", "guidance", "eps_deg"])
 def test_a_file_that_does_not_say_what_it_holds_is_refused(path, missing):
     written(path)
     table = pq.read_table(path)
@@ -174,6 +175,21 @@ def test_labels_of_another_guidance_are_refused(path):
     written(path, guidance="demonstration")
     with pytest.raises(UserError, match="demonstration labels"):
         read_for(path)
+
+
+def test_labels_of_another_strength_are_refused(path):
+    written(path, eps_deg=EPS / 2)
+    with pytest.raises(UserError, match=f"give --scalars.eps-deg {EPS / 2:g}"):
+        read_for(path)
+
+
+def test_a_digest_tells_contents_apart(path):
+    written(path)
+    first = files.digest(path)
+    written(path)
+    assert files.digest(path) == first
+    written(path, seed=1)
+    assert files.digest(path) != first
 
 
 def test_labels_for_a_grid_that_asks_for_none_are_refused(path):

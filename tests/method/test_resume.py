@@ -265,7 +265,7 @@ def test_labels_of_a_file_are_used_exactly(tmp_path):
     target = rng.normal(scale=0.1, size=(2, 60, 2)).astype(np.float32)
     given = probes.label_set(obs, action, target, np.ones((2, 60), bool))
     path = tmp_path / "given.parquet"
-    label_files.write(path, {"name": "window"}, "relative", np.array([3, 5]), given)
+    label_files.write(path, {"name": "window"}, "relative", CONFIG.scalars.eps_deg, np.array([3, 5]), given)
     grid = Grid(("relative",), seeds=(5, 3), labels=(35, 60))
     out = tmp_path / "run"
 
