@@ -49,7 +49,7 @@ def write(path: Path, task: dict[str, Any], guidance: str, eps_deg: float, seeds
     meta = {"task": task, "guidance": guidance, "eps_deg": float(eps_deg), "conventions": CONVENTIONS}
     table = pa.table(columns).replace_schema_metadata({META: json.dumps(meta).encode()})
     temporary = path.with_suffix(".tmp")
-    pq.write_table(table, temporary)
+    pq.write_table(table, temporary, write_page_checksum=True)
     os.replace(temporary, path)
 
 
@@ -58,7 +58,7 @@ def read(path: Path) -> LabelFile:
     if not path.is_file():
         raise UserError(f"no label file at {path}: give the path of a labels.parquet that a run or a person wrote")
     try:
-        table = pq.read_table(path)
+        table = pq.read_table(path, page_checksum_verification=True)
         meta = json.loads((table.schema.metadata or {})[META])
         columns = {name: np.array(table[name].to_pylist(), np.float32) for name in ("obs", "action", "target")}
         seeds = np.array(table["seed"].to_pylist(), np.int64)

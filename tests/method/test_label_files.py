@@ -108,7 +108,7 @@ def damaged_at(path, where, length):
     path.write_bytes(content)
 
 
-@pytest.mark.parametrize("share", [0.0, 0.3, 0.5, 0.9, 0.97])
+@pytest.mark.parametrize("share", [0.0, 0.1, 0.3, 0.5, 0.7, 0.9, 0.97])
 def test_a_damaged_file_is_refused(path, share):
     written(path)
     damaged_at(path, int(share * path.stat().st_size), 60)
