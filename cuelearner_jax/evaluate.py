@@ -8,11 +8,13 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.sharding import Mesh
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from cuelearner_jax import actions as geometry
 from cuelearner_jax import ddqn
 from cuelearner_jax.config import Scalars, Sizes
+from cuelearner_jax.devices import BY_LANE, SHARED, over_lanes
 from cuelearner_jax.feedback import relative_feedback, relative_target
 from cuelearner_jax.networks import applied, q_network
 from cuelearner_jax.refine import refine
@@ -139,12 +141,16 @@ def corrected_policy(base: Policy, teacher: Teacher, scalars: Scalars) -> Policy
     return policy
 
 
-@partial(jax.jit, static_argnames=("sizes", "num_envs", "steps"))
+@partial(jax.jit, static_argnames=("mesh", "sizes", "num_envs", "steps"))
 def evaluate_agents(
-    env: Environment, params: Params, key: PRNGKeyArray, *, sizes: Sizes, num_envs: int, steps: int
+    env: Environment, params: Params, key: PRNGKeyArray, *, mesh: Mesh, sizes: Sizes, num_envs: int, steps: int
 ) -> dict[str, Float[Array, " lanes"]]:
     """Validation of a block of agents (leading axis of `params`), all on the same episodes."""
-    return each_lane(lambda lane: rollout(agent_policy(sizes, lane), env, key, num_envs, steps), params)
+
+    def share(env: Environment, params: Params, key: PRNGKeyArray) -> dict[str, jax.Array]:
+        return each_lane(lambda lane: rollout(agent_policy(sizes, lane), env, key, num_envs, steps), params)
+
+    return over_lanes(mesh, share, (SHARED, BY_LANE, SHARED), BY_LANE)(env, params, key)
 
 
 def each_lane(measure: Callable[[Any], dict[str, jax.Array]], lanes: Any) -> dict[str, Float[Array, " lanes"]]:
@@ -153,20 +159,24 @@ def each_lane(measure: Callable[[Any], dict[str, jax.Array]], lanes: Any) -> dic
     return jax.lax.map(measure, lanes, batch_size=min(count, portions().agents))
 
 
-@partial(jax.jit, static_argnames=("guidance", "num_envs", "steps"))
+@partial(jax.jit, static_argnames=("mesh", "guidance", "num_envs", "steps"))
 def evaluate_guides(
     env: Environment,
     models: GuidanceModel,
     key: PRNGKeyArray,
     scalars: Scalars,
     *,
+    mesh: Mesh,
     guidance: Guidance,
     num_envs: int,
     steps: int,
 ) -> dict[str, Float[Array, " lanes"]]:
     """How good guidance is by itself: uniform actions under it, for a block of lanes on the same episodes."""
 
-    def one(model: GuidanceModel) -> dict[str, jax.Array]:
-        return rollout(guided_policy(uniform_policy(), guidance, model, env, scalars), env, key, num_envs, steps)
+    def share(env: Environment, models: GuidanceModel, key: PRNGKeyArray, scalars: Scalars) -> dict[str, jax.Array]:
+        def one(model: GuidanceModel) -> dict[str, jax.Array]:
+            return rollout(guided_policy(uniform_policy(), guidance, model, env, scalars), env, key, num_envs, steps)
 
-    return jax.vmap(one)(models)
+        return jax.vmap(one)(models)
+
+    return over_lanes(mesh, share, (SHARED, BY_LANE, SHARED, SHARED), BY_LANE)(env, models, key, scalars)

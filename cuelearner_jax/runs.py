@@ -4,7 +4,6 @@ Folder of a run:
 
     config.json                  everything that determines the results
     <guidance>/checkpoints/      the newest states
-    <guidance>/blocks.json       how the lanes are cut in them
     <guidance>/labels.parquet    what the teacher answered
     <guidance>/results.jsonl     one row a seed and evaluation; results.parquet once done
 """

@@ -23,10 +23,11 @@ from cuelearner_jax import guidance as guidances
 from cuelearner_jax import results
 from cuelearner_jax.checkpoint import Checkpoints, checkpoints
 from cuelearner_jax.config import RunConfig
+from cuelearner_jax.devices import SHARED, lane_mesh, place
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import episodes, evaluate_agents, evaluate_guides
 from cuelearner_jax.labelling import files as label_files
-from cuelearner_jax.lanes import Group, items, memory_report
+from cuelearner_jax.lanes import Group, items, memory_report, restore
 from cuelearner_jax.runs import Grid, check_folder, check_grid, describe, prepare_folder
 from cuelearner_jax.tasks import Task, shape_of
 from cuelearner_jax.train import label_slots, start_clock
@@ -65,10 +66,12 @@ def run(
     kinds = [guidances.make(kind, config.sizes, obs_size) for kind in grid.guidance]
     described = describe(task, config, grid, split, labels_from)
     check_folder(out, described, resume, overwrite)
-    env = task.environment(config.task)
+    mesh = lane_mesh()
+    env = place(mesh, task.environment(config.task), SHARED)
     for kind in kinds:
         console.print(memory_report(Group(config, env, kind, grid)))
-    teacher = task.teacher(config.task, env) if any(kind.asks for kind in kinds) and labels is None else None
+    asked = any(kind.asks for kind in kinds) and labels is None
+    teacher = place(mesh, task.teacher(config.task, env), SHARED) if asked else None
     examined = task.environment(config.task, split)
     prepare_folder(out, described, overwrite and not resume)
     with interruptible() as stopping, progress_bars() as bars:
@@ -143,7 +146,8 @@ class _Runner:
         self, group: Group, examined: Environment, task: Task, out: Path, stopping: threading.Event, bars: Progress
     ) -> None:
         self.group, self.task, self.stopping, self.bars = group, task, stopping, bars
-        self.examined = examined  # the environment of evaluations
+        self.mesh = group.mesh
+        self.examined = place(self.mesh, examined, SHARED)  # the environment of evaluations
         self.out = out
         self.folder = out / group.guidance.name
         self.split = json.loads((out / "config.json").read_text())["split"]
@@ -179,14 +183,13 @@ class _Runner:
     def _restore(self, saved: Checkpoints) -> None:
         """The newest checkpoint, or a fresh start; rows past it are dropped."""
         if saved.latest() is None:
-            self.group.write_blocks(self.folder)
             self.blocks = self.group.start()
             results.truncate_after(self.folder, -1)
             return
-        self.group.take_blocks_of(self.folder)
-        found = saved.restore(items(self.group.shapes(), jax.eval_shape(start_clock), 0.0))
-        self.blocks = [rest.replace(**policy) for policy, rest in zip(found["policy"], found["rest"], strict=True)]
-        self.clock, self.wall = found["clock"]["clock"], float(found["clock"]["wall_s"])
+        found = restore(self.group, saved, "policy", "rest")
+        blocks = [rest.replace(**policy) for policy, rest in zip(found["policy"], found["rest"], strict=True)]
+        self.blocks = self.group.recut(blocks)
+        self.clock, self.wall = place(self.mesh, found["clock"]["clock"], SHARED), float(found["clock"]["wall_s"])
         # A checkpoint of the labels alone comes before the rows of step 0.
         results.truncate_after(self.folder, int(self.clock.step) if int(self.clock.step) else -1)
 
@@ -280,6 +283,7 @@ class _Runner:
                 self.examined,
                 block.params,
                 episodes(self.split),
+                mesh=self.mesh,
                 sizes=group.config.sizes,
                 num_envs=schedule.eval_envs,
                 steps=schedule.eval_steps,
@@ -298,6 +302,7 @@ class _Runner:
                 block.guidance,
                 episodes(self.split),
                 group.config.scalars,
+                mesh=self.mesh,
                 guidance=group.guidance,
                 num_envs=schedule.eval_envs,
                 steps=schedule.eval_steps,

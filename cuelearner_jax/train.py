@@ -12,11 +12,13 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import optax
+from jax.sharding import Mesh
 from jaxtyping import Array, Int, PRNGKeyArray
 
 from cuelearner_jax import actions as geometry
 from cuelearner_jax import ddqn
 from cuelearner_jax.config import RunConfig, Scalars, Schedule, Sizes
+from cuelearner_jax.devices import BY_LANE, SHARED, lane_mesh, over_lanes
 from cuelearner_jax.feedback import empty_labels
 from cuelearner_jax.networks import applied, q_network
 from cuelearner_jax.refine import Refined, untouched
@@ -66,14 +68,18 @@ def label_slots(budget: int, sizes: Sizes) -> int:
     return -(-budget // sizes.labels_per_round) * sizes.labels_per_round
 
 
-def make_program(config: RunConfig, guidance: Guidance, env: Environment, largest_budget: int) -> Program:
+def make_program(
+    config: RunConfig, guidance: Guidance, env: Environment, largest_budget: int, mesh: Mesh | None = None
+) -> Program:
     """Compiles (on first use) the loop for one kind of guidance.
 
     Args:
         config: sizes and whether targets bootstrap are taken from here; scalars and schedule are passed at each call.
         env: gives shapes; any environment of the same structure may be passed at the calls.
         largest_budget: labels that the largest lane may use.
+        mesh: devices that share the lanes, whose number they must divide into (default: the first device alone).
     """
+    mesh = mesh or lane_mesh(jax.local_devices()[:1])
     lane = Lane(config.sizes, guidance, config.bootstraps, env.obs_size, largest_budget)
 
     def init(env, seeds, budgets, root):
@@ -96,11 +102,20 @@ def make_program(config: RunConfig, guidance: Guidance, env: Environment, larges
         (clock, state), metrics = jax.lax.scan(iteration, (clock, state), length=iterations)
         return clock, state, jax.tree.map(lambda leaf: leaf.mean(0), metrics)
 
+    def stretch(env, scalars, schedule, clock, state, iterations):
+        whole = over_lanes(
+            mesh, partial(train, iterations=iterations), (*(SHARED,) * 4, BY_LANE), (SHARED, BY_LANE, BY_LANE)
+        )
+        return whole(env, scalars, schedule, clock, state)
+
+    init = over_lanes(mesh, init, (SHARED, BY_LANE, BY_LANE, SHARED), BY_LANE)
+    label_round = over_lanes(mesh, label_round, (*(SHARED,) * 4, BY_LANE), (SHARED, BY_LANE))
+    take_labels = over_lanes(mesh, take_labels, (SHARED, SHARED, BY_LANE, BY_LANE), BY_LANE)
     return Program(
         init=jax.jit(init),
-        label_round=jax.jit(label_round, donate_argnames="state"),
-        take_labels=jax.jit(take_labels, donate_argnames="state"),
-        train=jax.jit(train, donate_argnames="state", static_argnames="iterations"),
+        label_round=jax.jit(label_round, donate_argnums=4),
+        take_labels=jax.jit(take_labels, donate_argnums=3),
+        train=jax.jit(stretch, donate_argnames="state", static_argnames="iterations"),
     )
 
 

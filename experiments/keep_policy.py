@@ -13,12 +13,10 @@ import jax
 import numpy as np
 
 from cuelearner_jax.checkpoint import checkpoints
-from cuelearner_jax.config import RunConfig
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.lanes import Group
 from cuelearner_jax.play import Subject, Trained, load_lanes
-from cuelearner_jax.runs import Grid, load
-from cuelearner_jax.tasks import TASKS, shape_of
+from cuelearner_jax.runs import load
+from cuelearner_jax.tasks import TASKS
 from cuelearner_jax.train import start_clock
 
 
@@ -36,17 +34,16 @@ def keep(run: Path, out: Path, seed: int, kind: str | None, labels: int | None) 
     described["grid"] = {"guidance": [lanes.guidance.name], "seeds": [seed], "labels": [budget]}
     out.mkdir(parents=True)
     (out / "config.json").write_text(json.dumps(described, indent=1) + "\n")
-    write(out / lanes.guidance.name, config, shape_of(task, config.task), lanes, int(found[0]))
+    write(out / lanes.guidance.name, lanes, int(found[0]))
 
 
-def write(folder: Path, config: RunConfig, env: object, lanes: Trained, index: int) -> None:
+def write(folder: Path, lanes: Trained, index: int) -> None:
     """The checkpoint of one lane's policy."""
-    seed, budget = int(lanes.seeds[index]), max(int(lanes.budgets[index]), 1)
-    Group(config, env, lanes.guidance, Grid((lanes.guidance.name,), (seed,), (budget,))).write_blocks(folder)
     policy = jax.tree.map(lambda leaf: leaf[index : index + 1], lanes.policies)
-    clock = {"clock": start_clock().replace(step=np.int32(lanes.step)), "wall_s": np.float32(0)}
+    clock = start_clock().replace(step=np.int32(lanes.step))
+    cut = np.array([1, 1], np.int32)  # one block of one lane
     with checkpoints(folder / "checkpoints") as saved:
-        saved.save(lanes.step, {"policy": [policy], "clock": clock})
+        saved.save(lanes.step, {"policy": [policy], "clock": {"clock": clock, "wall_s": np.float32(0), "cut": cut}})
 
 
 def main() -> int:

@@ -1,7 +1,8 @@
-"""Blocks of lanes: how they are cut, what memory they need, and what a checkpoint says of the cut."""
+"""Blocks of lanes: how they are cut, what memory they need."""
 
 import dataclasses
 
+import chex
 import numpy as np
 import pytest
 from probes import CONFIG, SIZES, Window
@@ -42,14 +43,11 @@ def test_memory_is_told_before_and_too_much_is_refused():
         lanes.memory_report(group_of(3, replay_capacity=10**12))
 
 
-def test_a_run_is_read_with_the_blocks_it_was_written_with(tmp_path, monkeypatch):
-    group = group_of(5, lanes_per_block=2)
-    group.write_blocks(tmp_path)
+def test_blocks_of_another_cut_are_cut_anew(monkeypatch):
     monkeypatch.setattr(lanes, "CORES", 1)
-    elsewhere = group_of(5)
-    assert len(elsewhere.blocks()) == 1
-    elsewhere.take_blocks_of(tmp_path)
-    assert [len(seeds) for seeds, _ in elsewhere.blocks()] == [2, 2, 2]
-    (tmp_path / lanes.BLOCKS).write_text("{")
-    with pytest.raises(UserError, match="damaged"):
-        elsewhere.take_blocks_of(tmp_path)
+    before, after = group_of(5, lanes_per_block=2), group_of(5)
+    blocks = before.start()
+    (joined,) = after.recut(blocks)
+    chex.assert_trees_all_equal(joined, *after.start())
+    kept = after.recut([joined])
+    assert kept[0] is joined

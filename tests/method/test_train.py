@@ -13,10 +13,12 @@ import pytest
 
 from cuelearner_jax import actions, evaluate, train
 from cuelearner_jax import guidance as guidances
+from cuelearner_jax.devices import lane_mesh
 from cuelearner_jax.networks import applied, q_network
 from cuelearner_jax.types import Label
 
 ENV, EXPERT = probes.Window(), probes.Expert(probes.Window())
+MESH = lane_mesh()
 DEG = math.pi / 180
 q = applied(q_network(probes.SIZES.q_layers))
 
@@ -59,7 +61,7 @@ def test_the_agent_learns_a_bandit_by_itself():
 
 def reward_of(params):
     key = jax.random.key(7)
-    measured = evaluate.evaluate_agents(ENV, params, key, sizes=probes.SIZES, num_envs=40, steps=80)
+    measured = evaluate.evaluate_agents(ENV, params, key, mesh=MESH, sizes=probes.SIZES, num_envs=40, steps=80)
     np.testing.assert_array_equal(measured["reward"], measured["hit"])
     return np.asarray(measured["reward"])
 
@@ -280,7 +282,7 @@ def assert_close(one, other, rtol=1e-4, atol=1e-5):
 
 def test_refined_uniform_actions_win_far_more_often_than_chance():
     _, state = labelled(probes.window_program("relative", LARGEST), SEEDS, BUDGETS)
-    measure = partial(evaluate.evaluate_guides, key=jax.random.key(3), num_envs=100, steps=1000)
+    measure = partial(evaluate.evaluate_guides, mesh=MESH, key=jax.random.key(3), num_envs=100, steps=1000)
     guidance = guidances.make("relative", probes.SIZES, 2)
     guided = measure(ENV, state.guidance, scalars=probes.SCALARS, guidance=guidance)["reward"]
     unfitted = state.guidance.replace(fitted=jnp.zeros(4, bool))
@@ -417,7 +419,7 @@ def test_evaluation_compiles_once_for_all_parameters_and_worlds():
     for index in range(3):
         params = probes.start(probes.window_program("none"), [index], [0]).params
         env = probes.Window(0.1 * index, 0.6)
-        evaluate.evaluate_agents(env, params, jax.random.key(index), sizes=probes.SIZES, num_envs=3, steps=6)
+        evaluate.evaluate_agents(env, params, jax.random.key(index), mesh=MESH, sizes=probes.SIZES, num_envs=3, steps=6)
     assert probes.compilations(evaluate.evaluate_agents) == [before + 1]
 
 

@@ -1,0 +1,70 @@
+"""A small sweep that `test_devices` runs in processes of their own, on as many devices as JAX_NUM_CPU_DEVICES says.
+
+python many_devices.py run FOLDER [STEP TO STOP AT] | resume FOLDER | communication
+"""
+
+import re
+import sys
+import threading
+from contextlib import contextmanager
+from pathlib import Path
+
+import jax
+import probes
+
+from cuelearner_jax import guidance as guidances
+from cuelearner_jax import lanes, sweep
+from cuelearner_jax.runs import Grid
+from cuelearner_jax.train import start_clock
+
+CONFIG = probes.config(
+    sizes={"q_layers": (16,), "feedback_layers": (16,), "fit_steps": 100, "replay_capacity": 40},
+    scalars={"discount": 0.5},
+    schedule={"total_steps": 64, "guidance_until": 48, "eval_every": 16, "checkpoint_every": 32},
+)
+GRID = Grid(("relative", "none"), seeds=(3, 5, 8), labels=(15, 30))  # 6 lanes and 3: neither divides among 4
+
+
+def run(out: Path, stop_at: int | None = None, **options) -> None:
+    """The sweep, interrupted at the given look at the event."""
+
+    class Event(threading.Event):
+        looks = 0
+
+        def is_set(self) -> bool:
+            self.looks += 1
+            return self.looks == stop_at
+
+    @contextmanager
+    def interruptible():
+        yield Event()
+
+    usual, sweep.interruptible = sweep.interruptible, interruptible
+    try:
+        sweep.run(probes.make_task(), CONFIG, GRID, out, **options)
+    except sweep.Interrupted:
+        assert stop_at is not None
+    finally:
+        sweep.interruptible = usual
+
+
+def communication() -> list[str]:
+    """Operations between devices in the compiled training."""
+    env = probes.Window()
+    group = lanes.Group(CONFIG, env, guidances.make("relative", CONFIG.sizes, env.obs_size), GRID)
+    (block,) = group.start()
+    train = group.program.train
+    text = train.lower(env, CONFIG.scalars, CONFIG.schedule, start_clock(), block, 4).compile().as_text()
+    assert "while" in text
+    assert len(block.key.sharding.device_set) == jax.device_count()
+    return re.findall(r"all-reduce|all-gather|all-to-all|collective-permute|reduce-scatter", text)
+
+
+if __name__ == "__main__":
+    asked, *rest = sys.argv[1:]
+    if asked == "communication":
+        print(jax.device_count(), communication())
+    elif asked == "resume":
+        run(Path(rest[0]), resume=True)
+    else:
+        run(Path(rest[0]), int(rest[1]) if len(rest) > 1 else None)
