@@ -218,7 +218,9 @@ def _evaluate(arguments: list[str]) -> None:
 
 def _measurements(measured: list[play.Measured], title: str) -> Table:
     """Interquartile means over seeds with their intervals, a row for each guidance and budget."""
-    table = Table("guidance", "labels", "seeds", "trained steps", "metric", "mean", "95% interval", title=title)
+    table = Table("guidance", "labels", "seeds", "steps", "metric", "mean", "95% interval", title=title)
+    for column in table.columns:
+        column.no_wrap = True
     for row in measured:
         own = [row.guidance, str(row.labels), str(len(row.seeds)), str(row.step)]
         for name, values in row.metrics.items():

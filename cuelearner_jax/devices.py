@@ -13,7 +13,7 @@ SHARED = PartitionSpec()  # the same on every device
 BY_LANE = PartitionSpec(LANES)  # leading axis cut into equal shares
 
 
-def lane_mesh(devices: Sequence[jax.Device] | None = None) -> Mesh:
+def lane_mesh(devices: Sequence[Any] | None = None) -> Mesh:
     """The devices that lanes are shared out to: all of this process's, or those given."""
     devices = jax.local_devices() if devices is None else list(devices)
     return jax.make_mesh((len(devices),), (LANES,), axis_types=(AxisType.Auto,), devices=devices)
