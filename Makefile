@@ -52,6 +52,7 @@ bench: $(VENV)/.tested
 	$(BIN)/python benchmarks/billiards_speed.py
 	$(BIN)/python benchmarks/training_speed.py
 	$(BIN)/python benchmarks/guidance_overhead.py
+	$(BIN)/python benchmarks/lidar_parity.py
 
 constraints: $(BIN)/uv
 	$(UV) pip compile --quiet --upgrade --universal --python-version 3.11 --all-extras --group dev --no-annotate --no-header \
