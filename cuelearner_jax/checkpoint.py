@@ -6,7 +6,9 @@ A checkpoint holds three items: `policy` (what acting needs, so that evaluation 
 
 from __future__ import annotations
 
+import errno
 import logging
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -19,6 +21,7 @@ import orbax.checkpoint as ocp
 from cuelearner_jax.errors import UserError
 
 KEPT = 2  # the newest checkpoints of a run
+ROOM_LEFT = 1 << 20  # beyond a checkpoint's arrays, for what describes them [bytes]
 
 
 def _is_key(leaf: Any) -> bool:
@@ -55,7 +58,7 @@ class Checkpoints:
     """The checkpoints of one program's run, in one folder; newest last."""
 
     def __init__(self, folder: Path, read_only: bool = False) -> None:
-        logging.getLogger("absl").setLevel(logging.ERROR)
+        logging.getLogger("absl").setLevel(logging.CRITICAL)  # its threads log what `save` then raises
         self._folder = folder.resolve()
         self._manager = ocp.CheckpointManager(
             self._folder,
@@ -69,7 +72,11 @@ class Checkpoints:
         return self._manager.latest_step()
 
     def save(self, number: int, items: dict[str, Any]) -> None:
-        """Writes a checkpoint; returns once it is complete on disk."""
+        """Writes a checkpoint; returns once it is complete on disk. Raises OSError where there is no room for it."""
+        # Asked first: a write that fails halfway leaves Orbax's threads complaining for pages.
+        needed = sum(leaf.nbytes for leaf in jax.tree.leaves(items) if hasattr(leaf, "nbytes"))
+        if shutil.disk_usage(self._folder).free < needed + ROOM_LEFT:
+            raise OSError(errno.ENOSPC, f"{needed / 1e6:.0f} MB are needed", str(self._folder))
         args = {name: ocp.args.StandardSave(_flat(item)) for name, item in items.items()}
         self._manager.save(number, args=ocp.args.Composite(**args))
         self._manager.wait_until_finished()

@@ -1,7 +1,7 @@
 """The command `cuelearner`: reads arguments, calls one function, turns errors into one line and an exit status.
 
 Exit status: 0 done; 2 bad input, nothing changed; 130 stopped by Ctrl-C, everything saved;
-141 nobody reads the output any more.
+1 the disk is full, everything up to the last checkpoint saved; 141 nobody reads the output any more.
 """
 
 from __future__ import annotations
@@ -25,10 +25,11 @@ from rich.console import Console
 from rich.table import Table
 
 from cuelearner_jax import play, runs, sweep, teaching
-from cuelearner_jax.errors import UserError, closest
+from cuelearner_jax.errors import UserError, closest, no_space
 from cuelearner_jax.evaluate import episodes
 from cuelearner_jax.options import Common, Evaluate, Render, Report, Sweep, TeacherTrain, Train
 from cuelearner_jax.report import report
+from cuelearner_jax.shards import Shard
 from cuelearner_jax.statistics import interval
 from cuelearner_jax.tasks import TASKS, Task
 
@@ -58,6 +59,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # whoever read our output has gone, as `head` does
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 141
+    except Exception as error:
+        if not no_space(error):
+            raise
+        print("error: the disk is full: free some, then go on with the same command and --resume", file=sys.stderr)
+        return 1
     except KeyboardInterrupt:
         print("stopped at once; what the last checkpoint holds is safe, go on with --resume", file=sys.stderr)
         return 130
@@ -165,10 +171,11 @@ def _sweep(arguments: list[str]) -> None:
     )
     asked = _parse(kind, rest, f"sweep {task.name}", default)
     seeds = tuple(range(asked.first_seed, asked.first_seed + asked.seeds))
-    _run(task, asked, runs.Grid(asked.guidance, seeds, asked.labels))
+    shard = Shard.parse(asked.shard) if asked.shard else None
+    _run(task, asked, runs.Grid(asked.guidance, seeds, asked.labels), shard)
 
 
-def _run(task: Task, asked: Common, grid: runs.Grid) -> None:
+def _run(task: Task, asked: Common, grid: runs.Grid, shard: Shard | None = None) -> None:
     sweep.run(
         task,
         asked.run,
@@ -177,6 +184,7 @@ def _run(task: Task, asked: Common, grid: runs.Grid) -> None:
         resume=asked.resume,
         overwrite=asked.overwrite,
         labels_from=asked.labels_from,
+        shard=shard,
         split="tuning" if asked.tuning else "validation",
     )
     out.print(f"done: {asked.out} (see it with: cuelearner report {asked.out} --out {asked.out}/report)")

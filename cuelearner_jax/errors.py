@@ -1,6 +1,7 @@
 """The one exception that a user is meant to read."""
 
 import difflib
+import errno
 from collections.abc import Iterable
 
 
@@ -9,6 +10,15 @@ class UserError(Exception):
 
     The command line prints the message alone, without a traceback, and exits with status 2.
     """
+
+
+def no_space(error: BaseException | None) -> bool:
+    """Does an exception, or what it came from, say that the disk is full? TensorStore says so in words alone."""
+    if error is None:
+        return False
+    told = isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+    words = ("No space left on device", "Disk quota exceeded", "File too large")
+    return told or any(text in str(error) for text in words) or no_space(error.__cause__ or error.__context__)
 
 
 def closest(word: str, known: Iterable[str]) -> str:

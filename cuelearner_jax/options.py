@@ -56,6 +56,9 @@ class Sweep(Common[TaskT], Generic[TaskT]):
     """Number of seeds."""
     first_seed: int = 0
     """The first seed; the others follow."""
+    shard: str | None = None
+    """Only piece i of n, as i/n: its share of the seeds, in a folder of its own below --out. Goes on by itself where it
+    was interrupted."""
 
 
 @dataclass(frozen=True)

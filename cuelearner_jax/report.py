@@ -18,7 +18,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from cuelearner_jax import results
+from cuelearner_jax import results, shards
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.figures import Group, draw_curves, draw_label_efficiency, save_figure
 from cuelearner_jax.statistics import curve, interval, mean_over_curve, steps_to_reach, stretches_apart
@@ -161,7 +161,9 @@ def _missing(folders: Sequence[str | os.PathLike[str]], table: pa.Table, groups:
             lines.append(f"{folder}: at step {last:,} of {total:,} ({last / total:.0%})")
         elif total is None and not (Path(folder) / results.PARQUET).exists():
             lines.append(f"{folder}: not finished, at step {last:,}")
-    for path in sorted({file.parent for folder in folders for file in Path(folder).rglob("config.json")}):
+    configurations = sorted({file for folder in folders for file in Path(folder).rglob("config.json")})
+    lines += shards.missing(configurations)
+    for path in (file.parent for file in configurations):
         found = {str(kind) for name, kind in zip(names, guidance, strict=True) if Path(name).is_relative_to(path)}
         planned = _config(path).get("grid", {}).get("guidance", [])
         lines += [f"{path.as_posix()}: no results of {kind} guidance" for kind in planned if kind not in found]

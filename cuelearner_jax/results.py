@@ -245,14 +245,19 @@ def _commit() -> str:
     root = Path(__file__).resolve().parents[1]
     if not (root / ".git").exists():  # an installed package may lie inside somebody else's repository
         return ""
-    command = ["git", "-C", str(root), "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"]
+    git = ["git", "-C", str(root), "--no-optional-locks"]  # nothing is written to the repository
+    asked = (["rev-parse", "--short=12", "HEAD"], ["status", "--porcelain", "--untracked-files=no"])
     try:
         with warnings.catch_warnings():
             # JAX warns of any fork; this one becomes git at once.
             warnings.filterwarnings("ignore", message=r"os\.fork", category=RuntimeWarning)
-            return subprocess.run(command, capture_output=True, text=True, timeout=10, check=True).stdout.strip()
+            told = [
+                subprocess.run([*git, *words], capture_output=True, text=True, timeout=10, check=True).stdout.strip()
+                for words in asked
+            ]
     except (OSError, subprocess.SubprocessError):
         return ""
+    return told[0] + ("-dirty" if told[1] else "")
 
 
 def _plain(value: Any) -> Any:

@@ -10,9 +10,12 @@ Folder of a run:
 
 from __future__ import annotations
 
+import fcntl
 import json
+import os
 import shutil
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,6 +28,7 @@ from cuelearner_jax.config import RunConfig
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import SPLITS
 from cuelearner_jax.labelling import files as label_files
+from cuelearner_jax.shards import Shard
 from cuelearner_jax.tasks import Task
 from cuelearner_jax.types import Guidance
 
@@ -65,7 +69,14 @@ def check_grid(grid: Grid) -> None:
             )
 
 
-def describe(task: Task, config: RunConfig, grid: Grid, split: str, labels_from: Path | None = None) -> dict[str, Any]:
+def describe(
+    task: Task,
+    config: RunConfig,
+    grid: Grid,
+    split: str,
+    labels_from: Path | None = None,
+    shard: Shard | None = None,
+) -> dict[str, Any]:
     """The contents of config.json."""
     return {
         "task": {"name": task.name, **configuration.to_json(config.task)},
@@ -76,6 +87,7 @@ def describe(task: Task, config: RunConfig, grid: Grid, split: str, labels_from:
         "split": split,
         "labels_from": f"{labels_from.name} {label_files.digest(labels_from)}" if labels_from else None,
         "total_steps": config.schedule.total_steps,
+        **({"shard": list(shard)} if shard else {}),
     }
 
 
@@ -132,11 +144,29 @@ def _differences(before: dict[str, Any], now: dict[str, Any], prefix: str = "") 
             yield prefix + name
 
 
-def prepare_folder(out: Path, described: dict[str, Any], clean: bool) -> None:
-    """Makes the folder and writes config.json, if it is not there."""
-    if clean and out.exists():
-        shutil.rmtree(out)
+@contextmanager
+def claimed(out: Path) -> Iterator[None]:
+    """Makes a run's folder and keeps it for this process alone; it is free again however the process ends.
+
+    Raises UserError if another process has it.
+    """
     out.mkdir(parents=True, exist_ok=True)
+    descriptor = os.open(out, os.O_RDONLY)  # the folder itself: no file is left behind
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(descriptor)
+        raise UserError(f"{out} is being written by another process: wait for it, or give another --out") from None
+    try:
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def prepare_folder(out: Path, described: dict[str, Any], clean: bool) -> None:
+    """Writes config.json into a claimed folder, if it is not there; with `clean`, nothing else is left in it."""
+    for entry in out.iterdir() if clean else ():
+        shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
     if not (out / "config.json").exists():
         temporary = out / "config.tmp"  # in one step, so that a crash leaves no half of it
         temporary.write_text(json.dumps(described, indent=1) + "\n")

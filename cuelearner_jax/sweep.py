@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 import signal
@@ -28,7 +29,8 @@ from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import episodes, evaluate_agents, evaluate_guides
 from cuelearner_jax.labelling import files as label_files
 from cuelearner_jax.lanes import Group, items, memory_report, restore
-from cuelearner_jax.runs import Grid, check_folder, check_grid, describe, prepare_folder
+from cuelearner_jax.runs import Grid, check_folder, check_grid, claimed, describe, prepare_folder
+from cuelearner_jax.shards import Shard
 from cuelearner_jax.tasks import Task, shape_of
 from cuelearner_jax.train import label_slots, start_clock
 from cuelearner_jax.types import Environment, Teacher
@@ -51,9 +53,12 @@ def run(
     resume: bool = False,
     overwrite: bool = False,
     labels_from: Path | None = None,
+    shard: Shard | None = None,
     split: str = "validation",
 ) -> None:
     """Trains every lane of the grid and leaves the results in `out`, measured on the episodes of `split`.
+
+    With `shard`, trains its share of the seeds alone, in its own folder below `out`, from wherever that stands.
 
     Raises:
         UserError: bad configuration, a folder in use, too little memory; nothing has been changed then.
@@ -61,10 +66,13 @@ def run(
     """
     configuration.check(config)
     check_grid(grid)
+    if shard:
+        grid, out = dataclasses.replace(grid, seeds=shard.seeds(grid.seeds)), shard.folder(out)
+        resume = resume or (not overwrite and (out / "config.json").is_file())
     obs_size = shape_of(task, config.task).obs_size
     labels = read_labels(labels_from, task, config, grid) if labels_from else None
     kinds = [guidances.make(kind, config.sizes, obs_size) for kind in grid.guidance]
-    described = describe(task, config, grid, split, labels_from)
+    described = describe(task, config, grid, split, labels_from, shard)
     check_folder(out, described, resume, overwrite)
     mesh = lane_mesh()
     env = place(mesh, task.environment(config.task), SHARED)
@@ -73,8 +81,8 @@ def run(
     asked = any(kind.asks for kind in kinds) and labels is None
     teacher = place(mesh, task.teacher(config.task, env), SHARED) if asked else None
     examined = task.environment(config.task, split)
-    prepare_folder(out, described, overwrite and not resume)
-    with interruptible() as stopping, progress_bars() as bars:
+    with claimed(out), interruptible() as stopping, progress_bars() as bars:
+        prepare_folder(out, described, overwrite and not resume)
         for kind in kinds:
             _Runner(Group(config, env, kind, grid), examined, task, out, stopping, bars).run(teacher, labels)
 
@@ -167,7 +175,8 @@ class _Runner:
 
     def _constants(self) -> dict[str, Any]:
         config = json.loads((self.out / "config.json").read_text())
-        config.pop("grid")
+        for name in ("grid", "shard"):  # do not change what a lane learns
+            config.pop(name, None)
         return {
             "run": self.out.name,
             "task": self.task.name,

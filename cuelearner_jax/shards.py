@@ -1,0 +1,58 @@
+"""A sweep in pieces that know nothing of each other: each with its own seeds and folder, free to be started anew."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from cuelearner_jax.errors import UserError
+
+
+class Shard(NamedTuple):
+    """Piece `index` (from 1) of `count`."""
+
+    index: int
+    count: int
+
+    @classmethod
+    def parse(cls, text: str) -> Shard:
+        """From "i/n". Raises UserError for anything else."""
+        found = re.fullmatch(r"(\d+)/(\d+)", text)
+        shard = cls(*(int(number) for number in found.groups())) if found else cls(0, 0)
+        if not 1 <= shard.index <= shard.count:
+            raise UserError(f"--shard is {text!r}: give i/n with i from 1 to n, for instance 3/8")
+        return shard
+
+    def folder(self, out: Path) -> Path:
+        """Where the piece writes below the sweep's folder."""
+        return out / f"shard-{self.index:0{len(str(self.count))}d}-of-{self.count}"
+
+    def seeds(self, seeds: tuple[int, ...]) -> tuple[int, ...]:
+        """Its share of a sweep's seeds: as many as the other pieces have, or one less.
+
+        Raises UserError if some piece would have none.
+        """
+        if self.count > len(seeds):
+            raise UserError(f"--shard: {len(seeds)} seeds do not make {self.count} pieces, at most {len(seeds)}")
+        return tuple(int(seed) for seed in np.array_split(np.array(seeds), self.count)[self.index - 1])
+
+
+def missing(configurations: list[Path]) -> list[str]:
+    """One line for each sweep of whose pieces some have not begun, given the config.json files that there are."""
+    begun: dict[tuple[Path, int], set[int]] = {}
+    for path in configurations:
+        try:
+            shard = Shard(*json.loads(path.read_text())["shard"])
+        except (OSError, ValueError, KeyError, TypeError):
+            continue
+        begun.setdefault((path.parent.parent, shard.count), set()).add(shard.index)
+    lines = []
+    for (sweep, count), there in sorted(begun.items()):
+        absent = sorted(set(range(1, count + 1)) - there)
+        if absent:
+            lines.append(f"{sweep.as_posix()}: shards not begun, of {count}: {', '.join(map(str, absent))}")
+    return lines
