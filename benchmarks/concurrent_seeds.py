@@ -1,9 +1,11 @@
-"""Training seeds at once on one device: navigation with the paper's networks and a replay of 100,000 steps for each.
+"""Training seeds at once: navigation with the paper's networks and a replay of 100,000 steps for each.
 
     python benchmarks/concurrent_seeds.py --seeds 1 16 1000
+    python benchmarks/concurrent_seeds.py --seeds 64 --devices 1 2 4
 
-For each number of seeds: memory at its peak, time of one gradient step of all of them, environment steps a second in
-all. Unguided lanes; guidance adds its forward passes. Writes benchmarks/results/concurrent_seeds.json with --write.
+For each number of seeds (on each device) and of devices: memory of the first device at its peak, time of one gradient
+step of all seeds, environment steps a second in all. Unguided lanes; guidance adds its forward passes. With --write it
+writes benchmarks/results/concurrent_seeds.json, or device_scaling.json where there are several numbers of devices.
 """
 
 from __future__ import annotations
@@ -19,18 +21,20 @@ from typing import Any
 import jax
 
 from cuelearner_jax import guidance, results
+from cuelearner_jax.devices import SHARED, lane_mesh, place
 from cuelearner_jax.lanes import Group, state_bytes
 from cuelearner_jax.runs import Grid
 from cuelearner_jax.tasks import NAVIGATION
 from cuelearner_jax.train import start_clock
 
-RESULTS = Path(__file__).parent / "results" / "concurrent_seeds.json"
+RESULTS = Path(__file__).parent / "results"
 
 
-def measure(config: Any, env: Any, seeds: int, iterations: int, repeats: int) -> dict[str, float]:
-    """Trains `seeds` lanes past their random steps and times stretches of `iterations`."""
-    kind = guidance.make("none", config.sizes, env.obs_size)
-    group = Group(config, env, kind, Grid(("none",), tuple(range(seeds)), (0,)))
+def measure(config: Any, env: Any, seeds: int, devices: int, iterations: int, repeats: int) -> dict[str, float]:
+    """Trains `seeds` lanes past their random steps on so many devices and times stretches of `iterations`."""
+    kind, mesh = guidance.make("none", config.sizes, env.obs_size), lane_mesh(jax.local_devices()[:devices])
+    group = Group(config, env, kind, Grid(("none",), tuple(range(seeds)), (0,)), mesh)
+    env = place(mesh, env, SHARED)
     clock, (block,) = start_clock(), group.start()
     at_rest = state_bytes(block)
     times = []
@@ -44,6 +48,7 @@ def measure(config: Any, env: Any, seeds: int, iterations: int, repeats: int) ->
     steps = iterations * config.sizes.num_envs
     second = statistics.median(times[1:]) / steps
     return {
+        "devices": devices,
         "seeds": seeds,
         "ms_per_update": 1e3 * second,
         "steps_per_second": seeds / second,
@@ -56,14 +61,17 @@ def measure(config: Any, env: Any, seeds: int, iterations: int, repeats: int) ->
 def main() -> None:
     """Measures, prints a table, writes JSON."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", type=int, nargs="+", default=[1, 16, 1000])
+    parser.add_argument("--seeds", type=int, nargs="+", default=[1, 16, 1000], help="on each device")
+    parser.add_argument("--devices", type=int, nargs="+", default=[1], help="that share the seeds")
     parser.add_argument("--iterations", type=int, default=20, help="iterations of num_envs steps in a timed stretch")
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--worlds", type=int, default=256)
     parser.add_argument("--target-dtype", choices=("float32", "bfloat16"), default="bfloat16")
     parser.add_argument("--layers", type=int, nargs="+", help="hidden layers (default: the paper's)")
-    parser.add_argument("--write", action="store_true", help=f"write {RESULTS.name}")
+    parser.add_argument("--write", action="store_true", help="write the JSON file")
     asked = parser.parse_args()
+    if max(asked.devices) > jax.local_device_count():
+        parser.error(f"--devices: there are {jax.local_device_count()}")
     config = NAVIGATION.presets["paper"].config
     sizes = dataclasses.replace(config.sizes, target_dtype=asked.target_dtype)
     if asked.layers:
@@ -72,17 +80,22 @@ def main() -> None:
     config = dataclasses.replace(
         config,
         task=dataclasses.replace(config.task, worlds=asked.worlds),
-        sizes=dataclasses.replace(sizes, lanes_per_block=max(asked.seeds)),
+        sizes=dataclasses.replace(sizes, lanes_per_block=max(asked.seeds) * max(asked.devices)),
         schedule=dataclasses.replace(config.schedule, random_steps=sizes.num_envs, learn_after=sizes.num_envs),
     )
     env = NAVIGATION.environment(config.task)
-    rows = [measure(config, env, seeds, asked.iterations, asked.repeats) for seeds in asked.seeds]
+    rows = [
+        measure(config, env, seeds * devices, devices, asked.iterations, asked.repeats)
+        for seeds in asked.seeds
+        for devices in asked.devices
+    ]
     names = list(rows[0])
     print("  ".join(f"{name:>17}" for name in names))
     for row in rows:
         print("  ".join(f"{row[name]:>17,.3f}" for name in names))
     if asked.write:
-        RESULTS.write_text(json.dumps({**results.provenance(), "rows": rows}, indent=1) + "\n")
+        name = "device_scaling.json" if len(asked.devices) > 1 else "concurrent_seeds.json"
+        (RESULTS / name).write_text(json.dumps({**results.provenance(), "rows": rows}, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh
 
 from cuelearner_jax.checkpoint import Checkpoints, checkpoints
 from cuelearner_jax.config import RunConfig
@@ -30,11 +31,11 @@ T = TypeVar("T")
 class Group:
     """The lanes of one kind of guidance: one compiled program, its lanes cut into equal blocks."""
 
-    def __init__(self, config: RunConfig, env: Any, guidance: Guidance, grid: Grid) -> None:
+    def __init__(self, config: RunConfig, env: Any, guidance: Guidance, grid: Grid, mesh: Mesh | None = None) -> None:
         self.config, self.env, self.guidance = config, env, guidance
         self.seeds, self.budgets = grid.lanes(guidance)
         self.largest_budget = int(self.budgets.max())
-        self.mesh = lane_mesh()
+        self.mesh = mesh or lane_mesh()  # by default all local devices
         self.program: Program = make_program(config, guidance, env, self.largest_budget, self.mesh)
         self.lanes_per_block = config.sizes.lanes_per_block or self._fitting_lanes()
 

@@ -164,7 +164,8 @@ def claimed(out: Path) -> Iterator[None]:
 
 
 def prepare_folder(out: Path, described: dict[str, Any], clean: bool) -> None:
-    """Writes config.json into a claimed folder, if it is not there; with `clean`, nothing else is left in it."""
+    """Makes the folder and writes config.json, if it is not there; with `clean`, nothing else is left in it."""
+    out.mkdir(parents=True, exist_ok=True)
     for entry in out.iterdir() if clean else ():
         shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
     if not (out / "config.json").exists():

@@ -20,7 +20,7 @@ from cuelearner_jax.shards import Shard
 
 ENTRY = [str(Path(sys.executable).with_name("cuelearner"))]
 SWEEP = ["sweep", "billiards", "--preset", "quickstart", *SMALL, "--seeds", "3", "--first-seed", "7"]
-SWEEP += ["--guidance", "relative", "none", "--labels", "10"]
+SWEEP += ["--guidance", "none"]
 
 
 def rows(*folders):
@@ -65,7 +65,7 @@ def test_pieces_give_what_the_whole_gives_and_a_report_says_which_are_missing(wh
     text = (tmp_path / "both" / "report.md").read_text()
     assert "not begun" not in text
     assert "differ in more than" not in text
-    assert "| relative | 10 | 3 |" in text
+    assert "| none | 0 | 3 |" in text
     before = {path: path.stat().st_mtime_ns for path in out.rglob("results.parquet")}
     assert main([*SWEEP, "--shard", "2/2", "--out", str(out)]) == 0  # finished: left as it is
     assert "finished before" in capsys.readouterr().err
@@ -79,7 +79,7 @@ def test_other_options_for_a_piece_that_has_begun_are_refused(refused, tmp_path)
 
 
 def test_a_piece_that_was_killed_goes_on_with_the_same_command(tmp_path):
-    command = [*SWEEP, "--guidance", "none", "--schedule.total-steps", "4000", "--shard", "1/2"]
+    command = [*SWEEP, "--schedule.total-steps", "2000", "--shard", "1/2"]
     calm, killed = tmp_path / "calm", tmp_path / "killed"
     assert main([*command, "--out", str(calm)]) == 0
     process = subprocess.Popen([*ENTRY, *command, "--out", str(killed)], stderr=subprocess.DEVNULL)
@@ -107,24 +107,23 @@ def test_a_folder_is_free_again_after_its_process(tmp_path):
     assert os.listdir(out) == []
 
 
-@pytest.mark.parametrize("guidance", ["relative", "none"])
-def test_a_full_disk_stops_a_piece_and_damages_nothing(whole, tmp_path, capsys, monkeypatch, guidance):
+def test_a_full_disk_stops_a_piece_and_damages_nothing(whole, tmp_path, capsys, monkeypatch):
     out = tmp_path / "run"
     full = SimpleNamespace(free=1000)
     with monkeypatch.context() as patch:
         patch.setattr(shutil, "disk_usage", lambda folder: full)
-        assert main([*SWEEP, "--guidance", guidance, "--shard", "1/1", "--out", str(out)]) == 1
+        assert main([*SWEEP, "--shard", "1/1", "--out", str(out)]) == 1
     told = capsys.readouterr().err.splitlines()
     assert told[-1].startswith("error: the disk is full: free some")
-    assert main([*SWEEP, "--guidance", guidance, "--shard", "1/1", "--out", str(out)]) == 0
-    assert rows(out) == [row for row in whole if row["guidance"] == guidance]
+    assert main([*SWEEP, "--shard", "1/1", "--out", str(out)]) == 0
+    assert rows(out) == whole
 
 
 def test_a_table_that_the_disk_has_no_room_for_is_reported(tmp_path):
     # Every file but the shortest is too large for this process.
     script = "import resource, sys; resource.setrlimit(resource.RLIMIT_FSIZE, (3000, 3000));"
     script += "from cuelearner_jax.cli import main; sys.exit(main(sys.argv[1:]))"
-    command = [sys.executable, "-c", script, *SWEEP, "--guidance", "none", "--out", str(tmp_path / "run")]
+    command = [sys.executable, "-c", script, *SWEEP, "--out", str(tmp_path / "run")]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 1
     assert "error: the disk is full" in done.stderr
