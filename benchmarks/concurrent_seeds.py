@@ -35,7 +35,7 @@ def measure(config: Any, env: Any, seeds: int, devices: int, iterations: int, re
     kind, mesh = guidance.make("none", config.sizes, env.obs_size), lane_mesh(jax.local_devices()[:devices])
     group = Group(config, env, kind, Grid(("none",), tuple(range(seeds)), (0,)), mesh)
     env = place(mesh, env, SHARED)
-    clock, (block,) = start_clock(), group.start()
+    clock, (block,) = place(mesh, start_clock(), SHARED), group.start()
     at_rest = state_bytes(block)
     times = []
     for _ in range(repeats + 1):  # the first compiles

@@ -20,6 +20,7 @@ import jax
 import numpy as np
 
 from cuelearner_jax import guidance
+from cuelearner_jax.devices import SHARED, place
 from cuelearner_jax.lanes import Group
 from cuelearner_jax.runs import Grid
 from cuelearner_jax.tasks import BILLIARDS
@@ -33,7 +34,7 @@ class Run:
         env = BILLIARDS.environment(config.task)
         made = guidance.make(kind, config.sizes, env.obs_size)
         self.group = Group(config, env, made, Grid((kind,), tuple(range(seeds)), (labels,)))
-        self.clock, self.blocks, self.rounds = start_clock(), self.group.start(), []
+        self.clock, self.blocks, self.rounds = place(self.group.mesh, start_clock(), SHARED), self.group.start(), []
         if made.asks:
             teacher = BILLIARDS.teacher(config.task, env)
             for _ in range(self.group.rounds):

@@ -25,6 +25,7 @@ from cartpole import CartPole
 
 from cuelearner_jax import guidance
 from cuelearner_jax.config import RunConfig, Scalars, Schedule, Sizes
+from cuelearner_jax.devices import SHARED, place
 from cuelearner_jax.lanes import Group
 from cuelearner_jax.runs import Grid
 from cuelearner_jax.train import start_clock
@@ -64,7 +65,7 @@ def measure(config: RunConfig, env: CartPole, seeds: int, steps: int, rounds: in
     operations = operations_a_step(config.sizes, env.obs_size)
     unguided = guidance.make("none", config.sizes, env.obs_size)
     group = Group(config, env, unguided, Grid(("none",), tuple(range(seeds)), ()))
-    clock, blocks, shares, rates, peaks = start_clock(), group.start(), [], [], []
+    clock, blocks, shares, rates, peaks = place(group.mesh, start_clock(), SHARED), group.start(), [], [], []
     for round_ in range(rounds + 1):
         peak = matmul_rate()
         began = time.perf_counter()

@@ -159,7 +159,7 @@ class _Runner:
         self.out = out
         self.folder = out / group.guidance.name
         self.split = json.loads((out / "config.json").read_text())["split"]
-        self.clock, self.blocks, self.wall = start_clock(), [], 0.0
+        self.clock, self.blocks, self.wall = place(self.mesh, start_clock(), SHARED), [], 0.0
 
     def run(self, teacher: Teacher | None, labels: label_files.LabelFile | None) -> None:
         """From wherever the group stands to its end."""
@@ -246,7 +246,8 @@ class _Runner:
         for index, (seeds, budgets) in enumerate(group.blocks()):
             rows = jax.tree.map(jnp.asarray, label_files.for_lanes(file, seeds, budgets, slots))
             self.blocks[index] = group.program.take_labels(group.env, group.config.scalars, rows, self.blocks[index])
-        self.clock = self.clock.replace(round=jnp.asarray(group.rounds, jnp.int32))
+        taken = self.clock.replace(round=jnp.asarray(group.rounds, jnp.int32))
+        self.clock = place(self.mesh, taken, SHARED)
 
     def _write_labels(self) -> None:
         group = self.group

@@ -5,11 +5,13 @@ import dataclasses
 import chex
 import numpy as np
 import pytest
-from probes import CONFIG, SIZES, Window
+from probes import CONFIG, SIZES, Window, compilations
 
 from cuelearner_jax import guidance, lanes
+from cuelearner_jax.devices import SHARED, place
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.runs import Grid
+from cuelearner_jax.train import start_clock
 
 
 def group_of(seeds, kind="none", **sizes):
@@ -49,5 +51,13 @@ def test_blocks_of_another_cut_are_cut_anew(monkeypatch):
     blocks = before.start()
     (joined,) = after.recut(blocks)
     chex.assert_trees_all_equal(joined, *after.start())
-    kept = after.recut([joined])
-    assert kept[0] is joined
+    chex.assert_trees_all_equal(after.recut([joined]), [joined])
+
+
+def test_training_is_compiled_once():
+    group, config = group_of(1), CONFIG
+    clock = place(group.mesh, start_clock(), SHARED)
+    (state,) = group.start()
+    for _ in range(2):
+        clock, state, _ = group.program.train(Window(), config.scalars, config.schedule, clock, state, 4)
+    assert compilations(group.program.train) == [1]
