@@ -25,6 +25,28 @@ def greedy(
     return directions[jnp.argmax(q(params, obs, directions)[:, 0])]
 
 
+def greedy_near_peaks(
+    q: ValueFunction,
+    params: Params,
+    obs: Float[Array, " obs"],
+    directions: Float[Array, "n 2"],
+    coarse: Float[Array, " coarse"],
+    peaks: int,
+) -> Float[Array, "2"]:
+    """The same choice as `greedy` makes, if the largest value lies next to one of the highest peaks of a first look.
+
+    Args:
+        directions: evenly spaced.
+        coarse: values of every (n / coarse)-th of them, computed as roughly as may be: they decide where to look only.
+        peaks: how many of its local maxima to look round, up to its neighbours.
+    """
+    stride = directions.shape[0] // coarse.shape[0]
+    summit = (coarse >= jnp.roll(coarse, 1)) & (coarse >= jnp.roll(coarse, -1))
+    _, highest = jax.lax.top_k(jnp.where(summit, coarse, -jnp.inf), peaks)
+    near = jnp.mod(highest[:, None] * stride + jnp.arange(1 - stride, stride), directions.shape[0]).ravel()
+    return greedy(q, params, obs, directions[near])
+
+
 def target(
     q: ValueFunction,
     params: Params,

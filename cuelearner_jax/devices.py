@@ -1,9 +1,9 @@
-"""Lanes over devices: each works on its share of a block of lanes, none waits for another."""
+"""Lanes over devices, each of which works on its share of a block and waits for none; how much one takes at once."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
@@ -11,6 +11,24 @@ from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 LANES = "lanes"
 SHARED = PartitionSpec()  # the same on every device
 BY_LANE = PartitionSpec(LANES)  # leading axis cut into equal shares
+
+
+class Portions(NamedTuple):
+    """How much is worked on at once: what a core's cache holds, or what keeps an accelerator busy within its memory."""
+
+    actions: int  # state-action pairs of one agent in one forward pass of an argmax
+    agents: int  # evaluated side by side
+    states: int  # that a teacher looks at together
+
+
+def portions() -> Portions:
+    """Those of the device that computes."""
+    return Portions(8192, 1, 16) if jax.default_backend() == "cpu" else Portions(1 << 14, 16, 256)
+
+
+def compiler_options() -> dict[str, Any]:
+    """XLA's options for the training loop: a GPU runs the independent kernels of a captured step side by side."""
+    return {"xla_gpu_command_buffer_scheduling_mode": "CONCURRENT"} if jax.default_backend() == "gpu" else {}
 
 
 def lane_mesh(devices: Sequence[Any] | None = None) -> Mesh:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -12,12 +12,11 @@ from jax.sharding import Mesh
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from cuelearner_jax import actions as geometry
-from cuelearner_jax import ddqn
 from cuelearner_jax.config import Scalars, Sizes
-from cuelearner_jax.devices import BY_LANE, SHARED, over_lanes
+from cuelearner_jax.devices import BY_LANE, SHARED, over_lanes, portions
 from cuelearner_jax.feedback import relative_feedback, relative_target
-from cuelearner_jax.networks import applied, q_network
 from cuelearner_jax.refine import refine
+from cuelearner_jax.search import greedy_actions
 from cuelearner_jax.types import Environment, Guidance, GuidanceModel, Params, Teacher
 
 # (key, environment states (n, ...), observations (n, obs)) -> directions (n, 2)
@@ -25,19 +24,6 @@ Policy = Callable[[PRNGKeyArray, Any, jax.Array], jax.Array]
 
 # Folded into the root key: episodes for reported figures only, and episodes for choosing settings.
 SPLITS = {"validation": 1_000_003, "tuning": 1_000_001}
-
-
-class Portions(NamedTuple):
-    """How much is worked on at once: what a core's cache holds, or what keeps an accelerator busy within its memory."""
-
-    actions: int  # state-action pairs in one forward pass of an argmax
-    agents: int  # evaluated side by side
-    states: int  # that a teacher looks at together
-
-
-def portions() -> Portions:
-    """Those of the device that computes."""
-    return Portions(8192, 1, 16) if jax.default_backend() == "cpu" else Portions(1 << 18, 16, 256)
 
 
 def episodes(split: str = "validation") -> PRNGKeyArray:
@@ -83,13 +69,7 @@ def rollout(
 
 def agent_policy(sizes: Sizes, params: Params) -> Policy:
     """The greedy choice of an action-value network."""
-    q, options = applied(q_network(sizes.q_layers)), geometry.evenly_spaced(sizes.directions)
-
-    def policy(key: PRNGKeyArray, state: Any, obs: jax.Array) -> jax.Array:
-        choose = partial(ddqn.greedy, q, params, directions=options)
-        return jax.lax.map(choose, obs, batch_size=max(1, min(len(obs), portions().actions // sizes.directions)))
-
-    return policy
+    return lambda key, state, obs: greedy_actions(sizes, params, obs)
 
 
 def uniform_policy() -> Policy:

@@ -16,9 +16,10 @@ from jax.sharding import Mesh
 
 from cuelearner_jax.checkpoint import Checkpoints, checkpoints
 from cuelearner_jax.config import RunConfig
-from cuelearner_jax.devices import BY_LANE, lane_mesh, place
+from cuelearner_jax.devices import BY_LANE, lane_mesh, place, portions
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.runs import Grid
+from cuelearner_jax.search import looked_at
 from cuelearner_jax.train import Program, label_slots, make_program, start_clock
 from cuelearner_jax.types import Clock, Guidance, TrainState
 
@@ -117,7 +118,10 @@ def memory_report(group: Group) -> str:
     kept = sum(state_bytes(block) for block in shapes) // devices
     # Activations of the widest pass: the argmax while acting, that inside targets, or a batch with its gradient.
     widest = max(*sizes.q_layers, *sizes.feedback_layers)
-    rows = max(sizes.num_envs * sizes.directions, 3 * sizes.batch_size * len(sizes.q_layers))
+    looked = looked_at(sizes)
+    rows = max(
+        min(sizes.num_envs * looked, max(portions().actions, looked)), 3 * sizes.batch_size * len(sizes.q_layers)
+    )
     if group.config.bootstraps:
         rows = max(rows, sizes.batch_size * sizes.target_directions * (2 if sizes.n_step > 1 else 1))
     working = 4 * 4 * widest * rows * (padded // len(shapes) // devices)

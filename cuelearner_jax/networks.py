@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from itertools import pairwise
 
 import flax.linen as nn
 import jax
@@ -64,3 +65,28 @@ def feedback_network(layers: Sequence[int]) -> MLP:
 def applied(network: MLP) -> Callable[[Params, jax.Array, jax.Array], jax.Array]:
     """A network as a function: (params, obs (..., obs), actions (..., 2)) -> outputs (..., outputs)."""
     return lambda params, obs, actions: jnp.asarray(network.apply(params, obs, actions))
+
+
+def widened(params: Params, layers: Sequence[int], multiple: int) -> tuple[Params, tuple[int, ...]]:
+    """The same function with hidden layers of widths that are multiples: a tensor core's rows must be aligned.
+
+    The units that are added are zero throughout and add exactly nothing.
+
+    Args:
+        params: of a network of this module.
+        layers: its hidden widths.
+        multiple: of which the new widths are.
+
+    Returns:
+        Parameters and hidden widths of the wider network.
+    """
+    wider = tuple(-(-width // multiple) * multiple for width in layers)
+    extra = [0, *(new - old for new, old in zip(wider, layers, strict=True)), 0]
+    dense = {
+        f"Dense_{place}": {
+            "kernel": jnp.pad(params["params"][f"Dense_{place}"]["kernel"], ((0, before), (0, after))),
+            "bias": jnp.pad(params["params"][f"Dense_{place}"]["bias"], (0, after)),
+        }
+        for place, (before, after) in enumerate(pairwise(extra))
+    }
+    return {"params": dense}, wider

@@ -85,7 +85,11 @@ BILLIARDS = Task(
     presets={
         "paper": Preset(
             "the paper's figure: regulation table, its networks, 10 million steps a seed",
-            RunConfig(BilliardsConfig("regulation", aim_error_deg=0.25)),
+            RunConfig(
+                BilliardsConfig("regulation", teacher="learned", aim_error_deg=0.25),
+                # The reference alternates 1,000 steps with 1,000 gradient steps, this a hundred with a hundred.
+                Sizes(num_envs=100, coarse_directions=360, coarse_dtype="bfloat16", peaks=4),
+            ),
             labels=(500, 1000),
         ),
         "easy": Preset(

@@ -18,11 +18,12 @@ from jaxtyping import Array, Int, PRNGKeyArray
 from cuelearner_jax import actions as geometry
 from cuelearner_jax import ddqn
 from cuelearner_jax.config import RunConfig, Scalars, Schedule, Sizes
-from cuelearner_jax.devices import BY_LANE, SHARED, lane_mesh, over_lanes
+from cuelearner_jax.devices import BY_LANE, SHARED, compiler_options, lane_mesh, over_lanes
 from cuelearner_jax.feedback import empty_labels
 from cuelearner_jax.networks import applied, q_network
 from cuelearner_jax.refine import Refined, untouched
 from cuelearner_jax.replay import RingBuffer, ring_buffer
+from cuelearner_jax.search import greedy_actions
 from cuelearner_jax.types import (
     Asking,
     Clock,
@@ -115,7 +116,9 @@ def make_program(
         init=jax.jit(init),
         label_round=jax.jit(label_round, donate_argnums=4),
         take_labels=jax.jit(take_labels, donate_argnums=3),
-        train=jax.jit(stretch, donate_argnames="state", static_argnames="iterations"),
+        train=jax.jit(
+            stretch, donate_argnames="state", static_argnames="iterations", compiler_options=compiler_options()
+        ),
     )
 
 
@@ -253,11 +256,10 @@ class Lane(NamedTuple):
         Uniform at first, then greedy; in guided episodes refined by the guidance until the cut-off. The branches hang
         on the shared clock alone, so they stay branches under vmap.
         """
-        options = directions(self.sizes)
         base = jax.lax.cond(
             clock.step < schedule.random_steps,
             lambda: geometry.uniform(key, (self.sizes.num_envs,)),
-            lambda: jax.vmap(lambda obs: ddqn.greedy(self.q, state.params, obs, options))(state.obs),
+            lambda: greedy_actions(self.sizes, state.params, state.obs),
         )
         guides = (clock.step >= schedule.random_steps) & (clock.step < schedule.guidance_until)
         return jax.lax.cond(

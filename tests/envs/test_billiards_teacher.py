@@ -101,28 +101,29 @@ def test_a_configuration_names_the_teacher():
     assert float(teacher.habit) == pytest.approx(0.1)
 
 
-def test_the_shipped_teacher_plays_the_easy_table_well():
-    config = BilliardsConfig("easy", teacher="learned")
+@pytest.mark.parametrize(("table", "least"), [("easy", 0.75), ("regulation", 0.45)])
+def test_the_shipped_teachers_play_well(table, least):
+    config = BilliardsConfig(table, teacher="learned")
     env = make_environment(config)
     teacher = billiards_teacher(config, env)
     assert isinstance(teacher, LearnedTeacher)
-    coarse = teacher.replace(directions=720)  # for speed
+    coarse = teacher.replace(directions=1440)  # for speed
     measured = jax.jit(lambda teacher: rollout(teacher_policy(teacher), env, episodes("tuning"), 30, 300))(coarse)
-    assert float(measured["reward"]) > 0.75  # 0.934 over 10,000 steps with its 3,600 directions
+    assert float(measured["reward"]) > least  # over 10,000 steps with their 3,600 directions: see teacher.json
 
 
-def test_the_shipped_teacher_tells_how_it_was_made():
-    told = json.loads((SHIPPED_TEACHERS / "easy" / "teacher.json").read_text())
-    assert 0.75 < told["reward"] < 1.0
+@pytest.mark.parametrize(("table", "preset", "least"), [("easy", "easy", 0.75), ("regulation", "paper", 0.45)])
+def test_the_shipped_teachers_tell_how_they_were_made(table, preset, least):
+    told = json.loads((SHIPPED_TEACHERS / table / "teacher.json").read_text())
+    assert least < told["reward"] < 1.0
     assert told["eval_steps"] == 10_000
-    assert told["command"].startswith("cuelearner teacher train billiards --preset easy")
+    assert told["command"].startswith(f"cuelearner teacher train billiards --preset {preset}")
     assert len(told["commit"]) >= 7
     assert "jax" in told["versions"]
-    assert (told["task"]["name"], told["task"]["table"]) == ("billiards", "easy")
+    assert (told["task"]["name"], told["task"]["table"]) == ("billiards", table)
 
 
-@pytest.mark.parametrize("table", ["one_ball", "regulation"])
-def test_a_table_without_a_shipped_teacher_says_what_to_do(table):
-    config = BilliardsConfig(table, teacher="learned")
+def test_a_table_without_a_shipped_teacher_says_what_to_do():
+    config = BilliardsConfig("one_ball", teacher="learned")
     with pytest.raises(UserError, match=r"cuelearner teacher train.*search teacher"):
         billiards_teacher(config, make_environment(config))
