@@ -14,45 +14,35 @@ import argparse
 import dataclasses
 import json
 import statistics
-import time
 from pathlib import Path
 from typing import Any
 
 import jax
 
-from cuelearner_jax import guidance, results
-from cuelearner_jax.devices import SHARED, lane_mesh, place
-from cuelearner_jax.lanes import Group, state_bytes
-from cuelearner_jax.runs import Grid
+from cuelearner_jax import results
+from cuelearner_jax.bench import Timed, learning
+from cuelearner_jax.config import RunConfig
+from cuelearner_jax.devices import lane_mesh
+from cuelearner_jax.lanes import state_bytes
 from cuelearner_jax.tasks import NAVIGATION
-from cuelearner_jax.train import start_clock
 
 RESULTS = Path(__file__).parent / "results"
 
 
-def measure(config: Any, env: Any, seeds: int, devices: int, iterations: int, repeats: int) -> dict[str, float]:
-    """Trains `seeds` lanes past their random steps on so many devices and times stretches of `iterations`."""
-    kind, mesh = guidance.make("none", config.sizes, env.obs_size), lane_mesh(jax.local_devices()[:devices])
-    group = Group(config, env, kind, Grid(("none",), tuple(range(seeds)), (0,)), mesh)
-    env = place(mesh, env, SHARED)
-    clock, (block,) = place(mesh, start_clock(), SHARED), group.start()
-    at_rest = state_bytes(block)
-    times = []
-    for _ in range(repeats + 1):  # the first compiles
-        began = time.perf_counter()
-        clock, block, _ = jax.block_until_ready(
-            group.program.train(env, config.scalars, config.schedule, clock, block, iterations)
-        )
-        times.append(time.perf_counter() - began)
+def measure(config: RunConfig, env: Any, seeds: int, devices: int, iterations: int, repeats: int) -> dict[str, float]:
+    """Trains `seeds` lanes on so many devices and times stretches of `iterations`."""
+    timed = Timed(config, env, "none", seeds, mesh=lane_mesh(jax.local_devices()[:devices]))
+    (block,) = timed.blocks
+    at_rest, row_bytes = state_bytes(block), block.replay.shape[-1] * 4
+    times = [timed.train(iterations) for _ in range(repeats + 1)]  # the first compiles
     stats = jax.devices()[0].memory_stats() or {}
-    steps = iterations * config.sizes.num_envs
-    second = statistics.median(times[1:]) / steps
+    second = statistics.median(times[1:]) / (iterations * config.sizes.num_envs)
     return {
         "devices": devices,
         "seeds": seeds,
         "ms_per_update": 1e3 * second,
         "steps_per_second": seeds / second,
-        "replay_gb": seeds * config.sizes.replay_capacity * block.replay.shape[-1] * 4 / 1e9,
+        "replay_gb": seeds * config.sizes.replay_capacity * row_bytes / 1e9,
         "at_rest_gb": at_rest / 1e9,
         "peak_gb": stats.get("peak_bytes_in_use", 0) / 1e9,
     }
@@ -76,12 +66,9 @@ def main() -> None:
     sizes = dataclasses.replace(config.sizes, target_dtype=asked.target_dtype)
     if asked.layers:
         sizes = dataclasses.replace(sizes, q_layers=tuple(asked.layers))
-    # Learning from the first iteration on: the first stretch, which compiles, also fills the replay a little.
-    config = dataclasses.replace(
-        config,
-        task=dataclasses.replace(config.task, worlds=asked.worlds),
-        sizes=dataclasses.replace(sizes, lanes_per_block=max(asked.seeds) * max(asked.devices)),
-        schedule=dataclasses.replace(config.schedule, random_steps=sizes.num_envs, learn_after=sizes.num_envs),
+    sizes = dataclasses.replace(sizes, lanes_per_block=max(asked.seeds) * max(asked.devices))
+    config = learning(
+        dataclasses.replace(config, task=dataclasses.replace(config.task, worlds=asked.worlds), sizes=sizes)
     )
     env = NAVIGATION.environment(config.task)
     rows = [

@@ -12,52 +12,24 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
-import time
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 
-from cuelearner_jax import guidance
-from cuelearner_jax.devices import SHARED, place
-from cuelearner_jax.lanes import Group
-from cuelearner_jax.runs import Grid
+from cuelearner_jax.bench import Timed, learning
 from cuelearner_jax.tasks import BILLIARDS
-from cuelearner_jax.train import start_clock
 
 
-class Run:
-    """One kind of guidance, ready to train."""
+class Run(Timed):
+    """One kind of guidance, its labels given, ready to train."""
 
     def __init__(self, kind: str, config: Any, seeds: int, labels: int) -> None:
         env = BILLIARDS.environment(config.task)
-        made = guidance.make(kind, config.sizes, env.obs_size)
-        self.group = Group(config, env, made, Grid((kind,), tuple(range(seeds)), (labels,)))
-        self.clock, self.blocks, self.rounds = place(self.group.mesh, start_clock(), SHARED), self.group.start(), []
-        if made.asks:
-            teacher = BILLIARDS.teacher(config.task, env)
-            for _ in range(self.group.rounds):
-                began = time.perf_counter()
-                program, scalars, clock = self.group.program, config.scalars, self.clock
-                done = self.group.each(
-                    lambda block, p=program, s=scalars, c=clock: p.label_round(env, teacher, s, c, block), self.blocks
-                )
-                self.clock, self.blocks = jax.block_until_ready((done[0][0], [entry[1] for entry in done]))
-                self.rounds.append(time.perf_counter() - began)
-
-    def train(self, iterations: int) -> float:
-        """Seconds of a stretch."""
-        config = self.group.config
-        began = time.perf_counter()
-        done = self.group.each(
-            lambda block: self.group.program.train(
-                self.group.env, config.scalars, config.schedule, self.clock, block, iterations
-            ),
-            self.blocks,
-        )
-        self.clock, self.blocks = jax.block_until_ready((done[0][0], [entry[1] for entry in done]))
-        return time.perf_counter() - began
+        super().__init__(config, env, kind, seeds, labels)
+        teacher = BILLIARDS.teacher(config.task, env) if self.group.guidance.asks else None
+        self.rounds = [self.label_round(teacher) for _ in range(self.group.rounds)] if teacher else []
 
 
 def main() -> None:
@@ -74,9 +46,8 @@ def main() -> None:
     for name in arguments.presets:
         config = BILLIARDS.presets[name].config
         labels = 2 * config.sizes.labels_per_round  # enough for a fitted model; the time of a round is scaled up below
-        schedule = dataclasses.replace(config.schedule, random_steps=0, learn_after=0, guidance_until=2**30)
         sizes = dataclasses.replace(config.sizes, replay_capacity=min(config.sizes.replay_capacity, 100_000))
-        measured = dataclasses.replace(config, schedule=schedule, sizes=sizes)
+        measured = learning(dataclasses.replace(config, sizes=sizes), guided=True)
         runs = {kind: Run(kind, measured, arguments.seeds, labels) for kind in ("none", "relative")}
         steps = arguments.steps or (1000 if name == "quickstart" else 20)
         iterations = -(-steps // sizes.num_envs)

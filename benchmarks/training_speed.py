@@ -4,8 +4,9 @@
 
 Cart and pole, the paper's six hidden layers, batch 256, one gradient step an environment step, double DQN with two
 directions. The whole loop is timed: acting, environment, replay, targets, gradient, optimiser, target network. Floating
-point operations are counted from the layers (multiply and add: 2), not taken from the compiler; the peak is a large
-float32 matrix product measured between the timed stretches of the same run. Medians over rounds, compile time apart.
+point operations are counted from the layers (`cuelearner_jax.operations`), not taken from the compiler; the peak is a
+large float32 matrix product measured between the timed stretches of the same run. Medians over rounds, compile time
+apart.
 Peers measured on another day on the same kind of machine (purejaxrl, rejax): 54 to 56% at 8 and 32 seeds.
 """
 
@@ -13,66 +14,26 @@ from __future__ import annotations
 
 import argparse
 import json
-import time
-from functools import partial
-from itertools import pairwise
 from pathlib import Path
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from cartpole import CartPole
 
-from cuelearner_jax import guidance
+from cuelearner_jax.bench import Timed, learning, matmul_rate
 from cuelearner_jax.config import RunConfig, Scalars, Schedule, Sizes
-from cuelearner_jax.devices import SHARED, place
-from cuelearner_jax.lanes import Group
-from cuelearner_jax.runs import Grid
-from cuelearner_jax.train import start_clock
+from cuelearner_jax.operations import step_operations
 
 BATCH, ENVS, DIRECTIONS = 256, 8, 2
 
 
-def operations_a_step(sizes: Sizes, obs_size: int) -> int:
-    """Floating point operations of one environment step with its gradient step.
-
-    Forward: 2 a weight and row. Backward: 4 (gradients of weights and of inputs), the first layer's inputs excepted.
-    """
-    widths = [obs_size + 2, *sizes.q_layers, 1]
-    weights = [a * b for a, b in pairwise(widths)]
-    total = sum(weights)
-    gradient = BATCH * (6 * total - 2 * weights[0])
-    targets = BATCH * 2 * total * (DIRECTIONS + 1)
-    acting = 2 * total * DIRECTIONS
-    return gradient + targets + acting
-
-
-def matmul_rate(size: int = 2048, repeats: int = 5) -> float:
-    """Float32 matrix products: operations a second, best of `repeats`."""
-    a, b = (jax.random.normal(jax.random.key(k), (size, size)) for k in (0, 1))
-    product = jax.jit(jnp.matmul)
-    product(a, b).block_until_ready()
-    best = np.inf
-    for _ in range(repeats):
-        began = time.perf_counter()
-        product(a, b).block_until_ready()
-        best = min(best, time.perf_counter() - began)
-    return 2 * size**3 / best
-
-
 def measure(config: RunConfig, env: CartPole, seeds: int, steps: int, rounds: int) -> dict[str, float]:
     """Medians over rounds of one number of seeds."""
-    operations = operations_a_step(config.sizes, env.obs_size)
-    unguided = guidance.make("none", config.sizes, env.obs_size)
-    group = Group(config, env, unguided, Grid(("none",), tuple(range(seeds)), ()))
-    clock, blocks, shares, rates, peaks = place(group.mesh, start_clock(), SHARED), group.start(), [], [], []
+    operations = step_operations(config.sizes, env.obs_size, config.bootstraps).total
+    timed, shares, rates, peaks = Timed(config, env, "none", seeds), [], [], []
     for round_ in range(rounds + 1):
         peak = matmul_rate()
-        began = time.perf_counter()
-        train = partial(group.program.train, env, config.scalars, config.schedule, clock, iterations=steps // ENVS)
-        done = group.each(train, blocks)
-        clock, blocks = jax.block_until_ready(done[0][0]), jax.block_until_ready([entry[1] for entry in done])
-        rate = steps * seeds / (time.perf_counter() - began)
+        rate = steps * seeds / timed.train(steps // ENVS)
         if round_:  # the first one compiles
             peak = max(peak, matmul_rate())
             shares.append(rate * operations / peak)
@@ -108,8 +69,7 @@ def main() -> None:
         lanes_per_block=arguments.lanes_per_block,
     )
     scalars = Scalars(discount=0.99, learning_rate=2.5e-4, polyak=0.005)
-    schedule = Schedule(random_steps=0, learn_after=0, guidance_until=0)
-    config = RunConfig(None, sizes, scalars, schedule)
+    config = learning(RunConfig(None, sizes, scalars, Schedule()))
     rows = [measure(config, env, seeds, arguments.steps, arguments.rounds) for seeds in arguments.seeds]
     print("seeds  steps/s (all)  GFLOP a step  matmul GFLOP/s  share of it")
     for row in rows:

@@ -24,10 +24,10 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from cuelearner_jax import play, runs, sweep, teaching
+from cuelearner_jax import bench, machines, play, runs, sweep, teaching
 from cuelearner_jax.errors import UserError, closest, no_space
 from cuelearner_jax.evaluate import episodes
-from cuelearner_jax.options import Common, Evaluate, Render, Report, Sweep, TeacherTrain, Train
+from cuelearner_jax.options import Bench, BenchTask, Common, Evaluate, Render, Report, Sweep, TeacherTrain, Train
 from cuelearner_jax.report import report
 from cuelearner_jax.shards import Shard
 from cuelearner_jax.statistics import interval
@@ -42,6 +42,7 @@ ABOUT = {
     "report": "Curves and tables with intervals from recorded results.",
     "render": "A still and a film of a policy at work.",
     "teacher": "teacher train: train a teacher from exhaustive tries in parallel.",
+    "bench": "Throughput, memory a seed and share of peak of this machine, beside known machines.",
 }
 
 
@@ -77,6 +78,7 @@ def _dispatch(arguments: list[str]) -> int:
         "report": _report,
         "render": _render,
         "teacher": _teacher,
+        "bench": _bench,
     }
     if not arguments or arguments[0] in ("-h", "--help"):
         _overview()
@@ -295,6 +297,36 @@ def _teacher(arguments: list[str]) -> None:
         task, asked.task, asked.teacher, asked.out, asked.seed, asked.eval_steps, command, asked.resume
     )
     out.print(f"reward a step over {asked.eval_steps} validation steps: {reward:.4f}; wrote {asked.out}")
+
+
+def _bench(arguments: list[str]) -> None:
+    if arguments and not arguments[0].startswith("-"):
+        task, rest = _task(arguments, "bench")
+        name, rest = _preset(task, rest)
+        kind = BenchTask[task.config]  # pyright: ignore[reportInvalidTypeArguments]
+        asked = _parse(kind, rest, f"bench {task.name}", kind(task.presets[name].config))
+        works = [bench.Work(task, name, asked.run)]
+    else:
+        asked = _parse(Bench, arguments, "bench")
+        if asked.add:
+            machines.add(asked.add)
+            out.print(f"{machines.TABLE.name} holds {asked.add} now")
+            return
+        name = "paper" if asked.full else "quickstart"
+        works = [bench.Work(task, name, task.presets[name].config) for task in TASKS.values() if name in task.presets]
+    known = machines.read()
+    entry = bench.run(works, asked.measuring, shlex.join(["cuelearner", "bench", *_without_out(arguments)]))
+    out.print(machines.figures(entry["rows"]), machines.beside(entry, known), sep="\n\n", markup=False)
+    if asked.measuring.out:
+        out.print(f"wrote {asked.measuring.out}")
+
+
+def _without_out(arguments: list[str]) -> list[str]:
+    """Arguments less --out and its path, which change no figure."""
+    given = [
+        not (a.startswith("--out=") or "--out" in arguments[max(i - 1, 0) : i + 1]) for i, a in enumerate(arguments)
+    ]
+    return [argument for argument, keep in zip(arguments, given, strict=True) if keep]
 
 
 if __name__ == "__main__":

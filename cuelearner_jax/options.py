@@ -8,6 +8,7 @@ from typing import Annotated, Generic, TypeVar
 
 import tyro
 
+from cuelearner_jax.bench import Measuring
 from cuelearner_jax.config import RunConfig
 from cuelearner_jax.teacher import TeacherConfig
 
@@ -136,3 +137,25 @@ class TeacherTrain(Generic[TaskT]):
     """Validation steps at the end."""
     resume: Flag[bool] = False
     """Go on with an interrupted training."""
+
+
+@dataclass(frozen=True)
+class Bench:
+    """Measure the small presets (quickstart) of all tasks, which takes about a minute, and compare with known machines.
+
+    Name a task first to measure one configuration: cuelearner bench billiards --preset paper --seeds 8 75
+    """
+
+    measuring: Annotated[Measuring, tyro.conf.arg(name="")] = field(default_factory=Measuring)
+    full: Flag[bool] = False
+    """The paper-sized presets instead (paper); minutes."""
+    add: Path | None = None
+    """Measure nothing: take this file, which --out wrote, into the table of known machines."""
+
+
+@dataclass(frozen=True)
+class BenchTask(Generic[TaskT]):
+    """Measure one configuration."""
+
+    run: Annotated[RunConfig[TaskT], tyro.conf.arg(name="")]
+    measuring: Annotated[Measuring, tyro.conf.arg(name="")] = field(default_factory=Measuring)

@@ -119,7 +119,7 @@ def test_a_tiny_teacher_is_trained(tmp_path):
     assert sorted(path.name for path in out.iterdir()) == ["network", "teacher.json"]
 
 
-@pytest.mark.parametrize("command", ["train", "sweep", "evaluate", "report", "render", "teacher"])
+@pytest.mark.parametrize("command", ["train", "sweep", "evaluate", "report", "render", "teacher", "bench"])
 def test_the_installed_command_explains_itself(command):
     task = {"teacher": ["train", "billiards"], "report": []}.get(command, ["billiards"])
     done = subprocess.run([*ENTRY, command, *task, "--help"], check=False, capture_output=True, text=True, timeout=120)

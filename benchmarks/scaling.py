@@ -1,0 +1,174 @@
+"""How cost grows with seeds, labels, directions and the width of the networks, on whatever machine.
+
+    python benchmarks/scaling.py --out scaling.json                                    # minutes on 2 cores
+    python benchmarks/scaling.py --preset paper --seeds 1 8 64 256 --out scaling.json  # an accelerator
+    python benchmarks/scaling.py --draw scaling.json --figure docs/figures/scaling
+
+One thing is varied at a time, from the preset's own sizes with `--base-seeds` seeds. Training is unguided, from the
+first step on; labels are measured by rounds of questions with their fit, and by the fit alone. Replay is cut to 100,000
+steps a seed, which changes memory alone. Every point is written when it is measured: the same command goes on where it
+was stopped, and `--stop-after` bounds one call.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import statistics
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+from matplotlib.figure import Figure
+
+from cuelearner_jax import results
+from cuelearner_jax.bench import Timed, Work, learning, measure
+from cuelearner_jax.devices import lane_mesh
+from cuelearner_jax.figures import COLOURS, STYLE, save_figure
+from cuelearner_jax.tasks import TASKS
+
+REPLAY = 100_000
+ROUNDS = 3  # of labels, after the one that compiles
+AXES = {
+    "seeds": ("seeds at once", "ms_a_step", "ms a step of all seeds"),
+    "directions": ("directions", "ms_a_step", "ms a step of all seeds"),
+    "width": ("width of the first layer", "ms_a_step", "ms a step of all seeds"),
+    "labels": ("labels", "all_rounds_s", "seconds for all rounds"),
+}
+
+
+def main() -> int:
+    """Measures what is missing, prints a table, or draws."""
+    asked = _arguments()
+    if asked.draw:
+        save_figure(_draw([json.loads(path.read_text()) for path in asked.draw]), asked.figure)
+        print(f"wrote {asked.figure}.png and .svg")
+        return 0
+    preset = TASKS[asked.task].presets[asked.preset]
+    setting = {"task": asked.task, "preset": asked.preset, "base_seeds": asked.base_seeds, "replay": REPLAY}
+    contents = {**setting, **results.provenance(), "rows": []}
+    if asked.out.exists():
+        contents = json.loads(asked.out.read_text())
+        if {name: contents.get(name) for name in setting} != setting:
+            raise SystemExit(f"{asked.out} holds measurements of another setting: give another --out")
+    sizes = dataclasses.replace(preset.config.sizes, replay_capacity=min(REPLAY, preset.config.sizes.replay_capacity))
+    work = Work(TASKS[asked.task], asked.preset, dataclasses.replace(preset.config, sizes=sizes))
+    began = time.perf_counter()
+    for axis, value in _points(asked, contents["rows"]):
+        if asked.stop_after and time.perf_counter() - began > asked.stop_after:
+            print(f"stopped after {asked.stop_after:g} s: the same command goes on")
+            return 0
+        print(f"{axis} {value} ...", flush=True)
+        figures = _labels(work, asked.base_seeds, value) if axis == "labels" else _training(work, asked, axis, value)
+        contents["rows"].append({"axis": axis, "value": value, **figures})
+        temporary = asked.out.with_name(asked.out.name + ".tmp")  # in one step: a killed call leaves the points before
+        temporary.write_text(json.dumps(contents, indent=1) + "\n")
+        temporary.replace(asked.out)
+    _print(contents["rows"])
+    return 0
+
+
+def _arguments() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--task", choices=sorted(TASKS), default="billiards")
+    parser.add_argument("--preset", default="quickstart")
+    parser.add_argument("--base-seeds", type=int, default=8, help="while something else is varied")
+    parser.add_argument("--seeds", type=int, nargs="*", default=[1, 4, 8, 16])
+    parser.add_argument("--labels", type=int, nargs="*", default=[100, 500, 2000])
+    parser.add_argument("--directions", type=int, nargs="*", default=[360, 1800, 3600])
+    parser.add_argument(
+        "--widths", type=int, nargs="*", default=[64, 128, 256], help="of the first layer; others scale"
+    )
+    parser.add_argument("--seconds", type=float, default=2.0, help="of each measurement of training")
+    parser.add_argument("--stop-after", type=float, default=0.0, help="seconds after which no new point begins")
+    parser.add_argument("--out", type=Path, default=Path("scaling.json"))
+    parser.add_argument("--draw", type=Path, nargs="+", help="draw these files instead of measuring")
+    parser.add_argument("--figure", type=Path, default=Path("scaling"), help="name of the figure without its ending")
+    asked = parser.parse_args()
+    if asked.preset not in TASKS[asked.task].presets:
+        parser.error(f"--preset: choose one of {', '.join(TASKS[asked.task].presets)}")
+    if min([1, asked.base_seeds, *asked.seeds, *asked.labels, *asked.directions, *asked.widths]) < 1:
+        parser.error("give positive numbers")
+    missing = [str(path) for path in asked.draw or () if not path.is_file()]
+    if missing:
+        parser.error(f"{missing[0]} does not exist")
+    return asked
+
+
+def _points(asked: argparse.Namespace, rows: Sequence[dict[str, Any]]) -> list[tuple[str, int]]:
+    """What is still to be measured."""
+    grid = {"seeds": asked.seeds, "directions": asked.directions, "width": asked.widths, "labels": asked.labels}
+    measured = {(row["axis"], row["value"]) for row in rows}
+    return [(axis, value) for axis, values in grid.items() for value in values if (axis, value) not in measured]
+
+
+def _training(work: Work, asked: argparse.Namespace, axis: str, value: int) -> dict[str, Any]:
+    """Figures of training with one thing changed."""
+    sizes, seeds = work.config.sizes, asked.base_seeds
+    if axis == "seeds":
+        seeds = value
+    elif axis == "directions":
+        sizes = dataclasses.replace(sizes, directions=value)
+    else:
+        layers = tuple(max(1, width * value // sizes.q_layers[0]) for width in sizes.q_layers)
+        sizes = dataclasses.replace(sizes, q_layers=layers)
+    changed = dataclasses.replace(work, config=dataclasses.replace(work.config, sizes=sizes))
+    return measure(changed, seeds, lane_mesh(), asked.seconds)
+
+
+def _labels(work: Work, seeds: int, budget: int) -> dict[str, Any]:
+    """Seconds of a round of questions with its fit, of the fit alone, and of all rounds of a budget."""
+    env = work.task.environment(work.config.task)
+    teacher = work.task.teacher(work.config.task, env)
+    began = time.perf_counter()
+    timed = Timed(learning(work.config), env, "relative", seeds, budget)
+    timed.label_round(teacher)
+    first = time.perf_counter() - began
+    round_s = statistics.median(timed.label_round(teacher) for _ in range(ROUNDS))
+    timed.fit()  # compiles
+    return {
+        "seeds": seeds,
+        "round_s": round_s,
+        "fit_s": statistics.median(timed.fit() for _ in range(ROUNDS)),
+        "all_rounds_s": round_s * timed.group.rounds,
+        "first_round_s": first,
+    }
+
+
+def _print(rows: Sequence[dict[str, Any]]) -> None:
+    print("varied          value  seeds  ms a step  steps/s (all)  of matmul  MB a seed  first step s")
+    for row in (row for row in rows if row["axis"] != "labels"):
+        share = row["share_of_matmul"]["float32"]
+        print(
+            f"{row['axis']:<10}  {row['value']:9d}  {row['seeds']:5d}  {row['ms_a_step']:9.3f}  "
+            f"{row['steps_a_second']:13,.0f}  {share:9.1%}  {row['mb_a_seed']:9.2f}  {row['first_step_s']:12.1f}"
+        )
+    print("labels  seeds  round with its fit s  fit s  all rounds s")
+    for row in (row for row in rows if row["axis"] == "labels"):
+        print(
+            f"{row['value']:6d}  {row['seeds']:5d}  {row['round_s']:20.3f}  {row['fit_s']:5.3f}  "
+            f"{row['all_rounds_s']:12.1f}"
+        )
+
+
+def _draw(measured: Sequence[dict[str, Any]]) -> Figure:
+    """One panel for each thing varied, one line a machine; straight lines of slope 1 are proportional growth."""
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(10, 3), layout="constrained")
+        for axes, (axis, (label, name, unit)) in zip(figure.subplots(1, len(AXES)), AXES.items(), strict=True):
+            for contents, colour in zip(measured, list(COLOURS.values()) * len(measured), strict=False):
+                points = sorted((row["value"], row[name]) for row in contents["rows"] if row["axis"] == axis)
+                machine = f"{contents['hardware']}, {contents['preset']}"
+                axes.plot(*zip(*points, strict=True), "o-", color=colour, label=machine, linewidth=1.5, markersize=4)
+            axes.set(xscale="log", yscale="log", xlabel=label)
+            axes.set_title(unit, fontsize=9)
+        handles, names = figure.axes[0].get_legend_handles_labels()
+        figure.legend(handles, names, loc="outside lower center", ncols=len(names))
+    return figure
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
