@@ -2,7 +2,7 @@
 
 Counted is the matrix arithmetic of the action values alone. The environment, the guidance, the optimiser (a few
 operations a weight, against 6 a weight and row of a batch) and activations are not, so that a share of the machine's
-matmul rate is what the networks get of it. The argmax counts as the full search, however it is found.
+matmul rate is what the networks get of it. Of an argmax near peaks, the values that are taken are counted.
 """
 
 from __future__ import annotations
@@ -12,12 +12,13 @@ from itertools import pairwise
 from typing import NamedTuple
 
 from cuelearner_jax.config import Sizes
+from cuelearner_jax.search import looked_at
 
 
 class Operations(NamedTuple):
     """Floating point operations of one environment step of one seed, with the gradient steps that follow it."""
 
-    acting: int  # the argmax over all directions
+    acting: int  # the values among which the argmax is taken
     gradient: int  # forward and backward through the batch
     targets: int  # the argmax inside targets and the value of its choice; 0 where nothing bootstraps
 
@@ -37,7 +38,7 @@ def step_operations(sizes: Sizes, obs_size: int, bootstraps: bool) -> Operations
     rows = sizes.batch_size * (2 if sizes.n_step > 1 else 1) if bootstraps else 0
     target = forward(sizes.q_layers, obs_size, sizes.target_directions) + forward(sizes.q_layers, obs_size, 1)
     return Operations(
-        acting=forward(sizes.q_layers, obs_size, sizes.directions),
+        acting=forward(sizes.q_layers, obs_size, looked_at(sizes)),
         gradient=sizes.updates_per_step * sizes.batch_size * forward_and_backward(sizes.q_layers, obs_size),
         targets=sizes.updates_per_step * rows * target,
     )
