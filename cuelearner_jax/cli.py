@@ -1,7 +1,7 @@
 """The command `cuelearner`: reads arguments, calls one function, turns errors into one line and an exit status.
 
 Exit status: 0 done; 2 bad input, nothing changed; 130 stopped by Ctrl-C, everything saved;
-1 the disk is full, everything up to the last checkpoint saved; 141 nobody reads the output any more.
+1 the disk is full or a job failed, everything up to the last checkpoint saved; 141 nobody reads the output any more.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import shlex
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 # Before JAX starts: warnings of its start-up are not the user's.
@@ -24,7 +25,7 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from cuelearner_jax import bench, machines, play, runs, sweep, teaching
+from cuelearner_jax import bench, cluster, machines, play, runs, sweep, teaching
 from cuelearner_jax.errors import UserError, closest, no_space
 from cuelearner_jax.evaluate import episodes
 from cuelearner_jax.options import Bench, BenchTask, Common, Evaluate, Render, Report, Sweep, TeacherTrain, Train
@@ -54,9 +55,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    except sweep.Interrupted as error:
+    except (sweep.Interrupted, cluster.JobsFailed) as error:
         print(str(error), file=sys.stderr)
-        return 130
+        return error.status
     except BrokenPipeError:  # whoever read our output has gone, as `head` does
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 141
@@ -173,8 +174,50 @@ def _sweep(arguments: list[str]) -> None:
     )
     asked = _parse(kind, rest, f"sweep {task.name}", default)
     seeds = tuple(range(asked.first_seed, asked.first_seed + asked.seeds))
+    grid = runs.Grid(asked.guidance, seeds, asked.labels)
+    if asked.cluster:
+        _submit(task, asked, grid, arguments)
+        return
+    if asked.shards is not None or asked.job != cluster.Job():
+        raise UserError("--shards and --job belong to --cluster: give --cluster slurm or local, or --shard i/n alone")
     shard = Shard.parse(asked.shard) if asked.shard else None
-    _run(task, asked, runs.Grid(asked.guidance, seeds, asked.labels), shard)
+    _run(task, asked, grid, shard)
+
+
+def _submit(task: Task, asked: Sweep, grid: runs.Grid, arguments: list[str]) -> None:
+    """Every piece of a sweep that is not finished, as a job."""
+    if asked.shard:
+        raise UserError("--shard runs one piece here, --cluster all of them as jobs: give one of the two")
+    if asked.shards is None or asked.shards < 1:
+        raise UserError(f"--cluster needs --shards of at least 1, the number of jobs; it is {asked.shards}")
+    if asked.overwrite:
+        raise UserError(
+            f"--overwrite with --cluster: a job that starts again would delete its own work; delete {asked.out} by "
+            "hand, or give another --out"
+        )
+    cluster.check(asked.cluster or "", asked.job)
+    jax.config.update("jax_platforms", "cpu")  # the accelerator's memory is for the jobs
+    shards = [Shard(index, asked.shards) for index in range(1, asked.shards + 1)]
+    split = "tuning" if asked.tuning else "validation"
+    plans = {
+        shard: sweep.planned(task, asked.run, grid, asked.out, labels_from=asked.labels_from, shard=shard, split=split)
+        for shard in shards
+    }
+    pieces = {s: cluster.piece_arguments(arguments, s) for s, plan in plans.items() if not plan.finished}
+    if len(pieces) < len(plans):
+        out.print(f"{len(plans) - len(pieces)} of {len(plans)} pieces were finished before")
+    told = f"cuelearner report {asked.out} --out {asked.out}/report"
+    if pieces and asked.cluster == "slurm":
+        number, logs = cluster.submit_to_slurm(pieces, asked.out, asked.job)
+        out.print(
+            f"submitted {len(pieces)} jobs as {number}; logs in {logs}\n"
+            f"how they stand: squeue --job {number}\nwhat there is and what is missing: {told}\n"
+            f"stop them: scancel {number}; the same command again goes on with what is not finished"
+        )
+        return
+    if pieces:
+        cluster.run_locally(pieces, asked.out, asked.job, lambda: fmean(plan.done for plan in plans.values()))
+    out.print(f"done: {asked.out} (see it with: {told})")
 
 
 def _run(task: Task, asked: Common, grid: runs.Grid, shard: Shard | None = None) -> None:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Generic, TypeVar
+from typing import Annotated, Generic, Literal, TypeVar
 
 import tyro
 
 from cuelearner_jax.bench import Measuring
+from cuelearner_jax.cluster import Job
 from cuelearner_jax.config import RunConfig
 from cuelearner_jax.teacher import TeacherConfig
 
@@ -60,6 +61,12 @@ class Sweep(Common[TaskT], Generic[TaskT]):
     shard: str | None = None
     """Only piece i of n, as i/n: its share of the seeds, in a folder of its own below --out. Goes on by itself where it
     was interrupted."""
+    cluster: Literal["slurm", "local"] | None = None
+    """Run the sweep as jobs, one a piece: slurm submits them as a job array and returns, local runs them on this
+    machine and waits. The same command again goes on with the pieces that are not finished. Needs submitit."""
+    shards: int | None = None
+    """With --cluster: number of pieces, and so of jobs."""
+    job: Job = field(default_factory=Job)
 
 
 @dataclass(frozen=True)

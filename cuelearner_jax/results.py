@@ -43,6 +43,7 @@ from cuelearner_jax.errors import UserError
 
 JSONL = "results.jsonl"
 PARQUET = "results.parquet"
+TAIL = 1 << 16  # more than the longest row [bytes]
 REQUIRED = ("run", "task", "guidance", "labels", "seed", "step", "split", "config_hash")
 STRINGS = ("run", "task", "guidance", "split", "config_hash", "commit", "versions", "hardware", "command")
 INTEGERS = ("labels", "seed", "step")
@@ -114,6 +115,17 @@ class ResultsWriter:
         self._file.write("".join(json.dumps(line, allow_nan=False) + "\n" for line in lines))
         self._file.flush()
         os.fsync(self._file.fileno())
+
+
+def last_step(folder: PathLike) -> int:
+    """Step of the newest complete row of a table that is still being written; 0 where there is none."""
+    try:
+        with (Path(folder) / JSONL).open("rb") as file:
+            file.seek(max(0, file.seek(0, os.SEEK_END) - TAIL))
+            lines = file.read().split(b"\n")[:-1]
+    except FileNotFoundError:
+        return 0
+    return json.loads(lines[-1]).get("step", 0) if lines else 0
 
 
 def truncate_after(folder: PathLike, step: int) -> None:

@@ -31,6 +31,19 @@ class Shard(NamedTuple):
         """Where the piece writes below the sweep's folder."""
         return out / f"shard-{self.index:0{len(str(self.count))}d}-of-{self.count}"
 
+    def check_sweep(self, out: Path) -> None:
+        """Raises UserError if the sweep's folder holds something else than pieces of this count."""
+        if out.exists() and not out.is_dir():
+            raise UserError(f"{out} is no folder: give another --out")
+        if (out / "config.json").exists():
+            raise UserError(f"{out} holds a run that is not cut into pieces: give another --out")
+        for folder in sorted(out.glob("shard-*-of-*")):
+            if not folder.name.endswith(f"-of-{self.count}"):
+                raise UserError(
+                    f"{folder} is a piece of another cut, whose seeds would count twice: "
+                    f"cut into as many pieces as before, or give another --out"
+                )
+
     def seeds(self, seeds: tuple[int, ...]) -> tuple[int, ...]:
         """Its share of a sweep's seeds: as many as the other pieces have, or one less.
 

@@ -11,7 +11,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -43,6 +43,8 @@ console = Console(stderr=True, highlight=False, soft_wrap=True)
 class Interrupted(Exception):
     """The user asked to stop; everything is saved."""
 
+    status = 130  # that a command ends with
+
 
 def run(
     task: Task,
@@ -64,16 +66,11 @@ def run(
         UserError: bad configuration, a folder in use, too little memory; nothing has been changed then.
         Interrupted: Ctrl-C; everything is saved.
     """
-    configuration.check(config)
-    check_grid(grid)
-    if shard:
-        grid, out = dataclasses.replace(grid, seeds=shard.seeds(grid.seeds)), shard.folder(out)
-        resume = resume or (not overwrite and (out / "config.json").is_file())
-    obs_size = shape_of(task, config.task).obs_size
-    labels = read_labels(labels_from, task, config, grid) if labels_from else None
-    kinds = [guidances.make(kind, config.sizes, obs_size) for kind in grid.guidance]
-    described = describe(task, config, grid, split, labels_from, shard)
-    check_folder(out, described, resume, overwrite)
+    plan = planned(
+        task, config, grid, out, resume=resume, overwrite=overwrite, labels_from=labels_from, shard=shard, split=split
+    )
+    grid, out, labels, described = plan.grid, plan.out, plan.labels, plan.described
+    kinds = [guidances.make(kind, config.sizes, shape_of(task, config.task).obs_size) for kind in grid.guidance]
     mesh = lane_mesh()
     env = place(mesh, task.environment(config.task), SHARED)
     for kind in kinds:
@@ -82,9 +79,57 @@ def run(
     teacher = place(mesh, task.teacher(config.task, env), SHARED) if asked else None
     examined = task.environment(config.task, split)
     with claimed(out), interruptible() as stopping, progress_bars() as bars:
-        prepare_folder(out, described, overwrite and not resume)
+        prepare_folder(out, described, overwrite and not plan.resume)
         for kind in kinds:
             _Runner(Group(config, env, kind, grid), examined, task, out, stopping, bars).run(teacher, labels)
+
+
+class Plan(NamedTuple):
+    """What a run will do, found to make sense; nothing has been written."""
+
+    grid: Grid
+    out: Path
+    described: dict[str, Any]
+    labels: label_files.LabelFile | None
+    resume: bool
+
+    @property
+    def finished(self) -> bool:
+        """Is there nothing left to do?"""
+        return self.done == 1
+
+    @property
+    def done(self) -> float:
+        """Share of the steps that have been taken, as its results say."""
+        folders = [self.out / kind for kind in self.grid.guidance]
+        total = self.described["total_steps"]
+        shares = [1 if (f / results.PARQUET).exists() else 0.99 * results.last_step(f) / total for f in folders]
+        return sum(shares) / len(shares)
+
+
+def planned(
+    task: Task,
+    config: RunConfig,
+    grid: Grid,
+    out: Path,
+    *,
+    resume: bool = False,
+    overwrite: bool = False,
+    labels_from: Path | None = None,
+    shard: Shard | None = None,
+    split: str = "validation",
+) -> Plan:
+    """What `run` does with the same arguments. Raises UserError for what it would refuse, but for too little memory."""
+    configuration.check(config)
+    check_grid(grid)
+    if shard:
+        shard.check_sweep(out)
+        grid, out = dataclasses.replace(grid, seeds=shard.seeds(grid.seeds)), shard.folder(out)
+        resume = resume or (not overwrite and (out / "config.json").is_file())
+    labels = read_labels(labels_from, task, config, grid) if labels_from else None
+    described = describe(task, config, grid, split, labels_from, shard)
+    check_folder(out, described, resume, overwrite)
+    return Plan(grid, out, described, labels, resume)
 
 
 def read_labels(path: Path, task: Task, config: RunConfig, grid: Grid) -> label_files.LabelFile:

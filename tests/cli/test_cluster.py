@@ -1,0 +1,243 @@
+"""Sweeps as jobs: on this machine, and on a Slurm whose commands write down what they are asked."""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+from small_runs import SMALL
+
+from cuelearner_jax import cluster, results
+from cuelearner_jax.cli import main
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.shards import Shard
+
+ENTRY = [str(Path(sys.executable).with_name("cuelearner"))]
+SWEEP = ["sweep", "billiards", "--preset", "quickstart", *SMALL, "--schedule.total-steps", "1500", "--guidance", "none"]
+SWEEP += ["--seeds", "2", "--first-seed", "7", "--sizes.lanes-per-block", "1"]
+LOCAL = [*SWEEP, "--cluster", "local", "--shards", "2"]
+SLURM = [*SWEEP, "--cluster", "slurm", "--shards", "2"]
+
+SBATCH = """#!/bin/sh
+cp "$1" "$FAKE_SLURM/script.sh"
+echo "Submitted batch job 77"
+"""
+REFUSING = """#!/bin/sh
+echo "sbatch: error: invalid partition specified: gpus" >&2
+exit 1
+"""
+SRUN = """#!/bin/sh
+echo $$ > "$FAKE_SLURM/pid"
+while true; do case "$1" in --output|--error) shift 2;; --*) shift;; *) break;; esac; done
+exec "$@"
+"""
+SCONTROL = """#!/bin/sh
+echo "$@" >> "$FAKE_SLURM/asked"
+"""
+
+
+def rows(folder):
+    names = ("guidance", "labels", "seed", "step", "reward", "train_loss", "guide_reward")
+    found = [{name: row.get(name) for name in names} for row in results.read([folder]).to_pylist()]
+    return sorted(found, key=lambda row: (row["seed"], row["step"]))
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("whole") / "run"
+    assert main([*SWEEP, "--out", str(folder)]) == 0
+    return rows(folder)
+
+
+@pytest.fixture
+def slurm(tmp_path, monkeypatch):
+    """Stand-ins for Slurm's commands; `sbatch` and `scontrol` leave what they are given in this folder."""
+    folder = tmp_path / "slurm"
+    folder.mkdir()
+    for name, script in (("sbatch", SBATCH), ("srun", SRUN), ("scontrol", SCONTROL)):
+        (folder / name).write_text(script)
+        (folder / name).chmod(0o755)
+    monkeypatch.setenv("PATH", f"{folder}:{os.environ['PATH']}")
+    monkeypatch.setenv("FAKE_SLURM", str(folder))
+    return folder
+
+
+def until(found, process=None):
+    for _ in range(3600):  # three minutes, for machines that are busy with something else
+        if found():
+            return
+        assert process is None or process.poll() is None, process.communicate()
+        time.sleep(0.05)
+    raise AssertionError("waited for nothing")
+
+
+def begun(out, shard, step=200):
+    file = out / f"shard-{shard}-of-2" / "none" / "results.jsonl"
+    return file.exists() and f'"step": {step}' in file.read_text()
+
+
+def command_of(out, shard):
+    """The process that runs a piece, as its job's log says."""
+    logs = "".join(path.read_text() for path in sorted(out.glob("jobs/*/*.out")))
+    return int(re.findall(rf"process (\d+): .*--shard {shard}/2\n", logs)[0])
+
+
+def test_submitted_twice_then_one_killed_then_submitted_again_gives_what_one_process_gives(whole, tmp_path, capsys):
+    out = tmp_path / "run"
+    command = [*LOCAL, "--out", str(out)]
+    first = subprocess.Popen([*ENTRY, *command], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    until(lambda: begun(out, 1) and begun(out, 2), first)
+    processes = [command_of(out, shard) for shard in (1, 2)]
+    for process in processes:
+        os.kill(process, signal.SIGSTOP)  # both live, and hold their folders
+    assert main(command) == 1
+    told = capsys.readouterr().err.splitlines()
+    assert sum("is being written by another process" in line for line in told) == 2
+    assert "2 of 2 pieces failed" in told[-1]
+    os.kill(processes[0], signal.SIGKILL)
+    os.kill(processes[1], signal.SIGCONT)
+    told = first.communicate(timeout=120)[1].splitlines()
+    assert first.returncode == 1
+    assert "piece 1/2: error: the process was killed by SIGKILL" in told
+    assert "1 of 2 pieces failed" in told[-1]
+    assert main(command) == 0
+    told = capsys.readouterr()
+    assert "1 of 2 pieces were finished before" in told.out
+    assert "1 done" in told.err
+    assert rows(out) == whole
+    commands = results.read([out])["command"].to_pylist()
+    assert {command.rpartition(" ")[2] for command in commands} == {"1/2", "2/2"}
+    assert all(command.startswith("cuelearner sweep billiards") for command in commands)
+    assert main(["report", str(out), "--out", str(tmp_path / "report")]) == 0
+    assert "not begun" not in (tmp_path / "report" / "report.md").read_text()
+    submissions = list((out / "jobs").iterdir())
+    assert main(command) == 0
+    assert "2 of 2 pieces were finished before" in capsys.readouterr().out
+    assert list((out / "jobs").iterdir()) == submissions
+
+
+def test_ctrl_c_stops_the_jobs_of_this_machine_and_loses_nothing(whole, tmp_path, capsys):
+    out = tmp_path / "run"
+    options = ["--schedule.checkpoint-every", "1500", "--out", str(out)]
+    folder = out / "shard-1-of-1" / "none"
+
+    def press():
+        until(lambda: results.last_step(folder) > 0)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    user = threading.Thread(target=press)
+    user.start()
+    assert main([*SWEEP, *options, "--cluster", "local", "--shards", "1"]) == 130
+    user.join()
+    told = capsys.readouterr().err
+    assert "piece 1/1: stopped at step" in told
+    assert "go on with the same command" in told.splitlines()[-1]
+    stopped = {row["step"] for row in rows(out)}
+    assert max(stopped) < 1500
+    assert max(stopped) in {int(path.name) for path in (folder / "checkpoints").iterdir() if path.name.isdigit()}
+    assert main([*SWEEP, *options, "--shard", "1/1"]) == 0
+    assert rows(out) == whole
+
+
+def test_slurm_gets_an_array_and_a_job_told_to_end_goes_on_when_started_again(whole, slurm, tmp_path, capsys):
+    out = tmp_path / "run"
+    options = "--job.partition gpus --job.account lab --job.gpus 1 --job.cpus 8 --job.memory-gb 1.5 --job.minutes 90"
+    options += " --job.at-once 1 --job.slurm qos=high gres=disk:1 --job.notice-s 240"
+    assert main([*SLURM, *options.split(), "--job.setup", "module load cuda", "--out", str(out)]) == 0
+    told = capsys.readouterr().out
+    assert "submitted 2 jobs as 77" in told
+    assert f"cuelearner report {out}" in told
+    script = (slurm / "script.sh").read_text()
+    for line in ("array=0-1%1", "partition=gpus", "account=lab", "gpus-per-node=1", "cpus-per-task=8", "mem=1536M"):
+        assert f"#SBATCH --{line}\n" in script
+    for line in ("time=90", "qos=high", "gres=disk:1", "signal=USR2@240", "requeue", "job-name=cuelearner-run"):
+        assert f"#SBATCH --{line}\n" in script
+    assert script.index("\nmodule load cuda\n") < script.index("\nsrun ")
+    assert f"-m submitit.core._submit {out}/jobs/" in script
+
+    own = {"SLURM_JOB_ID": "77", "SLURM_ARRAY_JOB_ID": "77", "SLURM_ARRAY_TASK_ID": "1", "SLURM_PROCID": "0"}
+    start = ["bash", "-c", "module() { :; }; . " + str(slurm / "script.sh")]
+    streams = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+    job = subprocess.Popen(start, env={**os.environ, **own}, **streams)
+    until(lambda: begun(out, 2), job)
+    waiting = int((slurm / "pid").read_text())
+    os.kill(waiting, signal.SIGTERM)  # as in preemption: it saves, and leaves what follows to Slurm
+    time.sleep(1.5)
+    assert job.poll() is None
+    os.kill(waiting, signal.SIGUSR2)
+    told = job.communicate(timeout=60)[0]
+    assert "stopped at step" in told
+    assert (slurm / "asked").read_text() == "requeue 77_1\n"
+    assert not (out / "shard-2-of-2" / "none" / "results.parquet").exists()
+    done = subprocess.run(start, env={**os.environ, **own}, **streams, check=False)
+    assert done.returncode == 0, done.stdout
+    assert rows(out) == [row for row in whole if row["seed"] == 8]
+
+
+REFUSED = [
+    ([*LOCAL, "--shard", "1/2"], "give one of the two"),
+    ([*LOCAL, "--overwrite"], "would delete its own work"),
+    ([*SWEEP, "--cluster", "local"], "--shards of at least 1"),
+    ([*SWEEP, "--cluster", "local", "--shards", "0"], "it is 0"),
+    ([*SWEEP, "--cluster", "local", "--shards", "3"], "2 seeds do not make 3 pieces"),
+    ([*SWEEP, "--cluster", "lsf", "--shards", "2"], "'slurm'"),
+    ([*SWEEP, "--shards", "2"], "belong to --cluster"),
+    ([*SWEEP, "--job.gpus", "2"], "belong to --cluster"),
+    ([*LOCAL, "--job.partition", "gpus"], "--job.partition is for --cluster slurm"),
+    ([*LOCAL, "--job.at-once", "-1"], "--job.at-once is -1"),
+    ([*LOCAL, "--scalars.eps-deg", "0"], "scalars.eps_deg is 0"),
+    ([*SLURM, "--job.slurm", "qos"], "give KEY=VALUE"),
+    ([*SLURM, "--job.slurm", "array=0-9"], "cannot set 'array'"),
+    ([*SLURM, "--job.minutes", "2"], "give less than the 120 s"),
+    (SLURM, "no srun here"),
+]
+
+
+@pytest.mark.parametrize(("command", "says"), REFUSED, ids=[" ".join(c[-3:]) for c, _ in REFUSED])
+def test_what_cannot_be_submitted_is_refused(refused, tmp_path, monkeypatch, command, says):
+    monkeypatch.setenv("PATH", str(tmp_path))  # no Slurm
+    refused([*command, "--out", tmp_path / "run"], says, tmp_path)
+    assert not (tmp_path / "run").exists()
+
+
+def test_without_submitit_the_extra_is_named(refused, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "submitit", None)
+    refused([*LOCAL, "--out", tmp_path / "run"], "install the extra `cluster`", tmp_path)
+    assert not (tmp_path / "run").exists()
+
+
+def test_what_slurm_refuses_leaves_nothing_behind(refused, slurm, tmp_path):
+    (slurm / "sbatch").write_text(REFUSING)
+    refused([*SLURM, "--out", tmp_path / "run"], "invalid partition specified: gpus", tmp_path)
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_folder_of_another_cut_is_refused(refused, tmp_path):
+    (tmp_path / "run" / "shard-1-of-3").mkdir(parents=True)
+    refused([*LOCAL, "--out", tmp_path / "run"], "shard-1-of-3 is a piece of another cut", tmp_path)
+    (tmp_path / "whole").mkdir()
+    (tmp_path / "whole" / "config.json").write_text("{}")
+    refused([*LOCAL, "--out", tmp_path / "whole"], "not cut into pieces", tmp_path)
+
+
+def test_a_piece_gets_the_sweeps_options_alone():
+    given = ["billiards", "--cluster=slurm", "--seeds", "4", "--job.slurm", "qos=a", "b=c", "--shards", "2", "--resume"]
+    given += ["--labels", "10", "20", "--job.at-once=1", "--out", "runs/a"]
+    kept = ("sweep", "billiards", "--seeds", "4", "--labels", "10", "20", "--out", "runs/a", "--shard", "2/2")
+    assert cluster.piece_arguments(given, Shard(2, 2)) == kept
+
+
+def test_jobs_of_this_machine_get_graphics_cards_of_their_own(tmp_path, monkeypatch):
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "2,3,5,7")
+    pieces = {Shard(index, 5): ("sweep",) for index in range(1, 6)}
+    assert cluster.LocalJobs(pieces, tmp_path, cluster.Job(gpus=2))._free == [[2, 3], [5, 7]]
+    assert cluster.LocalJobs(pieces, tmp_path, cluster.Job(gpus=1, at_once=3))._free == [[2], [3], [5]]
+    cluster.check("local", cluster.Job(gpus=2, at_once=2))
+    for job in (cluster.Job(gpus=2, at_once=3), cluster.Job(gpus=5)):
+        with pytest.raises(UserError, match=r"there are 4"):
+            cluster.check("local", job)
