@@ -3,6 +3,7 @@
 Folder of a run:
 
     config.json                  everything that determines the results
+    .lock                        held by the process that writes here
     <guidance>/checkpoints/      the newest states
     <guidance>/labels.parquet    what the teacher answered
     <guidance>/results.jsonl     one row a seed and evaluation; results.parquet once done
@@ -32,6 +33,7 @@ from cuelearner_jax.shards import Shard
 from cuelearner_jax.tasks import Task
 from cuelearner_jax.types import Guidance
 
+LOCK = ".lock"  # says which process writes in a run's folder; left behind empty
 LARGEST_SEED = min(SPLITS.values())  # seeds and splits are folded into one key
 
 
@@ -115,7 +117,7 @@ def check_folder(out: Path, described: dict[str, Any], resume: bool, overwrite: 
     """Raises UserError unless `out` may be used as asked."""
     if resume and overwrite:
         raise UserError("--resume continues a run and --overwrite deletes it: give one of them")
-    used = out.exists() and (not out.is_dir() or any(out.iterdir()))
+    used = out.exists() and (not out.is_dir() or any(entry.name != LOCK for entry in out.iterdir()))
     ours = (out / "config.json").is_file()
     if resume:
         if not ours:
@@ -148,10 +150,12 @@ def _differences(before: dict[str, Any], now: dict[str, Any], prefix: str = "") 
 def claimed(out: Path) -> Iterator[None]:
     """Makes a run's folder and keeps it for this process alone; it is free again however the process ends.
 
+    The lock is on a file, not on the folder: that is what NFS passes on between machines.
+
     Raises UserError if another process has it.
     """
     out.mkdir(parents=True, exist_ok=True)
-    descriptor = os.open(out, os.O_RDONLY)  # the folder itself: no file is left behind
+    descriptor = os.open(out / LOCK, os.O_RDWR | os.O_CREAT, 0o666)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
@@ -167,6 +171,8 @@ def prepare_folder(out: Path, described: dict[str, Any], clean: bool) -> None:
     """Makes the folder and writes config.json, if it is not there; with `clean`, nothing else is left in it."""
     out.mkdir(parents=True, exist_ok=True)
     for entry in out.iterdir() if clean else ():
+        if entry.name == LOCK:
+            continue
         shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
     if not (out / "config.json").exists():
         temporary = out / "config.tmp"  # in one step, so that a crash leaves no half of it
