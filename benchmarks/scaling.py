@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib
+from matplotlib import ticker
 from matplotlib.figure import Figure
 
 from cuelearner_jax import results
@@ -166,6 +167,12 @@ def _draw(measured: Sequence[dict[str, Any]]) -> Figure:
                 machine = f"{contents['hardware']}, {contents['preset']}"
                 axes.plot(*zip(*points, strict=True), "o-", color=colour, label=machine, linewidth=1.5, markersize=4)
             axes.set(xscale="log", yscale="log", xlabel=label)
+            values = sorted({row["value"] for contents in measured for row in contents["rows"] if row["axis"] == axis})
+            axes.set_xticks(values, [f"{value:,}" for value in values], rotation=45)
+            axes.xaxis.set_minor_locator(ticker.NullLocator())
+            axes.yaxis.set_major_locator(ticker.LogLocator(subs=(1, 2, 5)))
+            axes.yaxis.set_major_formatter(ticker.FormatStrFormatter("%g"))
+            axes.yaxis.set_minor_locator(ticker.NullLocator())
             axes.set_title(unit, fontsize=9)
         handles, names = figure.axes[0].get_legend_handles_labels()
         figure.legend(handles, names, loc="outside lower center", ncols=len(names))
