@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib
+from matplotlib import ticker
 from matplotlib.figure import Figure
 
 from cuelearner_jax import results
@@ -139,18 +140,20 @@ def _labels(work: Work, seeds: int, budget: int) -> dict[str, Any]:
 
 
 def _print(rows: Sequence[dict[str, Any]]) -> None:
-    print("varied          value  seeds  ms a step  steps/s (all)  of matmul  MB a seed  first step s")
+    """Markdown tables, as docs/scaling.md holds them."""
+    print("| varied | value | seeds | ms a step | steps a second, all seeds | of the float32 matmul rate |", end="")
+    print(" MB a seed | first step [s] |\n|---|---|---|---|---|---|---|---|")
     for row in (row for row in rows if row["axis"] != "labels"):
         share = row["share_of_matmul"]["float32"]
         print(
-            f"{row['axis']:<10}  {row['value']:9d}  {row['seeds']:5d}  {row['ms_a_step']:9.3f}  "
-            f"{row['steps_a_second']:13,.0f}  {share:9.1%}  {row['mb_a_seed']:9.2f}  {row['first_step_s']:12.1f}"
+            f"| {row['axis']} | {row['value']:,} | {row['seeds']} | {row['ms_a_step']:.3f} | "
+            f"{row['steps_a_second']:,.0f} | {share:.1%} | {row['mb_a_seed']:.2f} | {row['first_step_s']:.1f} |"
         )
-    print("labels  seeds  round with its fit s  fit s  all rounds s")
+    print("\n| labels | seeds | a round with its fit [s] | the fit alone [s] | all rounds [s] |\n|---|---|---|---|---|")
     for row in (row for row in rows if row["axis"] == "labels"):
         print(
-            f"{row['value']:6d}  {row['seeds']:5d}  {row['round_s']:20.3f}  {row['fit_s']:5.3f}  "
-            f"{row['all_rounds_s']:12.1f}"
+            f"| {row['value']:,} | {row['seeds']} | {row['round_s']:.3f} | {row['fit_s']:.3f} | "
+            f"{row['all_rounds_s']:.1f} |"
         )
 
 
@@ -164,6 +167,12 @@ def _draw(measured: Sequence[dict[str, Any]]) -> Figure:
                 machine = f"{contents['hardware']}, {contents['preset']}"
                 axes.plot(*zip(*points, strict=True), "o-", color=colour, label=machine, linewidth=1.5, markersize=4)
             axes.set(xscale="log", yscale="log", xlabel=label)
+            values = sorted({row["value"] for contents in measured for row in contents["rows"] if row["axis"] == axis})
+            axes.set_xticks(values, [f"{value:,}" for value in values], rotation=45)
+            axes.xaxis.set_minor_locator(ticker.NullLocator())
+            axes.yaxis.set_major_locator(ticker.LogLocator(subs=(1, 2, 5)))
+            axes.yaxis.set_major_formatter(ticker.FormatStrFormatter("%g"))
+            axes.yaxis.set_minor_locator(ticker.NullLocator())
             axes.set_title(unit, fontsize=9)
         handles, names = figure.axes[0].get_legend_handles_labels()
         figure.legend(handles, names, loc="outside lower center", ncols=len(names))
