@@ -17,6 +17,7 @@ import dataclasses
 import json
 import statistics
 import time
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -33,6 +34,7 @@ from cuelearner_jax.tasks import TASKS
 
 REPLAY = 100_000
 ROUNDS = 3  # of labels, after the one that compiles
+DECADE = 10.0  # no panel shows less, lest a flat line look steep
 AXES = {
     "seeds": ("seeds at once", "ms_a_step", "ms a step of all seeds"),
     "directions": ("directions", "ms_a_step", "ms a step of all seeds"),
@@ -160,13 +162,19 @@ def _print(rows: Sequence[dict[str, Any]]) -> None:
 def _draw(measured: Sequence[dict[str, Any]]) -> Figure:
     """One panel for each thing varied, one line a machine; straight lines of slope 1 are proportional growth."""
     with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(10, 3), layout="constrained")
-        for axes, (axis, (label, name, unit)) in zip(figure.subplots(1, len(AXES)), AXES.items(), strict=True):
+        counts = Counter(row["axis"] for contents in measured for row in contents["rows"])
+        drawn = {axis: about for axis, about in AXES.items() if counts[axis] > 1}
+        figure = Figure(figsize=(2.5 * len(drawn), 3), layout="constrained")
+        panels = figure.subplots(1, len(drawn), squeeze=False)[0]
+        for axes, (axis, (label, name, unit)) in zip(panels, drawn.items(), strict=True):
             for contents, colour in zip(measured, list(COLOURS.values()) * len(measured), strict=False):
                 points = sorted((row["value"], row[name]) for row in contents["rows"] if row["axis"] == axis)
                 machine = f"{contents['hardware']}, {contents['preset']}"
                 axes.plot(*zip(*points, strict=True), "o-", color=colour, label=machine, linewidth=1.5, markersize=4)
             axes.set(xscale="log", yscale="log", xlabel=label)
+            low, high = axes.get_ylim()
+            wider = max(1.0, (DECADE / (high / low)) ** 0.5)
+            axes.set_ylim(low / wider, high * wider)
             values = sorted({row["value"] for contents in measured for row in contents["rows"] if row["axis"] == axis})
             axes.set_xticks(values, [f"{value:,}" for value in values], rotation=45)
             axes.xaxis.set_minor_locator(ticker.NullLocator())
