@@ -25,14 +25,26 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from cuelearner_jax import bench, cluster, machines, play, runs, sweep, teaching
+from cuelearner_jax import bench, cluster, locomotion, machines, play, runs, sweep, teaching
 from cuelearner_jax.errors import UserError, closest, no_space
 from cuelearner_jax.evaluate import episodes
-from cuelearner_jax.options import Bench, BenchTask, Common, Evaluate, Render, Report, Sweep, TeacherTrain, Train
+from cuelearner_jax.options import (
+    Bench,
+    BenchTask,
+    Common,
+    Evaluate,
+    LocomotionEvaluate,
+    LocomotionTrain,
+    Render,
+    Report,
+    Sweep,
+    TeacherTrain,
+    Train,
+)
 from cuelearner_jax.report import report
 from cuelearner_jax.shards import Shard
 from cuelearner_jax.statistics import interval
-from cuelearner_jax.tasks import TASKS, Task
+from cuelearner_jax.tasks import TASKS, Task, anymal_walker
 
 out = Console(highlight=False, soft_wrap=True)
 
@@ -44,6 +56,7 @@ ABOUT = {
     "render": "A still and a film of a policy at work.",
     "teacher": "teacher train: train a teacher from exhaustive tries in parallel.",
     "bench": "Throughput, memory a seed and share of peak of this machine, beside known machines.",
+    "locomotion": "locomotion train, locomotion evaluate: the quadruped's walking policy.",
 }
 
 
@@ -80,6 +93,7 @@ def _dispatch(arguments: list[str]) -> int:
         "render": _render,
         "teacher": _teacher,
         "bench": _bench,
+        "locomotion": _locomotion,
     }
     if not arguments or arguments[0] in ("-h", "--help"):
         _overview()
@@ -257,15 +271,18 @@ def _evaluate(arguments: list[str]) -> None:
     kind = Evaluate[subject.task.config]  # pyright: ignore[reportInvalidTypeArguments]
     default = kind(subject.config.task, policy="agent" if subject.grid else "heuristic")
     asked = _parse(kind, rest, f"evaluate {subject.folder}", default)
+    own, subject = subject, subject.on(asked.robot)
+    engine = own.engine(asked.robot, asked.engine)
     subject.check(asked.policy, asked.task)
     if asked.steps < 1 or asked.envs < 1 or asked.steps % asked.envs:
         raise UserError(f"--steps is {asked.steps}: give a positive multiple of --envs ({asked.envs})")
     if asked.out and asked.out.exists():
         raise UserError(f"{asked.out} exists: give another --out")
-    measured = play.evaluate(subject, asked.task, asked.policy, asked.guidance, asked.envs, asked.steps)
-    out.print(_measurements(measured, f"{asked.policy}, {asked.steps} steps a lane"))
+    measured = play.evaluate(subject, asked.task, asked.policy, asked.guidance, asked.envs, asked.steps, engine)
+    body = {name: value for name, value in (("robot", asked.robot), ("engine", asked.engine)) if value}
+    out.print(_measurements(measured, ", ".join([asked.policy, *body.values(), f"{asked.steps} steps a lane"])))
     if asked.out:
-        play.write(asked.out, subject, asked.task, asked.policy, asked.envs, asked.steps, measured)
+        play.write(asked.out, subject, asked.task, asked.policy, asked.envs, asked.steps, measured, body)
         out.print(f"wrote {asked.out}")
 
 
@@ -305,12 +322,14 @@ def _render(arguments: list[str]) -> None:
     kind = Render[subject.task.config]  # pyright: ignore[reportInvalidTypeArguments]
     default = kind(subject.config.task, Path("pictures"), policy="agent" if subject.grid else "heuristic")
     asked = _parse(kind, rest, f"render {subject.folder}", default)
+    subject = subject.on(asked.robot)
     subject.check(asked.policy, asked.task)
     if asked.film not in ("gif", "mp4"):
         raise UserError(f"--film is {asked.film!r}: choose gif or mp4")
     if asked.steps < 1:
         raise UserError(f"--steps is {asked.steps}: give a positive number")
-    film, still = (asked.out / f"{subject.folder.name}-{asked.policy}{end}" for end in (f".{asked.film}", ".png"))
+    name = "-".join([subject.folder.name, *([asked.robot] if asked.robot else []), asked.policy])
+    film, still = (asked.out / f"{name}{end}" for end in (f".{asked.film}", ".png"))
     taken = [str(file) for file in (film, still) if file.exists()]
     if taken and not asked.overwrite:
         raise UserError(f"{taken[0]} exists: give --overwrite to replace it, or another --out")
@@ -370,6 +389,27 @@ def _without_out(arguments: list[str]) -> list[str]:
         not (a.startswith("--out=") or "--out" in arguments[max(i - 1, 0) : i + 1]) for i, a in enumerate(arguments)
     ]
     return [argument for argument, keep in zip(arguments, given, strict=True) if keep]
+
+
+def _locomotion(arguments: list[str]) -> None:
+    kinds = {"train": LocomotionTrain, "evaluate": LocomotionEvaluate}
+    if not arguments or arguments[0] in ("-h", "--help"):
+        print(f"usage: cuelearner locomotion {'|'.join(kinds)} [OPTIONS]\n\n{ABOUT['locomotion']}")
+        raise SystemExit(0 if arguments else 2)
+    if arguments[0] not in kinds:
+        raise UserError(f"unknown command 'locomotion {arguments[0]}'{closest(arguments[0], kinds)}")
+    asked = _parse(kinds[arguments[0]], arguments[1:], f"locomotion {arguments[0]}")
+    command = shlex.join(["cuelearner", "locomotion", *arguments])
+    if isinstance(asked, LocomotionTrain):
+        locomotion.check(asked.train)
+        about = locomotion.train(anymal_walker(), asked.train, asked.out, asked.seed, command, tell=out.print)
+        figures = about["figures"]
+    else:
+        figures = locomotion.evaluate(anymal_walker(), asked.policy, asked.robots, asked.seed, command, asked.out)
+    for name, found in figures.items():
+        out.print(f"{name:20}" + ", ".join(f"{key} {value:.4g}" for key, value in found.items()))
+    if asked.out:
+        out.print(f"wrote {asked.out}")
 
 
 if __name__ == "__main__":

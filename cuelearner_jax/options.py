@@ -11,6 +11,7 @@ import tyro
 from cuelearner_jax.bench import Measuring
 from cuelearner_jax.cluster import Job
 from cuelearner_jax.config import RunConfig
+from cuelearner_jax.locomotion import LocomotionConfig
 from cuelearner_jax.teacher import TeacherConfig
 
 TaskT = TypeVar("TaskT")
@@ -83,6 +84,10 @@ class Evaluate(Generic[TaskT]):
     """Environment steps for each lane."""
     envs: int = 100
     """Environments that share them."""
+    robot: str | None = None
+    """navigation: anymal, a quadruped with full physics in MJX (default: the task's own robot)."""
+    engine: str | None = None
+    """With a robot: mujoco, for C MuJoCo at a finer step instead of MJX; first episodes only."""
     out: Path | None = None
     """Also write the measurements to this JSON file."""
 
@@ -106,6 +111,8 @@ class Render(Generic[TaskT]):
     """Steps to film; a new episode follows the end of one."""
     episode: int = 0
     """Which random start."""
+    robot: str | None = None
+    """navigation: anymal, filmed by MuJoCo (default: the task's own robot)."""
     film: str = "gif"
     """gif or mp4."""
     overwrite: Flag[bool] = False
@@ -166,3 +173,28 @@ class BenchTask(Generic[TaskT]):
 
     run: Annotated[RunConfig[TaskT], tyro.conf.arg(name="")]
     measuring: Annotated[Measuring, tyro.conf.arg(name="")] = field(default_factory=Measuring)
+
+
+@dataclass(frozen=True)
+class LocomotionTrain:
+    """Train the quadruped's walking policy."""
+
+    out: Path = Path("runs/anymal-policy")
+    """Folder for the policy."""
+    train: LocomotionConfig = field(default_factory=LocomotionConfig)
+    seed: int = 0
+    """Seed."""
+
+
+@dataclass(frozen=True)
+class LocomotionEvaluate:
+    """Measure a walking policy in MJX and in C MuJoCo."""
+
+    policy: tyro.conf.Positional[Path | None] = None
+    """Folder of a policy (default: the shipped one)."""
+    robots: int = 512
+    """Robots that walk for 20 s in each trial."""
+    seed: int = 1
+    """Decides commands, grounds, noise and pushes."""
+    out: Path | None = None
+    """Also write the figures to this JSON file."""

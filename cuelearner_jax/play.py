@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -45,6 +46,30 @@ class Subject:
     config: RunConfig
     grid: Grid | None
     folder: Path
+
+    def on(self, robot: str | None) -> Subject:
+        """The same with another robot of the task's (None: its own). Raises UserError if it has no such robot."""
+        if robot is None:
+            return self
+        robots = self.task.robots
+        if not robots:
+            raise UserError(f"{self.task.name} has no robots to choose from: leave out --robot")
+        if robot not in robots:
+            raise UserError(f"unknown robot {robot!r}{closest(robot, robots)}")
+        record, still, animate = robots[robot].pictures()
+        changed = {"environment": robots[robot].environment, "record": record, "still": still, "animate": animate}
+        return replace(self, task=replace(self.task, **changed))
+
+    def engine(self, robot: str | None, name: str | None) -> Callable[..., dict[str, Any]] | None:
+        """A robot's roll-out in other physics (no name: its own). Raises UserError if it has no such engine."""
+        if name is None:
+            return None
+        if robot is None:
+            raise UserError(f"--engine {name} needs --robot: choose one of {', '.join(self.task.robots) or 'none'}")
+        engines = self.task.robots[robot].engines
+        if name not in engines:
+            raise UserError(f"unknown engine {name!r}{closest(name, engines)}")
+        return engines[name]
 
     def check(self, policy: str, changed: Any) -> None:
         """Raises UserError unless the policy can be had and acts in the changed world."""
@@ -117,35 +142,54 @@ class Measured(NamedTuple):
 
 
 def evaluate(
-    subject: Subject, world: Any, name: str, kinds: tuple[str, ...], num_envs: int, steps: int
+    subject: Subject,
+    world: Any,
+    name: str,
+    kinds: tuple[str, ...],
+    num_envs: int,
+    steps: int,
+    engine: Callable[..., dict[str, Any]] | None = None,
 ) -> list[Measured]:
-    """Metrics of a policy on validation episodes of a world (a task configuration), for each guidance and budget."""
+    """Metrics of a policy on validation episodes of a world (a task configuration), for each guidance and budget.
+
+    `engine` is a roll-out in other physics (`tasks.Robot.engines`); without one the environment's own are used.
+    """
     env = subject.task.environment(world, "validation")
     key = episodes()
     teacher = subject.task.teacher(world, env) if name in TAUGHT else None
     if name in UNTRAINED:
+
+        def measure_it(env: Environment, teacher: Teacher | None) -> dict[str, Any]:
+            return (engine or rollout)(untrained_policy(name, env, teacher), env, key, num_envs, steps)
+
         # As arguments: what is closed over becomes a constant of the program.
-        measure = jax.jit(lambda env, teacher: rollout(untrained_policy(name, env, teacher), env, key, num_envs, steps))
-        found = measure(env, teacher)
+        found = (measure_it if engine else jax.jit(measure_it))(env, teacher)
         metrics = {metric: np.asarray(value)[None] for metric, value in found.items()}
         return [Measured("-", 0, 0, np.zeros(1, int), metrics)]
     rows = []
     for lanes in load_lanes(subject, kinds):
 
-        @jax.jit
         def measure(env: Environment, teacher: Teacher | None, policies: Any, lanes: Trained = lanes) -> Any:
             def one(lane: Any) -> dict[str, jax.Array]:
                 policy = trained_policy(name, lanes, lane, subject.config, env, teacher)
-                return rollout(policy, env, key, num_envs, steps)
+                return (engine or rollout)(policy, env, key, num_envs, steps)
 
-            return each_lane(one, policies)
+            return _one_by_one(one, policies) if engine else each_lane(one, policies)
 
-        found = {metric: np.asarray(values) for metric, values in measure(env, teacher, lanes.policies).items()}
+        found = (measure if engine else jax.jit(measure))(env, teacher, lanes.policies)
+        found = {metric: np.asarray(values) for metric, values in found.items()}
         for budget in np.unique(lanes.budgets):
             own = lanes.budgets == budget
             metrics = {metric: values[own] for metric, values in found.items()}
             rows.append(Measured(lanes.guidance.name, int(budget), lanes.step, lanes.seeds[own], metrics))
     return rows
+
+
+def _one_by_one(one: Callable[[Any], dict[str, Any]], lanes: Any) -> dict[str, np.ndarray]:
+    """`each_lane` for what can't be compiled."""
+    count = jax.tree.leaves(lanes)[0].shape[0]
+    found = [one(jax.tree.map(lambda leaf, number=number: leaf[number], lanes)) for number in range(count)]
+    return {name: np.stack([measured[name] for measured in found]) for name in found[0]}
 
 
 def one_policy(
@@ -177,9 +221,16 @@ def _listed(values: np.ndarray) -> str:
 
 
 def write(
-    path: Path, subject: Subject, world: Any, policy: str, num_envs: int, steps: int, measured: list[Measured]
+    path: Path,
+    subject: Subject,
+    world: Any,
+    policy: str,
+    num_envs: int,
+    steps: int,
+    measured: list[Measured],
+    body: dict[str, str],
 ) -> None:
-    """Measurements as JSON, with the world and where the numbers come from."""
+    """Measurements as JSON, with the world, the body if it is not the task's own, and where the numbers come from."""
     rows = [
         {
             "guidance": row.guidance,
@@ -194,6 +245,7 @@ def write(
         "subject": subject.folder.name,
         "world": {"name": subject.task.name, **to_json(world)},
         "policy": policy,
+        **body,
         "envs": num_envs,
         "steps": steps,
         **results.provenance(),

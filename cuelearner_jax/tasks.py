@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +27,7 @@ from cuelearner_envs.navigation.recording import record as navigation_record
 from cuelearner_envs.navigation.roadmap import make_teacher
 from cuelearner_jax import teacher as learned
 from cuelearner_jax.config import RunConfig, Scalars, Schedule, Sizes
-from cuelearner_jax.types import Environment, Teacher
+from cuelearner_jax.types import Environment, Teacher, Walker
 
 
 @dataclass(frozen=True)
@@ -40,6 +40,18 @@ class Preset:
     labels: tuple[int, ...] = (500, 1000)
     seeds: int = 5
     first_seed: int = 0
+
+
+@dataclass(frozen=True)
+class Robot:
+    """Another body for a task, to agents the same: policies of the task act on it unchanged."""
+
+    about: str
+    environment: Callable[..., Environment]  # as `Task.environment`
+    engines: dict[str, Callable[..., dict[str, Any]]]  # roll-outs as `evaluate.rollout` in other physics, by name
+    pictures: Callable[
+        [], tuple[Callable, Callable, Callable]
+    ]  # loads `record`, `still`, `animate`, as a task has them
 
 
 @dataclass(frozen=True)
@@ -56,6 +68,7 @@ class Task:
     ]  # (env, policy, key, steps) -> frames for the two below, rewards
     still: Callable[[Any, list[Any], Path], None]  # (env, the frames of a record, file)
     animate: Callable[[Any, list[Any], Path], None]  # (env, the frames, file)
+    robots: dict[str, Robot] = field(default_factory=dict)  # beside its own
 
 
 def shape_of(task: Task, config: Any) -> Any:
@@ -146,6 +159,29 @@ NAVIGATION_SIZES = Sizes(
 # of its billiards code learn more slowly here, see docs/results.md.
 NAVIGATION_SCALARS = Scalars(learning_rate=0.001, discount=0.995, eps_deg=20.0, max_grad_norm=10.0, polyak=0.05)
 
+
+def _legged(config: NavigationConfig, split: str = "training") -> Environment:
+    from cuelearner_envs.anymal.environment import make_environment  # MuJoCo's loading is not for every command
+
+    return make_environment(config, split)
+
+
+def _judged(*arguments: Any) -> dict[str, Any]:
+    from cuelearner_envs.anymal.judged import rollout
+
+    return rollout(*arguments)
+
+
+def _legged_pictures() -> tuple[Callable, Callable, Callable]:
+    from cuelearner_envs.anymal import recording
+
+    return (
+        recording.record,
+        lambda env, frames, file: recording.still(frames, file),
+        lambda env, frames, file: recording.animate(frames, file),
+    )
+
+
 NAVIGATION = Task(
     name="navigation",
     config=NavigationConfig,
@@ -154,6 +190,7 @@ NAVIGATION = Task(
     record=navigation_record,
     still=lambda env, frames, file: navigation_drawing.still(env.robot, frames, file),
     animate=lambda env, frames, file: navigation_drawing.animate(env.robot, frames, file),
+    robots={"anymal": Robot("a quadruped with full physics", _legged, {"mujoco": _judged}, _legged_pictures)},
     presets={
         "paper": Preset(
             "the paper's figure: cluttered halls, its networks, 1 million steps a seed",
@@ -211,3 +248,18 @@ NAVIGATION = Task(
 )
 
 TASKS = {task.name: task for task in (BILLIARDS, NAVIGATION)}
+
+
+def anymal_walker() -> Walker:
+    """The quadruped that learns to walk."""
+    from cuelearner_envs.anymal import policy, tracking
+    from cuelearner_envs.anymal.locomotion import Locomotion
+
+    return Walker(
+        environment=Locomotion(),
+        policy=policy.from_brax,
+        measure=tracking.measure_training,
+        examine=tracking.examine,
+        save=policy.save,
+        load=policy.load,
+    )

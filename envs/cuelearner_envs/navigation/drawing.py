@@ -31,8 +31,13 @@ from cuelearner_envs.navigation.world import FAR_AWAY, World
 # Okabe and Ito's palette, as in the figures of results: told apart with any colour vision.
 BODY, GOAL, CRASH, ARROW, BEAMS, HITS = "#0072B2", "#009E73", "#D55E00", "#E69F00", "#56B4E9", "#CC79A7"
 START, INK = "#000000", "#333333"
-OUTCOMES = {"success": GOAL, "collision": CRASH, "timeout": INK}
-WORDS = {"success": "reached the goal after", "collision": "collision after", "timeout": "out of time after"}
+OUTCOMES = {"success": GOAL, "collision": CRASH, "fall": CRASH, "timeout": INK}
+WORDS = {
+    "success": "reached the goal after",
+    "collision": "collision after",
+    "fall": "fell after",
+    "timeout": "out of time after",
+}
 FLOOR, LOW, TALL = "#fbfaf7", "#c9ccd1", "#5d636b"
 LOWEST, TALLEST = 0.6, 1.5  # heights that have the colours `LOW` and `TALL` [m]
 WIDTH_INCHES, STRIP_INCHES, MARGIN = 7.0, 0.4, 0.35  # the strip below the floor is for words; margin in [m]
@@ -84,7 +89,7 @@ def still(robot: Robot, frames: Sequence[Frame], file: str | os.PathLike[str], d
     for pose in _spread(way, middle.pose):
         _Body(axes, robot, alpha=0.35).place(pose)
     _Body(axes, robot).place(middle.pose)
-    _Body(axes, robot, colour=CRASH if last.outcome == "collision" else BODY).place(last.next_pose)
+    _Body(axes, robot, colour=CRASH if last.outcome in ("collision", "fall") else BODY).place(last.next_pose)
     _arrow(axes).set_positions(*_arrow_ends(middle))
     words = WORDS.get(last.outcome, "still walking after")
     length = np.linalg.norm(np.diff(way[:, :2], axis=0), axis=-1).sum()
@@ -352,7 +357,7 @@ class _Stage:
 
     def end(self, last: Frame, way: Float[np.ndarray, "poses 3"]) -> UInt8[np.ndarray, "height width 3"]:
         """Where an episode ended, and how."""
-        body = self.crashed if last.outcome == "collision" else self.body
+        body = self.crashed if last.outcome in ("collision", "fall") else self.body
         body.place(last.next_pose)
         words = f"{WORDS[last.outcome]} {last.seconds:.1f} s"
         return self._picture(way, words, _outcome_colour(last), self.trail, body)

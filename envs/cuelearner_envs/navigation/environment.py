@@ -5,6 +5,8 @@ One step is one control step of walking in a chosen direction. Reward: +10 at th
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 from flax import struct
@@ -33,6 +35,9 @@ class Walker(struct.PyTreeNode):
     steps: Int[Array, ""]  # taken in this episode
 
 
+AnyWalker = Any  # a `Walker`, or what another body has in its place: pose, goal, previous, world, route and steps
+
+
 class Navigation(struct.PyTreeNode):
     """The environment (`cuelearner_jax.types.Environment`). Everything but the last field is traced."""
 
@@ -55,60 +60,85 @@ class Navigation(struct.PyTreeNode):
         """One of the worlds."""
         return jax.tree.map(lambda leaf: leaf[index], self.worlds)
 
-    def reset(self, key: PRNGKeyArray) -> tuple[Walker, Float[Array, " obs"]]:
+    def reset(self, key: PRNGKeyArray) -> tuple[AnyWalker, Float[Array, " obs"]]:
         """Stands still, turned at random, at the start of a random route of a random world."""
         state = self._start(key)
         return state, self.observe(state)
 
-    def step(self, key: PRNGKeyArray, state: Walker, action: Float[Array, "2"]) -> tuple[Walker, Step]:
+    def step(self, key: PRNGKeyArray, state: AnyWalker, action: Float[Array, "2"]) -> tuple[AnyWalker, Step]:
         """Walks for one period in the direction; a new episode follows an end."""
         after = self.moved(state, action)
-        success, collision = self.arrived(after), self.collided(after)
-        success = success & ~collision
-        terminated = success | collision
-        truncated = (after.steps >= self.max_steps) & ~terminated
-        ended = terminated | truncated
-        following = jax.tree.map(lambda new, old: jnp.where(ended, new, old), self._start(key), after)
+        outcome, terminated, truncated = self.ends(after)
+        following = jax.tree.map(lambda new, old: jnp.where(terminated | truncated, new, old), self._start(key), after)
         step = Step(
             obs=self.observe(following),
             final_obs=self.observe(after),
-            aftermath=after.pose,
-            reward=10.0 * success - 10.0 * collision,
+            aftermath=self.place(after),
+            reward=10.0 * outcome["success"] - 10.0 * (terminated - outcome["success"]),
             terminated=terminated,
             truncated=truncated,
             metrics={"speed": jnp.linalg.norm(after.pose[:2] - state.pose[:2]) / self.period},
-            outcome={
-                "success": success.astype(jnp.float32),
-                "collision": collision.astype(jnp.float32),
-                "timeout": truncated.astype(jnp.float32),
-                "duration": after.steps * jnp.asarray(self.period),
-            },
+            outcome=outcome,
         )
         return following, step
 
-    def moved(self, state: Walker, action: Float[Array, "2"]) -> Walker:
+    def ends(self, after: AnyWalker) -> tuple[dict[str, Float[Array, ""]], Bool[Array, ""], Bool[Array, ""]]:
+        """Outcome of a step that led to a state (1 or 0 each, and the time since the start [s]); is it over, and how?
+
+        Returns:
+            outcome, terminated, truncated.
+        """
+        failures = self.failures(after)
+        failed = jnp.stack(list(failures.values())).any()
+        success = self.arrived(after) & ~failed
+        terminated = success | failed
+        truncated = (after.steps >= self.max_steps) & ~terminated
+        named = {"success": success, **failures, "timeout": truncated}
+        outcome = {name: value.astype(jnp.float32) for name, value in named.items()}
+        return {**outcome, "duration": after.steps * jnp.asarray(self.period)}, terminated, truncated
+
+    def moved(self, state: AnyWalker, action: Float[Array, "2"]) -> AnyWalker:
         """The state after a step, without a reset."""
         motion = walk(self.robot, Motion(state.pose, state.velocity), action, self.period)
         return state.replace(
             pose=motion.pose,
             velocity=motion.velocity,
-            previous=_latest_first(action, state.previous),
+            previous=latest_first(action, state.previous),
             steps=state.steps + 1,
         )
 
-    def arrived(self, state: Walker) -> Bool[Array, ""]:
+    def arrived(self, state: AnyWalker) -> Bool[Array, ""]:
         """Is the goal reached?"""
         return jnp.linalg.norm(state.goal - state.pose[:2]) < self.goal_radius
 
-    def collided(self, state: Walker) -> Bool[Array, ""]:
+    def failures(self, state: AnyWalker) -> dict[str, Bool[Array, ""]]:
+        """What ends an episode in failure, by name; at most one holds."""
+        return {"collision": self.collided(state)}
+
+    def place(self, state: AnyWalker) -> Float[Array, "3"]:
+        """Where the sensor is, with the body: what replay keeps of it."""
+        return state.pose
+
+    def placed(
+        self,
+        place: Float[Array, "3"],
+        goal: Float[Array, "2"],
+        previous: Float[Array, "3 2"],
+        world: Int[Array, ""],
+        route: Int[Array, ""],
+    ) -> AnyWalker:
+        """A state at rest at a place."""
+        return Walker(place, jnp.zeros(2), goal, previous, world, route, jnp.zeros((), jnp.int32))
+
+    def collided(self, state: AnyWalker) -> Bool[Array, ""]:
         """Does the body touch anything?"""
         return collides(self.robot, self.world(state.world), state.pose)
 
-    def ranges(self, state: Walker) -> Float[Array, "271"]:
+    def ranges(self, state: AnyWalker) -> Float[Array, "271"]:
         """The lidar's distances as the robot perceives them [m]."""
         return self.lidar.read(self.world(state.world), state.pose)
 
-    def observe(self, state: Walker) -> Float[Array, " obs"]:
+    def observe(self, state: AnyWalker) -> Float[Array, " obs"]:
         """What the robot perceives; everything is of the order of one.
 
         - 271 entries: how near the lidar's beams end, from right behind to left behind, exp(-distance / 1 m) of
@@ -139,49 +169,45 @@ class Navigation(struct.PyTreeNode):
         image = jnp.concatenate([obs[:BEAMS][::-1], goal * sign, distance[None], (previous * sign).ravel()])
         return jnp.where(which == 1, image, obs), jnp.where(which == 1, vector * sign, vector)
 
-    def remember(self, state: Walker, obs: Float[Array, " obs"]) -> Float[Array, "12"]:
-        """Pose, goal, previous actions and number of the world: what `observe` looks at."""
-        return jnp.concatenate([state.pose, state.goal, state.previous.ravel(), state.world[None].astype(jnp.float32)])
+    def remember(self, state: AnyWalker, obs: Float[Array, " obs"]) -> Float[Array, "12"]:
+        """Place, goal, previous actions and number of the world: what `observe` looks at."""
+        world = state.world[None].astype(jnp.float32)
+        return jnp.concatenate([self.place(state), state.goal, state.previous.ravel(), world])
 
     def recall(self, memory: Float[Array, "12"]) -> Float[Array, " obs"]:
         """The observation, its lidar scanned anew."""
-        return self.observe(self._recalled(memory))
+        return self.observe(self.placed(*_remembered(memory)))
 
     def recall_next(
         self, memory: Float[Array, "12"], action: Float[Array, "2"], aftermath: Float[Array, "3"]
     ) -> Float[Array, " obs"]:
-        """The observation after the action, at the pose `aftermath`."""
-        state = self._recalled(memory)
-        return self.observe(state.replace(pose=aftermath, previous=_latest_first(action, state.previous)))
+        """The observation after the action, at the place `aftermath`."""
+        _, goal, previous, world, route = _remembered(memory)
+        return self.observe(self.placed(aftermath, goal, latest_first(action, previous), world, route))
 
-    def _recalled(self, memory: Float[Array, "12"]) -> Walker:
-        """A state that looks as the remembered one did."""
-        zero = jnp.zeros((), jnp.int32)
-        return Walker(
-            pose=memory[:3],
-            velocity=jnp.zeros(2),
-            goal=memory[3:5],
-            previous=memory[5:11].reshape(REMEMBERED, 2),
-            world=memory[11].astype(jnp.int32),
-            route=zero,
-            steps=zero,
-        )
-
-    def _start(self, key: PRNGKeyArray) -> Walker:
+    def start(self, key: PRNGKeyArray) -> tuple[Float[Array, "3"], Float[Array, "2"], Int[Array, ""], Int[Array, ""]]:
+        """A random route: pose at its start, turned at random; goal, number of the world and of the route."""
         k_world, k_route, k_yaw = jax.random.split(key, 3)
         worlds, routes = self.worlds.starts.shape[:2]
         world, route = jax.random.randint(k_world, (), 0, worlds), jax.random.randint(k_route, (), 0, routes)
         yaw = jax.random.uniform(k_yaw, (), minval=-jnp.pi, maxval=jnp.pi)
-        return Walker(
-            pose=jnp.append(self.worlds.starts[world, route], yaw),
-            velocity=jnp.zeros(2),
-            goal=self.worlds.goals[world, route],
-            previous=jnp.zeros((REMEMBERED, 2)),
-            world=world,
-            route=route,
-            steps=jnp.zeros((), jnp.int32),
-        )
+        return jnp.append(self.worlds.starts[world, route], yaw), self.worlds.goals[world, route], world, route
+
+    def _start(self, key: PRNGKeyArray) -> AnyWalker:
+        pose, goal, world, route = self.start(key)
+        return self.placed(self.at_rest(pose), goal, jnp.zeros((REMEMBERED, 2)), world, route)
+
+    def at_rest(self, pose: Float[Array, "3"]) -> Float[Array, "3"]:
+        """The place of a body that stands still at a pose."""
+        return pose
 
 
-def _latest_first(action: Float[Array, "2"], previous: Float[Array, "3 2"]) -> Float[Array, "3 2"]:
+def _remembered(memory: Float[Array, " memory"]) -> tuple[jax.Array, ...]:
+    """Place, goal, previous actions, number of the world and of a route, which `observe` does not ask for."""
+    previous = memory[-7:-1].reshape(REMEMBERED, 2)
+    return memory[:-9], memory[-9:-7], previous, memory[-1].astype(jnp.int32), jnp.zeros((), jnp.int32)
+
+
+def latest_first(action: Float[Array, "2"], previous: Float[Array, "3 2"]) -> Float[Array, "3 2"]:
+    """The remembered actions after another one."""
     return jnp.concatenate([action[None], previous[:-1]])

@@ -40,9 +40,12 @@ class Lidar(struct.PyTreeNode):
         Noise and drop-outs are drawn from the pose's bits, so that the same reading can be made again.
         """
         pose = jnp.asarray(pose)
-        ranges = scan(world, pose.at[2].add(self.rotation), self.max_range)
+        return self.faulty(scan(world, pose.at[2].add(self.rotation), self.max_range), pose)
 
-        def faulty() -> jax.Array:
+    def faulty(self, ranges: Float[Array, "271"], pose: Float[Array, " n"]) -> Float[Array, "271"]:
+        """True distances with the sensor's noise and drop-outs, which the numbers of a pose decide [m]."""
+
+        def drawn() -> jax.Array:
             key = jax.random.key(0)
             for bits in jax.lax.bitcast_convert_type(pose, jnp.uint32):
                 key = jax.random.fold_in(key, bits)
@@ -51,7 +54,7 @@ class Lidar(struct.PyTreeNode):
             return jnp.where(jax.random.bernoulli(k_drop, self.dropout, ranges.shape), self.max_range, noisy)
 
         has_faults = (jnp.asarray(self.noise) > 0) | (jnp.asarray(self.dropout) > 0)
-        return jax.lax.cond(has_faults, faulty, lambda: ranges)
+        return jax.lax.cond(has_faults, drawn, lambda: ranges)
 
 
 def scan(world: World, pose: Float[Array, "3"], max_range: Scalar = MAX_RANGE) -> Float[Array, "271"]:
@@ -67,14 +70,45 @@ def scan(world: World, pose: Float[Array, "3"], max_range: Scalar = MAX_RANGE) -
     """
     pose = jnp.asarray(pose)
     beams = rotate(from_angle(BEAM_ANGLES), pose[2])
-    nearest = jnp.maximum(_boxes(world.boxes, pose[:2], beams), _circles(world.circles, pose[:2], beams))
+    boxes, circles = _boxes(world.boxes, pose[:2], beams), _circles(world.circles, pose[:2], beams)
+    return 1.0 / jnp.maximum(jnp.maximum(boxes.max(0), circles.max(0)), 1.0 / max_range)
+
+
+def scan_tilted(
+    world: World, origin: Float[Array, "3"], turn: Float[Array, "3 3"], max_range: Scalar = MAX_RANGE
+) -> Float[Array, "271"]:
+    """`scan` of a sensor that is tilted: beams meet the floor, and pass over solids that are too low.
+
+    A beam that has entered a solid above its top is taken to pass over it, and one that begins above a solid's top or
+    leaves it upward likewise: tilts of walking are small.
+
+    Args:
+        world: one world.
+        origin: where the sensor is; the last entry is its height above the floor [m].
+        turn: the matrix that turns the sensor's frame into the world's.
+        max_range: what a beam reads that meets nothing nearer [m].
+    """
+    ahead = from_angle(BEAM_ANGLES)
+    # Sums, not a matrix product: an accelerator rounds the factors of those.
+    beams = ahead[:, :1] * turn[:, 0] + ahead[:, 1:] * turn[:, 1]
+    level = jnp.sqrt(jnp.sum(jnp.square(beams[:, :2]), -1))  # cosine of each beam's slope
+    flat, rise = beams[:, :2] / level[:, None], beams[:, 2] / level
+
+    def met(inverse: Float[Array, "solids beams"], heights: Float[Array, " solids"]) -> Float[Array, " beams"]:
+        """The nearest solid's that is high enough where the beam is: height + rise / inverse <= top."""
+        return jnp.where(rise <= (heights[:, None] - origin[2]) * inverse, inverse, 0.0).max(0)
+
+    boxes = met(_boxes(world.boxes, origin[:2], flat), world.box_heights)
+    circles = met(_circles(world.circles, origin[:2], flat), world.circle_heights)
+    floor = -rise / origin[2]
+    nearest = jnp.maximum(jnp.maximum(boxes, circles), floor) * level
     return 1.0 / jnp.maximum(nearest, 1.0 / max_range)
 
 
 def _boxes(
     boxes: Float[Array, "boxes 5"], origin: Float[Array, "2"], beams: Float[Array, "beams 2"]
-) -> Float[Array, " beams"]:
-    """Inverse distance to the nearest box along each beam; 0 or less where there is none.
+) -> Float[Array, "boxes beams"]:
+    """Inverse distance to each box along each beam; 0 or less where it is not met.
 
     The slab method: a beam is inside a box from where it has entered both of its slabs to where it leaves either.
     """
@@ -102,13 +136,13 @@ def _boxes(
         jnp.maximum(*products(leave_ahead)),
     )
     seen = jnp.where(within[:, None], left, entered)
-    return jnp.where(entered >= left, seen, 0.0).max(0)
+    return jnp.where(entered >= left, seen, 0.0)
 
 
 def _circles(
     circles: Float[Array, "circles 3"], origin: Float[Array, "2"], beams: Float[Array, "beams 2"]
-) -> Float[Array, " beams"]:
-    """Inverse distance to the nearest circle along each beam; 0 or less where there is none.
+) -> Float[Array, "circles beams"]:
+    """Inverse distance to each circle along each beam; 0 or less where it is not met.
 
     The two crossings multiply to |centre|^2 - radius^2, which turns the division into one for each circle.
     """
@@ -120,4 +154,4 @@ def _circles(
     across = centre[:, 0, None] * beams[:, 1] - centre[:, 1, None] * beams[:, 0]
     depth = jnp.square(radius)[:, None] - jnp.square(across)
     seen = (along + other[:, None] * jnp.sqrt(jnp.maximum(depth, 0.0))) / power[:, None]
-    return jnp.where(depth >= 0, seen, 0.0).max(0)
+    return jnp.where(depth >= 0, seen, 0.0)

@@ -13,7 +13,7 @@ from jaxtyping import Float, PRNGKeyArray
 from cuelearner_envs.navigation.environment import Navigation
 from cuelearner_envs.navigation.world import World
 
-ENDS = ("success", "collision", "timeout")
+ENDS = ("success", "collision", "fall", "timeout")
 
 
 class Frame(NamedTuple):
@@ -53,21 +53,22 @@ def record(
             moved = env.moved(state, action)
             following, step = env.step(k_step, state, action)
             seconds = moved.steps * jnp.asarray(env.period)
-            ends = jnp.stack([step.outcome[name] for name in ENDS])
-            seen = (state, env.ranges(state), action, moved.pose, seconds, ends, step.reward)
+            ends = jnp.stack([step.outcome.get(name, jnp.zeros(())) for name in ENDS])  # only legged robots fall
+            seen = (state.world, state.goal, state.pose, env.ranges(state))
+            seen += (action, moved.pose, seconds, ends, step.reward)
             return (following, step.obs), seen
 
         return jax.lax.scan(advance, env.reset(k_reset), jnp.arange(steps))[1]
 
-    states, ranges, actions, next_poses, seconds, ends, rewards = jax.device_get(play(env, key))
-    worlds = jax.device_get(env.world(states.world))
+    which, goals, poses, ranges, actions, next_poses, seconds, ends, rewards = jax.device_get(play(env, key))
+    worlds = jax.device_get(env.world(which))
     finished = np.cumsum(ends.any(-1))
     frames = [
         Frame(
             world=jax.tree.map(lambda leaf, number=number: leaf[number], worlds),
-            goal=states.goal[number],
+            goal=goals[number],
             goal_radius=float(env.goal_radius),
-            pose=states.pose[number],
+            pose=poses[number],
             ranges=ranges[number],
             max_range=float(env.lidar.max_range),
             action=actions[number],

@@ -1,0 +1,205 @@
+"""Training a walking policy by brax's PPO on the host: progress, regular saving, the finished policy measured.
+
+The folder of a policy always holds the newest one measured, with its history: a run that is cut leaves it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from cuelearner_jax import config as configuration
+from cuelearner_jax import results
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.sweep import Interrupted, interruptible
+from cuelearner_jax.types import Walker
+
+COLUMNS = ("steps", "wall_s", "error", "turning_error", "falls")  # of the history
+VALUE_LAYERS = (256, 256, 256, 256)
+
+
+@dataclass(frozen=True)
+class LocomotionConfig:
+    """How walking is learned (brax's PPO)."""
+
+    steps: int = 100_000_000
+    """Steps of control, over all robots."""
+    seconds: float = 0.0
+    """Stop at the first measurement after this time [s]; 0: only after all steps."""
+    robots: int = 4096
+    """Robots that walk in parallel."""
+    layers: tuple[int, ...] = (256, 128, 64)
+    """Hidden layers of the policy."""
+    unroll: int = 20
+    """Steps of control in a piece of experience."""
+    minibatches: int = 16
+    """Parts into which a batch is split."""
+    batch_size: int = 256
+    """Pieces of experience in a minibatch; times minibatches it must be a multiple of the robots."""
+    updates: int = 4
+    """Passes over each batch."""
+    learning_rate: float = 3e-4
+    """Adam's step size."""
+    entropy: float = 0.01
+    """Weight of the policy's entropy."""
+    discount: float = 0.97
+    """Discount factor."""
+    max_grad_norm: float = 1.0
+    """Bound on the gradient's norm."""
+    episode: int = 1000
+    """Steps of control of an episode."""
+    measurements: int = 20
+    """Times at which the policy is measured and saved."""
+    measured_robots: int = 512
+    """Robots that a measurement watches for 20 s."""
+
+
+def check(config: LocomotionConfig) -> None:
+    """Raises UserError for values that cannot work."""
+    for field in dataclasses.fields(config):
+        value = getattr(config, field.name)
+        if field.name not in ("seconds", "entropy", "layers") and value <= 0:
+            raise UserError(f"train.{field.name} is {value}: give a positive number")
+    if config.seconds < 0 or config.entropy < 0:
+        raise UserError("train.seconds and train.entropy can't be negative")
+    if not config.layers:
+        raise UserError("train.layers: give at least one layer")
+    if config.batch_size * config.minibatches % config.robots:
+        raise UserError(
+            f"train.batch_size times train.minibatches is {config.batch_size * config.minibatches}: "
+            f"give a multiple of train.robots ({config.robots})"
+        )
+
+
+class _Enough(Exception):
+    """The time is over, or Ctrl-C was pressed."""
+
+
+def train(
+    walker: Walker,
+    config: LocomotionConfig,
+    out: Path,
+    seed: int,
+    command: str,
+    tell: Callable[[str], None] = print,
+) -> dict[str, Any]:
+    """Trains a walking policy, measures it and writes it.
+
+    Returns:
+        What is written beside it: settings, history, figures.
+
+    Raises:
+        UserError: bad configuration, or a folder in use; nothing has been changed then.
+        Interrupted: Ctrl-C; the newest measured policy is saved.
+    """
+    check(config)
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise UserError(f"{out} is not empty: give another --out")
+    about = {"config": configuration.to_json(config), "seed": seed, **results.provenance(), "command": command}
+    history: list[list[float]] = []
+    key = jax.random.key(seed)
+    began = time.perf_counter()
+
+    def look(steps: int, _: Any, params: Any) -> None:
+        policy = walker.policy(params)
+        found = walker.measure(policy, jax.random.fold_in(key, 0), config.measured_robots)
+        wall = time.perf_counter() - began
+        history.append([steps, round(wall, 1), *(round(found[name], 4) for name in COLUMNS[2:])])
+        tell(
+            f"{wall:6.0f} s {steps / 1e6:7.1f}M steps   error {found['error']:.3f} m/s, "
+            f"turning {found['turning_error']:.3f} rad/s, falls {found['falls']:.1%}"
+        )
+        if steps:  # what is still untrained is not worth keeping
+            told = {"columns": list(COLUMNS), "rows": history}
+            walker.save(out, jax.device_get(policy), {**about, "finished": False, "history": told})
+        if stopping.is_set() or (config.seconds and wall > config.seconds):
+            raise _Enough
+
+    tell(f"{jax.devices()[0].device_kind}: compiling takes a minute or so")
+    with interruptible() as stopping:
+        try:
+            _ppo(walker, config, seed, look)
+        except _Enough:
+            if stopping.is_set():
+                raise Interrupted(f"stopped; {out} holds the policy of the last measurement") from None
+    trained = time.perf_counter() - began
+    figures = walker.examine(walker.load(out), jax.random.fold_in(key, 1), config.measured_robots)
+    about |= {
+        "finished": True,
+        "trained_steps": history[-1][0],
+        "training_s": round(trained, 1),
+        "figures": {name: _rounded(found) for name, found in figures.items()},
+        "history": {"columns": list(COLUMNS), "rows": history},
+    }
+    walker.save(out, walker.load(out), about)
+    return about
+
+
+def evaluate(
+    walker: Walker, folder: Path | None, robots: int, seed: int, command: str, out: Path | None = None
+) -> dict[str, dict[str, float]]:
+    """Figures of a policy (the shipped one if no folder is given), trial by trial; written to `out`, if given.
+
+    Raises:
+        UserError: no policy there, or `out` exists.
+    """
+    if robots < 1:
+        raise UserError(f"--robots is {robots}: give a positive number")
+    if out and out.exists():
+        raise UserError(f"{out} exists: give another --out")
+    policy = walker.load(folder) if folder else walker.load()
+    found = walker.examine(policy, jax.random.key(seed), robots)
+    figures = {name: _rounded(values) for name, values in found.items()}
+    if out:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        contents = {"seed": seed, **results.provenance(), "command": command, "figures": figures}
+        out.write_text(json.dumps(contents, indent=1) + "\n")
+    return figures
+
+
+def _ppo(walker: Walker, config: LocomotionConfig, seed: int, look: Callable[[int, Any, Any], None]) -> None:
+    """brax's PPO with the settings; `look` is called now and then with (steps, _, parameters)."""
+    from brax.training.agents.ppo import networks  # takes seconds to load, which other commands need not wait for
+    from brax.training.agents.ppo import train as ppo
+
+    from cuelearner_jax.brax_adapter import supply_device_put_replicated
+
+    supply_device_put_replicated()
+    ppo.train(
+        environment=walker.environment,
+        num_timesteps=config.steps,
+        max_devices_per_host=1,
+        num_envs=config.robots,
+        episode_length=config.episode,
+        learning_rate=config.learning_rate,
+        entropy_cost=config.entropy,
+        discounting=config.discount,
+        unroll_length=config.unroll,
+        batch_size=config.batch_size,
+        num_minibatches=config.minibatches,
+        num_updates_per_batch=config.updates,
+        normalize_observations=True,
+        max_grad_norm=config.max_grad_norm,
+        network_factory=partial(
+            networks.make_ppo_networks,
+            policy_hidden_layer_sizes=config.layers,
+            value_hidden_layer_sizes=VALUE_LAYERS,
+        ),
+        seed=seed,
+        num_evals=config.measurements + 1,
+        num_eval_envs=1,
+        run_evals=False,  # its evaluation is another compile and knows nothing of settled errors
+        policy_params_fn=look,
+    )
+
+
+def _rounded(found: dict[str, float]) -> dict[str, float]:
+    return {name: round(value, 5) for name, value in found.items()}

@@ -1,0 +1,146 @@
+"""Navigation by the quadruped: the simple robot's task with legs, physics and a tilting sensor in place of a motion.
+
+The chosen direction becomes a velocity command, as the simple robot takes it: walk there at up to 1 m/s, held in the
+world's frame for the step, while the body turns toward it. The walking policy acts on the command at 50 Hz, MJX
+simulates. Solids are no contacts of the physics: the body's three discs touching one ends the episode, as does a fall.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Bool, Float, Int
+
+from cuelearner_envs.anymal import model as robot
+from cuelearner_envs.anymal import policy as walking_policy
+from cuelearner_envs.anymal.physics import Body, Ground, control, standing
+from cuelearner_envs.anymal.policy import WalkingPolicy, observe
+from cuelearner_envs.navigation.config import NavigationConfig
+from cuelearner_envs.navigation.config import make_environment as make_navigation
+from cuelearner_envs.navigation.environment import Navigation, latest_first
+from cuelearner_envs.navigation.lidar import scan_tilted
+from cuelearner_jax.actions import difference, from_angle, rotate
+
+Scalar = float | Float[Array, ""]
+SENSOR_NOISE = 0.02  # standard deviation of a scanner's own error [m]
+CONTROL_STEPS = 10  # in a step of navigation: 0.2 s at 50 Hz
+TURNING_TIME = 0.1  # within which the body is told to be where it should look, at no more than the turn rate [s]
+
+
+class LeggedWalker(struct.PyTreeNode):
+    """State between steps: what the physics and the walking policy carry, and the episode's."""
+
+    body: Body
+    last_action: Float[Array, "12"]  # of the walking policy
+    goal: Float[Array, "2"]  # [m]
+    previous: Float[Array, "3 2"]  # actions, the latest first, as they were given; zeros before the first
+    world: Int[Array, ""]
+    route: Int[Array, ""]  # of that world
+    steps: Int[Array, ""]  # taken in this episode
+    fallen: Bool[Array, ""]
+
+    @property
+    def pose(self) -> Float[Array, "3"]:
+        """x, y, yaw [m, rad]."""
+        return robot.planar_pose(self.body.qpos)
+
+
+class LeggedNavigation(Navigation, kw_only=True):
+    """The environment (`cuelearner_jax.types.Environment`), to agents the same as `Navigation`."""
+
+    walking: WalkingPolicy
+    ground: Ground = Ground()
+    control_steps: int = struct.field(pytree_node=False, default=CONTROL_STEPS)  # `period` is that many times 0.02 s
+
+    def moved(self, state: LeggedWalker, action: Float[Array, "2"]) -> LeggedWalker:
+        """The state after a step, without a reset."""
+        heading = rotate(action, state.pose[2])
+
+        def one(carry: tuple, _: None) -> tuple[tuple, None]:
+            body, last_action, fallen = carry
+            last_action = self.act(body, last_action, heading)
+            after, felt = control(body, last_action, self.ground)
+            sound = jnp.isfinite(after.qvel).all()  # what blew up has fallen, and stays where it was
+            body = jax.tree.map(lambda new, old: jnp.where(sound, new, old), after, body)
+            return (body, last_action, fallen | felt.fallen), None
+
+        start = (state.body, state.last_action, state.fallen)
+        (body, last_action, fallen), _ = jax.lax.scan(one, start, length=self.control_steps)
+        return state.replace(
+            body=body,
+            last_action=last_action,
+            previous=latest_first(action, state.previous),
+            steps=state.steps + 1,
+            fallen=fallen,
+        )
+
+    def act(self, body: Body, last_action: Float[Array, "12"], heading: Float[Array, "2"]) -> Float[Array, "12"]:
+        """The walking policy's action, told to walk toward `heading` (unit vector in the world's frame)."""
+        return self.walking(observe(body.qpos, body.qvel, last_action, self.command(body, heading)))
+
+    def command(self, body: Body, heading: Float[Array, "2"]) -> Float[Array, "3"]:
+        """Velocity forward and to the left [m/s] and turning rate [rad/s] that lead toward `heading`."""
+        yaw = robot.planar_pose(body.qpos)[2]
+        off = difference(from_angle(yaw), heading)
+        turning = jnp.clip(off / TURNING_TIME, -self.robot.turn_rate, self.robot.turn_rate)
+        return jnp.append(self.robot.speed * rotate(heading, -yaw), turning)
+
+    def failures(self, state: LeggedWalker) -> dict[str, Bool[Array, ""]]:
+        """What ends an episode in failure, by name; at most one holds."""
+        return {"collision": self.collided(state) & ~state.fallen, "fall": state.fallen}
+
+    def ranges(self, state: LeggedWalker) -> Float[Array, "271"]:
+        """The lidar's distances as the robot perceives them [m]: from the trunk's middle, tilted as it is."""
+        place = state.body.qpos[:7]
+        turn = robot.rotation(place[3:])
+        cos, sin = jnp.cos(self.lidar.rotation), jnp.sin(self.lidar.rotation)
+        ahead, left = cos * turn[:, 0] + sin * turn[:, 1], cos * turn[:, 1] - sin * turn[:, 0]
+        turn = jnp.stack([ahead, left, turn[:, 2]], axis=1)
+        true = scan_tilted(self.world(state.world), place[:3], turn, self.lidar.max_range)
+        return self.lidar.faulty(true, place)
+
+    def place(self, state: LeggedWalker) -> Float[Array, "7"]:
+        """Place and quaternion of the trunk."""
+        return state.body.qpos[:7]
+
+    def at_rest(self, pose: Float[Array, "3"]) -> Float[Array, "7"]:
+        """The place of a robot that stands at a pose."""
+        return standing(pose[:2], pose[2]).qpos[:7]
+
+    def placed(
+        self,
+        place: Float[Array, "7"],
+        goal: Float[Array, "2"],
+        previous: Float[Array, "3 2"],
+        world: Int[Array, ""],
+        route: Int[Array, ""],
+    ) -> LeggedWalker:
+        """A state at rest with the trunk at a place."""
+        body = standing(place[:2], 0.0)
+        return LeggedWalker(
+            body=body.replace(qpos=body.qpos.at[:7].set(place)),
+            last_action=jnp.zeros(robot.JOINTS),
+            goal=goal,
+            previous=previous,
+            world=world,
+            route=route,
+            steps=jnp.zeros((), jnp.int32),
+            fallen=jnp.array(False),
+        )
+
+
+def make_environment(config: NavigationConfig, split: str = "training") -> LeggedNavigation:
+    """The environment of a configuration with the quadruped for a robot. Raises UserError if it can't be."""
+    plain = make_navigation(config, split)
+    noise = jnp.hypot(plain.lidar.noise, SENSOR_NOISE)
+    return LeggedNavigation(
+        worlds=plain.worlds,
+        robot=plain.robot,
+        lidar=plain.lidar.replace(noise=noise),
+        max_steps=plain.max_steps,
+        period=plain.period,
+        goal_radius=plain.goal_radius,
+        mirrors=plain.mirrors,
+        walking=walking_policy.load(),
+    )

@@ -1,0 +1,110 @@
+"""Navigation episodes of the quadruped in C MuJoCo: the same starts, policies, commands and lidar; other physics."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import PRNGKeyArray
+
+from cuelearner_envs.anymal.environment import LeggedNavigation, LeggedWalker
+from cuelearner_envs.anymal.judge import Judge
+from cuelearner_envs.anymal.model import planar_pose
+from cuelearner_envs.navigation.environment import latest_first
+from cuelearner_jax.actions import rotate
+
+Policy = Callable[[PRNGKeyArray, Any, jax.Array], jax.Array]  # (key, states, observations) -> directions
+
+
+@jax.jit
+def _begin(env: LeggedNavigation, keys: PRNGKeyArray) -> tuple[LeggedWalker, jax.Array]:
+    return jax.vmap(env.reset)(keys)
+
+
+@jax.jit
+def _act(env: LeggedNavigation, body: Any, last_action: jax.Array, headings: jax.Array) -> jax.Array:
+    return jax.vmap(env.act)(body, last_action, headings)
+
+
+_poses = jax.jit(jax.vmap(planar_pose))
+
+
+@jax.jit
+@partial(jax.vmap, in_axes=(None, 0, 0, 0, 0, 0))
+def _after(
+    env: LeggedNavigation, state: LeggedWalker, body: Any, last: jax.Array, action: jax.Array, fallen: jax.Array
+) -> tuple[LeggedWalker, jax.Array, Any]:
+    """The state that a step of another engine has led to, what is seen there, and what has ended."""
+    state = state.replace(
+        body=body,
+        last_action=last,
+        previous=latest_first(action, state.previous),
+        steps=state.steps + 1,
+        fallen=state.fallen | fallen,
+    )
+    return state, env.observe(state), env.ends(state)
+
+
+class Course:
+    """Robots in C MuJoCo, each in an episode of an environment."""
+
+    def __init__(self, env: LeggedNavigation, keys: PRNGKeyArray):
+        """As many robots as keys, each at the start that `env.reset` gives for its key."""
+        self.env = env
+        self.state, self.obs = _begin(env, keys)
+        count = len(keys)
+        self.judge = Judge([float(env.ground.friction)] * count, [float(env.ground.payload)] * count)
+        for number, pose in enumerate(self.poses):
+            self.judge.place(number, pose)
+
+    @property
+    def poses(self) -> np.ndarray:
+        """x, y, yaw [m, rad] of each robot (robots, 3)."""
+        return np.asarray(_poses(self.state.body.qpos))
+
+    def step(self, actions: jax.Array, each: Callable[[np.ndarray], None] | None = None) -> tuple[Any, Any, Any]:
+        """A step of navigation of each; `each` sees the configurations after every step of control.
+
+        Returns:
+            outcome, terminated, truncated, as `Navigation.ends` does, each (robots,).
+        """
+        headings = rotate(actions, jnp.asarray(self.poses[:, 2]))
+        body, last = self.state.body, self.state.last_action
+        for _ in range(self.env.control_steps):
+            last = _act(self.env, body, last, headings)
+            self.judge.control(np.asarray(last))
+            body = body.replace(qpos=jnp.asarray(self.judge.qpos), qvel=jnp.asarray(self.judge.qvel))
+            if each:
+                each(self.judge.qpos)
+        fallen = jnp.asarray(self.judge.fallen)
+        self.state, self.obs, ends = _after(self.env, self.state, body, last, actions, fallen)
+        return jax.device_get(ends)
+
+
+def rollout(
+    policy: Policy, env: LeggedNavigation, key: PRNGKeyArray, num_envs: int, steps: int
+) -> dict[str, np.ndarray]:
+    """`cuelearner_jax.evaluate.rollout` of first episodes alone, the same ones, in C MuJoCo.
+
+    Returns:
+        Means over the episodes that ended within `steps` shared by all, and "finished", their share.
+    """
+    k_reset, k_run = jax.random.split(key)
+    course = Course(env, jax.random.split(k_reset, num_envs))
+    choose = jax.jit(policy)
+    running, outcomes = np.ones(num_envs, bool), []
+    for index in range(steps // num_envs):
+        k_act, _ = jax.random.split(jax.random.fold_in(k_run, index))
+        outcome, terminated, truncated = course.step(choose(k_act, course.state, course.obs))
+        ended = running & (terminated | truncated)
+        outcomes += [{name: value[number] for name, value in outcome.items()} for number in np.flatnonzero(ended)]
+        running &= ~ended
+        course.judge.retired |= ended
+        if not running.any():
+            break
+    means = {name: np.asarray(np.mean([one[name] for one in outcomes])) for name in (outcomes[0] if outcomes else {})}
+    return {**means, "finished": np.asarray(1.0 - running.mean())}

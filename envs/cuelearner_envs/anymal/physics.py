@@ -1,0 +1,105 @@
+"""The quadruped's physics in MJX: a step of control from the little that has to be carried between steps."""
+
+# pyright: reportAttributeAccessIssue=false
+# (MuJoCo's compiled module has no stubs)
+
+from __future__ import annotations
+
+import contextlib
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Bool, Float
+
+from cuelearner_envs.anymal import model as robot
+
+with contextlib.redirect_stdout(None):  # it tells of an optional engine that is not installed
+    from mujoco import mjx
+
+Scalar = float | Float[Array, ""]
+LOWEST_TRUNK, LOWEST_KNEE = 0.3, 0.05  # lower than this the robot has fallen [m]
+LEAST_UPRIGHT = 0.5  # cosine of the tilt beyond which it has fallen
+
+
+class Body(struct.PyTreeNode):
+    """All that is carried; `mjx.Data` (kilobytes) is rebuilt from it each step."""
+
+    qpos: Float[Array, "19"]  # see `model`
+    qvel: Float[Array, "18"]
+    warmstart: Float[Array, "18"]  # the solver's first guess: the last accelerations [m/s^2, rad/s^2]
+
+
+class Ground(struct.PyTreeNode):
+    """What may differ between robots."""
+
+    friction: Scalar = robot.FRICTION  # of feet on the floor
+    payload: Scalar = 0.0  # carried at the trunk's centre of mass [kg]
+
+
+class Felt(struct.PyTreeNode):
+    """What a step of control tells beside the body's new state."""
+
+    foot_heights: Float[Array, "4"]  # of the feet's lowest points above the floor [m]
+    torques: Float[Array, "12"]  # of the drives, at the step's end [Nm]
+    fallen: Bool[Array, ""]
+
+
+@functools.cache
+def _compiled() -> tuple[Any, Any, Any]:
+    """MJX's model and an empty `mjx.Data`, and the numbers of what is looked at."""
+    model = robot.load()
+    legs = ("LF", "RF", "LH", "RH")
+    places = {
+        "feet": jnp.array([model.geom(f"{leg}_FOOT").id for leg in legs]),
+        "shanks": jnp.array([model.body(f"{leg}_SHANK").id for leg in legs]),
+        "trunk": model.body("trunk").id,
+    }
+    return mjx.put_model(model, impl="jax"), mjx.make_data(model, impl="jax"), places
+
+
+def compiled() -> tuple[Any, Any, Any]:
+    """`_compiled`, whose arrays are real ones even where this is first called while something is traced."""
+    with jax.ensure_compile_time_eval():
+        return _compiled()
+
+
+def standing(place: Float[Array, "2"], yaw: Scalar) -> Body:
+    """The robot at rest on straight feet at a place [m], turned by `yaw` [rad]."""
+    half = jnp.asarray(yaw) / 2
+    quaternion = jnp.stack([jnp.cos(half), jnp.zeros(()), jnp.zeros(()), jnp.sin(half)])
+    height = jnp.full(1, robot.STANDING_HEIGHT)
+    qpos = jnp.concatenate([place, height, quaternion, jnp.asarray(robot.HOME, jnp.float32)])
+    return Body(qpos, jnp.zeros(18), jnp.zeros(18))
+
+
+def control(body: Body, action: Float[Array, "12"], ground: Ground) -> tuple[Body, Felt]:
+    """The body after a step of control (0.02 s) with an action in [-1, 1]: targets of the joints round home."""
+    model, data, places = compiled()
+    trunk, feet = places["trunk"], places["feet"]
+    model = model.replace(
+        geom_friction=model.geom_friction.at[feet, 0].set(ground.friction),
+        body_mass=model.body_mass.at[trunk].add(ground.payload),
+    )
+    targets = jnp.asarray(robot.HOME) + jnp.asarray(robot.ACTION_SCALE) * action
+
+    def one(carry: Body, _: None) -> tuple[Body, tuple[jax.Array, ...]]:
+        begun = data.replace(qpos=carry.qpos, qvel=carry.qvel, qacc_warmstart=carry.warmstart, ctrl=targets)
+        with jax.default_matmul_precision("highest"):  # an accelerator would round the factors to three digits
+            done = mjx.step(model, begun)
+        heights = done.geom_xpos[feet, 2], done.xpos[places["shanks"], 2], done.actuator_force
+        return Body(done.qpos, done.qvel, done.qacc_warmstart), heights
+
+    steps = round(robot.CONTROL_PERIOD / float(robot.load().opt.timestep))
+    body, seen = jax.lax.scan(one, body, length=steps)
+    foot, knee, torques = (leaf[-1] for leaf in seen)
+    return body, Felt(foot - robot.FOOT_RADIUS, torques, fallen(body, knee))
+
+
+def fallen(body: Body, knees: Float[Array, "4"]) -> Bool[Array, ""]:
+    """Does anything but the feet reach the floor, or is the robot on its side? True for numbers that blew up, too."""
+    upright = robot.rotation(body.qpos[3:7])[2, 2]
+    stands = (upright > LEAST_UPRIGHT) & (body.qpos[2] > LOWEST_TRUNK) & (knees > LOWEST_KNEE).all()
+    return ~(stands & jnp.isfinite(body.qvel).all())

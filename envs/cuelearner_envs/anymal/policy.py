@@ -1,0 +1,114 @@
+"""The walking policy: what it perceives, its network as a plain function, and its file.
+
+policy/policy.npz    the network in half precision
+policy/policy.json   how it was trained and what it was measured to do
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from cuelearner_envs.anymal import model as robot
+from cuelearner_jax.errors import UserError
+
+OBS = 48
+WEIGHTS, ABOUT = "policy.npz", "policy.json"
+SHIPPED = Path(__file__).parent / "policy"
+
+# Largest error of each entry of an observation, as `observe` orders them: of velocity [m/s], turning [rad/s], down,
+# command (none), joints [rad], their speeds [rad/s], and the last action (none).
+NOISE = np.repeat([0.1, 0.2, 0.05, 0.0, 0.01, 1.5, 0.0], [3, 3, 3, 3, 12, 12, 12])
+
+
+class WalkingPolicy(struct.PyTreeNode):
+    """Observation -> targets of the joints in [-1, 1]: swish layers on normalised entries, the mean of PPO's policy."""
+
+    mean: Float[Array, "48"]
+    std: Float[Array, "48"]
+    layers: tuple[tuple[Float[Array, "inputs outputs"], Float[Array, " outputs"]], ...]  # kernel and bias of each
+
+    def __call__(self, obs: Float[Array, "... 48"]) -> Float[Array, "... 12"]:
+        """Any leading axes."""
+        x = (obs - self.mean) / self.std
+        for kernel, bias in self.layers[:-1]:
+            x = jax.nn.swish(x @ kernel + bias)
+        kernel, bias = self.layers[-1]
+        return jnp.tanh(x @ kernel + bias)
+
+
+def observe(
+    qpos: Float[Array, "19"], qvel: Float[Array, "18"], last_action: Float[Array, "12"], command: Float[Array, "3"]
+) -> Float[Array, "48"]:
+    """What the walking policy perceives, without errors.
+
+    - 3: the trunk's velocity [m/s], 3: its angular velocity [rad/s], 3: which way is down; all in its own frame
+    - 3: the command: velocity forward and to the left [m/s], turning rate [rad/s]
+    - 12: joints' angles from home [rad], 12: their speeds [rad/s]; 12: the last action
+    """
+    turn = robot.rotation(qpos[3:7])
+    return jnp.concatenate(
+        [
+            robot.in_body(turn, qvel[:3]),
+            qvel[3:6],
+            -turn[2],
+            command,
+            qpos[7:] - jnp.asarray(robot.HOME, jnp.float32),
+            qvel[6:],
+            last_action,
+        ]
+    )
+
+
+def noisy(key: PRNGKeyArray, obs: Float[Array, "48"], level: float | Float[Array, ""]) -> Float[Array, "48"]:
+    """An observation with uniform errors, at `level` 1 up to `NOISE`."""
+    return obs + level * jnp.asarray(NOISE, jnp.float32) * jax.random.uniform(key, (OBS,), minval=-1.0, maxval=1.0)
+
+
+def from_brax(params: Any) -> WalkingPolicy:
+    """Of the parameters (normaliser, policy, ...) that brax's PPO trains: the network's mean, not its spread."""
+    normaliser, dense = params[0], params[1]["params"]
+    layers = [(dense[f"hidden_{number}"]["kernel"], dense[f"hidden_{number}"]["bias"]) for number in range(len(dense))]
+    kernel, bias = layers[-1]
+    layers[-1] = kernel[:, : robot.JOINTS], bias[: robot.JOINTS]  # the rest is the logarithm of a spread
+    return WalkingPolicy(normaliser.mean, normaliser.std, tuple(layers))
+
+
+def save(folder: Path, policy: WalkingPolicy, about: dict[str, Any]) -> None:
+    """Writes a policy and what is to be known about it; replaces an earlier one in one step each."""
+    folder.mkdir(parents=True, exist_ok=True)
+    arrays = {"mean": policy.mean, "std": policy.std}
+    for number, (kernel, bias) in enumerate(policy.layers):
+        arrays |= {f"kernel_{number}": kernel, f"bias_{number}": bias}
+    temporary = folder / "unfinished.npz"
+    halves: dict[str, Any] = {name: np.asarray(leaf, np.float16) for name, leaf in arrays.items()}
+    np.savez_compressed(temporary, **halves)
+    temporary.replace(folder / WEIGHTS)
+    temporary = folder / "unfinished.json"
+    temporary.write_text(json.dumps(about, indent=1) + "\n")
+    temporary.replace(folder / ABOUT)
+
+
+def load(folder: Path = SHIPPED) -> WalkingPolicy:
+    """A policy that `save` wrote, the shipped one by default. Raises UserError if there is none."""
+    file = folder / WEIGHTS
+    if not file.is_file():
+        raise UserError(f"no walking policy in {folder}: train one with `cuelearner locomotion train --out {folder}`")
+    try:
+        with np.load(file) as stored:
+            arrays = {name: jnp.asarray(stored[name], jnp.float32) for name in stored.files}
+        count = sum(name.startswith("kernel_") for name in arrays)
+        layers = tuple((arrays[f"kernel_{number}"], arrays[f"bias_{number}"]) for number in range(count))
+        policy = WalkingPolicy(arrays["mean"], arrays["std"], layers)
+    except (OSError, ValueError, KeyError) as error:
+        raise UserError(f"{file} is damaged: restore it, or train the policy anew") from error
+    if not layers or layers[0][0].shape[0] != OBS or layers[-1][0].shape[1] != robot.JOINTS:
+        raise UserError(f"{file} is no walking policy of this robot ({OBS} observations, {robot.JOINTS} joints)")
+    return policy

@@ -1,0 +1,151 @@
+"""Pictures of the quadruped in its world, from above and from the side, rendered by MuJoCo off screen.
+
+Rendering needs OpenGL: a driver of the machine's, or Mesa's in software.
+"""
+
+# pyright: reportAttributeAccessIssue=false
+# (MuJoCo's compiled module has no stubs)
+
+from __future__ import annotations
+
+import importlib
+import os
+from types import TracebackType
+from typing import Any
+
+import mujoco
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from cuelearner_envs.anymal import model as robot
+from cuelearner_envs.navigation.world import FAR_AWAY, World
+from cuelearner_jax.errors import UserError
+
+Picture = UInt8[np.ndarray, "height width 3"]
+LOW, TALL, GOAL = (0.79, 0.8, 0.82, 1), (0.36, 0.39, 0.42, 1), (0.0, 0.62, 0.45, 0.55)
+BEAM, HIT = (0.34, 0.71, 0.91, 0.16), (0.8, 0.47, 0.65, 1)
+LOWEST, TALLEST = 0.6, 1.5  # heights that have the colours `LOW` and `TALL` [m]
+BEAMS_APART = 3  # of the beams every so many-th is drawn
+NO_OPENGL = (
+    "MuJoCo can't render here ({}): install OpenGL for EGL (apt-get install libegl1 libgl1-mesa-dri), "
+    "or OSMesa (libosmesa6) and set MUJOCO_GL=osmesa"
+)
+
+
+def furnished(world: World, goal: Float[np.ndarray, "2"], goal_radius: float) -> mujoco.MjModel:
+    """The robot's model with a world's solids and the goal, all of them to be looked at only."""
+    spec = mujoco.MjSpec.from_file(str(robot.FILE))
+    look: dict[str, Any] = {"contype": 0, "conaffinity": 0}
+    for (x, y, yaw, length, width), height in _used(world.boxes, world.box_heights):
+        turn = [np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)]
+        size, place = [length, width, height / 2], [x, y, height / 2]
+        kind = mujoco.mjtGeom.mjGEOM_BOX
+        spec.worldbody.add_geom(type=kind, pos=place, quat=turn, size=size, rgba=_shade(height), **look)
+    for (x, y, radius), height in _used(world.circles, world.circle_heights):
+        size, place = [radius, height / 2, 0], [x, y, height / 2]
+        kind = mujoco.mjtGeom.mjGEOM_CYLINDER
+        spec.worldbody.add_geom(type=kind, pos=place, size=size, rgba=_shade(height), **look)
+    disc = mujoco.mjtGeom.mjGEOM_CYLINDER
+    spec.worldbody.add_geom(type=disc, pos=[*goal, 0.01], size=[goal_radius, 0.01, 0], rgba=GOAL, **look)
+    return spec.compile()
+
+
+class Studio:
+    """Renders a model from several sides. Used as a context: the graphics memory is given back at its end."""
+
+    def __init__(self, model: mujoco.MjModel, width: int, height: int):
+        """Pictures of `width` by `height` dots. Raises UserError where there is no OpenGL."""
+        self.model, self.data = model, mujoco.MjData(model)
+        self.size = width, height
+        try:
+            self._gl = _gl_context()(width, height)
+            self._gl.make_current()
+            self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
+        except Exception as error:  # what is missing decides the kind: no library, no display, no driver
+            raise UserError(NO_OPENGL.format(str(error).strip().split("\n")[0][:80] or type(error).__name__)) from error
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
+        self._scene = mujoco.MjvScene(model, maxgeom=4000)
+        self._scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = 0
+
+    def __enter__(self) -> Studio:
+        return self
+
+    def __exit__(self, *_: type[BaseException] | BaseException | TracebackType | None) -> None:
+        self._context.free()
+        self._gl.free()
+
+    def pose(self, qpos: Float[np.ndarray, "19"]) -> None:
+        """Puts the robot into a configuration."""
+        self.data.qpos[:] = qpos
+        mujoco.mj_forward(self.model, self.data)
+
+    def picture(
+        self,
+        camera: mujoco.MjvCamera,
+        ends: Float[np.ndarray, "beams 3"] | None = None,
+        met: Bool[np.ndarray, " beams"] | None = None,
+    ) -> Picture:
+        """What a camera sees; with the lidar's beams up to where they end [m] and dots where they met something."""
+        option, every = mujoco.MjvOption(), mujoco.mjtCatBit.mjCAT_ALL
+        mujoco.mjv_updateScene(self.model, self.data, option, None, camera, every, self._scene)
+        if ends is not None and met is not None:
+            self._draw(ends, met)
+        rectangle = mujoco.MjrRect(0, 0, *self.size)
+        mujoco.mjr_render(rectangle, self._scene, self._context)
+        picture = np.empty((self.size[1], self.size[0], 3), np.uint8)
+        mujoco.mjr_readPixels(picture, None, rectangle, self._context)
+        return picture[::-1]
+
+    def _draw(self, ends: Float[np.ndarray, "beams 3"], met: Bool[np.ndarray, " beams"]) -> None:
+        origin = np.asarray(self.data.site("lidar").xpos)
+        line, ball = mujoco.mjtGeom.mjGEOM_LINE, mujoco.mjtGeom.mjGEOM_SPHERE
+        for number, end in enumerate(np.asarray(ends, float)):
+            if number % BEAMS_APART == 0:
+                mujoco.mjv_connector(self._added(line, BEAM), line, 1.0, origin, end)
+            if met[number]:
+                self._added(ball, HIT, end)
+
+    def _added(self, kind: Any, colour: tuple, place: np.ndarray | None = None) -> Any:
+        """One more thing in the scene, of 25 mm if it has a size."""
+        geom = self._scene.geoms[self._scene.ngeom]
+        at, size = np.zeros(3) if place is None else place, np.full(3, 0.025)
+        mujoco.mjv_initGeom(geom, kind, size, at, np.eye(3).ravel(), np.asarray(colour, np.float32))
+        self._scene.ngeom += 1
+        return geom
+
+
+def above(extent: Float[np.ndarray, "2"]) -> mujoco.MjvCamera:
+    """Looks down on the whole hall, x to the right."""
+    camera = mujoco.MjvCamera()
+    camera.lookat[:], camera.azimuth, camera.elevation = (0, 0, 0), 90, -90
+    camera.distance = 1.3 * float(np.max(extent))
+    return camera
+
+
+def beside(qpos: Float[np.ndarray, "19"], azimuth: float = 130.0, distance: float = 3.2) -> mujoco.MjvCamera:
+    """Looks at the robot from the side [deg, m]."""
+    camera = mujoco.MjvCamera()
+    camera.lookat[:] = qpos[0], qpos[1], 0.35
+    camera.azimuth, camera.elevation, camera.distance = azimuth, -22, distance
+    return camera
+
+
+def _gl_context() -> Any:
+    """MuJoCo's kind of OpenGL context: EGL, which needs no display, unless MUJOCO_GL names another."""
+    wanted = os.environ.get("MUJOCO_GL", "").lower()
+    name = wanted if wanted in ("egl", "osmesa", "glfw") else "egl"
+    if name != "glfw":
+        os.environ.setdefault("PYOPENGL_PLATFORM", name)
+    return importlib.import_module(f"mujoco.{name}").GLContext
+
+
+def _used(rows: Any, heights: Any) -> list[tuple[list[float], float]]:
+    """Solids that are there, and not far away to fill the arrays."""
+    pairs = zip(np.asarray(rows, float).tolist(), np.asarray(heights, float).tolist(), strict=True)
+    return [(row, height) for row, height in pairs if abs(row[0]) < FAR_AWAY / 2]
+
+
+def _shade(height: float) -> list[float]:
+    """The taller the darker."""
+    share = np.clip((height - LOWEST) / (TALLEST - LOWEST), 0, 1)
+    return [float((1 - share) * low + share * tall) for low, tall in zip(LOW, TALL, strict=True)]

@@ -1,0 +1,149 @@
+"""How well a walking policy tracks random commands, in MJX and in C MuJoCo: one protocol, one way to count.
+
+Commands change every 4 s. The last 2 s of each are settled. An error is a mean over all settled stretches of robots
+that stand: `error` of the stretch's mean velocity, `momentary_error` of the velocity at each moment, the sway of the
+gait included.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
+
+from cuelearner_envs.anymal import model as robot
+from cuelearner_envs.anymal.judge import Judge
+from cuelearner_envs.anymal.locomotion import Trial, pushed, random_command, random_ground
+from cuelearner_envs.anymal.physics import Body, Ground, control, standing
+from cuelearner_envs.anymal.policy import WalkingPolicy, noisy, observe
+
+HELD, SETTLING = 200, 100  # steps of control that a command is held for, and of those that are no settled ones
+SECONDS = 20.0  # a robot walks for
+
+CLEAN = Trial()
+DISTURBED = Trial(noise=1.0, push=0.5)
+VARIED = Trial(friction=(0.5, 1.25), payload=6.0)
+ENGINES = ("mjx", "mujoco")
+TRIALS = {"clean": CLEAN, "disturbed": DISTURBED, "varied": VARIED}
+
+
+def steps_of(seconds: float) -> int:
+    """Steps of control, whole commands of them."""
+    return max(1, round(seconds / robot.CONTROL_PERIOD / HELD)) * HELD
+
+
+@partial(jax.jit, static_argnames=("robots", "steps"))
+def walk(
+    policy: WalkingPolicy, trial: Trial, key: PRNGKeyArray, robots: int, steps: int
+) -> tuple[Float[Array, "steps robots 3"], Float[Array, "steps robots 3"], Bool[Array, "steps robots"]]:
+    """Velocities (`model.planar_velocity`), commands and who has fallen, step by step, in MJX."""
+    k_ground, k_run = jax.random.split(key)
+    grounds = jax.vmap(partial(random_ground, trial=trial))(jax.random.split(k_ground, robots))
+
+    def one(ground: Ground, key: PRNGKeyArray, state: tuple, index: jax.Array) -> tuple[tuple, tuple]:
+        body, last_action, down = state
+        command = random_command(jax.random.fold_in(key, index // HELD), trial)
+        k_noise, k_push = jax.random.split(jax.random.fold_in(jax.random.fold_in(key, 1), index))
+        obs = noisy(k_noise, observe(body.qpos, body.qvel, last_action, command), trial.noise)
+        action = policy(obs)
+        after, felt = control(pushed(k_push, body, trial), action, ground)
+        down = down | felt.fallen
+        body = jax.tree.map(partial(jnp.where, down), body, after)  # who has fallen stays there
+        return (body, action, down), (robot.planar_velocity(body.qpos, body.qvel), command, down)
+
+    keys = jax.random.split(k_run, robots)
+    start: Body = standing(jnp.zeros(2), 0.0)
+    begun = (start, jnp.zeros(robot.JOINTS), jnp.array(False))
+    states = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (robots, *leaf.shape)), begun)
+
+    def everyone(states: tuple, index: jax.Array) -> tuple[tuple, tuple]:
+        return jax.vmap(one, (0, 0, 0, None))(grounds, keys, states, index)
+
+    return jax.lax.scan(everyone, states, jnp.arange(steps))[1]
+
+
+def judged(
+    policy: WalkingPolicy, trial: Trial, key: PRNGKeyArray, robots: int, steps: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """`walk` in C MuJoCo at its finer step."""
+    k_ground, k_run = jax.random.split(key)
+    grounds = jax.vmap(partial(random_ground, trial=trial))(jax.random.split(k_ground, robots))
+    judge = Judge(np.asarray(grounds.friction).tolist(), np.asarray(grounds.payload).tolist())
+    keys = jax.random.split(k_run, robots)
+
+    @jax.jit
+    def before(qpos: jax.Array, qvel: jax.Array, last: jax.Array, index: jax.Array) -> tuple[jax.Array, ...]:
+        """Actions, commands and pushes of a step."""
+
+        def one(key: PRNGKeyArray, qpos: jax.Array, qvel: jax.Array, last: jax.Array) -> tuple[jax.Array, ...]:
+            command = random_command(jax.random.fold_in(key, index // HELD), trial)
+            k_noise, k_push = jax.random.split(jax.random.fold_in(jax.random.fold_in(key, 1), index))
+            action = policy(noisy(k_noise, observe(qpos, qvel, last, command), trial.noise))
+            after = pushed(k_push, Body(qpos, qvel, qvel), trial).qvel
+            return action, command, after[:2] - qvel[:2]
+
+        return jax.vmap(one)(keys, qpos, qvel, last)
+
+    measure = jax.jit(jax.vmap(robot.planar_velocity))
+    last = np.zeros((robots, robot.JOINTS), np.float32)
+    rows = []
+    for index in range(steps):
+        last, command, change = (np.asarray(leaf) for leaf in before(judge.qpos, judge.qvel, last, jnp.int32(index)))
+        for number in np.flatnonzero(change.any(-1)):
+            judge.push(int(number), change[number])
+        judge.control(last)
+        rows.append((np.asarray(measure(judge.qpos, judge.qvel)), command, judge.fallen.copy()))
+    velocities, commands, down = (np.stack(column) for column in zip(*rows, strict=True))
+    return velocities, commands, down
+
+
+def figures(
+    velocities: Float[np.ndarray, "steps robots 3"],
+    commands: Float[np.ndarray, "steps robots 3"],
+    down: Bool[np.ndarray, "steps robots"],
+) -> dict[str, float]:
+    """Errors of settled walking [m/s, rad/s] and the share of robots that fell."""
+    velocities, commands, down = (np.asarray(leaf) for leaf in (velocities, commands, down))
+    stretches = len(velocities) // HELD
+
+    def settled(leaf: np.ndarray) -> np.ndarray:
+        """(stretches, settled steps, robots, ...)"""
+        return leaf[: stretches * HELD].reshape(stretches, HELD, *leaf.shape[1:])[:, SETTLING:]
+
+    off, standing = settled(velocities - commands), ~settled(down).any(1)
+    mean = off.mean(1)
+
+    def over(values: np.ndarray) -> float:
+        return float(values[standing].mean()) if standing.any() else float("nan")
+
+    return {
+        "error": over(np.linalg.norm(mean[..., :2], axis=-1)),
+        "momentary_error": over(np.linalg.norm(off[..., :2], axis=-1).mean(1)),
+        "turning_error": over(np.abs(mean[..., 2])),
+        "falls": float(down[-1].mean()),
+        "robots": down.shape[1],
+        "seconds": len(down) * robot.CONTROL_PERIOD,
+    }
+
+
+def measure_training(policy: WalkingPolicy, key: PRNGKeyArray, robots: int) -> dict[str, float]:
+    """Figures of undisturbed walking in MJX."""
+    return measure(policy, "mjx", CLEAN, key, robots)
+
+
+def examine(policy: WalkingPolicy, key: PRNGKeyArray, robots: int) -> dict[str, dict[str, float]]:
+    """Figures of every trial of `TRIALS` in both engines."""
+    return {
+        f"{engine}, {name}": measure(policy, engine, trial, key, robots)
+        for engine in ENGINES
+        for name, trial in TRIALS.items()
+    }
+
+
+def measure(policy: WalkingPolicy, engine: str, trial: Trial, key: PRNGKeyArray, robots: int) -> dict[str, float]:
+    """Figures of 20 s of random commands in `mjx` or `mujoco`."""
+    play = {"mjx": walk, "mujoco": judged}[engine]
+    return figures(*jax.device_get(play(policy, trial, key, robots=robots, steps=steps_of(SECONDS))))

@@ -1,0 +1,100 @@
+"""The quadruped's commands: walking policies, other robots and engines for a trained agent."""
+
+import json
+from pathlib import Path
+
+import imageio.v2 as imageio
+import numpy as np
+import pytest
+
+from cuelearner_envs.anymal import model, policy, tracking
+from cuelearner_envs.anymal.scene import Studio
+from cuelearner_jax.cli import main
+from cuelearner_jax.errors import UserError
+
+AGENT = Path(__file__).parents[2] / "docs" / "data" / "navigation_agent"
+FEW = ["--envs", "3", "--steps", "12", "--task.worlds", "2", "--task.max-steps", "4"]
+
+REFUSED = [
+    (["evaluate", "billiards", "--robot", "anymal"], "billiards has no robots to choose from: leave out --robot"),
+    (["evaluate", "navigation", "--robot", "anymall"], "unknown robot 'anymall', did you mean 'anymal'"),
+    (["evaluate", "navigation", "--engine", "mujoco"], "--engine mujoco needs --robot: choose one of anymal"),
+    (["evaluate", "navigation", "--robot", "anymal", "--engine", "bullet"], "unknown engine 'bullet'"),
+    (["evaluate", "navigation", "--robot", "anymal", "--policy", "agent"], "needs a trained run"),
+    (["render", "billiards", "--robot", "anymal"], "billiards has no robots"),
+    (["locomotion", "walk"], "unknown command 'locomotion walk': choose one of train, evaluate"),
+    (["locomotion", "train", "--train.robots", "0"], "train.robots is 0: give a positive number"),
+    (["locomotion", "train", "--train.robots", "100"], "give a multiple of train.robots (100)"),
+    (["locomotion", "evaluate", "nowhere"], "no walking policy in nowhere: train one with"),
+    (["locomotion", "evaluate", "--robots", "0"], "--robots is 0: give a positive number"),
+    (["locomotion", "evaluate", "--robts", "3"], "perhaps you meant --robots"),
+]
+
+
+@pytest.mark.parametrize(("command", "says"), REFUSED, ids=[" ".join(command)[-40:] for command, _ in REFUSED])
+def test_bad_combinations_are_refused(refused, tmp_path, monkeypatch, command, says):
+    monkeypatch.chdir(tmp_path)
+    refused(command, says, tmp_path)
+
+
+def test_files_in_use_are_left_alone(refused, tmp_path):
+    kept = tmp_path / "kept.json"
+    kept.write_text("mine")
+    refused(["locomotion", "train", "--out", tmp_path], "not empty: give another --out", tmp_path)
+    refused(["locomotion", "evaluate", "--out", kept], "exists: give another --out", tmp_path)
+
+
+def test_a_policy_is_measured_trial_by_trial(tmp_path, monkeypatch, capsys):
+    short = {"clean": tracking.CLEAN}
+    monkeypatch.setattr(tracking, "TRIALS", short)
+    monkeypatch.setattr(tracking, "SECONDS", 4.0)
+    monkeypatch.setattr(tracking, "ENGINES", ("mujoco",))  # MJX compiles for long
+    out = tmp_path / "figures.json"
+    assert main(["locomotion", "evaluate", str(policy.SHIPPED), "--robots", "3", "--out", str(out)]) == 0
+    figures = json.loads(out.read_text())["figures"]
+    assert list(figures) == ["mujoco, clean"]
+    assert figures["mujoco, clean"]["robots"] == 3
+    assert "mujoco, clean" in capsys.readouterr().out
+
+
+def test_an_agent_of_the_simple_robot_walks_in_c_mujoco(tmp_path, capsys):
+    out = tmp_path / "measured.json"
+    command = ["evaluate", str(AGENT), "--robot", "anymal", "--engine", "mujoco", *FEW]
+    assert main([*command, "--out", str(out)]) == 0
+    measured = json.loads(out.read_text())
+    assert (measured["robot"], measured["engine"]) == ("anymal", "mujoco")
+    (row,) = measured["rows"]
+    assert row["finished"] == [1.0]
+    assert sum(row[name][0] for name in ("success", "collision", "fall", "timeout")) == pytest.approx(1)
+    assert "fall" in capsys.readouterr().out
+
+
+@pytest.fixture
+def opengl():
+    """Skips where MuJoCo can't render."""
+    try:
+        with Studio(model.load(), 32, 32):
+            pass
+    except UserError as error:
+        pytest.skip(str(error))
+
+
+def test_its_episodes_are_filmed_from_above_and_from_the_side(opengl, tmp_path):
+    command = ["render", str(AGENT), "--robot", "anymal", "--steps", "2", "--task.worlds", "2", "--out", str(tmp_path)]
+    assert main(command) == 0
+    pictures = imageio.mimread(tmp_path / "navigation_agent-anymal-agent.gif")
+    assert len(pictures) == 4  # 0.4 s at 10 a second
+    height, width = pictures[0].shape[:2]
+    assert width == 2 * height
+    for half in np.split(pictures[0][..., :3], 2, axis=1):
+        assert half.std() > 10
+    assert imageio.imread(tmp_path / "navigation_agent-anymal-agent.png").std() > 10
+
+
+def test_where_nothing_can_be_rendered_one_line_says_what_to_install(monkeypatch, refused, tmp_path):
+    def missing():
+        raise ImportError("no libEGL")
+
+    monkeypatch.setattr("cuelearner_envs.anymal.scene._gl_context", missing)
+    command = ["render", AGENT, "--robot", "anymal", "--steps", "1", "--task.worlds", "2", "--out", tmp_path]
+    refused(command, "MuJoCo can't render here (no libEGL): install OpenGL for EGL", tmp_path)

@@ -1,0 +1,149 @@
+"""Walking in MJX: steps of control against C MuJoCo, rewards and ends by hand. One compile serves the whole file."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from cuelearner_envs.anymal import model as robot
+from cuelearner_envs.anymal.locomotion import Locomotion, Trial, random_command, random_ground
+from cuelearner_envs.anymal.physics import Ground
+from cuelearner_envs.anymal.policy import OBS, observe
+
+ROBOTS = 8
+SCENES = ("standing", "trotting", "flying", "slippery", "loaded", "on its side", "low", "blown up")
+CALM = Trial(rest=1.0)  # no noise, no pushes; commands to stand
+
+
+@pytest.fixture(scope="module")
+def env():
+    return Locomotion(CALM)
+
+
+@pytest.fixture(scope="module")
+def scenes(env):
+    """Eight robots in different configurations, on different grounds, and actions for them."""
+    state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), ROBOTS))
+    rng = np.random.default_rng(0)
+    qpos, qvel = np.array(state.pipeline_state.body.qpos), np.array(state.pipeline_state.body.qvel)
+    qpos[:, :7], qvel[:] = [0, 0, 0.54, 1, 0, 0, 0], 0
+    qpos[1, 7:] += rng.uniform(-0.3, 0.3, 12)
+    qvel[1] = rng.uniform(-0.5, 0.5, 18)
+    qpos[2, 2], qvel[2, :6] = 1.0, [1.0, -0.5, 0.3, 0.4, -0.6, 0.8]
+    qvel[3, :2] = 0.8, 0.4  # slides
+    qpos[5, :7] = [0, 0, 0.6, np.cos(0.7), np.sin(0.7), 0, 0]
+    qpos[6, 2] = 0.25
+    qvel[7, 0] = np.nan
+    ground = Ground(
+        friction=jnp.array([0.8, 0.8, 0.8, 0.3, 0.8, 0.8, 0.8, 0.8]), payload=jnp.array([0, 0, 0, 0, 6.0, 0, 0, 0])
+    )
+    walk = state.pipeline_state
+    body = walk.body.replace(qpos=jnp.asarray(qpos), qvel=jnp.asarray(qvel))
+    state = state.replace(pipeline_state=walk.replace(body=body, ground=ground))
+    return state, jnp.asarray(rng.uniform(-0.5, 0.5, (ROBOTS, 12)), jnp.float32)
+
+
+@pytest.fixture(scope="module")
+def stepped(env, scenes):
+    """The scenes a step of control later."""
+    return jax.jit(jax.vmap(env.step))(*scenes)
+
+
+def in_c(state, action, number):
+    """The same step of control in C MuJoCo, with the solver's settings of the file."""
+    walk = state.pipeline_state
+    model = robot.load(friction=float(walk.ground.friction[number]), payload=float(walk.ground.payload[number]))
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:] = walk.body.qpos[number], walk.body.qvel[number]
+    data.ctrl[:] = robot.HOME + robot.ACTION_SCALE * np.asarray(action[number])
+    mujoco.mj_step(model, data, nstep=2)
+    return data
+
+
+@pytest.mark.parametrize("number", range(7), ids=SCENES[:7])
+def test_a_step_of_control_is_that_of_c_mujoco(scenes, stepped, number):
+    data, body = in_c(*scenes, number), stepped.pipeline_state.body
+    np.testing.assert_allclose(body.qpos[number], data.qpos, atol=5e-4)
+    np.testing.assert_allclose(body.qvel[number], data.qvel, atol=0.03)
+
+
+def test_in_flight_the_centre_of_mass_falls_freely(scenes, stepped):
+    state, _ = scenes
+    model, places, speeds = robot.load(), [], []
+    for walk in (state.pipeline_state, stepped.pipeline_state):
+        data = mujoco.MjData(model)
+        data.qpos[:], data.qvel[:] = walk.body.qpos[2], walk.body.qvel[2]
+        mujoco.mj_forward(model, data)
+        mujoco.mj_subtreeVel(model, data)
+        places.append(data.subtree_com[1].copy())
+        speeds.append(data.subtree_linvel[1].copy())
+    np.testing.assert_allclose(speeds[1] - speeds[0], [0, 0, -9.81 * 0.02], atol=6e-3)  # steps of 0.01 s while it spins
+    np.testing.assert_allclose(places[1] - places[0], 0.02 * (speeds[0] + speeds[1]) / 2, atol=2e-3)
+
+
+def test_friction_and_payload_make_a_difference(scenes, stepped):
+    state, action = scenes
+    walk = state.pipeline_state
+    usual = state.replace(pipeline_state=walk.replace(ground=Ground(jnp.full(ROBOTS, 0.8), jnp.zeros(ROBOTS))))
+    for number in (3, 4):
+        data = in_c(usual, action, number)
+        assert np.abs(stepped.pipeline_state.body.qvel[number] - data.qvel).max() > 0.01
+
+
+def test_falls_end_the_episode(stepped):
+    done = dict(zip(SCENES, np.asarray(stepped.done), strict=True))
+    assert {name for name, value in done.items() if value} == {"on its side", "low", "blown up"}
+
+
+def test_nothing_that_is_not_a_number_reaches_the_network_or_the_sum_of_rewards(stepped):
+    assert np.isfinite(stepped.reward).all()
+    assert np.isfinite(stepped.pipeline_state.body.qpos).all()
+
+
+def test_rewards_are_never_negative_and_calm_standing_earns_the_most(stepped):
+    reward = np.asarray(stepped.reward)
+    assert (reward >= 0).all()
+    assert reward[0] == reward[:3].max() > 0
+
+
+def test_observations_are_what_the_policy_is_told_in_order(stepped):
+    walk = stepped.pipeline_state
+    obs = np.asarray(stepped.obs)[0]
+    assert obs.shape == (OBS,)
+    np.testing.assert_allclose(obs[6:9], [0, 0, -1], atol=0.05)  # down
+    np.testing.assert_allclose(obs[9:12], walk.command[0])
+    np.testing.assert_allclose(obs[12:24], walk.body.qpos[0, 7:] - robot.HOME, atol=1e-6)
+    np.testing.assert_allclose(obs[24:36], walk.body.qvel[0, 6:], atol=1e-6)
+    np.testing.assert_allclose(obs[36:], walk.last_action[0])
+
+
+def test_velocities_are_told_in_the_trunks_own_frame():
+    half = np.pi / 4  # turned to the left by a right angle
+    qpos = jnp.concatenate([jnp.array([0, 0, 0.5, np.cos(half), 0, 0, np.sin(half)]), jnp.asarray(robot.HOME)])
+    qvel = jnp.zeros(18).at[1].set(1.0)  # along the world's y: straight ahead
+    np.testing.assert_allclose(observe(qpos, qvel, jnp.zeros(12), jnp.zeros(3))[:3], [1, 0, 0], atol=1e-6)
+
+
+def test_commands_fill_the_trials_bounds():
+    trial = Trial(speed=1.2, turning=1.6, rest=0.1)
+    draw = jax.jit(jax.vmap(partial(random_command, trial=trial)))
+    commands = np.asarray(draw(jax.random.split(jax.random.key(0), 4000)))
+    speed = np.linalg.norm(commands[:, :2], axis=-1)
+    assert 1.19 < speed.max() <= 1.2
+    assert 1.59 < np.abs(commands[:, 2]).max() <= 1.6
+    assert (speed == 0).mean() == pytest.approx(0.1, abs=0.02)  # 4000 draws: standard deviation 0.005
+    assert np.abs(commands.mean(0)).max() < 0.06
+
+
+def test_grounds_lie_within_the_trials_bounds():
+    trial = Trial(friction=(0.5, 1.25), payload=6.0)
+    draw = jax.jit(jax.vmap(partial(random_ground, trial=trial)))
+    ground = draw(jax.random.split(jax.random.key(0), 2000))
+    friction, payload = np.asarray(ground.friction), np.asarray(ground.payload)
+    assert 0.5 <= friction.min() < 0.51
+    assert 1.24 < friction.max() <= 1.25
+    assert 0 <= payload.min() < 0.1
+    assert 5.9 < payload.max() <= 6

@@ -1,0 +1,135 @@
+"""The walking policy: its file, its network against brax's, its tracking in C MuJoCo, and the counting by hand."""
+
+import itertools
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from cuelearner_envs.anymal import judge, policy, tracking
+from cuelearner_envs.anymal import model as robot
+from cuelearner_jax.errors import UserError
+
+
+def random_policy(layers=(16, 8)):
+    """A policy with random weights."""
+    rng, sizes = np.random.default_rng(0), (policy.OBS, *layers, robot.JOINTS)
+    pairs = itertools.pairwise(sizes)
+    made = [(rng.normal(size=pair) / 8, rng.normal(size=pair[1]) / 8) for pair in pairs]
+    mean, std = rng.normal(size=policy.OBS), rng.uniform(0.5, 2.0, policy.OBS)
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), policy.WalkingPolicy(mean, std, tuple(made)))
+
+
+# ----------------------------------------------------------------------------------------------- the network, the file
+
+
+def test_the_network_is_the_mean_of_braxs_policy():
+    from brax.training.acme import running_statistics, specs
+    from brax.training.agents.ppo import networks
+
+    made = networks.make_ppo_networks(
+        policy.OBS, robot.JOINTS, running_statistics.normalize, policy_hidden_layer_sizes=(32, 16)
+    )
+    seen = running_statistics.init_state(specs.Array((policy.OBS,), jnp.dtype("float32")))
+    obs = jax.random.normal(jax.random.key(1), (64, policy.OBS)) * 3 + 1
+    seen = running_statistics.update(seen, obs)
+    weights = made.policy_network.init(jax.random.PRNGKey(0))
+    params = (seen, weights, None)
+    wanted, _ = networks.make_inference_fn(made)(params, deterministic=True)(obs, jax.random.PRNGKey(2))
+    np.testing.assert_allclose(policy.from_brax(params)(obs), wanted, atol=1e-5)
+
+
+def test_a_saved_policy_acts_as_before(tmp_path):
+    made = random_policy()
+    policy.save(tmp_path / "kept", made, {"seed": 3})
+    obs = jax.random.normal(jax.random.key(0), (100, policy.OBS))
+    np.testing.assert_allclose(policy.load(tmp_path / "kept")(obs), made(obs), atol=5e-3)  # kept in half precision
+    assert json.loads((tmp_path / "kept" / policy.ABOUT).read_text()) == {"seed": 3}
+    assert sorted(path.name for path in (tmp_path / "kept").iterdir()) == [policy.ABOUT, policy.WEIGHTS]
+
+
+def test_what_is_no_policy_is_refused(tmp_path):
+    with pytest.raises(UserError, match=r"no walking policy in .*: train one with `cuelearner locomotion train"):
+        policy.load(tmp_path)
+    (tmp_path / policy.WEIGHTS).write_bytes(b"nothing")
+    with pytest.raises(UserError, match="is damaged"):
+        policy.load(tmp_path)
+    np.savez(tmp_path / policy.WEIGHTS, mean=np.zeros(3), std=np.ones(3), kernel_0=np.zeros((3, 2)), bias_0=np.zeros(2))
+    with pytest.raises(UserError, match="no walking policy of this robot"):
+        policy.load(tmp_path)
+
+
+def test_noise_stays_within_its_bounds_and_spares_command_and_last_action():
+    many = jax.vmap(policy.noisy, (0, None, None))(jax.random.split(jax.random.key(0), 500), jnp.zeros(policy.OBS), 1.0)
+    largest = np.abs(np.asarray(many)).max(0)
+    assert (largest <= policy.NOISE).all()
+    assert (largest[policy.NOISE > 0] > 0.95 * policy.NOISE[policy.NOISE > 0]).all()
+    assert (largest[[9, 10, 11, *range(36, 48)]] == 0).all()
+
+
+# ------------------------------------------------------------------------------------------------------------- counting
+
+
+def test_errors_count_where_commands_are_settled_and_the_robot_stands():
+    steps, settling = 2 * tracking.HELD, tracking.SETTLING
+    velocities, commands = np.zeros((steps, 2, 3)), np.zeros((steps, 2, 3))
+    commands[..., 0] = 1.0
+    velocities[:settling, :, 0] = -5.0  # before it is settled: does not count
+    velocities[settling : tracking.HELD, :, 0] = np.where(np.arange(settling) % 2, 1.3, 0.9)[:, None]  # sways about 1.1
+    velocities[tracking.HELD :, :, 0], velocities[tracking.HELD :, :, 2] = 1.0, 0.2
+    down = np.zeros((steps, 2), bool)
+    down[tracking.HELD + settling + 1 :, 1] = True  # the second robot falls during its second command
+    found = tracking.figures(velocities, commands, down)
+    assert found["error"] == pytest.approx((0.1 + 0.1 + 0.0) / 3)
+    assert found["momentary_error"] == pytest.approx((0.2 + 0.2 + 0.0) / 3)
+    assert found["turning_error"] == pytest.approx(0.2 / 3)
+    assert found["falls"] == 0.5
+    assert found["seconds"] == 8.0
+
+
+# -------------------------------------------------------------------------------------------------------- in C MuJoCo
+
+
+@pytest.fixture(scope="module")
+def shipped():
+    return policy.load()
+
+
+@pytest.mark.parametrize(("trial", "error", "falls"), [("clean", 0.05, 0), ("disturbed", 0.08, 1), ("varied", 0.08, 1)])
+def test_the_shipped_policy_tracks_random_commands(shipped, trial, error, falls):
+    robots = 12
+    found = tracking.measure(shipped, "mujoco", tracking.TRIALS[trial], jax.random.key(7), robots)
+    assert found["error"] < error
+    assert found["falls"] * robots <= falls
+
+
+def test_what_is_shipped_says_how_it_was_made():
+    about = json.loads((policy.SHIPPED / policy.ABOUT).read_text())
+    assert about["finished"]
+    assert about["command"].startswith("cuelearner locomotion train")
+    assert {"seed", "config", "hardware", "versions", "training_s"} <= about.keys()
+    assert set(about["figures"]) == {f"{engine}, {name}" for engine in ("mjx", "mujoco") for name in tracking.TRIALS}
+
+
+def test_a_judged_robot_is_where_it_is_placed_and_a_push_moves_it():
+    two = judge.Judge([0.8, 0.8], [0.0, 0.0])
+    two.place(1, np.array([3.0, -2.0, 1.0]))
+    np.testing.assert_allclose(robot.planar_pose(jnp.asarray(two.qpos[1])), [3.0, -2.0, 1.0], atol=1e-6)
+    two.push(1, np.array([0.0, 0.5]))
+    two.control(np.zeros((2, 12)))
+    moved = two.qpos[:, :2] - [[0, 0], [3, -2]]
+    assert moved[1, 1] > 0.005 > abs(moved[0, 1])
+
+
+def test_a_judged_robot_that_fell_or_retired_moves_no_more():
+    three = judge.Judge([0.8] * 3, [0.0] * 3)
+    three.data[0].qpos[3:7] = np.cos(0.8), np.sin(0.8), 0, 0  # on its side
+    three.retired[1] = True
+    three.control(np.zeros((3, 12)))
+    assert three.fallen.tolist() == [True, False, False]
+    before = three.qpos
+    three.control(np.ones((3, 12)))
+    moved = np.abs(three.qpos - before).max(-1)
+    assert moved[0] == moved[1] == 0 < moved[2]
