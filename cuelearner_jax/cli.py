@@ -402,12 +402,9 @@ def _locomotion(arguments: list[str]) -> None:
     command = shlex.join(["cuelearner", "locomotion", *arguments])
     if isinstance(asked, LocomotionTrain):
         locomotion.check(asked.train)
-        about = locomotion.train(anymal_walker(), asked.train, asked.out, asked.seed, command, tell=out.print)
-        figures = about["figures"]
+        locomotion.train(anymal_walker(), asked.train, asked.out, asked.seed, command, out.print)
     else:
-        figures = locomotion.evaluate(anymal_walker(), asked.policy, asked.robots, asked.seed, command, asked.out)
-    for name, found in figures.items():
-        out.print(f"{name:20}" + ", ".join(f"{key} {value:.4g}" for key, value in found.items()))
+        locomotion.evaluate(anymal_walker(), asked.policy, asked.robots, asked.seed, command, asked.out, out.print)
     if asked.out:
         out.print(f"wrote {asked.out}")
 

@@ -131,12 +131,12 @@ def train(
             if stopping.is_set():
                 raise Interrupted(f"stopped; {out} holds the policy of the last measurement") from None
     trained = time.perf_counter() - began
-    figures = walker.examine(walker.load(out), jax.random.fold_in(key, 1), config.measured_robots)
+    figures = _examined(walker, walker.load(out), jax.random.fold_in(key, 1), config.measured_robots, tell)
     about |= {
         "finished": True,
         "trained_steps": history[-1][0],
         "training_s": round(trained, 1),
-        "figures": {name: _rounded(found) for name, found in figures.items()},
+        "figures": figures,
         "history": {"columns": list(COLUMNS), "rows": history},
     }
     walker.save(out, walker.load(out), about)
@@ -144,7 +144,13 @@ def train(
 
 
 def evaluate(
-    walker: Walker, folder: Path | None, robots: int, seed: int, command: str, out: Path | None = None
+    walker: Walker,
+    folder: Path | None,
+    robots: int,
+    seed: int,
+    command: str,
+    out: Path | None = None,
+    tell: Callable[[str], None] = print,
 ) -> dict[str, dict[str, float]]:
     """Figures of a policy (the shipped one if no folder is given), trial by trial; written to `out`, if given.
 
@@ -156,8 +162,7 @@ def evaluate(
     if out and out.exists():
         raise UserError(f"{out} exists: give another --out")
     policy = walker.load(folder) if folder else walker.load()
-    found = walker.examine(policy, jax.random.key(seed), robots)
-    figures = {name: _rounded(values) for name, values in found.items()}
+    figures = _examined(walker, policy, jax.random.key(seed), robots, tell)
     if out:
         out.parent.mkdir(parents=True, exist_ok=True)
         contents = {"seed": seed, **results.provenance(), "command": command, "figures": figures}
@@ -201,5 +206,13 @@ def _ppo(walker: Walker, config: LocomotionConfig, seed: int, look: Callable[[in
     )
 
 
-def _rounded(found: dict[str, float]) -> dict[str, float]:
-    return {name: round(value, 5) for name, value in found.items()}
+def _examined(
+    walker: Walker, policy: Any, key: jax.Array, robots: int, tell: Callable[[str], None]
+) -> dict[str, dict[str, float]]:
+    """Figures of a policy by trial, each told as soon as it is measured."""
+    figures = {}
+    tell(f"{robots} robots walk for 20 s, trial by trial")
+    for name, found in walker.examine(policy, key, robots):
+        figures[name] = {figure: round(value, 5) for figure, value in found.items()}
+        tell(f"{name:20}" + ", ".join(f"{figure} {value:.4g}" for figure, value in figures[name].items()))
+    return figures

@@ -6,7 +6,7 @@ Directions are unit vectors in the plane; angles are radians, counterclockwise p
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
@@ -111,7 +111,7 @@ class Walker(NamedTuple):
     environment: Any  # brax.envs.Env: velocity commands are to be tracked
     policy: Callable[[Any], Any]  # brax's parameters -> a policy
     measure: Callable[[Any, PRNGKeyArray, int], dict[str, float]]  # (policy, key, robots) -> figures while it learns
-    examine: Callable[[Any, PRNGKeyArray, int], dict[str, dict[str, float]]]  # the same of a finished one, by trial
+    examine: Callable[[Any, PRNGKeyArray, int], Iterator[tuple[str, dict[str, float]]]]  # of a finished one, by trial
     save: Callable[[Path, Any, dict[str, Any]], None]  # (folder, policy, what is to be known of it)
     load: Callable[..., Any]  # (folder) -> the policy; the shipped one without a folder
 

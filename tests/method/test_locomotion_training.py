@@ -67,7 +67,7 @@ def walker(after_measure=lambda: None):
         environment=Point(),
         policy=lambda params: {"error": error(params)},
         measure=measure,
-        examine=lambda policy, key, robots: {"trial": {"error": policy["error"], "robots": robots}},
+        examine=lambda policy, key, robots: iter([("trial", {"error": policy["error"], "robots": robots})]),
         save=save,
         load=lambda folder: json.loads((folder / "policy.json").read_text()),
     )

@@ -7,6 +7,7 @@ gait included.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from functools import partial
 
 import jax
@@ -134,13 +135,11 @@ def measure_training(policy: WalkingPolicy, key: PRNGKeyArray, robots: int) -> d
     return measure(policy, "mjx", CLEAN, key, robots)
 
 
-def examine(policy: WalkingPolicy, key: PRNGKeyArray, robots: int) -> dict[str, dict[str, float]]:
-    """Figures of every trial of `TRIALS` in both engines."""
-    return {
-        f"{engine}, {name}": measure(policy, engine, trial, key, robots)
-        for engine in ENGINES
-        for name, trial in TRIALS.items()
-    }
+def examine(policy: WalkingPolicy, key: PRNGKeyArray, robots: int) -> Iterator[tuple[str, dict[str, float]]]:
+    """Figures of every trial of `TRIALS` in both engines, one after the other as they are measured."""
+    for engine in ENGINES:
+        for name, trial in TRIALS.items():
+            yield f"{engine}, {name}", measure(policy, engine, trial, key, robots)
 
 
 def measure(policy: WalkingPolicy, engine: str, trial: Trial, key: PRNGKeyArray, robots: int) -> dict[str, float]:
