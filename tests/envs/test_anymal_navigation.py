@@ -117,10 +117,23 @@ def test_all_that_is_carried_is_small(walked):
 def test_commands_lead_where_the_direction_points(env, walked):
     body = jax.tree.map(lambda leaf: leaf[0], walked[0][0].body)
     yaw = robot.planar_pose(body.qpos)[2]
-    for turn, turning in ((0.0, 0.0), (0.05, 0.5), (1.0, 1.5), (-2.0, -1.5)):
-        command = env.command(body, actions.from_angle(yaw + turn))
-        np.testing.assert_allclose(command[:2], [math.cos(turn), math.sin(turn)], atol=1e-5)
-        assert float(command[2]) == pytest.approx(turning, abs=1e-4)
+    for turn, turning in ((0.0, 0.0), (0.15, 0.5), (1.0, 1.5), (-2.0, -1.5)):
+        wanted = np.array([math.cos(turn), math.sin(turn), turning])
+        heading = actions.from_angle(yaw + turn)
+        np.testing.assert_allclose(env.command(body, jnp.asarray(wanted), heading), wanted, atol=1e-4)
+        told = jnp.zeros(3)
+        for _ in range(10):  # the steps of control of 0.2 s, in which the bounds allow 1.6 m/s and 4 rad/s
+            told = env.command(body, told, heading)
+        np.testing.assert_allclose(told, wanted, atol=1e-4)
+
+
+def test_commands_change_no_faster_than_legs_can_follow(env, walked):
+    body = jax.tree.map(lambda leaf: leaf[0], walked[0][0].body)
+    yaw = robot.planar_pose(body.qpos)[2]
+    forward, back = jnp.array([1.0, 0.0, 1.5]), actions.from_angle(yaw + math.pi - 0.01)
+    np.testing.assert_allclose(env.command(body, forward, -back), forward.at[2].set(1.5 - 0.4), atol=0.02)
+    np.testing.assert_allclose(env.command(body, -forward, back), [-1.0, 0.0, -1.5 + 0.4], atol=0.02)
+    np.testing.assert_allclose(env.command(body, forward, back)[0], 1.0 - 8.0 * 0.02, atol=1e-3)
 
 
 # ----------------------------------------------------------------------------------------------------------- the sensor

@@ -97,7 +97,7 @@ def test_it_says_how_it_went_and_what_made_it(trained):
     assert len(rows) == SMALL.measurements + 1
     assert [row[0] for row in rows] == sorted({row[0] for row in rows})
     assert kept["trained_steps"] == rows[-1][0] >= SMALL.steps
-    assert len(told) == len(rows) + 1
+    assert len(told) == len(rows) + 3  # that it compiles, that it examines, one trial
     assert about == {name: kept[name] for name in about}
 
 

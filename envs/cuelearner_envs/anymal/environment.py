@@ -25,7 +25,10 @@ from cuelearner_jax.actions import difference, from_angle, rotate
 Scalar = float | Float[Array, ""]
 SENSOR_NOISE = 0.02  # standard deviation of a scanner's own error [m]
 CONTROL_STEPS = 10  # in a step of navigation: 0.2 s at 50 Hz
-TURNING_TIME = 0.1  # within which the body is told to be where it should look, at no more than the turn rate [s]
+TURNING_TIME = 0.3  # within which the body is told to be where it should look, at no more than the turn rate [s]
+# The command changes by no more than this [m/s^2, rad/s^2]: of robots told other ways at once 11% fell within 10 s
+# (experiments/fit_robot.py), with these bounds none.
+ACCELERATION, TURN_ACCELERATION = 8.0, 20.0
 
 
 class LeggedWalker(struct.PyTreeNode):
@@ -33,6 +36,7 @@ class LeggedWalker(struct.PyTreeNode):
 
     body: Body
     last_action: Float[Array, "12"]  # of the walking policy
+    told: Float[Array, "3"]  # what that is commanded: velocity forward and to the left [m/s], turning rate [rad/s]
     goal: Float[Array, "2"]  # [m]
     previous: Float[Array, "3 2"]  # actions, the latest first, as they were given; zeros before the first
     world: Int[Array, ""]
@@ -58,33 +62,47 @@ class LeggedNavigation(Navigation, kw_only=True):
         heading = rotate(action, state.pose[2])
 
         def one(carry: tuple, _: None) -> tuple[tuple, None]:
-            body, last_action, fallen = carry
-            last_action = self.act(body, last_action, heading)
+            body, last_action, told, fallen = carry
+            last_action, told = self.act(body, last_action, told, heading)
             after, felt = control(body, last_action, self.ground)
             sound = jnp.isfinite(after.qvel).all()  # what blew up has fallen, and stays where it was
             body = jax.tree.map(lambda new, old: jnp.where(sound, new, old), after, body)
-            return (body, last_action, fallen | felt.fallen), None
+            return (body, last_action, told, fallen | felt.fallen), None
 
-        start = (state.body, state.last_action, state.fallen)
-        (body, last_action, fallen), _ = jax.lax.scan(one, start, length=self.control_steps)
+        start = (state.body, state.last_action, state.told, state.fallen)
+        (body, last_action, told, fallen), _ = jax.lax.scan(one, start, length=self.control_steps)
         return state.replace(
             body=body,
             last_action=last_action,
+            told=told,
             previous=latest_first(action, state.previous),
             steps=state.steps + 1,
             fallen=fallen,
         )
 
-    def act(self, body: Body, last_action: Float[Array, "12"], heading: Float[Array, "2"]) -> Float[Array, "12"]:
-        """The walking policy's action, told to walk toward `heading` (unit vector in the world's frame)."""
-        return self.walking(observe(body.qpos, body.qvel, last_action, self.command(body, heading)))
+    def act(
+        self, body: Body, last_action: Float[Array, "12"], told: Float[Array, "3"], heading: Float[Array, "2"]
+    ) -> tuple[Float[Array, "12"], Float[Array, "3"]]:
+        """The walking policy's action and the command behind it, on the way from `told` to walking toward `heading`."""
+        told = self.command(body, told, heading)
+        return self.walking(observe(body.qpos, body.qvel, last_action, told)), told
 
-    def command(self, body: Body, heading: Float[Array, "2"]) -> Float[Array, "3"]:
-        """Velocity forward and to the left [m/s] and turning rate [rad/s] that lead toward `heading`."""
+    def command(self, body: Body, told: Float[Array, "3"], heading: Float[Array, "2"]) -> Float[Array, "3"]:
+        """The command (as `LeggedWalker.told`) that follows `told` on the way toward a heading.
+
+        Args:
+            body: the robot now.
+            told: the command before.
+            heading: where to walk and to look, a unit vector in the world's frame.
+        """
         yaw = robot.planar_pose(body.qpos)[2]
         off = difference(from_angle(yaw), heading)
         turning = jnp.clip(off / TURNING_TIME, -self.robot.turn_rate, self.robot.turn_rate)
-        return jnp.append(self.robot.speed * rotate(heading, -yaw), turning)
+        change = self.robot.speed * rotate(heading, -yaw) - told[:2]
+        most = ACCELERATION * robot.CONTROL_PERIOD
+        change = change * (most / jnp.maximum(jnp.linalg.norm(change), most))
+        most = TURN_ACCELERATION * robot.CONTROL_PERIOD
+        return told + jnp.append(change, jnp.clip(turning - told[2], -most, most))
 
     def failures(self, state: LeggedWalker) -> dict[str, Bool[Array, ""]]:
         """What ends an episode in failure, by name; at most one holds."""
@@ -121,6 +139,7 @@ class LeggedNavigation(Navigation, kw_only=True):
         return LeggedWalker(
             body=body.replace(qpos=body.qpos.at[:7].set(place)),
             last_action=jnp.zeros(robot.JOINTS),
+            told=jnp.zeros(3),
             goal=goal,
             previous=previous,
             world=world,

@@ -26,22 +26,31 @@ def _begin(env: LeggedNavigation, keys: PRNGKeyArray) -> tuple[LeggedWalker, jax
 
 
 @jax.jit
-def _act(env: LeggedNavigation, body: Any, last_action: jax.Array, headings: jax.Array) -> jax.Array:
-    return jax.vmap(env.act)(body, last_action, headings)
+def _act(
+    env: LeggedNavigation, body: Any, last_action: jax.Array, told: jax.Array, headings: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    return jax.vmap(env.act)(body, last_action, told, headings)
 
 
 _poses = jax.jit(jax.vmap(planar_pose))
 
 
 @jax.jit
-@partial(jax.vmap, in_axes=(None, 0, 0, 0, 0, 0))
+@partial(jax.vmap, in_axes=(None, 0, 0, 0, 0, 0, 0))
 def _after(
-    env: LeggedNavigation, state: LeggedWalker, body: Any, last: jax.Array, action: jax.Array, fallen: jax.Array
+    env: LeggedNavigation,
+    state: LeggedWalker,
+    body: Any,
+    last: jax.Array,
+    told: jax.Array,
+    action: jax.Array,
+    fallen: jax.Array,
 ) -> tuple[LeggedWalker, jax.Array, Any]:
     """The state that a step of another engine has led to, what is seen there, and what has ended."""
     state = state.replace(
         body=body,
         last_action=last,
+        told=told,
         previous=latest_first(action, state.previous),
         steps=state.steps + 1,
         fallen=state.fallen | fallen,
@@ -73,15 +82,15 @@ class Course:
             outcome, terminated, truncated, as `Navigation.ends` does, each (robots,).
         """
         headings = rotate(actions, jnp.asarray(self.poses[:, 2]))
-        body, last = self.state.body, self.state.last_action
+        body, last, told = self.state.body, self.state.last_action, self.state.told
         for _ in range(self.env.control_steps):
-            last = _act(self.env, body, last, headings)
+            last, told = _act(self.env, body, last, told, headings)
             self.judge.control(np.asarray(last))
             body = body.replace(qpos=jnp.asarray(self.judge.qpos), qvel=jnp.asarray(self.judge.qvel))
             if each:
                 each(self.judge.qpos)
         fallen = jnp.asarray(self.judge.fallen)
-        self.state, self.obs, ends = _after(self.env, self.state, body, last, actions, fallen)
+        self.state, self.obs, ends = _after(self.env, self.state, body, last, told, actions, fallen)
         return jax.device_get(ends)
 
 
