@@ -41,9 +41,7 @@ from cuelearner_jax.options import (
     TeacherTrain,
     Train,
 )
-from cuelearner_jax.report import report
 from cuelearner_jax.shards import Shard
-from cuelearner_jax.statistics import interval
 from cuelearner_jax.tasks import TASKS, Task, anymal_walker
 
 out = Console(highlight=False, soft_wrap=True)
@@ -288,6 +286,8 @@ def _evaluate(arguments: list[str]) -> None:
 
 def _measurements(measured: list[play.Measured], title: str) -> Table:
     """Interquartile means over seeds with their intervals, a row for each guidance and budget."""
+    from cuelearner_jax.statistics import interval
+
     table = Table("guidance", "labels", "seeds", "steps", "metric", "mean", "95% interval", title=title)
     for column in table.columns:
         column.no_wrap = True
@@ -303,6 +303,8 @@ def _measurements(measured: list[play.Measured], title: str) -> Table:
 
 
 def _report(arguments: list[str]) -> None:
+    from cuelearner_jax.report import report  # it loads what draws, which other commands need not wait for
+
     asked = _parse(Report, arguments, "report")
     command = shlex.join(["cuelearner", "report", *arguments])
     written = report(

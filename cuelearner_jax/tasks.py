@@ -7,6 +7,7 @@ knows it.
 from __future__ import annotations
 
 import dataclasses
+import importlib
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,11 +17,9 @@ import jax
 import jax.numpy as jnp
 
 from cuelearner_envs import billiards
-from cuelearner_envs.billiards import drawing
 from cuelearner_envs.billiards.config import BilliardsConfig, make_environment
 from cuelearner_envs.billiards.recording import record
 from cuelearner_envs.billiards.teacher import SearchTeacher
-from cuelearner_envs.navigation import drawing as navigation_drawing
 from cuelearner_envs.navigation.config import NavigationConfig
 from cuelearner_envs.navigation.config import make_environment as make_navigation
 from cuelearner_envs.navigation.recording import record as navigation_record
@@ -71,6 +70,11 @@ class Task:
     robots: dict[str, Robot] = field(default_factory=dict)  # beside its own
 
 
+def _drawing(task: str) -> Any:
+    """The module that draws a task, loaded when something is drawn: it takes seconds."""
+    return importlib.import_module(f"cuelearner_envs.{task}.drawing")
+
+
 def shape_of(task: Task, config: Any) -> Any:
     """The environment of a configuration with shapes in place of arrays: costs next to nothing."""
     return jax.eval_shape(lambda: task.environment(config))
@@ -93,8 +97,8 @@ BILLIARDS = Task(
     environment=lambda config, split="training": make_environment(config),  # racks alone differ, and they by the key
     teacher=billiards_teacher,
     record=record,
-    still=lambda env, paths, file: drawing.still(env.table, paths[0], file),
-    animate=lambda env, paths, file: drawing.animate(env.table, paths, file),
+    still=lambda env, paths, file: _drawing("billiards").still(env.table, paths[0], file),
+    animate=lambda env, paths, file: _drawing("billiards").animate(env.table, paths, file),
     presets={
         "paper": Preset(
             "the paper's figure: regulation table, its networks, 10 million steps a seed",
@@ -188,8 +192,8 @@ NAVIGATION = Task(
     environment=make_navigation,
     teacher=lambda config, env: make_teacher(env),
     record=navigation_record,
-    still=lambda env, frames, file: navigation_drawing.still(env.robot, frames, file),
-    animate=lambda env, frames, file: navigation_drawing.animate(env.robot, frames, file),
+    still=lambda env, frames, file: _drawing("navigation").still(env.robot, frames, file),
+    animate=lambda env, frames, file: _drawing("navigation").animate(env.robot, frames, file),
     robots={"anymal": Robot("a quadruped with full physics", _legged, {"mujoco": _judged}, _legged_pictures)},
     presets={
         "paper": Preset(
