@@ -28,7 +28,7 @@ ARGUMENTS = [
     ([*QUICK, "--resume", "--overwrite"], "give one of them"),
     ([*QUICK, "--labels-from", "nowhere.parquet", "--guidance", "relative"], "no label file"),
     (["train", "billiards", "--preset", "quickstart", "--guidance", "all"], "unknown guidance 'all'"),
-    (["train", "billiards", "--task.teacher", "learned", "--guidance", "relative"], "cuelearner teacher train"),
+    (["train", "billiards", "--preset", "quickstart", "--task.teacher", "learned"], "cuelearner teacher train"),
     (["evaluate", "nowhere"], "neither a run folder nor a task"),
     (["evaluate", "billiards", "--policy", "agent"], "needs a trained run"),
     (["evaluate", "billiards", "--policy", "agnt"], "did you mean 'agent'"),
