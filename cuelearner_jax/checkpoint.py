@@ -7,8 +7,10 @@ A checkpoint holds three items: `policy` (what acting needs, so that evaluation 
 from __future__ import annotations
 
 import errno
+import gc
 import logging
 import shutil
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -52,6 +54,20 @@ def _unflat(flat: dict[str, Any], like: Any) -> Any:
         return jax.random.wrap_key_data(stored) if _is_key(kind) else stored
 
     return jax.tree_util.tree_map_with_path(leaf, like)
+
+
+def _collect_quietly() -> None:
+    """Ends the other reads of a restore that failed.
+
+    Orbax leaves them to the garbage collector, where each complains by pages, at any later time and in anybody's code.
+    """
+    log, hook = logging.getLogger("asyncio"), sys.unraisablehook
+    silenced = log.disabled
+    log.disabled, sys.unraisablehook = True, lambda _: None
+    try:
+        gc.collect()
+    finally:
+        log.disabled, sys.unraisablehook = silenced, hook
 
 
 class Checkpoints:
@@ -103,13 +119,14 @@ class Checkpoints:
                 number,
                 args=ocp.args.Composite(**{name: ocp.args.StandardRestore(item) for name, item in wanted.items()}),
             )
+            return {name: _unflat(restored[name], like[name]) for name in like}
         except Exception as error:  # Orbax and TensorStore raise many kinds for one cause: the files do not fit
             reason = str(error).strip().splitlines()[0][:160] if str(error).strip() else type(error).__name__
-            raise UserError(
-                f"checkpoint {number} in {self._folder} cannot be read ({reason}): it is damaged or of another "
-                "program; delete that checkpoint's folder to go back to the one before, or start the run anew"
-            ) from error
-        return {name: _unflat(restored[name], like[name]) for name in like}
+        _collect_quietly()
+        raise UserError(
+            f"checkpoint {number} in {self._folder} cannot be read ({reason}): it is damaged or of another "
+            "program; delete that checkpoint's folder to go back to the one before, or start the run anew"
+        )
 
     def close(self) -> None:
         """Releases Orbax's threads."""

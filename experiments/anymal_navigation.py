@@ -6,7 +6,8 @@ Every row is the same validation episodes, first ones of each environment. The s
 quadruped one cause at a time: the sensor's noise, then speed, lag and turn rate fitted to its responses
 (experiments/fit_robot.py), then all of these. The quadruped is also given a level scan. "fall" ends an episode too; the
 footprint is the same on both. In C MuJoCo the first `--judged` of the same episodes are walked, beside MJX's own
-figures for these. Writes docs/data/anymal_navigation.json with --write.
+figures for these. With --write every row goes to docs/data/anymal_navigation.json as soon as it is measured; --resume
+keeps the rows of the same agent that are there.
 """
 
 from __future__ import annotations
@@ -76,6 +77,7 @@ def main() -> int:
     parser.add_argument("--judged", type=int, default=50, help="of them also in C MuJoCo")
     parser.add_argument("--only", nargs="+", help="these rows alone, by name")
     parser.add_argument("--write", type=Path, nargs="?", const=RESULTS, help="file (default: %(const)s)")
+    parser.add_argument("--resume", action="store_true", help="keep the rows that the file of --write has")
     asked = parser.parse_args()
     try:
         task, config, grid = load(asked.run, TASKS)
@@ -84,7 +86,16 @@ def main() -> int:
         parser.error(str(error))
     params = jax.tree.map(lambda leaf: leaf[0], lanes.policies["params"])
     fitted = {name: json.loads(FIT.read_text())["fitted"][name] for name in FITTED}
+    about = {"run": asked.run.name, "fitted": fitted}
+    came = results.provenance()  # before the first row changes a file of the repository
     rows: list[dict[str, Any]] = []
+    if asked.resume:
+        if not asked.write or not asked.write.is_file():
+            parser.error("--resume needs the file of an interrupted --write")
+        before = json.loads(asked.write.read_text())
+        if {name: before.get(name) for name in about} != about:
+            parser.error(f"{asked.write} is of another agent or fit: leave out --resume")
+        rows = before["rows"]
 
     @partial(jax.jit, static_argnames="count")
     def in_jax(env: Any, params: Any, count: int) -> Any:
@@ -94,12 +105,15 @@ def main() -> int:
         return judged(agent_policy(config.sizes, params), env, episodes(), count, count * 200)
 
     def tell(style: str, name: str, count: int, measure: Callable[[], dict[str, Any]]) -> None:
-        if asked.only and name not in asked.only:
+        known = {(row["style"], row["robot"], row["episodes"]) for row in rows}
+        if (asked.only and name not in asked.only) or (style, name, count) in known:
             return
         found = {metric: float(np.asarray(value)) for metric, value in measure().items()}
         rows.append({"style": style, "robot": name, "episodes": count, **found})
         told = "".join(f"{found.get(metric, 0.0):10.3f}" for metric in SHOWN)
         print(f"{style:10}{name:36}{count:6d}{told}", flush=True)
+        if asked.write:
+            asked.write.write_text(json.dumps({**came, **about, "rows": rows}, indent=1) + "\n")
 
     print(f"{'style':10}{'robot':36}{'count':>6}" + "".join(f"{metric:>10}" for metric in SHOWN))
     for style in asked.styles:
@@ -109,9 +123,6 @@ def main() -> int:
             tell(style, name, asked.episodes, lambda env=env: in_jax(env, params, asked.episodes))
         tell(style, "anymal, the judged", asked.judged, lambda env=legged: in_jax(env, params, asked.judged))
         tell(style, "anymal, C MuJoCo", asked.judged, lambda env=legged: in_c(env, asked.judged))
-    if asked.write:
-        told = {"run": asked.run.name, "fitted": fitted, "rows": rows}
-        asked.write.write_text(json.dumps({**results.provenance(), **told}, indent=1) + "\n")
     return 0
 
 

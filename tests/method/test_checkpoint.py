@@ -1,5 +1,8 @@
 """Checkpoints: what was saved comes back bit by bit, and what cannot be read is said in one line."""
 
+import gc
+import sys
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -151,6 +154,18 @@ def test_a_checkpoint_of_other_shapes_is_refused(tmp_path, change):
     save(tmp_path, 5)
     with pytest.raises(UserError, match="damaged or of another program"):
         restore(tmp_path, other(change))
+
+
+def test_what_a_refused_checkpoint_leaves_behind_is_silent(tmp_path, caplog, monkeypatch):
+    save(tmp_path, 5)
+    complaints = []
+    monkeypatch.setattr(sys, "unraisablehook", complaints.append)
+    wider = other(lambda item: item.update(weights=jax.ShapeDtypeStruct((3, 401), jnp.float32)))
+    with pytest.raises(UserError):
+        restore(tmp_path, wider)
+    gc.collect()
+    assert complaints == []
+    assert caplog.records == []
 
 
 def test_an_item_that_was_never_saved_is_refused(tmp_path):
