@@ -11,6 +11,7 @@ import gc
 import logging
 import shutil
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -23,6 +24,7 @@ import orbax.checkpoint as ocp
 from cuelearner_jax.errors import UserError
 
 KEPT = 2  # the newest checkpoints of a run
+SETTLING_S = 0.2  # within which reads that are under way come to their end
 ROOM_LEFT = 1 << 20  # beyond a checkpoint's arrays, for what describes them [bytes]
 
 
@@ -56,6 +58,14 @@ def _unflat(flat: dict[str, Any], like: Any) -> Any:
     return jax.tree_util.tree_map_with_path(leaf, like)
 
 
+def _compare(stored: dict[str, Any], wanted: dict[str, jax.ShapeDtypeStruct]) -> None:
+    """Raises ValueError unless an item on disk has the leaves that are wanted, of their shapes."""
+    for path in {**stored, **wanted}:
+        there, here = (tuple(tree[path].shape) if path in tree else "none" for tree in (stored, wanted))
+        if there != here:
+            raise ValueError(f"{path} is {there}, expected {here}")
+
+
 def _collect_quietly() -> None:
     """Ends the other reads of a restore that failed.
 
@@ -65,6 +75,7 @@ def _collect_quietly() -> None:
     silenced = log.disabled
     log.disabled, sys.unraisablehook = True, lambda _: None
     try:
+        time.sleep(SETTLING_S)
         gc.collect()
     finally:
         log.disabled, sys.unraisablehook = silenced, hook
@@ -115,6 +126,10 @@ class Checkpoints:
             for name, item in like.items()
         }
         try:
+            for name, item in wanted.items():
+                _compare(
+                    ocp.StandardCheckpointHandler().metadata(self._manager.directory / str(number) / name).tree, item
+                )
             restored = self._manager.restore(
                 number,
                 args=ocp.args.Composite(**{name: ocp.args.StandardRestore(item) for name, item in wanted.items()}),

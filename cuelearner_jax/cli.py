@@ -6,26 +6,22 @@ Exit status: 0 done; 2 bad input, nothing changed; 130 stopped by Ctrl-C, everyt
 
 from __future__ import annotations
 
-import contextlib
-import io
 import os
-import re
 import shlex
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from statistics import fmean
-from typing import Any
 
 # Before JAX starts: warnings of its start-up are not the user's.
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
 
 import jax
-import tyro
 from rich.console import Console
 from rich.table import Table
 
 from cuelearner_jax import bench, cluster, locomotion, machines, play, runs, sweep, teaching
+from cuelearner_jax.arguments import ABOUT, parse, preset_of, subject_of, task_of
 from cuelearner_jax.errors import UserError, closest, no_space
 from cuelearner_jax.evaluate import episodes
 from cuelearner_jax.options import (
@@ -45,17 +41,6 @@ from cuelearner_jax.shards import Shard
 from cuelearner_jax.tasks import TASKS, Task, anymal_walker
 
 out = Console(highlight=False, soft_wrap=True)
-
-ABOUT = {
-    "train": "Train one seed under one kind of guidance.",
-    "sweep": "Train seeds x label budgets x kinds of guidance in one process.",
-    "evaluate": "Validate a run's newest checkpoints, or a task's teacher, heuristic or chance; in any changed world.",
-    "report": "Curves and tables with intervals from recorded results.",
-    "render": "A still and a film of a policy at work.",
-    "teacher": "teacher train: train a teacher from exhaustive tries in parallel.",
-    "bench": "Throughput, memory a seed and share of peak of this machine, beside known machines.",
-    "locomotion": "locomotion train, locomotion evaluate: the quadruped's walking policy.",
-}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -110,69 +95,20 @@ def _overview() -> None:
     print(f"\ntasks: {', '.join(TASKS)}. Each command has --help, for instance: cuelearner sweep billiards --help")
 
 
-def _parse(kind: Any, arguments: list[str], program: str, default: Any = None) -> Any:
-    """Arguments as a dataclass. Raises UserError with tyro's message in one line."""
-    errors = io.StringIO()
-    keywords = {} if default is None else {"default": default}
-    try:
-        with contextlib.redirect_stderr(errors):
-            return tyro.cli(kind, args=arguments, prog=f"cuelearner {program}", **keywords)
-    except SystemExit as stop:
-        if not stop.code:
-            raise
-        lines = [re.sub(r"^[│╭╰─\s]+|[│╮╯─\s]+$", "", line) for line in errors.getvalue().splitlines()]
-        told = " ".join(line for line in lines[1:] if line)
-        told = re.split(r"For full helptext|Argument helptext", told)[0].strip()
-        told = told.replace("Perhaps you meant:", "; perhaps you meant")
-        told = re.sub(r"\s+", " ", told).replace(" ;", ";")[:400]
-        raise UserError(f"{told}; see cuelearner {program} --help") from None
-
-
-def _task(arguments: list[str], command: str) -> tuple[Task, list[str]]:
-    """The task named first."""
-    if not arguments or arguments[0] in ("-h", "--help"):
-        print(f"usage: cuelearner {command} TASK [--preset NAME] [OPTIONS]\n\n{ABOUT[command.split(maxsplit=1)[0]]}\n")
-        for task in TASKS.values():
-            print(f"task {task.name}, presets:")
-            for name, preset in task.presets.items():
-                print(f"  {name:<12}{preset.about}")
-        print(f"\noptions and their defaults: cuelearner {command} TASK --help")
-        raise SystemExit(0 if arguments else 2)
-    name = arguments[0]
-    if name not in TASKS:
-        raise UserError(f"unknown task {name!r}{closest(name, TASKS)}")
-    return TASKS[name], arguments[1:]
-
-
-def _preset(task: Task, arguments: list[str]) -> tuple[str, list[str]]:
-    """The preset's name, taken out of the arguments; `paper` if none is given."""
-    rest, name = list(arguments), "paper"
-    for index, argument in enumerate(arguments):
-        if argument == "--preset" or argument.startswith("--preset="):
-            if argument == "--preset" and index + 1 == len(arguments):
-                raise UserError(f"--preset needs a name: choose one of {', '.join(task.presets)}")
-            name = argument.partition("=")[2] if "=" in argument else arguments[index + 1]
-            del rest[index : index + (1 if "=" in argument else 2)]
-            break
-    if name not in task.presets:
-        raise UserError(f"unknown preset {name!r}{closest(name, task.presets)}")
-    return name, rest
-
-
 def _train(arguments: list[str]) -> None:
-    task, rest = _task(arguments, "train")
-    name, rest = _preset(task, rest)
+    task, rest = task_of(arguments, "train")
+    name, rest = preset_of(task, rest)
     preset = task.presets[name]
     kind = Train[task.config]  # pyright: ignore[reportInvalidTypeArguments]
     default = kind(preset.config, out=Path("runs") / f"{task.name}-{name}", labels=preset.labels[0])
-    asked = _parse(kind, rest, f"train {task.name}", default)
+    asked = parse(kind, rest, f"train {task.name}", default)
     grid = runs.Grid((asked.guidance,), (asked.seed,), (asked.labels,))
     _run(task, asked, grid)
 
 
 def _sweep(arguments: list[str]) -> None:
-    task, rest = _task(arguments, "sweep")
-    name, rest = _preset(task, rest)
+    task, rest = task_of(arguments, "sweep")
+    name, rest = preset_of(task, rest)
     preset = task.presets[name]
     kind = Sweep[task.config]  # pyright: ignore[reportInvalidTypeArguments]
     folder = Path("runs") / f"{task.name}-{name}"
@@ -184,7 +120,7 @@ def _sweep(arguments: list[str]) -> None:
         seeds=preset.seeds,
         first_seed=preset.first_seed,
     )
-    asked = _parse(kind, rest, f"sweep {task.name}", default)
+    asked = parse(kind, rest, f"sweep {task.name}", default)
     seeds = tuple(range(asked.first_seed, asked.first_seed + asked.seeds))
     grid = runs.Grid(asked.guidance, seeds, asked.labels)
     if asked.cluster:
@@ -247,28 +183,11 @@ def _run(task: Task, asked: Common, grid: runs.Grid, shard: Shard | None = None)
     out.print(f"done: {asked.out} (see it with: cuelearner report {asked.out} --out {asked.out}/report)")
 
 
-def _subject(arguments: list[str], command: str) -> tuple[play.Subject, list[str]]:
-    """The run folder or task named first."""
-    if not arguments or arguments[0] in ("-h", "--help"):
-        print(f"usage: cuelearner {command} RUN_FOLDER|TASK [OPTIONS]\n\n{ABOUT[command]}\n")
-        print(f"options and their defaults: cuelearner {command} {next(iter(TASKS))} --help")
-        raise SystemExit(0 if arguments else 2)
-    name, rest = arguments[0], arguments[1:]
-    if name in TASKS and not Path(name, "config.json").exists():
-        task = TASKS[name]
-        preset, rest = _preset(task, rest)
-        return play.Subject(task, task.presets[preset].config, None, Path(name)), rest
-    if not Path(name).exists():
-        raise UserError(f"{name!r} is neither a run folder nor a task ({', '.join(TASKS)})")
-    task, config, grid = runs.load(Path(name), TASKS)
-    return play.Subject(task, config, grid, Path(name)), rest
-
-
 def _evaluate(arguments: list[str]) -> None:
-    subject, rest = _subject(arguments, "evaluate")
+    subject, rest = subject_of(arguments, "evaluate")
     kind = Evaluate[subject.task.config]  # pyright: ignore[reportInvalidTypeArguments]
     default = kind(subject.config.task, policy="agent" if subject.grid else "heuristic")
-    asked = _parse(kind, rest, f"evaluate {subject.folder}", default)
+    asked = parse(kind, rest, f"evaluate {subject.folder}", default)
     own, subject = subject, subject.on(asked.robot)
     engine = own.engine(asked.robot, asked.engine)
     subject.check(asked.policy, asked.task)
@@ -305,7 +224,7 @@ def _measurements(measured: list[play.Measured], title: str) -> Table:
 def _report(arguments: list[str]) -> None:
     from cuelearner_jax.report import report  # it loads what draws, which other commands need not wait for
 
-    asked = _parse(Report, arguments, "report")
+    asked = parse(Report, arguments, "report")
     command = shlex.join(["cuelearner", "report", *arguments])
     written = report(
         asked.folders,
@@ -320,10 +239,10 @@ def _report(arguments: list[str]) -> None:
 
 
 def _render(arguments: list[str]) -> None:
-    subject, rest = _subject(arguments, "render")
+    subject, rest = subject_of(arguments, "render")
     kind = Render[subject.task.config]  # pyright: ignore[reportInvalidTypeArguments]
     default = kind(subject.config.task, Path("pictures"), policy="agent" if subject.grid else "heuristic")
-    asked = _parse(kind, rest, f"render {subject.folder}", default)
+    asked = parse(kind, rest, f"render {subject.folder}", default)
     subject = subject.on(asked.robot)
     subject.check(asked.policy, asked.task)
     if asked.film not in ("gif", "mp4"):
@@ -351,11 +270,11 @@ def _teacher(arguments: list[str]) -> None:
         raise SystemExit(0 if arguments else 2)
     if arguments[0] != "train":
         raise UserError(f"unknown command 'teacher {arguments[0]}': it is cuelearner teacher train TASK")
-    task, rest = _task(arguments[1:], "teacher train")
+    task, rest = task_of(arguments[1:], "teacher train")
     kind = TeacherTrain[task.config]  # pyright: ignore[reportInvalidTypeArguments]
-    name, rest = _preset(task, rest)
+    name, rest = preset_of(task, rest)
     default = kind(task.presets[name].config.task, Path("runs") / f"{task.name}-teacher")
-    asked = _parse(kind, rest, f"teacher train {task.name}", default)
+    asked = parse(kind, rest, f"teacher train {task.name}", default)
     command = shlex.join(["cuelearner", "teacher", *arguments])
     reward = teaching.train(
         task, asked.task, asked.teacher, asked.out, asked.seed, asked.eval_steps, command, asked.resume
@@ -365,13 +284,13 @@ def _teacher(arguments: list[str]) -> None:
 
 def _bench(arguments: list[str]) -> None:
     if arguments and not arguments[0].startswith("-"):
-        task, rest = _task(arguments, "bench")
-        name, rest = _preset(task, rest)
+        task, rest = task_of(arguments, "bench")
+        name, rest = preset_of(task, rest)
         kind = BenchTask[task.config]  # pyright: ignore[reportInvalidTypeArguments]
-        asked = _parse(kind, rest, f"bench {task.name}", kind(task.presets[name].config))
+        asked = parse(kind, rest, f"bench {task.name}", kind(task.presets[name].config))
         works = [bench.Work(task, name, asked.run)]
     else:
-        asked = _parse(Bench, arguments, "bench")
+        asked = parse(Bench, arguments, "bench")
         if asked.add:
             machines.add(asked.add)
             out.print(f"{machines.TABLE.name} holds {asked.add} now")
@@ -400,7 +319,7 @@ def _locomotion(arguments: list[str]) -> None:
         raise SystemExit(0 if arguments else 2)
     if arguments[0] not in kinds:
         raise UserError(f"unknown command 'locomotion {arguments[0]}'{closest(arguments[0], kinds)}")
-    asked = _parse(kinds[arguments[0]], arguments[1:], f"locomotion {arguments[0]}")
+    asked = parse(kinds[arguments[0]], arguments[1:], f"locomotion {arguments[0]}")
     command = shlex.join(["cuelearner", "locomotion", *arguments])
     if isinstance(asked, LocomotionTrain):
         locomotion.check(asked.train)

@@ -19,6 +19,7 @@ import jax
 from cuelearner_jax import config as configuration
 from cuelearner_jax import results
 from cuelearner_jax.errors import UserError
+from cuelearner_jax.runs import in_use
 from cuelearner_jax.sweep import Interrupted, interruptible
 from cuelearner_jax.types import Walker
 
@@ -101,7 +102,7 @@ def train(
         Interrupted: Ctrl-C; the newest measured policy is saved.
     """
     check(config)
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+    if in_use(out):
         raise UserError(f"{out} is not empty: give another --out")
     about = {"config": configuration.to_json(config), "seed": seed, **results.provenance(), "command": command}
     history: list[list[float]] = []

@@ -21,6 +21,7 @@ import pyarrow.compute as pc
 from cuelearner_jax import results, shards
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.figures import Group, draw_curves, draw_label_efficiency, save_figure
+from cuelearner_jax.runs import in_use
 from cuelearner_jax.statistics import curve, interval, mean_over_curve, steps_to_reach, stretches_apart
 
 
@@ -56,7 +57,7 @@ def report(
     """
     folders = [folders] if isinstance(folders, str | os.PathLike) else list(folders)
     out = Path(out)
-    if out.exists() and (not out.is_dir() or any(out.iterdir())) and not overwrite:
+    if in_use(out) and not overwrite:
         raise UserError(
             f"{out} exists already: choose another folder (--out), or allow it to be overwritten (--overwrite)"
         )

@@ -113,11 +113,16 @@ def load(folder: Path, tasks: dict[str, Task]) -> tuple[Task, RunConfig, Grid]:
     return task, config, grid
 
 
+def in_use(out: Path) -> bool:
+    """Is there anything at `out`, the mark of a process that writes there apart?"""
+    return out.exists() and (not out.is_dir() or any(entry.name != LOCK for entry in out.iterdir()))
+
+
 def check_folder(out: Path, described: dict[str, Any], resume: bool, overwrite: bool) -> None:
     """Raises UserError unless `out` may be used as asked."""
     if resume and overwrite:
         raise UserError("--resume continues a run and --overwrite deletes it: give one of them")
-    used = out.exists() and (not out.is_dir() or any(entry.name != LOCK for entry in out.iterdir()))
+    used = in_use(out)
     ours = (out / "config.json").is_file()
     if resume:
         if not ours:

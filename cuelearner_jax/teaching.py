@@ -16,7 +16,7 @@ from cuelearner_jax import results, teacher
 from cuelearner_jax.checkpoint import checkpoints
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import episodes, rollout, teacher_policy
-from cuelearner_jax.runs import check_folder, prepare_folder
+from cuelearner_jax.runs import check_folder, in_use, prepare_folder
 from cuelearner_jax.sweep import Interrupted, interruptible, progress_bars
 from cuelearner_jax.tasks import Task
 from cuelearner_jax.teacher import LearnedTeacher, TeacherConfig
@@ -63,7 +63,7 @@ def train(
     if not hasattr(env, "features"):
         raise UserError(f"{task.name} gives a teacher no features to learn from")
     described = {"config": configuration.to_json(config), "task": {"name": task.name, **configuration.to_json(world)}}
-    if not resume and out.exists() and (not out.is_dir() or any(out.iterdir())):
+    if not resume and in_use(out):
         raise UserError(f"{out} is not empty: give --resume to go on with an interrupted training, or another --out")
     if resume:
         check_folder(out, {**described, "seed": seed}, resume=True, overwrite=False)

@@ -59,11 +59,6 @@ def start_clock() -> Clock:
     return Clock(jnp.zeros((), jnp.int32), jnp.zeros((), jnp.int32), jnp.zeros((), jnp.int32))
 
 
-def directions(sizes: Sizes) -> jax.Array:
-    """The agent's set of directions (directions, 2)."""
-    return geometry.evenly_spaced(sizes.directions)
-
-
 def label_slots(budget: int, sizes: Sizes) -> int:
     """Rows that a label set needs: the budget rounded up to whole rounds."""
     return -(-budget // sizes.labels_per_round) * sizes.labels_per_round

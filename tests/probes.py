@@ -16,10 +16,10 @@ import numpy as np
 from flax import struct
 
 from cuelearner_jax import guidance as guidances
-from cuelearner_jax.actions import difference, from_angle, rotate
+from cuelearner_jax.actions import difference, evenly_spaced, from_angle, rotate
 from cuelearner_jax.config import RunConfig, Scalars, Schedule, Sizes
 from cuelearner_jax.tasks import Task
-from cuelearner_jax.train import directions, make_program
+from cuelearner_jax.train import make_program
 from cuelearner_jax.types import Label, Step, WholeObservations
 
 
@@ -187,7 +187,7 @@ def stored(state, lane, steps):
 
 def greedy_actions(q, params, obs, sizes=SIZES):
     """The argmax of one lane's values over the agent's directions, for observations (n, 2)."""
-    options = directions(sizes)
+    options = evenly_spaced(sizes.directions)
     values = jax.vmap(lambda one: q(params, one, options)[:, 0])(jnp.asarray(obs))
     return np.asarray(options[jnp.argmax(values, -1)])
 

@@ -5,6 +5,8 @@ from pathlib import Path
 SMALL = [
     *("--sizes.q-layers", "16", "--sizes.feedback-layers", "16", "--sizes.directions", "36"),
     *("--sizes.fit-steps", "20", "--task.search-directions", "90"),
+    # However many seeds a test takes, its programs are those of one lane, which the compilation cache then has.
+    *("--sizes.lanes-per-block", "1"),
     *("--schedule.total-steps", "200", "--schedule.eval-every", "100", "--schedule.checkpoint-every", "100"),
 ]
 SWEEP = ["sweep", "billiards", "--preset", "quickstart", *SMALL, "--seeds", "2", "--labels", "10", "20"]

@@ -1,5 +1,6 @@
 """One tiny run that the tests of the command line share."""
 
+import fcntl
 from pathlib import Path
 
 import pytest
@@ -9,9 +10,14 @@ from cuelearner_jax.cli import main
 
 
 @pytest.fixture(scope="session")
-def run_folder(tmp_path_factory) -> Path:
-    folder = tmp_path_factory.mktemp("runs") / "small"
-    assert main([*SWEEP, "--out", str(folder)]) == 0
+def run_folder(tmp_path_factory, worker_id) -> Path:
+    """Made by the first worker that asks; nobody writes in it."""
+    base = tmp_path_factory.getbasetemp()
+    folder = (base if worker_id == "master" else base.parent) / "small"
+    with open(folder.with_suffix(".lock"), "w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not (folder / "heuristic" / "results.parquet").exists():
+            assert main([*SWEEP, "--out", str(folder)]) == 0
     return folder
 
 

@@ -19,7 +19,7 @@ from cuelearner_jax.shards import Shard
 
 ENTRY = [str(Path(sys.executable).with_name("cuelearner"))]
 SWEEP = ["sweep", "billiards", "--preset", "quickstart", *SMALL, "--schedule.total-steps", "1500", "--guidance", "none"]
-SWEEP += ["--seeds", "2", "--first-seed", "7", "--sizes.lanes-per-block", "1"]
+SWEEP += ["--seeds", "2", "--first-seed", "7"]
 LOCAL = [*SWEEP, "--cluster", "local", "--shards", "2"]
 SLURM = [*SWEEP, "--cluster", "slurm", "--shards", "2"]
 

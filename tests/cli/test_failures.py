@@ -60,12 +60,6 @@ def test_resume_with_other_options_names_them(refused, run_folder):
     refused(changed, "another scalars.eps_deg", run_folder)
 
 
-def test_a_finished_run_is_resumed_to_no_effect(run_folder):
-    before = listing(run_folder)
-    assert main([*SWEEP, "--out", str(run_folder), "--resume"]) == 0
-    assert listing(run_folder) == before
-
-
 def test_overwrite_deletes_an_earlier_run(run_folder, tmp_path):
     folder = tmp_path / "run"
     shutil.copytree(run_folder, folder)
@@ -76,6 +70,12 @@ def test_overwrite_deletes_an_earlier_run(run_folder, tmp_path):
 @pytest.fixture
 def copy(run_folder, tmp_path):
     return shutil.copytree(run_folder, tmp_path / "copy")
+
+
+def test_a_finished_run_is_resumed_to_no_effect(copy):
+    before = listing(copy)
+    assert main([*SWEEP, "--out", str(copy), "--resume"]) == 0
+    assert listing(copy) == before
 
 
 @pytest.mark.parametrize("command", ["evaluate", "render"])

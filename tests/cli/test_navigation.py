@@ -23,21 +23,20 @@ OUTCOMES = ("success", "collision", "timeout")
 def walked(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("runs") / "walked"
     command = ["sweep", "navigation", "--preset", "quickstart", *SMALL, "--seeds", "2", "--labels", "10"]
-    assert main([*command, "--guidance", "relative", "none", "--out", str(folder)]) == 0
+    assert main([*command, "--guidance", "relative", "--out", str(folder)]) == 0
     return folder
 
 
 def test_every_evaluation_accounts_for_all_its_episodes(walked):
-    for kind in ("relative", "none"):
-        rows = results.read(walked / kind).to_pylist()
-        assert [row["step"] for row in rows] == [0, 0, 100, 100, 200, 200]
-        for row in rows:
-            assert row["finished"] == 1  # 20 steps are time for each environment's first episode
-            assert sum(row[name] for name in OUTCOMES) == pytest.approx(1)
-            assert row["duration"] <= 4.0 + 1e-5  # 20 steps of 0.2 s
+    rows = results.read(walked / "relative").to_pylist()
+    assert [row["step"] for row in rows] == [0, 0, 100, 100, 200, 200]
+    for row in rows:
+        assert row["finished"] == 1  # 20 steps are time for each environment's first episode
+        assert sum(row[name] for name in OUTCOMES) == pytest.approx(1)
+        assert row["duration"] <= 4.0 + 1e-5  # 20 steps of 0.2 s
 
 
-@pytest.mark.parametrize("policy", ["agent", "corrected", "teacher"])
+@pytest.mark.parametrize("policy", ["corrected", "teacher"])
 def test_policies_are_evaluated_in_worlds_of_another_style(walked, tmp_path, policy):
     out = tmp_path / "measured.json"
     command = ["evaluate", str(walked), "--policy", policy, "--task.style", "rooms", "--task.max-steps", "200"]
@@ -46,8 +45,7 @@ def test_policies_are_evaluated_in_worlds_of_another_style(walked, tmp_path, pol
     assert measured["world"]["style"] == "rooms"
     for row in measured["rows"]:
         assert row["finished"] == [1] * len(row["seeds"])
-        if policy != "agent":  # the road map's word, alone or as what refines the agent's actions
-            assert min(row["success"]) >= 0.75
+        assert min(row["success"]) >= 0.75  # the road map's word, alone or as what refines the agent's actions
 
 
 def test_a_report_of_successes(walked, tmp_path):

@@ -161,7 +161,7 @@ def test_what_a_refused_checkpoint_leaves_behind_is_silent(tmp_path, caplog, mon
     complaints = []
     monkeypatch.setattr(sys, "unraisablehook", complaints.append)
     wider = other(lambda item: item.update(weights=jax.ShapeDtypeStruct((3, 401), jnp.float32)))
-    with pytest.raises(UserError):
+    with pytest.raises(UserError, match=r"\['weights'\] is \(3, 400\), expected \(3, 401\)"):
         restore(tmp_path, wider)
     gc.collect()
     assert complaints == []

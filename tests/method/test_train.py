@@ -147,7 +147,8 @@ def test_first_uniform_then_guided_then_greedy():
     met, params = acted("heuristic", scalars=always)
     greedy = probes.greedy_actions(q, params, met["obs"])
     turned = np.asarray(ENV.heuristic(met["obs"]))
-    among = np.abs(met["action"][:, None] - np.asarray(train.directions(probes.SIZES))[None]).max(-1).min(-1)
+    options = np.asarray(actions.evenly_spaced(probes.SIZES.directions))
+    among = np.abs(met["action"][:, None] - options).max(-1).min(-1)
     assert among[:8].min() > 1e-4  # a uniform direction is none of the sixteen
     np.testing.assert_allclose(met["action"][8:24], turned[8:24], atol=1e-6)
     np.testing.assert_array_equal(met["action"][24:], greedy[24:])
