@@ -10,7 +10,7 @@ SMALL = [
     *("--schedule.total-steps", "200", "--schedule.eval-every", "100", "--schedule.checkpoint-every", "100"),
 ]
 SWEEP = ["sweep", "billiards", "--preset", "quickstart", *SMALL, "--seeds", "2", "--labels", "10", "20"]
-SWEEP += ["--guidance", "none", "relative", "heuristic"]
+SWEEP += ["--guidance", "none", "relative"]
 
 
 def listing(folder: Path) -> dict[str, tuple[int, int]]:

@@ -16,7 +16,7 @@ def run_folder(tmp_path_factory, worker_id) -> Path:
     folder = (base if worker_id == "master" else base.parent) / "small"
     with open(folder.with_suffix(".lock"), "w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        if not (folder / "heuristic" / "results.parquet").exists():
+        if not (folder / "relative" / "results.parquet").exists():
             assert main([*SWEEP, "--out", str(folder)]) == 0
     return folder
 

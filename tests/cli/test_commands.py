@@ -18,11 +18,11 @@ def test_a_sweep_says_its_memory_first_and_leaves_a_complete_folder(run_folder, 
     described = json.loads((run_folder / "config.json").read_text())
     assert described["task"]["name"] == "billiards"
     assert described["grid"] == {
-        "guidance": ["none", "relative", "heuristic"],
+        "guidance": ["none", "relative"],
         "seeds": [2000, 2001],
         "labels": [10, 20],
     }
-    for kind, lanes in (("none", 2), ("relative", 4), ("heuristic", 2)):
+    for kind, lanes in (("none", 2), ("relative", 4)):
         rows = results.read(run_folder / kind).to_pylist()
         assert (run_folder / kind / "results.parquet").exists()
         assert len(rows) == lanes * 3  # steps 0, 100 and 200
@@ -53,7 +53,7 @@ def test_every_policy_is_evaluated(run_folder, tmp_path, capsys, policy):
     assert main(command) == 0
     assert "reward" in capsys.readouterr().out
     rows = json.loads(out.read_text())["rows"]
-    lanes = {("none", 0), ("relative", 10), ("relative", 20), ("heuristic", 0)}
+    lanes = {("none", 0), ("relative", 10), ("relative", 20)}
     trained = policy in ("agent", "guide", "guided")
     assert {(row["guidance"], row["labels"]) for row in rows} == (lanes if trained else {("-", 0)})
 

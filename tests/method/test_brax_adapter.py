@@ -243,10 +243,9 @@ def assert_learned(before, after, metrics, losses):
         assert np.isfinite(metrics[name]), name
 
 
-@pytest.mark.parametrize("wrap", [None, wrap_for_training])
-def test_ppo_of_brax_learns_on_billiards(wrap):
+def test_ppo_of_brax_learns_on_billiards():
     env = to_brax(billiards.make_environment(billiards.BilliardsConfig(table="one_ball")))
-    before, after, step, metrics = train_ppo(env, wrap)
+    before, after, step, metrics = train_ppo(env, None)  # with brax's own wrappers
     assert step == 256
     assert_learned(before, after, metrics, ["training/policy_loss", "training/v_loss", "training/entropy_loss"])
 
