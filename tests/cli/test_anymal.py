@@ -13,7 +13,7 @@ from cuelearner_jax.cli import main
 from cuelearner_jax.errors import UserError
 
 AGENT = Path(__file__).parents[2] / "docs" / "data" / "navigation_agent"
-FEW = ["--envs", "3", "--steps", "12", "--task.worlds", "2", "--task.max-steps", "4"]
+FEW = ["--envs", "3", "--steps", "12", "--task.worlds", "8", "--task.max-steps", "4"]
 
 REFUSED = [
     (["evaluate", "billiards", "--robot", "anymal"], "billiards has no robots to choose from: leave out --robot"),
@@ -80,7 +80,7 @@ def opengl():
 
 
 def test_its_episodes_are_filmed_from_above_and_from_the_side(opengl, tmp_path):
-    command = ["render", str(AGENT), "--robot", "anymal", "--steps", "2", "--task.worlds", "2", "--out", str(tmp_path)]
+    command = ["render", str(AGENT), "--robot", "anymal", "--steps", "2", "--task.worlds", "8", "--out", str(tmp_path)]
     assert main(command) == 0
     pictures = imageio.mimread(tmp_path / "navigation_agent-anymal-agent.gif")
     assert len(pictures) == 4  # 0.4 s at 10 a second
@@ -96,5 +96,5 @@ def test_where_nothing_can_be_rendered_one_line_says_what_to_install(monkeypatch
         raise ImportError("no libEGL")
 
     monkeypatch.setattr("cuelearner_envs.anymal.scene._gl_context", missing)
-    command = ["render", AGENT, "--robot", "anymal", "--steps", "1", "--task.worlds", "2", "--out", tmp_path]
+    command = ["render", AGENT, "--robot", "anymal", "--steps", "1", "--task.worlds", "8", "--out", tmp_path]
     refused(command, "MuJoCo can't render here (no libEGL): install OpenGL for EGL", tmp_path)

@@ -10,7 +10,7 @@ from small_runs import SMALL
 from cuelearner_jax import results
 
 ENTRY = [str(Path(sys.executable).with_name("cuelearner"))]
-STEPS = 4000
+STEPS = 2000
 LONG = [*SMALL, "--schedule.total-steps", str(STEPS), "--guidance", "none", "--seeds", "2"]
 COMMAND = [*ENTRY, "sweep", "billiards", "--preset", "quickstart", *LONG]
 

@@ -21,7 +21,7 @@ from cuelearner_envs.navigation.world import World
 from cuelearner_jax import actions
 
 WALKERS = 4
-CONFIG = NavigationConfig(worlds=4, max_steps=3)
+CONFIG = NavigationConfig(worlds=8, max_steps=3)
 
 begin = jax.jit(lambda env, keys: jax.vmap(env.reset)(keys))
 look = jax.jit(scan_tilted)
@@ -212,7 +212,7 @@ def test_a_tilted_sensor_reads_what_mujocos_rays_do(env):
 
 def test_the_sensor_has_noise_of_its_own(env):
     assert float(env.lidar.noise) == pytest.approx(SENSOR_NOISE)
-    more = make_environment(NavigationConfig(worlds=1, lidar_noise=0.1))
+    more = make_environment(NavigationConfig(worlds=8, lidar_noise=0.1))
     assert float(more.lidar.noise) == pytest.approx(math.hypot(0.1, SENSOR_NOISE))
 
 
@@ -220,7 +220,7 @@ def test_the_sensor_has_noise_of_its_own(env):
 
 
 def test_in_c_mujoco_walking_toward_the_goal_reaches_it_or_meets_something():
-    env = make_environment(NavigationConfig(worlds=4, max_steps=100))
+    env = make_environment(NavigationConfig(worlds=8, max_steps=100))
     found = judged.rollout(lambda key, state, obs: jax.vmap(env.heuristic)(obs), env, jax.random.key(0), 6, 600)
     assert float(found["finished"]) == 1
     ends = [float(found[name]) for name in ("success", "collision", "fall", "timeout")]

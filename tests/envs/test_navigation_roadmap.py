@@ -104,7 +104,8 @@ GATES = {6: 1, 7: -1}  # worlds with the gap on the left and on the right
 @pytest.fixture(scope="module")
 def teacher() -> RoadMapTeacher:
     """Two worlds of each style, then the two gates."""
-    worlds = [generate_many(jax.random.key(3), 2, style) for style in STYLES]
+    made = [generate_many(jax.random.key(3), 8, style) for style in STYLES]  # eight, as other tests have compiled
+    worlds = [jax.tree.map(lambda leaf: leaf[:2], many) for many in made]
     worlds += [jax.tree.map(lambda leaf: leaf[None], gate(side)) for side in GATES.values()]
     together = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *worlds)
     return make_teacher(Navigation(worlds=together, max_steps=jnp.int32(160)))

@@ -16,7 +16,7 @@ from cuelearner_envs.navigation.robot import Robot
 from cuelearner_envs.navigation.world import FAR_AWAY
 from cuelearner_envs.navigation.worlds import generate_many
 
-KEYS = 1000
+KEYS = 300
 STYLES = ("clutter", "rooms", "corridor")
 EXTENTS = {"clutter": (20.0, 20.0), "rooms": (18.0, 14.0), "corridor": (20.0, 4.6)}
 REACH = 0.2 + 0.265  # of the body: its front disc's offset and radius [m]
@@ -31,7 +31,7 @@ generate_one = jax.jit(generate, static_argnames=("style", "routes"))
 
 @pytest.fixture(scope="module", params=STYLES)
 def sample(request):
-    """A thousand worlds of a style, as numpy arrays: those of `generate_many`, one at a time on two threads."""
+    """Hundreds of worlds of a style, as numpy arrays: those of `generate_many`, one at a time on two threads."""
     keys = list(jax.vmap(partial(jax.random.fold_in, jax.random.key(3)))(jnp.arange(KEYS)))
     generate_one(keys[0], style=request.param)
     with ThreadPoolExecutor(2) as threads:

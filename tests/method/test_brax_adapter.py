@@ -251,7 +251,7 @@ def test_ppo_of_brax_learns_on_billiards():
 
 
 def test_ppo_of_brax_learns_on_navigation():
-    env = to_brax(navigation.make_environment(navigation.NavigationConfig(style="clutter", worlds=4)))
+    env = to_brax(navigation.make_environment(navigation.NavigationConfig(style="clutter", worlds=8)))
     before, after, step, metrics = train_ppo(env, wrap_for_training, num_timesteps=128)
     assert step == 128
     assert_learned(before, after, metrics, ["training/policy_loss", "training/v_loss", "training/entropy_loss"])
