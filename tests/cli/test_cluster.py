@@ -18,7 +18,7 @@ from cuelearner_jax.errors import UserError
 from cuelearner_jax.shards import Shard
 
 ENTRY = [str(Path(sys.executable).with_name("cuelearner"))]
-SWEEP = ["sweep", "billiards", "--preset", "quickstart", *SMALL, "--schedule.total-steps", "1500", "--guidance", "none"]
+SWEEP = ["sweep", "billiards", "--preset", "quickstart", *SMALL, "--schedule.total-steps", "800", "--guidance", "none"]
 SWEEP += ["--seeds", "2", "--first-seed", "7"]
 LOCAL = [*SWEEP, "--cluster", "local", "--shards", "2"]
 SLURM = [*SWEEP, "--cluster", "slurm", "--shards", "2"]
@@ -123,7 +123,7 @@ def test_submitted_twice_then_one_killed_then_submitted_again_gives_what_one_pro
 
 def test_ctrl_c_stops_the_jobs_of_this_machine_and_loses_nothing(whole, tmp_path, capsys):
     out = tmp_path / "run"
-    options = ["--schedule.checkpoint-every", "1500", "--out", str(out)]
+    options = ["--schedule.checkpoint-every", "800", "--out", str(out)]
     folder = out / "shard-1-of-1" / "none"
 
     def press():
@@ -138,7 +138,7 @@ def test_ctrl_c_stops_the_jobs_of_this_machine_and_loses_nothing(whole, tmp_path
     assert "piece 1/1: stopped at step" in told
     assert "go on with the same command" in told.splitlines()[-1]
     stopped = {row["step"] for row in rows(out)}
-    assert max(stopped) < 1500
+    assert max(stopped) < 800
     assert max(stopped) in {int(path.name) for path in (folder / "checkpoints").iterdir() if path.name.isdigit()}
     assert main([*SWEEP, *options, "--shard", "1/1"]) == 0
     assert rows(out) == whole

@@ -79,7 +79,7 @@ def test_other_options_for_a_piece_that_has_begun_are_refused(refused, tmp_path)
 
 
 def test_a_piece_that_was_killed_goes_on_with_the_same_command(tmp_path):
-    command = [*SWEEP, "--schedule.total-steps", "2000", "--shard", "1/2"]
+    command = [*SWEEP, "--schedule.total-steps", "1000", "--shard", "1/2"]
     calm, killed = tmp_path / "calm", tmp_path / "killed"
     assert main([*command, "--out", str(calm)]) == 0
     process = subprocess.Popen([*ENTRY, *command, "--out", str(killed)], stderr=subprocess.DEVNULL)

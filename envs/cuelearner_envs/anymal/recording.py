@@ -19,7 +19,7 @@ from cuelearner_envs import film
 from cuelearner_envs.anymal import model as robot
 from cuelearner_envs.anymal.environment import LeggedNavigation
 from cuelearner_envs.anymal.judged import Course, Policy
-from cuelearner_envs.anymal.scene import Picture, Studio, above, beside, furnished
+from cuelearner_envs.anymal.scene import AZIMUTH, Picture, Studio, above, beside, furnished, unobstructed
 from cuelearner_envs.navigation.lidar import BEAM_ANGLES
 from cuelearner_envs.navigation.recording import ENDS
 from cuelearner_envs.navigation.world import World
@@ -84,7 +84,8 @@ def still(frames: Sequence[LeggedFrame], file: str | os.PathLike[str]) -> None:
     frame = frames[-1]
     with Studio(furnished(frame.world, frame.goal, frame.goal_radius), *STILL) as studio:
         studio.pose(frame.qpos[0])
-        imageio.imwrite(Path(file), studio.picture(beside(frame.qpos[0], distance=4.5), frame.ends, frame.met))
+        camera = unobstructed(studio.model, studio.data, distance=4.5)
+        imageio.imwrite(Path(file), studio.picture(camera, frame.ends, frame.met))
 
 
 def animate(frames: Sequence[LeggedFrame], file: str | os.PathLike[str]) -> None:
@@ -121,11 +122,13 @@ def _pictures(frames: Sequence[LeggedFrame], fps: float) -> Iterator[Picture]:
         episode = list(group)
         first = episode[0]
         with Studio(furnished(first.world, first.goal, first.goal_radius), *VIEW) as studio:
-            high, picture = above(np.asarray(first.world.extent)), None
+            high, near, picture = above(np.asarray(first.world.extent)), AZIMUTH, None
             moments = [(frame, qpos) for frame in episode for qpos in frame.qpos]
             for frame, qpos in moments[::stride]:
                 studio.pose(qpos)
-                views = [studio.picture(camera, frame.ends, frame.met) for camera in (high, beside(qpos))]
+                side = unobstructed(studio.model, studio.data, near)
+                near = side.azimuth  # it stays there until something comes in between
+                views = [studio.picture(camera, frame.ends, frame.met) for camera in (high, side)]
                 picture = np.concatenate(views, axis=1)
                 yield picture
             if episode[-1].outcome and picture is not None:

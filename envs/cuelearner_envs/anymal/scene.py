@@ -25,6 +25,7 @@ Picture = UInt8[np.ndarray, "height width 3"]
 LOW, TALL, GOAL = (0.79, 0.8, 0.82, 1), (0.36, 0.39, 0.42, 1), (0.0, 0.62, 0.45, 0.55)
 BEAM, HIT = (0.34, 0.71, 0.91, 0.16), (0.8, 0.47, 0.65, 1)
 LOWEST, TALLEST = 0.6, 1.5  # heights that have the colours `LOW` and `TALL` [m]
+AZIMUTH, SIDES_APART = 130, 30  # from where the robot is seen, and how far apart other sides are tried [deg]
 BEAMS_APART = 3  # of the beams every so many-th is drawn
 NO_OPENGL = (
     "MuJoCo can't render here ({}): install OpenGL for EGL (apt-get install libegl1 libgl1-mesa-dri), "
@@ -122,12 +123,30 @@ def above(extent: Float[np.ndarray, "2"]) -> mujoco.MjvCamera:
     return camera
 
 
-def beside(qpos: Float[np.ndarray, "19"], azimuth: float = 130.0, distance: float = 3.2) -> mujoco.MjvCamera:
-    """Looks at the robot from the side [deg, m]."""
+def beside(qpos: Float[np.ndarray, "19"], azimuth: float = AZIMUTH, distance: float = 3.2) -> mujoco.MjvCamera:
+    """Looks at the robot from the side [deg, m], whatever stands in between."""
     camera = mujoco.MjvCamera()
     camera.lookat[:] = qpos[0], qpos[1], 0.35
     camera.azimuth, camera.elevation, camera.distance = azimuth, -22, distance
     return camera
+
+
+def unobstructed(
+    model: mujoco.MjModel, data: mujoco.MjData, azimuth: float = AZIMUTH, distance: float = 3.2
+) -> mujoco.MjvCamera:
+    """Looks at the robot from the side nearest to `azimuth` where no solid stands in between [deg, m]."""
+    turns = sorted(range(-180, 180, SIDES_APART), key=abs)
+    cameras = [beside(data.qpos, azimuth + turn, distance) for turn in turns]
+    return next((camera for camera in cameras if _sees(model, data, camera)), cameras[0])
+
+
+def _sees(model: mujoco.MjModel, data: mujoco.MjData, camera: mujoco.MjvCamera) -> bool:
+    """Is there no solid between a camera and what it looks at?"""
+    azimuth, elevation = np.radians([camera.azimuth, camera.elevation])
+    ahead = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
+    hit = np.full(1, -1, np.int32)
+    away = mujoco.mj_ray(model, data, camera.lookat - camera.distance * ahead, ahead, None, 1, -1, hit)
+    return not (0 <= away < camera.distance and model.geom_bodyid[hit[0]] == 0)
 
 
 def _gl_context() -> Any:
