@@ -19,11 +19,12 @@ class Portions(NamedTuple):
     actions: int  # state-action pairs of one agent in one forward pass of an argmax
     agents: int  # evaluated side by side
     states: int  # that a teacher looks at together
+    worlds: int  # generated together: all of them take as long as the one that is tried most often
 
 
 def portions() -> Portions:
     """Those of the device that computes."""
-    return Portions(8192, 1, 16) if jax.default_backend() == "cpu" else Portions(1 << 14, 16, 256)
+    return Portions(8192, 1, 16, 1) if jax.default_backend() == "cpu" else Portions(1 << 14, 16, 256, 64)
 
 
 def compiler_options() -> dict[str, Any]:
