@@ -24,7 +24,7 @@ import orbax.checkpoint as ocp
 from cuelearner_jax.errors import UserError
 
 KEPT = 2  # the newest checkpoints of a run
-SETTLING_S = 0.2  # within which reads that are under way come to their end
+SETTLING_S = 0.2  # within which reads that are under way come to their end [s]
 ROOM_LEFT = 1 << 20  # beyond a checkpoint's arrays, for what describes them [bytes]
 
 
@@ -59,7 +59,7 @@ def _unflat(flat: dict[str, Any], like: Any) -> Any:
 
 
 def _compare(stored: dict[str, Any], wanted: dict[str, jax.ShapeDtypeStruct]) -> None:
-    """Raises ValueError unless an item on disk has the leaves that are wanted, of their shapes."""
+    """Raises ValueError unless an item on disk has the leaves that are wanted, of their shapes (both by path)."""
     for path in {**stored, **wanted}:
         there, here = (tuple(tree[path].shape) if path in tree else "none" for tree in (stored, wanted))
         if there != here:
@@ -126,10 +126,9 @@ class Checkpoints:
             for name, item in like.items()
         }
         try:
+            folder, reader = self._manager.directory / str(number), ocp.StandardCheckpointHandler()
             for name, item in wanted.items():
-                _compare(
-                    ocp.StandardCheckpointHandler().metadata(self._manager.directory / str(number) / name).tree, item
-                )
+                _compare(reader.metadata(folder / name).tree, item)
             restored = self._manager.restore(
                 number,
                 args=ocp.args.Composite(**{name: ocp.args.StandardRestore(item) for name, item in wanted.items()}),
