@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from itertools import compress
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
 LANES = "lanes"
@@ -47,7 +49,28 @@ def over_lanes(mesh: Mesh, function: Callable[..., Any], takes: tuple[Any, ...],
         takes: `SHARED` or `BY_LANE` for each argument.
         gives: the same for what it returns.
     """
-    return jax.shard_map(function, mesh=mesh, in_specs=takes, out_specs=gives, check_vma=False)
+
+    def whole(*arguments: Any) -> Any:
+        leaves, structure = jax.tree.flatten(arguments)
+        specs = [spec for tree, spec in zip(arguments, takes, strict=True) for _ in jax.tree.leaves(tree)]
+        # Empty arrays (the labels of lanes without any) stay outside: XLA of JAX 0.11 crashes on one that enters.
+        full = [leaf.size > 0 for leaf in leaves]
+        entering, outside = compress(leaves, full), [not there for there in full]
+
+        def share(*entered: jax.Array) -> Any:
+            inside, empty = iter(entered), map(made, compress(leaves, outside), compress(specs, outside))
+            return function(*jax.tree.unflatten(structure, [next(inside if there else empty) for there in full]))
+
+        def made(leaf: jax.Array, spec: PartitionSpec) -> jax.Array:
+            rows = leaf.shape[0] // (mesh.size if spec == BY_LANE else 1)
+            return jnp.zeros((rows, *leaf.shape[1:]), leaf.dtype)
+
+        mapped = jax.shard_map(
+            share, mesh=mesh, in_specs=tuple(compress(specs, full)), out_specs=gives, check_vma=False
+        )
+        return mapped(*entering)
+
+    return whole
 
 
 def place(mesh: Mesh, tree: Any, where: PartitionSpec) -> Any:

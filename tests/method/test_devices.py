@@ -5,11 +5,15 @@ import subprocess
 import sys
 from pathlib import Path
 
+import chex
+import jax
+import jax.numpy as jnp
 import many_devices
 import numpy as np
 import pytest
 
 from cuelearner_jax import results
+from cuelearner_jax.devices import BY_LANE, SHARED, lane_mesh, over_lanes
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.play import Subject, load_lanes
 from cuelearner_jax.runs import load
@@ -36,6 +40,14 @@ def alone(tmp_path_factory):
 def shared(tmp_path_factory):
     folder = tmp_path_factory.mktemp("four") / "run"
     return folder, on_four("run", folder)[1]
+
+
+def test_empty_arrays_do_not_enter_the_shared_program():
+    double = over_lanes(lane_mesh(), lambda by, lanes: jax.tree.map(by.__mul__, lanes), (SHARED, BY_LANE), BY_LANE)
+    two, lanes = jnp.asarray(2.0), {"labels": jnp.zeros((4, 0)), "values": jnp.arange(4.0)}
+    (call,) = jax.make_jaxpr(double)(two, lanes).eqns
+    assert [value.aval.shape for value in call.invars] == [(), (4,)]
+    chex.assert_trees_all_equal(double(two, lanes), {"labels": jnp.zeros((4, 0)), "values": 2 * jnp.arange(4.0)})
 
 
 def measured(folder):
