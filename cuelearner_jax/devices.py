@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
 LANES = "lanes"
+LIBRARY_LANES = 16  # of a device, from which on the matrix products of NVIDIA's library are the faster ones
 SHARED = PartitionSpec()  # the same on every device
 BY_LANE = PartitionSpec(LANES)  # leading axis cut into equal shares
 
@@ -29,9 +30,18 @@ def portions() -> Portions:
     return Portions(8192, 1, 16, 1) if jax.default_backend() == "cpu" else Portions(1 << 14, 16, 256, 64)
 
 
-def compiler_options() -> dict[str, Any]:
-    """XLA's options for the training loop: a GPU runs the independent kernels of a captured step side by side."""
-    return {"xla_gpu_command_buffer_scheduling_mode": "CONCURRENT"} if jax.default_backend() == "gpu" else {}
+def compiler_options(lanes: int) -> dict[str, Any]:
+    """XLA's options for the training loop of so many lanes on each device.
+
+    A GPU runs the independent kernels of a captured step side by side, and takes the matrix products of many lanes from
+    NVIDIA's library, those of few from XLA's compiler (benchmarks/matrix_products.py).
+    """
+    if jax.default_backend() != "gpu":
+        return {}
+    return {
+        "xla_gpu_command_buffer_scheduling_mode": "CONCURRENT",
+        "xla_gpu_enable_triton_gemm": lanes < LIBRARY_LANES,
+    }
 
 
 def lane_mesh(devices: Sequence[Any] | None = None) -> Mesh:

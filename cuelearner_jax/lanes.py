@@ -37,8 +37,10 @@ class Group:
         self.seeds, self.budgets = grid.lanes(guidance)
         self.largest_budget = int(self.budgets.max())
         self.mesh = mesh or lane_mesh()  # by default all local devices
-        self.program: Program = make_program(config, guidance, env, self.largest_budget, self.mesh)
         self.lanes_per_block = config.sizes.lanes_per_block or self._fitting_lanes()
+        self.program: Program = make_program(
+            config, guidance, env, self.largest_budget, self.mesh, lanes=self.cut.shape[1] // self.mesh.size
+        )
 
     @property
     def rounds(self) -> int:

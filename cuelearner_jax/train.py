@@ -65,7 +65,12 @@ def label_slots(budget: int, sizes: Sizes) -> int:
 
 
 def make_program(
-    config: RunConfig, guidance: Guidance, env: Environment, largest_budget: int, mesh: Mesh | None = None
+    config: RunConfig,
+    guidance: Guidance,
+    env: Environment,
+    largest_budget: int,
+    mesh: Mesh | None = None,
+    lanes: int = 1,
 ) -> Program:
     """Compiles (on first use) the loop for one kind of guidance.
 
@@ -74,6 +79,7 @@ def make_program(
         env: gives shapes; any environment of the same structure may be passed at the calls.
         largest_budget: labels that the largest lane may use.
         mesh: devices that share the lanes, whose number they must divide into (default: the first device alone).
+        lanes: that each device is expected to take at once; how fast it is may hang on it, nothing else.
     """
     mesh = mesh or lane_mesh(jax.local_devices()[:1])
     lane = Lane(config.sizes, guidance, config.bootstraps, env.obs_size, largest_budget)
@@ -112,7 +118,7 @@ def make_program(
         label_round=jax.jit(label_round, donate_argnums=4),
         take_labels=jax.jit(take_labels, donate_argnums=3),
         train=jax.jit(
-            stretch, donate_argnames="state", static_argnames="iterations", compiler_options=compiler_options()
+            stretch, donate_argnames="state", static_argnames="iterations", compiler_options=compiler_options(lanes)
         ),
     )
 

@@ -37,10 +37,10 @@ def compiled_once():
     """Every run makes the same programs: compile them once. And two rounds of labels between checkpoints."""
     programs = {}
 
-    def made(config, guidance, env, largest_budget, mesh=None):
+    def made(config, guidance, env, largest_budget, mesh=None, lanes=1):
         known = (config.sizes, config.bootstraps, guidance, label_slots(largest_budget, config.sizes))
         if known not in programs:
-            programs[known] = make_program(config, guidance, env, largest_budget, mesh)
+            programs[known] = make_program(config, guidance, env, largest_budget, mesh, lanes)
         return programs[known]
 
     def committed(make):
