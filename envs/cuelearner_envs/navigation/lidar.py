@@ -10,6 +10,7 @@ import math
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 from jaxtyping import Array, Float
 
@@ -20,7 +21,8 @@ from cuelearner_jax.actions import from_angle, rotate
 BEAMS = 271
 FIELD_OF_VIEW = math.radians(270.0)
 MAX_RANGE = 10.0  # [m]
-BEAM_ANGLES = (jnp.arange(BEAMS) - (BEAMS - 1) / 2) * (FIELD_OF_VIEW / (BEAMS - 1))  # from straight ahead [rad]
+# From straight ahead [rad]; of NumPy, so that no device is taken for a command that needs none.
+BEAM_ANGLES = (np.arange(BEAMS, dtype=np.float32) - (BEAMS - 1) / 2) * (FIELD_OF_VIEW / (BEAMS - 1))
 NO_BOUND = 1e9  # an inverse distance that bounds nothing [1/m]
 
 Scalar = float | Float[Array, ""]
@@ -69,7 +71,7 @@ def scan(world: World, pose: Float[Array, "3"], max_range: Scalar = MAX_RANGE) -
         max_range: what a beam reads that meets nothing nearer [m].
     """
     pose = jnp.asarray(pose)
-    beams = rotate(from_angle(BEAM_ANGLES), pose[2])
+    beams = rotate(from_angle(jnp.asarray(BEAM_ANGLES)), pose[2])
     boxes, circles = _boxes(world.boxes, pose[:2], beams), _circles(world.circles, pose[:2], beams)
     return 1.0 / jnp.maximum(jnp.maximum(boxes.max(0), circles.max(0)), 1.0 / max_range)
 
@@ -88,7 +90,7 @@ def scan_tilted(
         turn: the matrix that turns the sensor's frame into the world's.
         max_range: what a beam reads that meets nothing nearer [m].
     """
-    ahead = from_angle(BEAM_ANGLES)
+    ahead = from_angle(jnp.asarray(BEAM_ANGLES))
     # Sums, not a matrix product: an accelerator rounds the factors of those.
     beams = ahead[:, :1] * turn[:, 0] + ahead[:, 1:] * turn[:, 1]
     level = jnp.sqrt(jnp.sum(jnp.square(beams[:, :2]), -1))  # cosine of each beam's slope
