@@ -60,9 +60,9 @@ def compare(env: Any, agents: Any, own: Sizes, way: Sizes, steps: int, precise: 
             reward = rollout(agent_policy(way, params), env, episodes(), 100, steps)["reward"]
         best, number = values.max(-1), values.argmax(-1)
         off = jnp.abs(geometry.difference(options[number], chosen))
-        taken = jnp.argmax(chosen @ options.T, axis=-1)
-        lost = (best - values[jnp.arange(STATES), taken]) / (best - values.mean(-1))
         tenth = jnp.deg2rad(360.0 / way.directions)
+        taken = jnp.round(geometry.to_angle(chosen) / tenth).astype(int) % way.directions
+        lost = (best - values[jnp.arange(STATES), taken]) / (best - values.mean(-1))
         return {
             "same": jnp.mean(off < 0.5 * tenth),
             "neighbouring": jnp.mean(off < 1.5 * tenth),

@@ -215,10 +215,11 @@ def run(works: Sequence[Work], asked: Measuring, command: str) -> dict[str, Any]
         UserError: bad options or too little memory; nothing has been measured then.
         Interrupted: Ctrl-C; its message holds what was measured.
     """
+    cache = _cache_state()  # before anything is compiled
     mesh = _check(works, asked)
     plan = sorted(((work, seeds) for work in works for seeds in asked.seeds), key=lambda pair: _at_rest(*pair, mesh))
     rows: list[dict[str, Any]] = []
-    entry = _entry(asked, command)
+    entry = _entry(asked, command, cache)
     console.print(f"measuring {len(plan)} times: some seconds to compile, then {asked.seconds:g} s of training each")
     try:
         with progress_bars() as bars:
@@ -275,7 +276,7 @@ def _at_rest(work: Work, seeds: int, mesh: Mesh) -> int:
     return sum(state_bytes(block) for block in _planned(work, seeds, mesh).shapes())
 
 
-def _entry(asked: Measuring, command: str) -> dict[str, Any]:
+def _entry(asked: Measuring, command: str, cache: str) -> dict[str, Any]:
     """Where and how the figures were measured."""
     came = {**results.provenance(), "command": command}
     return {
@@ -285,7 +286,7 @@ def _entry(asked: Measuring, command: str) -> dict[str, Any]:
         "processor": _processor(),
         "cores": CORES,
         "measured": datetime.datetime.now(datetime.UTC).date().isoformat(),
-        "compilation_cache": _cache_state(),
+        "compilation_cache": cache,
         "rows": [],
     }
 
