@@ -137,7 +137,7 @@ def beside(entry: dict[str, Any], known: Sequence[dict[str, Any]]) -> str:
             rates = same[-1:] and (row["steps_a_second"], same[-1]["steps_a_second"])  # the newest measurement
             cells.append(f"{rates[1]:,.0f} ({rates[0] / rates[1]:.2f}x)" if rates else "-")
         lines.append([*cells])
-    told = [f"  {machine['name']}: {_where(machine)}" for machine in known]
+    told = dict.fromkeys(f"  {machine['name']}: {_where(machine)}" for machine in known)  # each once
     table = _columns(("task", "preset", "seeds", *names), lines)
     return "\n".join(["steps/s on known machines (and this one over them):", table, *told])
 
