@@ -1,9 +1,10 @@
-"""Lanes over devices, each of which works on its share of a block and waits for none; how much one takes at once."""
+"""Lanes over devices, each of which works on its share of a block and waits for none; how much one holds and takes."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from itertools import compress
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -86,3 +87,44 @@ def over_lanes(mesh: Mesh, function: Callable[..., Any], takes: tuple[Any, ...],
 def place(mesh: Mesh, tree: Any, where: PartitionSpec) -> Any:
     """A tree of arrays as `over_lanes` gives them back. JAX compiles once more for arrays that lie otherwise."""
     return jax.device_put(tree, NamedSharding(mesh, where))
+
+
+def free_bytes() -> int | None:
+    """Free memory of the device that trains, where it can be known; of a CPU no more than its control group allows."""
+    device = jax.devices()[0]
+    if device.platform != "cpu":
+        stats = device.memory_stats() or {}
+        return stats["bytes_limit"] - stats.get("bytes_in_use", 0) if "bytes_limit" in stats else None
+    return min((found for found in (_host_bytes(), group_bytes()) if found is not None), default=None)
+
+
+def _host_bytes() -> int | None:
+    try:
+        lines = Path("/proc/meminfo").read_text().splitlines()
+    except OSError:
+        return None
+    return next((int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:")), None)
+
+
+def group_bytes(groups: Path = Path("/proc/self/cgroup"), root: Path = Path("/sys/fs/cgroup")) -> int | None:
+    """Memory that the control groups of this process (a container, a batch job) still grant; None without a limit.
+
+    Caches of files that the kernel would give up count as free. Source: Linux, Documentation/admin-guide/cgroup-v2.rst.
+
+    Args:
+        groups: names the process's own group, in the line that begins with "0::".
+        root: where the groups' files lie; a group is bound by those above it too.
+    """
+    granted = []
+    try:
+        own = next((line[3:] for line in groups.read_text().splitlines() if line.startswith("0::")), "/")
+        folder = root / own.lstrip("/")
+        for group in [folder, *folder.parents][: len(folder.relative_to(root).parts) + 1]:
+            limit = (group / "memory.max").read_text().strip() if (group / "memory.max").is_file() else "max"
+            if limit != "max":
+                used = int((group / "memory.current").read_text())
+                kinds = dict(line.split() for line in (group / "memory.stat").read_text().splitlines())
+                granted.append(max(0, int(limit) - used + int(kinds.get("inactive_file", 0))))
+    except OSError:
+        return None
+    return min(granted, default=None)

@@ -16,7 +16,7 @@ from jax.sharding import Mesh
 
 from cuelearner_jax.checkpoint import Checkpoints, checkpoints
 from cuelearner_jax.config import RunConfig
-from cuelearner_jax.devices import BY_LANE, lane_mesh, place, portions
+from cuelearner_jax.devices import BY_LANE, free_bytes, lane_mesh, place, portions
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.runs import Grid
 from cuelearner_jax.search import looked_at
@@ -128,7 +128,7 @@ def memory_report(group: Group) -> str:
         rows = max(rows, sizes.batch_size * sizes.target_directions * (2 if sizes.n_step > 1 else 1))
     working = 4 * 4 * widest * rows * (padded // len(shapes) // devices)
     each = f" on each of {devices} devices" if devices > 1 else ""
-    available = _available_bytes()
+    available = free_bytes()
     limit = f", {available / 1e9:.1f} GB are free" if available else ""
     if available and kept + working > available:
         fitting = max(int((available - working) // (kept / padded)), 0)
@@ -140,19 +140,6 @@ def memory_report(group: Group) -> str:
         f"{group.guidance.name}: {lanes} lanes, {kept * devices / padded / 1e6:.1f} MB a seed at rest, "
         f"{(kept + working) / 1e9:.2f} GB in all while training{each}{limit}"
     )
-
-
-def _available_bytes() -> int | None:
-    """Free memory of the device that trains, where it can be known."""
-    device = jax.devices()[0]
-    if device.platform != "cpu":
-        stats = device.memory_stats() or {}
-        return stats["bytes_limit"] - stats.get("bytes_in_use", 0) if "bytes_limit" in stats else None
-    try:
-        lines = Path("/proc/meminfo").read_text().splitlines()
-    except OSError:
-        return None
-    return next((int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:")), None)
 
 
 def items(blocks: list[TrainState], clock: Clock, wall: float) -> dict[str, Any]:

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from cuelearner_jax import results
-from cuelearner_jax.devices import BY_LANE, SHARED, lane_mesh, over_lanes
+from cuelearner_jax.devices import BY_LANE, SHARED, group_bytes, lane_mesh, over_lanes
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.play import Subject, load_lanes
 from cuelearner_jax.runs import load
@@ -48,6 +48,26 @@ def test_empty_arrays_do_not_enter_the_shared_program():
     (call,) = jax.make_jaxpr(double)(two, lanes).eqns
     assert [value.aval.shape for value in call.invars] == [(), (4,)]
     chex.assert_trees_all_equal(double(two, lanes), {"labels": jnp.zeros((4, 0)), "values": 2 * jnp.arange(4.0)})
+
+
+def test_a_batch_job_has_the_memory_that_its_narrowest_group_grants(tmp_path):
+    groups = tmp_path / "cgroup"
+    groups.write_text("1:name=systemd:/\n0::/slurm/job_7/step\n")
+    assert group_bytes(groups, tmp_path) is None  # no group sets a limit
+
+    def limit(group, allowed, used, files):
+        (tmp_path / group).mkdir(parents=True, exist_ok=True)
+        (tmp_path / group / "memory.max").write_text(f"{allowed}\n")
+        (tmp_path / group / "memory.current").write_text(f"{used}\n")
+        (tmp_path / group / "memory.stat").write_text(f"anon {used - files}\ninactive_file {files}\n")
+
+    limit("slurm/job_7/step", "max", 50, 0)
+    limit("slurm/job_7", 100, 80, 30)
+    limit("slurm", 1000, 990, 0)
+    assert group_bytes(groups, tmp_path) == 10
+    limit("slurm", 1000, 500, 0)
+    assert group_bytes(groups, tmp_path) == 50
+    assert group_bytes(tmp_path / "none", tmp_path) is None
 
 
 def measured(folder):
