@@ -3,12 +3,13 @@
 import dataclasses
 
 import chex
+import jax
 import numpy as np
 import pytest
 from probes import CONFIG, SIZES, Window, compilations
 
 from cuelearner_jax import guidance, lanes
-from cuelearner_jax.devices import SHARED, place
+from cuelearner_jax.devices import SHARED, compiler_options, place
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.runs import Grid
 from cuelearner_jax.train import start_clock
@@ -26,6 +27,17 @@ def test_blocks_are_equal_and_the_last_is_filled_with_repeats():
     assert [list(seeds) for seeds, _ in group.blocks()] == [[0, 1], [2, 3], [4, 4]]
     columns = group.lanes([{"reward": seeds * 1.0} for seeds, _ in group.blocks()])
     np.testing.assert_array_equal(columns["reward"], [0.0, 1.0, 2.0, 3.0, 4.0])
+
+
+def test_a_program_is_made_for_the_lanes_that_a_device_takes_at_once(monkeypatch):
+    made = []
+    monkeypatch.setattr(lanes, "make_program", lambda *arguments, lanes: made.append(lanes))
+    group_of(5, lanes_per_block=2)
+    group_of(40, lanes_per_block=40)
+    assert made == [2, 40]
+    assert compiler_options(40) == {}
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    assert [compiler_options(many)["xla_gpu_enable_triton_gemm"] for many in made] == [True, False]
 
 
 def test_lanes_are_seeds_for_each_budget_where_labels_are_asked_for():
