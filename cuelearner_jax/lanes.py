@@ -23,7 +23,7 @@ from cuelearner_jax.search import looked_at
 from cuelearner_jax.train import Program, label_slots, make_program, start_clock
 from cuelearner_jax.types import Clock, Guidance, TrainState
 
-CACHE_BYTES = 6_000_000  # of the action-value weights of a CPU's block: beyond, they leave the cache between two steps
+CACHE_BYTES = 4_000_000  # of the action-value weights of a CPU's block: beyond, they leave the cache between two steps
 CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 T = TypeVar("T")

@@ -18,7 +18,7 @@ from jaxtyping import Array, Int, PRNGKeyArray
 from cuelearner_jax import actions as geometry
 from cuelearner_jax import ddqn
 from cuelearner_jax.config import RunConfig, Scalars, Schedule, Sizes
-from cuelearner_jax.devices import BY_LANE, SHARED, compiler_options, lane_mesh, over_lanes
+from cuelearner_jax.devices import BY_LANE, SHARED, compiler_options, each_lane, lane_mesh, over_lanes
 from cuelearner_jax.feedback import empty_labels
 from cuelearner_jax.networks import applied, q_network
 from cuelearner_jax.refine import Refined, untouched
@@ -86,19 +86,19 @@ def make_program(
 
     def init(env, seeds, budgets, root):
         keys = jax.vmap(lambda seed: jax.random.fold_in(root, seed))(seeds)
-        return jax.vmap(partial(lane.init, env))(keys, budgets)
+        return each_lane(partial(lane.init, env))(keys, budgets)
 
     def label_round(env, teacher, scalars, clock, state):
-        state = jax.vmap(partial(lane.label_round, env, teacher, scalars, clock))(state)
+        state = each_lane(partial(lane.label_round, env, teacher, scalars, clock))(state)
         return clock.replace(round=clock.round + 1), state
 
     def take_labels(env, scalars, labels, state):
-        return jax.vmap(partial(lane.take_labels, env, scalars))(labels, state)
+        return each_lane(partial(lane.take_labels, env, scalars))(labels, state)
 
     def train(env, scalars, schedule, clock, state, iterations):
         def iteration(carry, _):
             clock, state = carry
-            state, metrics = jax.vmap(partial(lane.iterate, env, scalars, schedule, clock))(state)
+            state, metrics = each_lane(partial(lane.iterate, env, scalars, schedule, clock))(state)
             return (lane.advance(clock, schedule), state), metrics
 
         (clock, state), metrics = jax.lax.scan(iteration, (clock, state), length=iterations)

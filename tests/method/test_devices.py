@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from cuelearner_jax import results
-from cuelearner_jax.devices import BY_LANE, SHARED, group_bytes, lane_mesh, over_lanes
+from cuelearner_jax.devices import BY_LANE, SHARED, each_lane, group_bytes, lane_mesh, over_lanes
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.play import Subject, load_lanes
 from cuelearner_jax.runs import load
@@ -48,6 +48,21 @@ def test_empty_arrays_do_not_enter_the_shared_program():
     (call,) = jax.make_jaxpr(double)(two, lanes).eqns
     assert [value.aval.shape for value in call.invars] == [(), (4,)]
     chex.assert_trees_all_equal(double(two, lanes), {"labels": jnp.zeros((4, 0)), "values": 2 * jnp.arange(4.0)})
+
+
+@pytest.mark.parametrize("lanes", [1, 3])
+def test_a_single_lane_is_computed_as_one_of_many_is(lanes):
+    def product(lane, scale):
+        return {"product": lane["left"] @ lane["right"] * scale, "shape": jnp.asarray(lane["left"].ndim)}
+
+    keys = jax.random.split(jax.random.key(0), 2)
+    block = {name: jax.random.normal(key, (lanes, 5, 5)) for name, key in zip(("left", "right"), keys, strict=True)}
+    found = each_lane(product)(block, jnp.arange(lanes) + 2.0)
+    chex.assert_trees_all_close(found, jax.vmap(product)(block, jnp.arange(lanes) + 2.0), rtol=1e-6)
+    (product_made,) = [
+        e for e in jax.make_jaxpr(each_lane(product))(block, jnp.ones(lanes)).eqns if "dot" in e.primitive.name
+    ]
+    assert product_made.outvars[0].aval.ndim == (2 if lanes == 1 else 3)
 
 
 def test_a_batch_job_has_the_memory_that_its_narrowest_group_grants(tmp_path):

@@ -36,8 +36,11 @@ def test_a_program_is_made_for_the_lanes_that_a_device_takes_at_once(monkeypatch
     group_of(40, lanes_per_block=40)
     assert made == [2, 40]
     assert compiler_options(40) == {}
-    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    assert [compiler_options(many)["xla_gpu_enable_triton_gemm"] for many in made] == [True, False]
+    with monkeypatch.context() as patch:
+        patch.setattr(jax, "default_backend", lambda: "gpu")
+        few, many = (compiler_options(lanes) for lanes in made)
+    assert (few["xla_gpu_enable_triton_gemm"], many["xla_gpu_enable_triton_gemm"]) == (True, False)
+    assert jax.jit(lambda x: x + 1, compiler_options=many)(1) == 2  # XLA refuses names that it does not know
 
 
 def test_lanes_are_seeds_for_each_budget_where_labels_are_asked_for():
