@@ -96,13 +96,18 @@ def make_program(
         return each_lane(partial(lane.take_labels, env, scalars))(labels, state)
 
     def train(env, scalars, schedule, clock, state, iterations):
-        def iteration(carry, _):
-            clock, state = carry
-            state, metrics = each_lane(partial(lane.iterate, env, scalars, schedule, clock))(state)
-            return (lane.advance(clock, schedule), state), metrics
+        def run(state):
+            def iteration(carry, _):
+                clock, state = carry
+                state, metrics = lane.iterate(env, scalars, schedule, clock, state)
+                return (lane.advance(clock, schedule), state), metrics
 
-        (clock, state), metrics = jax.lax.scan(iteration, (clock, state), length=iterations)
-        return clock, state, jax.tree.map(lambda leaf: leaf.mean(0), metrics)
+            (_, state), metrics = jax.lax.scan(iteration, (clock, state), length=iterations)
+            return state, jax.tree.map(lambda leaf: leaf.mean(0), metrics)
+
+        # In the loop the clock is common to all lanes, which vmap leaves as it is but could not give back as it was.
+        after = jax.lax.fori_loop(0, iterations, lambda _, clock: lane.advance(clock, schedule), clock)
+        return after, *each_lane(run)(state)
 
     def stretch(env, scalars, schedule, clock, state, iterations):
         whole = over_lanes(
