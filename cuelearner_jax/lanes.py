@@ -67,7 +67,7 @@ class Group:
         return [place(self.mesh, block, BY_LANE) for block in blocks]
 
     def _fitting_lanes(self) -> int:
-        """Lanes of a block: on accelerators all; on one CPU device what fits its cache, in a block for each core at least."""
+        """Lanes of a block: on accelerators all; on one CPU device what fits its cache, and a block for each core."""
         if jax.default_backend() != "cpu" or self.mesh.size > 1:
             return len(self.seeds)
         widths = [self.env.obs_size + 2, *self.config.sizes.q_layers, 1]
