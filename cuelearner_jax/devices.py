@@ -1,10 +1,9 @@
-"""Lanes over devices, each of which works on its share of a block and waits for none; how much one holds and takes."""
+"""Lanes over devices, each of which works on its share of a block and waits for none; how much one takes at once."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from itertools import compress
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -23,12 +22,11 @@ class Portions(NamedTuple):
     actions: int  # state-action pairs of one agent in one forward pass of an argmax
     agents: int  # evaluated side by side
     states: int  # that a teacher looks at together
-    worlds: int  # generated together: all of them take as long as the one that is tried most often
 
 
 def portions() -> Portions:
     """Those of the device that computes."""
-    return Portions(8192, 1, 16, 1) if jax.default_backend() == "cpu" else Portions(1 << 14, 16, 256, 64)
+    return Portions(8192, 1, 16) if jax.default_backend() == "cpu" else Portions(1 << 14, 16, 256)
 
 
 def compiler_options(lanes: int) -> dict[str, Any]:
@@ -84,58 +82,30 @@ def over_lanes(mesh: Mesh, function: Callable[..., Any], takes: tuple[Any, ...],
     return whole
 
 
-def each_lane(function: Callable[..., Any]) -> Callable[..., Any]:
-    """`jax.vmap` over lanes. A single lane is computed without the axis, which slows XLA's matrix products on a CPU."""
+def each_lane(function: Callable[..., Any], gives: Any = 0) -> Callable[..., Any]:
+    """`jax.vmap` over lanes; one alone is computed without the axis, which slows XLA's matrix products on a CPU.
+
+    Args:
+        function: of one lane's trees of arrays.
+        gives: `out_axes` of `jax.vmap`: 0, or None for what all lanes have in common.
+
+    Returns:
+        The function of blocks: every leaf with a leading axis of lanes.
+    """
 
     def mapped(*blocks: Any) -> Any:
-        if all(leaf.shape[0] == 1 for leaf in jax.tree.leaves(blocks)):
-            return jax.tree.map(lambda leaf: leaf[None], function(*jax.tree.map(lambda leaf: leaf[0], blocks)))
-        return jax.vmap(function)(*blocks)
+        if any(leaf.shape[0] > 1 for leaf in jax.tree.leaves(blocks)):
+            return jax.vmap(function, out_axes=gives)(*blocks)
+        found = function(*jax.tree.map(lambda leaf: leaf[0], blocks))
+        return jax.tree.map(_with_axis, gives, found, is_leaf=lambda axis: axis is None)
 
     return mapped
+
+
+def _with_axis(axis: int | None, tree: Any) -> Any:
+    return tree if axis is None else jax.tree.map(lambda leaf: leaf[None], tree)
 
 
 def place(mesh: Mesh, tree: Any, where: PartitionSpec) -> Any:
     """A tree of arrays as `over_lanes` gives them back. JAX compiles once more for arrays that lie otherwise."""
     return jax.device_put(tree, NamedSharding(mesh, where))
-
-
-def free_bytes() -> int | None:
-    """Free memory of the device that trains, where it can be known; of a CPU no more than its control group allows."""
-    device = jax.devices()[0]
-    if device.platform != "cpu":
-        stats = device.memory_stats() or {}
-        return stats["bytes_limit"] - stats.get("bytes_in_use", 0) if "bytes_limit" in stats else None
-    return min((found for found in (_host_bytes(), group_bytes()) if found is not None), default=None)
-
-
-def _host_bytes() -> int | None:
-    try:
-        lines = Path("/proc/meminfo").read_text().splitlines()
-    except OSError:
-        return None
-    return next((int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:")), None)
-
-
-def group_bytes(groups: Path = Path("/proc/self/cgroup"), root: Path = Path("/sys/fs/cgroup")) -> int | None:
-    """Memory that the control groups of this process (a container, a batch job) still grant; None without a limit.
-
-    Caches of files that the kernel would give up count as free. Source: Linux, Documentation/admin-guide/cgroup-v2.rst.
-
-    Args:
-        groups: names the process's own group, in the line that begins with "0::".
-        root: where the groups' files lie; a group is bound by those above it too.
-    """
-    granted = []
-    try:
-        own = next((line[3:] for line in groups.read_text().splitlines() if line.startswith("0::")), "/")
-        folder = root / own.lstrip("/")
-        for group in [folder, *folder.parents][: len(folder.relative_to(root).parts) + 1]:
-            limit = (group / "memory.max").read_text().strip() if (group / "memory.max").is_file() else "max"
-            if limit != "max":
-                used = int((group / "memory.current").read_text())
-                kinds = dict(line.split() for line in (group / "memory.stat").read_text().splitlines())
-                granted.append(max(0, int(limit) - used + int(kinds.get("inactive_file", 0))))
-    except OSError:
-        return None
-    return min(granted, default=None)

@@ -102,12 +102,10 @@ def make_program(
                 state, metrics = lane.iterate(env, scalars, schedule, clock, state)
                 return (lane.advance(clock, schedule), state), metrics
 
-            (_, state), metrics = jax.lax.scan(iteration, (clock, state), length=iterations)
-            return state, jax.tree.map(lambda leaf: leaf.mean(0), metrics)
+            (after, state), metrics = jax.lax.scan(iteration, (clock, state), length=iterations)
+            return after, state, jax.tree.map(lambda leaf: leaf.mean(0), metrics)
 
-        # In the loop the clock is common to all lanes, which vmap leaves as it is but could not give back as it was.
-        after = jax.lax.fori_loop(0, iterations, lambda _, clock: lane.advance(clock, schedule), clock)
-        return after, *each_lane(run)(state)
+        return each_lane(run, gives=(None, 0, 0))(state)
 
     def stretch(env, scalars, schedule, clock, state, iterations):
         whole = over_lanes(

@@ -4,7 +4,6 @@ import itertools
 import math
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
-from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -284,10 +283,10 @@ def test_another_key_gives_another_world(sample):
 
 
 @pytest.mark.parametrize("sample", ["rooms"], indirect=True)
-@pytest.mark.parametrize("at_once", [1, 4])
+@pytest.mark.parametrize("at_once", [None, 3, 64])
 def test_worlds_generated_together_are_those_generated_alone(sample, monkeypatch, at_once):
     style, many = sample
-    monkeypatch.setattr("cuelearner_envs.navigation.worlds.portions", lambda: SimpleNamespace(worlds=at_once))
+    monkeypatch.setattr("cuelearner_envs.navigation.worlds.together", lambda: at_once)
     together = generate_many.__wrapped__(jax.random.key(3), 8, style)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b[:8], atol=1e-5), together, many)
 

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from cuelearner_jax import results
-from cuelearner_jax.devices import BY_LANE, SHARED, each_lane, group_bytes, lane_mesh, over_lanes
+from cuelearner_jax.devices import BY_LANE, SHARED, each_lane, lane_mesh, over_lanes
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.play import Subject, load_lanes
 from cuelearner_jax.runs import load
@@ -51,38 +51,17 @@ def test_empty_arrays_do_not_enter_the_shared_program():
 
 
 @pytest.mark.parametrize("lanes", [1, 3])
-def test_a_single_lane_is_computed_as_one_of_many_is(lanes):
-    def product(lane, scale):
-        return {"product": lane["left"] @ lane["right"] * scale, "shape": jnp.asarray(lane["left"].ndim)}
+def test_a_lane_alone_is_computed_without_the_axis_and_given_back_with_it(lanes):
+    def product(left, right):
+        return jnp.asarray(left.ndim), {"product": left @ right}
 
-    keys = jax.random.split(jax.random.key(0), 2)
-    block = {name: jax.random.normal(key, (lanes, 5, 5)) for name, key in zip(("left", "right"), keys, strict=True)}
-    found = each_lane(product)(block, jnp.arange(lanes) + 2.0)
-    chex.assert_trees_all_close(found, jax.vmap(product)(block, jnp.arange(lanes) + 2.0), rtol=1e-6)
-    (product_made,) = [
-        e for e in jax.make_jaxpr(each_lane(product))(block, jnp.ones(lanes)).eqns if "dot" in e.primitive.name
-    ]
-    assert product_made.outvars[0].aval.ndim == (2 if lanes == 1 else 3)
-
-
-def test_a_batch_job_has_the_memory_that_its_narrowest_group_grants(tmp_path):
-    groups = tmp_path / "cgroup"
-    groups.write_text("1:name=systemd:/\n0::/slurm/job_7/step\n")
-    assert group_bytes(groups, tmp_path) is None  # no group sets a limit
-
-    def limit(group, allowed, used, files):
-        (tmp_path / group).mkdir(parents=True, exist_ok=True)
-        (tmp_path / group / "memory.max").write_text(f"{allowed}\n")
-        (tmp_path / group / "memory.current").write_text(f"{used}\n")
-        (tmp_path / group / "memory.stat").write_text(f"anon {used - files}\ninactive_file {files}\n")
-
-    limit("slurm/job_7/step", "max", 50, 0)
-    limit("slurm/job_7", 100, 80, 30)
-    limit("slurm", 1000, 990, 0)
-    assert group_bytes(groups, tmp_path) == 10
-    limit("slurm", 1000, 500, 0)
-    assert group_bytes(groups, tmp_path) == 50
-    assert group_bytes(tmp_path / "none", tmp_path) is None
+    left, right = jax.random.normal(jax.random.key(0), (2, lanes, 5, 5))
+    mapped = each_lane(product, gives=(None, 0))
+    dimensions, found = mapped(left, right)
+    assert dimensions == 2  # what all lanes have in common
+    np.testing.assert_allclose(found["product"], np.matmul(left, right), rtol=1e-4, atol=1e-5)
+    (made,) = [step for step in jax.make_jaxpr(mapped)(left, right).eqns if step.primitive.name == "dot_general"]
+    assert made.outvars[0].aval.ndim == (2 if lanes == 1 else 3)
 
 
 def measured(folder):

@@ -17,13 +17,13 @@ from cuelearner_envs.navigation.geometry import clearance
 from cuelearner_envs.navigation.layouts import STYLES, Layout
 from cuelearner_envs.navigation.robot import Robot
 from cuelearner_envs.navigation.world import World
-from cuelearner_jax.devices import portions
 
 CELL = 0.2  # side of a grid cell [m]
 CELLS = 100  # along either side: the largest world is 20 m
 NEAREST, FARTHEST = 5.0, 15.0  # from start to goal [m]
 JITTER = 0.1  # starts and goals lie this far from a cell's middle at most, along x and y [m]
 ROUTES = 16
+WORLDS_AT_ONCE = 64  # generated together on an accelerator: bounds the memory of their grids
 
 
 def generate(key: PRNGKeyArray, style: str = "clutter", routes: int = ROUTES) -> World:
@@ -56,9 +56,12 @@ def generate(key: PRNGKeyArray, style: str = "clutter", routes: int = ROUTES) ->
 def generate_many(key: PRNGKeyArray, count: int, style: str = "clutter", routes: int = ROUTES) -> World:
     """`count` worlds (leading axis). World i does not depend on how many there are."""
     keys = jax.vmap(partial(jax.random.fold_in, key))(jnp.arange(count))
-    together = min(count, portions().worlds)
-    one = partial(generate, style=style, routes=routes)
-    return jax.lax.map(one, keys, batch_size=together if together > 1 else None)
+    return jax.lax.map(partial(generate, style=style, routes=routes), keys, batch_size=together())
+
+
+def together() -> int | None:
+    """Worlds generated together; None on a CPU, where all would wait for the one that is tried most often."""
+    return None if jax.default_backend() == "cpu" else WORLDS_AT_ONCE
 
 
 def cell_centres() -> Float[Array, "cells cells 2"]:

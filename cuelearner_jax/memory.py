@@ -1,0 +1,58 @@
+"""How much memory is free to train in: a device's, a machine's, or what a container or a batch job may have of it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import jax
+
+
+def free_bytes() -> int | None:
+    """Free memory of the device that trains [bytes], where known; of a CPU no more than its control groups grant."""
+    device = jax.devices()[0]
+    if device.platform != "cpu":
+        stats = device.memory_stats() or {}
+        return stats["bytes_limit"] - stats.get("bytes_in_use", 0) if "bytes_limit" in stats else None
+    return _least([_host_bytes(), group_bytes()])
+
+
+def _host_bytes() -> int | None:
+    try:
+        lines = Path("/proc/meminfo").read_text().splitlines()
+    except OSError:
+        return None
+    return next((int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:")), None)
+
+
+def group_bytes(groups: Path = Path("/proc/self/cgroup"), root: Path = Path("/sys/fs/cgroup")) -> int | None:
+    """Memory that the control groups of this process (a container, a batch job) still grant [bytes]; None if unlimited.
+
+    Source: Linux, Documentation/admin-guide/cgroup-v2.rst.
+
+    Args:
+        groups: names the process's own group, in the line that begins with "0::".
+        root: where the groups' files lie; a group is bound by those above it too.
+    """
+    try:
+        own = next((line[3:] for line in groups.read_text().splitlines() if line.startswith("0::")), "/")
+    except OSError:
+        return None
+    folder = root / own.lstrip("/")
+    above = len(folder.relative_to(root).parts)
+    return _least(_granted(group) for group in [folder, *folder.parents][: above + 1])
+
+
+def _granted(group: Path) -> int | None:
+    """What one group grants; caches of files, which the kernel would give up, count as free."""
+    try:
+        limit = (group / "memory.max").read_text().strip()
+        used = int((group / "memory.current").read_text())
+        kinds = dict(line.split() for line in (group / "memory.stat").read_text().splitlines())
+    except OSError:
+        return None
+    return None if limit == "max" else max(0, int(limit) - used + int(kinds.get("inactive_file", 0)))
+
+
+def _least(found: Iterable[int | None]) -> int | None:
+    return min((number for number in found if number is not None), default=None)
