@@ -25,7 +25,8 @@ from cuelearner_envs.anymal import policy
 from cuelearner_envs.anymal.environment import LeggedNavigation
 from cuelearner_envs.navigation.config import NavigationConfig
 from cuelearner_envs.navigation.config import make_environment as make_navigation
-from cuelearner_jax import actions, results
+from cuelearner_jax import actions
+from cuelearner_jax.records import results
 
 RESULTS = Path(__file__).parent / "results" / "anymal_speed.json"
 

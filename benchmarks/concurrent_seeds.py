@@ -19,12 +19,12 @@ from typing import Any
 
 import jax
 
-from cuelearner_jax import results
-from cuelearner_jax.bench import Timed, learning
+from cuelearner_jax.bench.measuring import Timed, learning
 from cuelearner_jax.config import RunConfig
 from cuelearner_jax.devices import lane_mesh
-from cuelearner_jax.lanes import state_bytes
-from cuelearner_jax.tasks import NAVIGATION
+from cuelearner_jax.records import results
+from cuelearner_jax.runs.lanes import state_bytes
+from cuelearner_jax.tasks.registry import NAVIGATION
 
 RESULTS = Path(__file__).parent / "results"
 

@@ -18,8 +18,8 @@ from typing import Any
 import jax
 import numpy as np
 
-from cuelearner_jax.bench import Timed, learning
-from cuelearner_jax.tasks import BILLIARDS
+from cuelearner_jax.bench.measuring import Timed, learning
+from cuelearner_jax.tasks.registry import BILLIARDS
 
 
 class Run(Timed):

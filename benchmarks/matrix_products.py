@@ -16,9 +16,10 @@ from pathlib import Path
 import jax
 from scaling import REPLAY
 
-from cuelearner_jax import devices, results
-from cuelearner_jax.bench import Work, measure
-from cuelearner_jax.tasks import TASKS
+from cuelearner_jax import devices
+from cuelearner_jax.bench.measuring import Work, measure
+from cuelearner_jax.records import results
+from cuelearner_jax.tasks.registry import TASKS
 
 WAYS = {"compiled": 2**30, "library": 0}  # from how many lanes on the library is used
 

@@ -33,8 +33,8 @@ import jax.numpy as jnp
 
 from cuelearner_envs.navigation.config import NavigationConfig, make_environment
 from cuelearner_envs.navigation.environment import Navigation
-from cuelearner_jax import results
 from cuelearner_jax.actions import from_angle
+from cuelearner_jax.records import results
 
 RESULTS = Path(__file__).parent / "results" / "navigation_speed.json"
 PEER = "JaxNav"

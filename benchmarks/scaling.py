@@ -26,11 +26,11 @@ import matplotlib
 from matplotlib import ticker
 from matplotlib.figure import Figure
 
-from cuelearner_jax import results
-from cuelearner_jax.bench import Timed, Work, learning, measure
+from cuelearner_jax.bench.measuring import Timed, Work, learning, measure
 from cuelearner_jax.devices import lane_mesh
-from cuelearner_jax.figures import COLOURS, STYLE, save_figure
-from cuelearner_jax.tasks import TASKS
+from cuelearner_jax.records import results
+from cuelearner_jax.report.figures import COLOURS, STYLE, save_figure
+from cuelearner_jax.tasks.registry import TASKS
 
 REPLAY = 100_000
 ROUNDS = 3  # of labels, after the one that compiles

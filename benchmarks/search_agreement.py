@@ -21,14 +21,16 @@ import jax
 import jax.numpy as jnp
 
 from cuelearner_jax import actions as geometry
-from cuelearner_jax import guidance, results, runs
+from cuelearner_jax.agent.choice import greedy_actions
+from cuelearner_jax.agent.networks import applied, q_network
 from cuelearner_jax.config import Sizes
 from cuelearner_jax.evaluate import agent_policy, episodes, rollout
-from cuelearner_jax.lanes import Group, restore_policies
-from cuelearner_jax.networks import applied, q_network
-from cuelearner_jax.runs import Grid
-from cuelearner_jax.search import greedy_actions
-from cuelearner_jax.tasks import TASKS
+from cuelearner_jax.guidance import registry as guidance
+from cuelearner_jax.records import results
+from cuelearner_jax.runs import grid as runs
+from cuelearner_jax.runs.grid import Grid
+from cuelearner_jax.runs.lanes import Group, restore_policies
+from cuelearner_jax.tasks.registry import TASKS
 
 STATES = 256  # of an agent
 NAMES = ("same", "neighbouring", "within_half_a_degree", "value_given_up", "reward")

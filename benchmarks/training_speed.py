@@ -20,9 +20,9 @@ import jax
 import numpy as np
 from cartpole import CartPole
 
-from cuelearner_jax.bench import Timed, learning, matmul_rate
+from cuelearner_jax.bench.measuring import Timed, learning, matmul_rate
+from cuelearner_jax.bench.operations import step_operations
 from cuelearner_jax.config import RunConfig, Scalars, Schedule, Sizes
-from cuelearner_jax.operations import step_operations
 
 BATCH, ENVS, DIRECTIONS = 256, 8, 2
 

@@ -16,14 +16,14 @@ from jax.sharding import Mesh
 from jaxtyping import Array, Int, PRNGKeyArray
 
 from cuelearner_jax import actions as geometry
-from cuelearner_jax import ddqn
+from cuelearner_jax.agent import ddqn
+from cuelearner_jax.agent.choice import greedy_actions
+from cuelearner_jax.agent.networks import applied, q_network
+from cuelearner_jax.agent.replay import RingBuffer, ring_buffer
 from cuelearner_jax.config import RunConfig, Scalars, Schedule, Sizes
 from cuelearner_jax.devices import BY_LANE, SHARED, compiler_options, each_lane, lane_mesh, over_lanes
-from cuelearner_jax.feedback import empty_labels
-from cuelearner_jax.networks import applied, q_network
-from cuelearner_jax.refine import Refined, untouched
-from cuelearner_jax.replay import RingBuffer, ring_buffer
-from cuelearner_jax.search import greedy_actions
+from cuelearner_jax.guidance.feedback import empty_labels
+from cuelearner_jax.guidance.refining import Refined, untouched
 from cuelearner_jax.types import (
     Asking,
     Clock,

@@ -31,12 +31,12 @@ from cuelearner_envs.anymal.environment import make_environment as make_legged
 from cuelearner_envs.anymal.judged import rollout as judged
 from cuelearner_envs.navigation.config import make_environment
 from cuelearner_envs.navigation.environment import Navigation
-from cuelearner_jax import results
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import agent_policy, episodes, rollout
-from cuelearner_jax.play import Subject, load_lanes
-from cuelearner_jax.runs import load
-from cuelearner_jax.tasks import TASKS
+from cuelearner_jax.records import results
+from cuelearner_jax.runs.grid import load
+from cuelearner_jax.runs.trained import Subject, load_lanes
+from cuelearner_jax.tasks.registry import TASKS
 
 ROOT = Path(__file__).parents[1]
 AGENT = ROOT / "docs" / "data" / "navigation_agent"

@@ -26,8 +26,8 @@ from cuelearner_envs.anymal.environment import make_environment
 from cuelearner_envs.anymal.judged import Course
 from cuelearner_envs.navigation.config import NavigationConfig
 from cuelearner_envs.navigation.robot import Motion, Robot, walk
-from cuelearner_jax import results
 from cuelearner_jax.actions import difference, from_angle
+from cuelearner_jax.records import results
 
 RESULTS = Path(__file__).parents[1] / "docs" / "data" / "anymal_fit.json"
 FITTED = ("speed", "lag", "turn_rate")

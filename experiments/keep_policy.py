@@ -12,11 +12,11 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from cuelearner_jax.checkpoint import checkpoints
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.play import Subject, Trained, load_lanes
-from cuelearner_jax.runs import load
-from cuelearner_jax.tasks import TASKS
+from cuelearner_jax.records.checkpoint import checkpoints
+from cuelearner_jax.runs.grid import load
+from cuelearner_jax.runs.trained import Subject, Trained, load_lanes
+from cuelearner_jax.tasks.registry import TASKS
 from cuelearner_jax.train import start_clock
 
 

@@ -15,9 +15,9 @@ from pathlib import Path
 
 import numpy as np
 
-from cuelearner_jax import results
 from cuelearner_jax.cli import main as cuelearner
-from cuelearner_jax.statistics import interval
+from cuelearner_jax.records import results
+from cuelearner_jax.report.statistics import interval
 
 STRENGTHS_DEG = (1, 2, 5)
 

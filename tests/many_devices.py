@@ -12,9 +12,9 @@ from pathlib import Path
 import jax
 import probes
 
-from cuelearner_jax import guidance as guidances
-from cuelearner_jax import lanes, sweep
-from cuelearner_jax.runs import Grid
+from cuelearner_jax.guidance import registry as guidances
+from cuelearner_jax.runs import lanes, sweep
+from cuelearner_jax.runs.grid import Grid
 from cuelearner_jax.train import start_clock
 
 CONFIG = probes.config(

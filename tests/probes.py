@@ -15,10 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from cuelearner_jax import guidance as guidances
 from cuelearner_jax.actions import difference, evenly_spaced, from_angle, rotate
 from cuelearner_jax.config import RunConfig, Scalars, Schedule, Sizes
-from cuelearner_jax.tasks import Task
+from cuelearner_jax.guidance import registry as guidances
+from cuelearner_jax.tasks.registry import Task
 from cuelearner_jax.train import make_program
 from cuelearner_jax.types import Label, Step, WholeObservations
 

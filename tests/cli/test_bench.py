@@ -8,7 +8,7 @@ import time
 
 import pytest
 
-from cuelearner_jax import machines
+from cuelearner_jax.bench import known_machines as machines
 from cuelearner_jax.cli import main
 
 SMALL = ["bench", "billiards", "--preset", "quickstart", "--seconds", "0.01", "--sizes.q-layers", "16"]
@@ -18,7 +18,18 @@ SMALL += ["--sizes.directions", "36", "--sizes.replay-capacity", "1000"]
 @pytest.fixture(scope="module")
 def measured(tmp_path_factory):
     out = tmp_path_factory.mktemp("bench") / "entry.json"
-    command = [sys.executable, "-m", "cuelearner_jax.cli", *SMALL, "--seeds", "2", "--name", "mine", "--out", str(out)]
+    command = [
+        sys.executable,
+        "-m",
+        "cuelearner_jax.cli",
+        *SMALL,
+        "--seeds",
+        "2",
+        "--name",
+        "mine",
+        "--out",
+        str(out),
+    ]
     done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
     return done, out

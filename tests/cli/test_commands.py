@@ -8,8 +8,8 @@ import imageio.v2 as imageio
 import pytest
 from small_runs import SMALL
 
-from cuelearner_jax import results
 from cuelearner_jax.cli import main
+from cuelearner_jax.records import results
 
 ENTRY = [str(Path(sys.executable).with_name("cuelearner"))]
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from small_runs import SMALL
 
-from cuelearner_jax import results
+from cuelearner_jax.records import results
 
 ENTRY = [str(Path(sys.executable).with_name("cuelearner"))]
 STEPS = 2000

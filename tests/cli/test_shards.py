@@ -12,11 +12,11 @@ from types import SimpleNamespace
 import pytest
 from small_runs import SMALL
 
-from cuelearner_jax import results
 from cuelearner_jax.cli import main
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.runs import claimed
-from cuelearner_jax.shards import Shard
+from cuelearner_jax.records import results
+from cuelearner_jax.runs.grid import claimed
+from cuelearner_jax.runs.shards import Shard
 
 ENTRY = [str(Path(sys.executable).with_name("cuelearner"))]
 SWEEP = ["sweep", "billiards", "--preset", "quickstart", *SMALL, "--seeds", "3", "--first-seed", "7"]

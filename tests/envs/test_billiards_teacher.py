@@ -10,8 +10,8 @@ from cuelearner_envs.billiards.teacher import SearchTeacher
 from cuelearner_jax import actions
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import episodes, rollout, teacher_policy
-from cuelearner_jax.tasks import SHIPPED_TEACHERS, billiards_teacher
-from cuelearner_jax.teacher import LearnedTeacher
+from cuelearner_jax.tasks.registry import SHIPPED_TEACHERS, billiards_teacher
+from cuelearner_jax.teachers.learned import LearnedTeacher
 
 RACKS, DIRECTIONS = 50, 1440
 ONE = make_environment(BilliardsConfig("one_ball"))

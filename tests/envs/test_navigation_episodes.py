@@ -14,7 +14,7 @@ from cuelearner_envs.navigation.lidar import Lidar
 from cuelearner_envs.navigation.robot import collides
 from cuelearner_envs.navigation.worlds import generate_many
 from cuelearner_jax import actions, train
-from cuelearner_jax import guidance as guidances
+from cuelearner_jax.guidance import registry as guidances
 
 KEY = jax.random.key(0)
 LEFT = jnp.array([0.0, 1.0])

@@ -15,10 +15,11 @@ from cuelearner_envs.navigation.layouts import BOXES, CIRCLES
 from cuelearner_envs.navigation.roadmap import BLOCKED, LINE_MARGIN, NODE_MARGIN, RoadMapTeacher, make_teacher, way
 from cuelearner_envs.navigation.world import FAR_AWAY
 from cuelearner_envs.navigation.worlds import generate_many
-from cuelearner_jax import evaluate, feedback
-from cuelearner_jax import guidance as guidances
+from cuelearner_jax import evaluate
 from cuelearner_jax.actions import difference, from_angle
 from cuelearner_jax.config import Scalars, Sizes
+from cuelearner_jax.guidance import feedback
+from cuelearner_jax.guidance import registry as guidances
 
 REACH = 0.465  # from the middle of the body to its farthest point [m]
 NEEDED = REACH + LINE_MARGIN

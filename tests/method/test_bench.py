@@ -9,13 +9,15 @@ import jax.numpy as jnp
 import pytest
 from probes import CONFIG, Window, compilations, make_task
 
-from cuelearner_jax import bench, ddqn, machines
+from cuelearner_jax.agent import ddqn
+from cuelearner_jax.agent.networks import applied, q_network
+from cuelearner_jax.bench import known_machines as machines
+from cuelearner_jax.bench import measuring as bench
+from cuelearner_jax.bench.operations import forward, forward_and_backward, step_operations
 from cuelearner_jax.config import Sizes
 from cuelearner_jax.devices import lane_mesh
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.networks import applied, q_network
-from cuelearner_jax.operations import forward, forward_and_backward, step_operations
-from cuelearner_jax.tasks import BILLIARDS, Preset
+from cuelearner_jax.tasks.registry import BILLIARDS, Preset
 from cuelearner_jax.types import Transition
 
 LAYERS, OBS = (64, 48), 10

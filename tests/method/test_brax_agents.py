@@ -18,8 +18,8 @@ from flax import struct
 
 from cuelearner_envs.billiards import config as billiards
 from cuelearner_envs.navigation import config as navigation
-from cuelearner_jax import brax_adapter
-from cuelearner_jax.brax_adapter import to_brax, wrap_for_training
+from cuelearner_jax.brax_bridge import adapter as brax_adapter
+from cuelearner_jax.brax_bridge.adapter import to_brax, wrap_for_training
 from cuelearner_jax.types import Step, WholeObservations
 
 RAW = jax.random.key_data(jax.random.key(0))

@@ -10,11 +10,11 @@ import pytest
 from brax import envs
 from brax.envs.wrappers import training
 
-from cuelearner_jax import guidance as guidances
 from cuelearner_jax import train
 from cuelearner_jax.actions import evenly_spaced
-from cuelearner_jax.brax_adapter import from_brax, to_brax
+from cuelearner_jax.brax_bridge.adapter import from_brax, to_brax
 from cuelearner_jax.errors import UserError
+from cuelearner_jax.guidance import registry as guidances
 from cuelearner_jax.types import Environment
 
 

@@ -9,8 +9,8 @@ import numpy as np
 import probes
 import pytest
 
-from cuelearner_jax.checkpoint import KEPT, checkpoints
 from cuelearner_jax.errors import UserError
+from cuelearner_jax.records.checkpoint import KEPT, checkpoints
 
 
 def state(seed=0):

@@ -12,11 +12,11 @@ import many_devices
 import numpy as np
 import pytest
 
-from cuelearner_jax import results
 from cuelearner_jax.devices import BY_LANE, SHARED, each_lane, lane_mesh, over_lanes
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.play import Subject, load_lanes
-from cuelearner_jax.runs import load
+from cuelearner_jax.records import results
+from cuelearner_jax.runs.grid import load
+from cuelearner_jax.runs.trained import Subject, load_lanes
 
 SCRIPT = Path(many_devices.__file__)
 

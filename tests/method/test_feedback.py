@@ -10,9 +10,10 @@ import numpy as np
 import probes
 import pytest
 
-from cuelearner_jax import actions, feedback
+from cuelearner_jax import actions
+from cuelearner_jax.agent.networks import applied, feedback_network
 from cuelearner_jax.config import Scalars, Sizes
-from cuelearner_jax.networks import applied, feedback_network
+from cuelearner_jax.guidance import feedback
 
 DEG = math.pi / 180
 

@@ -9,8 +9,10 @@ import numpy as np
 import probes
 import pytest
 
-from cuelearner_jax import actions, feedback, guidance
+from cuelearner_jax import actions
 from cuelearner_jax.errors import UserError
+from cuelearner_jax.guidance import feedback
+from cuelearner_jax.guidance import registry as guidance
 from cuelearner_jax.types import Label
 
 ENV = probes.Window()

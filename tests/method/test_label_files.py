@@ -7,11 +7,11 @@ import probes
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-
-from cuelearner_jax import sweep
-from cuelearner_jax.errors import UserError
 from cuelearner_jax.labelling import files
-from cuelearner_jax.runs import Grid
+
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.runs import sweep
+from cuelearner_jax.runs.grid import Grid
 
 TASK = {"name": "window", "half_width_deg": 28.0}
 EPS = probes.CONFIG.scalars.eps_deg

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from probes import CONFIG, SIZES, Window, compilations
 
-from cuelearner_jax import guidance, lanes
 from cuelearner_jax.devices import SHARED, compiler_options, place
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.runs import Grid
+from cuelearner_jax.guidance import registry as guidance
+from cuelearner_jax.runs import lanes
+from cuelearner_jax.runs.grid import Grid
 from cuelearner_jax.train import start_clock
 
 

@@ -9,9 +9,9 @@ import pytest
 from brax import envs
 from small_runs import listing
 
-from cuelearner_jax import locomotion
+from cuelearner_jax.brax_bridge import walking as locomotion
+from cuelearner_jax.brax_bridge.walking import LocomotionConfig
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.locomotion import LocomotionConfig
 from cuelearner_jax.types import Walker
 
 SMALL = LocomotionConfig(

@@ -10,13 +10,14 @@ import numpy as np
 import probes
 import pytest
 
-from cuelearner_jax import ddqn, train
-from cuelearner_jax import guidance as guidances
+from cuelearner_jax import train
 from cuelearner_jax.actions import evenly_spaced
+from cuelearner_jax.agent import ddqn
+from cuelearner_jax.agent.networks import MLP, Joined, applied, q_network
+from cuelearner_jax.agent.replay import Following
 from cuelearner_jax.config import Scalars, check
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.networks import MLP, Joined, applied, q_network
-from cuelearner_jax.replay import Following
+from cuelearner_jax.guidance import registry as guidances
 from cuelearner_jax.types import Memory, Transition
 
 HALF = 0.5  # the discount factor of everything worked out by hand

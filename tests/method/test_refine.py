@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from cuelearner_jax import actions
-from cuelearner_jax.refine import refine, untouched
+from cuelearner_jax.guidance.refining import refine, untouched
 
 DEG = math.pi / 180
 ROWS = 256

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from cuelearner_jax.replay import ring_buffer
+from cuelearner_jax.agent.replay import ring_buffer
 from cuelearner_jax.types import Memory
 
 EXAMPLE = Memory(jnp.zeros(3), jnp.zeros(2), jnp.zeros(()), jnp.zeros(1), jnp.zeros(1), jnp.zeros(3))

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from cuelearner_jax import results
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.report import report
+from cuelearner_jax.records import results
+from cuelearner_jax.report.document import report
 
 STEPS = np.arange(0, 101, 10)
 

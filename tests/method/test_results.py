@@ -7,8 +7,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from cuelearner_jax import results
 from cuelearner_jax.errors import UserError
+from cuelearner_jax.records import results
 
 CONSTANTS = {"run": "a", "task": "one_ball", "guidance": "relative", "config_hash": "0f", "hardware": "1 x cpu"}
 SEEDS, LABELS = np.array([3, 4]), np.array([100, 500])

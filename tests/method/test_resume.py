@@ -9,12 +9,12 @@ import numpy as np
 import probes
 import pytest
 
-from cuelearner_jax import guidance as guidances
-from cuelearner_jax import lanes, results, sweep
-from cuelearner_jax.checkpoint import checkpoints
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.labelling import files as label_files
-from cuelearner_jax.runs import Grid
+from cuelearner_jax.guidance import registry as guidances
+from cuelearner_jax.records import label_files, results
+from cuelearner_jax.records.checkpoint import checkpoints
+from cuelearner_jax.runs import lanes, sweep
+from cuelearner_jax.runs.grid import Grid
 from cuelearner_jax.train import label_slots, make_program, start_clock
 
 # Bootstraps, so that target network, next observations and Adam's moments are in the checkpoint as well.

@@ -6,10 +6,11 @@ import numpy as np
 import probes
 import pytest
 
-from cuelearner_jax import guidance as guidances
-from cuelearner_jax import runs, sweep
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.runs import Grid
+from cuelearner_jax.guidance import registry as guidances
+from cuelearner_jax.runs import grid as runs
+from cuelearner_jax.runs import sweep
+from cuelearner_jax.runs.grid import Grid
 
 TASK = probes.make_task()
 TASKS = {TASK.name: TASK}

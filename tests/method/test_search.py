@@ -10,11 +10,12 @@ import pytest
 from probes import CONFIG, SIZES
 
 from cuelearner_jax import config as configuration
-from cuelearner_jax import ddqn, search
 from cuelearner_jax.actions import evenly_spaced, from_angle
+from cuelearner_jax.agent import choice as search
+from cuelearner_jax.agent import ddqn
+from cuelearner_jax.agent.networks import applied, q_network, widened
 from cuelearner_jax.devices import Portions
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.networks import applied, q_network, widened
 
 LAYERS = (24, 24, 17)
 FULL = dataclasses.replace(SIZES, q_layers=LAYERS, directions=360, coarse_directions=0)

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from cuelearner_jax import statistics
-from cuelearner_jax.statistics import Curve
+from cuelearner_jax.report import statistics
+from cuelearner_jax.report.statistics import Curve
 
 
 def flat(steps, lower, upper):

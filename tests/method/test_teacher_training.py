@@ -9,11 +9,12 @@ import numpy as np
 import probes
 import pytest
 
-from cuelearner_jax import actions, teacher
+from cuelearner_jax import actions
 from cuelearner_jax.config import to_json
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import rollout, teacher_policy
-from cuelearner_jax.teacher import TeacherConfig
+from cuelearner_jax.teachers import learned as teacher
+from cuelearner_jax.teachers.learned import TeacherConfig
 
 ENV = probes.Window(mirrors=True)
 CONFIG = TeacherConfig(

@@ -12,9 +12,9 @@ import probes
 import pytest
 
 from cuelearner_jax import actions, evaluate, train
-from cuelearner_jax import guidance as guidances
+from cuelearner_jax.agent.networks import applied, q_network
 from cuelearner_jax.devices import lane_mesh
-from cuelearner_jax.networks import applied, q_network
+from cuelearner_jax.guidance import registry as guidances
 from cuelearner_jax.types import Label
 
 ENV, EXPERT = probes.Window(), probes.Expert(probes.Window())

@@ -24,8 +24,8 @@ from cuelearner_envs.navigation.config import NavigationConfig
 from cuelearner_envs.navigation.config import make_environment as make_navigation
 from cuelearner_envs.navigation.recording import record as navigation_record
 from cuelearner_envs.navigation.roadmap import make_teacher
-from cuelearner_jax import teacher as learned
 from cuelearner_jax.config import RunConfig, Scalars, Schedule, Sizes
+from cuelearner_jax.teachers import learned
 from cuelearner_jax.types import Environment, Teacher, Walker
 
 

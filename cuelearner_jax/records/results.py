@@ -254,7 +254,7 @@ def _version(package: str) -> str:
 
 
 def _commit() -> str:
-    root = Path(__file__).resolve().parents[1]
+    root = Path(__file__).resolve().parents[2]
     if not (root / ".git").exists():  # an installed package may lie inside somebody else's repository
         return ""
     git = ["git", "-C", str(root), "--no-optional-locks"]  # nothing is written to the repository

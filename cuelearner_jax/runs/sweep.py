@@ -20,18 +20,17 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from cuelearner_jax import config as configuration
-from cuelearner_jax import guidance as guidances
-from cuelearner_jax import results
-from cuelearner_jax.checkpoint import Checkpoints, checkpoints
 from cuelearner_jax.config import RunConfig
 from cuelearner_jax.devices import SHARED, lane_mesh, place
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import episodes, evaluate_agents, evaluate_guides
-from cuelearner_jax.labelling import files as label_files
-from cuelearner_jax.lanes import Group, items, memory_report, restore
-from cuelearner_jax.runs import Grid, check_folder, check_grid, claimed, describe, prepare_folder
-from cuelearner_jax.shards import Shard
-from cuelearner_jax.tasks import Task, shape_of
+from cuelearner_jax.guidance import registry as guidances
+from cuelearner_jax.records import label_files, results
+from cuelearner_jax.records.checkpoint import Checkpoints, checkpoints
+from cuelearner_jax.runs.grid import Grid, check_folder, check_grid, claimed, describe, prepare_folder
+from cuelearner_jax.runs.lanes import Group, items, memory_report, restore
+from cuelearner_jax.runs.shards import Shard
+from cuelearner_jax.tasks.registry import Task, shape_of
 from cuelearner_jax.train import label_slots, start_clock
 from cuelearner_jax.types import Environment, Teacher
 

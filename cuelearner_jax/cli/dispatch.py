@@ -20,11 +20,11 @@ import jax
 from rich.console import Console
 from rich.table import Table
 
-from cuelearner_jax import bench, cluster, locomotion, machines, play, runs, sweep, teaching
-from cuelearner_jax.arguments import ABOUT, parse, preset_of, subject_of, task_of
-from cuelearner_jax.errors import UserError, closest, no_space
-from cuelearner_jax.evaluate import episodes
-from cuelearner_jax.options import (
+from cuelearner_jax.bench import known_machines as machines
+from cuelearner_jax.bench import measuring as bench
+from cuelearner_jax.brax_bridge import walking as locomotion
+from cuelearner_jax.cli.arguments import ABOUT, parse, preset_of, subject_of, task_of
+from cuelearner_jax.cli.options import (
     Bench,
     BenchTask,
     Common,
@@ -37,8 +37,14 @@ from cuelearner_jax.options import (
     TeacherTrain,
     Train,
 )
-from cuelearner_jax.shards import Shard
-from cuelearner_jax.tasks import TASKS, Task, anymal_walker
+from cuelearner_jax.errors import UserError, closest, no_space
+from cuelearner_jax.evaluate import episodes
+from cuelearner_jax.runs import cluster, sweep
+from cuelearner_jax.runs import grid as runs
+from cuelearner_jax.runs import trained as play
+from cuelearner_jax.runs.shards import Shard
+from cuelearner_jax.tasks.registry import TASKS, Task, anymal_walker
+from cuelearner_jax.teachers import training as teaching
 
 out = Console(highlight=False, soft_wrap=True)
 
@@ -205,7 +211,7 @@ def _evaluate(arguments: list[str]) -> None:
 
 def _measurements(measured: list[play.Measured], title: str) -> Table:
     """Interquartile means over seeds with their intervals, a row for each guidance and budget."""
-    from cuelearner_jax.statistics import interval
+    from cuelearner_jax.report.statistics import interval
 
     table = Table("guidance", "labels", "seeds", "steps", "metric", "mean", "95% interval", title=title)
     for column in table.columns:
@@ -222,7 +228,7 @@ def _measurements(measured: list[play.Measured], title: str) -> Table:
 
 
 def _report(arguments: list[str]) -> None:
-    from cuelearner_jax.report import report  # it loads what draws, which other commands need not wait for
+    from cuelearner_jax.report.document import report  # it loads what draws, which other commands need not wait for
 
     asked = parse(Report, arguments, "report")
     command = shlex.join(["cuelearner", "report", *arguments])
@@ -328,7 +334,3 @@ def _locomotion(arguments: list[str]) -> None:
         locomotion.evaluate(anymal_walker(), asked.policy, asked.robots, asked.seed, command, asked.out, out.print)
     if asked.out:
         out.print(f"wrote {asked.out}")
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

@@ -1,4 +1,4 @@
-"""The table of known machines (machines.json): entries that `cuelearner bench --out` wrote; how figures are printed."""
+"""The table of known machines (known_machines.json), of entries that `cuelearner bench --out` wrote; printing figures."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 from cuelearner_jax.errors import UserError
 
-TABLE = Path(__file__).with_name("machines.json")
+TABLE = Path(__file__).with_name("known_machines.json")
 
 # What an entry holds, and what each means.
 ENTRY: dict[str, type | tuple[type, ...]] = {

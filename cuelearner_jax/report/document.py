@@ -18,11 +18,12 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from cuelearner_jax import results, shards
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.figures import Group, draw_curves, draw_label_efficiency, save_figure
-from cuelearner_jax.runs import in_use
-from cuelearner_jax.statistics import curve, interval, mean_over_curve, steps_to_reach, stretches_apart
+from cuelearner_jax.records import results
+from cuelearner_jax.report.figures import Group, draw_curves, draw_label_efficiency, save_figure
+from cuelearner_jax.report.statistics import curve, interval, mean_over_curve, steps_to_reach, stretches_apart
+from cuelearner_jax.runs import shards
+from cuelearner_jax.runs.grid import in_use
 
 
 def report(

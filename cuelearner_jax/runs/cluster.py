@@ -27,7 +27,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.shards import Shard
+from cuelearner_jax.runs.shards import Shard
 
 # The command, named in the results as if it had been typed.
 ENTRY = "import sys; sys.argv[0] = 'cuelearner'; from cuelearner_jax.cli import main; sys.exit(main())"

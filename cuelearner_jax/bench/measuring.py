@@ -25,16 +25,17 @@ import jax.numpy as jnp
 from jax.sharding import Mesh
 
 from cuelearner_jax import config as configuration
-from cuelearner_jax import guidance as guidances
-from cuelearner_jax import machines, results
+from cuelearner_jax.bench import known_machines as machines
+from cuelearner_jax.bench.operations import step_operations
 from cuelearner_jax.config import RunConfig
 from cuelearner_jax.devices import SHARED, lane_mesh, place
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.lanes import CORES, Group, memory_report, state_bytes
-from cuelearner_jax.operations import step_operations
-from cuelearner_jax.runs import LARGEST_SEED, Grid
-from cuelearner_jax.sweep import Interrupted, console, progress_bars
-from cuelearner_jax.tasks import Task, shape_of
+from cuelearner_jax.guidance import registry as guidances
+from cuelearner_jax.records import results
+from cuelearner_jax.runs.grid import LARGEST_SEED, Grid
+from cuelearner_jax.runs.lanes import CORES, Group, memory_report, state_bytes
+from cuelearner_jax.runs.sweep import Interrupted, console, progress_bars
+from cuelearner_jax.tasks.registry import Task, shape_of
 from cuelearner_jax.train import start_clock
 from cuelearner_jax.types import Environment, Teacher
 

@@ -8,11 +8,11 @@ from typing import Annotated, Generic, Literal, TypeVar
 
 import tyro
 
-from cuelearner_jax.bench import Measuring
-from cuelearner_jax.cluster import Job
+from cuelearner_jax.bench.measuring import Measuring
+from cuelearner_jax.brax_bridge.walking import LocomotionConfig
 from cuelearner_jax.config import RunConfig
-from cuelearner_jax.locomotion import LocomotionConfig
-from cuelearner_jax.teacher import TeacherConfig
+from cuelearner_jax.runs.cluster import Job
+from cuelearner_jax.teachers.learned import TeacherConfig
 
 TaskT = TypeVar("TaskT")
 Flag = tyro.conf.FlagCreatePairsOff

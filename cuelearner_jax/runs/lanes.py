@@ -14,13 +14,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
 
-from cuelearner_jax.checkpoint import Checkpoints, checkpoints
+from cuelearner_jax.agent.choice import looked_at
 from cuelearner_jax.config import RunConfig
 from cuelearner_jax.devices import BY_LANE, lane_mesh, place, portions
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.memory import free_bytes
-from cuelearner_jax.runs import Grid
-from cuelearner_jax.search import looked_at
+from cuelearner_jax.records.checkpoint import Checkpoints, checkpoints
+from cuelearner_jax.runs.free_memory import free_bytes
+from cuelearner_jax.runs.grid import Grid
 from cuelearner_jax.train import Program, label_slots, make_program, start_clock
 from cuelearner_jax.types import Clock, Guidance, TrainState
 

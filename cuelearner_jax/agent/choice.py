@@ -9,10 +9,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from cuelearner_jax import actions as geometry
-from cuelearner_jax import ddqn
+from cuelearner_jax.agent import ddqn
+from cuelearner_jax.agent.networks import applied, q_network, widened
 from cuelearner_jax.config import Sizes
 from cuelearner_jax.devices import portions
-from cuelearner_jax.networks import applied, q_network, widened
 from cuelearner_jax.types import Params
 
 ALIGNED = 64  # layers computed in bfloat16 are filled up to multiples: 20% faster on an H200, whose rows want alignment

@@ -15,7 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
-from cuelearner_jax.statistics import Curve, Interval
+from cuelearner_jax.report.statistics import Curve, Interval
 
 # Okabe and Ito's palette: one hue for each guidance, told apart with any colour vision.
 COLOURS = {"none": "#4d4d4d", "relative": "#0072B2", "heuristic": "#D55E00", "demonstration": "#009E73"}

@@ -10,11 +10,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from cuelearner_jax import feedback
+from cuelearner_jax.agent.networks import applied, feedback_network
 from cuelearner_jax.config import Scalars, Sizes
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.networks import applied, feedback_network
-from cuelearner_jax.refine import Refined, refine, untouched
+from cuelearner_jax.guidance import feedback
+from cuelearner_jax.guidance.refining import Refined, refine, untouched
 from cuelearner_jax.types import Environment, Guidance, GuidanceModel, Label
 
 KINDS = ("none", "relative", "heuristic")

@@ -17,10 +17,10 @@ from typing import Any
 import jax
 
 from cuelearner_jax import config as configuration
-from cuelearner_jax import results
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.runs import in_use
-from cuelearner_jax.sweep import Interrupted, interruptible
+from cuelearner_jax.records import results
+from cuelearner_jax.runs.grid import in_use
+from cuelearner_jax.runs.sweep import Interrupted, interruptible
 from cuelearner_jax.types import Walker
 
 COLUMNS = ("steps", "wall_s", "error", "turning_error", "falls")  # of the history
@@ -176,7 +176,7 @@ def _ppo(walker: Walker, config: LocomotionConfig, seed: int, look: Callable[[in
     from brax.training.agents.ppo import networks  # takes seconds to load, which other commands need not wait for
     from brax.training.agents.ppo import train as ppo
 
-    from cuelearner_jax.brax_adapter import supply_device_put_replicated
+    from cuelearner_jax.brax_bridge.adapter import supply_device_put_replicated
 
     supply_device_put_replicated()
     ppo.train(

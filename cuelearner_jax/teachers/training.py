@@ -12,14 +12,15 @@ import jax
 import numpy as np
 
 from cuelearner_jax import config as configuration
-from cuelearner_jax import results, teacher
-from cuelearner_jax.checkpoint import checkpoints
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import episodes, rollout, teacher_policy
-from cuelearner_jax.runs import check_folder, in_use, prepare_folder
-from cuelearner_jax.sweep import Interrupted, interruptible, progress_bars
-from cuelearner_jax.tasks import Task
-from cuelearner_jax.teacher import LearnedTeacher, TeacherConfig
+from cuelearner_jax.records import results
+from cuelearner_jax.records.checkpoint import checkpoints
+from cuelearner_jax.runs.grid import check_folder, in_use, prepare_folder
+from cuelearner_jax.runs.sweep import Interrupted, interruptible, progress_bars
+from cuelearner_jax.tasks.registry import Task
+from cuelearner_jax.teachers import learned as teacher
+from cuelearner_jax.teachers.learned import LearnedTeacher, TeacherConfig
 
 ROUNDS_A_STRETCH = 50  # in one jitted call
 SECONDS_BETWEEN_CHECKPOINTS = 60.0

@@ -24,13 +24,13 @@ from typing import Any
 import numpy as np
 
 from cuelearner_jax import config as configuration
-from cuelearner_jax import guidance as guidances
 from cuelearner_jax.config import RunConfig
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import SPLITS
-from cuelearner_jax.labelling import files as label_files
-from cuelearner_jax.shards import Shard
-from cuelearner_jax.tasks import Task
+from cuelearner_jax.guidance import registry as guidances
+from cuelearner_jax.records import label_files
+from cuelearner_jax.runs.shards import Shard
+from cuelearner_jax.tasks.registry import Task
 from cuelearner_jax.types import Guidance
 
 LOCK = ".lock"  # says which process writes in a run's folder; left behind empty

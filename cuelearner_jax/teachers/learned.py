@@ -23,9 +23,9 @@ from flax import struct
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from cuelearner_jax import actions as geometry
-from cuelearner_jax.checkpoint import checkpoints
 from cuelearner_jax.config import from_json
 from cuelearner_jax.errors import UserError
+from cuelearner_jax.records.checkpoint import checkpoints
 from cuelearner_jax.types import Params
 
 SHARPNESS = 0.05  # values that differ by this are told apart when promising directions are drawn

@@ -11,8 +11,6 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from cuelearner_jax import guidance as guidances
-from cuelearner_jax import results
 from cuelearner_jax.config import RunConfig, to_json
 from cuelearner_jax.errors import UserError, closest
 from cuelearner_jax.evaluate import (
@@ -27,9 +25,11 @@ from cuelearner_jax.evaluate import (
     teacher_policy,
     uniform_policy,
 )
-from cuelearner_jax.lanes import Group, restore_policies
-from cuelearner_jax.runs import Grid
-from cuelearner_jax.tasks import Task, shape_of
+from cuelearner_jax.guidance import registry as guidances
+from cuelearner_jax.records import results
+from cuelearner_jax.runs.grid import Grid
+from cuelearner_jax.runs.lanes import Group, restore_policies
+from cuelearner_jax.tasks.registry import Task, shape_of
 from cuelearner_jax.types import Environment, Guidance, Teacher
 
 # The agent; guidance of uniform actions; guidance of the agent's actions; the teacher's own corrections of them.

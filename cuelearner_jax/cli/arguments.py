@@ -10,9 +10,10 @@ from typing import Any
 
 import tyro
 
-from cuelearner_jax import play, runs
 from cuelearner_jax.errors import UserError, closest
-from cuelearner_jax.tasks import TASKS, Task
+from cuelearner_jax.runs import grid as runs
+from cuelearner_jax.runs import trained as play
+from cuelearner_jax.tasks.registry import TASKS, Task
 
 ABOUT = {
     "train": "Train one seed under one kind of guidance.",

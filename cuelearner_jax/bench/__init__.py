@@ -1,0 +1,1 @@
+"""Measuring a machine, and the machines that are known."""

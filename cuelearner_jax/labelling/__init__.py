@@ -1,1 +1,0 @@
-"""Labels from people and programs: the files they are kept in."""

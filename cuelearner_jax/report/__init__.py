@@ -1,0 +1,1 @@
+"""From recorded results to statistics, figures and a document."""

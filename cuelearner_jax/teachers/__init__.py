@@ -1,0 +1,1 @@
+"""Learned teachers and their training."""
