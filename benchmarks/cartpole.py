@@ -10,7 +10,8 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from cuelearner_jax.types import Step, WholeObservations
+from cuelearner_jax.environment import Quantity, WholeObservations
+from cuelearner_jax.types import Step
 
 GRAVITY, CART, POLE, HALF_LENGTH, FORCE, SECONDS = 9.8, 1.0, 0.1, 0.5, 10.0, 0.02
 
@@ -26,8 +27,11 @@ class CartPole(WholeObservations, struct.PyTreeNode):
     """The force points along x with the sign of the direction's first entry."""
 
     force: float = FORCE
-    obs_size: int = struct.field(pytree_node=False, default=4)
-    symmetries: int = struct.field(pytree_node=False, default=1)
+
+    observation = (
+        Quantity("cart", 2, "m, m/s", "position, velocity"),
+        Quantity("pole", 2, "rad, rad/s", "angle, angular velocity"),
+    )
 
     def reset(self, key: jax.Array) -> tuple[CartState, jax.Array]:
         """All four entries uniform in +-0.05."""
@@ -49,11 +53,3 @@ class CartPole(WholeObservations, struct.PyTreeNode):
         after = CartState(final, state.steps + 1)
         after = jax.tree.map(lambda new, old: jnp.where(terminated | truncated, new, old), fresh, after)
         return after, Step(after.obs, final, final, jnp.ones(()), terminated, truncated, {}, {})
-
-    def heuristic(self, obs: jax.Array) -> jax.Array:
-        """Toward the side to which the pole falls."""
-        return jnp.stack([jnp.sign(obs[2] + obs[3]), 0.0])
-
-    def mirror(self, which: jax.Array, obs: jax.Array, vector: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """No symmetry is offered."""
-        return obs, vector

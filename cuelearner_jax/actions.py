@@ -1,12 +1,14 @@
-"""Geometry of the action space: directions in the plane as unit vectors (paper, section IV-A).
+"""The action space as a bundle of functions, and its one instance: directions in the plane, as unit vectors.
 
-Angles are radians, counterclockwise positive. Every function works on any leading axes. Angles are wrapped with
-`atan2`, never with a modulo, so that the functions export to other runtimes unchanged.
+Source: paper, section IV-A. Angles are radians, counterclockwise positive. Every function works on any leading axes.
+Angles are wrapped with `atan2`, never with a modulo, so that the functions export to other runtimes unchanged.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +16,19 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 Direction = Float[Array, "... 2"]
 Angle = Float[Array, "..."] | float
+
+
+class Actions(NamedTuple):
+    """An action space. Every function works on any leading axes; actions have `size` entries on the last one."""
+
+    size: int
+    uniform: Callable[[PRNGKeyArray, tuple[int, ...]], Array]  # (key, shape) -> random actions (*shape, size)
+    spread: Callable[[int], Array]  # count -> actions (count, size), evenly spaced
+    retract: Callable[[Array], Array]  # any vector -> the nearest action
+    clip: Callable[[Array, Array, Angle], Array]  # (action, base, radius) -> the nearest action within it of base
+    distance: Callable[[Array, Array], Array]  # (action, other) -> how far apart they are
+    sense: Callable[[Array, Array], Array]  # (action, goal) -> h: -1, 0 or +1, the way from one to the other
+    toward: Callable[[Array, Array, Angle], Array]  # (action, h, step) -> the action moved by a step the way of h
 
 
 def from_angle(angle: Angle) -> Direction:
@@ -58,6 +73,21 @@ def clip_to_ball(action: Direction, base: Direction, radius: Angle) -> Direction
     return jnp.where(inside[..., None], action, rotate(base, jnp.clip(turn, -radius, radius)))
 
 
+def distance(action: Direction, other: Direction) -> Float[Array, "..."]:
+    """Angle between two directions, in [0, pi] [rad]."""
+    return jnp.abs(difference(action, other))
+
+
+def sense(action: Direction, goal: Direction) -> Float[Array, "..."]:
+    """h: +1 if `goal` lies counterclockwise of `action`, -1 if clockwise, 0 if it is the same."""
+    return jnp.sign(difference(action, goal))
+
+
+def toward(action: Direction, h: Float[Array, "..."], step: Angle) -> Direction:
+    """`action` turned by h * step [rad]."""
+    return rotate(action, h * step)
+
+
 def evenly_spaced(count: int) -> Float[Array, "count 2"]:
     """`count` directions, the first along x, the others counterclockwise."""
     return from_angle(jnp.arange(count) * (2 * math.pi / count))
@@ -66,6 +96,18 @@ def evenly_spaced(count: int) -> Float[Array, "count 2"]:
 def uniform(key: PRNGKeyArray, shape: tuple[int, ...] = ()) -> Direction:
     """Directions drawn uniformly (paper, Eq. 6): shape (*shape, 2)."""
     return from_angle(jax.random.uniform(key, shape, minval=-math.pi, maxval=math.pi))
+
+
+DIRECTIONS = Actions(
+    size=2,
+    uniform=uniform,
+    spread=evenly_spaced,
+    retract=retract,
+    clip=clip_to_ball,
+    distance=distance,
+    sense=sense,
+    toward=toward,
+)
 
 
 def best_direction(

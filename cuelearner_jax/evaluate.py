@@ -15,9 +15,10 @@ from cuelearner_jax import actions as geometry
 from cuelearner_jax.agent.choice import greedy_actions
 from cuelearner_jax.config import Scalars, Sizes
 from cuelearner_jax.devices import BY_LANE, SHARED, over_lanes, portions
+from cuelearner_jax.environment import Environment
 from cuelearner_jax.guidance.feedback import relative_feedback, relative_target
 from cuelearner_jax.guidance.refining import refine
-from cuelearner_jax.types import Environment, Guidance, GuidanceModel, Params, Teacher
+from cuelearner_jax.types import Guidance, GuidanceModel, Params, Teacher
 
 # (key, environment states (n, ...), observations (n, obs)) -> directions (n, 2)
 Policy = Callable[[PRNGKeyArray, Any, jax.Array], jax.Array]

@@ -22,21 +22,10 @@ from cuelearner_jax.agent.networks import applied, q_network
 from cuelearner_jax.agent.replay import RingBuffer, ring_buffer
 from cuelearner_jax.config import RunConfig, Scalars, Schedule, Sizes
 from cuelearner_jax.devices import BY_LANE, SHARED, compiler_options, each_lane, lane_mesh, over_lanes
+from cuelearner_jax.environment import Environment, random_symmetries
 from cuelearner_jax.guidance.feedback import empty_labels
 from cuelearner_jax.guidance.refining import Refined, untouched
-from cuelearner_jax.types import (
-    Asking,
-    Clock,
-    Environment,
-    Guidance,
-    Label,
-    Memory,
-    Params,
-    Step,
-    Teacher,
-    TrainState,
-    Transition,
-)
+from cuelearner_jax.types import Asking, Clock, Guidance, Label, Memory, Params, Step, Teacher, TrainState, Transition
 
 # Streams of random numbers of one lane, each folded into the lane's key before a counter is.
 INIT, ASK, FIT, TRAIN = range(4)
@@ -348,12 +337,8 @@ class Lane(NamedTuple):
 
 
 def mirrored(key: PRNGKeyArray, env: Environment, batch: Transition) -> Transition:
-    """Each transition under a random symmetry of the environment; the batch itself where there is none."""
-    if env.symmetries == 1:
-        return batch
-    which = jax.random.randint(key, batch.reward.shape, 0, env.symmetries)
-    obs, action = jax.vmap(env.mirror)(which, batch.obs, batch.action)
-    if batch.next_obs.shape[-1]:
-        next_obs, _ = jax.vmap(env.mirror)(which, batch.next_obs, batch.action)
-        batch = batch.replace(next_obs=next_obs)
-    return batch.replace(obs=obs, action=action)
+    """Each transition under a random symmetry of the environment."""
+    image = random_symmetries(key, env, batch.reward.shape[0])
+    obs, action = image(batch.obs, batch.action)
+    next_obs = image(batch.next_obs, batch.action)[0] if batch.next_obs.shape[-1] else batch.next_obs
+    return batch.replace(obs=obs, action=action, next_obs=next_obs)

@@ -17,10 +17,11 @@ from flax import struct
 
 from cuelearner_jax.actions import difference, evenly_spaced, from_angle, rotate
 from cuelearner_jax.config import RunConfig, Scalars, Schedule, Sizes
+from cuelearner_jax.environment import Quantity, WholeObservations
 from cuelearner_jax.guidance import registry as guidances
 from cuelearner_jax.tasks.registry import Task
 from cuelearner_jax.train import make_program
-from cuelearner_jax.types import Label, Step, WholeObservations
+from cuelearner_jax.types import Label, Step
 
 
 class Window(WholeObservations, struct.PyTreeNode):
@@ -35,7 +36,7 @@ class Window(WholeObservations, struct.PyTreeNode):
     contexts: int = struct.field(pytree_node=False, default=4)
     mirrors: bool = struct.field(pytree_node=False, default=False)
 
-    obs_size = 2
+    observation = (Quantity("context", 2, "1"),)
 
     @property
     def symmetries(self):
@@ -73,7 +74,7 @@ class Chain(WholeObservations, struct.PyTreeNode):
 
     truncates: jax.Array | bool = False
 
-    obs_size = 2
+    observation = (Quantity("context", 2, "1"),)
     symmetries = 1
 
     def reset(self, key):

@@ -1,4 +1,4 @@
-"""The table of known machines (known_machines.json), of entries that `cuelearner bench --out` wrote; printing figures."""
+"""The table of known machines (known_machines.json): what `cuelearner bench --out` wrote; how figures are printed."""
 
 from __future__ import annotations
 

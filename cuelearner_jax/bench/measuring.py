@@ -29,6 +29,7 @@ from cuelearner_jax.bench import known_machines as machines
 from cuelearner_jax.bench.operations import step_operations
 from cuelearner_jax.config import RunConfig
 from cuelearner_jax.devices import SHARED, lane_mesh, place
+from cuelearner_jax.environment import Environment
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guidance import registry as guidances
 from cuelearner_jax.records import results
@@ -37,7 +38,7 @@ from cuelearner_jax.runs.lanes import CORES, Group, memory_report, state_bytes
 from cuelearner_jax.runs.sweep import Interrupted, console, progress_bars
 from cuelearner_jax.tasks.registry import Task, shape_of
 from cuelearner_jax.train import start_clock
-from cuelearner_jax.types import Environment, Teacher
+from cuelearner_jax.types import Teacher
 
 FEWEST_STRETCHES = 3
 LONGEST_STRETCH = 1024  # steps of a seed

@@ -19,8 +19,9 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from cuelearner_jax.actions import retract
+from cuelearner_jax.environment import Environment, Quantity, WholeObservations
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.types import Environment, EnvState, Step, WholeObservations
+from cuelearner_jax.types import EnvState, Step
 
 RawKey = Any  # uint32 words, which is what brax passes: the wrappers read a batch's shape from them
 State = Any  # brax.envs.State, whose methods of flax a type checker does not know
@@ -209,18 +210,18 @@ class Running(struct.PyTreeNode):
 
 
 class BraxTask(WholeObservations, struct.PyTreeNode):
-    """A brax environment as one of ours (`cuelearner_jax.types.Environment`), made by `from_brax`."""
+    """A brax environment as one of ours (`cuelearner_jax.environment.Environment`), made by `from_brax`."""
 
     max_steps: Int[Array, ""]  # an episode is truncated after this many
     env: Any = struct.field(pytree_node=False)  # brax.envs.Env
-    obs_size: int = struct.field(pytree_node=False)
+    entries: int = struct.field(pytree_node=False)  # of an observation
     to_action: Callable[[Float[Array, "2"]], Float[Array, " n"]] = struct.field(pytree_node=False)
-    obvious: Callable[[Float[Array, " obs"]], Float[Array, "2"]] = struct.field(pytree_node=False)
+    heuristic: Callable[[Float[Array, " obs"]], Float[Array, "2"]] | None = struct.field(pytree_node=False)
 
     @property
-    def symmetries(self) -> int:
-        """Only the identity: brax declares none."""
-        return 1
+    def observation(self) -> tuple[Quantity, ...]:
+        """One slice: brax names none."""
+        return (Quantity(type(self.env.unwrapped).__name__.lower(), self.entries, "as brax has them"),)
 
     def reset(self, key: PRNGKeyArray) -> tuple[Running, Float[Array, " obs"]]:
         """Starts an episode."""
@@ -248,16 +249,6 @@ class BraxTask(WholeObservations, struct.PyTreeNode):
         )
         return jax.tree.map(partial(jnp.where, ended), fresh, after), step
 
-    def heuristic(self, obs: Float[Array, " obs"]) -> Float[Array, "2"]:
-        """What was given to `from_brax`."""
-        return self.obvious(obs)
-
-    def mirror(
-        self, which: Int[Array, ""], obs: Float[Array, " obs"], vector: Float[Array, "2"]
-    ) -> tuple[Float[Array, " obs"], Float[Array, "2"]]:
-        """Itself."""
-        return obs, vector
-
 
 def from_brax(
     env: envs.Env,
@@ -272,8 +263,8 @@ def from_brax(
         to_action: direction (2,) -> brax action (n,) in [-1, 1]^n. Not needed for two actions (the direction itself, in
             the box [-1, 1]^2) and for one (the direction's x).
         max_steps: an episode is truncated after this many steps.
-        heuristic: observation -> the obvious direction. A brax environment names none: without this it is the x axis,
-            so that the guidance "heuristic" means nothing there.
+        heuristic: observation -> the obvious direction. A brax environment names none: without this the guidance
+            "heuristic" is refused there.
 
     Raises:
         UserError: observations or actions do not fit.
@@ -296,9 +287,9 @@ def from_brax(
     return BraxTask(
         max_steps=jnp.array(max_steps, jnp.int32),
         env=env,
-        obs_size=shapes.obs.shape[0],
+        entries=shapes.obs.shape[0],
         to_action=to_action,
-        obvious=heuristic or _along_x,
+        heuristic=heuristic,
     )
 
 
@@ -325,7 +316,3 @@ def _itself(action: Float[Array, "2"]) -> Float[Array, "2"]:
 
 def _x_alone(action: Float[Array, "2"]) -> Float[Array, "1"]:
     return action[:1]
-
-
-def _along_x(obs: Float[Array, " obs"]) -> Float[Array, "2"]:
-    return jnp.array(X_AXIS)

@@ -15,7 +15,8 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from cuelearner_jax import actions as geometry
 from cuelearner_jax.config import Scalars, Sizes
-from cuelearner_jax.types import Environment, GuidanceModel, Label, Params
+from cuelearner_jax.environment import Environment, random_symmetries
+from cuelearner_jax.types import GuidanceModel, Label, Params
 
 VALIDATION_STRIDE = 5  # every fifth label is a validation label: the 80/20 split of the paper's public code
 
@@ -109,7 +110,9 @@ def fit(
         params, opt_state = carry
         key_draw, key_mirror = jax.random.split(key)
         batch = jax.tree.map(lambda leaf: leaf[draw(key_draw, sizes.fit_batch_size)], labels)
-        batch = mirrored(key_mirror, env, batch)
+        image = random_symmetries(key_mirror, env, sizes.fit_batch_size)
+        (obs, action), (_, target) = image(batch.obs, batch.action), image(batch.obs, batch.target)
+        batch = batch.replace(obs=obs, action=action, target=target)
         updates, opt_state = optimizer.update(jax.grad(loss)(params, batch), opt_state, params)
         return (optax.apply_updates(params, updates), opt_state), None
 
@@ -130,13 +133,3 @@ def fit(
     start = ((params, optimizer.init(params)), params, jnp.inf)
     (_, best, _), _ = jax.lax.scan(stretch, start, keys)
     return GuidanceModel(best, training.any())
-
-
-def mirrored(key: PRNGKeyArray, env: Environment, batch: Label) -> Label:
-    """Each row under a random symmetry of the environment; the batch itself where there is none."""
-    if env.symmetries == 1:
-        return batch
-    which = jax.random.randint(key, batch.valid.shape, 0, env.symmetries)
-    obs, action = jax.vmap(env.mirror)(which, batch.obs, batch.action)
-    _, target = jax.vmap(env.mirror)(which, batch.obs, batch.target)
-    return batch.replace(obs=obs, action=action, target=target)

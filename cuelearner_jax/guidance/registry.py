@@ -6,16 +6,19 @@ are.
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from cuelearner_jax.agent.networks import applied, feedback_network
 from cuelearner_jax.config import Scalars, Sizes
+from cuelearner_jax.environment import Environment
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guidance import feedback
 from cuelearner_jax.guidance.refining import Refined, refine, untouched
-from cuelearner_jax.types import Environment, Guidance, GuidanceModel, Label
+from cuelearner_jax.types import Guidance, GuidanceModel, Label
 
 KINDS = ("none", "relative", "heuristic")
 
@@ -44,7 +47,7 @@ def _identity(
 
 def _heuristic(
     model: GuidanceModel,
-    env: Environment,
+    env: Any,
     obs: Float[Array, "batch obs"],
     actions: Float[Array, "batch 2"],
     active: Bool[Array, " batch"],

@@ -22,6 +22,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from cuelearner_jax import config as configuration
 from cuelearner_jax.config import RunConfig
 from cuelearner_jax.devices import SHARED, lane_mesh, place
+from cuelearner_jax.environment import Environment
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import episodes, evaluate_agents, evaluate_guides
 from cuelearner_jax.guidance import registry as guidances
@@ -32,7 +33,7 @@ from cuelearner_jax.runs.lanes import Group, items, memory_report, restore
 from cuelearner_jax.runs.shards import Shard
 from cuelearner_jax.tasks.registry import Task, shape_of
 from cuelearner_jax.train import label_slots, start_clock
-from cuelearner_jax.types import Environment, Teacher
+from cuelearner_jax.types import Teacher
 
 ROUNDS_A_CHUNK = 10  # label rounds between two checkpoints
 

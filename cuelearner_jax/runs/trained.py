@@ -12,6 +12,7 @@ import jax
 import numpy as np
 
 from cuelearner_jax.config import RunConfig, to_json
+from cuelearner_jax.environment import Environment
 from cuelearner_jax.errors import UserError, closest
 from cuelearner_jax.evaluate import (
     Policy,
@@ -30,7 +31,7 @@ from cuelearner_jax.records import results
 from cuelearner_jax.runs.grid import Grid
 from cuelearner_jax.runs.lanes import Group, restore_policies
 from cuelearner_jax.tasks.registry import Task, shape_of
-from cuelearner_jax.types import Environment, Guidance, Teacher
+from cuelearner_jax.types import Guidance, Teacher
 
 # The agent; guidance of uniform actions; guidance of the agent's actions; the teacher's own corrections of them.
 TRAINED = ("agent", "guide", "guided", "corrected")

@@ -25,8 +25,9 @@ from cuelearner_envs.navigation.config import make_environment as make_navigatio
 from cuelearner_envs.navigation.recording import record as navigation_record
 from cuelearner_envs.navigation.roadmap import make_teacher
 from cuelearner_jax.config import RunConfig, Scalars, Schedule, Sizes
+from cuelearner_jax.environment import Environment
 from cuelearner_jax.teachers import learned
-from cuelearner_jax.types import Environment, Teacher, Walker
+from cuelearner_jax.types import Teacher, Walker
 
 
 @dataclass(frozen=True)

@@ -24,6 +24,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from cuelearner_jax import actions as geometry
 from cuelearner_jax.config import from_json
+from cuelearner_jax.environment import random_symmetries
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.records.checkpoint import checkpoints
 from cuelearner_jax.types import Params
@@ -207,8 +208,7 @@ class _Training(NamedTuple):
         where = (jax.random.randint(k_round, shape, 0, filled), jax.random.randint(k_table, shape, 0, c.tables))
         attempt = jax.random.randint(k_try, shape, 0, c.tries)
         obs, action, reward = state.obs[where], state.tried[(*where, attempt)], state.rewards[(*where, attempt)]
-        if env.symmetries > 1:
-            obs, action = jax.vmap(env.mirror)(jax.random.randint(k_mirror, shape, 0, env.symmetries), obs, action)
+        obs, action = random_symmetries(k_mirror, env, c.batch_size)(obs, action)
 
         def loss(params: Params) -> jax.Array:
             values = jax.vmap(partial(self.value, env, params))(obs, action)

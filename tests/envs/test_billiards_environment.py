@@ -12,7 +12,7 @@ from cuelearner_envs.billiards.environment import Balls, Billiards
 from cuelearner_envs.billiards.recording import record
 from cuelearner_envs.billiards.table import Table, rack
 from cuelearner_jax import actions
-from cuelearner_jax.types import Environment
+from cuelearner_jax.environment import Environment
 
 TABLES: list[Literal["one_ball", "easy", "regulation"]] = ["one_ball", "easy", "regulation"]
 EASY = make_environment(BilliardsConfig("easy"))

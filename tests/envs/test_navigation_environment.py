@@ -14,8 +14,8 @@ from cuelearner_envs.navigation.config import NavigationConfig, make_environment
 from cuelearner_envs.navigation.environment import Navigation, Walker
 from cuelearner_envs.navigation.lidar import Lidar
 from cuelearner_envs.navigation.world import FAR_AWAY
+from cuelearner_jax.environment import Environment
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.types import Environment
 
 KEY = jax.random.key(0)
 AHEAD, LEFT, BACK = jnp.array([1.0, 0.0]), jnp.array([0.0, 1.0]), jnp.array([-1.0, 0.0])

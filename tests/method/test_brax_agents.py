@@ -20,7 +20,8 @@ from cuelearner_envs.billiards import config as billiards
 from cuelearner_envs.navigation import config as navigation
 from cuelearner_jax.brax_bridge import adapter as brax_adapter
 from cuelearner_jax.brax_bridge.adapter import to_brax, wrap_for_training
-from cuelearner_jax.types import Step, WholeObservations
+from cuelearner_jax.environment import WholeObservations
+from cuelearner_jax.types import Step
 
 RAW = jax.random.key_data(jax.random.key(0))
 WRAPS = {"brax": training.wrap, "ours": wrap_for_training}

@@ -51,7 +51,7 @@ class LeggedWalker(struct.PyTreeNode):
 
 
 class LeggedNavigation(Navigation, kw_only=True):
-    """The environment (`cuelearner_jax.types.Environment`), to agents the same as `Navigation`."""
+    """The environment (`cuelearner_jax.environment.Environment`), to agents the same as `Navigation`."""
 
     walking: WalkingPolicy
     ground: Ground = Ground()

@@ -14,7 +14,8 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from cuelearner_envs.billiards.physics import simulate
 from cuelearner_envs.billiards.table import Table, parking, rack
 from cuelearner_jax.actions import retract, rotate, to_angle
-from cuelearner_jax.types import Step, WholeObservations
+from cuelearner_jax.environment import Quantity, WholeObservations
+from cuelearner_jax.types import Step
 
 PLACEMENTS = 16  # places tried for a ball that must not touch another
 FLAG = 0.5  # third entry of a ball's observation: +0.5 once pocketed, -0.5 before
@@ -29,7 +30,7 @@ class Balls(struct.PyTreeNode):
 
 
 class Billiards(WholeObservations, struct.PyTreeNode):
-    """The environment (`cuelearner_jax.types.Environment`). Everything but the last two fields is traced."""
+    """The environment (`cuelearner_jax.environment.Environment`). Everything but the last two fields is traced."""
 
     table: Table
     action_turn: Float[Array, ""] | float = 0.0  # embodiment shift: every strike is turned by this [rad]
@@ -38,9 +39,17 @@ class Billiards(WholeObservations, struct.PyTreeNode):
     mirrors: bool = struct.field(pytree_node=False, default=False)  # offer the table's symmetries as data?
 
     @property
-    def obs_size(self) -> int:
-        """Three entries a ball."""
-        return 3 * self.table.balls
+    def observation(self) -> tuple[Quantity, ...]:
+        """Three entries a ball, the cue ball first; see `observe`."""
+        targets = [f"target {number}" for number in range(1, self.table.balls)]
+        return tuple(
+            quantity
+            for name in ["cue ball", *targets]
+            for quantity in (
+                Quantity(f"{name}: place", 2, "m", "x, y from the table's centre"),
+                Quantity(f"{name}: pocketed", 1, "1", f"+{FLAG} once pocketed, -{FLAG} before"),
+            )
+        )
 
     @property
     def symmetries(self) -> int:

@@ -17,6 +17,7 @@ from cuelearner_envs.navigation.robot import Motion, Robot, collides, walk
 from cuelearner_envs.navigation.world import World
 from cuelearner_envs.navigation.worlds import FARTHEST
 from cuelearner_jax.actions import retract, rotate
+from cuelearner_jax.environment import Described, Quantity
 from cuelearner_jax.types import Step
 
 REMEMBERED = 3  # actions in the observation
@@ -38,8 +39,8 @@ class Walker(struct.PyTreeNode):
 AnyWalker = Any  # a `Walker`, or what another body has in its place: pose, goal, previous, world, route and steps
 
 
-class Navigation(struct.PyTreeNode):
-    """The environment (`cuelearner_jax.types.Environment`). Everything but the last field is traced."""
+class Navigation(Described, struct.PyTreeNode):
+    """The environment (`cuelearner_jax.environment.Environment`). Everything but the last field is traced."""
 
     worlds: World  # leading axis: worlds
     robot: Robot = Robot()
@@ -49,7 +50,12 @@ class Navigation(struct.PyTreeNode):
     goal_radius: Scalar = 0.5  # nearer than this, the goal is reached [m]
     mirrors: bool = struct.field(pytree_node=False, default=False)  # offer the mirror image as data?
 
-    obs_size = BEAMS + 3 + 2 * REMEMBERED
+    observation = (
+        Quantity("lidar", BEAMS, "1", "exp(-distance / 1 m) of each beam, from -135 to +135 degrees, counterclockwise"),
+        Quantity("goal: direction", 2, "1", "unit vector in the body's frame"),
+        Quantity("goal: distance", 1, f"{FARTHEST:g} m"),
+        Quantity("previous actions", 2 * REMEMBERED, "1", "unit vectors, the latest first; zeros before the first"),
+    )
 
     @property
     def symmetries(self) -> int:

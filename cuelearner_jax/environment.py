@@ -1,0 +1,159 @@
+"""What an environment is to the method, what it may offer beyond that, and the symmetries of its data.
+
+An environment is a pytree: its parameters are traced, so a changed world needs no new compile. What every environment
+has stands in `Environment`. Optional are `heuristic`, `mirror` with `symmetries`, `features` and `actions`; ask by
+`offers`, `symmetries_of` and `actions_of`, never by the name of a task.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+
+from cuelearner_jax.actions import DIRECTIONS, Actions
+from cuelearner_jax.types import EnvState, Step
+
+
+class Quantity(NamedTuple):
+    """One slice of an observation."""
+
+    name: str
+    size: int  # entries
+    unit: str  # of an entry, as "m", "rad" or "1" for a pure number
+    about: str = ""  # what it is, where from and in which order, in a few words
+
+
+class Environment(Protocol):
+    """One task. Inherit `WholeObservations` (or `Described`) for what can be derived."""
+
+    @property
+    def observation(self) -> tuple[Quantity, ...]:
+        """The slices of an observation, in their order."""
+        ...
+
+    @property
+    def obs_size(self) -> int:
+        """Number of entries of an observation: the sum of its slices."""
+        ...
+
+    def reset(self, key: PRNGKeyArray) -> tuple[EnvState, Float[Array, " obs"]]:
+        """Starts an episode."""
+        ...
+
+    def step(self, key: PRNGKeyArray, state: EnvState, action: Float[Array, " action"]) -> tuple[EnvState, Step]:
+        """Executes an action; resets automatically when the episode ends."""
+        ...
+
+    def remember(self, state: EnvState, obs: Float[Array, " obs"]) -> Float[Array, " memory"]:
+        """What replay keeps of an observation: as little as `recall` needs."""
+        ...
+
+    def recall(self, memory: Float[Array, " memory"]) -> Float[Array, " obs"]:
+        """The observation that was acted on."""
+        ...
+
+    def recall_next(
+        self, memory: Float[Array, " memory"], action: Float[Array, " action"], aftermath: Float[Array, " aftermath"]
+    ) -> Float[Array, " obs"]:
+        """`Step.final_obs` of the step that `action` led to from there."""
+        ...
+
+
+class OffersHeuristic(Protocol):
+    """An environment with an obvious action that needs no learning."""
+
+    def heuristic(self, obs: Float[Array, " obs"]) -> Float[Array, " action"]:
+        """The obvious action."""
+        ...
+
+
+class OffersMirror(Protocol):
+    """An environment with exact symmetries that data may be multiplied by."""
+
+    @property
+    def symmetries(self) -> int:
+        """Their number (1: only the identity)."""
+        ...
+
+    def mirror(
+        self, which: Int[Array, ""], obs: Float[Array, " obs"], vector: Float[Array, " action"]
+    ) -> tuple[Float[Array, " obs"], Float[Array, " action"]]:
+        """Image of an observation and of a vector like an action (an action, a residual) under symmetry `which`.
+
+        0 is the identity.
+        """
+        ...
+
+
+class OffersFeatures(Protocol):
+    """An environment that can show an observation as it looks from an action."""
+
+    def features(self, obs: Float[Array, " obs"], actions: Float[Array, "*n action"]) -> Float[Array, "*n features"]:
+        """What a network is to see of one observation and each of the actions."""
+        ...
+
+
+class Described:
+    """Mixed into an environment: what follows from its `observation`."""
+
+    observation: tuple[Quantity, ...]
+
+    @property
+    def obs_size(self) -> int:
+        """Number of entries of an observation: the sum of its slices."""
+        return sum(quantity.size for quantity in self.observation)
+
+
+class WholeObservations(Described):
+    """Mixed into an environment whose observations are small: replay keeps them as they are.
+
+    `Step.aftermath` is then `Step.final_obs`.
+    """
+
+    def remember(self, state: EnvState, obs: Float[Array, " obs"]) -> Float[Array, " obs"]:
+        """The observation."""
+        return obs
+
+    def recall(self, memory: Float[Array, " obs"]) -> Float[Array, " obs"]:
+        """The observation."""
+        return memory
+
+    def recall_next(
+        self, memory: Float[Array, " obs"], action: Float[Array, " action"], aftermath: Float[Array, " obs"]
+    ) -> Float[Array, " obs"]:
+        """The next observation."""
+        return aftermath
+
+
+def offers(env: Any, name: str) -> bool:
+    """Has an environment the optional member `name` (`heuristic`, `mirror`, `features`)?"""
+    return getattr(env, name, None) is not None
+
+
+def actions_of(env: Any) -> Actions:
+    """What an environment takes for actions: its `actions`, or directions in the plane."""
+    return getattr(env, "actions", DIRECTIONS)
+
+
+def symmetries_of(env: Any) -> int:
+    """Number of symmetries that an environment offers (1: only the identity)."""
+    return int(getattr(env, "symmetries", 1)) if offers(env, "mirror") else 1
+
+
+Image = Callable[[Array, Array], tuple[Array, Array]]  # observations (n, obs), vectors (n, action) -> their images
+
+
+def random_symmetries(key: PRNGKeyArray, env: Any, count: int) -> Image:
+    """One random symmetry of the environment for each of `count` rows, as the function that maps rows under it.
+
+    Where an environment has none, rows stay as they are.
+    """
+    symmetries = symmetries_of(env)
+    if symmetries == 1:
+        return lambda obs, vectors: (obs, vectors)
+    which = jax.random.randint(key, (count,), 0, symmetries)
+    return lambda obs, vectors: jax.vmap(env.mirror)(which, obs, jnp.asarray(vectors))
