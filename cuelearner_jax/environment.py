@@ -139,6 +139,18 @@ def actions_of(env: Any) -> Actions:
     return getattr(env, "actions", DIRECTIONS)
 
 
+class Spaces(NamedTuple):
+    """What networks have to know of an environment."""
+
+    obs_size: int
+    actions: Actions
+
+
+def spaces_of(env: Any) -> Spaces:
+    """An environment's; shapes in place of its arrays will do."""
+    return Spaces(env.obs_size, actions_of(env))
+
+
 def symmetries_of(env: Any) -> int:
     """Number of symmetries that an environment offers (1: only the identity)."""
     return int(getattr(env, "symmetries", 1)) if offers(env, "mirror") else 1

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from cuelearner_jax.types import Memory
+from cuelearner_jax.types import StoredStep
 
 
 class Following(NamedTuple):
@@ -34,7 +34,7 @@ class RingBuffer(NamedTuple):
     empty: Callable[[int], Float[Array, "capacity width"]]
     add: Callable[..., Float[Array, "capacity width"]]  # (rows, step, steps (n, ...)) -> rows
     draw: Callable[..., Int[Array, " batch"]]  # (key, rows, step, batch_size) -> rows' numbers
-    read: Callable[..., Memory]  # (rows, numbers (batch,)) -> steps (batch, ...)
+    read: Callable[..., StoredStep]  # (rows, numbers (batch,)) -> steps (batch, ...)
     follow: Callable[..., Following]  # (rows, step, numbers (batch,), n, num_envs) -> Following
 
 
@@ -55,7 +55,7 @@ def _write_lanes(axis_size: int, batched: list[bool], rows: Array, packed: Array
     return _write(rows, packed, start), True
 
 
-def ring_buffer(example: Memory) -> RingBuffer:
+def ring_buffer(example: StoredStep) -> RingBuffer:
     """Builds the buffer for steps shaped like `example`.
 
     `add` requires the capacity to be a multiple of the number of steps added at once: one of each environment. So the
@@ -69,7 +69,7 @@ def ring_buffer(example: Memory) -> RingBuffer:
         return jnp.zeros((capacity, width), jnp.float32)
 
     def add(
-        rows: Float[Array, "capacity width"], step: Int[Array, ""], steps: Memory
+        rows: Float[Array, "capacity width"], step: Int[Array, ""], steps: StoredStep
     ) -> Float[Array, "capacity width"]:
         packed = jax.vmap(lambda item: ravel_pytree(item)[0])(steps)
         if rows.shape[0] % packed.shape[0]:
@@ -81,7 +81,7 @@ def ring_buffer(example: Memory) -> RingBuffer:
     ) -> Int[Array, " batch"]:
         return jax.random.randint(key, (batch_size,), 0, jnp.clip(step, 1, rows.shape[0]))
 
-    def read(rows: Float[Array, "capacity width"], numbers: Int[Array, " batch"]) -> Memory:
+    def read(rows: Float[Array, "capacity width"], numbers: Int[Array, " batch"]) -> StoredStep:
         return jax.vmap(unravel)(rows[numbers])
 
     def follow(
