@@ -25,12 +25,7 @@ from __future__ import annotations
 import json
 import math
 import os
-import shlex
-import subprocess
-import sys
-import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -226,50 +221,6 @@ def read(paths: PathLike | Sequence[PathLike], task: str | None = None) -> pa.Ta
 def metrics(table: pa.Table) -> list[str]:
     """The names of the metric columns of a table of results."""
     return [name for name in table.column_names if name not in (*STRINGS, *INTEGERS, "wall_s", "folder")]
-
-
-def provenance() -> dict[str, str]:
-    """The columns `commit`, `versions`, `hardware` and `command` of this process.
-
-    `commit` is empty where the package does not come from a git checkout.
-    """
-    import jax
-
-    packages = ("cuelearner-jax", "jax", "jaxlib", "flax", "optax", "numpy")
-    found = [(name, _version(name)) for name in packages]
-    kinds = [device.device_kind for device in jax.devices()]
-    return {
-        "commit": _commit(),
-        "versions": ", ".join([f"python {sys.version.split()[0]}", *(f"{n} {v}" for n, v in found if v)]),
-        "hardware": ", ".join(f"{kinds.count(kind)} x {kind}" for kind in dict.fromkeys(kinds)),
-        "command": shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),
-    }
-
-
-def _version(package: str) -> str:
-    try:
-        return metadata.version(package)
-    except metadata.PackageNotFoundError:
-        return ""
-
-
-def _commit() -> str:
-    root = Path(__file__).resolve().parents[2]
-    if not (root / ".git").exists():  # an installed package may lie inside somebody else's repository
-        return ""
-    git = ["git", "-C", str(root), "--no-optional-locks"]  # nothing is written to the repository
-    asked = (["rev-parse", "--short=12", "HEAD"], ["status", "--porcelain", "--untracked-files=no"])
-    try:
-        with warnings.catch_warnings():
-            # JAX warns of any fork; this one becomes git at once.
-            warnings.filterwarnings("ignore", message=r"os\.fork", category=RuntimeWarning)
-            told = [
-                subprocess.run([*git, *words], capture_output=True, text=True, timeout=10, check=True).stdout.strip()
-                for words in asked
-            ]
-    except (OSError, subprocess.SubprocessError):
-        return ""
-    return told[0] + ("-dirty" if told[1] else "")
 
 
 def _plain(value: Any) -> Any:
