@@ -22,7 +22,7 @@ import jax
 from cuelearner_jax.bench.measuring import Timed, learning
 from cuelearner_jax.config import RunConfig
 from cuelearner_jax.devices import lane_mesh
-from cuelearner_jax.records import results
+from cuelearner_jax.records.provenance import provenance
 from cuelearner_jax.runs.lanes import state_bytes
 from cuelearner_jax.tasks.registry import NAVIGATION
 
@@ -82,7 +82,7 @@ def main() -> None:
         print("  ".join(f"{row[name]:>17,.3f}" for name in names))
     if asked.write:
         name = "device_scaling.json" if len(asked.devices) > 1 else "concurrent_seeds.json"
-        (RESULTS / name).write_text(json.dumps({**results.provenance(), "rows": rows}, indent=1) + "\n")
+        (RESULTS / name).write_text(json.dumps({**provenance(), "rows": rows}, indent=1) + "\n")
 
 
 if __name__ == "__main__":

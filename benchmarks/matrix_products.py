@@ -18,7 +18,7 @@ from scaling import REPLAY
 
 from cuelearner_jax import devices
 from cuelearner_jax.bench.measuring import Work, measure
-from cuelearner_jax.records import results
+from cuelearner_jax.records.provenance import provenance
 from cuelearner_jax.tasks.registry import TASKS
 
 WAYS = {"compiled": 2**30, "library": 0}  # from how many lanes on the library is used
@@ -44,7 +44,7 @@ def main() -> None:
         rows.append({"task": asked.task, "lanes": lanes, **found})
         print(f"{lanes:>6}  " + "  ".join(f"{value:>14.4f}" for value in found.values()), flush=True)
         if asked.out:
-            asked.out.write_text(json.dumps({**results.provenance(), "rows": rows}, indent=1) + "\n")
+            asked.out.write_text(json.dumps({**provenance(), "rows": rows}, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -35,7 +35,7 @@ from cuelearner_envs.navigation.environment import Navigation
 from cuelearner_envs.navigation.roadmap import BLOCKED, LINE_MARGIN, RoadMapTeacher, make_teacher, way
 from cuelearner_envs.navigation.world import FAR_AWAY, World
 from cuelearner_jax import evaluate
-from cuelearner_jax.records.results import provenance
+from cuelearner_jax.records.provenance import provenance
 
 RESULTS = Path(__file__).parent / "results" / "roadmap_paths.json"
 STYLES: tuple[Style, ...] = ("clutter", "rooms", "corridor")

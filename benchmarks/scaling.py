@@ -28,7 +28,7 @@ from matplotlib.figure import Figure
 
 from cuelearner_jax.bench.measuring import Timed, Work, learning, measure
 from cuelearner_jax.devices import lane_mesh
-from cuelearner_jax.records import results
+from cuelearner_jax.records.provenance import provenance
 from cuelearner_jax.report.figures import COLOURS, STYLE, save_figure
 from cuelearner_jax.tasks.registry import TASKS
 
@@ -52,7 +52,7 @@ def main() -> int:
         return 0
     preset = TASKS[asked.task].presets[asked.preset]
     setting = {"task": asked.task, "preset": asked.preset, "base_seeds": asked.base_seeds, "replay": REPLAY}
-    contents = {**setting, **results.provenance(), "rows": []}
+    contents = {**setting, **provenance(), "rows": []}
     if asked.out.exists():
         contents = json.loads(asked.out.read_text())
         if {name: contents.get(name) for name in setting} != setting:

@@ -26,7 +26,7 @@ from cuelearner_jax.agent.networks import applied, q_network
 from cuelearner_jax.config import Sizes
 from cuelearner_jax.evaluate import agent_policy, episodes, rollout
 from cuelearner_jax.guidance import registry as guidance
-from cuelearner_jax.records import results
+from cuelearner_jax.records.provenance import provenance
 from cuelearner_jax.runs import grid as runs
 from cuelearner_jax.runs.grid import Grid
 from cuelearner_jax.runs.lanes import Group, restore_policies
@@ -105,7 +105,7 @@ def main() -> None:
     for row in rows:
         print(f"{row['search']:32s}  " + "  ".join(f"{row[name]:>20.5f}" for name in NAMES))
     if asked.out:
-        told = {**results.provenance(), "step": step, "seeds": list(grid.seeds), "rows": rows}
+        told = {**provenance(), "step": step, "seeds": list(grid.seeds), "rows": rows}
         asked.out.write_text(json.dumps(told, indent=1) + "\n")
 
 

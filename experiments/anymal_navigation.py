@@ -33,7 +33,7 @@ from cuelearner_envs.navigation.config import make_environment
 from cuelearner_envs.navigation.environment import Navigation
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import agent_policy, episodes, rollout
-from cuelearner_jax.records import results
+from cuelearner_jax.records.provenance import provenance
 from cuelearner_jax.runs.grid import load
 from cuelearner_jax.runs.trained import Subject, load_lanes
 from cuelearner_jax.tasks.registry import TASKS
@@ -89,7 +89,7 @@ def main() -> int:
     sizes = replace(config.sizes, coarse_directions=asked.coarse)
     fitted = {name: json.loads(FIT.read_text())["fitted"][name] for name in FITTED}
     about = {"run": asked.run.name, "fitted": fitted, "coarse": asked.coarse}
-    came = results.provenance()  # before the first row changes a file of the repository
+    came = provenance()  # before the first row changes a file of the repository
     rows: list[dict[str, Any]] = []
     if asked.resume:
         if not asked.write or not asked.write.is_file():

@@ -15,6 +15,7 @@ import probes
 from cuelearner_jax.guidance import registry as guidances
 from cuelearner_jax.runs import lanes, sweep
 from cuelearner_jax.runs.grid import Grid
+from cuelearner_jax.terminal import Interrupted
 from cuelearner_jax.train import start_clock
 
 CONFIG = probes.config(
@@ -42,7 +43,7 @@ def run(out: Path, stop_at: int | None = None, **options) -> None:
     usual, sweep.interruptible = sweep.interruptible, interruptible
     try:
         sweep.run(probes.make_task(), CONFIG, GRID, out, **options)
-    except sweep.Interrupted:
+    except Interrupted:
         assert stop_at is not None
     finally:
         sweep.interruptible = usual

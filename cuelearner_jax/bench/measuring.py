@@ -32,11 +32,11 @@ from cuelearner_jax.devices import SHARED, lane_mesh, place
 from cuelearner_jax.environment import Environment
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guidance import registry as guidances
-from cuelearner_jax.records import results
+from cuelearner_jax.records.provenance import provenance
 from cuelearner_jax.runs.grid import LARGEST_SEED, Grid
 from cuelearner_jax.runs.lanes import CORES, Group, memory_report, state_bytes
-from cuelearner_jax.runs.sweep import Interrupted, console, progress_bars
 from cuelearner_jax.tasks.registry import Task, shape_of
+from cuelearner_jax.terminal import Interrupted, console, progress_bars
 from cuelearner_jax.train import start_clock
 from cuelearner_jax.types import Teacher
 
@@ -280,7 +280,7 @@ def _at_rest(work: Work, seeds: int, mesh: Mesh) -> int:
 
 def _entry(asked: Measuring, command: str, cache: str) -> dict[str, Any]:
     """Where and how the figures were measured."""
-    came = {**results.provenance(), "command": command}
+    came = {**provenance(), "command": command}
     return {
         "name": asked.name or (came["hardware"] if jax.default_backend() != "cpu" else f"{CORES} cores"),
         "note": asked.note,

@@ -18,9 +18,9 @@ import jax
 
 from cuelearner_jax import config as configuration
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.records import results
+from cuelearner_jax.records.provenance import provenance
 from cuelearner_jax.runs.grid import in_use
-from cuelearner_jax.runs.sweep import Interrupted, interruptible
+from cuelearner_jax.terminal import Interrupted, interruptible
 from cuelearner_jax.types import Walker
 
 COLUMNS = ("steps", "wall_s", "error", "turning_error", "falls")  # of the history
@@ -104,7 +104,7 @@ def train(
     check(config)
     if in_use(out):
         raise UserError(f"{out} is not empty: give another --out")
-    about = {"config": configuration.to_json(config), "seed": seed, **results.provenance(), "command": command}
+    about = {"config": configuration.to_json(config), "seed": seed, **provenance(), "command": command}
     history: list[list[float]] = []
     key = jax.random.key(seed)
     began = time.perf_counter()
@@ -166,7 +166,7 @@ def evaluate(
     figures = _examined(walker, policy, jax.random.key(seed), robots, tell)
     if out:
         out.parent.mkdir(parents=True, exist_ok=True)
-        contents = {"seed": seed, **results.provenance(), "command": command, "figures": figures}
+        contents = {"seed": seed, **provenance(), "command": command, "figures": figures}
         out.write_text(json.dumps(contents, indent=1) + "\n")
     return figures
 

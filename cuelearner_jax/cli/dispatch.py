@@ -45,6 +45,7 @@ from cuelearner_jax.runs import trained as play
 from cuelearner_jax.runs.shards import Shard
 from cuelearner_jax.tasks.registry import TASKS, Task, anymal_walker
 from cuelearner_jax.teachers import training as teaching
+from cuelearner_jax.terminal import Interrupted
 
 out = Console(highlight=False, soft_wrap=True)
 
@@ -57,7 +58,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    except (sweep.Interrupted, cluster.JobsFailed) as error:
+    except (Interrupted, cluster.JobsFailed) as error:
         print(str(error), file=sys.stderr)
         return error.status
     except BrokenPipeError:  # whoever read our output has gone, as `head` does

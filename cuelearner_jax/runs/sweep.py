@@ -5,19 +5,15 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-import signal
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import Progress
 
 from cuelearner_jax import config as configuration
 from cuelearner_jax.config import RunConfig
@@ -28,22 +24,16 @@ from cuelearner_jax.evaluate import episodes, evaluate_agents, evaluate_guides
 from cuelearner_jax.guidance import registry as guidances
 from cuelearner_jax.records import label_files, results
 from cuelearner_jax.records.checkpoint import Checkpoints, checkpoints
+from cuelearner_jax.records.provenance import provenance
 from cuelearner_jax.runs.grid import Grid, check_folder, check_grid, claimed, describe, prepare_folder
 from cuelearner_jax.runs.lanes import Group, items, memory_report, restore
 from cuelearner_jax.runs.shards import Shard
 from cuelearner_jax.tasks.registry import Task, shape_of
+from cuelearner_jax.terminal import Interrupted, console, interruptible, progress_bars
 from cuelearner_jax.train import label_slots, start_clock
 from cuelearner_jax.types import Teacher
 
 ROUNDS_A_CHUNK = 10  # label rounds between two checkpoints
-
-console = Console(stderr=True, highlight=False, soft_wrap=True)
-
-
-class Interrupted(Exception):
-    """The user asked to stop; everything is saved."""
-
-    status = 130  # that a command ends with
 
 
 def run(
@@ -157,41 +147,6 @@ def read_labels(path: Path, task: Task, config: RunConfig, grid: Grid) -> label_
     return file
 
 
-@contextmanager
-def interruptible() -> Iterator[threading.Event]:
-    """An event that the first Ctrl-C sets; a second one stops at once, losing what was not saved."""
-    stopping = threading.Event()
-
-    def stop(number: int, frame: Any) -> None:
-        if stopping.is_set():
-            raise KeyboardInterrupt
-        stopping.set()
-        console.print("stopping after this stretch of steps (Ctrl-C again: at once)")
-
-    if threading.current_thread() is not threading.main_thread():
-        yield stopping
-        return
-    before = signal.signal(signal.SIGINT, stop)
-    try:
-        yield stopping
-    finally:
-        signal.signal(signal.SIGINT, before)
-
-
-@contextmanager
-def progress_bars() -> Iterator[Progress]:
-    """Progress bars on standard error."""
-    columns = (
-        TextColumn("{task.description:<12}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("{task.fields[note]}"),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=console) as bars:
-        yield bars
-
-
 class _Runner:
     """Runs one group: labels, then training, with evaluation, rows and checkpoints between jitted stretches."""
 
@@ -228,7 +183,7 @@ class _Runner:
             "guidance": self.group.guidance.name,
             "split": self.split,
             "config_hash": configuration.digest(config),
-            **results.provenance(),
+            **provenance(),
         }
 
     def _items(self) -> dict[str, Any]:

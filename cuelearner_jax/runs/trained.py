@@ -27,7 +27,7 @@ from cuelearner_jax.evaluate import (
     uniform_policy,
 )
 from cuelearner_jax.guidance import registry as guidances
-from cuelearner_jax.records import results
+from cuelearner_jax.records.provenance import provenance
 from cuelearner_jax.runs.grid import Grid
 from cuelearner_jax.runs.lanes import Group, restore_policies
 from cuelearner_jax.tasks.registry import Task, shape_of
@@ -249,7 +249,7 @@ def write(
         **body,
         "envs": num_envs,
         "steps": steps,
-        **results.provenance(),
+        **provenance(),
         "rows": rows,
     }
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -14,13 +14,13 @@ import numpy as np
 from cuelearner_jax import config as configuration
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import episodes, rollout, teacher_policy
-from cuelearner_jax.records import results
 from cuelearner_jax.records.checkpoint import checkpoints
+from cuelearner_jax.records.provenance import provenance
 from cuelearner_jax.runs.grid import check_folder, in_use, prepare_folder
-from cuelearner_jax.runs.sweep import Interrupted, interruptible, progress_bars
 from cuelearner_jax.tasks.registry import Task
 from cuelearner_jax.teachers import learned as teacher
 from cuelearner_jax.teachers.learned import LearnedTeacher, TeacherConfig
+from cuelearner_jax.terminal import Interrupted, interruptible, progress_bars
 
 ROUNDS_A_STRETCH = 50  # in one jitted call
 SECONDS_BETWEEN_CHECKPOINTS = 60.0
@@ -80,7 +80,7 @@ def train(
         "seed": seed,
         "reward": round(reward, 4),
         "eval_steps": eval_steps,
-        **results.provenance(),
+        **provenance(),
         "command": command,
         "history": {"columns": ["round", "wall_s", "reward", "loss"], "rows": history[:: max(1, len(history) // 50)]},
     }

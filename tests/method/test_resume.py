@@ -15,6 +15,7 @@ from cuelearner_jax.records import label_files, results
 from cuelearner_jax.records.checkpoint import checkpoints
 from cuelearner_jax.runs import lanes, sweep
 from cuelearner_jax.runs.grid import Grid
+from cuelearner_jax.terminal import Interrupted
 from cuelearner_jax.train import label_slots, make_program, start_clock
 
 # Bootstraps, so that target network, next observations and Adam's moments are in the checkpoint as well.
@@ -163,7 +164,7 @@ def test_the_same_command_gives_the_same_run(whole, tmp_path):
 
 def test_stopped_and_killed_while_labelling(whole, tmp_path):
     out = tmp_path / "run"
-    with stopping_at(3), pytest.raises(sweep.Interrupted, match="--resume"):
+    with stopping_at(3), pytest.raises(Interrupted, match="--resume"):
         run(out)
     assert newest(out, "relative")[1] == 3
     # Round 4 is saved, round 5 is asked, then the process dies.
@@ -177,7 +178,7 @@ def test_stopped_and_killed_while_labelling(whole, tmp_path):
 
 def test_stopped_and_killed_while_training(whole, tmp_path):
     out = tmp_path / "run"
-    with stopping_at(6 + 3), pytest.raises(sweep.Interrupted, match="step 48 of relative"):
+    with stopping_at(6 + 3), pytest.raises(Interrupted, match="step 48 of relative"):
         run(out)
     assert newest(out, "relative")[1] == 6 + 48
     # The row of step 80 is on disk, its checkpoint (at 64) is not the newest state.
@@ -216,7 +217,7 @@ def test_killed_between_the_labels_and_the_first_row(whole, tmp_path):
 
 def test_stopped_in_the_last_round_of_labels(whole, tmp_path):
     out = tmp_path / "run"
-    with stopping_at(6), pytest.raises(sweep.Interrupted):
+    with stopping_at(6), pytest.raises(Interrupted):
         run(out)
     run(out, resume=True)
     assert_same_run(out, whole)
@@ -224,7 +225,7 @@ def test_stopped_in_the_last_round_of_labels(whole, tmp_path):
 
 def test_stopped_after_the_last_step(whole, tmp_path):
     out = tmp_path / "run"
-    with stopping_at(6 + 6), pytest.raises(sweep.Interrupted):
+    with stopping_at(6 + 6), pytest.raises(Interrupted):
         run(out)
     run(out, resume=True)
     assert_same_run(out, whole)
@@ -238,7 +239,7 @@ def test_resuming_a_finished_run_changes_nothing(whole):
 
 def test_a_torn_last_row_is_written_anew(whole, tmp_path):
     out = tmp_path / "run"
-    with stopping_at(6 + 3), pytest.raises(sweep.Interrupted):
+    with stopping_at(6 + 3), pytest.raises(Interrupted):
         run(out)
     with (out / "relative" / results.JSONL).open("a") as file:
         file.write('{"step": 48, "se')
@@ -274,7 +275,7 @@ def test_labels_of_a_file_are_used_exactly(tmp_path):
 
     task = probes.make_task()
     object.__setattr__(task, "teacher", refuse)
-    with stopping_at(2), pytest.raises(sweep.Interrupted):
+    with stopping_at(2), pytest.raises(Interrupted):
         sweep.run(task, CONFIG, grid, out, labels_from=path)
     sweep.run(task, CONFIG, grid, out, labels_from=path, resume=True)
     state, _ = newest(out, "relative", grid)
@@ -304,7 +305,7 @@ def test_the_labels_that_a_run_wrote_give_its_guidance_again(whole, tmp_path):
 
 def test_a_damaged_checkpoint_is_refused_and_the_one_before_serves(whole, tmp_path):
     out = tmp_path / "run"
-    with stopping_at(6 + 3), pytest.raises(sweep.Interrupted):
+    with stopping_at(6 + 3), pytest.raises(Interrupted):
         run(out)
     newest_folder = out / "relative" / "checkpoints" / str(6 + 48)
     for path in (newest_folder / "rest").rglob("*"):
