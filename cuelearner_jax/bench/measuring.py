@@ -34,7 +34,8 @@ from cuelearner_jax.errors import UserError
 from cuelearner_jax.guidance import registry as guidances
 from cuelearner_jax.records.provenance import provenance
 from cuelearner_jax.runs.grid import LARGEST_SEED, Grid
-from cuelearner_jax.runs.lanes import CORES, Group, memory_report, state_bytes
+from cuelearner_jax.runs.lanes import CORES, LaneGroup
+from cuelearner_jax.runs.memory_report import memory_report, state_bytes
 from cuelearner_jax.tasks.registry import Task, shape_of
 from cuelearner_jax.terminal import Interrupted, console, progress_bars
 from cuelearner_jax.train import start_clock
@@ -89,48 +90,28 @@ class Timed:
         self, config: RunConfig, env: Environment, kind: str, seeds: int, labels: int = 0, mesh: Mesh | None = None
     ) -> None:
         mesh = mesh or lane_mesh()
-        made = guidances.make(kind, config.sizes, env.obs_size)
+        made = guidances.make(kind, config.sizes, env)
         env = place(mesh, env, SHARED)
-        self.group = Group(config, env, made, Grid((kind,), tuple(range(seeds)), (labels,)), mesh)
+        self.group = LaneGroup(config, env, made, Grid((kind,), tuple(range(seeds)), (labels,)), mesh)
         self.clock, self.blocks = place(mesh, start_clock(), SHARED), self.group.start()
 
     def train(self, iterations: int) -> float:
         """Seconds of so many iterations of all lanes. The first call with a number compiles."""
-        group, clock = self.group, self.clock
-        config = group.config
-        seconds, done = _timed(
-            lambda: group.each(
-                lambda block: group.program.train(group.env, config.scalars, config.schedule, clock, block, iterations),
-                self.blocks,
-            )
-        )
-        self.clock, self.blocks = done[0][0], [block for _, block, _ in done]
+        seconds, done = _timed(lambda: self.group.train(self.clock, self.blocks, iterations))
+        self.clock, self.blocks, _ = done
         return seconds
 
     def label_round(self, teacher: Teacher) -> float:
         """Seconds of one round of questions and the fit that follows it. The first call compiles."""
-        group, clock = self.group, self.clock
-        seconds, done = _timed(
-            lambda: group.each(
-                lambda block: group.program.label_round(group.env, teacher, group.config.scalars, clock, block),
-                self.blocks,
-            )
-        )
-        self.clock, self.blocks = done[0][0], [block for _, block in done]
+        seconds, done = _timed(lambda: self.group.label_round(teacher, self.clock, self.blocks))
+        self.clock, self.blocks = done
         return seconds
 
     def fit(self) -> float:
         """Seconds of one fit to the labels there are. The first call compiles."""
-        group = self.group
         # The blocks are given up to the program, so their labels go into it as copies.
-        labels = [jax.block_until_ready(jax.tree.map(jnp.copy, block.asking.labels)) for block in self.blocks]
-        seconds, self.blocks = _timed(
-            lambda: group.each(
-                lambda rows, block: group.program.take_labels(group.env, group.config.scalars, rows, block),
-                labels,
-                self.blocks,
-            )
-        )
+        labels = [jax.block_until_ready(jax.tree.map(jnp.copy, block.guide.labels)) for block in self.blocks]
+        seconds, self.blocks = _timed(lambda: self.group.take_labels(labels, self.blocks))
         return seconds
 
 
@@ -266,11 +247,11 @@ def _check(works: Sequence[Work], asked: Measuring) -> Mesh:
     return mesh
 
 
-def _planned(work: Work, seeds: int, mesh: Mesh) -> Group:
+def _planned(work: Work, seeds: int, mesh: Mesh) -> LaneGroup:
     """The lanes of a measurement, of which nothing but shapes is made."""
     env = shape_of(work.task, work.config.task)
-    made = guidances.make("none", work.config.sizes, env.obs_size)
-    return Group(learning(work.config), env, made, Grid(("none",), tuple(range(seeds)), ()), mesh)
+    made = guidances.make("none", work.config.sizes, env)
+    return LaneGroup(learning(work.config), env, made, Grid(("none",), tuple(range(seeds)), ()), mesh)
 
 
 def _at_rest(work: Work, seeds: int, mesh: Mesh) -> int:

@@ -8,11 +8,11 @@ from __future__ import annotations
 import dataclasses
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 
@@ -21,7 +21,6 @@ from cuelearner_jax.errors import UserError
 from cuelearner_jax.records.provenance import provenance
 from cuelearner_jax.runs.grid import in_use
 from cuelearner_jax.terminal import Interrupted, interruptible
-from cuelearner_jax.types import Walker
 
 COLUMNS = ("steps", "wall_s", "error", "turning_error", "falls")  # of the history
 VALUE_LAYERS = (256, 256, 256, 256)
@@ -78,6 +77,17 @@ def check(config: LocomotionConfig) -> None:
             f"train.batch_size times train.minibatches is {config.batch_size * config.minibatches}: "
             f"give a multiple of train.robots ({config.robots})"
         )
+
+
+class Walker(NamedTuple):
+    """What training has to know of a robot that learns to walk. Figures are numbers by name."""
+
+    environment: Any  # brax.envs.Env: velocity commands are to be tracked
+    policy: Callable[[Any], Any]  # brax's parameters -> a policy
+    measure: Callable[[Any, Any, int], dict[str, float]]  # (policy, key, robots) -> figures while it learns
+    examine: Callable[[Any, Any, int], Iterator[tuple[str, dict[str, float]]]]  # of a finished one, by trial
+    save: Callable[[Path, Any, dict[str, Any]], None]  # (folder, policy, what is to be known of it)
+    load: Callable[..., Any]  # (folder) -> the policy; the shipped one without a folder
 
 
 class _Enough(Exception):

@@ -76,7 +76,7 @@ def preset_of(task: Task, arguments: list[str]) -> tuple[str, list[str]]:
     return name, rest
 
 
-def subject_of(arguments: list[str], command: str) -> tuple[play.Subject, list[str]]:
+def subject_of(arguments: list[str], command: str) -> tuple[play.PolicySource, list[str]]:
     """The run folder or task named first."""
     if not arguments or arguments[0] in ("-h", "--help"):
         print(f"usage: cuelearner {command} RUN_FOLDER|TASK [OPTIONS]\n\n{ABOUT[command]}\n")
@@ -89,8 +89,8 @@ def subject_of(arguments: list[str], command: str) -> tuple[play.Subject, list[s
     if name in TASKS and not Path(name, "config.json").exists():
         task = TASKS[name]
         preset, rest = preset_of(task, rest)
-        return play.Subject(task, task.presets[preset].config, None, Path(name)), rest
+        return play.PolicySource(task, task.presets[preset].config, None, Path(name)), rest
     if not Path(name).exists():
         raise UserError(f"{name!r} is neither a run folder nor a task ({', '.join(TASKS)})")
     task, config, grid = runs.load(Path(name), TASKS)
-    return play.Subject(task, config, grid, Path(name)), rest
+    return play.PolicySource(task, config, grid, Path(name)), rest

@@ -42,6 +42,7 @@ from cuelearner_jax.evaluate import episodes
 from cuelearner_jax.runs import cluster, sweep
 from cuelearner_jax.runs import grid as runs
 from cuelearner_jax.runs import trained as play
+from cuelearner_jax.runs.order import Order, planned
 from cuelearner_jax.runs.shards import Shard
 from cuelearner_jax.tasks.registry import TASKS, Task, anymal_walker
 from cuelearner_jax.teachers import training as teaching
@@ -155,7 +156,7 @@ def _submit(task: Task, asked: Sweep, grid: runs.Grid, arguments: list[str]) -> 
     shards = [Shard(index, asked.shards) for index in range(1, asked.shards + 1)]
     split = "tuning" if asked.tuning else "validation"
     plans = {
-        shard: sweep.planned(task, asked.run, grid, asked.out, labels_from=asked.labels_from, shard=shard, split=split)
+        shard: planned(Order(task, asked.run, grid, asked.out, labels_from=asked.labels_from, shard=shard, split=split))
         for shard in shards
     }
     pieces = {s: cluster.piece_arguments(arguments, s) for s, plan in plans.items() if not plan.finished}
@@ -177,15 +178,17 @@ def _submit(task: Task, asked: Sweep, grid: runs.Grid, arguments: list[str]) -> 
 
 def _run(task: Task, asked: Common, grid: runs.Grid, shard: Shard | None = None) -> None:
     sweep.run(
-        task,
-        asked.run,
-        grid,
-        asked.out,
-        resume=asked.resume,
-        overwrite=asked.overwrite,
-        labels_from=asked.labels_from,
-        shard=shard,
-        split="tuning" if asked.tuning else "validation",
+        Order(
+            task,
+            asked.run,
+            grid,
+            asked.out,
+            resume=asked.resume,
+            overwrite=asked.overwrite,
+            labels_from=asked.labels_from,
+            shard=shard,
+            split="tuning" if asked.tuning else "validation",
+        )
     )
     out.print(f"done: {asked.out} (see it with: cuelearner report {asked.out} --out {asked.out}/report)")
 

@@ -23,7 +23,7 @@ META = b"cuelearner"
 CONVENTIONS = {
     "obs": "the task's observation at the question",
     "action": "unit vector asked about",
-    "target": "what the guidance model is to predict; relative: action turned by h * eps, less the action",
+    "answer": "what the guidance model is to predict; relative: action turned by h * eps, less the action",
     "angles": "radians, counterclockwise positive",
 }
 
@@ -32,21 +32,21 @@ class LabelFile(NamedTuple):
     """Label sets and where they come from."""
 
     task: dict[str, Any]  # {"name": ..., configuration of the task}
-    guidance: str
+    answers: str
     eps_deg: float  # strength of the labels [deg]
     seeds: np.ndarray  # (labels,)
     labels: Label  # rows (labels, ...), in the order they were given
 
 
-def write(path: Path, task: dict[str, Any], guidance: str, eps_deg: float, seeds: np.ndarray, labels: Label) -> None:
+def write(path: Path, task: dict[str, Any], answers: str, eps_deg: float, seeds: np.ndarray, labels: Label) -> None:
     """Writes the labels that count. `seeds` (lanes,), `labels` (lanes, slots, ...). Replaces `path` in one step."""
     valid = np.asarray(labels.valid)
     rows = jax.tree.map(lambda leaf: np.asarray(leaf)[valid], labels)
     seed = np.broadcast_to(np.asarray(seeds)[:, None], valid.shape)[valid]
     columns = {"seed": pa.array(seed.astype(np.int64))}
-    for name in ("obs", "action", "target"):
+    for name in ("obs", "action", "answer"):
         columns[name] = pa.array(list(getattr(rows, name)), pa.list_(pa.float32()))
-    meta = {"task": task, "guidance": guidance, "eps_deg": float(eps_deg), "conventions": CONVENTIONS}
+    meta = {"task": task, "answers": answers, "eps_deg": float(eps_deg), "conventions": CONVENTIONS}
     table = pa.table(columns).replace_schema_metadata({META: json.dumps(meta).encode()})
     temporary = path.with_suffix(".tmp")
     pq.write_table(table, temporary, write_page_checksum=True)
@@ -60,10 +60,10 @@ def read(path: Path) -> LabelFile:
     try:
         table = pq.read_table(path, page_checksum_verification=True)
         meta = json.loads((table.schema.metadata or {})[META])
-        columns = {name: np.array(table[name].to_pylist(), np.float32) for name in ("obs", "action", "target")}
+        columns = {name: np.array(table[name].to_pylist(), np.float32) for name in ("obs", "action", "answer")}
         seeds = np.array(table["seed"].to_pylist(), np.int64)
         labels = Label(**columns, valid=np.ones(len(seeds), bool))  # pyright: ignore[reportArgumentType]
-        file = LabelFile(meta["task"], meta["guidance"], float(meta["eps_deg"]), seeds, labels)
+        file = LabelFile(meta["task"], meta["answers"], float(meta["eps_deg"]), seeds, labels)
     except (OSError, pa.ArrowException, KeyError, TypeError, ValueError) as error:
         raise UserError(f"{path} is not a label file of cuelearner, or it is damaged: write it anew") from error
     if not len(seeds):

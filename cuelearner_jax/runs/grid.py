@@ -28,10 +28,10 @@ from cuelearner_jax.config import RunConfig
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import SPLITS
 from cuelearner_jax.guidance import registry as guidances
+from cuelearner_jax.guidance.bundle import Guidance
 from cuelearner_jax.records import label_files
 from cuelearner_jax.runs.shards import Shard
 from cuelearner_jax.tasks.registry import Task
-from cuelearner_jax.types import Guidance
 
 LOCK = ".lock"  # says which process writes in a run's folder; left behind empty
 LARGEST_SEED = min(SPLITS.values())  # seeds and splits are folded into one key
@@ -54,14 +54,12 @@ class Grid:
 
 def check_grid(grid: Grid) -> None:
     """Raises UserError for a grid that makes no sense."""
-    for kind in grid.guidance:
-        if kind not in guidances.KINDS:
-            raise UserError(f"unknown guidance {kind!r}: choose among {', '.join(guidances.KINDS)}")
+    kinds = [guidances.find(kind) for kind in grid.guidance]
     if not grid.guidance or len(set(grid.guidance)) < len(grid.guidance):
         raise UserError("--guidance: give each kind once, and at least one")
     if not grid.seeds or len(set(grid.seeds)) < len(grid.seeds) or not all(0 <= s < LARGEST_SEED for s in grid.seeds):
         raise UserError(f"seeds must be different numbers from 0 to {LARGEST_SEED - 1}: give --seeds and --first-seed")
-    if "relative" in grid.guidance:
+    if any(kind.asks for kind in kinds):
         if not grid.labels or len(set(grid.labels)) < len(grid.labels):
             raise UserError("--labels: give each budget once, and at least one")
         if min(grid.labels) < 1:

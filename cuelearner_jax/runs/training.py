@@ -125,6 +125,4 @@ class Training:
     def _measured(self, policy_of: Any) -> dict[str, np.ndarray]:
         schedule = self.group.config.schedule
         key = episodes(self.split)
-        return self.group.evaluate(
-            policy_of, self.examined, key, schedule.eval_envs, schedule.eval_steps, self.blocks
-        )
+        return self.group.evaluate(policy_of, self.examined, key, schedule.eval_envs, schedule.eval_steps, self.blocks)

@@ -27,7 +27,7 @@ from cuelearner_envs.navigation.roadmap import make_teacher
 from cuelearner_jax.config import RunConfig, Scalars, Schedule, Sizes
 from cuelearner_jax.environment import Environment
 from cuelearner_jax.teachers import learned
-from cuelearner_jax.types import Teacher, Walker
+from cuelearner_jax.types import Teacher
 
 
 @dataclass(frozen=True)
@@ -255,9 +255,10 @@ NAVIGATION = Task(
 TASKS = {task.name: task for task in (BILLIARDS, NAVIGATION)}
 
 
-def anymal_walker() -> Walker:
+def anymal_walker() -> Any:
     """The quadruped that learns to walk."""
     from cuelearner_envs.anymal import policy, tracking
+    from cuelearner_jax.brax_bridge.walking import Walker
     from cuelearner_envs.anymal.locomotion import Locomotion
 
     return Walker(

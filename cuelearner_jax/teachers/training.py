@@ -13,7 +13,8 @@ import numpy as np
 
 from cuelearner_jax import config as configuration
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.evaluate import episodes, rollout, teacher_policy
+from cuelearner_jax.evaluate import episodes, evaluate_policy
+from cuelearner_jax.policies import Taught
 from cuelearner_jax.records.checkpoint import checkpoints
 from cuelearner_jax.records.provenance import provenance
 from cuelearner_jax.runs.grid import check_folder, in_use, prepare_folder
@@ -119,7 +120,5 @@ def _learn(program: teacher.TeacherProgram, env: Any, config: TeacherConfig, out
 
 def validate(made: LearnedTeacher, env: Any, steps: int) -> float:
     """Reward a step of a teacher's own choices on validation episodes."""
-    key = episodes()
-    envs = min(100, steps)
-    measure = jax.jit(lambda made, env: rollout(teacher_policy(made), env, key, envs, steps))
-    return float(np.asarray(measure(made, env)["reward"]))
+    found = evaluate_policy(env, Taught(made), episodes(), min(100, steps), steps)
+    return float(np.asarray(found["reward"]))
