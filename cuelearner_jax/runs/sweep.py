@@ -24,8 +24,9 @@ from cuelearner_jax.evaluate import episodes, evaluate_agents, evaluate_guides
 from cuelearner_jax.guidance import registry as guidances
 from cuelearner_jax.records import label_files, results
 from cuelearner_jax.records.checkpoint import Checkpoints, checkpoints
+from cuelearner_jax.records.folders import check_folder, claimed, prepare_folder
 from cuelearner_jax.records.provenance import provenance
-from cuelearner_jax.runs.grid import Grid, check_folder, check_grid, claimed, describe, prepare_folder
+from cuelearner_jax.runs.grid import Grid, check_grid, config_hash, describe
 from cuelearner_jax.runs.lanes import Group, items, memory_report, restore
 from cuelearner_jax.runs.shards import Shard
 from cuelearner_jax.tasks.registry import Task, shape_of
@@ -174,15 +175,13 @@ class _Runner:
         results.finish(self.folder)
 
     def _constants(self) -> dict[str, Any]:
-        config = json.loads((self.out / "config.json").read_text())
-        for name in ("grid", "shard"):  # do not change what a lane learns
-            config.pop(name, None)
+        described = json.loads((self.out / "config.json").read_text())
         return {
             "run": self.out.name,
             "task": self.task.name,
             "guidance": self.group.guidance.name,
             "split": self.split,
-            "config_hash": configuration.digest(config),
+            "config_hash": config_hash(described),
             **provenance(),
         }
 
