@@ -71,11 +71,11 @@ class Transition(struct.PyTreeNode):
 
 
 class Label(struct.PyTreeNode):
-    """One answer of a teacher."""
+    """One answer of a teacher: what was said, not what a model is to predict of it."""
 
     obs: Float[Array, " obs"]
-    action: Float[Array, "2"]  # the action asked about
-    target: Float[Array, "2"]  # what the guidance model is to predict; relative: rotate(action, eps * h) - action
+    action: Float[Array, " action"]  # the action asked about
+    answer: Float[Array, " width"]  # relative: h in {-1, 0, 1}; demonstration: a direction; scalar: 0 or 1
     valid: Bool[Array, ""]  # False: padding, past this lane's budget, or no answer
 
 

@@ -135,12 +135,12 @@ def read_labels(path: Path, task: Task, config: RunConfig, grid: Grid) -> label_
     asking = [kind for kind in grid.guidance if guidances.make(kind, config.sizes, env.obs_size).asks]
     if not asking:
         raise UserError("--labels-from needs a guidance that uses labels: add --guidance relative")
-    if asking != [file.guidance]:
-        raise UserError(f"{path} holds {file.guidance} labels, the run uses {', '.join(asking)}: give fitting labels")
-    if not math.isclose(file.eps_deg, config.scalars.eps_deg, rel_tol=1e-6):
+    if asking != [file.answers]:
+        raise UserError(f"{path} holds {file.answers} labels, the run uses {', '.join(asking)}: give fitting labels")
+    if not math.isclose(file.eps_deg or 0.0, config.scalars.eps_deg, rel_tol=1e-6):
         raise UserError(
-            f"{path} holds labels of {file.eps_deg:g} degrees, the run's are of {config.scalars.eps_deg:g}: "
-            f"give --scalars.eps-deg {file.eps_deg:g}, or other labels"
+            f"{path} holds labels of {file.eps_deg or 0.0:g} degrees, the run's are of {config.scalars.eps_deg:g}: "
+            f"give --scalars.eps-deg {file.eps_deg or 0.0:g}, or other labels"
         )
     for kind in asking:
         seeds, budgets = grid.lanes(guidances.make(kind, config.sizes, env.obs_size))
