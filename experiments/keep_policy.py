@@ -13,6 +13,7 @@ import jax
 import numpy as np
 
 from cuelearner_jax.errors import UserError
+from cuelearner_jax.records import formats
 from cuelearner_jax.records.checkpoint import checkpoints
 from cuelearner_jax.runs.grid import load
 from cuelearner_jax.runs.trained import Subject, Trained, load_lanes
@@ -30,7 +31,7 @@ def keep(run: Path, out: Path, seed: int, kind: str | None, labels: int | None) 
     found = np.flatnonzero((lanes.seeds == seed) & (lanes.budgets == budget))
     if not len(found):
         raise UserError(f"{run} has no lane of seed {seed} with {budget} labels")
-    described = json.loads((run / "config.json").read_text())
+    described = formats.read("config", run / "config.json")
     described["grid"] = {"guidance": [lanes.guidance.name], "seeds": [seed], "labels": [budget]}
     out.mkdir(parents=True)
     (out / "config.json").write_text(json.dumps(described, indent=1) + "\n")

@@ -193,9 +193,9 @@ def greedy_actions(q, params, obs, sizes=SIZES):
     return np.asarray(options[jnp.argmax(values, -1)])
 
 
-def label_set(obs, action, target, valid):
+def label_set(obs, action, answer, valid):
     """Labels as NumPy arrays."""
-    return Label(obs, action, target, valid)
+    return Label(obs, action, answer, valid)
 
 
 def compilations(*functions):

@@ -18,8 +18,8 @@ import jax
 
 from cuelearner_jax import config as configuration
 from cuelearner_jax.errors import UserError
+from cuelearner_jax.records.folders import in_use
 from cuelearner_jax.records.provenance import provenance
-from cuelearner_jax.runs.grid import in_use
 from cuelearner_jax.terminal import Interrupted, interruptible
 
 COLUMNS = ("steps", "wall_s", "error", "turning_error", "falls")  # of the history

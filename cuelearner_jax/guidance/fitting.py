@@ -29,7 +29,9 @@ class Lesson(struct.PyTreeNode):
 
 def lessons(labels: Label, target: TargetFunction, scalars: GuideScalars) -> Lesson:
     """Labels (slots, ...) with what their answers mean to a network."""
-    return Lesson(labels.obs, labels.action, jax.vmap(lambda label: target(label, scalars))(labels), labels.valid)
+    targets = jax.vmap(lambda label: target(label, scalars))(labels)
+    # Rounded here, whatever is computed of them next: fused with that, their last bits would hang on the compiler.
+    return Lesson(labels.obs, labels.action, jax.lax.optimization_barrier(targets), labels.valid)
 
 
 def _subset(valid: Bool[Array, " labels"]) -> Callable[[PRNGKeyArray, int], jax.Array]:

@@ -35,14 +35,13 @@ def make(sizes: GuideSizes, spaces: Spaces) -> Guidance:
         return GuidanceModel(init_params(key), jnp.array(False))
 
     def target(label: Label, scalars: GuideScalars) -> Float[Array, " action"]:
-        """Eq. 3's eps * h as a vector, in units of eps: (the action turned by h * eps, less the action) / eps."""
-        eps = scalars.radians("eps")
-        return (space.toward(label.action, label.answer[0], eps) - label.action) / eps
+        """Eq. 3's eps * h as a vector: the action turned by h * eps, less the action."""
+        return space.toward(label.action, label.answer[0], scalars.radians("eps")) - label.action
 
     def fit(key: PRNGKeyArray, env: Any, labels: Label, former: GuidanceModel, scalars: GuideScalars) -> GuidanceModel:
-        return fit_least_squares(
-            key, env, lessons(labels, target, scalars), scalars, init=init_params, apply=predict, sizes=sizes
-        )
+        rows = lessons(labels, target, scalars)
+        rows = rows.replace(target=rows.target / scalars.radians("eps"))
+        return fit_least_squares(key, env, rows, scalars, init=init_params, apply=predict, sizes=sizes)
 
     def act(
         model: GuidanceModel,

@@ -8,7 +8,6 @@ table), `curves.csv` (what the curves show), `curves.png/.svg` and, where there 
 from __future__ import annotations
 
 import csv
-import json
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -19,11 +18,11 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.records import results
+from cuelearner_jax.records import formats, results
+from cuelearner_jax.records.folders import in_use
 from cuelearner_jax.report.figures import Group, draw_curves, draw_label_efficiency, save_figure
 from cuelearner_jax.report.statistics import curve, interval, mean_over_curve, steps_to_reach, stretches_apart
 from cuelearner_jax.runs import shards
-from cuelearner_jax.runs.grid import in_use
 
 
 def report(
@@ -191,10 +190,9 @@ def _missing(folders: Sequence[str | os.PathLike[str]], table: pa.Table, groups:
 
 def _config(folder: Path) -> dict[str, Any]:
     try:
-        config = json.loads((folder / "config.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        return formats.read("config", folder / "config.json")
+    except UserError:
         return {}
-    return config if isinstance(config, dict) else {}
 
 
 # --- tables ----------------------------------------------------------------------------------------------------------

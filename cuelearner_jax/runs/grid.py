@@ -1,22 +1,7 @@
-"""What a run is and the folder it lives in: the grid of lanes, config.json, and what may be done to a folder.
-
-Folder of a run:
-
-    config.json                  everything that determines the results
-    .lock                        held by the process that writes here
-    <guidance>/checkpoints/      the newest states
-    <guidance>/labels.parquet    what the teacher answered
-    <guidance>/results.jsonl     one row a seed and evaluation; results.parquet once done
-"""
+"""What a run is: the grid of its lanes, and its description in config.json."""
 
 from __future__ import annotations
 
-import fcntl
-import json
-import os
-import shutil
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -29,11 +14,10 @@ from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import SPLITS
 from cuelearner_jax.guidance import registry as guidances
 from cuelearner_jax.guidance.bundle import Guidance
-from cuelearner_jax.records import label_files
+from cuelearner_jax.records import formats, label_files
 from cuelearner_jax.runs.shards import Shard
 from cuelearner_jax.tasks.registry import Task
 
-LOCK = ".lock"  # says which process writes in a run's folder; left behind empty
 LARGEST_SEED = min(SPLITS.values())  # seeds and splits are folded into one key
 
 
@@ -79,6 +63,7 @@ def describe(
 ) -> dict[str, Any]:
     """The contents of config.json."""
     return {
+        "format": formats.FORMATS["config"],
         "task": {"name": task.name, **configuration.to_json(config.task)},
         "sizes": configuration.to_json(config.sizes),
         "scalars": configuration.to_json(config.scalars),
@@ -91,13 +76,19 @@ def describe(
     }
 
 
+def config_hash(described: dict[str, Any]) -> str:
+    """Short hash of what a lane learns from: of a description less the file's format and the other lanes."""
+    apart = ("format", "grid", "shard")
+    return configuration.digest({name: value for name, value in described.items() if name not in apart})
+
+
 def load(folder: Path, tasks: dict[str, Task]) -> tuple[Task, RunConfig, Grid]:
     """What a run folder's config.json says. Raises UserError if it is no run folder."""
     path = folder / "config.json"
     if not path.is_file():
         raise UserError(f"{folder} is no run folder (it has no config.json): give the --out of a train or sweep")
+    values = formats.read("config", path)
     try:
-        values = json.loads(path.read_text())
         task = tasks[values["task"].pop("name")]
         config = RunConfig(
             configuration.from_json(task.config, values["task"]),
@@ -107,77 +98,5 @@ def load(folder: Path, tasks: dict[str, Task]) -> tuple[Task, RunConfig, Grid]:
         )
         grid = Grid(*(tuple(values["grid"][name]) for name in ("guidance", "seeds", "labels")))
     except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise UserError(f"{path} is damaged or of another program: restore it or train anew") from error
+        raise formats.damaged("config", path) from error
     return task, config, grid
-
-
-def in_use(out: Path) -> bool:
-    """Is there anything at `out`, the mark of a process that writes there apart?"""
-    return out.exists() and (not out.is_dir() or any(entry.name != LOCK for entry in out.iterdir()))
-
-
-def check_folder(out: Path, described: dict[str, Any], resume: bool, overwrite: bool) -> None:
-    """Raises UserError unless `out` may be used as asked."""
-    if resume and overwrite:
-        raise UserError("--resume continues a run and --overwrite deletes it: give one of them")
-    used = in_use(out)
-    ours = (out / "config.json").is_file()
-    if resume:
-        if not ours:
-            raise UserError(f"nothing to resume in {out}: give the --out of an interrupted run, or leave out --resume")
-        try:
-            before = json.loads((out / "config.json").read_text())
-            differing = sorted(_differences(before, described))
-        except (ValueError, TypeError) as error:  # no JSON, or JSON of something else
-            raise UserError(f"{out / 'config.json'} is damaged: restore it or start anew with --overwrite") from error
-        if differing:
-            raise UserError(
-                f"{out} was run with another {', '.join(differing[:4])}: give the same options, or another --out"
-            )
-    elif used and not overwrite:
-        raise UserError(f"{out} is not empty: give --resume to go on, --overwrite to delete it, or another --out")
-    elif used and not ours:
-        raise UserError(f"{out} is not a run folder, so --overwrite will not delete it: give another --out")
-
-
-def _differences(before: dict[str, Any], now: dict[str, Any], prefix: str = "") -> Iterator[str]:
-    for name in {**before, **now}:
-        old, new = before.get(name), now.get(name)
-        if isinstance(old, dict) and isinstance(new, dict):
-            yield from _differences(old, new, f"{prefix}{name}.")
-        elif old != new:
-            yield prefix + name
-
-
-@contextmanager
-def claimed(out: Path) -> Iterator[None]:
-    """Makes a run's folder and keeps it for this process alone; it is free again however the process ends.
-
-    The lock is on a file, not on the folder: that is what NFS passes on between machines.
-
-    Raises UserError if another process has it.
-    """
-    out.mkdir(parents=True, exist_ok=True)
-    descriptor = os.open(out / LOCK, os.O_RDWR | os.O_CREAT, 0o666)
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        os.close(descriptor)
-        raise UserError(f"{out} is being written by another process: wait for it, or give another --out") from None
-    try:
-        yield
-    finally:
-        os.close(descriptor)
-
-
-def prepare_folder(out: Path, described: dict[str, Any], clean: bool) -> None:
-    """Makes the folder and writes config.json, if it is not there; with `clean`, nothing else is left in it."""
-    out.mkdir(parents=True, exist_ok=True)
-    for entry in out.iterdir() if clean else ():
-        if entry.name == LOCK:
-            continue
-        shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
-    if not (out / "config.json").exists():
-        temporary = out / "config.tmp"  # in one step, so that a crash leaves no half of it
-        temporary.write_text(json.dumps(described, indent=1) + "\n")
-        temporary.replace(out / "config.json")

@@ -14,7 +14,8 @@ from cuelearner_jax.config import RunConfig
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guidance import registry as guidances
 from cuelearner_jax.records import label_files, results
-from cuelearner_jax.runs.grid import Grid, check_folder, check_grid, describe
+from cuelearner_jax.records.folders import check_folder
+from cuelearner_jax.runs.grid import Grid, check_grid, describe
 from cuelearner_jax.runs.shards import Shard
 from cuelearner_jax.tasks.registry import Task, shape_of
 

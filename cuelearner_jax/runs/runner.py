@@ -12,6 +12,7 @@ from cuelearner_jax import config as configuration
 from cuelearner_jax.environment import Environment
 from cuelearner_jax.records import label_files, provenance, results
 from cuelearner_jax.records.checkpoint import Checkpoints, checkpoints
+from cuelearner_jax.runs.grid import config_hash
 from cuelearner_jax.runs.kept import items, restore_blocks
 from cuelearner_jax.runs.lanes import LaneGroup
 from cuelearner_jax.runs.order import Order
@@ -20,7 +21,6 @@ from cuelearner_jax.terminal import Interrupted, console
 from cuelearner_jax.types import Teacher
 
 ROUNDS_A_CHUNK = 10  # label rounds between two checkpoints
-NOT_LEARNED_FROM = ("grid", "shard", "format")  # of config.json: they do not change what a lane learns
 
 
 class Runner:
@@ -57,13 +57,12 @@ class Runner:
         results.finish(self.folder)
 
     def _constants(self) -> dict[str, Any]:
-        learned_from = {name: value for name, value in self.described.items() if name not in NOT_LEARNED_FROM}
         return {
             "run": self.order.out.name,
             "task": self.order.task.name,
             "guidance": self.group.guidance.name,
             "split": self.order.split,
-            "config_hash": configuration.digest(learned_from),
+            "config_hash": config_hash(self.described),
             **provenance.provenance(),
         }
 

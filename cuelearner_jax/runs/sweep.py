@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from cuelearner_jax.devices import SHARED, lane_mesh, place
 from cuelearner_jax.guidance import registry as guidances
-from cuelearner_jax.runs.grid import claimed, prepare_folder
+from cuelearner_jax.records.folders import claimed, prepare_folder
 from cuelearner_jax.runs.lanes import LaneGroup
 from cuelearner_jax.runs.memory_report import memory_report
 from cuelearner_jax.runs.order import Order, planned

@@ -258,8 +258,8 @@ TASKS = {task.name: task for task in (BILLIARDS, NAVIGATION)}
 def anymal_walker() -> Any:
     """The quadruped that learns to walk."""
     from cuelearner_envs.anymal import policy, tracking
-    from cuelearner_jax.brax_bridge.walking import Walker
     from cuelearner_envs.anymal.locomotion import Locomotion
+    from cuelearner_jax.brax_bridge.walking import Walker
 
     return Walker(
         environment=Locomotion(),

@@ -26,6 +26,7 @@ from cuelearner_jax import actions as geometry
 from cuelearner_jax.config import from_json
 from cuelearner_jax.environment import random_symmetries
 from cuelearner_jax.errors import UserError
+from cuelearner_jax.records import formats
 from cuelearner_jax.records.checkpoint import checkpoints
 from cuelearner_jax.types import Params
 
@@ -250,17 +251,18 @@ def save(folder: Path, teacher: LearnedTeacher, about: dict[str, Any]) -> None:
     params = jax.tree.map(lambda leaf: leaf.astype(jnp.float16), teacher.params)
     with checkpoints(folder / "network") as saved:
         saved.save(0, {"params": params})
-    (folder / "teacher.json").write_text(json.dumps(about, indent=1) + "\n")
+    (folder / "teacher.json").write_text(json.dumps({"format": formats.FORMATS["teacher"], **about}, indent=1) + "\n")
 
 
 def load(folder: Path, env: Any, aim_error: Any, habit: Any) -> LearnedTeacher:
     """A teacher that `save` wrote. Raises UserError if there is none, or one of another task."""
     if not (folder / "teacher.json").is_file():
         raise UserError(f"no teacher in {folder}: train one with `cuelearner teacher train`, or use the search teacher")
+    about = formats.read("teacher", folder / "teacher.json")
     try:
-        config = from_json(TeacherConfig, json.loads((folder / "teacher.json").read_text())["config"])
+        config = from_json(TeacherConfig, about["config"])
     except (ValueError, KeyError, TypeError) as error:
-        raise UserError(f"{folder / 'teacher.json'} is damaged: restore it, or train the teacher anew") from error
+        raise formats.damaged("teacher", folder / "teacher.json") from error
     template = jax.eval_shape(_Training(config).init, env, jax.random.key(0)).params
     halves = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, jnp.float16), template)
     with checkpoints(folder / "network", read_only=True) as saved:

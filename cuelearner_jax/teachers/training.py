@@ -16,8 +16,9 @@ from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import episodes, evaluate_policy
 from cuelearner_jax.policies import Taught
 from cuelearner_jax.records.checkpoint import checkpoints
+from cuelearner_jax.records.folders import check_folder, in_use, prepare_folder
+from cuelearner_jax.records.formats import FORMATS
 from cuelearner_jax.records.provenance import provenance
-from cuelearner_jax.runs.grid import check_folder, in_use, prepare_folder
 from cuelearner_jax.tasks.registry import Task
 from cuelearner_jax.teachers import learned as teacher
 from cuelearner_jax.teachers.learned import LearnedTeacher, TeacherConfig
@@ -65,11 +66,12 @@ def train(
     if not hasattr(env, "features"):
         raise UserError(f"{task.name} gives a teacher no features to learn from")
     described = {"config": configuration.to_json(config), "task": {"name": task.name, **configuration.to_json(world)}}
+    asked = {"format": FORMATS["config"], **described, "seed": seed}
     if not resume and in_use(out):
         raise UserError(f"{out} is not empty: give --resume to go on with an interrupted training, or another --out")
     if resume:
-        check_folder(out, {**described, "seed": seed}, resume=True, overwrite=False)
-    prepare_folder(out, {**described, "seed": seed}, clean=False)
+        check_folder(out, asked, resume=True, overwrite=False)
+    prepare_folder(out, asked, clean=False)
     history = _learn(teacher.make_program(config), env, config, out, seed)
     with checkpoints(out / TRAINING, read_only=True) as saved:
         shapes = jax.eval_shape(teacher.make_program(config).init, env, jax.random.key(seed))

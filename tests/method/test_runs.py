@@ -1,6 +1,7 @@
-"""A run's folder: what may be done to it, what it says of itself, and grids that make no sense."""
+"""What a run says of itself, grids that make no sense, and runs that are refused."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import probes
@@ -8,10 +9,13 @@ import pytest
 
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guidance import registry as guidances
+from cuelearner_jax.records import results
+from cuelearner_jax.records.folders import check_folder, prepare_folder
 from cuelearner_jax.runs import grid as runs
 from cuelearner_jax.runs import sweep
 from cuelearner_jax.runs.grid import Grid
 
+ROOT = Path(__file__).resolve().parents[2]
 TASK = probes.make_task()
 TASKS = {TASK.name: TASK}
 GRID = Grid(("none", "relative"), seeds=(4, 9), labels=(10, 15))
@@ -25,89 +29,10 @@ def described(config=probes.CONFIG, grid=GRID, split="tuning", task=TASK):
 def out(tmp_path):
     """The folder of an interrupted run."""
     folder = tmp_path / "run"
-    runs.prepare_folder(folder, described(), clean=False)
+    prepare_folder(folder, described(), clean=False)
     (folder / "none").mkdir()
     (folder / "none" / "results.jsonl").write_text("{}\n")
     return folder
-
-
-def refused(folder, message, now=None, resume=False, overwrite=False):
-    """`check_folder` refuses with `message` and changes nothing."""
-    before = probes.files_of(folder.parent)
-    with pytest.raises(UserError, match=message) as refusal:
-        runs.check_folder(folder, described() if now is None else now, resume, overwrite)
-    assert "\n" not in str(refusal.value)
-    assert probes.files_of(folder.parent) == before
-
-
-# What may be done to a folder.
-
-
-def test_a_missing_or_empty_folder_may_be_used(tmp_path):
-    runs.check_folder(tmp_path, described(), resume=False, overwrite=False)
-    for overwrite in (False, True):
-        runs.check_folder(tmp_path / "new", described(), resume=False, overwrite=overwrite)
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_a_run_may_be_resumed_or_overwritten_and_nothing_else(out):
-    refused(out, "not empty: give --resume to go on, --overwrite to delete it")
-    runs.check_folder(out, described(), resume=True, overwrite=False)
-    runs.check_folder(out, described(), resume=False, overwrite=True)
-    refused(out, "give one of them", resume=True, overwrite=True)
-
-
-def test_nothing_to_resume(tmp_path):
-    refused(tmp_path / "new", "nothing to resume", resume=True)
-    refused(tmp_path, "nothing to resume", resume=True)
-    (tmp_path / "photo.txt").write_text("mine")
-    refused(tmp_path, "nothing to resume", resume=True)
-
-
-def test_overwriting_never_deletes_what_is_no_run(tmp_path):
-    (tmp_path / "photo.txt").write_text("mine")
-    refused(tmp_path, "not a run folder, so --overwrite will not delete it", overwrite=True)
-    refused(tmp_path / "photo.txt", "not a run folder, so --overwrite will not delete it", overwrite=True)
-    refused(tmp_path / "photo.txt", "not empty")
-
-
-@pytest.mark.parametrize(
-    ("name", "other"),
-    [
-        ("sizes.directions", described(probes.config(sizes={"directions": 32}))),
-        ("sizes.q_layers", described(probes.config(sizes={"q_layers": (32,)}))),
-        ("scalars.eps_deg", described(probes.config(scalars={"eps_deg": 6.0}))),
-        ("schedule.guidance_until", described(probes.config(schedule={"guidance_until": 32}))),
-        ("grid.seeds", described(grid=Grid(("none", "relative"), (4, 8), (10, 15)))),
-        ("grid.labels", described(grid=Grid(("none", "relative"), (4, 9), (10,)))),
-        ("grid.guidance", described(grid=Grid(("none",), (4, 9), (10, 15)))),
-        ("split", described(split="validation")),
-        ("task.name", described(task=probes.make_task("another"))),
-        ("task.half_width_deg", {**described(), "task": {"name": "window", "half_width_deg": 5.0}}),
-    ],
-)
-def test_resuming_with_another_option_names_it(out, name, other):
-    refused(out, rf"was run with another {name}: give the same options", other, resume=True)
-
-
-def test_resuming_names_several_options_and_those_that_only_one_side_has(out):
-    other = described(probes.config(sizes={"directions": 32, "batch_size": 8}, scalars={"k_max": 3}))
-    refused(out, r"another scalars\.k_max, sizes\.batch_size, sizes\.directions: give", other, resume=True)
-    fewer = described()
-    del fewer["scalars"]["k_max"]
-    refused(out, r"another scalars\.k_max: give", fewer, resume=True)
-    refused(out, r"another scalars\.more: give", {**described(), "scalars": {**described()["scalars"], "more": 1}},
-            resume=True)  # fmt: skip
-
-
-DAMAGED = [b"", b"{", b"\xff\xfe\x00", b"[]", b"3", b"null"]
-
-
-@pytest.mark.parametrize("content", DAMAGED)
-def test_resuming_from_a_damaged_description_is_refused(out, content):
-    (out / "config.json").write_bytes(content)
-    refused(out, r"config\.json is damaged: restore it or start anew with --overwrite", resume=True)
-    runs.check_folder(out, described(), resume=False, overwrite=True)  # as the message says
 
 
 # What it says of itself.
@@ -115,7 +40,7 @@ def test_resuming_from_a_damaged_description_is_refused(out, content):
 
 def test_a_run_comes_back_from_its_description(out):
     config = probes.config(sizes={"q_layers": (8, 4)}, scalars={"eps_deg": 7.5}, schedule={"random_steps": 4})
-    runs.prepare_folder(out, described(config), clean=True)
+    prepare_folder(out, described(config), clean=True)
     task, found, grid = runs.load(out, TASKS)
     assert task is TASK
     assert found == config
@@ -123,18 +48,42 @@ def test_a_run_comes_back_from_its_description(out):
     assert grid == GRID
 
 
-def test_a_clean_start_deletes_the_run_and_any_other_keeps_it(out):
-    runs.prepare_folder(out, described(split="validation"), clean=False)
-    assert (out / "none" / "results.jsonl").exists()
-    assert json.loads((out / "config.json").read_text())["split"] == "tuning"
-    runs.prepare_folder(out, described(split="validation"), clean=True)
-    assert [path.name for path in out.iterdir()] == ["config.json"]
-    assert json.loads((out / "config.json").read_text())["split"] == "validation"
+@pytest.mark.parametrize(
+    ("name", "config", "grid", "options"),
+    [
+        ("sizes.directions", probes.config(sizes={"directions": 32}), GRID, {}),
+        ("sizes.q_layers", probes.config(sizes={"q_layers": (32,)}), GRID, {}),
+        ("scalars.eps_deg", probes.config(scalars={"eps_deg": 6.0}), GRID, {}),
+        ("schedule.guidance_until", probes.config(schedule={"guidance_until": 32}), GRID, {}),
+        ("grid.seeds", probes.CONFIG, Grid(("none", "relative"), (4, 8), (10, 15)), {}),
+        ("grid.labels", probes.CONFIG, Grid(("none", "relative"), (4, 9), (10,)), {}),
+        ("grid.guidance", probes.CONFIG, Grid(("none",), (4, 9), (10, 15)), {}),
+        ("split", probes.CONFIG, GRID, {"split": "validation"}),
+        ("task.name", probes.CONFIG, GRID, {"task": probes.make_task("another")}),
+    ],
+)
+def test_everything_that_determines_results_is_described(out, name, config, grid, options):
+    check_folder(out, described(), resume=True, overwrite=False)
+    with pytest.raises(UserError, match=rf"was run with another {name}: give the same options"):
+        check_folder(out, described(config, grid, **options), resume=True, overwrite=False)
 
 
-def test_a_folder_inside_folders_is_made(tmp_path):
-    runs.prepare_folder(tmp_path / "a" / "b", described(), clean=True)
-    assert runs.load(tmp_path / "a" / "b", TASKS)[2] == GRID
+@pytest.mark.parametrize("folder", ["quickstart", "billiards_paper/shard-1-of-3", "navigation/relative-500"])
+def test_the_hash_of_a_configuration_is_that_of_its_recorded_results(folder):
+    recorded = ROOT / "docs" / "data" / folder
+    values = json.loads((recorded / "config.json").read_text())
+    hashes = set(results.read(recorded)["config_hash"].to_pylist())
+    assert hashes == {runs.config_hash(values)} == {runs.config_hash({**values, "format": 1})}
+    assert runs.config_hash({**values, "split": "other"}) not in hashes
+
+
+def test_runs_described_before_formats_had_numbers_are_resumed_and_loaded(out):
+    assert described()["format"] == 1
+    probes.edit_json(out / "config.json", lambda values: values.pop("format"))
+    check_folder(out, described(), resume=True, overwrite=False)
+    assert runs.load(out, TASKS)[1] == probes.CONFIG
+    probes.edit_json(out / "config.json", lambda values: values.update(format=2))
+    not_loaded(out, "written by a newer cuelearner")
 
 
 def not_loaded(folder, message):
@@ -150,7 +99,7 @@ def test_a_folder_that_is_no_run_is_not_loaded(tmp_path):
     not_loaded(tmp_path / "missing", "no run folder")
 
 
-@pytest.mark.parametrize("content", DAMAGED)
+@pytest.mark.parametrize("content", [b"", b"{", b"\xff\xfe\x00", b"[]", b"3", b"null"])
 def test_a_damaged_description_is_not_loaded(out, content):
     (out / "config.json").write_bytes(content)
     not_loaded(out, "damaged or of another program")

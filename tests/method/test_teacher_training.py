@@ -114,6 +114,16 @@ def test_saving_again_replaces_the_network(made, tmp_path):
     np.testing.assert_allclose(weights, 2 * jax.tree.leaves(made.params)[1], rtol=2e-3)
 
 
+def test_its_description_has_a_format_and_a_newer_one_is_refused(made, tmp_path):
+    teacher.save(tmp_path, made, {"config": to_json(CONFIG)})
+    assert json.loads((tmp_path / "teacher.json").read_text()) == {"format": 1, "config": to_json(CONFIG)}
+    probes.edit_json(tmp_path / "teacher.json", lambda about: about.pop("format"))
+    assert teacher.load(tmp_path, ENV, 0.0, 0.0).layers == CONFIG.layers
+    probes.edit_json(tmp_path / "teacher.json", lambda about: about.update(format=2))
+    with pytest.raises(UserError, match="written by a newer cuelearner"):
+        teacher.load(tmp_path, ENV, 0.0, 0.0)
+
+
 def test_a_folder_without_a_teacher_is_refused(tmp_path):
     with pytest.raises(UserError, match="no teacher"):
         teacher.load(tmp_path, ENV, 0.0, 0.0)

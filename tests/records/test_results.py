@@ -9,7 +9,6 @@ import pytest
 
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.records import results
-from cuelearner_jax.records.provenance import provenance
 
 CONSTANTS = {"run": "a", "task": "one_ball", "guidance": "relative", "config_hash": "0f", "hardware": "1 x cpu"}
 SEEDS, LABELS = np.array([3, 4]), np.array([100, 500])
@@ -188,10 +187,3 @@ def test_errors_are_one_clear_line(tmp_path):
     assert "lacks the columns" in message(tmp_path / "d")
     (tmp_path / "d" / results.JSONL).write_text(json.dumps({"step": "three"}) + "\n")
     assert "corrupt" in message(tmp_path / "d")
-
-
-def test_provenance_names_versions_and_hardware():
-    columns = provenance()
-    assert set(columns) == {"commit", "versions", "hardware", "command"}
-    assert "jax 0." in columns["versions"]
-    assert columns["hardware"]
