@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, PRNGKeyArray
+from jaxtyping import ArrayLike, Float, PRNGKeyArray
 
 from cuelearner_envs.navigation.environment import Navigation
 from cuelearner_envs.navigation.world import World
@@ -30,6 +30,35 @@ class Frame(NamedTuple):
     seconds: float  # since the episode began, at the end of the step [s]
     outcome: str  # one of `ENDS` if the episode ended with this step, otherwise empty
     episode: int  # counted from 0
+
+
+def situation(env: Navigation, state: Any, action: Float[ArrayLike, "2"]) -> Frame:
+    """What a picture needs of a state that has not been left yet, with an action in question."""
+    seen = jax.device_get(_seen(env, state))
+    return Frame(
+        world=seen["world"],
+        goal=seen["goal"],
+        goal_radius=float(env.goal_radius),
+        pose=seen["pose"],
+        ranges=seen["ranges"],
+        max_range=float(env.lidar.max_range),
+        action=np.asarray(action),
+        next_pose=seen["pose"],
+        seconds=float(seen["seconds"]),
+        outcome="",
+        episode=0,
+    )
+
+
+@jax.jit
+def _seen(env: Navigation, state: Any) -> dict[str, Any]:
+    return {
+        "world": env.world(state.world),
+        "goal": state.goal,
+        "pose": state.pose,
+        "ranges": env.ranges(state),
+        "seconds": state.steps * jnp.asarray(env.period),
+    }
 
 
 def record(
