@@ -6,8 +6,7 @@ Directions are unit vectors in the plane; angles are radians, counterclockwise p
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
-from pathlib import Path
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple, Protocol
 
 from flax import struct
@@ -36,17 +35,6 @@ class Teacher(Protocol):
     def best_action(self, state: EnvState, obs: Float[Array, " obs"]) -> Float[Array, "2"]:
         """The direction that the teacher would choose."""
         ...
-
-
-class Walker(NamedTuple):
-    """What training has to know of a robot that learns to walk. Figures are numbers by name."""
-
-    environment: Any  # brax.envs.Env: velocity commands are to be tracked
-    policy: Callable[[Any], Any]  # brax's parameters -> a policy
-    measure: Callable[[Any, PRNGKeyArray, int], dict[str, float]]  # (policy, key, robots) -> figures while it learns
-    examine: Callable[[Any, PRNGKeyArray, int], Iterator[tuple[str, dict[str, float]]]]  # of a finished one, by trial
-    save: Callable[[Path, Any, dict[str, Any]], None]  # (folder, policy, what is to be known of it)
-    load: Callable[..., Any]  # (folder) -> the policy; the shipped one without a folder
 
 
 class Memory(struct.PyTreeNode):

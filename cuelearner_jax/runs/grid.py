@@ -15,7 +15,7 @@ import fcntl
 import json
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,7 +30,7 @@ from cuelearner_jax.evaluate import SPLITS
 from cuelearner_jax.guidance import registry as guidances
 from cuelearner_jax.records import label_files
 from cuelearner_jax.runs.shards import Shard
-from cuelearner_jax.tasks.registry import Task
+from cuelearner_jax.task import ORIGIN, Task
 from cuelearner_jax.types import Guidance
 
 LOCK = ".lock"  # says which process writes in a run's folder; left behind empty
@@ -80,8 +80,9 @@ def describe(
     shard: Shard | None = None,
 ) -> dict[str, Any]:
     """The contents of config.json."""
+    origin = {"from": task.origin} if task.origin else {}  # no field of a configuration can be called so
     return {
-        "task": {"name": task.name, **configuration.to_json(config.task)},
+        "task": {"name": task.name, **origin, **configuration.to_json(config.task)},
         "sizes": configuration.to_json(config.sizes),
         "scalars": configuration.to_json(config.scalars),
         "schedule": configuration.to_json(config.schedule),
@@ -93,14 +94,25 @@ def describe(
     }
 
 
-def load(folder: Path, tasks: dict[str, Task]) -> tuple[Task, RunConfig, Grid]:
-    """What a run folder's config.json says. Raises UserError if it is no run folder."""
+def load(folder: Path, find: Callable[[str], Task]) -> tuple[Task, RunConfig, Grid]:
+    """What a run folder's config.json says.
+
+    Args:
+        folder: of the run.
+        find: the task of a name; raises UserError for one that is not known. Code that the file names is never loaded.
+
+    Raises:
+        UserError: it is no run folder, or of a task that is not known.
+    """
     path = folder / "config.json"
     if not path.is_file():
         raise UserError(f"{folder} is no run folder (it has no config.json): give the --out of a train or sweep")
     try:
         values = json.loads(path.read_text())
-        task = tasks[values["task"].pop("name")]
+        name, origin = values["task"].pop("name"), values["task"].pop("from", None)
+        if origin is not None and not ORIGIN.fullmatch(origin):
+            raise ValueError(f"{origin!r} names no code")
+        task = _known(find, name, origin, path)
         config = RunConfig(
             configuration.from_json(task.config, values["task"]),
             configuration.from_json(configuration.Sizes, values["sizes"]),
@@ -111,6 +123,19 @@ def load(folder: Path, tasks: dict[str, Task]) -> tuple[Task, RunConfig, Grid]:
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise UserError(f"{path} is damaged or of another program: restore it or train anew") from error
     return task, config, grid
+
+
+def _known(find: Callable[[str], Task], name: str, origin: str | None, path: Path) -> Task:
+    """The task of a run. Raises UserError if it is not known, saying how one from outside becomes so."""
+    try:
+        return find(name)
+    except UserError as error:
+        if origin is None:
+            raise UserError(f"{path} is of a task that is not here ({error})") from error
+        raise UserError(
+            f"{path} is of a task from outside, whose code is not loaded because a file names it: "
+            f"add --task {origin} if you trust that code"
+        ) from error
 
 
 def in_use(out: Path) -> bool:
@@ -144,6 +169,8 @@ def check_folder(out: Path, described: dict[str, Any], resume: bool, overwrite: 
 
 def _differences(before: dict[str, Any], now: dict[str, Any], prefix: str = "") -> Iterator[str]:
     for name in {**before, **now}:
+        if f"{prefix}{name}" == "task.from":  # where a task's code lies changes nothing in it
+            continue
         old, new = before.get(name), now.get(name)
         if isinstance(old, dict) and isinstance(new, dict):
             yield from _differences(old, new, f"{prefix}{name}.")

@@ -31,7 +31,7 @@ from cuelearner_jax.records.checkpoint import Checkpoints, checkpoints
 from cuelearner_jax.runs.grid import Grid, check_folder, check_grid, claimed, describe, prepare_folder
 from cuelearner_jax.runs.lanes import Group, items, memory_report, restore
 from cuelearner_jax.runs.shards import Shard
-from cuelearner_jax.tasks.registry import Task, shape_of
+from cuelearner_jax.task import Task, shape_of
 from cuelearner_jax.train import label_slots, start_clock
 from cuelearner_jax.types import Teacher
 
@@ -76,7 +76,7 @@ def run(
     for kind in kinds:
         console.print(memory_report(Group(config, env, kind, grid)))
     asked = any(kind.asks for kind in kinds) and labels is None
-    teacher = place(mesh, task.teacher(config.task, env), SHARED) if asked else None
+    teacher = place(mesh, task.make_teacher(config.task, env), SHARED) if asked else None
     examined = task.environment(config.task, split)
     with claimed(out), interruptible() as stopping, progress_bars() as bars:
         prepare_folder(out, described, overwrite and not plan.resume)
@@ -222,6 +222,7 @@ class _Runner:
         config = json.loads((self.out / "config.json").read_text())
         for name in ("grid", "shard"):  # do not change what a lane learns
             config.pop(name, None)
+        config["task"].pop("from", None)  # nor does where the task's code lies
         return {
             "run": self.out.name,
             "task": self.task.name,

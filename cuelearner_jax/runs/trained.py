@@ -30,7 +30,7 @@ from cuelearner_jax.guidance import registry as guidances
 from cuelearner_jax.records import results
 from cuelearner_jax.runs.grid import Grid
 from cuelearner_jax.runs.lanes import Group, restore_policies
-from cuelearner_jax.tasks.registry import Task, shape_of
+from cuelearner_jax.task import Rollout, Task, shape_of
 from cuelearner_jax.types import Guidance, Teacher
 
 # The agent; guidance of uniform actions; guidance of the agent's actions; the teacher's own corrections of them.
@@ -50,27 +50,7 @@ class Subject:
 
     def on(self, robot: str | None) -> Subject:
         """The same with another robot of the task's (None: its own). Raises UserError if it has no such robot."""
-        if robot is None:
-            return self
-        robots = self.task.robots
-        if not robots:
-            raise UserError(f"{self.task.name} has no robots to choose from: leave out --robot")
-        if robot not in robots:
-            raise UserError(f"unknown robot {robot!r}{closest(robot, robots)}")
-        record, still, animate = robots[robot].pictures()
-        changed = {"environment": robots[robot].environment, "record": record, "still": still, "animate": animate}
-        return replace(self, task=replace(self.task, **changed))
-
-    def engine(self, robot: str | None, name: str | None) -> Callable[..., dict[str, Any]] | None:
-        """A robot's roll-out in other physics (no name: its own). Raises UserError if it has no such engine."""
-        if name is None:
-            return None
-        if robot is None:
-            raise UserError(f"--engine {name} needs --robot: choose one of {', '.join(self.task.robots) or 'none'}")
-        engines = self.task.robots[robot].engines
-        if name not in engines:
-            raise UserError(f"unknown engine {name!r}{closest(name, engines)}")
-        return engines[name]
+        return replace(self, task=self.task.on(robot))
 
     def check(self, policy: str, changed: Any) -> None:
         """Raises UserError unless the policy can be had and acts in the changed world."""
@@ -149,15 +129,15 @@ def evaluate(
     kinds: tuple[str, ...],
     num_envs: int,
     steps: int,
-    engine: Callable[..., dict[str, Any]] | None = None,
+    engine: Rollout | None = None,
 ) -> list[Measured]:
     """Metrics of a policy on validation episodes of a world (a task configuration), for each guidance and budget.
 
-    `engine` is a roll-out in other physics (`tasks.Robot.engines`); without one the environment's own are used.
+    `engine` is a roll-out in other physics (`task.Body.engines`); without one the environment's own are used.
     """
     env = subject.task.environment(world, "validation")
     key = episodes()
-    teacher = subject.task.teacher(world, env) if name in TAUGHT else None
+    teacher = subject.task.make_teacher(world, env) if name in TAUGHT else None
     if name in UNTRAINED:
 
         def measure_it(env: Environment, teacher: Teacher | None) -> dict[str, Any]:
@@ -197,7 +177,7 @@ def one_policy(
     subject: Subject, env: Environment, world: Any, name: str, kind: str | None, labels: int | None, seed: int | None
 ) -> Policy:
     """A single policy: of one lane of a run, or of the task. Raises UserError if the run has no such lane."""
-    teacher = subject.task.teacher(world, env) if name in TAUGHT else None
+    teacher = subject.task.make_teacher(world, env) if name in TAUGHT else None
     if name in UNTRAINED:
         return untrained_policy(name, env, teacher)
     assert subject.grid is not None  # Subject.check has seen to it

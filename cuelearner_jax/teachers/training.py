@@ -18,7 +18,7 @@ from cuelearner_jax.records import results
 from cuelearner_jax.records.checkpoint import checkpoints
 from cuelearner_jax.runs.grid import check_folder, in_use, prepare_folder
 from cuelearner_jax.runs.sweep import Interrupted, interruptible, progress_bars
-from cuelearner_jax.tasks.registry import Task
+from cuelearner_jax.task import Task
 from cuelearner_jax.teachers import learned as teacher
 from cuelearner_jax.teachers.learned import LearnedTeacher, TeacherConfig
 

@@ -13,7 +13,15 @@ from cuelearner_jax.runs import sweep
 from cuelearner_jax.runs.grid import Grid
 
 TASK = probes.make_task()
-TASKS = {TASK.name: TASK}
+
+
+def find(name):
+    """The one task that is known here."""
+    if name != TASK.name:
+        raise UserError(f"unknown task {name!r}")
+    return TASK
+
+
 GRID = Grid(("none", "relative"), seeds=(4, 9), labels=(10, 15))
 
 
@@ -116,7 +124,7 @@ def test_resuming_from_a_damaged_description_is_refused(out, content):
 def test_a_run_comes_back_from_its_description(out):
     config = probes.config(sizes={"q_layers": (8, 4)}, scalars={"eps_deg": 7.5}, schedule={"random_steps": 4})
     runs.prepare_folder(out, described(config), clean=True)
-    task, found, grid = runs.load(out, TASKS)
+    task, found, grid = runs.load(out, find)
     assert task is TASK
     assert found == config
     assert isinstance(found.sizes.q_layers, tuple)
@@ -134,13 +142,13 @@ def test_a_clean_start_deletes_the_run_and_any_other_keeps_it(out):
 
 def test_a_folder_inside_folders_is_made(tmp_path):
     runs.prepare_folder(tmp_path / "a" / "b", described(), clean=True)
-    assert runs.load(tmp_path / "a" / "b", TASKS)[2] == GRID
+    assert runs.load(tmp_path / "a" / "b", find)[2] == GRID
 
 
 def not_loaded(folder, message):
     before = probes.files_of(folder)
     with pytest.raises(UserError, match=message) as refusal:
-        runs.load(folder, TASKS)
+        runs.load(folder, find)
     assert "\n" not in str(refusal.value)
     assert probes.files_of(folder) == before
 
@@ -166,7 +174,7 @@ def test_a_damaged_description_is_not_loaded(out, content):
         (lambda values: values.pop("schedule"), "damaged or of another program"),
         (lambda values: values.update(sizes=3), "damaged or of another program"),
         (lambda values: values["task"].pop("name"), "damaged or of another program"),
-        (lambda values: values["task"].update(name="tennis"), "damaged or of another program"),
+        (lambda values: values["task"].update(name="tennis"), "of a task that is not here .unknown task 'tennis'"),
         (lambda values: values["scalars"].update(colour=1), "unknown field 'colour' for Scalars"),
     ],
 )
