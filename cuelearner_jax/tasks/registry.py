@@ -68,6 +68,8 @@ def resolve(text: str) -> Task:
     """
     if ":" not in text:
         return find(text)
+    if os.getcwd() not in sys.path and "" not in sys.path:
+        sys.path.append(os.getcwd())
     task = dataclasses.replace(_loaded(text), origin=text)
     installed = _installed().get(task.name)
     return find(task.name) if installed and installed.value == text else register(task)
@@ -83,8 +85,6 @@ def _loaded(origin: str) -> Task:
     if not ORIGIN.fullmatch(origin):
         raise UserError(f"{origin!r} names no task: give package.module:name, for instance my_task:TASK")
     module, _, attribute = origin.partition(":")
-    if os.getcwd() not in sys.path and "" not in sys.path:
-        sys.path.append(os.getcwd())
     importlib.invalidate_caches()  # the file may be younger than what Python knows of its folder
     try:
         found: Any = importlib.import_module(module)

@@ -27,8 +27,9 @@ def apart(monkeypatch, tmp_path):
             del sys.modules[name]
 
 
-def install(monkeypatch, **tasks):
-    """As if a package with these entry points were installed."""
+def install(monkeypatch, folder, **tasks):
+    """As if a package with these entry points were installed in a folder."""
+    monkeypatch.syspath_prepend(folder)
     entries = [EntryPoint(name, value, registry.GROUP) for name, value in tasks.items()]
     monkeypatch.setattr(registry, "entry_points", lambda group: entries if group == registry.GROUP else [])
 
@@ -121,7 +122,7 @@ def test_two_tasks_of_one_name_are_refused(tmp_path):
 
 def test_an_installed_package_offers_tasks(tmp_path, monkeypatch):
     (tmp_path / "own_packed.py").write_text(OWN.format(name="packed"))
-    install(monkeypatch, packed="own_packed:TASK", billiards="own_evil:TASK")
+    install(monkeypatch, tmp_path, packed="own_packed:TASK", billiards="own_evil:TASK")
     assert registry.names() == (*registry.BUILT_IN, "packed")
     assert "own_packed" not in sys.modules  # known by name, and not loaded
     task = registry.find("packed")
@@ -134,7 +135,7 @@ def test_an_installed_package_offers_tasks(tmp_path, monkeypatch):
 
 def test_an_installed_task_that_cannot_be_had_is_refused(tmp_path, monkeypatch):
     (tmp_path / "own_packed.py").write_text(OWN.format(name="other"))
-    install(monkeypatch, packed="own_packed:TASK", gone="own_gone:TASK")
+    install(monkeypatch, tmp_path, packed="own_packed:TASK", gone="own_gone:TASK")
     with pytest.raises(UserError, match="the installed task 'packed' calls itself 'other'"):
         registry.find("packed")
     with pytest.raises(UserError, match="no module 'own_gone'"):
