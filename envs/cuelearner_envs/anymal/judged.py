@@ -16,8 +16,7 @@ from cuelearner_envs.anymal.judge import Judge
 from cuelearner_envs.anymal.model import planar_pose
 from cuelearner_envs.navigation.environment import latest_first
 from cuelearner_jax.actions import rotate
-
-Policy = Callable[[PRNGKeyArray, Any, jax.Array], jax.Array]  # (key, states, observations) -> directions
+from cuelearner_jax.types import Policy
 
 
 @jax.jit
@@ -104,7 +103,7 @@ def rollout(
     """
     k_reset, k_run = jax.random.split(key)
     course = Course(env, jax.random.split(k_reset, num_envs))
-    choose = jax.jit(policy)
+    choose = jax.jit(policy.act)
     running, outcomes = np.ones(num_envs, bool), []
     for index in range(steps // num_envs):
         k_act, _ = jax.random.split(jax.random.fold_in(k_run, index))

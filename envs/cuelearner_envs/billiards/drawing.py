@@ -76,8 +76,31 @@ def still(table: Table, path: Path, file: str | os.PathLike[str], dpi: int = 160
     start = np.asarray(path.positions[0])
     _Balls(axes, table, ghosts=True).place(start, np.asarray(path.pocketed[0]))
     _arrow(axes, table).set_positions(*_arrow_ends(table, start[0], _angle(path)))
-    with matplotlib.rc_context({"svg.hashsalt": "cuelearner"}):  # with no date: the same shot, the same bytes
-        figure.savefig(file, dpi=dpi, metadata={"Date": None} if str(file).endswith(".svg") else None)
+    _save(figure, file, dpi)
+
+
+def question(
+    table: Table,
+    positions: Float[ArrayLike, "balls 2"],
+    pocketed: Bool[ArrayLike, "balls"],
+    action: Float[ArrayLike, "2"],
+    file: str | os.PathLike[str],
+    dpi: int = 160,
+) -> None:
+    """Writes a picture of balls at rest and of the shot in question as an arrow, for somebody to judge it.
+
+    Args:
+        table: one table (no batch).
+        positions: places of the balls [m], ball 0 is the cue ball.
+        pocketed: balls that are off the table.
+        action: direction of the shot.
+        file: a name that ends in .png, .svg or .pdf.
+        dpi: dots per inch of a .png; the picture is 8 inches wide.
+    """
+    figure, axes = _figure(table, dpi)
+    x, y = np.asarray(action, dtype=float)
+    draw_table(axes, table, positions, pocketed, angle=math.atan2(y, x))
+    _save(figure, file, dpi)
 
 
 def animate(
@@ -124,6 +147,12 @@ def _figure(table: Table, dpi: float) -> tuple[Figure, Axes]:
     figure = Figure(figsize=(dots / dpi, 2 * round(dots * (top - bottom) / (right - left) / 2) / dpi), dpi=dpi)
     FigureCanvasAgg(figure)
     return figure, figure.add_axes((0, 0, 1, 1))
+
+
+def _save(figure: Figure, file: str | os.PathLike[str], dpi: float) -> None:
+    """Writes a picture with no date: the same drawing, the same bytes."""
+    with matplotlib.rc_context({"svg.hashsalt": "cuelearner"}):
+        figure.savefig(file, dpi=dpi, metadata={"Date": None} if str(file).endswith(".svg") else None)
 
 
 def _draw_room(axes: Axes, table: Table) -> None:
