@@ -9,13 +9,13 @@ import jax
 from jaxtyping import PRNGKeyArray
 
 from cuelearner_envs.billiards.environment import Balls, Billiards
-from cuelearner_envs.billiards.physics import Path, trace
+from cuelearner_envs.billiards.physics import Trajectory, trace
 from cuelearner_jax.actions import to_angle
 
 
 def record(
     env: Billiards, policy: Callable[[PRNGKeyArray, Any, jax.Array], jax.Array], key: PRNGKeyArray, shots: int
-) -> tuple[list[Path], list[float]]:
+) -> tuple[list[Trajectory], list[float]]:
     """Paths and rewards of `shots` shots of a policy; a new rack follows the end of an episode.
 
     Args:
@@ -23,7 +23,7 @@ def record(
     """
 
     @jax.jit
-    def play(key: PRNGKeyArray, state: Balls, obs: jax.Array) -> tuple[Balls, jax.Array, jax.Array, Path]:
+    def play(key: PRNGKeyArray, state: Balls, obs: jax.Array) -> tuple[Balls, jax.Array, jax.Array, Trajectory]:
         k_act, k_step = jax.random.split(key)
         states = jax.tree.map(lambda leaf: leaf[None], state)
         action = policy(k_act, states, obs[None])[0]
