@@ -167,7 +167,7 @@ def _draw(measured: Sequence[dict[str, Any]]) -> Figure:
         figure = Figure(figsize=(2.5 * len(drawn), 3), layout="constrained")
         panels = figure.subplots(1, len(drawn), squeeze=False)[0]
         for axes, (axis, (label, name, unit)) in zip(panels, drawn.items(), strict=True):
-            for contents, colour in zip(measured, list(COLOURS.values()) * len(measured), strict=False):
+            for contents, colour in zip(measured, list(COLOURS) * len(measured), strict=False):
                 points = sorted((row["value"], row[name]) for row in contents["rows"] if row["axis"] == axis)
                 machine = f"{contents['hardware']}, {contents['preset']}"
                 axes.plot(*zip(*points, strict=True), "o-", color=colour, label=machine, linewidth=1.5, markersize=4)

@@ -37,6 +37,12 @@ def known() -> tuple[Kind, ...]:
     return tuple(_KINDS.values())
 
 
+def registered(name: str) -> Kind | None:
+    """The kind of that name, or None: of results whose kind is not known here."""
+    _register_installed()
+    return _KINDS.get(name)
+
+
 def find(name: str) -> Kind:
     """The kind of that name, or that `package.module:NAME` leads to.
 

@@ -9,7 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import PRNGKeyArray
+from jaxtyping import Array, Key, PRNGKeyArray
 
 from cuelearner_envs.anymal.environment import LeggedNavigation, LeggedWalker
 from cuelearner_envs.anymal.judge import Judge
@@ -20,7 +20,7 @@ from cuelearner_jax.types import Policy
 
 
 @jax.jit
-def _begin(env: LeggedNavigation, keys: PRNGKeyArray) -> tuple[LeggedWalker, jax.Array]:
+def _begin(env: LeggedNavigation, keys: Key[Array, " robots"]) -> tuple[LeggedWalker, jax.Array]:
     return jax.vmap(env.reset)(keys)
 
 
@@ -60,7 +60,7 @@ def _after(
 class Course:
     """Robots in C MuJoCo, each in an episode of an environment."""
 
-    def __init__(self, env: LeggedNavigation, keys: PRNGKeyArray):
+    def __init__(self, env: LeggedNavigation, keys: Key[Array, " robots"]):
         """As many robots as keys, each at the start that `env.reset` gives for its key."""
         self.env = env
         self.state, self.obs = _begin(env, keys)

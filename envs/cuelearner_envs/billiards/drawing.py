@@ -22,7 +22,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, FancyArrowPatch, FancyBboxPatch, Rectangle
 
 from cuelearner_envs import film
-from cuelearner_envs.billiards.physics import Path, positions_at
+from cuelearner_envs.billiards.physics import Trajectory, positions_at
 from cuelearner_envs.billiards.table import Table, corner_gap, cushions, pockets
 
 CLOTH, CUSHION, RAIL, RAIL_EDGE, HOLE = "#2f7f5f", "#1d5741", "#6d4a32", "#4b3222", "#15110e"
@@ -42,7 +42,7 @@ def draw_table(
     pocketed: Bool[ArrayLike, "balls"],
     *,
     angle: float | None = None,
-    path: Path | None = None,
+    path: Trajectory | None = None,
 ) -> None:
     """Draws a table and its balls, filling the axes.
 
@@ -62,7 +62,7 @@ def draw_table(
         _arrow(axes, table).set_positions(*_arrow_ends(table, np.asarray(positions)[0], angle))
 
 
-def still(table: Table, path: Path, file: str | os.PathLike[str], dpi: int = 160) -> None:
+def still(table: Table, path: Trajectory, file: str | os.PathLike[str], dpi: int = 160) -> None:
     """Writes a picture of one shot: pale balls where it began, the way of each, solid balls where they came to rest.
 
     Args:
@@ -104,7 +104,7 @@ def question(
 
 
 def animate(
-    table: Table, shots: Sequence[Path], file: str | os.PathLike[str], fps: float = 30.0, speed: float = 1.0
+    table: Table, shots: Sequence[Trajectory], file: str | os.PathLike[str], fps: float = 30.0, speed: float = 1.0
 ) -> None:
     """Writes an animation of shots, one after the other; before each, an arrow shows its direction.
 
@@ -234,7 +234,7 @@ def _ball_colour(ball: int) -> str:
     return CUE if ball == 0 else TARGETS[(ball - 1) % len(TARGETS)]
 
 
-def _angle(path: Path) -> float:
+def _angle(path: Trajectory) -> float:
     x, y = np.asarray(path.velocities[0, 0], dtype=float)
     return math.atan2(y, x)
 
@@ -254,7 +254,7 @@ def _arrow_ends(table: Table, cue: np.ndarray, angle: float) -> tuple[tuple[floa
     return (x0, y0), (x1, y1)
 
 
-def _draw_tracks(axes: Axes, table: Table, path: Path) -> None:
+def _draw_tracks(axes: Axes, table: Table, path: Trajectory) -> None:
     """One line for each ball that moves, from its start to where it rests or falls."""
     times, positions, pocketed = np.asarray(path.times), np.asarray(path.positions), np.asarray(path.pocketed)
     for ball in range(table.balls):
@@ -273,7 +273,7 @@ def _draw_tracks(axes: Axes, table: Table, path: Path) -> None:
 
 
 def _frames(
-    table: Table, shots: Sequence[Path], fps: float, speed: float
+    table: Table, shots: Sequence[Trajectory], fps: float, speed: float
 ) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
     """Pictures of the shots at a fixed rate. The table is drawn once; each frame draws only what moves over it."""
     figure, axes = _figure(table, dpi=100)
@@ -301,7 +301,7 @@ def _frames(
 
 
 def _film(
-    table: Table, path: Path, fps: float, speed: float
+    table: Table, path: Trajectory, fps: float, speed: float
 ) -> tuple[Float[np.ndarray, "frames balls 2"], Bool[np.ndarray, "frames balls"], int]:
     """Positions [m] and pocketed balls of one shot's frames, at rest before and after it; the frames before it."""
     held, after = round(HOLD_BEFORE * fps), round(HOLD_AFTER * fps)

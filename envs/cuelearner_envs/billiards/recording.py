@@ -6,12 +6,12 @@ import jax
 from jaxtyping import PRNGKeyArray
 
 from cuelearner_envs.billiards.environment import Balls, Billiards
-from cuelearner_envs.billiards.physics import Path, trace
+from cuelearner_envs.billiards.physics import Trajectory, trace
 from cuelearner_jax.actions import to_angle
 from cuelearner_jax.types import Policy
 
 
-def record(env: Billiards, policy: Policy, key: PRNGKeyArray, shots: int) -> tuple[list[Path], list[float]]:
+def record(env: Billiards, policy: Policy, key: PRNGKeyArray, shots: int) -> tuple[list[Trajectory], list[float]]:
     """Paths and rewards of `shots` shots of a policy; a new rack follows the end of an episode.
 
     Args:
@@ -19,7 +19,7 @@ def record(env: Billiards, policy: Policy, key: PRNGKeyArray, shots: int) -> tup
     """
 
     @jax.jit
-    def play(key: PRNGKeyArray, state: Balls, obs: jax.Array) -> tuple[Balls, jax.Array, jax.Array, Path]:
+    def play(key: PRNGKeyArray, state: Balls, obs: jax.Array) -> tuple[Balls, jax.Array, jax.Array, Trajectory]:
         k_act, k_step = jax.random.split(key)
         states = jax.tree.map(lambda leaf: leaf[None], state)
         action = policy.act(k_act, states, obs[None])[0]
