@@ -29,7 +29,7 @@ from matplotlib.figure import Figure
 from cuelearner_jax.bench.measuring import Timed, Work, learning, measure
 from cuelearner_jax.devices import lane_mesh
 from cuelearner_jax.records.provenance import provenance
-from cuelearner_jax.report.figures import COLOURS, STYLE, save_figure
+from cuelearner_jax.report.figures import OTHER_COLOURS, STYLE, save_figure
 from cuelearner_jax.tasks import registry
 
 REPLAY = 100_000
@@ -167,7 +167,7 @@ def _draw(measured: Sequence[dict[str, Any]]) -> Figure:
         figure = Figure(figsize=(2.5 * len(drawn), 3), layout="constrained")
         panels = figure.subplots(1, len(drawn), squeeze=False)[0]
         for axes, (axis, (label, name, unit)) in zip(panels, drawn.items(), strict=True):
-            for contents, colour in zip(measured, list(COLOURS) * len(measured), strict=False):
+            for contents, colour in zip(measured, list(OTHER_COLOURS) * len(measured), strict=False):
                 points = sorted((row["value"], row[name]) for row in contents["rows"] if row["axis"] == axis)
                 machine = f"{contents['hardware']}, {contents['preset']}"
                 axes.plot(*zip(*points, strict=True), "o-", color=colour, label=machine, linewidth=1.5, markersize=4)

@@ -26,7 +26,7 @@ class Preset:
 
     about: str
     config: RunConfig
-    guidance: tuple[str, ...] = ("none", "relative", "heuristic")
+    guidance: tuple[str, ...] = ()  # kinds that it compares; none named: all that the task can have
     labels: tuple[int, ...] = (500, 1000)
     seeds: int = 5
     first_seed: int = 0

@@ -102,7 +102,7 @@ def test_imports_point_down():
                 allowed = room(module) == "tasks"
             else:
                 mine, its = room(module), room(other)
-                allowed = mine == its or ROW.get(its, len(ROWS)) < ROW.get(mine, -1)
+                allowed = mine == its or other == METHOD or ROW.get(its, len(ROWS)) < ROW.get(mine, -1)
             if not allowed:
                 wrong.append(f"{module} imports {other}")
     assert sorted(wrong) == []
@@ -150,7 +150,8 @@ def test_everything_public_has_a_docstring(package):
 def test_no_kind_of_guidance_is_named_outside_its_room():
     named = []
     for module, file in MODULES.items():
-        if room(module) in ("guidance", "tasks") or not module.startswith(METHOD):
+        # What files of earlier formats hold is called as it was then.
+        if room(module) in ("guidance", "tasks") or module.endswith("records.formats") or not module.startswith(METHOD):
             continue
         nodes = list(ast.walk(tree(file)))
         otherwise = {node.value for node in nodes if isinstance(node, ast.Expr)}  # docstrings

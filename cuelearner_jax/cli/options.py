@@ -13,7 +13,7 @@ from cuelearner_jax.guidance import registry as guidances
 from cuelearner_jax.runs.grid import Grid
 from cuelearner_jax.runs.order import Order
 from cuelearner_jax.runs.shards import Shard
-from cuelearner_jax.task import Task
+from cuelearner_jax.task import Preset, Task, shape_of
 
 TaskT = TypeVar("TaskT")
 Flag = tyro.conf.FlagCreatePairsOff
@@ -53,6 +53,11 @@ class Training(Generic[TaskT]):
     def done(self) -> str:
         """What is told at the end."""
         return f"done: {self.out} (see it with: cuelearner report {self.out} --out {self.out}/report)"
+
+
+def preset_kinds(task: Task, preset: Preset) -> tuple[str, ...]:
+    """The kinds of guidance that a preset compares: those it names, or all that the task can have."""
+    return preset.guidance or guidances.possible(shape_of(task, preset.config.task), taught=task.teacher is not None)
 
 
 def asking_kind(kinds: tuple[str, ...]) -> str:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Generic, Literal
 
 from cuelearner_jax.cli.arguments import about, out, parse, preset_of, task_of
-from cuelearner_jax.cli.options import TaskT, Training
+from cuelearner_jax.cli.options import TaskT, Training, preset_kinds
 from cuelearner_jax.runs import submission, sweep
 from cuelearner_jax.runs.cluster import Job
 from cuelearner_jax.runs.grid import Grid
@@ -49,7 +49,7 @@ def run(arguments: list[str]) -> None:
     default = kind(
         preset.config,
         out=Path("runs") / f"{task.name}-{name}",
-        guidance=preset.guidance,
+        guidance=preset_kinds(task, preset),
         labels=preset.labels,
         seeds=preset.seeds,
         first_seed=preset.first_seed,

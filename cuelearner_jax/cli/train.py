@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Generic
 
 from cuelearner_jax.cli.arguments import about, out, parse, preset_of, task_of
-from cuelearner_jax.cli.options import TaskT, Training, asking_kind
+from cuelearner_jax.cli.options import TaskT, Training, asking_kind, preset_kinds
 from cuelearner_jax.runs import sweep
 from cuelearner_jax.runs.grid import Grid
 
@@ -35,7 +35,7 @@ def run(arguments: list[str]) -> None:
     default = kind(
         preset.config,
         out=Path("runs") / f"{task.name}-{name}",
-        guidance=asking_kind(preset.guidance),
+        guidance=asking_kind(preset_kinds(task, preset)),
         labels=preset.labels[0],
     )
     asked = parse(kind, rest, f"train {task.name}", default, about(Train, task))

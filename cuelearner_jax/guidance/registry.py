@@ -59,6 +59,12 @@ def find(name: str) -> Kind:
     return _KINDS[name]
 
 
+def possible(env: Any, taught: bool) -> tuple[str, ...]:
+    """Names of the kinds that an environment can have; `taught`: is there a teacher to ask?"""
+    fitting = (kind for kind in known() if (taught or not kind.asks) and all(offers(env, need) for need in kind.needs))
+    return tuple(kind.name for kind in fitting)
+
+
 def make(name: str, sizes: GuideSizes, env: Any) -> Guidance:
     """A kind's bundle for an environment (shapes in place of arrays will do); the same one for the same sizes.
 
