@@ -18,7 +18,7 @@ from cuelearner_jax.records.checkpoint import checkpoints
 from cuelearner_jax.runs.grid import load
 from cuelearner_jax.runs.trained import Subject, Trained, load_lanes
 from cuelearner_jax.tasks import registry
-from cuelearner_jax.train import start_clock
+from cuelearner_jax.loop import start_clock
 
 
 def keep(run: Path, out: Path, seed: int, kind: str | None, labels: int | None) -> None:

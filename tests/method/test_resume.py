@@ -16,7 +16,7 @@ from cuelearner_jax.records.checkpoint import checkpoints
 from cuelearner_jax.runs import lanes, sweep
 from cuelearner_jax.runs.grid import Grid
 from cuelearner_jax.terminal import Interrupted
-from cuelearner_jax.train import label_slots, make_program, start_clock
+from cuelearner_jax.loop import label_slots, make_program, start_clock
 
 # Bootstraps, so that target network, next observations and Adam's moments are in the checkpoint as well.
 CONFIG = probes.config(
