@@ -69,5 +69,5 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    """The face's names beside the module's own."""
-    return sorted({*globals(), *__all__})
+    """The face."""
+    return sorted([*__all__, "__version__"])
