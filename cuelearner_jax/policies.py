@@ -7,7 +7,7 @@ A policy's `act` sees many environments at once. Its `axes` say which of its lea
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -30,6 +30,7 @@ from cuelearner_jax.types import EnvState, GuidanceModel, Params, Teacher
 SHARED, BY_LANE = None, 0  # of a leaf: the same for all lanes, or one for each
 
 
+@runtime_checkable
 class Policy(types.Policy, Protocol):
     """A policy of which a block of lanes may have one each."""
 

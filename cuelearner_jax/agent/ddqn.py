@@ -43,7 +43,7 @@ def greedy_near_peaks(
     stride = options.shape[0] // coarse.shape[0]
     summit = (coarse >= jnp.roll(coarse, 1)) & (coarse >= jnp.roll(coarse, -1))
     _, highest = jax.lax.top_k(jnp.where(summit, coarse, -jnp.inf), peaks)
-    near = jnp.mod(highest[:, None] * stride + jnp.arange(1 - stride, stride), options.shape[0]).ravel()
+    near = jnp.mod(highest[:, None] * stride + jnp.arange(1 - stride, stride)[None], options.shape[0]).ravel()
     return greedy(q, params, obs, options[near])
 
 

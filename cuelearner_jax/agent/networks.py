@@ -30,7 +30,10 @@ class Joined(nn.Module):
         kernel = self.param("kernel", nn.initializers.xavier_uniform(), shape)
         bias = self.param("bias", nn.initializers.zeros, (self.width,))
         obs, action, kernel, bias = (jnp.asarray(x, self.dtype) for x in (obs, action, kernel, bias))
-        return (obs @ kernel[: obs.shape[-1]] + bias) + action @ kernel[obs.shape[-1] :]
+        seen, chosen = obs @ kernel[: obs.shape[-1]], action @ kernel[obs.shape[-1] :]
+        rank = max(seen.ndim, chosen.ndim)
+        bias, seen, chosen = (jnp.expand_dims(x, tuple(range(rank - x.ndim))) for x in (bias, seen, chosen))
+        return (seen + bias) + chosen
 
 
 class MLP(nn.Module):

@@ -90,9 +90,9 @@ def ring_buffer(example: StoredStep) -> RingBuffer:
         capacity = rows.shape[0]
         further = jnp.arange(n) * num_envs
         newer = jnp.mod(step - 1 - numbers, capacity)  # rows written after each
-        places = jnp.mod(numbers[:, None] + further, capacity)
+        places = jnp.mod(numbers[:, None] + further[None], capacity)
         # Three neighbouring numbers of each row, not the row.
-        found = rows[places[..., None], reward_column + jnp.arange(3)]
-        return Following(*jnp.moveaxis(found, -1, 0), known=further <= newer[:, None])
+        found = rows[places[..., None], reward_column + jnp.arange(3)[None, None]]
+        return Following(*jnp.moveaxis(found, -1, 0), known=further[None] <= newer[:, None])
 
     return RingBuffer(width, empty, add, draw, read, follow)

@@ -5,7 +5,7 @@ What a teacher *said* (its answer, kept in labels) and what a network is to *pre
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
@@ -14,6 +14,7 @@ from cuelearner_jax.guidance.refining import Refined
 from cuelearner_jax.types import EnvState, GuidanceModel, Label, Teacher
 
 
+@runtime_checkable
 class AnswerFunction(Protocol):
     """What a simulated teacher with the faults of `scalars` says about an action in a situation."""
 
@@ -39,6 +40,7 @@ class AnswerForm(NamedTuple):
     answer: AnswerFunction
 
 
+@runtime_checkable
 class InitFunction(Protocol):
     """An unfitted model."""
 
@@ -47,6 +49,7 @@ class InitFunction(Protocol):
         ...
 
 
+@runtime_checkable
 class QuestionFunction(Protocol):
     """Which action to ask about in a situation."""
 
@@ -63,6 +66,7 @@ class QuestionFunction(Protocol):
         ...
 
 
+@runtime_checkable
 class TargetFunction(Protocol):
     """What the model is to predict of one label."""
 
@@ -71,6 +75,7 @@ class TargetFunction(Protocol):
         ...
 
 
+@runtime_checkable
 class FitFunction(Protocol):
     """The model of labels (slots, ...)."""
 
@@ -81,6 +86,7 @@ class FitFunction(Protocol):
         ...
 
 
+@runtime_checkable
 class ActFunction(Protocol):
     """What to execute in place of a batch of actions."""
 
