@@ -75,7 +75,6 @@ class Chain(WholeObservations, struct.PyTreeNode):
     truncates: jax.Array | bool = False
 
     observation = (Quantity("context", 2, "1"),)
-    symmetries = 1
 
     def reset(self, key):
         return jnp.zeros((), jnp.int32), self.observe(0)
@@ -93,9 +92,6 @@ class Chain(WholeObservations, struct.PyTreeNode):
 
     def heuristic(self, obs):
         return from_angle(jnp.array(2.0))
-
-    def mirror(self, which, obs, vector):
-        return obs, vector
 
 
 class Expert(struct.PyTreeNode):
@@ -168,7 +164,7 @@ def config(sizes=None, scalars=None, schedule=None):
 @cache
 def window_program(kind, largest_budget=0):
     """One compiled loop on the bandit for all tests."""
-    return make_program(CONFIG, guidances.make(kind, SIZES, 2), Window(), largest_budget)
+    return make_program(CONFIG, guidances.make(kind, SIZES, Window()), Window(), largest_budget)
 
 
 def start(program, seeds, budgets, env=None):
@@ -179,7 +175,7 @@ def start(program, seeds, budgets, env=None):
 
 def stored(state, lane, steps):
     """What a lane's environments met: columns (steps, ...) of its replay in the order of time."""
-    rows = np.asarray(state.replay[lane, :steps])
+    rows = np.asarray(state.agent.replay[lane, :steps])
     names = {"obs": slice(0, 2), "action": slice(2, 4), "reward": 4}
     if rows.shape[1] > 5:  # something bootstraps
         names |= {"discount": 5, "ended": 6, "next_obs": slice(7, None)}
