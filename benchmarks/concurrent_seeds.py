@@ -24,7 +24,7 @@ from cuelearner_jax.config import RunConfig
 from cuelearner_jax.devices import lane_mesh
 from cuelearner_jax.records.provenance import provenance
 from cuelearner_jax.runs.lanes import state_bytes
-from cuelearner_jax.tasks.registry import NAVIGATION
+from cuelearner_jax.tasks.navigation import NAVIGATION
 
 RESULTS = Path(__file__).parent / "results"
 

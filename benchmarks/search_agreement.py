@@ -30,7 +30,7 @@ from cuelearner_jax.records.provenance import provenance
 from cuelearner_jax.runs import grid as runs
 from cuelearner_jax.runs.grid import Grid
 from cuelearner_jax.runs.lanes import Group, restore_policies
-from cuelearner_jax.tasks.registry import TASKS
+from cuelearner_jax.tasks import registry
 
 STATES = 256  # of an agent
 NAMES = ("same", "neighbouring", "within_half_a_degree", "value_given_up", "reward")
@@ -86,7 +86,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=10_000)
     parser.add_argument("--out", type=Path, help="write the figures to this JSON file")
     asked = parser.parse_args()
-    task, config, grid = runs.load(asked.run, TASKS)
+    task, config, grid = runs.load(asked.run, registry.find)
     env = task.environment(config.task, "validation")
     kind = guidance.make(grid.guidance[0], config.sizes, env.obs_size)
     group = Group(config, env, kind, Grid((kind.name,), grid.seeds, grid.labels))

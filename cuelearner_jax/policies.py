@@ -15,6 +15,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from cuelearner_jax import types
 from cuelearner_jax.actions import DIRECTIONS, Actions
 from cuelearner_jax.agent.choice import greedy_actions
 from cuelearner_jax.config import AgentSizes, GuideScalars
@@ -29,12 +30,8 @@ from cuelearner_jax.types import EnvState, GuidanceModel, Params, Teacher
 SHARED, BY_LANE = None, 0  # of a leaf: the same for all lanes, or one for each
 
 
-class Policy(Protocol):
-    """Anything that acts. A pytree."""
-
-    def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
-        """Actions in n situations; `states` are what a teacher may look at, and what no agent does."""
-        ...
+class Policy(types.Policy, Protocol):
+    """A policy of which a block of lanes may have one each."""
 
     @property
     def axes(self) -> Any:

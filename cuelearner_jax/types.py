@@ -38,6 +38,14 @@ class Teacher(Protocol):
         ...
 
 
+class Policy(Protocol):
+    """Anything that acts. A pytree, like an environment; see `policies`."""
+
+    def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
+        """Actions in n situations; `states` are what a teacher may look at, and what no agent does."""
+        ...
+
+
 class StoredStep(struct.PyTreeNode):
     """One step in replay, as small as the environment can make it."""
 

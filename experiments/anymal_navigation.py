@@ -36,7 +36,7 @@ from cuelearner_jax.evaluate import agent_policy, episodes, rollout
 from cuelearner_jax.records.provenance import provenance
 from cuelearner_jax.runs.grid import load
 from cuelearner_jax.runs.trained import Subject, load_lanes
-from cuelearner_jax.tasks.registry import TASKS
+from cuelearner_jax.tasks import registry
 
 ROOT = Path(__file__).parents[1]
 AGENT = ROOT / "docs" / "data" / "navigation_agent"
@@ -81,7 +81,7 @@ def main() -> int:
     parser.add_argument("--resume", action="store_true", help="keep the rows that the file of --write has")
     asked = parser.parse_args()
     try:
-        task, config, grid = load(asked.run, TASKS)
+        task, config, grid = load(asked.run, registry.find)
         lanes = load_lanes(Subject(task, config, grid, asked.run), ())[0]
     except UserError as error:
         parser.error(str(error))

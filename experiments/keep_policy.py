@@ -17,7 +17,7 @@ from cuelearner_jax.records import formats
 from cuelearner_jax.records.checkpoint import checkpoints
 from cuelearner_jax.runs.grid import load
 from cuelearner_jax.runs.trained import Subject, Trained, load_lanes
-from cuelearner_jax.tasks.registry import TASKS
+from cuelearner_jax.tasks import registry
 from cuelearner_jax.train import start_clock
 
 
@@ -25,7 +25,7 @@ def keep(run: Path, out: Path, seed: int, kind: str | None, labels: int | None) 
     """Writes the run folder `out`. Raises UserError if the run has no such lane or `out` is in use."""
     if out.exists():
         raise UserError(f"{out} exists: give another --out")
-    task, config, grid = load(run, TASKS)
+    task, config, grid = load(run, registry.find)
     lanes = load_lanes(Subject(task, config, grid, run), (kind or grid.guidance[-1],))[0]
     budget = int(lanes.budgets.max()) if labels is None else labels
     found = np.flatnonzero((lanes.seeds == seed) & (lanes.budgets == budget))

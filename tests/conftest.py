@@ -1,9 +1,12 @@
-"""Settings of every test: the CPU, and compiled programs kept between runs."""
+"""Settings of every test: the CPU, compiled programs kept between runs, shapes in signatures checked."""
 
 import os
 from pathlib import Path
 
 import jaxlib.version
+import pytest
+from checked import PACKAGES, STRICT_RANKS
+from jaxtyping import install_import_hook
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(__file__).resolve().parents[1] / ".jax_cache"))
@@ -14,3 +17,15 @@ flags = ["--xla_backend_optimization_level=1"]
 if jaxlib.version.__version_info__ < (0, 11):  # JAX does not start with a flag that it no longer knows
     flags.append("--xla_cpu_use_fusion_emitters=false")
 os.environ["XLA_FLAGS"] = " ".join([*flags, os.environ.get("XLA_FLAGS", "")]).strip()
+
+install_import_hook(PACKAGES, "checked.checked")  # before anything of them is imported
+
+
+@pytest.fixture(scope="module", autouse=True)
+def strict_ranks(request):
+    """Raises at implicit rank promotion in the tests of `STRICT_RANKS`."""
+    import jax  # reads the settings above
+
+    folder = request.path.parent.relative_to(Path(__file__).resolve().parent).as_posix()
+    with jax.numpy_rank_promotion("raise" if folder in STRICT_RANKS else "allow"):
+        yield

@@ -8,7 +8,6 @@ import json
 import math
 from dataclasses import dataclass
 from functools import cache, partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +18,7 @@ from cuelearner_jax.actions import difference, evenly_spaced, from_angle, rotate
 from cuelearner_jax.config import RunConfig, Scalars, Schedule, Sizes
 from cuelearner_jax.environment import Quantity, WholeObservations
 from cuelearner_jax.guidance import registry as guidances
-from cuelearner_jax.tasks.registry import Task
+from cuelearner_jax.task import Body, Task
 from cuelearner_jax.train import make_program
 from cuelearner_jax.types import Label, Step
 
@@ -112,16 +111,9 @@ class WindowConfig:
 
 
 def make_task(name="window"):
-    """The bandit as a task; the pictures are never asked for."""
-    known: dict[str, Any] = {
-        "name": name,
-        "config": WindowConfig,
-        "environment": lambda config, split="training": Window(jnp.deg2rad(jnp.array(config.half_width_deg))),
-        "teacher": lambda config, env: Expert(env),
-        "presets": {},
-    }
-    values: dict[str, Any] = {field.name: known.get(field.name) for field in dataclasses.fields(Task)}
-    return Task(**values)
+    """The bandit as a task that nothing draws."""
+    body = Body("point", "", lambda config, split: Window(jnp.deg2rad(jnp.array(config.half_width_deg))))
+    return Task(name, "the bandit", WindowConfig, (body,), teacher=lambda config, env: Expert(env))
 
 
 SIZES = Sizes(

@@ -75,9 +75,7 @@ def test_a_module_that_fails_is_told_in_one_line(folder, text, message):
 def test_a_missing_name_is_told_with_the_nearest_that_would_do(folder):
     (folder / "near_module.py").write_text("OAK_TABLE = {'legs': 4}\nOAK_LEAF = 3\n")
     refused("near_module:OAK_TABEL", "near_module has no 'OAK_TABEL', did you mean 'OAK_TABLE'")
-    refused(
-        "near_module:OAK_LEAFS", "has no 'OAK_LEAFS' and no frozenset", kind=frozenset
-    )  # what is there is of no use
+    refused("near_module:OAK_LEAFS", "has no 'OAK_LEAFS' and no frozenset", kind=frozenset)
 
 
 def test_an_object_of_another_kind_is_refused(folder):

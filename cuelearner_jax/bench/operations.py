@@ -24,6 +24,7 @@ class Operations(NamedTuple):
 
     @property
     def total(self) -> int:
+        """All of them together."""
         return sum(self)
 
 

@@ -37,6 +37,12 @@ def known() -> tuple[Kind, ...]:
     return tuple(_KINDS.values())
 
 
+def registered(name: str) -> Kind | None:
+    """The kind of that name, or None: of results whose kind is not known here."""
+    _register_installed()
+    return _KINDS.get(name)
+
+
 def find(name: str) -> Kind:
     """The kind of that name, or that `package.module:NAME` leads to.
 
@@ -51,6 +57,12 @@ def find(name: str) -> Kind:
             f"unknown guidance {name!r}{closest(name, _KINDS)}; one of your own is named as package.module:NAME"
         )
     return _KINDS[name]
+
+
+def possible(env: Any, taught: bool) -> tuple[str, ...]:
+    """Names of the kinds that an environment can have; `taught`: is there a teacher to ask?"""
+    fitting = (kind for kind in known() if (taught or not kind.asks) and all(offers(env, need) for need in kind.needs))
+    return tuple(kind.name for kind in fitting)
 
 
 def make(name: str, sizes: GuideSizes, env: Any) -> Guidance:

@@ -53,6 +53,8 @@ def check_folder(out: Path, described: dict[str, Any], resume: bool, overwrite: 
 
 def _differences(before: dict[str, Any], now: dict[str, Any], prefix: str = "") -> Iterator[str]:
     for name in {**before, **now}:
+        if f"{prefix}{name}" == "task.from":  # where a task's code lies changes nothing in it
+            continue
         old, new = before.get(name), now.get(name)
         if isinstance(old, dict) and isinstance(new, dict):
             yield from _differences(old, new, f"{prefix}{name}.")

@@ -42,9 +42,6 @@ CONVENTIONS = {
     "obs": "the task's observation at the question",
     "action": "unit vector asked about",
     "answer": "what the teacher said of the action, in the form that `answers` names",
-    "relative": "answer h, one number: 1 turn by eps_deg counterclockwise, -1 clockwise, 0 already right",
-    "demonstration": "answer: the direction that the teacher would choose, a unit vector",
-    "scalar": "answer, one number: 1 good, 0 bad",
     "eps_deg": "strength of an answer [deg], null where the form has none",
     "angles": "radians, counterclockwise positive",
 }
@@ -55,7 +52,7 @@ class LabelFile(NamedTuple):
     """Label sets and where they come from."""
 
     task: dict[str, Any]  # {"name": ..., configuration of the task}
-    answers: str  # form of the answers: "relative", "demonstration", "scalar"
+    answers: str  # name of the form of the answers, see `guidance.answers`
     eps_deg: float | None  # strength of an answer [deg]; None where the form has none
     seeds: np.ndarray  # (labels,)
     labels: Label  # rows (labels, ...), in the order they were given
@@ -68,7 +65,9 @@ class LabelWriter(tables.TableWriter):
     (Parquet) becomes JSONL again.
     """
 
-    def __init__(self, folder: Path, task: dict[str, Any], answers: str, eps_deg: float | None) -> None:
+    def __init__(
+        self, folder: Path, task: dict[str, Any], answers: str, eps_deg: float | None, meaning: str = ""
+    ) -> None:
         """Opens the file, creating it and the folder where needed.
 
         Args:
@@ -76,11 +75,12 @@ class LabelWriter(tables.TableWriter):
             task: {"name": ..., configuration of the task}.
             answers: form of the answers.
             eps_deg: strength of an answer [deg]; None where the form has none.
+            meaning: of an answer's numbers, written into the file.
 
         Raises:
             UserError: the folder holds labels of something else, or they cannot be read; nothing has been changed.
         """
-        about = _about(task, answers, eps_deg)
+        about = _about(task, answers, eps_deg, meaning)
         there = next((folder / name for name in (PARQUET, JSONL) if (folder / name).exists()), None)
         self._widths: dict[str, int] = {}
         if there is not None:
@@ -122,7 +122,13 @@ def finish(folder: Path) -> Path:
 
 
 def write(
-    path: Path, task: dict[str, Any], answers: str, eps_deg: float | None, seeds: np.ndarray, labels: Label
+    path: Path,
+    task: dict[str, Any],
+    answers: str,
+    eps_deg: float | None,
+    seeds: np.ndarray,
+    labels: Label,
+    meaning: str = "",
 ) -> None:
     """Writes the labels that count as Parquet, replacing `path` in one step.
 
@@ -133,6 +139,7 @@ def write(
         eps_deg: strength of an answer [deg]; None where the form has none.
         seeds: of the lanes, (lanes,).
         labels: (lanes, slots, ...).
+        meaning: of an answer's numbers, written into the file.
     """
     valid = np.asarray(labels.valid)
     rows = jax.tree.map(lambda leaf: np.asarray(leaf)[valid], labels)
@@ -140,7 +147,7 @@ def write(
     columns = {"seed": pa.array(seed.astype(np.int64))}
     for name in ROW:
         columns[name] = pa.array(list(getattr(rows, name)), SCHEMA.type(name))
-    tables.write(path, pa.table(columns), SCHEMA, about=_about(task, answers, eps_deg))
+    tables.write(path, pa.table(columns), SCHEMA, about=_about(task, answers, eps_deg, meaning))
 
 
 def read(path: Path) -> LabelFile:
@@ -196,14 +203,14 @@ def for_lanes(file: LabelFile, seeds: np.ndarray, budgets: np.ndarray, slots: in
     return jax.tree.map(lambda *leaves: np.stack(leaves), *sets)
 
 
-def _about(task: dict[str, Any], answers: str, eps_deg: float | None) -> dict[str, Any]:
+def _about(task: dict[str, Any], answers: str, eps_deg: float | None, meaning: str) -> dict[str, Any]:
     """What a file of labels says of itself."""
     return {
         "format": formats.FORMATS["labels"],
         "task": task,
         "answers": answers,
         "eps_deg": None if eps_deg is None else float(eps_deg),
-        "conventions": CONVENTIONS,
+        "conventions": {**CONVENTIONS, **({"answer": meaning} if meaning else {})},
     }
 
 

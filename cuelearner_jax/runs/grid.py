@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,9 +15,10 @@ from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import SPLITS
 from cuelearner_jax.guidance import registry as guidances
 from cuelearner_jax.guidance.bundle import Guidance
+from cuelearner_jax.plugins import REFERENCE
 from cuelearner_jax.records import formats, label_files
 from cuelearner_jax.runs.shards import Shard
-from cuelearner_jax.tasks.registry import Task
+from cuelearner_jax.task import Task
 
 LARGEST_SEED = min(SPLITS.values())  # seeds and splits are folded into one key
 
@@ -62,9 +64,10 @@ def describe(
     shard: Shard | None = None,
 ) -> dict[str, Any]:
     """The contents of config.json."""
+    origin = {"from": task.origin} if task.origin else {}  # no field of a configuration can be called so
     return {
         "format": formats.FORMATS["config"],
-        "task": {"name": task.name, **configuration.to_json(config.task)},
+        "task": {"name": task.name, **origin, **configuration.to_json(config.task)},
         "sizes": configuration.to_json(config.sizes),
         "scalars": configuration.to_json(config.scalars),
         "schedule": configuration.to_json(config.schedule),
@@ -79,17 +82,30 @@ def describe(
 def config_hash(described: dict[str, Any]) -> str:
     """Short hash of what a lane learns from: of a description less the file's format and the other lanes."""
     apart = ("format", "grid", "shard")
-    return configuration.digest({name: value for name, value in described.items() if name not in apart})
+    learned_from = {name: value for name, value in described.items() if name not in apart}
+    task = {name: value for name, value in described["task"].items() if name != "from"}
+    return configuration.digest({**learned_from, "task": task})
 
 
-def load(folder: Path, tasks: dict[str, Task]) -> tuple[Task, RunConfig, Grid]:
-    """What a run folder's config.json says. Raises UserError if it is no run folder."""
+def load(folder: Path, find: Callable[[str], Task]) -> tuple[Task, RunConfig, Grid]:
+    """What a run folder's config.json says.
+
+    Args:
+        folder: of the run.
+        find: the task of a name; raises UserError for one that is not known. Code that the file names is never loaded.
+
+    Raises:
+        UserError: it is no run folder, or of a task that is not known.
+    """
     path = folder / "config.json"
     if not path.is_file():
         raise UserError(f"{folder} is no run folder (it has no config.json): give the --out of a train or sweep")
     values = formats.read("config", path)
     try:
-        task = tasks[values["task"].pop("name")]
+        name, origin = values["task"].pop("name"), values["task"].pop("from", None)
+        if origin is not None and not REFERENCE.fullmatch(origin):
+            raise ValueError(f"{origin!r} names no code")
+        task = _known(find, name, origin, path)
         config = RunConfig(
             configuration.from_json(task.config, values["task"]),
             configuration.from_json(configuration.Sizes, values["sizes"]),
@@ -100,3 +116,16 @@ def load(folder: Path, tasks: dict[str, Task]) -> tuple[Task, RunConfig, Grid]:
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise formats.damaged("config", path) from error
     return task, config, grid
+
+
+def _known(find: Callable[[str], Task], name: str, origin: str | None, path: Path) -> Task:
+    """The task of a run. Raises UserError if it is not known, saying how one from outside becomes so."""
+    try:
+        return find(name)
+    except UserError as error:
+        if origin is None:
+            raise UserError(f"{path} is of a task that is not here ({error})") from error
+        raise UserError(
+            f"{path} is of a task from outside, whose code is not loaded because a file names it: "
+            f"add --task {origin} if you trust that code"
+        ) from error

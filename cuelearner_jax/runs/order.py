@@ -17,7 +17,7 @@ from cuelearner_jax.records import label_files, results
 from cuelearner_jax.records.folders import check_folder
 from cuelearner_jax.runs.grid import Grid, check_grid, describe
 from cuelearner_jax.runs.shards import Shard
-from cuelearner_jax.tasks.registry import Task, shape_of
+from cuelearner_jax.task import Task, shape_of
 
 
 @dataclass(frozen=True)

@@ -111,7 +111,8 @@ class Runner:
         assert form is not None
         task = {"name": self.order.task.name, **configuration.to_json(config.task)}
         seeds, labels = self.training.labels()
-        label_files.write(self.folder / "labels.parquet", task, form.name, config.scalars.eps_deg, seeds, labels)
+        eps = config.scalars.eps_deg
+        label_files.write(self.folder / "labels.parquet", task, form.name, eps, seeds, labels, form.meaning)
 
     def _train(self, saved: Checkpoints, writer: results.ResultsWriter) -> None:
         now, schedule = self.training, self.group.config.schedule

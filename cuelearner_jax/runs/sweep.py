@@ -31,7 +31,7 @@ def run(order: Order) -> None:
     for group in groups:
         console.print(memory_report(group))
     asked = any(kind.asks for kind in kinds) and plan.labels is None
-    teacher = place(mesh, task.teacher(config.task, env), SHARED) if asked else None
+    teacher = place(mesh, task.make_teacher(config.task, env), SHARED) if asked else None
     examined = task.environment(config.task, order.split)
     with claimed(order.out), interruptible() as stopping, progress_bars() as bars:
         prepare_folder(order.out, plan.described, order.overwrite and not order.resume)

@@ -23,7 +23,7 @@ from cuelearner_jax.records.provenance import provenance
 from cuelearner_jax.runs.grid import Grid
 from cuelearner_jax.runs.kept import restore_policies
 from cuelearner_jax.runs.lanes import LaneGroup
-from cuelearner_jax.tasks.registry import Task, shape_of
+from cuelearner_jax.task import Task, shape_of
 from cuelearner_jax.types import Teacher
 
 
@@ -104,27 +104,7 @@ class PolicySource:
 
     def on(self, robot: str | None) -> PolicySource:
         """The same with another robot of the task's (None: its own). Raises UserError if it has no such robot."""
-        if robot is None:
-            return self
-        robots = self.task.robots
-        if not robots:
-            raise UserError(f"{self.task.name} has no robots to choose from: leave out --robot")
-        if robot not in robots:
-            raise UserError(f"unknown robot {robot!r}{closest(robot, robots)}")
-        record, still, animate = robots[robot].pictures()
-        changed = {"environment": robots[robot].environment, "record": record, "still": still, "animate": animate}
-        return replace(self, task=replace(self.task, **changed))
-
-    def engine(self, robot: str | None, name: str | None) -> Callable[..., dict[str, Any]] | None:
-        """A robot's roll-out in other physics (no name: its own). Raises UserError if it has no such engine."""
-        if name is None:
-            return None
-        if robot is None:
-            raise UserError(f"--engine {name} needs --robot: choose one of {', '.join(self.task.robots) or 'none'}")
-        engines = self.task.robots[robot].engines
-        if name not in engines:
-            raise UserError(f"unknown engine {name!r}{closest(name, engines)}")
-        return engines[name]
+        return replace(self, task=self.task.on(robot))
 
     def check(self, policy: str, changed: Any) -> None:
         """Raises UserError unless the policy can be had and acts in the changed world."""
@@ -182,7 +162,7 @@ def evaluate(
     """
     named, key = POLICIES[name], episodes()
     env = source.task.environment(world, "validation")
-    teacher = source.task.teacher(world, env) if named.taught else None
+    teacher = source.task.make_teacher(world, env) if named.taught else None
     if not named.trained:
         policy = named.make(Parts(source.config, env, teacher, None))
         found = (engine or _compiled)(policy, env, key, num_envs, steps)
@@ -213,7 +193,7 @@ def one_policy(
 ) -> Policy:
     """A single policy: of one lane of a run, or of the task. Raises UserError if the run has no such lane."""
     named = POLICIES[name]
-    teacher = source.task.teacher(world, env) if named.taught else None
+    teacher = source.task.make_teacher(world, env) if named.taught else None
     if not named.trained:
         return named.make(Parts(source.config, env, teacher, None))
     assert source.grid is not None  # `check` has seen to it

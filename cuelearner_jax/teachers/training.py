@@ -19,7 +19,7 @@ from cuelearner_jax.records.checkpoint import checkpoints
 from cuelearner_jax.records.folders import check_folder, in_use, prepare_folder
 from cuelearner_jax.records.formats import FORMATS
 from cuelearner_jax.records.provenance import provenance
-from cuelearner_jax.tasks.registry import Task
+from cuelearner_jax.task import Task
 from cuelearner_jax.teachers import learned as teacher
 from cuelearner_jax.teachers.learned import LearnedTeacher, TeacherConfig
 from cuelearner_jax.terminal import Interrupted, interruptible, progress_bars

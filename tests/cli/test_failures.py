@@ -33,6 +33,8 @@ ARGUMENTS = [
     (["evaluate", "billiards", "--policy", "agent"], "needs a trained run"),
     (["evaluate", "billiards", "--policy", "agnt"], "did you mean 'agent'"),
     (["evaluate", "billiards", "--steps", "150"], "multiple of --envs"),
+    (["evaluate", "billiards", "--scenario", "tilted_tabel"], "did you mean 'tilted_table'"),
+    (["evaluate", "billiards", "--scenario"], "choose one of turned_strike, shifted_balls, tilted_table"),
     (["render", "billiards", "--film", "avi"], "gif or mp4"),
     (["render", "billiards", "--steps", "0"], "positive"),
     (["teacher", "trian"], "cuelearner teacher train"),

@@ -11,7 +11,7 @@ from cuelearner_jax import actions
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import episodes, rollout
 from cuelearner_jax.policies import Taught
-from cuelearner_jax.tasks.registry import SHIPPED_TEACHERS, billiards_teacher
+from cuelearner_jax.tasks.billiards import SHIPPED_TEACHERS, make_teacher
 from cuelearner_jax.teachers.learned import LearnedTeacher
 
 RACKS, DIRECTIONS = 50, 1440
@@ -95,7 +95,7 @@ def test_it_knows_of_a_changed_world(chosen):
 
 def test_a_configuration_names_the_teacher():
     config = BilliardsConfig("one_ball", aim_error_deg=2.0, habit=0.1, search_directions=90)
-    teacher = billiards_teacher(config, ONE)
+    teacher = make_teacher(config, ONE)
     assert isinstance(teacher, SearchTeacher)
     assert (teacher.env, teacher.directions) == (ONE, 90)
     assert float(teacher.aim_error) == pytest.approx(np.deg2rad(2.0))
@@ -106,7 +106,7 @@ def test_a_configuration_names_the_teacher():
 def test_the_shipped_teachers_play_well(table, least):
     config = BilliardsConfig(table, teacher="learned")
     env = make_environment(config)
-    teacher = billiards_teacher(config, env)
+    teacher = make_teacher(config, env)
     assert isinstance(teacher, LearnedTeacher)
     coarse = teacher.replace(directions=1440)  # for speed
     measured = jax.jit(lambda teacher: rollout(Taught(teacher), env, episodes("tuning"), 30, 300))(coarse)
@@ -127,4 +127,4 @@ def test_the_shipped_teachers_tell_how_they_were_made(table, preset, least):
 def test_a_table_without_a_shipped_teacher_says_what_to_do():
     config = BilliardsConfig("one_ball", teacher="learned")
     with pytest.raises(UserError, match=r"cuelearner teacher train.*search teacher"):
-        billiards_teacher(config, make_environment(config))
+        make_teacher(config, make_environment(config))

@@ -212,24 +212,25 @@ def test_the_number_of_a_world_survives_being_stored(plays):
 # --- mirrors ---------------------------------------------------------------------------------------------------------
 
 
+SIGNS = jnp.array([1.0, -1.0, -1.0, 1.0, 1.0])  # of x, y, yaw and two lengths when left and right are exchanged
+
+
 def mirrored_worlds(worlds):
     """Every world with y turned round."""
-    flip = jnp.array([1.0, -1.0])
     return worlds.replace(
-        boxes=worlds.boxes * jnp.array([1.0, -1.0, -1.0, 1.0, 1.0]),
-        circles=worlds.circles * jnp.array([1.0, -1.0, 1.0]),
-        starts=worlds.starts * flip,
-        goals=worlds.goals * flip,
+        boxes=worlds.boxes * SIGNS[None, None],
+        circles=worlds.circles * SIGNS[None, None, jnp.array([0, 1, 3])],
+        starts=worlds.starts * SIGNS[None, None, :2],
+        goals=worlds.goals * SIGNS[None, None, :2],
     )
 
 
 def mirrored_states(states):
-    flip = jnp.array([1.0, -1.0])
     return states.replace(
-        pose=states.pose * jnp.array([1.0, -1.0, -1.0]),
-        velocity=states.velocity * flip,
-        goal=states.goal * flip,
-        previous=states.previous * flip,
+        pose=states.pose * SIGNS[None, :3],
+        velocity=states.velocity * SIGNS[None, :2],
+        goal=states.goal * SIGNS[None, :2],
+        previous=states.previous * SIGNS[None, None, :2],
     )
 
 
@@ -260,7 +261,7 @@ def test_mirroring_twice_or_under_the_identity_changes_nothing(plays):
     image = jax.vmap(WORLDS.mirror, (None, 0, 0))
     chex.assert_trees_all_equal(image(0, obs, action), (obs, action))
     chex.assert_trees_all_equal(image(1, *image(1, obs, action)), (obs, action))
-    np.testing.assert_array_equal(image(1, obs, action)[1], action * jnp.array([1.0, -1.0]))
+    np.testing.assert_array_equal(image(1, obs, action)[1], action * SIGNS[None, :2])
 
 
 # --- changes ---------------------------------------------------------------------------------------------------------

@@ -19,7 +19,7 @@ STEPS = np.arange(0, 101, 10)
 def write(folder, guidance, level, labels=0, *, seeds: Sequence[int] = range(8), steps=STEPS, **constants):
     """Seeds that all stand at 0 until step 30 and at `level`, give or take 0.02, from step 40 on."""
     constants = {"run": folder.name, "task": "one_ball", "guidance": guidance, "config_hash": "0f"} | constants
-    rng = np.random.default_rng(len(seeds))  # groups of one size differ in nothing but their level
+    rng = np.random.default_rng(len(seeds))  # variants of one size differ in nothing but their level
     with results.ResultsWriter(folder, commit="abc", versions="jax 0", hardware="1 x cpu", **constants) as writer:
         for step in steps:
             reward = (step > 30) * level + rng.uniform(-0.02, 0.02, len(seeds))
@@ -81,7 +81,7 @@ def test_figures_show_something_and_repeat_byte_for_byte(runs, tmp_path):
     assert (np.abs(picture(tmp_path / "one" / "curves.png") - blue).max(axis=-1) < 0.02).sum() > 500
 
 
-def test_curve_data_has_a_row_for_each_group_and_step(runs, tmp_path):
+def test_curve_data_has_a_row_for_each_variant_and_step(runs, tmp_path):
     report(runs, tmp_path / "report")
     with (tmp_path / "report" / "curves.csv").open() as file:
         assert len(list(csv.DictReader(file))) == 3 * len(STEPS)
@@ -143,7 +143,7 @@ def test_says_what_is_missing(runs, tmp_path):
     assert "configurations 0f, 1e" in missing
     assert "means over the curve are taken to step 50" in missing
     assert "scalar-b: at step" not in missing
-    # The mean over the curve of a finished group ends with the shortest: half of 30..40 and 40..50, over 50.
+    # The mean over the curve of a finished variant ends with the shortest: half of 30..40 and 40..50, over 50.
     assert float(summary(tmp_path / "report")["relative", 500]["mean"]) == pytest.approx(0.6 * 15 / 50, abs=0.01)
 
 

@@ -16,7 +16,7 @@ SCENES = 40
 def engine():
     """The table in Chipmunk, a file shared with the benchmarks."""
     pytest.importorskip("pymunk")
-    path = Path(__file__).parents[2] / "benchmarks" / "pymunk_table.py"
+    path = Path(__file__).parents[3] / "benchmarks" / "pymunk_table.py"
     spec = importlib.util.spec_from_file_location("pymunk_table", path)
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)

@@ -17,7 +17,7 @@ from PIL import Image, ImageSequence
 
 from cuelearner_envs.navigation import World, drawing, scan
 from cuelearner_envs.navigation.environment import Navigation
-from cuelearner_envs.navigation.recording import ENDS, record
+from cuelearner_envs.navigation.recording import ENDS, record, situation
 from cuelearner_envs.navigation.robot import Robot, discs
 from cuelearner_envs.navigation.world import FAR_AWAY
 
@@ -208,6 +208,28 @@ def test_still_shows_start_way_end_and_goal(records, tmp_path, name):
     direction = math.atan2(*middle.action[::-1]) + middle.pose[2]
     tip = middle.pose[:2] + 1.4 * np.array([math.cos(direction), math.sin(direction)])
     assert is_colour(pixel(*tip), drawing.ARROW)
+
+
+@pytest.mark.parametrize("turn", [0.5, -2.0])
+def test_a_question_shows_the_first_situation_and_the_direction_in_question(records, tmp_path, turn):
+    env, first = ENVIRONMENTS["success"], records["success"][0][0]
+    state, _ = env.reset(jax.random.split(jax.random.key(1))[0])
+    frame = situation(env, state, np.array([math.cos(turn), math.sin(turn)]))
+    for name in ("pose", "goal", "ranges"):
+        np.testing.assert_allclose(getattr(frame, name), getattr(first, name), atol=1e-5)
+    assert (frame.outcome, frame.seconds) == ("", 0.0)
+    drawing.question(Robot(), frame, tmp_path / "question.png")
+    image = imageio.imread(tmp_path / "question.png")[..., :3] / 255
+    assert image.shape[1] == 1120
+    pixel = looker(image, drawing.STRIP_INCHES * 160)
+    yaw = frame.pose[2]
+    ahead = np.array([math.cos(yaw), math.sin(yaw)])
+    asked = np.array([math.cos(yaw + turn), math.sin(yaw + turn)])
+    assert is_colour(pixel(*(frame.pose[:2] - 0.35 * ahead)), drawing.BODY)
+    assert is_colour(pixel(*(frame.pose[:2] + 1.4 * asked)), drawing.ARROW)
+    assert not is_colour(pixel(*(frame.pose[:2] - 1.4 * asked)), drawing.ARROW)
+    red, green, _ = pixel(frame.goal[0], frame.goal[1] + 0.4)
+    assert green - red > 0.08
 
 
 def test_still_leaves_out_later_episodes_and_repeats(records, tmp_path):

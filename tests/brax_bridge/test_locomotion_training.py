@@ -12,7 +12,6 @@ from small_runs import listing
 from cuelearner_jax.brax_bridge import walking as locomotion
 from cuelearner_jax.brax_bridge.walking import LocomotionConfig
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.types import Walker
 
 SMALL = LocomotionConfig(
     steps=20_000,
@@ -63,7 +62,7 @@ def walker(after_measure=lambda: None):
         folder.mkdir(parents=True, exist_ok=True)
         (folder / "policy.json").write_text(json.dumps({**policy, **about}))
 
-    return Walker(
+    return locomotion.LocomotionTask(
         environment=Point(),
         policy=lambda params: {"error": error(params)},
         measure=measure,

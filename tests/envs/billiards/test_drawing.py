@@ -91,6 +91,24 @@ def test_tracks_end_at_rest_or_where_the_ball_falls(shot):
     np.testing.assert_allclose(target[-1], [0.4, 0.2], atol=3e-3)
 
 
+@pytest.mark.parametrize("angle", [1.0, -2.5])
+def test_a_question_shows_the_balls_and_the_shot_as_an_arrow(tmp_path, angle):
+    positions, ahead = np.array([[-0.1, 0.02], [0.3, 0.1]]), np.array([math.cos(angle), math.sin(angle)])
+    drawing.question(TABLE, positions, np.array([False, False]), ahead, tmp_path / "question.png")
+    image = imageio.imread(tmp_path / "question.png")[..., :3] / 255
+    assert image.shape[1] == 1280
+    left, right, _, top = drawing._limits(TABLE)
+
+    def pixel(place):
+        dots = image.shape[1] / (right - left)  # in a metre
+        return image[int((top - place[1]) * dots), int((place[0] - left) * dots)]
+
+    assert is_colour(pixel(positions[0]), drawing.CUE)
+    assert is_colour(pixel(positions[1] + [0.0, 0.012]), drawing.TARGETS[0])
+    assert is_colour(pixel(positions[0] + 0.05 * ahead), drawing.ARROW, 0.1)
+    assert is_colour(pixel(positions[0] - 0.05 * ahead), drawing.CLOTH)
+
+
 @pytest.mark.parametrize("suffix", ["png", "svg"])
 def test_still_is_a_picture_and_repeats(shot, tmp_path, suffix):
     files = [tmp_path / f"{name}.{suffix}" for name in ("one", "two")]

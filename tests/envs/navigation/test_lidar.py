@@ -247,7 +247,7 @@ def test_changed_faults_need_no_new_trace():
 @pytest.fixture(scope="module")
 def engine():
     """Worlds in MuJoCo, a file shared with the benchmarks."""
-    path = Path(__file__).parents[2] / "benchmarks" / "mujoco_world.py"
+    path = Path(__file__).parents[3] / "benchmarks" / "mujoco_world.py"
     spec = importlib.util.spec_from_file_location("mujoco_world", path)
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)

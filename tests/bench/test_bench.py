@@ -17,7 +17,8 @@ from cuelearner_jax.bench.operations import forward, forward_and_backward, step_
 from cuelearner_jax.config import Sizes
 from cuelearner_jax.devices import lane_mesh
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.tasks.registry import BILLIARDS, Preset
+from cuelearner_jax.task import Preset
+from cuelearner_jax.tasks.billiards import BILLIARDS
 from cuelearner_jax.types import Transition
 
 LAYERS, OBS = (64, 48), 10

@@ -188,7 +188,7 @@ def test_beams_pass_over_what_is_too_low():
 
 
 def test_a_tilted_sensor_reads_what_mujocos_rays_do(env):
-    path = Path(__file__).parents[2] / "benchmarks" / "mujoco_world.py"
+    path = Path(__file__).parents[3] / "benchmarks" / "mujoco_world.py"
     spec = importlib.util.spec_from_file_location("mujoco_world", path)
     engine = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(engine)
