@@ -21,10 +21,11 @@ import jax
 import jax.numpy as jnp
 
 from cuelearner_jax import actions as geometry
+from cuelearner_jax.actions import DIRECTIONS
 from cuelearner_jax.agent.choice import greedy_actions
 from cuelearner_jax.agent.networks import applied, q_network
 from cuelearner_jax.config import Sizes
-from cuelearner_jax.evaluate import agent_policy, episodes, rollout
+from cuelearner_jax.evaluate import episodes, rollout
 from cuelearner_jax.guidance import registry as guidance
 from cuelearner_jax.records.provenance import provenance
 from cuelearner_jax.runs import grid as runs
@@ -42,7 +43,7 @@ def met(env: Any, sizes: Sizes, params: Any) -> jax.Array:
 
     def step(carry: tuple, key: jax.Array) -> tuple[tuple, None]:
         state, obs = carry
-        after, made = jax.vmap(env.step)(jax.random.split(key, STATES), state, greedy_actions(sizes, params, obs))
+        after, made = jax.vmap(env.step)(jax.random.split(key, STATES), state, greedy_actions(sizes, DIRECTIONS, params, obs))
         return (after, made.obs), None
 
     return jax.lax.scan(step, (state, obs), jax.random.split(jax.random.key(1), 5))[0][1]
@@ -58,8 +59,8 @@ def compare(env: Any, agents: Any, own: Sizes, way: Sizes, steps: int, precise: 
         with jax.default_matmul_precision("highest"):
             values = jax.lax.map(lambda seen: q(params, seen, options)[:, 0], obs, batch_size=16)
         with jax.default_matmul_precision("highest" if precise else "default"):
-            chosen = greedy_actions(way, params, obs)
-            reward = rollout(agent_policy(way, params), env, episodes(), 100, steps)["reward"]
+            chosen = greedy_actions(way, DIRECTIONS, params, obs)
+            reward = rollout(Agent(params, way), env, episodes(), 100, steps)["reward"]
         best, number = values.max(-1), values.argmax(-1)
         off = jnp.abs(geometry.difference(options[number], chosen))
         tenth = jnp.deg2rad(360.0 / way.directions)

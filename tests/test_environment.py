@@ -20,7 +20,8 @@ from cuelearner_jax.environment import (
     spaces_of,
     symmetries_of,
 )
-from cuelearner_jax.tasks.registry import TASKS, shape_of
+from cuelearner_jax.task import shape_of
+from cuelearner_jax.tasks import registry
 
 ROWS = 200
 PROBES = {
@@ -32,7 +33,7 @@ PROBES = {
 SHAPES = {
     **{
         f"{task.name} {name}": shape_of(task, p.config.task)
-        for task in TASKS.values()
+        for task in map(registry.find, registry.BUILT_IN)
         for name, p in task.presets.items()
     },
     **PROBES,

@@ -42,20 +42,38 @@ def test_an_object_of_a_package_is_found(folder):
 
 
 @pytest.mark.parametrize(
-    "reference", ["", "module", "module:", ":NAME", "a b:NAME", "my-module:NAME", ".module:NAME", "a..b:NAME"]
+    "reference",
+    [
+        "",
+        "module",
+        "module:",
+        ":NAME",
+        "a b:NAME",
+        "my-module:NAME",
+        ".module:NAME",
+        "a..b:NAME",
+        "a:B.c",
+        "9a:B",
+        "a:b:C",
+    ],
 )
 def test_what_is_no_reference_is_told_its_form(folder, reference):
     refused(reference, "does not name a table: give package.module:NAME")
 
 
 def test_a_missing_module_is_to_be_installed_or_run_beside(folder):
-    refused("nowhere_to_be_found:OAK", "no module 'nowhere_to_be_found' .*install it, or run from the folder")
-    refused("nowhere_to_be_found.shop:OAK", "no module 'nowhere_to_be_found.shop'")
+    refused(
+        "nowhere_to_be_found:OAK",
+        "no module 'nowhere_to_be_found' for .*: run in the folder that holds it, or install it",
+    )
+    refused("nowhere_to_be_found.shop:OAK", "no module 'nowhere_to_be_found'")
 
 
 def test_a_module_that_needs_a_missing_one_says_which(folder):
     (folder / "needy_module.py").write_text("import nowhere_to_be_found\n")
-    refused("needy_module:OAK", "needy_module cannot be imported .*nowhere_to_be_found")
+    refused(
+        "needy_module:OAK", "needy_module fails to import .ModuleNotFoundError: .*nowhere_to_be_found.*: mend it first"
+    )
 
 
 @pytest.mark.parametrize(
@@ -65,19 +83,20 @@ def test_a_module_that_needs_a_missing_one_says_which(folder):
         ("OAK = (\n", "SyntaxError"),
         ("raise ValueError('first\\nsecond')\n", "ValueError: first"),
         ("raise ValueError\n", "ValueError: "),
+        ("raise SystemExit(3)\n", "SystemExit: 3"),
     ],
 )
 def test_a_module_that_fails_is_told_in_one_line(folder, text, message):
     (folder / "broken_module.py").write_text(text)
-    refused("broken_module:OAK", f"broken_module cannot be imported .{message}")
+    refused("broken_module:OAK", f"broken_module fails to import .{message}")
 
 
 def test_a_missing_name_is_told_with_the_nearest_that_would_do(folder):
     (folder / "near_module.py").write_text("OAK_TABLE = {'legs': 4}\nOAK_LEAF = 3\n")
     refused("near_module:OAK_TABEL", "near_module has no 'OAK_TABEL', did you mean 'OAK_TABLE'")
-    refused("near_module:OAK_LEAFS", "has no 'OAK_LEAFS' and no frozenset", kind=frozenset)
+    refused("near_module:OAK_LEAFS", "has no 'OAK_LEAFS', nor a table", kind=frozenset)
 
 
 def test_an_object_of_another_kind_is_refused(folder):
     (folder / "other_module.py").write_text("OAK = 4\n")
-    refused("other_module:OAK", "other_module:OAK is an? int, not a table")
+    refused("other_module:OAK", "other_module:OAK is of type int: a table is a builtins.dict")
