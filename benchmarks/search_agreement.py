@@ -27,10 +27,12 @@ from cuelearner_jax.agent.networks import applied, q_network
 from cuelearner_jax.config import Sizes
 from cuelearner_jax.evaluate import episodes, rollout
 from cuelearner_jax.guidance import registry as guidance
+from cuelearner_jax.policies import Agent
 from cuelearner_jax.records.provenance import provenance
 from cuelearner_jax.runs import grid as runs
 from cuelearner_jax.runs.grid import Grid
-from cuelearner_jax.runs.lanes import Group, restore_policies
+from cuelearner_jax.runs.kept import restore_policies
+from cuelearner_jax.runs.lanes import LaneGroup
 from cuelearner_jax.tasks import registry
 
 STATES = 256  # of an agent
@@ -43,7 +45,9 @@ def met(env: Any, sizes: Sizes, params: Any) -> jax.Array:
 
     def step(carry: tuple, key: jax.Array) -> tuple[tuple, None]:
         state, obs = carry
-        after, made = jax.vmap(env.step)(jax.random.split(key, STATES), state, greedy_actions(sizes, DIRECTIONS, params, obs))
+        after, made = jax.vmap(env.step)(
+            jax.random.split(key, STATES), state, greedy_actions(sizes, DIRECTIONS, params, obs)
+        )
         return (after, made.obs), None
 
     return jax.lax.scan(step, (state, obs), jax.random.split(jax.random.key(1), 5))[0][1]
@@ -89,8 +93,8 @@ def main() -> None:
     asked = parser.parse_args()
     task, config, grid = runs.load(asked.run, registry.find)
     env = task.environment(config.task, "validation")
-    kind = guidance.make(grid.guidance[0], config.sizes, env.obs_size)
-    group = Group(config, env, kind, Grid((kind.name,), grid.seeds, grid.labels))
+    kind = guidance.make(grid.guidance[0], config.sizes, env)
+    group = LaneGroup(config, env, kind, Grid((kind.name,), grid.seeds, grid.labels))
     policies, step = restore_policies(group, asked.run / kind.name)
     all_ = dataclasses.replace(config.sizes, coarse_directions=0)
     ways = {"all, in full float32": (all_, True), "all, as computed by default": (all_, False)}

@@ -42,8 +42,8 @@ def interruptible() -> Iterator[threading.Event]:
 
 
 @contextmanager
-def progress_bars() -> Iterator[Progress]:
-    """Progress bars on standard error."""
+def progress_bars(shown: bool = True) -> Iterator[Progress]:
+    """Progress bars on standard error, or none to be seen."""
     columns = (
         TextColumn("{task.description:<12}"),
         BarColumn(),
@@ -51,5 +51,5 @@ def progress_bars() -> Iterator[Progress]:
         TextColumn("{task.fields[note]}"),
         TimeRemainingColumn(),
     )
-    with Progress(*columns, console=console) as bars:
+    with Progress(*columns, console=console, disable=not shown) as bars:
         yield bars

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from enum import IntEnum
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
@@ -38,6 +38,7 @@ class Teacher(Protocol):
         ...
 
 
+@runtime_checkable
 class Policy(Protocol):
     """Anything that acts. A pytree, like an environment; see `policies`."""
 

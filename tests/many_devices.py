@@ -13,11 +13,11 @@ import jax
 import probes
 
 from cuelearner_jax.guidance import registry as guidances
+from cuelearner_jax.loop import start_clock
 from cuelearner_jax.runs import lanes, sweep
 from cuelearner_jax.runs.grid import Grid
 from cuelearner_jax.runs.order import Order
 from cuelearner_jax.terminal import Interrupted
-from cuelearner_jax.train import start_clock
 
 CONFIG = probes.config(
     sizes={"q_layers": (16,), "feedback_layers": (16,), "fit_steps": 100, "replay_capacity": 40},

@@ -18,8 +18,8 @@ from cuelearner_jax.actions import difference, evenly_spaced, from_angle, rotate
 from cuelearner_jax.config import RunConfig, Scalars, Schedule, Sizes
 from cuelearner_jax.environment import Quantity, WholeObservations
 from cuelearner_jax.guidance import registry as guidances
+from cuelearner_jax.loop import make_program
 from cuelearner_jax.task import Body, Task
-from cuelearner_jax.train import make_program
 from cuelearner_jax.types import Label, Step
 
 

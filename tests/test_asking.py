@@ -12,8 +12,8 @@ import pytest
 
 from cuelearner_jax import actions, asking
 from cuelearner_jax.guidance import registry as guidances
+from cuelearner_jax.loop import start_clock
 from cuelearner_jax.policies import Heuristic, Taught, Uniform
-from cuelearner_jax.train import start_clock
 
 ENV, EXPERT = probes.Window(), probes.Expert(probes.Window())
 RELATIVE = guidances.make("relative", probes.SIZES, ENV)

@@ -16,6 +16,7 @@ from cuelearner_jax.devices import lane_mesh
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import evaluate_lanes, evaluate_policy, one_lane, rollout
 from cuelearner_jax.guidance import registry as guidances
+from cuelearner_jax.loop import start_clock
 from cuelearner_jax.policies import (
     Agent,
     Corrected,
@@ -28,7 +29,6 @@ from cuelearner_jax.policies import (
     Uniform,
     best_actions,
 )
-from cuelearner_jax.train import start_clock
 
 ENV, EXPERT = probes.Window(), probes.Expert(probes.Window())
 OBS = actions.evenly_spaced(40)

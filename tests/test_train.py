@@ -11,7 +11,7 @@ import numpy as np
 import probes
 import pytest
 
-from cuelearner_jax import actions, asking, evaluate, train
+from cuelearner_jax import actions, asking, evaluate, loop
 from cuelearner_jax.agent.learning import mirrored
 from cuelearner_jax.agent.networks import applied, q_network
 from cuelearner_jax.devices import lane_mesh
@@ -49,7 +49,7 @@ def test_the_agent_learns_a_bandit_by_itself():
     state = probes.start(program, [0], [0])
     before = reward_of(state.agent.params)
     schedule = replaced(random_steps=400, learn_after=32)
-    _, state, metrics = run(program, probes.SCALARS, schedule, train.start_clock(), state, stretches=34)
+    _, state, metrics = run(program, probes.SCALARS, schedule, loop.start_clock(), state, stretches=34)
     assert reward_of(state.agent.params)[0] == 1.0
     assert before[0] < 0.8
     assert metrics["loss"].shape == (1,)
@@ -79,7 +79,7 @@ CHAIN = probes.config(
 @cache
 def chain_program():
     env = probes.Chain(jnp.array(False))
-    return train.make_program(CHAIN, guidances.make("heuristic", CHAIN.sizes, env), env, 0)
+    return loop.make_program(CHAIN, guidances.make("heuristic", CHAIN.sizes, env), env, 0)
 
 
 def chain_values(truncates, schedule=CHAIN.schedule):
@@ -87,7 +87,7 @@ def chain_values(truncates, schedule=CHAIN.schedule):
     env = probes.Chain(jnp.array(truncates))
     state = probes.start(chain_program(), [3], [0], env)
     assert state.agent.target_params is not None
-    _, state, _ = chain_program().train(env, CHAIN.scalars, schedule, train.start_clock(), state, 1000)
+    _, state, _ = chain_program().train(env, CHAIN.scalars, schedule, loop.start_clock(), state, 1000)
     params = probes.lane(state.agent.params, 0)
     values = [np.asarray(q(params, env.observe(place), actions.evenly_spaced(4)))[:, 0] for place in (0, 1)]
     return values, state
@@ -140,7 +140,7 @@ def acted(kind, scalars=probes.SCALARS, stretches=1, **schedule):
     program = probes.window_program(kind, LARGEST if kind == "relative" else 0)
     state = probes.start(program, [0], [0])
     schedule = replaced(learn_after=10**9, **schedule)
-    clock, state, _ = run(program, scalars, schedule, train.start_clock(), state, stretches)
+    clock, state, _ = run(program, scalars, schedule, loop.start_clock(), state, stretches)
     assert int(clock.step) == 48 * stretches
     assert int(clock.update) == 0
     return probes.stored(state, 0, 48 * stretches), probes.lane(state.agent.params, 0)
@@ -186,7 +186,7 @@ def test_an_episode_is_guided_as_a_whole():
     env = probes.Chain(jnp.array(False))
     state = probes.start(chain_program(), [0], [0], env)
     schedule = replaced(random_steps=2, learn_after=10**9, guidance_until=2000)
-    _, state, _ = chain_program().train(env, CHAIN.scalars, schedule, train.start_clock(), state, 1000)
+    _, state, _ = chain_program().train(env, CHAIN.scalars, schedule, loop.start_clock(), state, 1000)
     met = probes.stored(state, 0, 2000)
     turned = np.abs(met["action"] - np.asarray(env.heuristic(None))).max(-1) < 1e-6
     by_episode = turned.reshape(-1, 2, 2)[1:]  # (episodes, its two steps, environments)
@@ -199,7 +199,7 @@ def test_learning_begins_after_learn_after(learn_after, updates):
     program = probes.window_program("none")
     state = probes.start(program, [0], [0])
     before = probes.lane(state.agent.params, 0)
-    clock, state, _ = run(program, probes.SCALARS, replaced(learn_after=learn_after), train.start_clock(), state)
+    clock, state, _ = run(program, probes.SCALARS, replaced(learn_after=learn_after), loop.start_clock(), state)
     assert int(clock.update) == updates  # one for each of four environments, from the iteration that reaches the step
     same = [
         np.array_equal(*pair)
@@ -216,7 +216,7 @@ PARTS = ("obs", "action", "answer")
 
 
 def labelled(program, seeds, budgets, rounds=LARGEST // 10, scalars=probes.SCALARS):
-    clock, state = train.start_clock(), probes.start(program, seeds, budgets)
+    clock, state = loop.start_clock(), probes.start(program, seeds, budgets)
     for _ in range(rounds):
         clock, state = program.label_round(ENV, EXPERT, scalars, clock, state)
     return clock, state
@@ -403,7 +403,7 @@ def test_one_stretch_of_steps_is_two_of_half_the_length():
     program = probes.window_program("none")
     results = []
     for iterations in ((STRETCH,), (STRETCH // 2, STRETCH // 2)):
-        clock, state = train.start_clock(), probes.start(program, [0], [0])
+        clock, state = loop.start_clock(), probes.start(program, [0], [0])
         for count in iterations:
             clock, state, _ = program.train(ENV, probes.SCALARS, probes.SCHEDULE, clock, state, count)
         results.append(jax.tree.map(np.asarray, (clock, state.replace(key=jax.random.key_data(state.key)))))
@@ -417,7 +417,7 @@ def test_other_scalars_schedules_worlds_and_times_compile_nothing(grid):
     program = probes.window_program("relative", LARGEST)
     functions = (program.init, program.label_round, program.train)
     before = probes.compilations(*functions)
-    clock, state = train.start_clock(), probes.start(program, [7, 8, 9, 10], [1, 11, 33, LARGEST])
+    clock, state = loop.start_clock(), probes.start(program, [7, 8, 9, 10], [1, 11, 33, LARGEST])
     for index in range(3):
         env = probes.Window(0.1 * index, 0.2 * index)
         scalars = dataclasses.replace(

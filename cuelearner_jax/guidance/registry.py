@@ -75,11 +75,12 @@ def make(name: str, sizes: GuideSizes, env: Any) -> Guidance:
     for need in kind.needs:
         if not offers(env, need):
             raise UserError(f"guidance {kind.name!r} needs an environment with a {need}, which this task's is not")
-    return _made(kind, sizes, spaces_of(env))
+    return made_for(kind, sizes, spaces_of(env))
 
 
 @cache
-def _made(kind: Kind, sizes: GuideSizes, spaces: Spaces) -> Guidance:
+def made_for(kind: Kind, sizes: GuideSizes, spaces: Spaces) -> Guidance:
+    """A kind's bundle for an observation and action space; the same one for the same sizes and spaces."""
     made = kind.make(sizes, spaces)
     if made.form != kind.form or made.name != kind.name:
         raise ValueError(f"guidance {kind.name!r} was made with another name or form of answers than its kind has")

@@ -10,9 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from cuelearner_jax.errors import UserError
+from cuelearner_jax.loop import start_clock
 from cuelearner_jax.records.checkpoint import Checkpoints, checkpoints
 from cuelearner_jax.runs.lanes import LaneGroup
-from cuelearner_jax.train import start_clock
 from cuelearner_jax.types import Clock, TrainState
 
 

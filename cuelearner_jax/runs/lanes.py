@@ -20,9 +20,9 @@ from cuelearner_jax.devices import BY_LANE, lane_mesh, place
 from cuelearner_jax.environment import Environment, actions_of
 from cuelearner_jax.evaluate import evaluate_lanes
 from cuelearner_jax.guidance.bundle import Guidance
+from cuelearner_jax.loop import Program, make_program
 from cuelearner_jax.policies import Policy
 from cuelearner_jax.runs.grid import Grid
-from cuelearner_jax.train import Program, make_program
 from cuelearner_jax.types import Clock, Label, Teacher, TrainState
 
 CACHE_BYTES = 4_000_000  # of the action-value weights of a CPU's block: beyond, they leave the cache between two steps

@@ -10,7 +10,7 @@ import numpy as np
 import probes
 import pytest
 
-from cuelearner_jax import train
+from cuelearner_jax import loop
 from cuelearner_jax.actions import evenly_spaced
 from cuelearner_jax.agent import ddqn
 from cuelearner_jax.agent.learning import learner
@@ -178,7 +178,7 @@ LOOP = probes.config(
 
 @cache
 def program():
-    return train.make_program(LOOP, guidances.make("none", LOOP.sizes, CHAIN), CHAIN, 0)
+    return loop.make_program(LOOP, guidances.make("none", LOOP.sizes, CHAIN), CHAIN, 0)
 
 
 def learned(truncates, weight, **schedule):
@@ -187,7 +187,7 @@ def learned(truncates, weight, **schedule):
     scalars = dataclasses.replace(LOOP.scalars, n_step_weight=weight)
     schedule = dataclasses.replace(LOOP.schedule, **schedule)
     state = probes.start(program(), [3], [0], env)
-    _, state, _ = program().train(env, scalars, schedule, train.start_clock(), state, 1000)
+    _, state, _ = program().train(env, scalars, schedule, loop.start_clock(), state, 1000)
     q, params = applied(q_network(LOOP.sizes.q_layers)), probes.lane(state.agent.params, 0)
     return [np.asarray(q(params, env.observe(place), evenly_spaced(4)))[:, 0] for place in (0, 1)]
 

@@ -11,10 +11,10 @@ from probes import CONFIG, SIZES, Window, compilations
 from cuelearner_jax.devices import SHARED, compiler_options, place
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guidance import registry as guidance
+from cuelearner_jax.loop import start_clock
 from cuelearner_jax.runs import lanes
 from cuelearner_jax.runs.grid import Grid
 from cuelearner_jax.runs.memory_report import memory_report
-from cuelearner_jax.train import start_clock
 
 
 def group_of(seeds, kind="none", **sizes):

@@ -11,6 +11,7 @@ import pytest
 from cuelearner_jax.asking import label_slots
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guidance import registry as guidances
+from cuelearner_jax.loop import make_program, start_clock
 from cuelearner_jax.records import label_files, results
 from cuelearner_jax.records.checkpoint import checkpoints
 from cuelearner_jax.runs import lanes, runner, sweep, training
@@ -18,7 +19,6 @@ from cuelearner_jax.runs.grid import Grid
 from cuelearner_jax.runs.kept import items
 from cuelearner_jax.runs.order import Order
 from cuelearner_jax.terminal import Interrupted
-from cuelearner_jax.train import make_program, start_clock
 
 # Bootstraps, so that target network, next observations and Adam's moments are in the checkpoint as well.
 CONFIG = probes.config(
