@@ -32,10 +32,11 @@ from cuelearner_envs.anymal.judged import rollout as judged
 from cuelearner_envs.navigation.config import make_environment
 from cuelearner_envs.navigation.environment import Navigation
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.evaluate import agent_policy, episodes, rollout
+from cuelearner_jax.evaluate import episodes, rollout
+from cuelearner_jax.policies import Agent
 from cuelearner_jax.records.provenance import provenance
 from cuelearner_jax.runs.grid import load
-from cuelearner_jax.runs.trained import Subject, load_lanes
+from cuelearner_jax.runs.trained import PolicySource
 from cuelearner_jax.tasks import registry
 
 ROOT = Path(__file__).parents[1]
@@ -82,7 +83,7 @@ def main() -> int:
     asked = parser.parse_args()
     try:
         task, config, grid = load(asked.run, registry.find)
-        lanes = load_lanes(Subject(task, config, grid, asked.run), ())[0]
+        lanes = PolicySource(task, config, grid, asked.run).load()[0]
     except UserError as error:
         parser.error(str(error))
     params = jax.tree.map(lambda leaf: leaf[0], lanes.policies["params"])
@@ -101,10 +102,10 @@ def main() -> int:
 
     @partial(jax.jit, static_argnames="count")
     def in_jax(env: Any, params: Any, count: int) -> Any:
-        return rollout(agent_policy(sizes, params), env, episodes(), count, count * 200)
+        return rollout(Agent(params, sizes), env, episodes(), count, count * 200)
 
     def in_c(env: Any, count: int) -> Any:
-        return judged(agent_policy(sizes, params), env, episodes(), count, count * 200)
+        return judged(Agent(params, sizes), env, episodes(), count, count * 200)
 
     def tell(style: str, name: str, count: int, measure: Callable[[], dict[str, Any]]) -> None:
         known = {(row["style"], row["robot"], row["episodes"]) for row in rows}

@@ -18,8 +18,8 @@ from cuelearner_jax.actions import difference, evenly_spaced, from_angle, rotate
 from cuelearner_jax.config import RunConfig, Scalars, Schedule, Sizes
 from cuelearner_jax.environment import Quantity, WholeObservations
 from cuelearner_jax.guidance import registry as guidances
-from cuelearner_jax.task import Body, Task
 from cuelearner_jax.loop import make_program
+from cuelearner_jax.task import Body, Task
 from cuelearner_jax.types import Label, Step
 
 
@@ -74,7 +74,6 @@ class Chain(WholeObservations, struct.PyTreeNode):
     truncates: jax.Array | bool = False
 
     observation = (Quantity("context", 2, "1"),)
-    symmetries = 1
 
     def reset(self, key):
         return jnp.zeros((), jnp.int32), self.observe(0)
@@ -93,9 +92,6 @@ class Chain(WholeObservations, struct.PyTreeNode):
     def heuristic(self, obs):
         return from_angle(jnp.array(2.0))
 
-    def mirror(self, which, obs, vector):
-        return obs, vector
-
 
 class Expert(struct.PyTreeNode):
     """Knows a window's best direction exactly."""
@@ -104,6 +100,13 @@ class Expert(struct.PyTreeNode):
 
     def best_action(self, state, obs):
         return self.env.best(obs)
+
+
+class Acting:
+    """A policy of a function: (key, states, observations) -> actions."""
+
+    def __init__(self, act):
+        self.act = act
 
 
 @dataclass(frozen=True)
@@ -160,7 +163,7 @@ def config(sizes=None, scalars=None, schedule=None):
 @cache
 def window_program(kind, largest_budget=0):
     """One compiled loop on the bandit for all tests."""
-    return make_program(CONFIG, guidances.make(kind, SIZES, 2), Window(), largest_budget)
+    return make_program(CONFIG, guidances.make(kind, SIZES, Window()), Window(), largest_budget)
 
 
 def start(program, seeds, budgets, env=None):
@@ -171,7 +174,7 @@ def start(program, seeds, budgets, env=None):
 
 def stored(state, lane, steps):
     """What a lane's environments met: columns (steps, ...) of its replay in the order of time."""
-    rows = np.asarray(state.replay[lane, :steps])
+    rows = np.asarray(state.agent.replay[lane, :steps])
     names = {"obs": slice(0, 2), "action": slice(2, 4), "reward": 4}
     if rows.shape[1] > 5:  # something bootstraps
         names |= {"discount": 5, "ended": 6, "next_obs": slice(7, None)}

@@ -16,7 +16,7 @@ from cuelearner_jax.devices import BY_LANE, SHARED, each_lane, lane_mesh, over_l
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.records import results
 from cuelearner_jax.runs.grid import load
-from cuelearner_jax.runs.trained import Subject, load_lanes
+from cuelearner_jax.runs.trained import PolicySource
 
 SCRIPT = Path(many_devices.__file__)
 
@@ -106,7 +106,7 @@ def test_policies_of_four_devices_are_those_of_one(alone, shared):
     for folder in (alone, shared[0]):
         task = many_devices.probes.make_task()
         _, config, grid = load(folder, {task.name: task})
-        found.append(load_lanes(Subject(task, config, grid, folder), ("relative",))[0])
+        found.append(PolicySource(task, config, grid, folder).load(("relative",))[0])
     one, four = found
     np.testing.assert_array_equal(one.seeds, four.seeds)
     leaves = zip(*(many_devices.jax.tree.leaves(lanes.policies["params"]) for lanes in found), strict=True)
@@ -119,4 +119,4 @@ def test_a_checkpoint_of_fewer_lanes_is_refused(shared):
     _, config, _ = load(shared[0], {task.name: task})
     grid = many_devices.Grid(("relative",), tuple(range(9)), (30,))
     with pytest.raises(UserError, match="holds 8 lanes, the run has 9"):
-        load_lanes(Subject(task, config, grid, shared[0]), ("relative",))
+        PolicySource(task, config, grid, shared[0]).load(("relative",))

@@ -10,15 +10,16 @@ import numpy as np
 import probes
 import pytest
 
-from cuelearner_jax import train
+from cuelearner_jax import loop
 from cuelearner_jax.actions import evenly_spaced
 from cuelearner_jax.agent import ddqn
+from cuelearner_jax.agent.learning import learner
 from cuelearner_jax.agent.networks import MLP, Joined, applied, q_network
 from cuelearner_jax.agent.replay import Following
 from cuelearner_jax.config import Scalars, check
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guidance import registry as guidances
-from cuelearner_jax.types import Memory, Transition
+from cuelearner_jax.types import StoredStep, Transition
 
 HALF = 0.5  # the discount factor of everything worked out by hand
 
@@ -81,8 +82,8 @@ def test_steps_that_have_not_been_made_yet_shorten_the_window():
 ENVS, CAPACITY, WINDOW = 3, 24, 4
 SIZES = dataclasses.replace(probes.SIZES, n_step=WINDOW, num_envs=ENVS, replay_capacity=CAPACITY)
 CHAIN = probes.Chain(jnp.array(False))
-LANE = train.Lane(SIZES, guidances.make("none", SIZES, 2), True, 2, 0)
-BUFFER = LANE.buffer(CHAIN)
+AGENT = learner(SIZES, True, CHAIN)
+BUFFER = AGENT.buffer
 
 
 def course(count):
@@ -99,7 +100,7 @@ def stored(count):
     ended, terminated, rewards, number = course(count)
     rows, add = BUFFER.empty(CAPACITY), jax.jit(BUFFER.add)
     for index in range(count):
-        memory = Memory(
+        memory = StoredStep(
             obs=np.stack([number[index], number[index]], -1),
             action=np.stack([number[index] + 0.25, number[index]], -1),
             reward=rewards[index],
@@ -112,7 +113,7 @@ def stored(count):
     return rows
 
 
-n_step = jax.jit(lambda rows, filled, numbers, scalars: LANE.n_step(CHAIN, BUFFER, rows, filled, numbers, scalars))
+n_step = jax.jit(lambda rows, filled, numbers, scalars: AGENT.n_step(CHAIN, rows, filled, numbers, scalars))
 
 
 @pytest.mark.parametrize("count", [5, 8, 13, 16])  # not yet full, just full, in the second turn, at its end
@@ -162,8 +163,8 @@ def test_the_target_lies_between_that_of_one_step_and_that_of_many_by_the_weight
     # termination with 2; three steps: 3 + 0.5 * 0.25 * 8 and 3 with a termination.
     near, far = batch([1.0, 2.0], [1.0, 0.0]), batch([3.0, 3.0], [0.25, 0.0])
     scalars = Scalars(discount=HALF, n_step_weight=weight)
-    np.testing.assert_allclose(LANE.targets(constant(-3.0), constant(8.0), [near, far], scalars), expected, rtol=1e-6)
-    np.testing.assert_allclose(LANE.targets(constant(-3.0), constant(8.0), [near], scalars), [5.0, 2.0], rtol=1e-6)
+    np.testing.assert_allclose(AGENT.targets(constant(-3.0), constant(8.0), [near, far], scalars), expected, rtol=1e-6)
+    np.testing.assert_allclose(AGENT.targets(constant(-3.0), constant(8.0), [near], scalars), [5.0, 2.0], rtol=1e-6)
 
 
 # The whole loop.
@@ -177,7 +178,7 @@ LOOP = probes.config(
 
 @cache
 def program():
-    return train.make_program(LOOP, guidances.make("none", LOOP.sizes, 2), CHAIN, 0)
+    return loop.make_program(LOOP, guidances.make("none", LOOP.sizes, CHAIN), CHAIN, 0)
 
 
 def learned(truncates, weight, **schedule):
@@ -186,8 +187,8 @@ def learned(truncates, weight, **schedule):
     scalars = dataclasses.replace(LOOP.scalars, n_step_weight=weight)
     schedule = dataclasses.replace(LOOP.schedule, **schedule)
     state = probes.start(program(), [3], [0], env)
-    _, state, _ = program().train(env, scalars, schedule, train.start_clock(), state, 1000)
-    q, params = applied(q_network(LOOP.sizes.q_layers)), probes.lane(state.params, 0)
+    _, state, _ = program().train(env, scalars, schedule, loop.start_clock(), state, 1000)
+    q, params = applied(q_network(LOOP.sizes.q_layers)), probes.lane(state.agent.params, 0)
     return [np.asarray(q(params, env.observe(place), evenly_spaced(4)))[:, 0] for place in (0, 1)]
 
 

@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 
 from cuelearner_jax.agent.replay import ring_buffer
-from cuelearner_jax.types import Memory
+from cuelearner_jax.types import StoredStep
 
-EXAMPLE = Memory(jnp.zeros(3), jnp.zeros(2), jnp.zeros(()), jnp.zeros(1), jnp.zeros(1), jnp.zeros(3))
+EXAMPLE = StoredStep(jnp.zeros(3), jnp.zeros(2), jnp.zeros(()), jnp.zeros(1), jnp.zeros(1), jnp.zeros(3))
 
 
 def numbered(first, count, bootstraps=True):
     """Steps whose every entry is their own number, apart from its place."""
     kept = slice(None) if bootstraps else slice(0)
     numbers = jnp.arange(first, first + count, dtype=jnp.float32)
-    return Memory(
+    return StoredStep(
         obs=numbers[:, None] + jnp.array([0.0, 0.1, 0.2]),
         action=numbers[:, None] + jnp.array([0.3, 0.4]),
         reward=numbers + 0.5,

@@ -65,7 +65,7 @@ def test_operations_are_those_that_xla_counts():
     gradient = traced_operations(loss, params)
     assert gradient == pytest.approx(batch * forward_and_backward(LAYERS, OBS), rel=0.05)
     other = jax.tree.map(lambda leaf: leaf + 1, params)
-    target = partial(ddqn.target, Q, params, other, directions=directions, discount=0.9)
+    target = partial(ddqn.target, Q, params, other, options=directions, discount=0.9)
     targets = traced_operations(jax.vmap(target), items)
     assert targets == pytest.approx(batch * (forward(LAYERS, OBS, 72) + forward(LAYERS, OBS, 1)), rel=0.05)
 

@@ -20,7 +20,7 @@ from cuelearner_envs.billiards import config as billiards
 from cuelearner_envs.navigation import config as navigation
 from cuelearner_jax.brax_bridge import adapter as brax_adapter
 from cuelearner_jax.brax_bridge.adapter import to_brax, wrap_for_training
-from cuelearner_jax.environment import WholeObservations
+from cuelearner_jax.environment import Quantity, WholeObservations
 from cuelearner_jax.types import Step
 
 RAW = jax.random.key_data(jax.random.key(0))
@@ -116,8 +116,7 @@ def test_an_end_amid_repeated_actions_is_not_lost(wrap, truncates):
 class Countdown(WholeObservations, struct.PyTreeNode):
     """Three steps, cut or not after two; what the last one was drawn tells whether the key moves on."""
 
-    obs_size = 1
-    symmetries = 1
+    observation = (Quantity("draw", 1, "1"),)
 
     def reset(self, key):
         return jnp.zeros((), jnp.int32), jax.random.uniform(key, (1,))

@@ -10,7 +10,7 @@ import pytest
 from brax import envs
 from brax.envs.wrappers import training
 
-from cuelearner_jax import train
+from cuelearner_jax import loop
 from cuelearner_jax.actions import evenly_spaced
 from cuelearner_jax.brax_bridge.adapter import from_brax, to_brax
 from cuelearner_jax.environment import Environment, offers, symmetries_of
@@ -144,13 +144,13 @@ BOOTSTRAPPING = probes.config(scalars={"discount": 0.9}, schedule={"target_every
 )
 def test_our_loop_learns_on_an_environment_of_brax(make):
     env = from_brax(make(), max_steps=5)
-    program = train.make_program(BOOTSTRAPPING, guidances.make("none", probes.SIZES, env.obs_size), env, 0)
+    program = loop.make_program(BOOTSTRAPPING, guidances.make("none", probes.SIZES, env), env, 0)
     state = probes.start(program, [0], [0], env)
-    fresh = probes.lane(state.params, 0)
-    clock, state, metrics = program.train(env, probes.SCALARS, probes.SCHEDULE, train.start_clock(), state, 12)
+    fresh = probes.lane(state.agent.params, 0)
+    clock, state, metrics = program.train(env, probes.SCALARS, probes.SCHEDULE, loop.start_clock(), state, 12)
     assert (int(clock.step), int(clock.update)) == (48, 48)
     assert np.isfinite(metrics["loss"]).all()
     assert np.isfinite(metrics["reward"]).all()
-    for old, new in zip(jax.tree.leaves(fresh), jax.tree.leaves(probes.lane(state.params, 0)), strict=True):
+    for old, new in zip(jax.tree.leaves(fresh), jax.tree.leaves(probes.lane(state.agent.params, 0)), strict=True):
         assert np.isfinite(new).all()
         assert (old != new).any()

@@ -10,10 +10,14 @@ import numpy as np
 import probes
 import pytest
 
-from cuelearner_jax import actions
-from cuelearner_jax.agent.networks import applied, feedback_network
+from cuelearner_jax import actions, asking
+from cuelearner_jax.agent.networks import applied, residual_network
 from cuelearner_jax.config import Scalars, Sizes
-from cuelearner_jax.guidance import feedback
+from cuelearner_jax.environment import random_symmetries
+from cuelearner_jax.guidance import registry as guidances
+from cuelearner_jax.guidance.answers import human_answer, relative_feedback
+from cuelearner_jax.guidance.fitting import Lesson, fit_least_squares, lessons
+from cuelearner_jax.types import Label
 
 DEG = math.pi / 180
 
@@ -40,22 +44,22 @@ def direction(degrees):
     ],
 )
 def test_relative_feedback_by_hand(action, best, h):
-    assert float(feedback.relative_feedback(direction(action), direction(best), jnp.array(10 * DEG))) == h
+    assert float(relative_feedback(direction(action), direction(best), jnp.array(10 * DEG))) == h
 
 
 def test_an_error_of_exactly_half_eps_is_right():
     action, best = jnp.array([1.0, 0.0]), jnp.array([0.0, 1.0])
     error = actions.difference(action, best)
-    assert float(feedback.relative_feedback(action, best, 2 * error)) == 0
-    assert float(feedback.relative_feedback(action, best, 2 * jnp.nextafter(error, 0.0))) == 1
+    assert float(relative_feedback(action, best, 2 * error)) == 0
+    assert float(relative_feedback(action, best, 2 * jnp.nextafter(error, 0.0))) == 1
 
 
 def test_opposite_directions_are_told_a_turn():
-    assert abs(float(feedback.relative_feedback(direction(0), direction(180), jnp.array(0.1)))) == 1
+    assert abs(float(relative_feedback(direction(0), direction(180), jnp.array(0.1)))) == 1
 
 
 def test_indifference_widens_what_is_right_and_never_narrows_it():
-    told = partial(feedback.relative_feedback, direction(0), eps=jnp.array(10 * DEG))
+    told = partial(relative_feedback, direction(0), eps=jnp.array(10 * DEG))
     assert float(told(direction(7))) == 1
     assert float(told(direction(7), indifference=8 * DEG)) == 0
     assert float(told(direction(9), indifference=8 * DEG)) == 1
@@ -66,7 +70,7 @@ def test_indifference_widens_what_is_right_and_never_narrows_it():
 def test_feedback_is_the_turn_that_comes_nearest(eps_deg):
     rng = np.random.default_rng(int(eps_deg * 10))
     action, best = rng.uniform(-math.pi, math.pi, (2, 2000))
-    h = jax.vmap(feedback.relative_feedback, (0, 0, None))(
+    h = jax.vmap(relative_feedback, (0, 0, None))(
         actions.from_angle(jnp.array(action)), actions.from_angle(jnp.array(best)), jnp.array(eps_deg * DEG)
     )
     turns = np.array([-1, 0, 1])
@@ -77,18 +81,33 @@ def test_feedback_is_the_turn_that_comes_nearest(eps_deg):
     np.testing.assert_array_equal(np.asarray(h)[clear], turns[np.argmin(left, 1)][clear])
 
 
+def target_of(action, h, eps_rad):
+    """What the paper's network is to predict of one answer."""
+    label = Label(jnp.zeros(2), jnp.array(action), jnp.array([h]), jnp.array(True))
+    relative = guidances.make("relative", SIZES, probes.Window())
+    return relative.target(label, Scalars(eps_deg=math.degrees(eps_rad)))
+
+
 def test_the_target_is_the_turned_action_less_the_action():
-    target = feedback.relative_target(jnp.array([1.0, 0.0]), jnp.array(1.0), jnp.array(math.pi / 6))
-    np.testing.assert_allclose(target, [math.sqrt(3) / 2 - 1, 0.5], atol=1e-7)
-    opposite = feedback.relative_target(jnp.array([0.0, 1.0]), jnp.array(-1.0), jnp.array(math.pi / 2))
-    np.testing.assert_allclose(opposite, [1, -1], atol=1e-6)
-    np.testing.assert_array_equal(feedback.relative_target(jnp.array([0.6, 0.8]), jnp.array(0.0), jnp.array(1.0)), 0)
+    np.testing.assert_allclose(target_of([1.0, 0.0], 1.0, math.pi / 6), [math.sqrt(3) / 2 - 1, 0.5], atol=1e-7)
+    np.testing.assert_allclose(target_of([0.0, 1.0], -1.0, math.pi / 2), [1, -1], atol=1e-6)
+    np.testing.assert_array_equal(target_of([0.6, 0.8], 0.0, 1.0), 0)
+
+
+def test_lessons_are_labels_with_their_targets_in_place_of_the_answers():
+    rng = np.random.default_rng(0)
+    obs, action = jnp.array(rng.normal(size=(2, 7, 2)), jnp.float32)
+    labels = Label(obs, action, jnp.arange(7.0)[:, None], jnp.arange(7) < 5)
+    rows = lessons(labels, lambda label, scalars: scalars.eps_deg * label.answer + label.action, Scalars(eps_deg=3.0))
+    np.testing.assert_allclose(rows.target, 3 * np.arange(7.0)[:, None] + action, rtol=1e-6)
+    for name in ("obs", "action", "valid"):
+        np.testing.assert_array_equal(getattr(rows, name), getattr(labels, name))
 
 
 @jax.jit
 def answers(scalars, best_deg):
     keys = jax.random.split(jax.random.key(0), 2000)
-    return jax.vmap(lambda key: feedback.human_answer(key, direction(0), direction(best_deg), scalars))(keys)
+    return jax.vmap(lambda key: human_answer(key, direction(0), direction(best_deg), scalars))(keys)
 
 
 def test_a_teacher_without_faults():
@@ -131,7 +150,7 @@ def test_an_indifferent_teacher_passes_larger_errors_for_right():
 SIZES = Sizes(feedback_layers=(32, 32), fit_steps=600, fit_batch_size=32, validate_every=20)
 SCALARS = Scalars(feedback_learning_rate=5e-3)
 ROWS = 100
-NETWORK = feedback_network(SIZES.feedback_layers)
+NETWORK = residual_network(SIZES.feedback_layers, 2)
 HELD_OUT = np.arange(ROWS) % 5 == 4
 
 
@@ -143,8 +162,8 @@ predict = applied(NETWORK)
 
 
 @jax.jit
-def fit(key, labels, scalars=SCALARS, env=probes.Window()):  # noqa: B008
-    return feedback.fit(key, env, labels, scalars, init=fresh, apply=predict, sizes=SIZES)
+def fit(key, rows, scalars=SCALARS, env=probes.Window()):  # noqa: B008
+    return fit_least_squares(key, env, rows, scalars, init=fresh, apply=predict, sizes=SIZES)
 
 
 def label_set(seed, noise=0.0, valid=ROWS, dtype=np.float32):
@@ -153,7 +172,7 @@ def label_set(seed, noise=0.0, valid=ROWS, dtype=np.float32):
     obs, action = rng.uniform(-1, 1, (2, ROWS, 2)).astype(dtype)
     action /= np.linalg.norm(action, axis=-1, keepdims=True)
     target = 0.3 * action[:, ::-1] * obs + noise * rng.normal(size=(ROWS, 2))
-    return probes.label_set(obs, action, target.astype(dtype), np.arange(ROWS) < valid)
+    return Lesson(obs, action, target.astype(dtype), np.arange(ROWS) < valid)
 
 
 def mean_error(model, labels, rows):
@@ -204,7 +223,7 @@ def test_validation_keeps_the_best_parameters_when_the_last_ones_overfit():
 def test_of_all_looks_the_one_nearest_to_the_validation_labels_is_kept():
     # A model of one vector, which walks from 0 by 0.01 a step toward (1, 0): 0.2, 0.4, 0.6, 0.8 at the looks.
     labels = label_set(0).replace(target=np.stack([np.where(HELD_OUT, 0.45, 1.0), np.zeros(ROWS)], -1))
-    model = feedback.fit(
+    model = fit_least_squares(
         jax.random.key(0),
         probes.Window(),
         jax.tree.map(jnp.asarray, labels),
@@ -243,14 +262,16 @@ def test_the_key_and_the_learning_rate_matter():
 
 def test_mirrored_labels_are_turned_as_a_whole():
     labels = jax.tree.map(jnp.asarray, label_set(4))
-    image = feedback.mirrored(jax.random.key(0), probes.Window(mirrors=True), labels)
-    turn = actions.difference(labels.obs, image.obs)
+    image = random_symmetries(jax.random.key(0), probes.Window(mirrors=True), ROWS)
+    (obs, action), (again, target) = image(labels.obs, labels.action), image(labels.obs, labels.target)
+    np.testing.assert_array_equal(obs, again)
+    turn = actions.difference(labels.obs, obs)
     quarters = np.round(np.asarray(turn) / (math.pi / 2)).astype(int) % 4
     np.testing.assert_allclose(np.abs(np.exp(1j * np.asarray(turn)) - 1j**quarters), 0, atol=1e-5)
     assert set(quarters) == {0, 1, 2, 3}
-    for name in ("action", "target"):
+    for name, found in (("action", action), ("target", target)):
         expected = actions.rotate(getattr(labels, name), jnp.array(quarters * math.pi / 2))
-        np.testing.assert_allclose(getattr(image, name), expected, atol=1e-5)
+        np.testing.assert_allclose(found, expected, atol=1e-5)
 
 
 def test_every_fit_starts_from_its_key_and_from_no_earlier_model():
@@ -274,11 +295,14 @@ def test_symmetries_teach_what_no_label_showed():
 
 def test_without_symmetries_labels_stay_as_they_are():
     labels = label_set(4)
-    assert feedback.mirrored(jax.random.key(0), probes.Window(), labels) is labels
+    obs, target = random_symmetries(jax.random.key(0), probes.Window(), ROWS)(labels.obs, labels.target)
+    assert obs is labels.obs
+    assert target is labels.target
 
 
 def test_empty_labels_are_padding():
-    labels = feedback.empty_labels(7, 5)
+    labels = asking.empty_labels(7, 5, 2, 1)
     assert labels.obs.shape == (7, 5)
-    assert labels.target.shape == (7, 2)
+    assert labels.action.shape == (7, 2)
+    assert labels.answer.shape == (7, 1)
     assert not bool(labels.valid.any())

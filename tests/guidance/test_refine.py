@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from cuelearner_jax import actions
+from cuelearner_jax.actions import DIRECTIONS
 from cuelearner_jax.guidance.refining import refine, untouched
 
 DEG = math.pi / 180
@@ -27,7 +28,8 @@ def residual_of(weights, tanh, array):
 
 @jax.jit
 def refined_by_network(weights, first, active, tau, tau_max, k_max):
-    return refine(residual_of(weights, jnp.tanh, jnp.asarray), first, active, tau=tau, tau_max=tau_max, k_max=k_max)
+    residual = residual_of(weights, jnp.tanh, jnp.asarray)
+    return refine(residual, first, active, space=DIRECTIONS, tau=tau, tau_max=tau_max, k_max=k_max)
 
 
 def starts(seed, count=ROWS):
@@ -133,7 +135,7 @@ def refined_degrees(start, goal, eps, tau_max=180.0, k_max=50):
     first = actions.from_angle(jnp.array(start) * DEG)
     residual = told(actions.from_angle(jnp.array(goal * DEG)), eps * DEG)
     active = jnp.ones(len(start), bool)
-    result = refine(residual, first, active, tau=0.1 * DEG, tau_max=tau_max * DEG, k_max=k_max)
+    result = refine(residual, first, active, space=DIRECTIONS, tau=0.1 * DEG, tau_max=tau_max * DEG, k_max=k_max)
     return np.asarray(actions.to_angle(result.actions)) / DEG, result.passes.tolist()
 
 
@@ -174,7 +176,9 @@ def test_under_vmap_each_lane_has_its_own_number_of_passes():
     first = actions.from_angle(jnp.array([[47.0], [3.0]]) * DEG)
 
     def one(start):
-        return refine(told(goal, 10.0 * DEG), start, jnp.ones(1, bool), tau=0.1 * DEG, tau_max=math.pi, k_max=50)
+        active = jnp.ones(1, bool)
+        residual = told(goal, 10.0 * DEG)
+        return refine(residual, start, active, space=DIRECTIONS, tau=0.1 * DEG, tau_max=math.pi, k_max=50)
 
     assert jax.vmap(one)(first).passes.tolist() == [[6], [1]]
 
@@ -185,7 +189,7 @@ def test_one_row_a_batch_jit_and_vmap_agree():
 
     def refined(first, active):
         residual = residual_of(weights, jnp.tanh, lambda x: jnp.asarray(x, jnp.float32))
-        return refine(residual, first, active, tau=0.5 * DEG, tau_max=1.0, k_max=20)
+        return refine(residual, first, active, space=DIRECTIONS, tau=0.5 * DEG, tau_max=1.0, k_max=20)
 
     alone = [refined(first[row : row + 1], active[row : row + 1]) for row in range(5)]
     passes = [int(result.passes[0]) for result in alone]

@@ -6,8 +6,8 @@ import pytest
 
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.records import label_files
-from cuelearner_jax.runs import sweep
 from cuelearner_jax.runs.grid import Grid
+from cuelearner_jax.runs.order import Order, read_labels
 
 TASK = {"name": "window", "half_width_deg": 28.0}
 EPS = probes.CONFIG.scalars.eps_deg
@@ -29,7 +29,7 @@ GRID = Grid(("none", "relative"), seeds=(4, 9), labels=(10, 15))
 
 
 def read_for(path, grid=GRID, task=None):
-    return sweep.read_labels(path, task or probes.make_task(), probes.CONFIG, grid)
+    return read_labels(Order(task or probes.make_task(), probes.CONFIG, grid, path.parent / "run", labels_from=path))
 
 
 def test_labels_that_fit_a_run(path):
@@ -51,7 +51,7 @@ def test_labels_of_other_observations_are_refused(path):
 
 def test_answers_of_another_form_are_refused(path):
     written(path, answers="demonstration")
-    with pytest.raises(UserError, match="demonstration labels"):
+    with pytest.raises(UserError, match="demonstration answers"):
         read_for(path)
 
 

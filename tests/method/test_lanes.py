@@ -11,22 +11,23 @@ from probes import CONFIG, SIZES, Window, compilations
 from cuelearner_jax.devices import SHARED, compiler_options, place
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guidance import registry as guidance
+from cuelearner_jax.loop import start_clock
 from cuelearner_jax.runs import lanes
 from cuelearner_jax.runs.grid import Grid
-from cuelearner_jax.loop import start_clock
+from cuelearner_jax.runs.memory_report import memory_report
 
 
 def group_of(seeds, kind="none", **sizes):
     config = dataclasses.replace(CONFIG, sizes=dataclasses.replace(SIZES, **sizes))
     env = Window()
-    made = guidance.make(kind, config.sizes, env.obs_size)
-    return lanes.Group(config, env, made, Grid((kind,), tuple(range(seeds)), (10, 20)))
+    made = guidance.make(kind, config.sizes, env)
+    return lanes.LaneGroup(config, env, made, Grid((kind,), tuple(range(seeds)), (10, 20)))
 
 
 def test_blocks_are_equal_and_the_last_is_filled_with_repeats():
     group = group_of(5, lanes_per_block=2)
     assert [list(seeds) for seeds, _ in group.blocks()] == [[0, 1], [2, 3], [4, 4]]
-    columns = group.lanes([{"reward": seeds * 1.0} for seeds, _ in group.blocks()])
+    columns = group.columns([{"reward": seeds * 1.0} for seeds, _ in group.blocks()])
     np.testing.assert_array_equal(columns["reward"], [0.0, 1.0, 2.0, 3.0, 4.0])
 
 
@@ -56,9 +57,9 @@ def test_lanes_are_seeds_for_each_budget_where_labels_are_asked_for():
 
 
 def test_memory_is_told_before_and_too_much_is_refused():
-    assert "3 lanes" in lanes.memory_report(group_of(3))
+    assert "3 lanes" in memory_report(group_of(3))
     with pytest.raises(UserError, match="train at most 0 at once"):
-        lanes.memory_report(group_of(3, replay_capacity=10**12))
+        memory_report(group_of(3, replay_capacity=10**12))
 
 
 def test_blocks_of_another_cut_are_cut_anew(monkeypatch):

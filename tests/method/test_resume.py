@@ -2,21 +2,23 @@
 
 import threading
 from contextlib import contextmanager
-from functools import cache
 
 import jax
 import numpy as np
 import probes
 import pytest
 
+from cuelearner_jax.asking import label_slots
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guidance import registry as guidances
+from cuelearner_jax.loop import make_program, start_clock
 from cuelearner_jax.records import label_files, results
 from cuelearner_jax.records.checkpoint import checkpoints
-from cuelearner_jax.runs import lanes, sweep
+from cuelearner_jax.runs import lanes, runner, sweep, training
 from cuelearner_jax.runs.grid import Grid
+from cuelearner_jax.runs.kept import items
+from cuelearner_jax.runs.order import Order
 from cuelearner_jax.terminal import Interrupted
-from cuelearner_jax.loop import label_slots, make_program, start_clock
 
 # Bootstraps, so that target network, next observations and Adam's moments are in the checkpoint as well.
 CONFIG = probes.config(
@@ -49,11 +51,10 @@ def compiled_once():
         return lambda *arguments: jax.device_put(make(*arguments), jax.devices()[0])
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(lanes.Group, "start", committed(lanes.Group.start))
-        patch.setattr(sweep, "start_clock", committed(start_clock))
-        patch.setattr(sweep.guidances, "make", cache(guidances.make))
+        patch.setattr(lanes.LaneGroup, "start", committed(lanes.LaneGroup.start))
+        patch.setattr(training, "start_clock", committed(start_clock))
         patch.setattr(lanes, "make_program", made)
-        patch.setattr(sweep, "ROUNDS_A_CHUNK", 2)
+        patch.setattr(runner, "ROUNDS_A_CHUNK", 2)
         yield
 
 
@@ -81,7 +82,7 @@ def stopping_at(when):
 def killed_at(when, method):
     """A kill in place of the given call of a method of the runner."""
     calls = 0
-    usual = getattr(sweep._Runner, method)
+    usual = getattr(runner.Runner, method)
 
     def counted(self, *arguments):
         nonlocal calls
@@ -91,18 +92,19 @@ def killed_at(when, method):
         return usual(self, *arguments)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sweep._Runner, method, counted)
+        patch.setattr(runner.Runner, method, counted)
         yield
 
 
 def run(out, **options):
-    sweep.run(TASK, CONFIG, GRID, out, **options)
+    sweep.run(Order(TASK, CONFIG, GRID, out, **options))
 
 
 def newest(out, kind, grid=GRID):
     """The newest checkpoint's arrays and number."""
-    group = lanes.Group(CONFIG, TASK.environment(CONFIG.task), guidances.make(kind, CONFIG.sizes, 2), grid)
-    like = lanes.items(group.shapes(), jax.eval_shape(start_clock), 0.0)
+    env = TASK.environment(CONFIG.task)
+    group = lanes.LaneGroup(CONFIG, env, guidances.make(kind, CONFIG.sizes, env), grid)
+    like = items(group.shapes(), jax.eval_shape(start_clock), 0.0)
     with checkpoints(out / kind / "checkpoints", read_only=True) as saved:
         found = saved.restore(like)
         del found["clock"]["wall_s"]
@@ -116,7 +118,7 @@ def rows(out):
 
 def read_labels(out):
     file = label_files.read(out / "relative" / "labels.parquet")
-    return [file.seeds, file.labels.obs, file.labels.action, file.labels.target]
+    return [file.seeds, file.labels.obs, file.labels.action, file.labels.answer]
 
 
 @pytest.fixture(scope="module")
@@ -153,7 +155,7 @@ def test_a_run_leaves_a_row_for_each_lane_and_evaluation(whole):
     assert {row["config_hash"] for row in table} == {table[0]["config_hash"]}
     state, number = newest(whole, "relative")
     assert number == 6 + 96
-    assert state["rest"][0].target_params is not None
+    assert state["rest"][0].agent.target_params is not None
     assert int(state["clock"]["clock"].update) == 96
 
 
@@ -249,7 +251,7 @@ def test_a_torn_last_row_is_written_anew(whole, tmp_path):
 
 def test_a_block_filled_up_with_repeats_has_a_row_for_each_seed(whole, tmp_path):
     out = tmp_path / "run"
-    sweep.run(TASK, CONFIG, Grid(("none",), (3, 5, 7), ()), out)  # blocks of 3, 5 and of 7, 7
+    sweep.run(Order(TASK, CONFIG, Grid(("none",), (3, 5, 7), ()), out))  # blocks of 3, 5 and of 7, 7
     table = rows(out)
     assert [row["seed"] for row in table if row["step"] == 96] == [3, 5, 7]
     expected = [row for row in rows(whole) if row["guidance"] == "none"]
@@ -263,8 +265,8 @@ def test_labels_of_a_file_are_used_exactly(tmp_path):
     rng = np.random.default_rng(0)
     angle = rng.uniform(-np.pi, np.pi, (2, 2, 60))
     obs, action = np.stack([np.cos(angle), np.sin(angle)], -1).astype(np.float32)
-    target = rng.normal(scale=0.1, size=(2, 60, 2)).astype(np.float32)
-    given = probes.label_set(obs, action, target, np.ones((2, 60), bool))
+    answer = rng.integers(-1, 2, size=(2, 60, 1)).astype(np.float32)
+    given = probes.label_set(obs, action, answer, np.ones((2, 60), bool))
     path = tmp_path / "given.parquet"
     label_files.write(path, {"name": "window"}, "relative", CONFIG.scalars.eps_deg, np.array([3, 5]), given)
     grid = Grid(("relative",), seeds=(5, 3), labels=(35, 60))
@@ -276,18 +278,18 @@ def test_labels_of_a_file_are_used_exactly(tmp_path):
     task = probes.make_task()
     object.__setattr__(task, "teacher", refuse)
     with stopping_at(2), pytest.raises(Interrupted):
-        sweep.run(task, CONFIG, grid, out, labels_from=path)
-    sweep.run(task, CONFIG, grid, out, labels_from=path, resume=True)
+        sweep.run(Order(task, CONFIG, grid, out, labels_from=path))
+    sweep.run(Order(task, CONFIG, grid, out, labels_from=path, resume=True))
     state, _ = newest(out, "relative", grid)
-    labels = jax.tree.map(lambda *leaves: np.concatenate(leaves), *(block.asking.labels for block in state["rest"]))
+    labels = jax.tree.map(lambda *leaves: np.concatenate(leaves), *(block.guide.labels for block in state["rest"]))
     for lane, (seed, budget) in enumerate([(1, 35), (0, 35), (1, 60), (0, 60)]):
         np.testing.assert_array_equal(labels.valid[lane], np.arange(60) < budget)
-        for name in ("obs", "action", "target"):
+        for name in ("obs", "action", "answer"):
             np.testing.assert_array_equal(getattr(labels, name)[lane, :budget], getattr(given, name)[seed, :budget])
     assert all(bool(block["guidance"].fitted.all()) for block in state["policy"])
     copied = label_files.read(out / "relative" / "labels.parquet")
     assert copied.seeds.tolist() == [5] * 60 + [3] * 60
-    np.testing.assert_array_equal(copied.labels.target, np.concatenate([target[1], target[0]]))
+    np.testing.assert_array_equal(copied.labels.answer, np.concatenate([answer[1], answer[0]]))
 
 
 def test_the_labels_that_a_run_wrote_give_its_guidance_again(whole, tmp_path):
@@ -296,7 +298,7 @@ def test_the_labels_that_a_run_wrote_give_its_guidance_again(whole, tmp_path):
     counts = [int((written.seeds == seed).sum()) for seed in GRID.seeds]
     assert all(50 < count < 60 for count in counts)
     grid = Grid(("relative",), GRID.seeds, (min(counts),))
-    sweep.run(TASK, CONFIG, grid, tmp_path / "run", labels_from=whole / "relative" / "labels.parquet")
+    sweep.run(Order(TASK, CONFIG, grid, tmp_path / "run", labels_from=whole / "relative" / "labels.parquet"))
     again = label_files.read(tmp_path / "run" / "relative" / "labels.parquet")
     for seed in GRID.seeds:
         mine, theirs = (file.labels.obs[file.seeds == seed][: min(counts)] for file in (again, written))

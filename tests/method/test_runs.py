@@ -14,6 +14,7 @@ from cuelearner_jax.records.folders import check_folder, prepare_folder
 from cuelearner_jax.runs import grid as runs
 from cuelearner_jax.runs import sweep
 from cuelearner_jax.runs.grid import Grid
+from cuelearner_jax.runs.order import Order
 
 ROOT = Path(__file__).resolve().parents[2]
 TASK = probes.make_task()
@@ -152,7 +153,7 @@ def test_grids_that_make_no_sense_are_refused(grid, message, tmp_path):
     with pytest.raises(UserError, match=message):
         runs.check_grid(grid)
     with pytest.raises(UserError, match=message):
-        sweep.run(TASK, probes.CONFIG, grid, tmp_path / "run")
+        sweep.run(Order(TASK, probes.CONFIG, grid, tmp_path / "run"))
     assert list(tmp_path.iterdir()) == []
 
 
@@ -163,7 +164,7 @@ def test_grids_that_make_sense():
 
 
 def test_lanes_are_seeds_times_budgets_and_one_a_seed_without_labels():
-    relative, none = (guidances.make(kind, probes.SIZES, 2) for kind in ("relative", "none"))
+    relative, none = (guidances.make(kind, probes.SIZES, probes.Window()) for kind in ("relative", "none"))
     seeds, budgets = GRID.lanes(relative)
     assert list(zip(seeds.tolist(), budgets.tolist(), strict=True)) == [(4, 10), (9, 10), (4, 15), (9, 15)]
     seeds, budgets = GRID.lanes(none)
@@ -188,7 +189,7 @@ def test_lanes_are_seeds_times_budgets_and_one_a_seed_without_labels():
 def test_a_refused_run_changes_nothing(out, config, grid, options, message):
     before = probes.files_of(out.parent)
     with pytest.raises(UserError, match=message):
-        sweep.run(TASK, config, grid, out, split="tuning", **options)
+        sweep.run(Order(TASK, config, grid, out, split="tuning", **options))
     assert probes.files_of(out.parent) == before
 
 
@@ -199,5 +200,5 @@ def test_a_missing_teacher_is_said_before_anything_is_deleted(out):
     task = TASK.__class__(**{**TASK.__dict__, "teacher": no_teacher})
     before = probes.files_of(out.parent)
     with pytest.raises(UserError, match="no teacher"):
-        sweep.run(task, probes.CONFIG, GRID, out, overwrite=True, split="tuning")
+        sweep.run(Order(task, probes.CONFIG, GRID, out, overwrite=True, split="tuning"))
     assert probes.files_of(out.parent) == before

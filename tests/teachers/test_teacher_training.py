@@ -12,7 +12,8 @@ import pytest
 from cuelearner_jax import actions
 from cuelearner_jax.config import to_json
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.evaluate import rollout, teacher_policy
+from cuelearner_jax.evaluate import rollout
+from cuelearner_jax.policies import Taught
 from cuelearner_jax.teachers import learned as teacher
 from cuelearner_jax.teachers.learned import TeacherConfig
 
@@ -54,7 +55,7 @@ def made(trained):
 
 
 def test_it_learns_to_win_nearly_always(made, trained):
-    measure = jax.jit(lambda made: rollout(teacher_policy(made), ENV, jax.random.key(5), 20, 200))
+    measure = jax.jit(lambda made: rollout(Taught(made), ENV, jax.random.key(5), 20, 200))
     assert float(measure(made)["reward"]) > 0.97
     (_, metrics) = trained
     assert metrics[1]["reward"] > metrics[0]["reward"]

@@ -19,6 +19,7 @@ from cuelearner_envs.navigation.config import make_environment as make_simple
 from cuelearner_envs.navigation.lidar import scan, scan_tilted
 from cuelearner_envs.navigation.world import World
 from cuelearner_jax import actions
+from cuelearner_jax.policies import Heuristic
 
 WALKERS = 4
 CONFIG = NavigationConfig(worlds=8, max_steps=3)
@@ -221,7 +222,7 @@ def test_the_sensor_has_noise_of_its_own(env):
 
 def test_in_c_mujoco_walking_toward_the_goal_reaches_it_or_meets_something():
     env = make_environment(NavigationConfig(worlds=8, max_steps=100))
-    found = judged.rollout(lambda key, state, obs: jax.vmap(env.heuristic)(obs), env, jax.random.key(0), 6, 600)
+    found = judged.rollout(Heuristic(env), env, jax.random.key(0), 6, 600)
     assert float(found["finished"]) == 1
     ends = [float(found[name]) for name in ("success", "collision", "fall", "timeout")]
     assert sum(ends) == pytest.approx(1)

@@ -4,6 +4,7 @@ import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
+import probes
 import pytest
 from billiards_scenes import (
     BATCH,
@@ -25,6 +26,7 @@ from cuelearner_envs.billiards.recording import record
 from cuelearner_envs.billiards.table import Table, rack
 from cuelearner_jax import actions
 from cuelearner_jax.environment import Environment
+from cuelearner_jax.policies import Heuristic
 
 TABLES: list[Literal["one_ball", "easy", "regulation"]] = ["one_ball", "easy", "regulation"]
 ONE = make_environment(BilliardsConfig("one_ball"))
@@ -304,7 +306,7 @@ def test_a_batch_plays_as_one_table_does():
 
 
 def test_records_hold_the_path_of_every_shot_and_what_the_environment_paid():
-    paths, rewards = record(EASY, lambda key, state, obs: jax.vmap(EASY.heuristic)(obs), jax.random.key(2), 12)
+    paths, rewards = record(EASY, Heuristic(EASY), jax.random.key(2), 12)
     assert len(paths) == len(rewards) == 12
     assert sum(rewards) > 0
     for number, (path, reward) in enumerate(zip(paths, rewards, strict=True)):
@@ -324,7 +326,7 @@ def test_a_recorded_policy_sees_the_state_and_its_strikes_are_turned():
         assert states.positions.shape == (1, 2, 2)
         return actions.retract(states.positions[:, 1] - states.positions[:, 0])
 
-    paths, _ = record(turned, policy, KEY, 2)
+    paths, _ = record(turned, probes.Acting(policy), KEY, 2)
     for path in paths:
         aim = actions.to_angle(jnp.asarray(path.positions[0, 1] - path.positions[0, 0]))
         struck = actions.to_angle(jnp.asarray(path.velocities[0, 0]))

@@ -9,7 +9,8 @@ from cuelearner_envs.billiards.config import BilliardsConfig, make_environment
 from cuelearner_envs.billiards.teacher import SearchTeacher
 from cuelearner_jax import actions
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.evaluate import episodes, rollout, teacher_policy
+from cuelearner_jax.evaluate import episodes, rollout
+from cuelearner_jax.policies import Taught
 from cuelearner_jax.tasks.billiards import SHIPPED_TEACHERS, make_teacher
 from cuelearner_jax.teachers.learned import LearnedTeacher
 
@@ -108,7 +109,7 @@ def test_the_shipped_teachers_play_well(table, least):
     teacher = make_teacher(config, env)
     assert isinstance(teacher, LearnedTeacher)
     coarse = teacher.replace(directions=1440)  # for speed
-    measured = jax.jit(lambda teacher: rollout(teacher_policy(teacher), env, episodes("tuning"), 30, 300))(coarse)
+    measured = jax.jit(lambda teacher: rollout(Taught(teacher), env, episodes("tuning"), 30, 300))(coarse)
     assert float(measured["reward"]) > least  # over 10,000 steps with their 3,600 directions: see teacher.json
 
 

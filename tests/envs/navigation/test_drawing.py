@@ -9,6 +9,7 @@ import imageio.v2 as imageio
 import jax
 import jax.numpy as jnp
 import numpy as np
+import probes
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
@@ -20,6 +21,7 @@ from cuelearner_envs.navigation.environment import Navigation
 from cuelearner_envs.navigation.recording import ENDS, record, situation
 from cuelearner_envs.navigation.robot import Robot, discs
 from cuelearner_envs.navigation.world import FAR_AWAY
+from cuelearner_jax.policies import Heuristic
 
 STEPS = 80
 BODY = {"success": drawing.BODY, "collision": drawing.CRASH}
@@ -44,10 +46,6 @@ def environment(starts, goals, **fields):
     return Navigation(worlds=jax.tree.map(lambda leaf: leaf[None], room(starts, goals)), **fields)
 
 
-def straight(env):
-    return lambda key, states, obs: jax.vmap(env.heuristic)(obs)
-
-
 ENVIRONMENTS = {
     "success": environment([[-3.5, 0.0]], [[4.0, 0.0]]),
     "collision": environment([[-5.5, 2.0]], [[4.0, 2.0]]),
@@ -58,7 +56,7 @@ ENVIRONMENTS = {
 @pytest.fixture(scope="module")
 def records():
     """Frames and rewards of walking straight to the goal, by how the episodes end."""
-    return {name: record(env, straight(env), jax.random.key(1), STEPS) for name, env in ENVIRONMENTS.items()}
+    return {name: record(env, Heuristic(env), jax.random.key(1), STEPS) for name, env in ENVIRONMENTS.items()}
 
 
 def is_colour(found, name, tolerance=0.02):
@@ -126,7 +124,7 @@ def test_the_policy_is_traced_once_and_decides():
         traces.append((states.pose.shape, obs.shape))
         return -jax.vmap(env.heuristic)(obs)
 
-    frames, _ = record(env, backwards, jax.random.key(0), 5)
+    frames, _ = record(env, probes.Acting(backwards), jax.random.key(0), 5)
     assert traces == [((1, 3), (1, env.obs_size))]
     assert frames[4].next_pose[0] < frames[0].pose[0] - 0.5
 

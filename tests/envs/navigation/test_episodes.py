@@ -1,6 +1,7 @@
 """Navigation over whole episodes: how they end and begin, what replay makes of them, and their mirror images."""
 
 import math
+from functools import partial
 
 import chex
 import jax
@@ -13,8 +14,8 @@ from cuelearner_envs.navigation.environment import Navigation
 from cuelearner_envs.navigation.lidar import Lidar
 from cuelearner_envs.navigation.robot import collides
 from cuelearner_envs.navigation.worlds import generate_many
-from cuelearner_jax import actions, train
-from cuelearner_jax.guidance import registry as guidances
+from cuelearner_jax import actions
+from cuelearner_jax.agent.learning import learner, stored_step
 
 KEY = jax.random.key(0)
 LEFT = jnp.array([0.0, 1.0])
@@ -135,11 +136,6 @@ def test_each_step_has_one_end_at_most_and_pays_accordingly(plays):
 # --- replay ----------------------------------------------------------------------------------------------------------
 
 
-def lane(env):
-    sizes = probes.SIZES
-    return train.Lane(sizes, guidances.make("none", sizes, env.obs_size), True, env.obs_size, 0)
-
-
 @pytest.mark.parametrize("kind", KINDS)
 def test_remembered_steps_rebuild_what_was_seen_before_and_after(plays, kind):
     env, played_steps = plays[kind]
@@ -172,22 +168,22 @@ def test_a_faulty_reading_is_made_again_and_not_drawn_again(plays):
 
 def test_a_stored_transition_takes_80_bytes():
     for env in (WORLDS, WORLDS.replace(lidar=FAULTS, mirrors=True)):
-        rows = lane(env).buffer(env).empty(10)
+        rows = learner(probes.SIZES, True, env).buffer.empty(10)
         assert rows.nbytes / 10 <= 80
 
 
 @jax.jit
 def through(env, memory, action, result):
     """The last 320 of 960 steps as a ring buffer of that many rows gives them back, oldest first."""
-    loop = lane(env)
-    buffer = loop.buffer(env)
+    agent = learner(probes.SIZES, True, env)
+    buffer, stored = agent.buffer, partial(stored_step, bootstraps=True)
 
     def add(rows, item):
         number, *parts = item
-        return buffer.add(rows, number * 16, jax.vmap(loop.memory)(*parts)), None
+        return buffer.add(rows, number * 16, jax.vmap(stored)(*parts)), None
 
     rows, _ = jax.lax.scan(add, buffer.empty(320), (jnp.arange(60), memory, action, result))
-    return loop.one_step(env, buffer.read(rows, jnp.arange(320)))
+    return agent.one_step(env, buffer.read(rows, jnp.arange(320)))
 
 
 @pytest.mark.parametrize("kind", KINDS)

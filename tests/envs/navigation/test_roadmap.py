@@ -18,8 +18,10 @@ from cuelearner_envs.navigation.worlds import generate_many
 from cuelearner_jax import evaluate
 from cuelearner_jax.actions import difference, from_angle
 from cuelearner_jax.config import Scalars, Sizes
-from cuelearner_jax.guidance import feedback
 from cuelearner_jax.guidance import registry as guidances
+from cuelearner_jax.guidance.answers import human_answer, relative_answer
+from cuelearner_jax.policies import Taught
+from cuelearner_jax.types import Label
 
 REACH = 0.465  # from the middle of the body to its farthest point [m]
 NEEDED = REACH + LINE_MARGIN
@@ -281,9 +283,7 @@ def test_the_teacher_points_at_the_next_place_in_the_bodys_frame(teacher, index)
 
 
 def test_whoever_follows_the_teacher_arrives(teacher):
-    measure = jax.jit(
-        lambda teacher, key: evaluate.rollout(evaluate.teacher_policy(teacher), teacher.env, key, 24, 24 * 160)
-    )
+    measure = jax.jit(lambda teacher, key: evaluate.rollout(Taught(teacher), teacher.env, key, 24, 24 * 160))
     found = {name: float(value) for name, value in measure(teacher, jax.random.key(5)).items()}
     assert found["finished"] == 1
     assert found["success"] >= 23 / 24
@@ -294,8 +294,7 @@ def test_whoever_follows_the_teacher_arrives(teacher):
 
 
 SCALARS = Scalars(eps_deg=20.0)
-relative = jax.jit(guidances.make("relative", Sizes(feedback_layers=(8,)), 280).label)
-told = jax.jit(feedback.human_answer)
+told, asked = jax.jit(human_answer), jax.jit(relative_answer)
 
 
 def answer(teacher, index, pose, goal, action_deg, scalars=SCALARS):
@@ -303,10 +302,14 @@ def answer(teacher, index, pose, goal, action_deg, scalars=SCALARS):
     world = one(teacher.env.worlds, index)
     state = walkers(world, index, goal, np.array([pose[:2]], np.float32), [math.radians(pose[2])])
     action = from_angle(jnp.deg2rad(jnp.float32(action_deg)))
-    key, wanted = jax.random.key(0), best(teacher, state)[0]
+    key, wanted, obs = jax.random.key(0), best(teacher, state)[0], observe(teacher.env, state)[0]
     h, _ = told(key, action, wanted, scalars)
-    target, answered = relative(key, action, wanted, scalars)
+    relative = guidances.make("relative", Sizes(feedback_layers=(8,)), teacher.env)
+    where = jax.tree.map(lambda leaf: leaf[0], state)
+    said, answered = asked(key, teacher, where, obs, action, scalars)
     assert bool(answered)
+    assert said.tolist() == [float(h)]
+    target = relative.target(Label(obs, action, said, answered), scalars)
     return int(h), round(math.degrees(float(difference(action, action + target))), 3)
 
 
