@@ -105,7 +105,7 @@ def test_policies_of_four_devices_are_those_of_one(alone, shared):
     found = []
     for folder in (alone, shared[0]):
         task = many_devices.probes.make_task()
-        _, config, grid = load(folder, {task.name: task})
+        _, config, grid = load(folder, {task.name: task}.__getitem__)
         found.append(PolicySource(task, config, grid, folder).load(("relative",))[0])
     one, four = found
     np.testing.assert_array_equal(one.seeds, four.seeds)
@@ -116,7 +116,7 @@ def test_policies_of_four_devices_are_those_of_one(alone, shared):
 
 def test_a_checkpoint_of_fewer_lanes_is_refused(shared):
     task = many_devices.probes.make_task()
-    _, config, _ = load(shared[0], {task.name: task})
+    _, config, _ = load(shared[0], {task.name: task}.__getitem__)
     grid = many_devices.Grid(("relative",), tuple(range(9)), (30,))
     with pytest.raises(UserError, match="holds 8 lanes, the run has 9"):
         PolicySource(task, config, grid, shared[0]).load(("relative",))

@@ -22,7 +22,7 @@ ROWS = [
     ["policies"],
     ["asking", "evaluate"],
     ["export"],
-    ["train", "adapt"],
+    ["loop", "adapt"],
     ["teachers"],
     ["runs"],
     ["report"],
