@@ -9,10 +9,10 @@ from beartype import BeartypeConf, beartype
 
 Function = TypeVar("Function", bound=Callable)
 
-PACKAGES = ["cuelearner_envs"]  # whose functions and methods are checked
-# Folders of tests in which an operand of a lower rank is an error, not filled up by NumPy's rule. Never those of what
-# brax and MuJoCo's MJX run: they rely on that rule.
-STRICT_RANKS = ["envs/billiards", "envs/navigation"]
+PACKAGES = ["cuelearner_envs", "cuelearner_jax"]  # whose functions and methods are checked
+# Folders of tests in which an operand of a lower rank is filled up by NumPy's rule, and is an error elsewhere: brax and
+# MuJoCo's MJX rely on it.
+LOOSE_RANKS = ["envs/anymal", "brax_bridge"]
 
 _conf = BeartypeConf(is_pep484_tower=True)  # an int is a float, as pyright has it
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import jaxlib.version
 import pytest
-from checked import PACKAGES, STRICT_RANKS
+from checked import LOOSE_RANKS, PACKAGES
 from jaxtyping import install_import_hook
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
@@ -23,9 +23,9 @@ install_import_hook(PACKAGES, "checked.checked")  # before anything of them is i
 
 @pytest.fixture(scope="module", autouse=True)
 def strict_ranks(request):
-    """Raises at implicit rank promotion in the tests of `STRICT_RANKS`."""
+    """Raises at implicit rank promotion, but in the tests of `LOOSE_RANKS`."""
     import jax  # reads the settings above
 
     folder = request.path.parent.relative_to(Path(__file__).resolve().parent).as_posix()
-    with jax.numpy_rank_promotion("raise" if folder in STRICT_RANKS else "allow"):
+    with jax.numpy_rank_promotion("allow" if folder in LOOSE_RANKS else "raise"):
         yield

@@ -69,7 +69,7 @@ def train(
     teacher: Teacher | None = None,
     config: RunConfig | str = "quickstart",
     *,
-    guidance: Sequence[str] = ("none", "relative"),
+    guidance: Sequence[str] = (),
     labels: Sequence[int] = (100,),
     seeds: int | Sequence[int] = 8,
     split: str = "validation",
@@ -81,7 +81,7 @@ def train(
         world: where.
         teacher: who answers; needed by kinds of guidance that ask.
         config: everything else, or the name of one of the task's presets; its world is the one given.
-        guidance: kinds of guidance.
+        guidance: kinds of guidance (default: all that the world can have with what is given).
         labels: label budgets.
         seeds: their number (0, 1, ...), or the seeds.
         split: episodes of the evaluations: "validation", or "tuning" for choosing settings.
@@ -92,7 +92,8 @@ def train(
     """
     run_config = dataclasses.replace(_config(world, config), task=world.config)
     configuration.check(run_config)
-    names = tuple(registry.find(kind).name for kind in guidance)
+    asked = guidance or registry.possible(world.env, taught=teacher is not None)
+    names = tuple(registry.find(kind).name for kind in asked)
     grid = Grid(names, tuple(range(seeds)) if isinstance(seeds, int) else tuple(seeds), tuple(labels))
     check_grid(grid)
     mesh = lane_mesh()

@@ -16,7 +16,8 @@ DIRECTIONS = evenly_spaced(4)  # east, north, west, south
 
 def linear(params, obs, actions):
     """A value that is linear in the action: w . a, times the observation's first entry."""
-    return (actions @ params)[..., None] * obs[..., :1]
+    value = (actions @ params)[..., None]
+    return value * jnp.broadcast_to(obs[..., :1], value.shape)
 
 
 ONLINE, TARGET = jnp.array([1.0, 0.5]), jnp.array([0.2, 5.0])  # online prefers east, target north

@@ -16,12 +16,12 @@ def numbered(first, count, bootstraps=True):
     kept = slice(None) if bootstraps else slice(0)
     numbers = jnp.arange(first, first + count, dtype=jnp.float32)
     return StoredStep(
-        obs=numbers[:, None] + jnp.array([0.0, 0.1, 0.2]),
-        action=numbers[:, None] + jnp.array([0.3, 0.4]),
+        obs=numbers[:, None] + jnp.array([[0.0, 0.1, 0.2]]),
+        action=numbers[:, None] + jnp.array([[0.3, 0.4]]),
         reward=numbers + 0.5,
         discount=(numbers[:, None] + 0.6)[:, kept],
         ended=(numbers[:, None] + 0.7)[:, kept],
-        aftermath=(numbers[:, None] + jnp.array([0.8, 0.9, 1.0]))[:, kept],
+        aftermath=(numbers[:, None] + jnp.array([[0.8, 0.9, 1.0]]))[:, kept],
     )
 
 

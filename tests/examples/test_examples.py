@@ -203,7 +203,7 @@ def test_the_skipper_makes_straight_for_the_buoy():
     jax = importlib.import_module("jax")
     for rudder in (0.0, 25.0):
         env = reach.make_environment(reach.ReachConfig(rudder_deg=rudder))
-        state, obs = env.reset(jax.random.key(3))
+        state, _ = env.reset(jax.random.key(3))
         line = np.asarray(state.buoy)
         for _ in range(5):
             state = env.moved(state, reach.Skipper(env).best_action(state, env.observe(state)))

@@ -153,7 +153,7 @@ NONSENSE = [
     (lambda: cl.ask(policy, WORLD, TEACHER, labels=5, bound_deg=200.0), "bound_deg is 200.0"),
     (lambda: cl.ask(42, WORLD, TEACHER, labels=5), "a int is no policy"),
     (lambda: cl.load_policy("nowhere"), "nowhere is no run folder"),
-    (lambda: cl.train(WORLD, None, probes.CONFIG, seeds=1), "asks a teacher: give one"),
+    (lambda: cl.train(WORLD, None, probes.CONFIG, guidance=["relative"], seeds=1), "asks a teacher: give one"),
     (lambda: cl.train(WORLD, TEACHER, "quickstat", seeds=1), "unknown preset 'quickstat'"),
     (lambda: cl.train(WORLD, TEACHER, probes.CONFIG, seeds=0), "seeds must be different numbers"),
     (lambda: cl.train(WORLD, TEACHER, probes.CONFIG, guidance=["telepathy"]), "unknown guidance 'telepathy'"),
@@ -172,7 +172,8 @@ def rows_of(rows, columns):
 
 
 def test_training_from_python_gives_what_the_command_gives(tmp_path):
-    run = cl.train(WORLD, TEACHER, probes.CONFIG, labels=[10], seeds=[3, 5], progress=False)
+    kinds = ["none", "relative"]
+    run = cl.train(WORLD, TEACHER, probes.CONFIG, guidance=kinds, labels=[10], seeds=[3, 5], progress=False)
     grid = Grid(("none", "relative"), (3, 5), (10,))
     sweep.run(Order(TASK, probes.CONFIG, grid, tmp_path / "run"))
     columns = ("guidance", "labels", "seed", "step", "reward", "train_loss", "guide_reward")

@@ -23,7 +23,7 @@ def network(seed, scale):
 
 def residual_of(weights, tanh, array):
     first, bias, second = map(array, weights)
-    return lambda action: tanh(action @ first + bias) @ second
+    return lambda action: tanh(action @ first + bias.reshape(*[1] * (action.ndim - 1), -1)) @ second
 
 
 @jax.jit
