@@ -19,7 +19,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, TypeVar
 
 import numpy as np
 import pyarrow as pa
@@ -32,6 +32,7 @@ TAIL = 1 << 16  # more than the longest row of most tables [bytes]
 
 PathLike = str | os.PathLike[str]
 Row = dict[str, Any]
+Writer = TypeVar("Writer", bound="TableWriter")
 
 
 @dataclass(frozen=True)
@@ -130,7 +131,7 @@ class TableWriter:
         """Closes the file; the table stays JSONL until `finish`."""
         self._file.close()
 
-    def __enter__(self) -> TableWriter:
+    def __enter__(self: Writer) -> Writer:
         return self
 
     def __exit__(self, *_: object) -> None:
