@@ -20,8 +20,8 @@ import jax
 import numpy as np
 from cartpole import CartPole
 
+from cuelearner_jax.bench.flops import step_operations
 from cuelearner_jax.bench.measuring import Timed, learning, matmul_rate
-from cuelearner_jax.bench.operations import step_operations
 from cuelearner_jax.config import RunConfig, Scalars, Schedule, Sizes
 
 BATCH, ENVS, DIRECTIONS = 256, 8, 2

@@ -26,7 +26,7 @@ from jax.sharding import Mesh
 
 from cuelearner_jax import config as configuration
 from cuelearner_jax.bench import known_machines as machines
-from cuelearner_jax.bench.operations import step_operations
+from cuelearner_jax.bench.flops import step_operations
 from cuelearner_jax.config import RunConfig
 from cuelearner_jax.devices import SHARED, lane_mesh, place
 from cuelearner_jax.environment import Environment

@@ -13,7 +13,7 @@ from cuelearner_jax.agent import ddqn
 from cuelearner_jax.agent.networks import applied, q_network
 from cuelearner_jax.bench import known_machines as machines
 from cuelearner_jax.bench import measuring as bench
-from cuelearner_jax.bench.operations import forward, forward_and_backward, step_operations
+from cuelearner_jax.bench.flops import forward, forward_and_backward, step_operations
 from cuelearner_jax.config import Sizes
 from cuelearner_jax.devices import lane_mesh
 from cuelearner_jax.errors import UserError
