@@ -31,7 +31,7 @@ from matplotlib.figure import Figure
 from cuelearner_envs import film
 from cuelearner_jax.actions import from_angle, retract, rotate
 from cuelearner_jax.config import RunConfig, Scalars, Schedule, Sizes
-from cuelearner_jax.environment import Environment, Quantity, WholeObservations
+from cuelearner_jax.environment import Quantity, WholeObservations
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.task import Body, Pictures, Preset, Scenario, Task
 from cuelearner_jax.types import Policy, Step
@@ -262,13 +262,6 @@ def _pixels(way: list[Frame]) -> np.ndarray:
 # ------------------------------------------------------------------------------------------------------ the task
 
 
-def _bodies() -> tuple[Body, ...]:
-    def environment(config: ReachConfig, split: str) -> Environment:
-        return make_environment(config, split)
-
-    return (Body("boat", "goes where it is sent, and with the wind", environment, pictures=_pictures),)
-
-
 def _pictures() -> Pictures:
     return Pictures(record=record, still=still, animate=animate, question=question)
 
@@ -277,7 +270,7 @@ TASK = Task(
     name="reach",
     about="reach a buoy in a cross wind",
     config=ReachConfig,
-    bodies=_bodies(),
+    bodies=(Body("boat", "goes where it is sent, and with the wind", make_environment, pictures=_pictures),),
     teacher=lambda config, env: Skipper(env),
     scenarios={
         "storm": Scenario("a wind that the boat barely makes way against", {"wind": 0.75}, bound_deg=60.0),
@@ -287,7 +280,7 @@ TASK = Task(
         "quickstart": Preset(
             "guided and unguided, four seeds: seconds on two CPU cores",
             RunConfig(
-                ReachConfig(),
+                ReachConfig(mirrors=True),
                 Sizes(
                     q_layers=(64, 64),
                     feedback_layers=(64, 64),
@@ -297,19 +290,26 @@ TASK = Task(
                     batch_size=64,
                     replay_capacity=20_000,
                     optimizer="adam",
-                    fit_steps=200,
+                    fit_steps=600,
                     fit_batch_size=64,
                 ),
-                Scalars(learning_rate=0.003, discount=0.9, max_grad_norm=10.0, polyak=0.05, eps_deg=20.0),
+                Scalars(
+                    learning_rate=0.003,
+                    feedback_learning_rate=0.005,
+                    discount=0.9,
+                    max_grad_norm=10.0,
+                    polyak=0.05,
+                    eps_deg=40.0,
+                ),
                 Schedule(
-                    total_steps=4_000,
+                    total_steps=3_000,
                     random_steps=200,
                     learn_after=200,
-                    guidance_until=2_000,
+                    guidance_until=1_500,
                     eval_every=500,
                     eval_steps=8_000,
                     eval_envs=200,
-                    checkpoint_every=2_000,
+                    checkpoint_every=1_500,
                 ),
             ),
             guidance=("none", "relative"),

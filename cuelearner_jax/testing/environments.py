@@ -110,7 +110,8 @@ def _check_shapes(laws: Laws, env: Environment) -> None:
         given = (memory, action, step.aftermath)
         following = jax.eval_shape(lambda env, *given: env.recall_next(*given), env, *given)
         _vector(laws, following, "what `recall_next` gives", env.obs_size)
-    first, second = (_program(env, key) for _ in range(2))
+    with laws.attempted("tracing `reset` and `step`", mend):
+        first, second = (_program(env, key) for _ in range(2))
     laws.hold(
         first == second,
         "two traces give two programs: draw random numbers from the key alone, NumPy's and Python's are constants",

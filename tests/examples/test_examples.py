@@ -21,36 +21,12 @@ from cuelearner_jax.tasks import registry as tasks
 from cuelearner_jax.testing import check_environment, check_guidance, check_policy, check_task
 
 ROOT = Path(__file__).resolve().parents[2]
-TINY = [
-    "--sizes.q-layers",
-    "8",
-    "--sizes.feedback-layers",
-    "8",
-    "--sizes.directions",
-    "6",
-    "--sizes.target-directions",
-    "6",
-    "--sizes.fit-steps",
-    "20",
-    "--sizes.labels-per-round",
-    "5",
-    "--schedule.total-steps",
-    "40",
-    "--schedule.random-steps",
-    "10",
-    "--schedule.learn-after",
-    "10",
-    "--schedule.guidance-until",
-    "20",
-    "--schedule.eval-every",
-    "20",
-    "--schedule.eval-steps",
-    "40",
-    "--schedule.eval-envs",
-    "4",
-    "--schedule.checkpoint-every",
-    "40",
-]
+TINY = shlex.split("""
+    --sizes.q-layers 8 --sizes.feedback-layers 8 --sizes.directions 6 --sizes.target-directions 6 --sizes.fit-steps 20
+    --sizes.labels-per-round 5 --schedule.total-steps 40 --schedule.random-steps 10 --schedule.learn-after 10
+    --schedule.guidance-until 20 --schedule.eval-every 20 --schedule.eval-steps 40 --schedule.eval-envs 4
+    --schedule.checkpoint-every 40
+""")
 SMALL = {
     "train": [*TINY, "--labels", "5"],
     "sweep": [*TINY, "--labels", "5", "--seeds", "2"],
@@ -203,7 +179,7 @@ def test_the_skipper_makes_straight_for_the_buoy():
     jax = importlib.import_module("jax")
     for rudder in (0.0, 25.0):
         env = reach.make_environment(reach.ReachConfig(rudder_deg=rudder))
-        state, obs = env.reset(jax.random.key(3))
+        state, _ = env.reset(jax.random.key(3))
         line = np.asarray(state.buoy)
         for _ in range(5):
             state = env.moved(state, reach.Skipper(env).best_action(state, env.observe(state)))
