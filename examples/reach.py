@@ -24,7 +24,6 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jaxtyping import Array, Float, Int, PRNGKeyArray
-from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
@@ -201,14 +200,14 @@ def record(env: Reach, policy: Policy, key: PRNGKeyArray, steps: int) -> tuple[l
 
     states, actions, after, taken = jax.device_get(play(env, key))
     ends = np.where(taken.terminated, "reached", np.where(taken.truncated, "out of time", ""))
-    rows = zip(states.place, after, states.buoy, states.wind, actions, ends, strict=True)
-    return [Frame(*row[:-1], str(row[-1])) for row in rows], [float(reward) for reward in taken.reward]
+    rows = zip(states.place, after, states.buoy, states.wind, actions, map(str, ends), strict=True)
+    return [Frame(*row) for row in rows], [float(reward) for reward in taken.reward]
 
 
 def still(env: Reach, frames: list[Frame], file: Path) -> None:
     """The way of the first episode, and what was chosen on it."""
     last = next((number for number, frame in enumerate(frames) if frame.ended), len(frames) - 1)
-    _drawn(frames[: last + 1], "chosen").figure.savefig(file)
+    _drawn(frames[: last + 1], "chosen").savefig(file)
 
 
 def animate(env: Reach, frames: list[Frame], file: Path) -> None:
@@ -230,10 +229,10 @@ def question(env: Reach, state: Boat, obs: Float[Array, "4"], action: Float[Arra
     """The situation and the action in question, as a person is asked about it."""
     seen = jax.device_get(state)
     frame = Frame(seen.place, seen.place, seen.buoy, seen.wind, np.asarray(action), "")
-    _drawn([frame], "in question").figure.savefig(file)
+    _drawn([frame], "in question").savefig(file)
 
 
-def _drawn(way: list[Frame], arrow: str) -> Axes:
+def _drawn(way: list[Frame], arrow: str) -> Figure:
     """An episode's steps so far on the lake, the latest action as an arrow."""
     figure = Figure(figsize=(4.8, 4.8), dpi=100)
     FigureCanvasAgg(figure)
@@ -250,11 +249,11 @@ def _drawn(way: list[Frame], arrow: str) -> Axes:
     seconds, ended = PERIOD * len(way), latest.ended or "under way"
     told = f"{ended}, {seconds:.1f} s" if latest.after is not latest.place else "buoy: green, boat: blue"
     axes.text(0.0, -1.72, f"{told}; arrow: direction {arrow}", ha="center")
-    return axes
+    return figure
 
 
 def _pixels(way: list[Frame]) -> np.ndarray:
-    canvas: Any = _drawn(way, "chosen").figure.canvas
+    canvas: Any = _drawn(way, "chosen").canvas
     canvas.draw()
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
