@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Literal
 
+import jax
 import jax.numpy as jnp
 from brax import envs
 from jaxtyping import Array, Float
@@ -36,7 +37,8 @@ class PendulumConfig:
 @cache
 def _made(backend: str) -> envs.Env:
     """One object for each physics: it is a constant of what is compiled, and another one is compiled anew."""
-    return envs.get_environment("inverted_pendulum", backend=backend)
+    with jax.ensure_compile_time_eval():  # it holds arrays, and may be asked for while something is traced
+        return envs.get_environment("inverted_pendulum", backend=backend)
 
 
 def toward_the_lean(obs: Float[Array, " obs"]) -> Float[Array, "2"]:

@@ -131,6 +131,11 @@ class PolicySource:
             name = guidances.find(kind).name if ":" in kind else kind
             if name not in self.grid.guidance:
                 raise UserError(f"{self.folder} has no guidance {kind!r}: choose among {', '.join(self.grid.guidance)}")
+            if guidances.registered(name) is None:
+                raise UserError(
+                    f"{self.folder} has lanes of a guidance from outside, {name!r}: name its code by "
+                    "--guidance package.module:NAME, if you trust that code"
+                )
             group = LaneGroup(self.config, env, guidances.make(name, self.config.sizes, env), self.grid)
             policies, step = restore_policies(group, self.folder / name)
             loaded.append(Lanes(group.guidance, group.seeds, group.budgets, policies, step))

@@ -7,7 +7,7 @@ from typing import Any
 
 import jax
 
-from cuelearner_jax.config import RunConfig, check
+from cuelearner_jax.config import check
 from cuelearner_jax.environment import actions_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import SPLITS
@@ -99,7 +99,7 @@ def _check_teacher(laws: Laws, task: Task, config: Any) -> None:
     laws.actions(actions_of(env), action, "its teacher's best action")
 
 
-def _check_pictures(laws: Laws, task: Task, config: RunConfig, folder: Path) -> None:
+def _check_pictures(laws: Laws, task: Task, config: Any, folder: Path) -> None:
     """A film, a still and a question of a few random steps."""
     try:
         drawn = task.pictures()

@@ -21,36 +21,12 @@ from cuelearner_jax.tasks import registry as tasks
 from cuelearner_jax.testing import check_environment, check_guidance, check_policy, check_task
 
 ROOT = Path(__file__).resolve().parents[2]
-TINY = [
-    "--sizes.q-layers",
-    "8",
-    "--sizes.feedback-layers",
-    "8",
-    "--sizes.directions",
-    "6",
-    "--sizes.target-directions",
-    "6",
-    "--sizes.fit-steps",
-    "20",
-    "--sizes.labels-per-round",
-    "5",
-    "--schedule.total-steps",
-    "40",
-    "--schedule.random-steps",
-    "10",
-    "--schedule.learn-after",
-    "10",
-    "--schedule.guidance-until",
-    "20",
-    "--schedule.eval-every",
-    "20",
-    "--schedule.eval-steps",
-    "40",
-    "--schedule.eval-envs",
-    "4",
-    "--schedule.checkpoint-every",
-    "40",
-]
+TINY = shlex.split("""
+    --sizes.q-layers 8 --sizes.feedback-layers 8 --sizes.directions 6 --sizes.target-directions 6 --sizes.fit-steps 20
+    --sizes.labels-per-round 5 --schedule.total-steps 40 --schedule.random-steps 10 --schedule.learn-after 10
+    --schedule.guidance-until 20 --schedule.eval-every 20 --schedule.eval-steps 40 --schedule.eval-envs 4
+    --schedule.checkpoint-every 40
+""")
 SMALL = {
     "train": [*TINY, "--labels", "5"],
     "sweep": [*TINY, "--labels", "5", "--seeds", "2"],
