@@ -43,8 +43,9 @@ class TeacherState(struct.PyTreeNode):
 class TeacherProgram(NamedTuple):
     """Jitted functions."""
 
-    init: Callable[..., TeacherState]  # (env, key) -> state
-    train: Callable[..., tuple[TeacherState, dict[str, jax.Array]]]  # (env, state, rounds) -> state, metrics
+    init: Callable[[Any, PRNGKeyArray], TeacherState]  # (env, key) -> state
+    # (env, state, rounds) -> state, metrics
+    train: Callable[[Any, TeacherState, int], tuple[TeacherState, dict[str, jax.Array]]]
 
 
 def make_program(config: TeacherConfig) -> TeacherProgram:
