@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from jax.sharding import Mesh
+from jax.typing import ArrayLike
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from cuelearner_jax.devices import BY_LANE, SHARED, over_lanes, portions
@@ -69,13 +70,13 @@ class _Structure(NamedTuple):
     tree: Any
     by_lane: tuple[bool, ...]
 
-    def take_apart(self, policy: Any) -> tuple[list[Array], list[Array]]:
+    def take_apart(self, policy: Any) -> tuple[list[ArrayLike], list[ArrayLike]]:
         """(one for each lane, shared)"""
         leaves = jax.tree.leaves(policy)
         each = [leaf for leaf, own in zip(leaves, self.by_lane, strict=True) if own]
         return each, [leaf for leaf, own in zip(leaves, self.by_lane, strict=True) if not own]
 
-    def put_together(self, each: list[Array], shared: list[Array]) -> Any:
+    def put_together(self, each: list[ArrayLike], shared: list[ArrayLike]) -> Any:
         """The inverse, also of one lane's leaves."""
         own, common = iter(each), iter(shared)
         return jax.tree.unflatten(self.tree, [next(own if lane else common) for lane in self.by_lane])
@@ -98,7 +99,7 @@ def one_lane(policy: Policy, index: int) -> Any:
     """One lane's policy out of a block's."""
     structure = _structure(policy)
     each, shared = structure.take_apart(policy)
-    return structure.put_together([leaf[index] for leaf in each], shared)
+    return structure.put_together([jnp.asarray(leaf)[index] for leaf in each], shared)
 
 
 def evaluate_lanes(

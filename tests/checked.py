@@ -12,7 +12,7 @@ Function = TypeVar("Function", bound=Callable)
 PACKAGES = ["cuelearner_envs", "cuelearner_jax"]  # whose functions and methods are checked
 # Folders of tests in which an operand of a lower rank is filled up by NumPy's rule, and is an error elsewhere: brax and
 # MuJoCo's MJX rely on it.
-LOOSE_RANKS = ["envs/anymal", "brax_bridge"]
+LOOSE_RANKS = ["envs/anymal", "brax_bridge", "examples"]
 
 _conf = BeartypeConf(is_pep484_tower=True)  # an int is a float, as pyright has it
 

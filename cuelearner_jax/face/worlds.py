@@ -7,6 +7,7 @@ from functools import cached_property
 from typing import Any
 
 import jax
+import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from cuelearner_jax.actions import Actions
@@ -48,7 +49,9 @@ class World:
         """Starts an episode: (state, observation)."""
         return jax.jit(self.env.reset)(key)
 
-    def step(self, key: PRNGKeyArray, state: EnvState, action: Float[Array, " action"]) -> tuple[EnvState, Step]:
+    def step(
+        self, key: PRNGKeyArray, state: EnvState, action: Float[Array, " action"] | Float[np.ndarray, " action"]
+    ) -> tuple[EnvState, Step]:
         """Executes an action; a new episode begins by itself where one ends."""
         return jax.jit(self.env.step)(key, state, action)
 

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import optax
 from flax import struct
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Key, PRNGKeyArray
 
 from cuelearner_jax.config import GuideScalars, GuideSizes
 from cuelearner_jax.environment import Environment, random_symmetries
@@ -43,7 +43,7 @@ def _subset(valid: Bool[Array, " labels"]) -> Callable[[PRNGKeyArray, int], jax.
 
 def fit_least_squares(
     key: PRNGKeyArray,
-    env: Environment,
+    env: Environment | None,
     rows: Lesson,
     scalars: GuideScalars,
     *,
@@ -58,6 +58,7 @@ def fit_least_squares(
     the last parameters are kept.
 
     Args:
+        env: whose symmetries they are; None: there is none, and nothing multiplies them.
         rows: lessons (slots, ...), of which the valid ones count.
         init: parameters from a key.
         apply: (params, obs (n, obs), actions (n, action)) -> predictions (n, outputs).
@@ -92,7 +93,7 @@ def fit_least_squares(
         error = apply(params, rows.obs, rows.action) - rows.target
         return jnp.sum(jnp.sum(jnp.square(error), -1), where=validation)
 
-    def stretch(carry: tuple, keys: PRNGKeyArray) -> tuple[tuple, None]:
+    def stretch(carry: tuple, keys: Key[Array, " steps"]) -> tuple[tuple, None]:
         running, best, best_loss = carry
         running, _ = jax.lax.scan(step, running, keys)
         score = validate(running[0])

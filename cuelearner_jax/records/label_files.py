@@ -218,12 +218,9 @@ def _told(path: Path) -> tuple[pa.Table, dict[str, Any] | None]:
     """A file's table and what it says of itself, in whatever format; None: nothing."""
     table = tables.read(path, SCHEMA)
     try:
-        told = tables.about_of(table)
+        return table, tables.about_of(table)
     except ValueError as error:
         raise formats.damaged("labels", path) from error
-    if told is not None and not isinstance(told, dict):
-        raise formats.damaged("labels", path)
-    return table, told
 
 
 def _array(column: pa.ChunkedArray, name: str) -> np.ndarray:

@@ -19,7 +19,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any, Self
+from typing import IO, Any
 
 import numpy as np
 import pyarrow as pa
@@ -130,7 +130,7 @@ class TableWriter:
         """Closes the file; the table stays JSONL until `finish`."""
         self._file.close()
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> TableWriter:
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -223,9 +223,12 @@ def read(path: Path, schema: Schema) -> pa.Table:
 
 
 def about_of(table: pa.Table) -> Row | None:
-    """What a table says of itself. Raises ValueError if that is no JSON."""
+    """What a table says of itself. Raises ValueError if that is no JSON object."""
     told = (table.schema.metadata or {}).get(META)
-    return None if told is None else json.loads(told)
+    about = None if told is None else json.loads(told)
+    if not isinstance(about, dict | None):
+        raise ValueError(f"a table says of itself {about!r}, which is no JSON object")
+    return about
 
 
 def _described(table: pa.Table, about: Row) -> pa.Table:

@@ -94,7 +94,7 @@ def test_a_policy_of_a_run_acts_on_one_observation_and_on_many(tmp_path):
     np.testing.assert_allclose(np.linalg.norm(many, axis=-1), 1, atol=1e-6)
     np.testing.assert_array_equal(loaded(SEEN[0]), many[0])
     assert isinstance(loaded.policy, Agent)
-    np.testing.assert_array_equal(loaded.act(jax.random.key(0), None, SEEN), many)
+    np.testing.assert_array_equal(loaded.act(jax.random.key(0), None, jax.numpy.asarray(SEEN)), many)
     with pytest.raises(cl.UserError, match="no lane with seed 4"):
         cl.load_policy(folder, seed=4, task=TASK)
     with pytest.raises(cl.UserError, match=r"shape \(3,\): give \(2,\) or \(n, 2\)"):

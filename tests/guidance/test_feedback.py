@@ -176,7 +176,8 @@ def label_set(seed, noise=0.0, valid=ROWS, dtype=np.float32):
 
 
 def mean_error(model, labels, rows):
-    error = np.asarray(predict(model.params, labels.obs, labels.action)) - labels.target
+    found = predict(model.params, jnp.asarray(labels.obs), jnp.asarray(labels.action))
+    error = np.asarray(found) - labels.target
     return float(np.square(error).sum(-1)[rows].mean())
 
 

@@ -22,7 +22,7 @@ from cuelearner_jax.types import Label
 ENV = probes.Window()
 OBS = actions.evenly_spaced(6)
 BASE = actions.rotate(OBS, 0.3)
-ACTIVE = np.array([True, False, True, True, False, False])
+ACTIVE = jnp.array([True, False, True, True, False, False])
 
 
 def made(kind):

@@ -85,15 +85,15 @@ def test_a_task_from_outside_is_known_once_it_is_named(tmp_path):
 
 REFUSED = [
     ("own_here:TASKK", "own_here has no 'TASKK', did you mean 'TASK'?"),
-    ("own_here:NUMBER", "own_here:NUMBER is of type int: it must be a cuelearner_jax.task.Task"),
-    ("own_nowhere:TASK", "no module 'own_nowhere' for the task own_nowhere:TASK: run in the folder that holds it"),
-    ("own_here.part:TASK", "no module 'own_here.part' for the task"),
+    ("own_here:NUMBER", "own_here:NUMBER is of type int: a task is a cuelearner_jax.task.Task"),
+    ("own_nowhere:TASK", "no module 'own_nowhere' for own_nowhere:TASK: run in the folder that holds it"),
+    ("own_here.part:TASK", "no module 'own_here.part' for own_here.part:TASK"),
     ("own_broken:TASK", "own_broken fails to import (ZeroDivisionError: division by zero): mend it first"),
     ("own_poor:TASK", "own_poor fails to import (ModuleNotFoundError: No module named 'own_missing')"),
     ("own_leaving:TASK", "own_leaving fails to import (SystemExit: 3)"),
     ("own_taken:TASK", "there is a task 'billiards' already: give this one another name"),
-    ("own_here:", "names no task: give package.module:name"),
-    ("own here:TASK", "names no task: give package.module:name"),
+    ("own_here:", "does not name a task: give package.module:NAME"),
+    ("own here:TASK", "does not name a task: give package.module:NAME"),
     ("billards", "unknown task 'billards', did you mean 'billiards'?"),
 ]
 

@@ -8,7 +8,7 @@ from flax import struct
 from probes import Chain, Window
 
 from cuelearner_jax.actions import DIRECTIONS, rotate
-from cuelearner_jax.environment import Quantity
+from cuelearner_jax.environment import Quantity, WholeObservations
 from cuelearner_jax.testing import check_environment
 
 
@@ -41,6 +41,13 @@ class Listed(Window):
 
 class Unhashable(Window):
     table: np.ndarray = struct.field(pytree_node=False, default_factory=lambda: np.zeros(2))
+
+
+class Bare(WholeObservations):
+    """No pytree."""
+
+    observation = Window.observation
+    reset, step = Window.reset, Window.step
 
 
 class Branching(Window):
@@ -113,7 +120,7 @@ class Astray(Window):
 
 class Narrow(Window):
     def features(self, obs, action):
-        return (obs * action).sum()
+        return (jnp.broadcast_to(obs, action.shape) * action).sum()
 
 
 class Loose(Window):
@@ -146,7 +153,7 @@ BROKEN = {
     "no unit": (Unitless(), "lacks a name or a unit"),
     "no array": (Listed(), "field extra is of type str, which is not traced"),
     "no hash": (Unhashable(), "a static field must be hashable"),
-    "no pytree": (object(), "is no pytree"),
+    "no pytree": (Bare(), "is no pytree"),
     "an if": (Branching(), "with jnp.where and lax.cond in place of if"),
     "numpy's random numbers": (Outside(), "draw random numbers from the key alone"),
     "another state": (Longer(), "a state of other fields, shapes or types"),

@@ -4,7 +4,6 @@ import dataclasses
 
 import jax.numpy as jnp
 import pytest
-from flax import struct
 from probes import Chain, Window
 
 from cuelearner_jax.guidance import registry
@@ -105,8 +104,10 @@ def test_our_own_kinds_keep_the_laws(name):
 
 
 def test_what_a_kind_needs_must_be_there():
-    class Plain(struct.PyTreeNode):
+    class Plain(Window):
         """An environment of which nothing is obvious."""
+
+        heuristic = None
 
     with pytest.raises(AssertionError, match="it needs a heuristic, which Plain lacks"):
         check_guidance(registry.find("heuristic"), Plain(), SIZES)

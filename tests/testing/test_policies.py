@@ -67,6 +67,7 @@ class Bare:
     """No pytree."""
 
     axes = None
+    act = Turned.act
 
 
 BROKEN = {
