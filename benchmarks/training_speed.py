@@ -20,16 +20,17 @@ import jax
 import numpy as np
 from cartpole import CartPole
 
+from cuelearner_jax.bench.flops import step_operations
 from cuelearner_jax.bench.measuring import Timed, learning, matmul_rate
-from cuelearner_jax.bench.operations import step_operations
 from cuelearner_jax.config import RunConfig, Scalars, Schedule, Sizes
+from cuelearner_jax.environment import spaces_of
 
 BATCH, ENVS, DIRECTIONS = 256, 8, 2
 
 
 def measure(config: RunConfig, env: CartPole, seeds: int, steps: int, rounds: int) -> dict[str, float]:
     """Medians over rounds of one number of seeds."""
-    operations = step_operations(config.sizes, env.obs_size, config.bootstraps).total
+    operations = step_operations(config.sizes, spaces_of(env), config.bootstraps).total
     timed, shares, rates, peaks = Timed(config, env, "none", seeds), [], [], []
     for round_ in range(rounds + 1):
         peak = matmul_rate()

@@ -6,6 +6,7 @@ come from the lane's own key folded with the shared counters, so a lane's result
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -32,10 +33,14 @@ class Program(NamedTuple):
     The clock is not donated: blocks share it.
     """
 
-    init: Any  # (env, seeds (lanes,), budgets (lanes,), root key) -> TrainState
-    label_round: Any  # (env, teacher, scalars, clock, state) -> (clock, state)
-    take_labels: Any  # (env, scalars, labels (lanes, slots, ...), state) -> state: labels that were given elsewhere
-    train: Any  # (env, scalars, schedule, clock, state, iterations) -> (clock, state, metrics (lanes,))
+    # (env, seeds (lanes,), budgets (lanes,), root key) -> state
+    init: Callable[[Any, Array, Array, PRNGKeyArray], TrainState]
+    # (env, teacher, scalars, clock, state) -> clock, state
+    label_round: Callable[[Any, Teacher, Scalars, Clock, TrainState], tuple[Clock, TrainState]]
+    # (env, scalars, labels (lanes, slots, ...) that were given elsewhere, state) -> state
+    take_labels: Callable[[Any, Scalars, Label, TrainState], TrainState]
+    # (env, scalars, schedule, clock, state, iterations) -> clock, state, metrics (lanes,)
+    train: Callable[[Any, Scalars, Schedule, Clock, TrainState, int], tuple[Clock, TrainState, dict[str, Array]]]
 
 
 def start_clock() -> Clock:

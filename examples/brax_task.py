@@ -37,7 +37,7 @@ class PendulumConfig:
 @cache
 def _made(backend: str) -> envs.Env:
     """One object for each physics: it is a constant of what is compiled, and another one is compiled anew."""
-    with jax.ensure_compile_time_eval():  # what is kept must be arrays, also where a trace is the first to ask
+    with jax.ensure_compile_time_eval():  # it holds arrays, and may be asked for while something is traced
         return envs.get_environment("inverted_pendulum", backend=backend)
 
 

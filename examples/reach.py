@@ -24,14 +24,13 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jaxtyping import Array, Float, Int, PRNGKeyArray
-from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from cuelearner_envs import film
 from cuelearner_jax.actions import from_angle, retract, rotate
 from cuelearner_jax.config import RunConfig, Scalars, Schedule, Sizes
-from cuelearner_jax.environment import Environment, Quantity, WholeObservations
+from cuelearner_jax.environment import Quantity, WholeObservations
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.task import Body, Pictures, Preset, Scenario, Task
 from cuelearner_jax.types import Policy, Step
@@ -201,14 +200,14 @@ def record(env: Reach, policy: Policy, key: PRNGKeyArray, steps: int) -> tuple[l
 
     states, actions, after, taken = jax.device_get(play(env, key))
     ends = np.where(taken.terminated, "reached", np.where(taken.truncated, "out of time", ""))
-    rows = zip(states.place, after, states.buoy, states.wind, actions, ends, strict=True)
-    return [Frame(*row[:-1], str(row[-1])) for row in rows], [float(reward) for reward in taken.reward]
+    rows = zip(states.place, after, states.buoy, states.wind, actions, map(str, ends), strict=True)
+    return [Frame(*row) for row in rows], [float(reward) for reward in taken.reward]
 
 
 def still(env: Reach, frames: list[Frame], file: Path) -> None:
     """The way of the first episode, and what was chosen on it."""
     last = next((number for number, frame in enumerate(frames) if frame.ended), len(frames) - 1)
-    _drawn(frames[: last + 1], "chosen").figure.savefig(file)
+    _drawn(frames[: last + 1], "chosen").savefig(file)
 
 
 def animate(env: Reach, frames: list[Frame], file: Path) -> None:
@@ -230,10 +229,10 @@ def question(env: Reach, state: Boat, obs: Float[Array, "4"], action: Float[Arra
     """The situation and the action in question, as a person is asked about it."""
     seen = jax.device_get(state)
     frame = Frame(seen.place, seen.place, seen.buoy, seen.wind, np.asarray(action), "")
-    _drawn([frame], "in question").figure.savefig(file)
+    _drawn([frame], "in question").savefig(file)
 
 
-def _drawn(way: list[Frame], arrow: str) -> Axes:
+def _drawn(way: list[Frame], arrow: str) -> Figure:
     """An episode's steps so far on the lake, the latest action as an arrow."""
     figure = Figure(figsize=(4.8, 4.8), dpi=100)
     FigureCanvasAgg(figure)
@@ -250,23 +249,16 @@ def _drawn(way: list[Frame], arrow: str) -> Axes:
     seconds, ended = PERIOD * len(way), latest.ended or "under way"
     told = f"{ended}, {seconds:.1f} s" if latest.after is not latest.place else "buoy: green, boat: blue"
     axes.text(0.0, -1.72, f"{told}; arrow: direction {arrow}", ha="center")
-    return axes
+    return figure
 
 
 def _pixels(way: list[Frame]) -> np.ndarray:
-    canvas: Any = _drawn(way, "chosen").figure.canvas
+    canvas: Any = _drawn(way, "chosen").canvas
     canvas.draw()
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
 
 # ------------------------------------------------------------------------------------------------------ the task
-
-
-def _bodies() -> tuple[Body, ...]:
-    def environment(config: ReachConfig, split: str) -> Environment:
-        return make_environment(config, split)
-
-    return (Body("boat", "goes where it is sent, and with the wind", environment, pictures=_pictures),)
 
 
 def _pictures() -> Pictures:
@@ -277,7 +269,7 @@ TASK = Task(
     name="reach",
     about="reach a buoy in a cross wind",
     config=ReachConfig,
-    bodies=_bodies(),
+    bodies=(Body("boat", "goes where it is sent, and with the wind", make_environment, pictures=_pictures),),
     teacher=lambda config, env: Skipper(env),
     scenarios={
         "storm": Scenario("a wind that the boat barely makes way against", {"wind": 0.75}, bound_deg=60.0),
@@ -287,7 +279,7 @@ TASK = Task(
         "quickstart": Preset(
             "guided and unguided, four seeds: seconds on two CPU cores",
             RunConfig(
-                ReachConfig(),
+                ReachConfig(mirrors=True),
                 Sizes(
                     q_layers=(64, 64),
                     feedback_layers=(64, 64),
@@ -297,19 +289,26 @@ TASK = Task(
                     batch_size=64,
                     replay_capacity=20_000,
                     optimizer="adam",
-                    fit_steps=200,
+                    fit_steps=600,
                     fit_batch_size=64,
                 ),
-                Scalars(learning_rate=0.003, discount=0.9, max_grad_norm=10.0, polyak=0.05, eps_deg=20.0),
+                Scalars(
+                    learning_rate=0.003,
+                    feedback_learning_rate=0.005,
+                    discount=0.9,
+                    max_grad_norm=10.0,
+                    polyak=0.05,
+                    eps_deg=40.0,
+                ),
                 Schedule(
-                    total_steps=4_000,
+                    total_steps=3_000,
                     random_steps=200,
                     learn_after=200,
-                    guidance_until=2_000,
+                    guidance_until=1_500,
                     eval_every=500,
                     eval_steps=8_000,
                     eval_envs=200,
-                    checkpoint_every=2_000,
+                    checkpoint_every=1_500,
                 ),
             ),
             guidance=("none", "relative"),

@@ -8,8 +8,10 @@ import pytest
 from checked import LOOSE_RANKS, PACKAGES
 from jaxtyping import install_import_hook
 
+TESTS = Path(__file__).resolve().parent
+
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
-os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(__file__).resolve().parents[1] / ".jax_cache"))
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(TESTS.parent / ".jax_cache"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.2")
 # Compiling is most of what the tests take: a third of it with LLVM's first level and XLA's former emitters, and what
 # they assert holds with any.
@@ -26,6 +28,27 @@ def strict_ranks(request):
     """Raises at implicit rank promotion, but in the tests of `LOOSE_RANKS`."""
     import jax  # reads the settings above
 
-    folder = request.path.parent.relative_to(Path(__file__).resolve().parent).as_posix()
+    folder = request.path.parent.relative_to(TESTS).as_posix()
     with jax.numpy_rank_promotion("allow" if folder in LOOSE_RANKS else "raise"):
         yield
+
+
+# What `make test-quick` leaves out: files and folders with a compile of more than a few seconds, or with processes of
+# their own to wait for.
+SLOW = (
+    *("bench", "brax_bridge", "cli", "envs/anymal", "examples", "face", "teachers", "testing"),
+    *("agent/test_choice.py", "agent/test_n_step.py", "records/test_checkpoint.py", "tasks/test_registry.py"),
+    *("runs/test_given_labels.py", "runs/test_lanes.py", "runs/test_resume.py", "runs/test_runs.py"),
+    *("envs/billiards/test_environment.py", "envs/billiards/test_mirrors.py", "envs/billiards/test_parity.py"),
+    *("envs/billiards/test_teacher.py", "envs/navigation/test_drawing.py", "envs/navigation/test_environment.py"),
+    *("envs/navigation/test_episodes.py", "envs/navigation/test_roadmap.py", "envs/navigation/test_worlds.py"),
+    *("test_asking.py", "test_devices.py", "test_environment.py", "test_loop.py", "test_policies.py"),
+)
+
+
+def pytest_collection_modifyitems(items):
+    """Marks the tests of `SLOW`."""
+    folders = [TESTS / name for name in SLOW]
+    for item in items:
+        if any(folder in (item.path, *item.path.parents) for folder in folders):
+            item.add_marker(pytest.mark.slow)

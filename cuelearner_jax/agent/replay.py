@@ -32,10 +32,12 @@ class RingBuffer(NamedTuple):
 
     width: int
     empty: Callable[[int], Float[Array, "capacity width"]]
-    add: Callable[..., Float[Array, "capacity width"]]  # (rows, step, steps (n, ...)) -> rows
-    draw: Callable[..., Int[Array, " batch"]]  # (key, rows, step, batch_size) -> rows' numbers
-    read: Callable[..., StoredStep]  # (rows, numbers (batch,)) -> steps (batch, ...)
-    follow: Callable[..., Following]  # (rows, step, numbers (batch,), n, num_envs) -> Following
+    add: Callable[[Array, Array, StoredStep], Array]  # (rows, step, steps (n, ...)) -> rows
+    draw: Callable[[PRNGKeyArray, Array, Array, int], Array]  # (key, rows, step, batch_size) -> rows' numbers
+    read: Callable[[Array, Array], StoredStep]  # (rows, numbers (batch,)) -> steps (batch, ...)
+    follow: Callable[
+        [Array, Array, Array, int, int], Following
+    ]  # (rows, step, numbers (batch,), n, num_envs) -> Following
 
 
 @jax.custom_batching.custom_vmap

@@ -26,10 +26,10 @@ from jax.sharding import Mesh
 
 from cuelearner_jax import config as configuration
 from cuelearner_jax.bench import known_machines as machines
-from cuelearner_jax.bench.operations import step_operations
+from cuelearner_jax.bench.flops import step_operations
 from cuelearner_jax.config import RunConfig
 from cuelearner_jax.devices import SHARED, lane_mesh, place
-from cuelearner_jax.environment import Environment
+from cuelearner_jax.environment import Environment, Spaces, spaces_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guidance import registry as guidances
 from cuelearner_jax.loop import start_clock
@@ -135,11 +135,11 @@ def matmul_rate(dtype: str = "float32", repeats: int = 5) -> float:
     return queued * 2 * size**3 / best
 
 
-def iterations_of(config: RunConfig, obs_size: int, seeds: int) -> int:
+def iterations_of(config: RunConfig, spaces: Spaces, seeds: int) -> int:
     """Iterations of one stretch: a power of two that depends on the work alone, so that programs are found compiled."""
     sizes = config.sizes
     rate = NOMINAL_RATE["cpu" if jax.default_backend() == "cpu" else "accelerator"]
-    one = seeds * sizes.num_envs * step_operations(sizes, obs_size, config.bootstraps).total / rate
+    one = seeds * sizes.num_envs * step_operations(sizes, spaces, config.bootstraps).total / rate
     most = min(STRETCH_S / one, LONGEST_STRETCH / sizes.num_envs)
     return 2 ** max(0, math.floor(math.log2(most)))
 
@@ -154,7 +154,7 @@ def measure(
     began = time.perf_counter()
     env = work.task.environment(config.task)
     timed = Timed(config, env, "none", seeds, mesh=mesh)
-    iterations = iterations_of(config, env.obs_size, seeds)
+    iterations = iterations_of(config, spaces_of(env), seeds)
     timed.train(iterations)
     first = time.perf_counter() - began
     at_rest = sum(state_bytes(block) for block in timed.blocks)
@@ -166,7 +166,7 @@ def measure(
     rates = {name: max(rate, rates[name]) for name, rate in _rates().items()}
     iteration = statistics.median(stretches) / iterations
     steps = seeds * sizes.num_envs / iteration
-    flops = steps * step_operations(sizes, env.obs_size, config.bootstraps).total
+    flops = steps * step_operations(sizes, spaces_of(env), config.bootstraps).total
     working = mesh.size if jax.default_backend() != "cpu" else 1  # CPU devices share the cores
     memory = jax.local_devices()[0].memory_stats() or {}
     return {

@@ -11,8 +11,8 @@ import tyro
 
 from cuelearner_jax.bench import known_machines, measuring
 from cuelearner_jax.bench.measuring import Measuring
-from cuelearner_jax.cli.arguments import out, parse, preset_of, task_of
-from cuelearner_jax.cli.options import Flag, TaskT
+from cuelearner_jax.cli.parsing import out, parse, preset_of, task_of
+from cuelearner_jax.cli.shared_options import Flag, TaskT
 from cuelearner_jax.config import RunConfig
 from cuelearner_jax.tasks import registry
 

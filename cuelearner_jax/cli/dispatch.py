@@ -16,7 +16,7 @@ from types import ModuleType
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
 
 from cuelearner_jax import __version__
-from cuelearner_jax.cli.arguments import HELP, summary
+from cuelearner_jax.cli.parsing import HELP, summary
 from cuelearner_jax.errors import UserError, closest, no_space
 from cuelearner_jax.runs.cluster import JobsFailed
 from cuelearner_jax.tasks import registry

@@ -8,8 +8,8 @@ from typing import Generic
 
 from rich.table import Table
 
-from cuelearner_jax.cli.arguments import about, out, parse, source_of, world_of
-from cuelearner_jax.cli.options import TaskT
+from cuelearner_jax.cli.parsing import about, out, parse, source_of, world_of
+from cuelearner_jax.cli.shared_options import TaskT
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.runs import trained
 

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Generic
 
-from cuelearner_jax.cli.arguments import about, out, parse, source_of, world_of
-from cuelearner_jax.cli.options import Flag, TaskT
+from cuelearner_jax.cli.parsing import about, out, parse, source_of, world_of
+from cuelearner_jax.cli.shared_options import Flag, TaskT
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.runs import filming, trained
 

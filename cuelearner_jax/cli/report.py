@@ -8,8 +8,8 @@ from pathlib import Path
 
 import tyro
 
-from cuelearner_jax.cli.arguments import out, parse
-from cuelearner_jax.cli.options import Flag
+from cuelearner_jax.cli.parsing import out, parse
+from cuelearner_jax.cli.shared_options import Flag
 
 
 @dataclass(frozen=True)

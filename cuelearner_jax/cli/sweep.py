@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Generic, Literal
 
-from cuelearner_jax.cli.arguments import about, out, parse, preset_of, task_of
-from cuelearner_jax.cli.options import TaskT, Training, preset_kinds
+from cuelearner_jax.cli.parsing import about, out, parse, preset_of, task_of
+from cuelearner_jax.cli.shared_options import TaskT, Training, preset_kinds
 from cuelearner_jax.runs import submission, sweep
 from cuelearner_jax.runs.cluster import Job
 from cuelearner_jax.runs.grid import Grid

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Generic
 
-from cuelearner_jax.cli.arguments import HELP, out, parse, preset_of, summary, task_of
-from cuelearner_jax.cli.options import Flag, TaskT
+from cuelearner_jax.cli.parsing import HELP, out, parse, preset_of, summary, task_of
+from cuelearner_jax.cli.shared_options import Flag, TaskT
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.teachers import training
 from cuelearner_jax.teachers.learned import TeacherConfig

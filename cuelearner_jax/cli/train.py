@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Generic
 
-from cuelearner_jax.cli.arguments import about, out, parse, preset_of, task_of
-from cuelearner_jax.cli.options import TaskT, Training, asking_kind, preset_kinds
+from cuelearner_jax.cli.parsing import about, out, parse, preset_of, task_of
+from cuelearner_jax.cli.shared_options import TaskT, Training, asking_kind, preset_kinds
 from cuelearner_jax.runs import sweep
 from cuelearner_jax.runs.grid import Grid
 

@@ -75,6 +75,7 @@ class Named(NamedTuple):
     make: Callable[[Parts], Policy]
     trained: bool = False  # does it need a run?
     taught: bool = False  # does it ask the teacher?
+    needs: tuple[str, ...] = ()  # optional members of an environment without which there is none
 
 
 POLICIES: dict[str, Named] = {
@@ -88,7 +89,7 @@ POLICIES: dict[str, Named] = {
         taught=True,
     ),
     "teacher": Named("the teacher", lambda parts: parts.taught(), taught=True),
-    "heuristic": Named("the task's obvious action", lambda parts: Heuristic(parts.env)),
+    "heuristic": Named("the task's obvious action", lambda parts: Heuristic(parts.env), needs=("heuristic",)),
     "uniform": Named("chance", lambda parts: Uniform(actions_of(parts.env))),
 }
 
@@ -114,8 +115,9 @@ class PolicySource:
             untrained = ", ".join(name for name, named in POLICIES.items() if not named.trained)
             raise UserError(f"policy {policy!r} needs a trained run: give a run folder, or one of {untrained}")
         before, after = (shape_of(self.task, world) for world in (self.config.task, changed))
-        if policy == "heuristic" and not offers(after, "heuristic"):
-            raise UserError(f"{self.task.name} has no heuristic: choose another policy")
+        for need in POLICIES[policy].needs:
+            if not offers(after, need):
+                raise UserError(f"{self.task.name} has no {need}: choose another policy")
         if before.obs_size != after.obs_size:
             raise UserError(
                 f"the run's observations have {before.obs_size} entries, this world's {after.obs_size}: "
@@ -131,6 +133,11 @@ class PolicySource:
             name = guidances.find(kind).name if ":" in kind else kind
             if name not in self.grid.guidance:
                 raise UserError(f"{self.folder} has no guidance {kind!r}: choose among {', '.join(self.grid.guidance)}")
+            if guidances.registered(name) is None:
+                raise UserError(
+                    f"{self.folder} has lanes of a guidance from outside, {name!r}: name its code by "
+                    "--guidance package.module:NAME, if you trust that code"
+                )
             group = LaneGroup(self.config, env, guidances.make(name, self.config.sizes, env), self.grid)
             policies, step = restore_policies(group, self.folder / name)
             loaded.append(Lanes(group.guidance, group.seeds, group.budgets, policies, step))

@@ -12,7 +12,7 @@ from cuelearner_envs.billiards.config import BilliardsConfig, make_environment
 from cuelearner_envs.billiards.teacher import SearchTeacher
 from cuelearner_jax.config import RunConfig, Scalars, Schedule, Sizes
 from cuelearner_jax.task import Body, Pictures, Preset, Scenario, Task
-from cuelearner_jax.teachers import learned
+from cuelearner_jax.teachers import stored
 from cuelearner_jax.types import Teacher
 
 SHIPPED_TEACHERS = Path(billiards.__file__).parent / "teachers"
@@ -24,7 +24,7 @@ def make_teacher(config: BilliardsConfig, env: Any) -> Teacher:
     habit = jnp.array(config.habit, jnp.float32)
     if config.teacher == "search":
         return SearchTeacher(env, aim_error, habit, config.search_directions)
-    return learned.load(SHIPPED_TEACHERS / config.table, env, aim_error, habit)
+    return stored.load(SHIPPED_TEACHERS / config.table, env, aim_error, habit)
 
 
 def _pictures() -> Pictures:

@@ -20,8 +20,9 @@ from cuelearner_jax.records.folders import check_folder, in_use, prepare_folder
 from cuelearner_jax.records.formats import FORMATS
 from cuelearner_jax.records.provenance import provenance
 from cuelearner_jax.task import Task
-from cuelearner_jax.teachers import learned as teacher
+from cuelearner_jax.teachers import stored
 from cuelearner_jax.teachers.learned import LearnedTeacher, TeacherConfig
+from cuelearner_jax.teachers.program import TeacherProgram, finished, make_program
 from cuelearner_jax.terminal import Interrupted, interruptible, progress_bars
 
 ROUNDS_A_STRETCH = 50  # in one jitted call
@@ -72,11 +73,11 @@ def train(
     if resume:
         check_folder(out, asked, resume=True, overwrite=False)
     prepare_folder(out, asked, clean=False)
-    history = _learn(teacher.make_program(config), env, config, out, seed)
+    history = _learn(make_program(config), env, config, out, seed)
     with checkpoints(out / TRAINING, read_only=True) as saved:
-        shapes = jax.eval_shape(teacher.make_program(config).init, env, jax.random.key(seed))
+        shapes = jax.eval_shape(make_program(config).init, env, jax.random.key(seed))
         state = saved.restore({"state": shapes})["state"]
-    made = teacher.finished(config, env, state)
+    made = finished(config, env, state)
     reward = validate(made, env, eval_steps)
     about = {
         **described,
@@ -87,14 +88,14 @@ def train(
         "command": command,
         "history": {"columns": ["round", "wall_s", "reward", "loss"], "rows": history[:: max(1, len(history) // 50)]},
     }
-    teacher.save(out, made, about)
+    stored.save(out, made, about)
     shutil.rmtree(out / TRAINING)
     (out / HISTORY).unlink()
     (out / "config.json").unlink()
     return reward
 
 
-def _learn(program: teacher.TeacherProgram, env: Any, config: TeacherConfig, out: Path, seed: int) -> list[list[float]]:
+def _learn(program: TeacherProgram, env: Any, config: TeacherConfig, out: Path, seed: int) -> list[list[float]]:
     """All rounds, from wherever the folder's newest checkpoint is. Returns (round, wall_s, reward, loss) a stretch."""
     file = out / HISTORY
     with checkpoints(out / TRAINING) as saved, interruptible() as stopping, progress_bars() as bars:

@@ -110,7 +110,8 @@ def _check_shapes(laws: Laws, env: Environment) -> None:
         given = (memory, action, step.aftermath)
         following = jax.eval_shape(lambda env, *given: env.recall_next(*given), env, *given)
         _vector(laws, following, "what `recall_next` gives", env.obs_size)
-    first, second = (_program(env, key) for _ in range(2))
+    with laws.attempted("tracing `reset` and `step`", mend):
+        first, second = (_program(env, key) for _ in range(2))
     laws.hold(
         first == second,
         "two traces give two programs: draw random numbers from the key alone, NumPy's and Python's are constants",
@@ -287,6 +288,6 @@ def _check_mirrors(laws: Laws, walk: Walk, images: Any, other: Any, combined: An
         laws.hold(back, f"no symmetry undoes `mirror` {number}: add its inverse, or mend its observation")
 
 
-def _first(rows: Array | np.ndarray) -> int:
+def _first(rows: Any) -> int:
     """The first of the rows in which something is true."""
-    return int(np.argmax(rows.reshape(len(rows), -1).any(-1)))
+    return int(np.argmax(np.asarray(rows).reshape(len(rows), -1).any(-1)))

@@ -16,7 +16,7 @@ ARGUMENTS = [
     ([*QUICK, "--seedz", "3"], "perhaps you meant --seeds"),
     ([*QUICK, "--seeds", "three"], "--seeds"),
     ([*QUICK, "--task.table", "snooker"], "'one_ball', 'easy', 'regulation'"),
-    ([*QUICK, "--guidance", "relativ"], "choose among none, relative, heuristic"),
+    ([*QUICK, "--guidance", "relativ"], "unknown guidance 'relativ', did you mean 'relative'"),
     ([*QUICK, "--guidance", "none", "none"], "give each kind once"),
     ([*QUICK, "--labels", "0"], "teaches nothing"),
     ([*QUICK, "--labels", "10", "10"], "give each budget once"),

@@ -21,36 +21,12 @@ from cuelearner_jax.tasks import registry as tasks
 from cuelearner_jax.testing import check_environment, check_guidance, check_policy, check_task
 
 ROOT = Path(__file__).resolve().parents[2]
-TINY = [
-    "--sizes.q-layers",
-    "8",
-    "--sizes.feedback-layers",
-    "8",
-    "--sizes.directions",
-    "6",
-    "--sizes.target-directions",
-    "6",
-    "--sizes.fit-steps",
-    "20",
-    "--sizes.labels-per-round",
-    "5",
-    "--schedule.total-steps",
-    "40",
-    "--schedule.random-steps",
-    "10",
-    "--schedule.learn-after",
-    "10",
-    "--schedule.guidance-until",
-    "20",
-    "--schedule.eval-every",
-    "20",
-    "--schedule.eval-steps",
-    "40",
-    "--schedule.eval-envs",
-    "4",
-    "--schedule.checkpoint-every",
-    "40",
-]
+TINY = shlex.split("""
+    --sizes.q-layers 8 --sizes.feedback-layers 8 --sizes.directions 6 --sizes.target-directions 6 --sizes.fit-steps 20
+    --sizes.labels-per-round 5 --schedule.total-steps 40 --schedule.random-steps 10 --schedule.learn-after 10
+    --schedule.guidance-until 20 --schedule.eval-every 20 --schedule.eval-steps 40 --schedule.eval-envs 4
+    --schedule.checkpoint-every 40
+""")
 SMALL = {
     "train": [*TINY, "--labels", "5"],
     "sweep": [*TINY, "--labels", "5", "--seeds", "2"],
@@ -221,3 +197,26 @@ def test_policies_of_ones_own_reach_the_buoy(tmp_path, capsys):
     for name in ("leaning.gif", "leaning.png"):
         assert (tmp_path / name).stat().st_size > 1000
     assert "wrote" in capsys.readouterr().out
+
+
+def test_a_kind_of_ones_own_that_asks_needs_labels(tmp_path, capsys):
+    command = [
+        "sweep",
+        "examples.reach:TASK",
+        *TINY,
+        "--guidance",
+        "examples.clone:KIND",
+        "--out",
+        str(tmp_path / "run"),
+    ]
+    assert main([*command, "--labels", "0"]) == 2
+    assert "a label budget of 0 teaches nothing" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
+
+
+def test_any_function_is_corrected(capsys):
+    from examples.correct_a_policy import main as correct
+
+    rates = correct(worlds=4, labels=10, episodes_measured=4)
+    assert [line.split(":")[0] for line in capsys.readouterr().out.splitlines()] == ["compass", "refined"]
+    assert all(rate in (0.0, 0.25, 0.5, 0.75, 1.0) for rate in rates)

@@ -14,7 +14,8 @@ from cuelearner_jax.config import to_json
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import rollout
 from cuelearner_jax.policies import Taught
-from cuelearner_jax.teachers import learned as teacher
+from cuelearner_jax.teachers import program as training_program
+from cuelearner_jax.teachers import stored
 from cuelearner_jax.teachers.learned import TeacherConfig
 
 ENV = probes.Window(mirrors=True)
@@ -36,7 +37,7 @@ OBS = actions.evenly_spaced(4)
 
 @pytest.fixture(scope="module")
 def program():
-    return teacher.make_program(CONFIG)
+    return training_program.make_program(CONFIG)
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +52,7 @@ def trained(program):
 
 @pytest.fixture(scope="module")
 def made(trained):
-    return teacher.finished(CONFIG, ENV, trained[0])
+    return training_program.finished(CONFIG, ENV, trained[0])
 
 
 def test_it_learns_to_win_nearly_always(made, trained):
@@ -77,7 +78,7 @@ def test_an_imperfect_aim_goes_to_the_middle_of_the_window(made):
 
 
 def test_tries_come_first_from_the_best_and_last_from_anywhere(program):
-    training = teacher._Training(CONFIG)
+    training = training_program.Trainer(CONFIG)
     state = program.init(ENV, jax.random.key(1))
     keys = jax.random.split(jax.random.key(2), 500)
     tried = jax.jit(jax.vmap(lambda key: training.propose(ENV, state.params, OBS[0], key)))(keys)
@@ -97,8 +98,8 @@ def test_two_seeds_differ_and_one_seed_repeats(program):
 
 
 def test_it_comes_back_from_disk_in_half_precision(made, tmp_path):
-    teacher.save(tmp_path / "made", made, {"config": to_json(CONFIG)})
-    loaded = teacher.load(tmp_path / "made", ENV, 0.2, 0.1)
+    stored.save(tmp_path / "made", made, {"config": to_json(CONFIG)})
+    loaded = stored.load(tmp_path / "made", ENV, 0.2, 0.1)
     for mine, yours in zip(jax.tree.leaves(loaded.params), jax.tree.leaves(made.params), strict=True):
         assert mine.dtype == jnp.float32
         np.testing.assert_array_equal(mine, np.asarray(yours).astype(np.float16).astype(np.float32))
@@ -108,38 +109,38 @@ def test_it_comes_back_from_disk_in_half_precision(made, tmp_path):
 
 
 def test_saving_again_replaces_the_network(made, tmp_path):
-    teacher.save(tmp_path, made, {"config": to_json(CONFIG)})
+    stored.save(tmp_path, made, {"config": to_json(CONFIG)})
     other = made.replace(params=jax.tree.map(lambda leaf: 2 * leaf, made.params))
-    teacher.save(tmp_path, other, {"config": to_json(CONFIG)})
-    weights = jax.tree.leaves(teacher.load(tmp_path, ENV, 0.0, 0.0).params)[1]
+    stored.save(tmp_path, other, {"config": to_json(CONFIG)})
+    weights = jax.tree.leaves(stored.load(tmp_path, ENV, 0.0, 0.0).params)[1]
     np.testing.assert_allclose(weights, 2 * jax.tree.leaves(made.params)[1], rtol=2e-3)
 
 
 def test_its_description_has_a_format_and_a_newer_one_is_refused(made, tmp_path):
-    teacher.save(tmp_path, made, {"config": to_json(CONFIG)})
+    stored.save(tmp_path, made, {"config": to_json(CONFIG)})
     assert json.loads((tmp_path / "teacher.json").read_text()) == {"format": 1, "config": to_json(CONFIG)}
     probes.edit_json(tmp_path / "teacher.json", lambda about: about.pop("format"))
-    assert teacher.load(tmp_path, ENV, 0.0, 0.0).layers == CONFIG.layers
+    assert stored.load(tmp_path, ENV, 0.0, 0.0).layers == CONFIG.layers
     probes.edit_json(tmp_path / "teacher.json", lambda about: about.update(format=2))
     with pytest.raises(UserError, match="written by a newer cuelearner"):
-        teacher.load(tmp_path, ENV, 0.0, 0.0)
+        stored.load(tmp_path, ENV, 0.0, 0.0)
 
 
 def test_a_folder_without_a_teacher_is_refused(tmp_path):
     with pytest.raises(UserError, match="no teacher"):
-        teacher.load(tmp_path, ENV, 0.0, 0.0)
+        stored.load(tmp_path, ENV, 0.0, 0.0)
 
 
 def test_a_teacher_of_another_task_is_refused(made, tmp_path):
-    teacher.save(tmp_path, made, {"config": to_json(CONFIG)})
+    stored.save(tmp_path, made, {"config": to_json(CONFIG)})
     probes.edit_json(tmp_path / "teacher.json", lambda about: about["config"].update(layers=[32]))
     with pytest.raises(UserError, match="another program"):
-        teacher.load(tmp_path, ENV, 0.0, 0.0)
+        stored.load(tmp_path, ENV, 0.0, 0.0)
 
 
 @pytest.mark.parametrize("text", ["{", "[]", "{}", json.dumps({"config": 3})])
 def test_a_damaged_description_is_refused(made, tmp_path, text):
-    teacher.save(tmp_path, made, {"config": to_json(CONFIG)})
+    stored.save(tmp_path, made, {"config": to_json(CONFIG)})
     (tmp_path / "teacher.json").write_text(text)
     with pytest.raises(UserError, match="damaged"):
-        teacher.load(tmp_path, ENV, 0.0, 0.0)
+        stored.load(tmp_path, ENV, 0.0, 0.0)

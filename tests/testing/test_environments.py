@@ -203,3 +203,27 @@ def test_the_probes_keep_the_laws(env):
 def test_a_short_roll_out_says_that_it_met_no_end():
     with pytest.raises(AssertionError, match="no episode ends within 1 steps: give the check more steps"):
         check_environment(Chain(), steps=1)
+
+
+@jax.tree_util.register_pytree_node_class
+class Labelled:
+    """The bandit in a pytree whose static part follows from a value: each value is another program."""
+
+    def __init__(self, window):
+        self.window = window
+        self.label = str(getattr(window, "half_width", ""))
+
+    def __getattr__(self, name):
+        return getattr(self.window, name)
+
+    def tree_flatten(self):
+        return (self.window,), self.label
+
+    @classmethod
+    def tree_unflatten(cls, label, children):
+        return cls(*children)
+
+
+def test_values_that_compile_anew_are_found():
+    with pytest.raises(AssertionError, match="other values of its floats are traced anew"):
+        check_environment(Labelled(Window(jnp.float32(0.5))))

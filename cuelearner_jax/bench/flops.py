@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 from cuelearner_jax.agent.choice import looked_at
 from cuelearner_jax.config import Sizes
+from cuelearner_jax.environment import Spaces
 
 
 class Operations(NamedTuple):
@@ -28,38 +29,38 @@ class Operations(NamedTuple):
         return sum(self)
 
 
-def step_operations(sizes: Sizes, obs_size: int, bootstraps: bool) -> Operations:
+def step_operations(sizes: Sizes, spaces: Spaces, bootstraps: bool) -> Operations:
     """Operations of one environment step.
 
     Args:
         sizes: layers, directions, batch, n-step returns and gradient steps a step are taken from here.
-        obs_size: length of an observation.
+        spaces: of the environment.
         bootstraps: whether targets look at the next observation.
     """
     rows = sizes.batch_size * (2 if sizes.n_step > 1 else 1) if bootstraps else 0
-    target = forward(sizes.q_layers, obs_size, sizes.target_directions) + forward(sizes.q_layers, obs_size, 1)
+    target = forward(sizes.q_layers, spaces, sizes.target_directions) + forward(sizes.q_layers, spaces, 1)
     return Operations(
-        acting=forward(sizes.q_layers, obs_size, looked_at(sizes)),
-        gradient=sizes.updates_per_step * sizes.batch_size * forward_and_backward(sizes.q_layers, obs_size),
+        acting=forward(sizes.q_layers, spaces, looked_at(sizes)),
+        gradient=sizes.updates_per_step * sizes.batch_size * forward_and_backward(sizes.q_layers, spaces),
         targets=sizes.updates_per_step * rows * target,
     )
 
 
-def forward(layers: Sequence[int], obs_size: int, actions: int) -> int:
+def forward(layers: Sequence[int], spaces: Spaces, actions: int) -> int:
     """Values of so many actions in one state. The observation's share of the first layer is computed once a state."""
-    first, later = _weights(layers)
-    return 2 * (obs_size * layers[0] + actions * (first + later))
+    first, later = _weights(layers, spaces)
+    return 2 * (spaces.obs_size * layers[0] + actions * (first + later))
 
 
-def forward_and_backward(layers: Sequence[int], obs_size: int) -> int:
+def forward_and_backward(layers: Sequence[int], spaces: Spaces) -> int:
     """The value of one action and its gradient: 2 a weight forward, 4 backward (gradients of weights and of inputs).
 
     Nobody asks for the gradient of the first layer's inputs.
     """
-    first, later = _weights(layers)
-    return 4 * (obs_size * layers[0] + first) + 6 * later
+    first, later = _weights(layers, spaces)
+    return 4 * (spaces.obs_size * layers[0] + first) + 6 * later
 
 
-def _weights(layers: Sequence[int]) -> tuple[int, int]:
-    """Weights from the two numbers of an action to the first layer, and of all later layers with the output."""
-    return 2 * layers[0], sum(a * b for a, b in pairwise([*layers, 1]))
+def _weights(layers: Sequence[int], spaces: Spaces) -> tuple[int, int]:
+    """Weights from the entries of an action to the first layer, and of all later layers with the output."""
+    return spaces.actions.size * layers[0], sum(a * b for a, b in pairwise([*layers, 1]))
