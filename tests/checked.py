@@ -10,7 +10,7 @@ from beartype import BeartypeConf, beartype
 Function = TypeVar("Function", bound=Callable)
 
 PACKAGES = ["cuelearner_envs", "cuelearner_jax"]  # whose functions and methods are checked
-# Folders of tests in which an operand of a lower rank is filled up by NumPy's rule, and is an error elsewhere: brax and
+# Folders and files of tests in which an operand of a lower rank is filled up by NumPy's rule, and is an error elsewhere: brax and
 # MuJoCo's MJX rely on it.
 LOOSE_RANKS = ["envs/anymal", "brax_bridge", "examples"]
 

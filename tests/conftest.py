@@ -23,13 +23,17 @@ os.environ["XLA_FLAGS"] = " ".join([*flags, os.environ.get("XLA_FLAGS", "")]).st
 install_import_hook(PACKAGES, "checked.checked")  # before anything of them is imported
 
 
+def lies_in(path, places):
+    """Is a file one of these files, or in one of these folders of tests?"""
+    return any(TESTS / place in (path, *path.parents) for place in places)
+
+
 @pytest.fixture(scope="module", autouse=True)
 def strict_ranks(request):
     """Raises at implicit rank promotion, but in the tests of `LOOSE_RANKS`."""
     import jax  # reads the settings above
 
-    folder = request.path.parent.relative_to(TESTS).as_posix()
-    with jax.numpy_rank_promotion("allow" if folder in LOOSE_RANKS else "raise"):
+    with jax.numpy_rank_promotion("allow" if lies_in(request.path, LOOSE_RANKS) else "raise"):
         yield
 
 
@@ -48,7 +52,6 @@ SLOW = (
 
 def pytest_collection_modifyitems(items):
     """Marks the tests of `SLOW`."""
-    folders = [TESTS / name for name in SLOW]
     for item in items:
-        if any(folder in (item.path, *item.path.parents) for folder in folders):
+        if lies_in(item.path, SLOW):
             item.add_marker(pytest.mark.slow)

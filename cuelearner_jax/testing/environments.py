@@ -31,13 +31,11 @@ class Walk(NamedTuple):
     optional: dict[str, Any]  # what the members give that an environment may have
 
 
-def check_environment(
-    env: Environment, steps: int = 64, key: PRNGKeyArray | None = None, tolerance: float = 1e-5
-) -> None:
+def check_environment(env: Any, steps: int = 64, key: PRNGKeyArray | None = None, tolerance: float = 1e-5) -> None:
     """Holds an environment against its laws.
 
     Args:
-        env: the environment, small: it is compiled once, with a batch of a few steps.
+        env: what claims to be an environment, small: it is compiled once, with a batch of a few steps.
         steps: of the roll-out; enough for an episode to end.
         key: of the roll-out (default: always the same).
         tolerance: relative and absolute, of numbers that are computed in two ways (a recalled observation, a batch).
