@@ -286,6 +286,6 @@ def _check_mirrors(laws: Laws, walk: Walk, images: Any, other: Any, combined: An
         laws.hold(back, f"no symmetry undoes `mirror` {number}: add its inverse, or mend its observation")
 
 
-def _first(rows: Any) -> int:
+def _first(rows: Array | np.ndarray) -> int:
     """The first of the rows in which something is true."""
     return int(np.argmax(np.asarray(rows).reshape(len(rows), -1).any(-1)))
