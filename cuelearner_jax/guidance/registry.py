@@ -54,7 +54,7 @@ def find(name: str) -> Kind:
     _register_installed()
     if name not in _KINDS:
         raise UserError(
-            f"unknown guidance {name!r}{closest(name, _KINDS)}; one of your own is named as package.module:NAME"
+            f"unknown guidance {name!r}{closest(name, _KINDS)} (one of your own is named as package.module:NAME)"
         )
     return _KINDS[name]
 

@@ -38,7 +38,7 @@ def find(name: str) -> Task:
     installed = _installed()
     if name not in installed:
         raise UserError(
-            f"unknown task {name!r}{closest(name, names())}, or name one of your own as package.module:name"
+            f"unknown task {name!r}{closest(name, names())} (one of your own is named as package.module:NAME)"
         )
     task = plugins.load(installed[name].value, Task, "a task")
     if task.name != name:
