@@ -5,10 +5,11 @@ BIN := $(VENV)/bin
 UV := $(BIN)/python -m uv
 UV_VERSION := $(shell sed -n 's/^uv==\([0-9.]*\).*/\1/p' constraints.txt)
 
-.PHONY: help setup quickstart test lint format bench constraints clean
+.PHONY: help setup quickstart test test-quick lint format bench constraints clean
 help:
 	@echo "make quickstart   train, report and film the small billiards example (two to three minutes)"
-	@echo "make test         run the tests"
+	@echo "make test         run the tests (some 10 minutes on 2 idle cores)"
+	@echo "make test-quick   those of them that compile next to nothing (under 3 minutes)"
 	@echo "make lint         ruff and pyright"
 	@echo "make format       what ruff can put right by itself"
 	@echo "make bench        the benchmarks of this machine (some minutes)"
@@ -38,6 +39,9 @@ quickstart: $(VENV)/.installed
 
 test: $(VENV)/.tested
 	$(BIN)/python -m pytest -n 2 --dist loadfile
+
+test-quick: $(VENV)/.tested
+	$(BIN)/python -m pytest -n 2 --dist loadfile -m "not slow"
 
 lint: $(VENV)/.tested
 	$(BIN)/ruff check .

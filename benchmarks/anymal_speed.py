@@ -26,7 +26,7 @@ from cuelearner_envs.anymal.environment import LeggedNavigation
 from cuelearner_envs.navigation.config import NavigationConfig
 from cuelearner_envs.navigation.config import make_environment as make_navigation
 from cuelearner_jax import actions
-from cuelearner_jax.records import results
+from cuelearner_jax.records.provenance import provenance
 
 RESULTS = Path(__file__).parent / "results" / "anymal_speed.json"
 
@@ -110,7 +110,7 @@ def main() -> None:
                     flush=True,
                 )
     if asked.write:
-        asked.write.write_text(json.dumps({**results.provenance(), "rows": rows}, indent=1) + "\n")
+        asked.write.write_text(json.dumps({**provenance(), "rows": rows}, indent=1) + "\n")
 
 
 if __name__ == "__main__":

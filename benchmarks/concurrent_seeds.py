@@ -22,9 +22,9 @@ import jax
 from cuelearner_jax.bench.measuring import Timed, learning
 from cuelearner_jax.config import RunConfig
 from cuelearner_jax.devices import lane_mesh
-from cuelearner_jax.records import results
-from cuelearner_jax.runs.lanes import state_bytes
-from cuelearner_jax.tasks.registry import NAVIGATION
+from cuelearner_jax.records.provenance import provenance
+from cuelearner_jax.runs.memory_report import state_bytes
+from cuelearner_jax.tasks.navigation import NAVIGATION
 
 RESULTS = Path(__file__).parent / "results"
 
@@ -33,7 +33,7 @@ def measure(config: RunConfig, env: Any, seeds: int, devices: int, iterations: i
     """Trains `seeds` lanes on so many devices and times stretches of `iterations`."""
     timed = Timed(config, env, "none", seeds, mesh=lane_mesh(jax.local_devices()[:devices]))
     (block,) = timed.blocks
-    at_rest, row_bytes = state_bytes(block), block.replay.shape[-1] * 4
+    at_rest, row_bytes = state_bytes(block), block.agent.replay.shape[-1] * 4
     times = [timed.train(iterations) for _ in range(repeats + 1)]  # the first compiles
     stats = jax.devices()[0].memory_stats() or {}
     second = statistics.median(times[1:]) / (iterations * config.sizes.num_envs)
@@ -82,7 +82,7 @@ def main() -> None:
         print("  ".join(f"{row[name]:>17,.3f}" for name in names))
     if asked.write:
         name = "device_scaling.json" if len(asked.devices) > 1 else "concurrent_seeds.json"
-        (RESULTS / name).write_text(json.dumps({**results.provenance(), "rows": rows}, indent=1) + "\n")
+        (RESULTS / name).write_text(json.dumps({**provenance(), "rows": rows}, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -19,7 +19,7 @@ import jax
 import numpy as np
 
 from cuelearner_jax.bench.measuring import Timed, learning
-from cuelearner_jax.tasks.registry import BILLIARDS
+from cuelearner_jax.tasks.billiards import BILLIARDS
 
 
 class Run(Timed):
@@ -28,7 +28,7 @@ class Run(Timed):
     def __init__(self, kind: str, config: Any, seeds: int, labels: int) -> None:
         env = BILLIARDS.environment(config.task)
         super().__init__(config, env, kind, seeds, labels)
-        teacher = BILLIARDS.teacher(config.task, env) if self.group.guidance.asks else None
+        teacher = BILLIARDS.make_teacher(config.task, env) if self.group.guidance.asks else None
         self.rounds = [self.label_round(teacher) for _ in range(self.group.rounds)] if teacher else []
 
 

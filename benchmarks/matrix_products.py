@@ -18,8 +18,8 @@ from scaling import REPLAY
 
 from cuelearner_jax import devices
 from cuelearner_jax.bench.measuring import Work, measure
-from cuelearner_jax.records import results
-from cuelearner_jax.tasks.registry import TASKS
+from cuelearner_jax.records.provenance import provenance
+from cuelearner_jax.tasks import registry
 
 WAYS = {"compiled": 2**30, "library": 0}  # from how many lanes on the library is used
 
@@ -27,15 +27,19 @@ WAYS = {"compiled": 2**30, "library": 0}  # from how many lanes on the library i
 def main() -> None:
     """Measures, prints a table, writes JSON."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--task", choices=sorted(TASKS), default="billiards")
+    parser.add_argument("--task", choices=sorted(registry.names()), default="billiards")
     parser.add_argument("--preset", default="paper")
     parser.add_argument("--lanes", type=int, nargs="+", default=[1, 8, 16, 75, 512])
     parser.add_argument("--seconds", type=float, default=2.0, help="of each measurement")
     parser.add_argument("--out", type=Path, help="write the figures to this JSON file")
     asked = parser.parse_args()
-    config = TASKS[asked.task].presets[asked.preset].config
+    config = registry.find(asked.task).presets[asked.preset].config
     config = dataclasses.replace(config, sizes=dataclasses.replace(config.sizes, replay_capacity=REPLAY))
-    work, mesh, rows = Work(TASKS[asked.task], asked.preset, config), devices.lane_mesh(jax.local_devices()[:1]), []
+    work, mesh, rows = (
+        Work(registry.find(asked.task), asked.preset, config),
+        devices.lane_mesh(jax.local_devices()[:1]),
+        [],
+    )
     print(f"{'lanes':>6}  " + "  ".join(f"{way + ' [ms]':>14}" for way in WAYS))
     for lanes in asked.lanes:
         found = {}
@@ -44,7 +48,7 @@ def main() -> None:
         rows.append({"task": asked.task, "lanes": lanes, **found})
         print(f"{lanes:>6}  " + "  ".join(f"{value:>14.4f}" for value in found.values()), flush=True)
         if asked.out:
-            asked.out.write_text(json.dumps({**results.provenance(), "rows": rows}, indent=1) + "\n")
+            asked.out.write_text(json.dumps({**provenance(), "rows": rows}, indent=1) + "\n")
 
 
 if __name__ == "__main__":

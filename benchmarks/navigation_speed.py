@@ -34,7 +34,7 @@ import jax.numpy as jnp
 from cuelearner_envs.navigation.config import NavigationConfig, make_environment
 from cuelearner_envs.navigation.environment import Navigation
 from cuelearner_jax.actions import from_angle
-from cuelearner_jax.records import results
+from cuelearner_jax.records.provenance import provenance
 
 RESULTS = Path(__file__).parent / "results" / "navigation_speed.json"
 PEER = "JaxNav"
@@ -193,8 +193,8 @@ def main() -> None:
             f"{row['fastest']:10,.0f}{row['times_jaxnav']:10.2f}{row['ends_per_1000_steps']:11.1f}"
         )
     if asked.write:
-        provenance = {**results.provenance(), "cores": os.cpu_count(), "jaxmarl": version}
-        RESULTS.write_text(json.dumps({**provenance, "rows": rows}, indent=1) + "\n")
+        came = {**provenance(), "cores": os.cpu_count(), "jaxmarl": version}
+        RESULTS.write_text(json.dumps({**came, "rows": rows}, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -35,7 +35,8 @@ from cuelearner_envs.navigation.environment import Navigation
 from cuelearner_envs.navigation.roadmap import BLOCKED, LINE_MARGIN, RoadMapTeacher, make_teacher, way
 from cuelearner_envs.navigation.world import FAR_AWAY, World
 from cuelearner_jax import evaluate
-from cuelearner_jax.records.results import provenance
+from cuelearner_jax.policies import Heuristic, Policy, Taught, Uniform
+from cuelearner_jax.records.provenance import provenance
 
 RESULTS = Path(__file__).parent / "results" / "roadmap_paths.json"
 STYLES: tuple[Style, ...] = ("clutter", "rooms", "corridor")
@@ -43,10 +44,10 @@ CHORDS = 8  # of a quarter circle
 HALF = np.pi / (4 * CHORDS)  # half of a chord's angle [rad]
 SLACK = 1e-9  # a line may be this much nearer than allowed, for rounding [m]
 
-POLICIES: dict[str, Callable[[Navigation, RoadMapTeacher], evaluate.Policy]] = {
-    "road map": lambda env, teacher: evaluate.teacher_policy(teacher),
-    "heuristic": lambda env, teacher: evaluate.heuristic_policy(env),
-    "uniform": lambda env, teacher: evaluate.uniform_policy(),
+POLICIES: dict[str, Callable[[Navigation, RoadMapTeacher], Policy]] = {
+    "road map": lambda env, teacher: Taught(teacher),
+    "heuristic": lambda env, teacher: Heuristic(env),
+    "uniform": lambda env, teacher: Uniform(),
 }
 
 

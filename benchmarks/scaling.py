@@ -28,9 +28,9 @@ from matplotlib.figure import Figure
 
 from cuelearner_jax.bench.measuring import Timed, Work, learning, measure
 from cuelearner_jax.devices import lane_mesh
-from cuelearner_jax.records import results
-from cuelearner_jax.report.figures import COLOURS, STYLE, save_figure
-from cuelearner_jax.tasks.registry import TASKS
+from cuelearner_jax.records.provenance import provenance
+from cuelearner_jax.report.figures import OTHER_COLOURS, STYLE, save_figure
+from cuelearner_jax.tasks import registry
 
 REPLAY = 100_000
 ROUNDS = 3  # of labels, after the one that compiles
@@ -50,15 +50,15 @@ def main() -> int:
         save_figure(_draw([json.loads(path.read_text()) for path in asked.draw]), asked.figure)
         print(f"wrote {asked.figure}.png and .svg")
         return 0
-    preset = TASKS[asked.task].presets[asked.preset]
+    preset = registry.find(asked.task).presets[asked.preset]
     setting = {"task": asked.task, "preset": asked.preset, "base_seeds": asked.base_seeds, "replay": REPLAY}
-    contents = {**setting, **results.provenance(), "rows": []}
+    contents = {**setting, **provenance(), "rows": []}
     if asked.out.exists():
         contents = json.loads(asked.out.read_text())
         if {name: contents.get(name) for name in setting} != setting:
             raise SystemExit(f"{asked.out} holds measurements of another setting: give another --out")
     sizes = dataclasses.replace(preset.config.sizes, replay_capacity=min(REPLAY, preset.config.sizes.replay_capacity))
-    work = Work(TASKS[asked.task], asked.preset, dataclasses.replace(preset.config, sizes=sizes))
+    work = Work(registry.find(asked.task), asked.preset, dataclasses.replace(preset.config, sizes=sizes))
     began = time.perf_counter()
     for axis, value in _points(asked, contents["rows"]):
         if asked.stop_after and time.perf_counter() - began > asked.stop_after:
@@ -76,7 +76,7 @@ def main() -> int:
 
 def _arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--task", choices=sorted(TASKS), default="billiards")
+    parser.add_argument("--task", choices=sorted(registry.names()), default="billiards")
     parser.add_argument("--preset", default="quickstart")
     parser.add_argument("--base-seeds", type=int, default=8, help="while something else is varied")
     parser.add_argument("--seeds", type=int, nargs="*", default=[1, 4, 8, 16])
@@ -91,8 +91,8 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--draw", type=Path, nargs="+", help="draw these files instead of measuring")
     parser.add_argument("--figure", type=Path, default=Path("scaling"), help="name of the figure without its ending")
     asked = parser.parse_args()
-    if asked.preset not in TASKS[asked.task].presets:
-        parser.error(f"--preset: choose one of {', '.join(TASKS[asked.task].presets)}")
+    if asked.preset not in registry.find(asked.task).presets:
+        parser.error(f"--preset: choose one of {', '.join(registry.find(asked.task).presets)}")
     if min([1, asked.base_seeds, *asked.seeds, *asked.labels, *asked.directions, *asked.widths]) < 1:
         parser.error("give positive numbers")
     missing = [str(path) for path in asked.draw or () if not path.is_file()]
@@ -125,7 +125,7 @@ def _training(work: Work, asked: argparse.Namespace, axis: str, value: int) -> d
 def _labels(work: Work, seeds: int, budget: int) -> dict[str, Any]:
     """Seconds of a round of questions with its fit, of the fit alone, and of all rounds of a budget."""
     env = work.task.environment(work.config.task)
-    teacher = work.task.teacher(work.config.task, env)
+    teacher = work.task.make_teacher(work.config.task, env)
     began = time.perf_counter()
     timed = Timed(learning(work.config), env, "relative", seeds, budget)
     timed.label_round(teacher)
@@ -167,7 +167,7 @@ def _draw(measured: Sequence[dict[str, Any]]) -> Figure:
         figure = Figure(figsize=(2.5 * len(drawn), 3), layout="constrained")
         panels = figure.subplots(1, len(drawn), squeeze=False)[0]
         for axes, (axis, (label, name, unit)) in zip(panels, drawn.items(), strict=True):
-            for contents, colour in zip(measured, list(COLOURS.values()) * len(measured), strict=False):
+            for contents, colour in zip(measured, list(OTHER_COLOURS) * len(measured), strict=False):
                 points = sorted((row["value"], row[name]) for row in contents["rows"] if row["axis"] == axis)
                 machine = f"{contents['hardware']}, {contents['preset']}"
                 axes.plot(*zip(*points, strict=True), "o-", color=colour, label=machine, linewidth=1.5, markersize=4)

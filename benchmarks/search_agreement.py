@@ -21,16 +21,19 @@ import jax
 import jax.numpy as jnp
 
 from cuelearner_jax import actions as geometry
+from cuelearner_jax.actions import DIRECTIONS
 from cuelearner_jax.agent.choice import greedy_actions
 from cuelearner_jax.agent.networks import applied, q_network
 from cuelearner_jax.config import Sizes
-from cuelearner_jax.evaluate import agent_policy, episodes, rollout
+from cuelearner_jax.evaluate import episodes, rollout
 from cuelearner_jax.guidance import registry as guidance
-from cuelearner_jax.records import results
+from cuelearner_jax.policies import Agent
+from cuelearner_jax.records.provenance import provenance
 from cuelearner_jax.runs import grid as runs
 from cuelearner_jax.runs.grid import Grid
-from cuelearner_jax.runs.lanes import Group, restore_policies
-from cuelearner_jax.tasks.registry import TASKS
+from cuelearner_jax.runs.kept import restore_policies
+from cuelearner_jax.runs.lanes import LaneGroup
+from cuelearner_jax.tasks import registry
 
 STATES = 256  # of an agent
 NAMES = ("same", "neighbouring", "within_half_a_degree", "value_given_up", "reward")
@@ -42,7 +45,9 @@ def met(env: Any, sizes: Sizes, params: Any) -> jax.Array:
 
     def step(carry: tuple, key: jax.Array) -> tuple[tuple, None]:
         state, obs = carry
-        after, made = jax.vmap(env.step)(jax.random.split(key, STATES), state, greedy_actions(sizes, params, obs))
+        after, made = jax.vmap(env.step)(
+            jax.random.split(key, STATES), state, greedy_actions(sizes, DIRECTIONS, params, obs)
+        )
         return (after, made.obs), None
 
     return jax.lax.scan(step, (state, obs), jax.random.split(jax.random.key(1), 5))[0][1]
@@ -58,8 +63,8 @@ def compare(env: Any, agents: Any, own: Sizes, way: Sizes, steps: int, precise: 
         with jax.default_matmul_precision("highest"):
             values = jax.lax.map(lambda seen: q(params, seen, options)[:, 0], obs, batch_size=16)
         with jax.default_matmul_precision("highest" if precise else "default"):
-            chosen = greedy_actions(way, params, obs)
-            reward = rollout(agent_policy(way, params), env, episodes(), 100, steps)["reward"]
+            chosen = greedy_actions(way, DIRECTIONS, params, obs)
+            reward = rollout(Agent(params, way), env, episodes(), 100, steps)["reward"]
         best, number = values.max(-1), values.argmax(-1)
         off = jnp.abs(geometry.difference(options[number], chosen))
         tenth = jnp.deg2rad(360.0 / way.directions)
@@ -86,10 +91,10 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=10_000)
     parser.add_argument("--out", type=Path, help="write the figures to this JSON file")
     asked = parser.parse_args()
-    task, config, grid = runs.load(asked.run, TASKS)
+    task, config, grid = runs.load(asked.run, registry.find)
     env = task.environment(config.task, "validation")
-    kind = guidance.make(grid.guidance[0], config.sizes, env.obs_size)
-    group = Group(config, env, kind, Grid((kind.name,), grid.seeds, grid.labels))
+    kind = guidance.make(grid.guidance[0], config.sizes, env)
+    group = LaneGroup(config, env, kind, Grid((kind.name,), grid.seeds, grid.labels))
     policies, step = restore_policies(group, asked.run / kind.name)
     all_ = dataclasses.replace(config.sizes, coarse_directions=0)
     ways = {"all, in full float32": (all_, True), "all, as computed by default": (all_, False)}
@@ -105,7 +110,7 @@ def main() -> None:
     for row in rows:
         print(f"{row['search']:32s}  " + "  ".join(f"{row[name]:>20.5f}" for name in NAMES))
     if asked.out:
-        told = {**results.provenance(), "step": step, "seeds": list(grid.seeds), "rows": rows}
+        told = {**provenance(), "step": step, "seeds": list(grid.seeds), "rows": rows}
         asked.out.write_text(json.dumps(told, indent=1) + "\n")
 
 

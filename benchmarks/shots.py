@@ -21,7 +21,7 @@ import jax.numpy as jnp
 from cuelearner_envs.billiards import Table
 from cuelearner_envs.billiards.physics import Shot, simulate_many
 from cuelearner_envs.billiards.table import rack
-from cuelearner_jax.records import results
+from cuelearner_jax.records.provenance import provenance
 
 
 def scattered(table: Table, tables: int, block: int) -> tuple[jax.Array, jax.Array]:
@@ -72,7 +72,7 @@ def main() -> None:
     for row in rows:
         print(f"{row['tables']:9,d} {row['block']:9,d} {row['shots_a_second']:15,.0f} {row['events_a_shot']:14.2f}")
     if asked.out:
-        asked.out.write_text(json.dumps({**results.provenance(), "rows": rows}, indent=1) + "\n")
+        asked.out.write_text(json.dumps({**provenance(), "rows": rows}, indent=1) + "\n")
 
 
 if __name__ == "__main__":

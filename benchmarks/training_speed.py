@@ -4,7 +4,7 @@
 
 Cart and pole, the paper's six hidden layers, batch 256, one gradient step an environment step, double DQN with two
 directions. The whole loop is timed: acting, environment, replay, targets, gradient, optimiser, target network. Floating
-point operations are counted from the layers (`cuelearner_jax.operations`), not taken from the compiler; the peak is a
+point operations are counted from the layers (`cuelearner_jax.bench.flops`), not taken from the compiler; the peak is a
 large float32 matrix product measured between the timed stretches of the same run. Medians over rounds, compile time
 apart.
 Peers measured on another day on the same kind of machine (purejaxrl, rejax): 54 to 56% at 8 and 32 seeds.
@@ -20,16 +20,17 @@ import jax
 import numpy as np
 from cartpole import CartPole
 
+from cuelearner_jax.bench.flops import step_operations
 from cuelearner_jax.bench.measuring import Timed, learning, matmul_rate
-from cuelearner_jax.bench.operations import step_operations
 from cuelearner_jax.config import RunConfig, Scalars, Schedule, Sizes
+from cuelearner_jax.environment import spaces_of
 
 BATCH, ENVS, DIRECTIONS = 256, 8, 2
 
 
 def measure(config: RunConfig, env: CartPole, seeds: int, steps: int, rounds: int) -> dict[str, float]:
     """Medians over rounds of one number of seeds."""
-    operations = step_operations(config.sizes, env.obs_size, config.bootstraps).total
+    operations = step_operations(config.sizes, spaces_of(env), config.bootstraps).total
     timed, shares, rates, peaks = Timed(config, env, "none", seeds), [], [], []
     for round_ in range(rounds + 1):
         peak = matmul_rate()

@@ -12,10 +12,12 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 Direction = Float[Array, "... 2"]
-Angle = Float[Array, "..."] | float
+DirectionLike = Direction | Float[np.ndarray, "... 2"]  # what functions take; they give JAX's arrays
+Angle = Float[Array, "..."] | Float[np.ndarray, "..."] | float
 
 
 class Actions(NamedTuple):
@@ -36,33 +38,33 @@ def from_angle(angle: Angle) -> Direction:
     return jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)
 
 
-def to_angle(action: Direction) -> Float[Array, "..."]:
+def to_angle(action: DirectionLike) -> Float[Array, "..."]:
     """Angle of a direction in (-pi, pi] [rad]."""
     return jnp.arctan2(action[..., 1], action[..., 0])
 
 
-def rotate(action: Direction, angle: Angle) -> Direction:
+def rotate(action: DirectionLike, angle: Angle) -> Direction:
     """`action` turned counterclockwise by `angle` [rad]."""
     cos, sin = jnp.cos(angle), jnp.sin(angle)
     x, y = action[..., 0], action[..., 1]
     return jnp.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
 
 
-def difference(start: Direction, end: Direction) -> Float[Array, "..."]:
+def difference(start: DirectionLike, end: DirectionLike) -> Float[Array, "..."]:
     """Signed angle from `start` to `end` in (-pi, pi] [rad]; positive: counterclockwise."""
     cross = start[..., 0] * end[..., 1] - start[..., 1] * end[..., 0]
     dot = start[..., 0] * end[..., 0] + start[..., 1] * end[..., 1]
     return jnp.arctan2(cross, dot)
 
 
-def retract(vector: Direction) -> Direction:
+def retract(vector: DirectionLike) -> Direction:
     """The direction nearest to a vector (the vector divided by its length). The zero vector gives the x axis."""
     length = jnp.linalg.norm(vector, axis=-1, keepdims=True)
     safe = jnp.where(length > 0, length, 1.0)
     return jnp.where(length > 0, vector / safe, jnp.array([1.0, 0.0], vector.dtype))
 
 
-def clip_to_ball(action: Direction, base: Direction, radius: Angle) -> Direction:
+def clip_to_ball(action: DirectionLike, base: DirectionLike, radius: Angle) -> Direction:
     """The direction within `radius` [rad] of `base` that lies nearest to `action` (paper, Eq. 5).
 
     On the unit circle the L2 ball of radius r round `base` is the arc of half-width 2 asin(r / 2), so the bound is an
@@ -73,17 +75,17 @@ def clip_to_ball(action: Direction, base: Direction, radius: Angle) -> Direction
     return jnp.where(inside[..., None], action, rotate(base, jnp.clip(turn, -radius, radius)))
 
 
-def distance(action: Direction, other: Direction) -> Float[Array, "..."]:
+def distance(action: DirectionLike, other: DirectionLike) -> Float[Array, "..."]:
     """Angle between two directions, in [0, pi] [rad]."""
     return jnp.abs(difference(action, other))
 
 
-def sense(action: Direction, goal: Direction) -> Float[Array, "..."]:
+def sense(action: DirectionLike, goal: DirectionLike) -> Float[Array, "..."]:
     """h: +1 if `goal` lies counterclockwise of `action`, -1 if clockwise, 0 if it is the same."""
     return jnp.sign(difference(action, goal))
 
 
-def toward(action: Direction, h: Float[Array, "..."], step: Angle) -> Direction:
+def toward(action: DirectionLike, h: Float[Array, "..."], step: Angle) -> Direction:
     """`action` turned by h * step [rad]."""
     return rotate(action, h * step)
 

@@ -2,7 +2,8 @@
 
 Three kinds of number, kept apart: `Sizes` shape the compiled program (another value compiles again), `Scalars` are
 traced (another value costs nothing), `Schedule` counts steps on the host and the shared clock. The defaults are the
-billiards hyper-parameters of the paper (appendix) and of its public code.
+billiards hyper-parameters of the paper (appendix) and of its public code. `Sizes` and `Scalars` are the agent's, the
+guide's and the simulated teacher's together, on one level of options; what concerns one of them takes that part alone.
 """
 
 from __future__ import annotations
@@ -23,13 +24,11 @@ TaskT = TypeVar("TaskT")
 
 
 @dataclass(frozen=True)
-class Sizes:
-    """Static sizes: changing one compiles the program again."""
+class AgentSizes:
+    """Static sizes of the agent."""
 
     q_layers: tuple[int, ...] = (400, 400, 400, 300, 300, 300)
     """Hidden layers of the action-value network."""
-    feedback_layers: tuple[int, ...] = (400, 400, 300, 300)
-    """Hidden layers of the guidance model."""
     directions: int = 3600
     """Directions over which the agent takes its argmax (3600: every 0.1 deg)."""
     coarse_directions: int = 0
@@ -55,6 +54,14 @@ class Sizes:
     """Steps of the n-step return that is averaged with the one-step return (1: the one-step return alone)."""
     updates_per_step: int = 1
     """Gradient steps for each environment step."""
+
+
+@dataclass(frozen=True)
+class GuideSizes:
+    """Static sizes of the guidance model and of its fitting."""
+
+    feedback_layers: tuple[int, ...] = (400, 400, 300, 300)
+    """Hidden layers of the guidance model."""
     labels_per_round: int = 10
     """New labels after which the guidance model is fitted again from scratch."""
     fit_steps: int = 2000
@@ -63,13 +70,35 @@ class Sizes:
     """Labels in one step of a fit."""
     validate_every: int = 20
     """Adam steps between two looks at the validation labels (every fifth label); the best parameters are kept."""
+
+
+@dataclass(frozen=True)
+class Sizes(GuideSizes, AgentSizes):
+    """Static sizes: changing one compiles the program again."""
+
     lanes_per_block: int = 0
     """Seeds trained in one vmapped block (0: on a CPU as many as its cache holds, on an accelerator all)."""
 
 
+class _Degrees:
+    """Mixed into scalars of which some are angles in degrees."""
+
+    def radians(self, name: str) -> jax.Array:
+        """The field `name` + `_deg`, in radians; traced where the field is."""
+        return jnp.deg2rad(jnp.asarray(getattr(self, name + "_deg"), jnp.float32))
+
+
 @dataclass(frozen=True)
-class Scalars:
-    """Traced scalars: changing one needs no new compile."""
+class _Clipping:
+    """What the agent and the guide share."""
+
+    max_grad_norm: float = 0.5
+    """Gradients are clipped to this global norm."""
+
+
+@dataclass(frozen=True)
+class AgentScalars(_Clipping):
+    """Traced scalars of the agent."""
 
     learning_rate: float = 0.1
     """Step size of the action-value network."""
@@ -77,10 +106,14 @@ class Scalars:
     """Discount factor; at 0 no target network exists."""
     n_step_weight: float = 0.5
     """Share of the n-step return in a target; the rest is the one-step return."""
-    max_grad_norm: float = 0.5
-    """Gradients are clipped to this global norm."""
     polyak: float = 0.005
     """Rate at which the target network follows."""
+
+
+@dataclass(frozen=True)
+class GuideScalars(_Degrees, _Clipping):
+    """Traced scalars of the guide: of fitting, of refining, and of what it asks about."""
+
     feedback_learning_rate: float = 1e-3
     """Adam's step size of the guidance model."""
     eps_deg: float = 5.0
@@ -95,6 +128,12 @@ class Scalars:
     """Share of the labels after the first fit asked about refined actions (DAgger); the rest about base actions."""
     guided_probability: float = 0.5
     """Probability that an episode is guided."""
+
+
+@dataclass(frozen=True)
+class TeacherFaults(_Degrees):
+    """Traced scalars of a simulated teacher: how it errs."""
+
     mistake_probability: float = 0.0
     """Teacher's fault: a turn is told the wrong way round with this probability."""
     silence_probability: float = 0.0
@@ -104,9 +143,10 @@ class Scalars:
     teacher_bias_deg: float = 0.0
     """Teacher's fault: constant error of what it takes for the best action, counterclockwise [deg]."""
 
-    def radians(self, name: str) -> jax.Array:
-        """The field `name` + `_deg`, in radians; traced where the field is."""
-        return jnp.deg2rad(jnp.asarray(getattr(self, name + "_deg"), jnp.float32))
+
+@dataclass(frozen=True)
+class Scalars(TeacherFaults, GuideScalars, AgentScalars):
+    """Traced scalars: changing one needs no new compile."""
 
 
 @dataclass(frozen=True)
@@ -133,7 +173,7 @@ class Schedule:
     """Steps between two checkpoints, which is what a killed run may lose."""
 
 
-for _traced in (Scalars, Schedule):
+for _traced in (AgentScalars, GuideScalars, TeacherFaults, Scalars, Schedule):
     jax.tree_util.register_dataclass(_traced, [field.name for field in dataclasses.fields(_traced)], [])
 
 
@@ -156,7 +196,9 @@ def check(config: RunConfig) -> None:
     """Raises UserError with one line for the first value that cannot work."""
     sizes, schedule = config.sizes, config.schedule
     _check_sizes(sizes)
-    _check_scalars(config.scalars)
+    check_guide(sizes, config.scalars)
+    if config.scalars.discount >= 1:
+        raise UserError(f"scalars.discount is {config.scalars.discount}: give a number below 1")
     for name in ("total_steps", "eval_every", "eval_steps", "eval_envs", "checkpoint_every", "target_every"):
         if getattr(schedule, name) < 1:
             raise UserError(f"schedule.{name} is {getattr(schedule, name)}: give a positive number")
@@ -167,23 +209,11 @@ def check(config: RunConfig) -> None:
     _check_multiple(schedule.total_steps, schedule.eval_every, "schedule.total_steps", "schedule.eval_every")
     _check_multiple(schedule.checkpoint_every, schedule.eval_every, "schedule.checkpoint_every", "schedule.eval_every")
     _check_multiple(schedule.eval_steps, schedule.eval_envs, "schedule.eval_steps", "schedule.eval_envs")
-    _check_multiple(sizes.fit_steps, sizes.validate_every, "sizes.fit_steps", "sizes.validate_every")
 
 
 def _check_sizes(sizes: Sizes) -> None:
-    positive = (
-        "directions",
-        "peaks",
-        "target_directions",
-        "num_envs",
-        "batch_size",
-        "replay_capacity",
-        "updates_per_step",
-    )
-    positive += ("n_step", "labels_per_round", "fit_steps", "fit_batch_size", "validate_every")
-    for name in positive:
-        if getattr(sizes, name) < 1:
-            raise UserError(f"sizes.{name} is {getattr(sizes, name)}: give a positive number")
+    positive = ("directions", "peaks", "target_directions", "num_envs", "batch_size", "replay_capacity")
+    _check_positive(sizes, (*positive, "updates_per_step", "n_step"))
     if sizes.coarse_directions and (sizes.coarse_directions < 3 or sizes.directions % sizes.coarse_directions):
         raise UserError(
             f"sizes.coarse_directions is {sizes.coarse_directions}: give a divisor of sizes.directions "
@@ -195,11 +225,35 @@ def _check_sizes(sizes: Sizes) -> None:
         raise UserError(
             f"sizes.lanes_per_block is {sizes.lanes_per_block}: give a positive number, or 0 to leave it open"
         )
-    if not sizes.q_layers or not sizes.feedback_layers or min(sizes.q_layers + sizes.feedback_layers) < 1:
-        raise UserError("sizes.q_layers and sizes.feedback_layers each need at least one layer of positive width")
+    _check_layers(sizes.q_layers, "sizes.q_layers")
 
 
-def _check_scalars(scalars: Scalars) -> None:
+def check_guide(sizes: GuideSizes, scalars: GuideScalars) -> None:
+    """Raises UserError with one line for the first value of a guide's that cannot work."""
+    _check_positive(sizes, ("labels_per_round", "fit_steps", "fit_batch_size", "validate_every"))
+    _check_layers(sizes.feedback_layers, "sizes.feedback_layers")
+    _check_multiple(sizes.fit_steps, sizes.validate_every, "sizes.fit_steps", "sizes.validate_every")
+    _check_numbers(scalars)
+    if not 0 < scalars.eps_deg <= 180:
+        raise UserError(
+            f"scalars.eps_deg is {scalars.eps_deg}: a relative label is a turn of more than 0 and up to 180"
+        )
+    if scalars.max_grad_norm <= 0:  # a zero gradient would be scaled by 0 / 0
+        raise UserError(f"scalars.max_grad_norm is {scalars.max_grad_norm}: give a positive number")
+
+
+def _check_positive(sizes: Any, names: tuple[str, ...]) -> None:
+    for name in names:
+        if getattr(sizes, name) < 1:
+            raise UserError(f"sizes.{name} is {getattr(sizes, name)}: give a positive number")
+
+
+def _check_layers(layers: tuple[int, ...], name: str) -> None:
+    if not layers or min(layers) < 1:
+        raise UserError(f"{name}: give at least one layer of positive width")
+
+
+def _check_numbers(scalars: Any) -> None:
     for name, value in dataclasses.asdict(scalars).items():
         if name.endswith(("probability", "fraction", "polyak", "weight")) and not 0 <= value <= 1:
             raise UserError(f"scalars.{name} is {value}: give a number from 0 to 1")
@@ -207,14 +261,6 @@ def _check_scalars(scalars: Scalars) -> None:
             raise UserError(f"scalars.{name} is {value}: give a finite number")
         if name != "teacher_bias_deg" and value < 0:
             raise UserError(f"scalars.{name} is {value}: give a number that is not negative")
-    if not 0 < scalars.eps_deg <= 180:
-        raise UserError(
-            f"scalars.eps_deg is {scalars.eps_deg}: a relative label is a turn of more than 0 and up to 180"
-        )
-    if scalars.max_grad_norm <= 0:  # a zero gradient would be scaled by 0 / 0
-        raise UserError(f"scalars.max_grad_norm is {scalars.max_grad_norm}: give a positive number")
-    if scalars.discount >= 1:
-        raise UserError(f"scalars.discount is {scalars.discount}: give a number below 1")
 
 
 def _check_multiple(value: int, unit: int, name: str, unit_name: str) -> None:

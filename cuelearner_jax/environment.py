@@ -8,7 +8,7 @@ has stands in `Environment`. Optional are `heuristic`, `mirror` with `symmetries
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -27,6 +27,7 @@ class Quantity(NamedTuple):
     about: str = ""  # what it is, where from and in which order, in a few words
 
 
+@runtime_checkable
 class Environment(Protocol):
     """One task. Inherit `WholeObservations` (or `Described`) for what can be derived."""
 
@@ -63,6 +64,7 @@ class Environment(Protocol):
         ...
 
 
+@runtime_checkable
 class OffersHeuristic(Protocol):
     """An environment with an obvious action that needs no learning."""
 
@@ -71,6 +73,7 @@ class OffersHeuristic(Protocol):
         ...
 
 
+@runtime_checkable
 class OffersMirror(Protocol):
     """An environment with exact symmetries that data may be multiplied by."""
 
@@ -89,6 +92,7 @@ class OffersMirror(Protocol):
         ...
 
 
+@runtime_checkable
 class OffersFeatures(Protocol):
     """An environment that can show an observation as it looks from an action."""
 
@@ -137,6 +141,18 @@ def offers(env: Any, name: str) -> bool:
 def actions_of(env: Any) -> Actions:
     """What an environment takes for actions: its `actions`, or directions in the plane."""
     return getattr(env, "actions", DIRECTIONS)
+
+
+class Spaces(NamedTuple):
+    """What networks have to know of an environment."""
+
+    obs_size: int
+    actions: Actions
+
+
+def spaces_of(env: Any) -> Spaces:
+    """An environment's; shapes in place of its arrays will do."""
+    return Spaces(env.obs_size, actions_of(env))
 
 
 def symmetries_of(env: Any) -> int:

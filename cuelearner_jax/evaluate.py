@@ -4,27 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax.sharding import Mesh
+from jax.typing import ArrayLike
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from cuelearner_jax import actions as geometry
-from cuelearner_jax.agent.choice import greedy_actions
-from cuelearner_jax.config import Scalars, Sizes
 from cuelearner_jax.devices import BY_LANE, SHARED, over_lanes, portions
 from cuelearner_jax.environment import Environment
-from cuelearner_jax.guidance.feedback import relative_feedback, relative_target
-from cuelearner_jax.guidance.refining import refine
-from cuelearner_jax.types import Guidance, GuidanceModel, Params, Teacher
-
-# (key, environment states (n, ...), observations (n, obs)) -> directions (n, 2)
-Policy = Callable[[PRNGKeyArray, Any, jax.Array], jax.Array]
+from cuelearner_jax.policies import Policy
 
 # Folded into the root key: episodes for reported figures only, and episodes for choosing settings.
 SPLITS = {"validation": 1_000_003, "tuning": 1_000_001}
+
+# (policy, env, key, environments, steps) -> metrics: `rollout`, or the same in other physics
+Rollout = Callable[[Policy, Any, PRNGKeyArray, int, int], dict[str, Any]]
 
 
 def episodes(split: str = "validation") -> PRNGKeyArray:
@@ -49,7 +45,7 @@ def rollout(
     def one_step(carry: tuple, index: jax.Array) -> tuple[tuple, tuple[dict, dict]]:
         state, obs, first = carry
         k_act, k_env = jax.random.split(jax.random.fold_in(k_run, index))
-        action = policy(k_act, state, obs)
+        action = policy.act(k_act, state, obs)
         state, step = jax.vmap(env.step)(jax.random.split(k_env, num_envs), state, action)
         done = step.terminated | step.truncated
         means = {"reward": step.reward.mean(), **{name: value.mean() for name, value in step.metrics.items()}}
@@ -68,96 +64,81 @@ def rollout(
     return metrics
 
 
-def agent_policy(sizes: Sizes, params: Params) -> Policy:
-    """The greedy choice of an action-value network."""
-    return lambda key, state, obs: greedy_actions(sizes, params, obs)
+class _Structure(NamedTuple):
+    """How a block's policy is put together again from the leaves that lanes have each and those that they share."""
+
+    tree: Any
+    by_lane: tuple[bool, ...]
+
+    def take_apart(self, policy: Any) -> tuple[list[ArrayLike], list[ArrayLike]]:
+        """(one for each lane, shared)"""
+        leaves = jax.tree.leaves(policy)
+        each = [leaf for leaf, own in zip(leaves, self.by_lane, strict=True) if own]
+        return each, [leaf for leaf, own in zip(leaves, self.by_lane, strict=True) if not own]
+
+    def put_together(self, each: list[ArrayLike], shared: list[ArrayLike]) -> Any:
+        """The inverse, also of one lane's leaves."""
+        own, common = iter(each), iter(shared)
+        return jax.tree.unflatten(self.tree, [next(own if lane else common) for lane in self.by_lane])
 
 
-def uniform_policy() -> Policy:
-    """Uniform directions."""
-    return lambda key, state, obs: geometry.uniform(key, (obs.shape[0],))
+def _structure(policy: Policy) -> _Structure:
+    leaves, tree = jax.tree.flatten(policy)
+    axes = jax.tree.map(
+        lambda axis, part: jax.tree.map(lambda _: axis is not None, part),
+        policy.axes,
+        policy,
+        is_leaf=lambda leaf: leaf is None,
+    )
+    found = _Structure(tree, tuple(jax.tree.leaves(axes)))
+    assert len(found.by_lane) == len(leaves)
+    return found
 
 
-def teacher_policy(teacher: Teacher) -> Policy:
-    """What a teacher holds for best."""
-    return lambda key, state, obs: _best_actions(teacher, state, obs)
+def one_lane(policy: Policy, index: int) -> Any:
+    """One lane's policy out of a block's."""
+    structure = _structure(policy)
+    each, shared = structure.take_apart(policy)
+    return structure.put_together([jnp.asarray(leaf)[index] for leaf in each], shared)
 
 
-def _best_actions(teacher: Teacher, state: Any, obs: jax.Array) -> jax.Array:
-    # Few states at a time: a teacher by search simulates hundreds of actions of each.
-    ask = lambda pair: teacher.best_action(*pair)  # noqa: E731
-    return jax.lax.map(ask, (state, obs), batch_size=min(len(obs), portions().states))
-
-
-def heuristic_policy(env: Environment) -> Policy:
-    """The environment's own heuristic."""
-    return lambda key, state, obs: jax.vmap(env.heuristic)(obs)
-
-
-def guided_policy(base: Policy, guidance: Guidance, model: GuidanceModel, env: Environment, scalars: Scalars) -> Policy:
-    """Another policy's actions, every one of them under guidance."""
-
-    def policy(key: PRNGKeyArray, state: Any, obs: jax.Array) -> jax.Array:
-        everywhere = jnp.ones(obs.shape[0], bool)
-        return guidance.act(model, env, obs, base(key, state, obs), everywhere, scalars)[0]
-
-    return policy
-
-
-def corrected_policy(base: Policy, teacher: Teacher, scalars: Scalars) -> Policy:
-    """Another policy's actions, refined by the teacher's own relative feedback instead of a model of it."""
-
-    def policy(key: PRNGKeyArray, state: Any, obs: jax.Array) -> jax.Array:
-        best, eps = _best_actions(teacher, state, obs), scalars.radians("eps")
-        told = jax.vmap(lambda action, best: relative_target(action, relative_feedback(action, best, eps), eps))
-        return refine(
-            lambda actions: told(actions, best),
-            base(key, state, obs),
-            jnp.ones(obs.shape[0], bool),
-            tau=scalars.radians("tau"),
-            tau_max=scalars.radians("tau_max"),
-            k_max=scalars.k_max,
-        ).actions
-
-    return policy
-
-
-@partial(jax.jit, static_argnames=("mesh", "sizes", "num_envs", "steps"))
-def evaluate_agents(
-    env: Environment, params: Params, key: PRNGKeyArray, *, mesh: Mesh, sizes: Sizes, num_envs: int, steps: int
+def evaluate_lanes(
+    env: Environment, policy: Policy, key: PRNGKeyArray, *, mesh: Mesh, num_envs: int, steps: int
 ) -> dict[str, Float[Array, " lanes"]]:
-    """Validation of a block of agents (leading axis of `params`), all on the same episodes."""
+    """Validation of a block of lanes, all on the same episodes.
 
-    def share(env: Environment, params: Params, key: PRNGKeyArray) -> dict[str, jax.Array]:
-        return each_lane(lambda lane: rollout(agent_policy(sizes, lane), env, key, num_envs, steps), params)
+    Args:
+        env: the environment.
+        policy: leaves that are `BY_LANE` in its `axes` have a leading axis of lanes.
+        key: of the episodes.
+        mesh: devices that share the lanes.
+        num_envs, steps: as `rollout` has them.
 
-    return over_lanes(mesh, share, (SHARED, BY_LANE, SHARED), BY_LANE)(env, params, key)
+    Returns:
+        Metrics by name.
+    """
+    structure = _structure(policy)
+    each, shared = structure.take_apart(policy)
+    return _evaluate(env, each, shared, key, structure=structure, mesh=mesh, num_envs=num_envs, steps=steps)
 
 
-def each_lane(measure: Callable[[Any], dict[str, jax.Array]], lanes: Any) -> dict[str, Float[Array, " lanes"]]:
-    """`measure` of every lane (leading axis), as many at once as the device takes well."""
-    count = jax.tree.leaves(lanes)[0].shape[0]
-    return jax.lax.map(measure, lanes, batch_size=min(count, portions().agents))
-
-
-@partial(jax.jit, static_argnames=("mesh", "guidance", "num_envs", "steps"))
-def evaluate_guides(
-    env: Environment,
-    models: GuidanceModel,
-    key: PRNGKeyArray,
-    scalars: Scalars,
-    *,
-    mesh: Mesh,
-    guidance: Guidance,
-    num_envs: int,
-    steps: int,
+@partial(jax.jit, static_argnames=("structure", "mesh", "num_envs", "steps"))
+def _evaluate(
+    env: Any, each: list[Array], shared: list[Array], key: PRNGKeyArray, *, structure, mesh, num_envs, steps
 ) -> dict[str, Float[Array, " lanes"]]:
-    """How good guidance is by itself: uniform actions under it, for a block of lanes on the same episodes."""
+    def share(env: Any, each: list[Array], shared: list[Array], key: PRNGKeyArray) -> dict[str, jax.Array]:
+        def one(lane: list[Array]) -> dict[str, jax.Array]:
+            return rollout(structure.put_together(lane, shared), env, key, num_envs, steps)
 
-    def share(env: Environment, models: GuidanceModel, key: PRNGKeyArray, scalars: Scalars) -> dict[str, jax.Array]:
-        def one(model: GuidanceModel) -> dict[str, jax.Array]:
-            return rollout(guided_policy(uniform_policy(), guidance, model, env, scalars), env, key, num_envs, steps)
+        # As many lanes at once as the device takes well.
+        return jax.lax.map(one, each, batch_size=min(each[0].shape[0], portions().agents))
 
-        return jax.vmap(one)(models)
+    return over_lanes(mesh, share, (SHARED, BY_LANE, SHARED, SHARED), BY_LANE)(env, each, shared, key)
 
-    return over_lanes(mesh, share, (SHARED, BY_LANE, SHARED, SHARED), BY_LANE)(env, models, key, scalars)
+
+@partial(jax.jit, static_argnames=("num_envs", "steps"))
+def evaluate_policy(
+    env: Environment, policy: Policy, key: PRNGKeyArray, num_envs: int, steps: int
+) -> dict[str, Float[Array, ""]]:
+    """`rollout` of one policy, compiled."""
+    return rollout(policy, env, key, num_envs, steps)

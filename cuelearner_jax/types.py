@@ -1,4 +1,4 @@
-"""Every record that flows through the system, with the shape and unit of each field, and the protocols.
+"""Every record that flows through the system, with the shape and unit of each field.
 
 Records describe one sample or one seed; leading axes appear only where code is vmapped.
 Directions are unit vectors in the plane; angles are radians, counterclockwise positive.
@@ -6,9 +6,9 @@ Directions are unit vectors in the plane; angles are radians, counterclockwise p
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
-from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from collections.abc import Mapping
+from enum import IntEnum
+from typing import Any, Protocol, runtime_checkable
 
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
@@ -30,30 +30,29 @@ class Step(struct.PyTreeNode):
     outcome: Mapping[str, Float[Array, ""]]  # averaged over episodes: counts where an episode ends
 
 
+@runtime_checkable
 class Teacher(Protocol):
     """Knows (or believes it knows) the best action. A pytree, like an environment."""
 
-    def best_action(self, state: EnvState, obs: Float[Array, " obs"]) -> Float[Array, "2"]:
-        """The direction that the teacher would choose."""
+    def best_action(self, state: EnvState, obs: Float[Array, " obs"]) -> Float[Array, " action"]:
+        """The action that the teacher would choose."""
         ...
 
 
-class Walker(NamedTuple):
-    """What training has to know of a robot that learns to walk. Figures are numbers by name."""
+@runtime_checkable
+class Policy(Protocol):
+    """Anything that acts. A pytree, like an environment; see `policies`."""
 
-    environment: Any  # brax.envs.Env: velocity commands are to be tracked
-    policy: Callable[[Any], Any]  # brax's parameters -> a policy
-    measure: Callable[[Any, PRNGKeyArray, int], dict[str, float]]  # (policy, key, robots) -> figures while it learns
-    examine: Callable[[Any, PRNGKeyArray, int], Iterator[tuple[str, dict[str, float]]]]  # of a finished one, by trial
-    save: Callable[[Path, Any, dict[str, Any]], None]  # (folder, policy, what is to be known of it)
-    load: Callable[..., Any]  # (folder) -> the policy; the shipped one without a folder
+    def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
+        """Actions in n situations; `states` are what a teacher may look at, and what no agent does."""
+        ...
 
 
-class Memory(struct.PyTreeNode):
-    """One stored step, as small as the environment can make it."""
+class StoredStep(struct.PyTreeNode):
+    """One step in replay, as small as the environment can make it."""
 
     obs: Float[Array, " memory"]  # see `Environment.remember`
-    action: Float[Array, "2"]  # as executed
+    action: Float[Array, " action"]  # as executed
     reward: Float[Array, ""]
     discount: Float[Array, " 1_or_0"]  # this and the next two have no entries where nothing bootstraps
     ended: Float[Array, " 1_or_0"]  # 1 where the episode ended, terminated or truncated
@@ -64,18 +63,18 @@ class Transition(struct.PyTreeNode):
     """One step to learn from. `next_obs` has no entries where nothing bootstraps from it (discount 0)."""
 
     obs: Float[Array, " obs"]
-    action: Float[Array, "2"]  # as executed
+    action: Float[Array, " action"]  # as executed
     reward: Float[Array, ""]
     discount: Float[Array, ""]  # of `next_obs`: 0 at termination, never at truncation; 1 after one step
     next_obs: Float[Array, " obs_or_0"]
 
 
 class Label(struct.PyTreeNode):
-    """One answer of a teacher."""
+    """One answer of a teacher: what it said, not what a network is to predict of it (`Guidance.target`)."""
 
     obs: Float[Array, " obs"]
-    action: Float[Array, "2"]  # the action asked about
-    target: Float[Array, "2"]  # what the guidance model is to predict; relative: rotate(action, eps * h) - action
+    action: Float[Array, " action"]  # the action asked about
+    answer: Float[Array, " answer"]  # in its form's words; relative: h in {-1, 0, +1}, see `guidance.answers`
     valid: Bool[Array, ""]  # False: padding, past this lane's budget, or no answer
 
 
@@ -86,27 +85,33 @@ class GuidanceModel(struct.PyTreeNode):
     fitted: Bool[Array, ""]  # False until labels have been fitted: the model then leaves actions alone
 
 
-class Asking(struct.PyTreeNode):
-    """The table at which the teacher is asked, and its answers so far."""
+class GuideState(struct.PyTreeNode):
+    """The guide's part of a lane: its model, the answers so far, and the situation in which it asks next."""
 
+    model: GuidanceModel
+    labels: Label  # leading axis: slots, the largest budget of the sweep in whole rounds
+    budget: Int[Array, ""]  # labels that this lane may use
     env: EnvState
     obs: Float[Array, " obs"]
-    labels: Label  # leading axis: the largest budget of the sweep
-    budget: Int[Array, ""]  # labels that this lane may use
 
 
-class TrainState(struct.PyTreeNode):
-    """One lane's everything: a lane is one seed with one label budget."""
+class AgentState(struct.PyTreeNode):
+    """The agent's part of a lane: its networks, what it has lived through, and where it stands."""
 
     params: Params
     target_params: Params  # None where nothing bootstraps (discount 0)
     opt_state: Any
     replay: Float[Array, "capacity width"]
-    guidance: GuidanceModel
-    asking: Asking
     env: EnvState  # leading axis: num_envs
     obs: Float[Array, "num_envs obs"]
     guided: Bool[Array, " num_envs"]  # is the running episode a guided one?
+
+
+class TrainState(struct.PyTreeNode):
+    """One lane's everything: a lane is one seed with one label budget."""
+
+    agent: AgentState
+    guide: GuideState
     key: PRNGKeyArray
 
 
@@ -118,12 +123,10 @@ class Clock(struct.PyTreeNode):
     round: Int[Array, ""]  # label rounds of each lane
 
 
-class Guidance(NamedTuple):
-    """One form of guidance: a bundle of pure functions, chosen in Python before tracing."""
+class Stream(IntEnum):
+    """Streams of random numbers of one lane, each folded into the lane's key before a counter is."""
 
-    name: str
-    asks: bool  # does it ask a teacher for labels?
-    init: Callable[[PRNGKeyArray], GuidanceModel]
-    label: Callable[..., tuple[Float[Array, "2"], Bool[Array, ""]]]  # (key, action, best, scalars) -> target, valid
-    fit: Callable[..., GuidanceModel]  # (key, env, labels, scalars) -> model
-    act: Callable[..., Any]  # (model, env, obs (n, obs), actions (n, 2), active (n,), scalars) -> refine.Refined
+    INIT = 0
+    ASK = 1
+    FIT = 2
+    TRAIN = 3

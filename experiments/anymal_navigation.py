@@ -32,11 +32,12 @@ from cuelearner_envs.anymal.judged import rollout as judged
 from cuelearner_envs.navigation.config import make_environment
 from cuelearner_envs.navigation.environment import Navigation
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.evaluate import agent_policy, episodes, rollout
-from cuelearner_jax.records import results
+from cuelearner_jax.evaluate import episodes, rollout
+from cuelearner_jax.policies import Agent
+from cuelearner_jax.records.provenance import provenance
 from cuelearner_jax.runs.grid import load
-from cuelearner_jax.runs.trained import Subject, load_lanes
-from cuelearner_jax.tasks.registry import TASKS
+from cuelearner_jax.runs.trained import PolicySource
+from cuelearner_jax.tasks import registry
 
 ROOT = Path(__file__).parents[1]
 AGENT = ROOT / "docs" / "data" / "navigation_agent"
@@ -81,15 +82,15 @@ def main() -> int:
     parser.add_argument("--resume", action="store_true", help="keep the rows that the file of --write has")
     asked = parser.parse_args()
     try:
-        task, config, grid = load(asked.run, TASKS)
-        lanes = load_lanes(Subject(task, config, grid, asked.run), ())[0]
+        task, config, grid = load(asked.run, registry.find)
+        lanes = PolicySource(task, config, grid, asked.run).load()[0]
     except UserError as error:
         parser.error(str(error))
     params = jax.tree.map(lambda leaf: leaf[0], lanes.policies["params"])
     sizes = replace(config.sizes, coarse_directions=asked.coarse)
     fitted = {name: json.loads(FIT.read_text())["fitted"][name] for name in FITTED}
     about = {"run": asked.run.name, "fitted": fitted, "coarse": asked.coarse}
-    came = results.provenance()  # before the first row changes a file of the repository
+    came = provenance()  # before the first row changes a file of the repository
     rows: list[dict[str, Any]] = []
     if asked.resume:
         if not asked.write or not asked.write.is_file():
@@ -101,10 +102,10 @@ def main() -> int:
 
     @partial(jax.jit, static_argnames="count")
     def in_jax(env: Any, params: Any, count: int) -> Any:
-        return rollout(agent_policy(sizes, params), env, episodes(), count, count * 200)
+        return rollout(Agent(params, sizes), env, episodes(), count, count * 200)
 
     def in_c(env: Any, count: int) -> Any:
-        return judged(agent_policy(sizes, params), env, episodes(), count, count * 200)
+        return judged(Agent(params, sizes), env, episodes(), count, count * 200)
 
     def tell(style: str, name: str, count: int, measure: Callable[[], dict[str, Any]]) -> None:
         known = {(row["style"], row["robot"], row["episodes"]) for row in rows}

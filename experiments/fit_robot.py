@@ -27,7 +27,7 @@ from cuelearner_envs.anymal.judged import Course
 from cuelearner_envs.navigation.config import NavigationConfig
 from cuelearner_envs.navigation.robot import Motion, Robot, walk
 from cuelearner_jax.actions import difference, from_angle
-from cuelearner_jax.records import results
+from cuelearner_jax.records.provenance import provenance
 
 RESULTS = Path(__file__).parents[1] / "docs" / "data" / "anymal_fit.json"
 FITTED = ("speed", "lag", "turn_rate")
@@ -124,7 +124,7 @@ def main() -> None:
     for name in ("before", "fitted"):
         print(f"{name:7}", ", ".join(f"{key} {value:.3f}" for key, value in told[name].items()))
     if asked.write:
-        asked.write.write_text(json.dumps({**results.provenance(), **told}, indent=1) + "\n")
+        asked.write.write_text(json.dumps({**provenance(), **told}, indent=1) + "\n")
 
 
 if __name__ == "__main__":

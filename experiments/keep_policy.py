@@ -13,31 +13,32 @@ import jax
 import numpy as np
 
 from cuelearner_jax.errors import UserError
+from cuelearner_jax.loop import start_clock
+from cuelearner_jax.records import formats
 from cuelearner_jax.records.checkpoint import checkpoints
 from cuelearner_jax.runs.grid import load
-from cuelearner_jax.runs.trained import Subject, Trained, load_lanes
-from cuelearner_jax.tasks.registry import TASKS
-from cuelearner_jax.train import start_clock
+from cuelearner_jax.runs.trained import Lanes, PolicySource
+from cuelearner_jax.tasks import registry
 
 
 def keep(run: Path, out: Path, seed: int, kind: str | None, labels: int | None) -> None:
     """Writes the run folder `out`. Raises UserError if the run has no such lane or `out` is in use."""
     if out.exists():
         raise UserError(f"{out} exists: give another --out")
-    task, config, grid = load(run, TASKS)
-    lanes = load_lanes(Subject(task, config, grid, run), (kind or grid.guidance[-1],))[0]
+    task, config, grid = load(run, registry.find)
+    lanes = PolicySource(task, config, grid, run).load((kind or grid.guidance[-1],))[0]
     budget = int(lanes.budgets.max()) if labels is None else labels
     found = np.flatnonzero((lanes.seeds == seed) & (lanes.budgets == budget))
     if not len(found):
         raise UserError(f"{run} has no lane of seed {seed} with {budget} labels")
-    described = json.loads((run / "config.json").read_text())
+    described = formats.read("config", run / "config.json")
     described["grid"] = {"guidance": [lanes.guidance.name], "seeds": [seed], "labels": [budget]}
     out.mkdir(parents=True)
     (out / "config.json").write_text(json.dumps(described, indent=1) + "\n")
     write(out / lanes.guidance.name, lanes, int(found[0]))
 
 
-def write(folder: Path, lanes: Trained, index: int) -> None:
+def write(folder: Path, lanes: Lanes, index: int) -> None:
     """The checkpoint of one lane's policy."""
     policy = jax.tree.map(lambda leaf: leaf[index : index + 1], lanes.policies)
     clock = start_clock().replace(step=np.int32(lanes.step))

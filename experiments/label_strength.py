@@ -17,6 +17,7 @@ import numpy as np
 
 from cuelearner_jax.cli import main as cuelearner
 from cuelearner_jax.records import results
+from cuelearner_jax.records.provenance import provenance
 from cuelearner_jax.report.statistics import interval
 
 STRENGTHS_DEG = (1, 2, 5)
@@ -54,7 +55,7 @@ def main() -> int:
         low, high = row["interval"]
         spread = f"{row['iqm']:.3f} [{low:.3f}, {high:.3f}]"
         print(f"{row['eps_deg']:9d}  {spread} {row['mean']:20.3f} {row['rewards'][0]:12.3f}")
-    contents = {**results.provenance(), "command": "python experiments/label_strength.py", "rows": rows}
+    contents = {**provenance(), "command": "python experiments/label_strength.py", "rows": rows}
     (arguments.out / "label_strength.json").write_text(json.dumps(contents, indent=1) + "\n")
     return 0
 

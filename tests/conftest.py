@@ -1,12 +1,17 @@
-"""Settings of every test: the CPU, and compiled programs kept between runs."""
+"""Settings of every test: the CPU, compiled programs kept between runs, shapes in signatures checked."""
 
 import os
 from pathlib import Path
 
 import jaxlib.version
+import pytest
+from checked import LOOSE_RANKS, PACKAGES
+from jaxtyping import install_import_hook
+
+TESTS = Path(__file__).resolve().parent
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
-os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(__file__).resolve().parents[1] / ".jax_cache"))
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(TESTS.parent / ".jax_cache"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.2")
 # Compiling is most of what the tests take: a third of it with LLVM's first level and XLA's former emitters, and what
 # they assert holds with any.
@@ -14,3 +19,39 @@ flags = ["--xla_backend_optimization_level=1"]
 if jaxlib.version.__version_info__ < (0, 11):  # JAX does not start with a flag that it no longer knows
     flags.append("--xla_cpu_use_fusion_emitters=false")
 os.environ["XLA_FLAGS"] = " ".join([*flags, os.environ.get("XLA_FLAGS", "")]).strip()
+
+install_import_hook(PACKAGES, "checked.checked")  # before anything of them is imported
+
+
+def lies_in(path, places):
+    """Is a file one of these files, or in one of these folders of tests?"""
+    return any(TESTS / place in (path, *path.parents) for place in places)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def strict_ranks(request):
+    """Raises at implicit rank promotion, but in the tests of `LOOSE_RANKS`."""
+    import jax  # reads the settings above
+
+    with jax.numpy_rank_promotion("allow" if lies_in(request.path, LOOSE_RANKS) else "raise"):
+        yield
+
+
+# What `make test-quick` leaves out: files and folders with a compile of more than a few seconds, or with processes of
+# their own to wait for.
+SLOW = (
+    *("bench", "brax_bridge", "cli", "envs/anymal", "examples", "face", "teachers", "testing"),
+    *("agent/test_choice.py", "agent/test_n_step.py", "records/test_checkpoint.py", "tasks/test_registry.py"),
+    *("runs/test_given_labels.py", "runs/test_lanes.py", "runs/test_resume.py", "runs/test_runs.py"),
+    *("envs/billiards/test_environment.py", "envs/billiards/test_mirrors.py", "envs/billiards/test_parity.py"),
+    *("envs/billiards/test_teacher.py", "envs/navigation/test_drawing.py", "envs/navigation/test_environment.py"),
+    *("envs/navigation/test_episodes.py", "envs/navigation/test_roadmap.py", "envs/navigation/test_worlds.py"),
+    *("test_asking.py", "test_devices.py", "test_environment.py", "test_loop.py", "test_policies.py"),
+)
+
+
+def pytest_collection_modifyitems(items):
+    """Marks the tests of `SLOW`."""
+    for item in items:
+        if lies_in(item.path, SLOW):
+            item.add_marker(pytest.mark.slow)

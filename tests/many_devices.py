@@ -13,9 +13,11 @@ import jax
 import probes
 
 from cuelearner_jax.guidance import registry as guidances
+from cuelearner_jax.loop import start_clock
 from cuelearner_jax.runs import lanes, sweep
 from cuelearner_jax.runs.grid import Grid
-from cuelearner_jax.train import start_clock
+from cuelearner_jax.runs.order import Order
+from cuelearner_jax.terminal import Interrupted
 
 CONFIG = probes.config(
     sizes={"q_layers": (16,), "feedback_layers": (16,), "fit_steps": 100, "replay_capacity": 40},
@@ -41,8 +43,8 @@ def run(out: Path, stop_at: int | None = None, **options) -> None:
 
     usual, sweep.interruptible = sweep.interruptible, interruptible
     try:
-        sweep.run(probes.make_task(), CONFIG, GRID, out, **options)
-    except sweep.Interrupted:
+        sweep.run(Order(probes.make_task(), CONFIG, GRID, out, **options))
+    except Interrupted:
         assert stop_at is not None
     finally:
         sweep.interruptible = usual
@@ -51,7 +53,7 @@ def run(out: Path, stop_at: int | None = None, **options) -> None:
 def communication() -> list[str]:
     """Operations between devices in the compiled training."""
     env = probes.Window()
-    group = lanes.Group(CONFIG, env, guidances.make("relative", CONFIG.sizes, env.obs_size), GRID)
+    group = lanes.LaneGroup(CONFIG, env, guidances.make("relative", CONFIG.sizes, env), GRID)
     (block,) = group.start()
     train = group.program.train
     text = train.lower(env, CONFIG.scalars, CONFIG.schedule, start_clock(), block, 4).compile().as_text()

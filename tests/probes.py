@@ -8,7 +8,6 @@ import json
 import math
 from dataclasses import dataclass
 from functools import cache, partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -19,8 +18,8 @@ from cuelearner_jax.actions import difference, evenly_spaced, from_angle, rotate
 from cuelearner_jax.config import RunConfig, Scalars, Schedule, Sizes
 from cuelearner_jax.environment import Quantity, WholeObservations
 from cuelearner_jax.guidance import registry as guidances
-from cuelearner_jax.tasks.registry import Task
-from cuelearner_jax.train import make_program
+from cuelearner_jax.loop import make_program
+from cuelearner_jax.task import Body, Task
 from cuelearner_jax.types import Label, Step
 
 
@@ -75,7 +74,6 @@ class Chain(WholeObservations, struct.PyTreeNode):
     truncates: jax.Array | bool = False
 
     observation = (Quantity("context", 2, "1"),)
-    symmetries = 1
 
     def reset(self, key):
         return jnp.zeros((), jnp.int32), self.observe(0)
@@ -94,9 +92,6 @@ class Chain(WholeObservations, struct.PyTreeNode):
     def heuristic(self, obs):
         return from_angle(jnp.array(2.0))
 
-    def mirror(self, which, obs, vector):
-        return obs, vector
-
 
 class Expert(struct.PyTreeNode):
     """Knows a window's best direction exactly."""
@@ -105,6 +100,13 @@ class Expert(struct.PyTreeNode):
 
     def best_action(self, state, obs):
         return self.env.best(obs)
+
+
+class Acting:
+    """A policy of a function: (key, states, observations) -> actions."""
+
+    def __init__(self, act):
+        self.act = act
 
 
 @dataclass(frozen=True)
@@ -116,16 +118,9 @@ class WindowConfig:
 
 
 def make_task(name="window"):
-    """The bandit as a task; the pictures are never asked for."""
-    known: dict[str, Any] = {
-        "name": name,
-        "config": WindowConfig,
-        "environment": lambda config, split="training": Window(jnp.deg2rad(jnp.array(config.half_width_deg))),
-        "teacher": lambda config, env: Expert(env),
-        "presets": {},
-    }
-    values: dict[str, Any] = {field.name: known.get(field.name) for field in dataclasses.fields(Task)}
-    return Task(**values)
+    """The bandit as a task that nothing draws."""
+    body = Body("point", "", lambda config, split: Window(jnp.deg2rad(jnp.array(config.half_width_deg))))
+    return Task(name, "the bandit", WindowConfig, (body,), teacher=lambda config, env: Expert(env))
 
 
 SIZES = Sizes(
@@ -168,7 +163,7 @@ def config(sizes=None, scalars=None, schedule=None):
 @cache
 def window_program(kind, largest_budget=0):
     """One compiled loop on the bandit for all tests."""
-    return make_program(CONFIG, guidances.make(kind, SIZES, 2), Window(), largest_budget)
+    return make_program(CONFIG, guidances.make(kind, SIZES, Window()), Window(), largest_budget)
 
 
 def start(program, seeds, budgets, env=None):
@@ -179,7 +174,7 @@ def start(program, seeds, budgets, env=None):
 
 def stored(state, lane, steps):
     """What a lane's environments met: columns (steps, ...) of its replay in the order of time."""
-    rows = np.asarray(state.replay[lane, :steps])
+    rows = np.asarray(state.agent.replay[lane, :steps])
     names = {"obs": slice(0, 2), "action": slice(2, 4), "reward": 4}
     if rows.shape[1] > 5:  # something bootstraps
         names |= {"discount": 5, "ended": 6, "next_obs": slice(7, None)}
@@ -193,9 +188,9 @@ def greedy_actions(q, params, obs, sizes=SIZES):
     return np.asarray(options[jnp.argmax(values, -1)])
 
 
-def label_set(obs, action, target, valid):
+def label_set(obs, action, answer, valid):
     """Labels as NumPy arrays."""
-    return Label(obs, action, target, valid)
+    return Label(obs, action, answer, valid)
 
 
 def compilations(*functions):

@@ -1,4 +1,4 @@
-"""Double DQN over a finite set of directions: targets, loss and greedy choice, pure and unbatched.
+"""Double DQN over a finite set of actions: targets, loss and greedy choice, pure and unbatched.
 
 Source: van Hasselt, Guez, Silver, "Deep reinforcement learning with double Q-learning", Eq. 4.
 """
@@ -14,37 +14,37 @@ from jaxtyping import Array, Bool, Float, Int
 
 from cuelearner_jax.types import Params, Transition
 
-# (params, obs (..., obs), actions (..., 2)) -> (..., 1)
+# (params, obs (..., obs), actions (..., action)) -> (..., 1)
 ValueFunction = Callable[[Params, jax.Array, jax.Array], jax.Array]
 
 
 def greedy(
-    q: ValueFunction, params: Params, obs: Float[Array, " obs"], directions: Float[Array, "n 2"]
-) -> Float[Array, "2"]:
-    """The direction of the set with the largest value."""
-    return directions[jnp.argmax(q(params, obs, directions)[:, 0])]
+    q: ValueFunction, params: Params, obs: Float[Array, " obs"], options: Float[Array, "n action"]
+) -> Float[Array, " action"]:
+    """The action of a set with the largest value."""
+    return options[jnp.argmax(q(params, obs, options)[:, 0])]
 
 
 def greedy_near_peaks(
     q: ValueFunction,
     params: Params,
     obs: Float[Array, " obs"],
-    directions: Float[Array, "n 2"],
+    options: Float[Array, "n action"],
     coarse: Float[Array, " coarse"],
     peaks: int,
-) -> Float[Array, "2"]:
+) -> Float[Array, " action"]:
     """The same choice as `greedy` makes, if the largest value lies next to one of the highest peaks of a first look.
 
     Args:
-        directions: evenly spaced.
+        options: evenly spaced, the last beside the first.
         coarse: values of every (n / coarse)-th of them, computed as roughly as may be: they decide where to look only.
         peaks: how many of its local maxima to look round, up to its neighbours.
     """
-    stride = directions.shape[0] // coarse.shape[0]
+    stride = options.shape[0] // coarse.shape[0]
     summit = (coarse >= jnp.roll(coarse, 1)) & (coarse >= jnp.roll(coarse, -1))
     _, highest = jax.lax.top_k(jnp.where(summit, coarse, -jnp.inf), peaks)
-    near = jnp.mod(highest[:, None] * stride + jnp.arange(1 - stride, stride), directions.shape[0]).ravel()
-    return greedy(q, params, obs, directions[near])
+    near = jnp.mod(highest[:, None] * stride + jnp.arange(1 - stride, stride)[None], options.shape[0]).ravel()
+    return greedy(q, params, obs, options[near])
 
 
 def target(
@@ -52,7 +52,7 @@ def target(
     params: Params,
     target_params: Params,
     transition: Transition,
-    directions: Float[Array, "n 2"],
+    options: Float[Array, "n action"],
     discount: Float[Array, ""] | float,
     chooser: ValueFunction | None = None,
 ) -> Float[Array, ""]:
@@ -63,7 +63,7 @@ def target(
     """
     if target_params is None:
         return transition.reward
-    choice = greedy(chooser or q, params, transition.next_obs, directions)
+    choice = greedy(chooser or q, params, transition.next_obs, options)
     value = q(target_params, transition.next_obs, choice)[0]
     return transition.reward + discount * transition.discount * value
 

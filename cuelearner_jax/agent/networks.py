@@ -24,13 +24,16 @@ class Joined(nn.Module):
     dtype: DTypeLike = jnp.float32
 
     @nn.compact
-    def __call__(self, obs: Float[Array, "... obs"], action: Float[Array, "... 2"]) -> Float[Array, "... width"]:
+    def __call__(self, obs: Float[Array, "... obs"], action: Float[Array, "... action"]) -> Float[Array, "... width"]:
         """Leading axes of `obs` and `action` must broadcast."""
         shape = (obs.shape[-1] + action.shape[-1], self.width)
         kernel = self.param("kernel", nn.initializers.xavier_uniform(), shape)
         bias = self.param("bias", nn.initializers.zeros, (self.width,))
         obs, action, kernel, bias = (jnp.asarray(x, self.dtype) for x in (obs, action, kernel, bias))
-        return (obs @ kernel[: obs.shape[-1]] + bias) + action @ kernel[obs.shape[-1] :]
+        seen, chosen = obs @ kernel[: obs.shape[-1]], action @ kernel[obs.shape[-1] :]
+        rank = max(seen.ndim, chosen.ndim)
+        bias, seen, chosen = (jnp.expand_dims(x, tuple(range(rank - x.ndim))) for x in (bias, seen, chosen))
+        return (seen + bias) + chosen
 
 
 class MLP(nn.Module):
@@ -41,7 +44,7 @@ class MLP(nn.Module):
     dtype: DTypeLike = jnp.float32  # of the hidden layers' arithmetic; parameters and outputs are float32
 
     @nn.compact
-    def __call__(self, obs: Float[Array, "... obs"], action: Float[Array, "... 2"]) -> Float[Array, "... outputs"]:
+    def __call__(self, obs: Float[Array, "... obs"], action: Float[Array, "... action"]) -> Float[Array, "... outputs"]:
         """Leading axes of `obs` and `action` must broadcast."""
         x = nn.relu(Joined(self.layers[0], self.dtype, name="Dense_0")(obs, action))
         for place, width in enumerate(self.layers[1:], start=1):
@@ -57,13 +60,13 @@ def q_network(layers: Sequence[int], dtype: DTypeLike = jnp.float32) -> MLP:
     return MLP(tuple(layers), 1, dtype)
 
 
-def feedback_network(layers: Sequence[int]) -> MLP:
-    """phi(s, a): a residual in the plane."""
-    return MLP(tuple(layers), 2)
+def residual_network(layers: Sequence[int], outputs: int) -> MLP:
+    """phi(s, a): something to add to an action."""
+    return MLP(tuple(layers), outputs)
 
 
 def applied(network: MLP) -> Callable[[Params, jax.Array, jax.Array], jax.Array]:
-    """A network as a function: (params, obs (..., obs), actions (..., 2)) -> outputs (..., outputs)."""
+    """A network as a function: (params, obs (..., obs), actions (..., action)) -> outputs (..., outputs)."""
     return lambda params, obs, actions: jnp.asarray(network.apply(params, obs, actions))
 
 

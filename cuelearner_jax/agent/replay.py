@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from cuelearner_jax.types import Memory
+from cuelearner_jax.types import StoredStep
 
 
 class Following(NamedTuple):
@@ -32,10 +32,12 @@ class RingBuffer(NamedTuple):
 
     width: int
     empty: Callable[[int], Float[Array, "capacity width"]]
-    add: Callable[..., Float[Array, "capacity width"]]  # (rows, step, steps (n, ...)) -> rows
-    draw: Callable[..., Int[Array, " batch"]]  # (key, rows, step, batch_size) -> rows' numbers
-    read: Callable[..., Memory]  # (rows, numbers (batch,)) -> steps (batch, ...)
-    follow: Callable[..., Following]  # (rows, step, numbers (batch,), n, num_envs) -> Following
+    add: Callable[[Array, Array, StoredStep], Array]  # (rows, step, steps (n, ...)) -> rows
+    draw: Callable[[PRNGKeyArray, Array, Array, int], Array]  # (key, rows, step, batch_size) -> rows' numbers
+    read: Callable[[Array, Array], StoredStep]  # (rows, numbers (batch,)) -> steps (batch, ...)
+    follow: Callable[
+        [Array, Array, Array, int, int], Following
+    ]  # (rows, step, numbers (batch,), n, num_envs) -> Following
 
 
 @jax.custom_batching.custom_vmap
@@ -55,7 +57,7 @@ def _write_lanes(axis_size: int, batched: list[bool], rows: Array, packed: Array
     return _write(rows, packed, start), True
 
 
-def ring_buffer(example: Memory) -> RingBuffer:
+def ring_buffer(example: StoredStep) -> RingBuffer:
     """Builds the buffer for steps shaped like `example`.
 
     `add` requires the capacity to be a multiple of the number of steps added at once: one of each environment. So the
@@ -69,7 +71,7 @@ def ring_buffer(example: Memory) -> RingBuffer:
         return jnp.zeros((capacity, width), jnp.float32)
 
     def add(
-        rows: Float[Array, "capacity width"], step: Int[Array, ""], steps: Memory
+        rows: Float[Array, "capacity width"], step: Int[Array, ""], steps: StoredStep
     ) -> Float[Array, "capacity width"]:
         packed = jax.vmap(lambda item: ravel_pytree(item)[0])(steps)
         if rows.shape[0] % packed.shape[0]:
@@ -81,7 +83,7 @@ def ring_buffer(example: Memory) -> RingBuffer:
     ) -> Int[Array, " batch"]:
         return jax.random.randint(key, (batch_size,), 0, jnp.clip(step, 1, rows.shape[0]))
 
-    def read(rows: Float[Array, "capacity width"], numbers: Int[Array, " batch"]) -> Memory:
+    def read(rows: Float[Array, "capacity width"], numbers: Int[Array, " batch"]) -> StoredStep:
         return jax.vmap(unravel)(rows[numbers])
 
     def follow(
@@ -90,9 +92,9 @@ def ring_buffer(example: Memory) -> RingBuffer:
         capacity = rows.shape[0]
         further = jnp.arange(n) * num_envs
         newer = jnp.mod(step - 1 - numbers, capacity)  # rows written after each
-        places = jnp.mod(numbers[:, None] + further, capacity)
+        places = jnp.mod(numbers[:, None] + further[None], capacity)
         # Three neighbouring numbers of each row, not the row.
-        found = rows[places[..., None], reward_column + jnp.arange(3)]
-        return Following(*jnp.moveaxis(found, -1, 0), known=further <= newer[:, None])
+        found = rows[places[..., None], reward_column + jnp.arange(3)[None, None]]
+        return Following(*jnp.moveaxis(found, -1, 0), known=further[None] <= newer[:, None])
 
     return RingBuffer(width, empty, add, draw, read, follow)

@@ -36,7 +36,7 @@ ROW: dict[str, type | tuple[type, ...]] = {
     "updates_a_second": NUMBER,  # gradient steps, of all seeds
     "ms_an_iteration": NUMBER,  # num_envs steps of every seed, and their gradient steps
     "ms_a_step": NUMBER,  # one step of every seed
-    "mflop_a_step": NUMBER,  # of one seed, see operations.py
+    "mflop_a_step": NUMBER,  # of one seed, see flops.py
     "gflops": NUMBER,  # reached
     "matmul_gflops": dict,  # rate of large matrix products by data type, in the same run, on all devices
     "share_of_matmul": dict,  # reached over that

@@ -26,18 +26,19 @@ from jax.sharding import Mesh
 
 from cuelearner_jax import config as configuration
 from cuelearner_jax.bench import known_machines as machines
-from cuelearner_jax.bench.operations import step_operations
+from cuelearner_jax.bench.flops import step_operations
 from cuelearner_jax.config import RunConfig
 from cuelearner_jax.devices import SHARED, lane_mesh, place
-from cuelearner_jax.environment import Environment
+from cuelearner_jax.environment import Environment, Spaces, spaces_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guidance import registry as guidances
-from cuelearner_jax.records import results
+from cuelearner_jax.loop import start_clock
+from cuelearner_jax.records.provenance import provenance
 from cuelearner_jax.runs.grid import LARGEST_SEED, Grid
-from cuelearner_jax.runs.lanes import CORES, Group, memory_report, state_bytes
-from cuelearner_jax.runs.sweep import Interrupted, console, progress_bars
-from cuelearner_jax.tasks.registry import Task, shape_of
-from cuelearner_jax.train import start_clock
+from cuelearner_jax.runs.lanes import CORES, LaneGroup
+from cuelearner_jax.runs.memory_report import memory_report, state_bytes
+from cuelearner_jax.task import Task, shape_of
+from cuelearner_jax.terminal import Interrupted, console, progress_bars
 from cuelearner_jax.types import Teacher
 
 FEWEST_STRETCHES = 3
@@ -89,48 +90,28 @@ class Timed:
         self, config: RunConfig, env: Environment, kind: str, seeds: int, labels: int = 0, mesh: Mesh | None = None
     ) -> None:
         mesh = mesh or lane_mesh()
-        made = guidances.make(kind, config.sizes, env.obs_size)
+        made = guidances.make(kind, config.sizes, env)
         env = place(mesh, env, SHARED)
-        self.group = Group(config, env, made, Grid((kind,), tuple(range(seeds)), (labels,)), mesh)
+        self.group = LaneGroup(config, env, made, Grid((kind,), tuple(range(seeds)), (labels,)), mesh)
         self.clock, self.blocks = place(mesh, start_clock(), SHARED), self.group.start()
 
     def train(self, iterations: int) -> float:
         """Seconds of so many iterations of all lanes. The first call with a number compiles."""
-        group, clock = self.group, self.clock
-        config = group.config
-        seconds, done = _timed(
-            lambda: group.each(
-                lambda block: group.program.train(group.env, config.scalars, config.schedule, clock, block, iterations),
-                self.blocks,
-            )
-        )
-        self.clock, self.blocks = done[0][0], [block for _, block, _ in done]
+        seconds, done = _timed(lambda: self.group.train(self.clock, self.blocks, iterations))
+        self.clock, self.blocks, _ = done
         return seconds
 
     def label_round(self, teacher: Teacher) -> float:
         """Seconds of one round of questions and the fit that follows it. The first call compiles."""
-        group, clock = self.group, self.clock
-        seconds, done = _timed(
-            lambda: group.each(
-                lambda block: group.program.label_round(group.env, teacher, group.config.scalars, clock, block),
-                self.blocks,
-            )
-        )
-        self.clock, self.blocks = done[0][0], [block for _, block in done]
+        seconds, done = _timed(lambda: self.group.label_round(teacher, self.clock, self.blocks))
+        self.clock, self.blocks = done
         return seconds
 
     def fit(self) -> float:
         """Seconds of one fit to the labels there are. The first call compiles."""
-        group = self.group
         # The blocks are given up to the program, so their labels go into it as copies.
-        labels = [jax.block_until_ready(jax.tree.map(jnp.copy, block.asking.labels)) for block in self.blocks]
-        seconds, self.blocks = _timed(
-            lambda: group.each(
-                lambda rows, block: group.program.take_labels(group.env, group.config.scalars, rows, block),
-                labels,
-                self.blocks,
-            )
-        )
+        labels = [jax.block_until_ready(jax.tree.map(jnp.copy, block.guide.labels)) for block in self.blocks]
+        seconds, self.blocks = _timed(lambda: self.group.take_labels(labels, self.blocks))
         return seconds
 
 
@@ -154,11 +135,11 @@ def matmul_rate(dtype: str = "float32", repeats: int = 5) -> float:
     return queued * 2 * size**3 / best
 
 
-def iterations_of(config: RunConfig, obs_size: int, seeds: int) -> int:
+def iterations_of(config: RunConfig, spaces: Spaces, seeds: int) -> int:
     """Iterations of one stretch: a power of two that depends on the work alone, so that programs are found compiled."""
     sizes = config.sizes
     rate = NOMINAL_RATE["cpu" if jax.default_backend() == "cpu" else "accelerator"]
-    one = seeds * sizes.num_envs * step_operations(sizes, obs_size, config.bootstraps).total / rate
+    one = seeds * sizes.num_envs * step_operations(sizes, spaces, config.bootstraps).total / rate
     most = min(STRETCH_S / one, LONGEST_STRETCH / sizes.num_envs)
     return 2 ** max(0, math.floor(math.log2(most)))
 
@@ -173,7 +154,7 @@ def measure(
     began = time.perf_counter()
     env = work.task.environment(config.task)
     timed = Timed(config, env, "none", seeds, mesh=mesh)
-    iterations = iterations_of(config, env.obs_size, seeds)
+    iterations = iterations_of(config, spaces_of(env), seeds)
     timed.train(iterations)
     first = time.perf_counter() - began
     at_rest = sum(state_bytes(block) for block in timed.blocks)
@@ -185,7 +166,7 @@ def measure(
     rates = {name: max(rate, rates[name]) for name, rate in _rates().items()}
     iteration = statistics.median(stretches) / iterations
     steps = seeds * sizes.num_envs / iteration
-    flops = steps * step_operations(sizes, env.obs_size, config.bootstraps).total
+    flops = steps * step_operations(sizes, spaces_of(env), config.bootstraps).total
     working = mesh.size if jax.default_backend() != "cpu" else 1  # CPU devices share the cores
     memory = jax.local_devices()[0].memory_stats() or {}
     return {
@@ -266,11 +247,11 @@ def _check(works: Sequence[Work], asked: Measuring) -> Mesh:
     return mesh
 
 
-def _planned(work: Work, seeds: int, mesh: Mesh) -> Group:
+def _planned(work: Work, seeds: int, mesh: Mesh) -> LaneGroup:
     """The lanes of a measurement, of which nothing but shapes is made."""
     env = shape_of(work.task, work.config.task)
-    made = guidances.make("none", work.config.sizes, env.obs_size)
-    return Group(learning(work.config), env, made, Grid(("none",), tuple(range(seeds)), ()), mesh)
+    made = guidances.make("none", work.config.sizes, env)
+    return LaneGroup(learning(work.config), env, made, Grid(("none",), tuple(range(seeds)), ()), mesh)
 
 
 def _at_rest(work: Work, seeds: int, mesh: Mesh) -> int:
@@ -280,7 +261,7 @@ def _at_rest(work: Work, seeds: int, mesh: Mesh) -> int:
 
 def _entry(asked: Measuring, command: str, cache: str) -> dict[str, Any]:
     """Where and how the figures were measured."""
-    came = {**results.provenance(), "command": command}
+    came = {**provenance(), "command": command}
     return {
         "name": asked.name or (came["hardware"] if jax.default_backend() != "cpu" else f"{CORES} cores"),
         "note": asked.note,

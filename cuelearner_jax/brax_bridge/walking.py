@@ -8,23 +8,34 @@ from __future__ import annotations
 import dataclasses
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
+from jaxtyping import PRNGKeyArray
 
 from cuelearner_jax import config as configuration
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.records import results
-from cuelearner_jax.runs.grid import in_use
-from cuelearner_jax.runs.sweep import Interrupted, interruptible
-from cuelearner_jax.types import Walker
+from cuelearner_jax.records.folders import in_use
+from cuelearner_jax.records.provenance import provenance
+from cuelearner_jax.terminal import Interrupted, interruptible
 
 COLUMNS = ("steps", "wall_s", "error", "turning_error", "falls")  # of the history
 VALUE_LAYERS = (256, 256, 256, 256)
+
+
+class LocomotionTask(NamedTuple):
+    """What training has to know of a robot that learns to walk. Figures are numbers by name."""
+
+    environment: Any  # brax.envs.Env: velocity commands are to be tracked
+    policy: Callable[[Any], Any]  # brax's parameters -> a policy
+    measure: Callable[[Any, PRNGKeyArray, int], dict[str, float]]  # (policy, key, robots) -> figures while it learns
+    examine: Callable[[Any, PRNGKeyArray, int], Iterator[tuple[str, dict[str, float]]]]  # of a finished one, by trial
+    save: Callable[[Path, Any, dict[str, Any]], None]  # (folder, policy, what is to be known of it)
+    load: Callable[..., Any]  # (folder) -> the policy; the shipped one without a folder
 
 
 @dataclass(frozen=True)
@@ -85,7 +96,7 @@ class _Enough(Exception):
 
 
 def train(
-    walker: Walker,
+    robot: LocomotionTask,
     config: LocomotionConfig,
     out: Path,
     seed: int,
@@ -104,14 +115,14 @@ def train(
     check(config)
     if in_use(out):
         raise UserError(f"{out} is not empty: give another --out")
-    about = {"config": configuration.to_json(config), "seed": seed, **results.provenance(), "command": command}
+    about = {"config": configuration.to_json(config), "seed": seed, **provenance(), "command": command}
     history: list[list[float]] = []
     key = jax.random.key(seed)
     began = time.perf_counter()
 
     def look(steps: int, _: Any, params: Any) -> None:
-        policy = walker.policy(params)
-        found = walker.measure(policy, jax.random.fold_in(key, 0), config.measured_robots)
+        policy = robot.policy(params)
+        found = robot.measure(policy, jax.random.fold_in(key, 0), config.measured_robots)
         wall = time.perf_counter() - began
         history.append([steps, round(wall, 1), *(round(found[name], 4) for name in COLUMNS[2:])])
         tell(
@@ -120,19 +131,19 @@ def train(
         )
         if steps:  # what is still untrained is not worth keeping
             told = {"columns": list(COLUMNS), "rows": history}
-            walker.save(out, jax.device_get(policy), {**about, "finished": False, "history": told})
+            robot.save(out, jax.device_get(policy), {**about, "finished": False, "history": told})
         if stopping.is_set() or (config.seconds and wall > config.seconds):
             raise _Enough
 
     tell(f"{jax.devices()[0].device_kind}: compiling takes a minute or so")
     with interruptible() as stopping:
         try:
-            _ppo(walker, config, seed, look)
+            _ppo(robot, config, seed, look)
         except _Enough:
             if stopping.is_set():
                 raise Interrupted(f"stopped; {out} holds the policy of the last measurement") from None
     trained = time.perf_counter() - began
-    figures = _examined(walker, walker.load(out), jax.random.fold_in(key, 1), config.measured_robots, tell)
+    figures = _examined(robot, robot.load(out), jax.random.fold_in(key, 1), config.measured_robots, tell)
     about |= {
         "finished": True,
         "trained_steps": history[-1][0],
@@ -140,12 +151,12 @@ def train(
         "figures": figures,
         "history": {"columns": list(COLUMNS), "rows": history},
     }
-    walker.save(out, walker.load(out), about)
+    robot.save(out, robot.load(out), about)
     return about
 
 
 def evaluate(
-    walker: Walker,
+    robot: LocomotionTask,
     folder: Path | None,
     robots: int,
     seed: int,
@@ -162,16 +173,16 @@ def evaluate(
         raise UserError(f"--robots is {robots}: give a positive number")
     if out and out.exists():
         raise UserError(f"{out} exists: give another --out")
-    policy = walker.load(folder) if folder else walker.load()
-    figures = _examined(walker, policy, jax.random.key(seed), robots, tell)
+    policy = robot.load(folder) if folder else robot.load()
+    figures = _examined(robot, policy, jax.random.key(seed), robots, tell)
     if out:
         out.parent.mkdir(parents=True, exist_ok=True)
-        contents = {"seed": seed, **results.provenance(), "command": command, "figures": figures}
+        contents = {"seed": seed, **provenance(), "command": command, "figures": figures}
         out.write_text(json.dumps(contents, indent=1) + "\n")
     return figures
 
 
-def _ppo(walker: Walker, config: LocomotionConfig, seed: int, look: Callable[[int, Any, Any], None]) -> None:
+def _ppo(robot: LocomotionTask, config: LocomotionConfig, seed: int, look: Callable[[int, Any, Any], None]) -> None:
     """brax's PPO with the settings; `look` is called now and then with (steps, _, parameters)."""
     from brax.training.agents.ppo import networks  # takes seconds to load, which other commands need not wait for
     from brax.training.agents.ppo import train as ppo
@@ -180,7 +191,7 @@ def _ppo(walker: Walker, config: LocomotionConfig, seed: int, look: Callable[[in
 
     supply_device_put_replicated()
     ppo.train(
-        environment=walker.environment,
+        environment=robot.environment,
         num_timesteps=config.steps,
         max_devices_per_host=1,
         num_envs=config.robots,
@@ -208,12 +219,12 @@ def _ppo(walker: Walker, config: LocomotionConfig, seed: int, look: Callable[[in
 
 
 def _examined(
-    walker: Walker, policy: Any, key: jax.Array, robots: int, tell: Callable[[str], None]
+    robot: LocomotionTask, policy: Any, key: jax.Array, robots: int, tell: Callable[[str], None]
 ) -> dict[str, dict[str, float]]:
     """Figures of a policy by trial, each told as soon as it is measured."""
     figures = {}
     tell(f"{robots} robots walk for 20 s, trial by trial")
-    for name, found in walker.examine(policy, key, robots):
+    for name, found in robot.examine(policy, key, robots):
         figures[name] = {figure: round(value, 5) for figure, value in found.items()}
         tell(f"{name:20}" + ", ".join(f"{figure} {value:.4g}" for figure, value in figures[name].items()))
     return figures

@@ -13,38 +13,40 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from cuelearner_jax import actions as geometry
+from cuelearner_jax.actions import Actions
 
 
 class Refined(NamedTuple):
     """Result of a refinement."""
 
-    actions: Float[Array, "batch 2"]
-    passes: Int[Array, " batch"]  # how often each row was moved
+    actions: Float[Array, "n action"]
+    passes: Int[Array, " n"]  # how often each row was moved
 
 
-def untouched(actions: Float[Array, "batch 2"]) -> Refined:
+def untouched(actions: Float[Array, "n action"]) -> Refined:
     """Actions that nothing refined."""
     return Refined(actions, jnp.zeros(actions.shape[0], jnp.int32))
 
 
 def refine(
-    residual: Callable[[Float[Array, "batch 2"]], Float[Array, "batch 2"]],
-    first: Float[Array, "batch 2"],
-    active: Bool[Array, " batch"],
+    residual: Callable[[Float[Array, "n action"]], Float[Array, "n action"]],
+    first: Float[Array, "n action"],
+    active: Bool[Array, " n"],
     *,
+    space: Actions,
     tau: Float[Array, ""] | float,
     tau_max: Float[Array, ""] | float,
     k_max: Int[Array, ""] | int,
 ) -> Refined:
-    """Refines a batch of directions.
+    """Refines a batch of actions.
 
     Args:
-        residual: phi(s, .) of the rows' own observations: directions -> residuals.
-        first: a_0, unit vectors.
+        residual: phi(s, .) of the rows' own observations: actions -> residuals.
+        first: a_0.
         active: rows to refine; the others come back untouched.
-        tau: a row stops once a pass turns it by less than this [rad].
-        tau_max: bound on the turn away from `first` [rad]; every iterate is clipped to it.
+        space: the action space.
+        tau: a row stops once a pass moves it by less than this [rad].
+        tau_max: bound on the way from `first` [rad]; every iterate is clipped to it.
         k_max: largest number of passes.
     """
 
@@ -56,9 +58,9 @@ def refine(
         carry: tuple[jax.Array, jax.Array, jax.Array, jax.Array],
     ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
         current, done, passes, k = carry
-        proposal = geometry.retract(current + residual(current))
-        proposal = geometry.clip_to_ball(proposal, first, tau_max)
-        settled = jnp.abs(geometry.difference(current, proposal)) < tau
+        proposal = space.retract(current + residual(current))
+        proposal = space.clip(proposal, first, tau_max)
+        settled = space.distance(current, proposal) < tau
         moved = jnp.where(done[:, None], current, proposal)
         return moved, done | settled, passes + ~done, k + 1
 

@@ -1,113 +1,98 @@
-"""The forms of guidance, each one bundle of pure functions: none, heuristic, relative.
+"""The one place that lists the kinds of guidance: those of the package, of installed packages, and of one's own.
 
-`act` receives a batch of base actions and returns what is to be executed; it leaves rows that are not active as they
-are.
+A kind of one's own is a `Kind`: pass it to `register`, offer it under the entry-point group `cuelearner.guidances`, or
+name it as `package.module:NAME` wherever the name of a kind is asked for.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from functools import cache
+from importlib import metadata
 from typing import Any
 
-import jax
-import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from cuelearner_jax.config import GuideSizes
+from cuelearner_jax.environment import Spaces, offers, spaces_of
+from cuelearner_jax.errors import UserError, closest
+from cuelearner_jax.guidance import heuristic, none, relative
+from cuelearner_jax.guidance.bundle import Guidance
+from cuelearner_jax.guidance.kind import Kind
+from cuelearner_jax.plugins import load
 
-from cuelearner_jax.agent.networks import applied, feedback_network
-from cuelearner_jax.config import Scalars, Sizes
-from cuelearner_jax.environment import Environment
-from cuelearner_jax.errors import UserError
-from cuelearner_jax.guidance import feedback
-from cuelearner_jax.guidance.refining import Refined, refine, untouched
-from cuelearner_jax.types import Guidance, GuidanceModel, Label
+ENTRY_POINTS = "cuelearner.guidances"
 
-KINDS = ("none", "relative", "heuristic")
+_KINDS: dict[str, Kind] = {kind.name: kind for kind in (none.KIND, relative.KIND, heuristic.KIND)}
 
 
-def make(kind: str, sizes: Sizes, obs_size: int) -> Guidance:
-    """The guidance called `kind`. Raises UserError for another name."""
-    if kind == "none":
-        return _unlabelled("none", _identity)
-    if kind == "heuristic":
-        return _unlabelled("heuristic", _heuristic)
-    if kind == "relative":
-        return _relative(sizes, obs_size)
-    raise UserError(f"unknown guidance {kind!r}: choose one of {', '.join(KINDS)}")
+def register(kind: Kind) -> Kind:
+    """Makes a kind known under its name. Raises UserError if another one has the name."""
+    if _KINDS.setdefault(kind.name, kind) != kind:
+        raise UserError(f"there is another guidance called {kind.name!r}: give yours another name")
+    return kind
 
 
-def _identity(
-    model: GuidanceModel,
-    env: Environment,
-    obs: Float[Array, "batch obs"],
-    actions: Float[Array, "batch 2"],
-    active: Bool[Array, " batch"],
-    scalars: Scalars,
-) -> Refined:
-    return untouched(actions)
+def known() -> tuple[Kind, ...]:
+    """The kinds that can be named, those of installed packages included."""
+    _register_installed()
+    return tuple(_KINDS.values())
 
 
-def _heuristic(
-    model: GuidanceModel,
-    env: Any,
-    obs: Float[Array, "batch obs"],
-    actions: Float[Array, "batch 2"],
-    active: Bool[Array, " batch"],
-    scalars: Scalars,
-) -> Refined:
-    return Refined(jnp.where(active[:, None], jax.vmap(env.heuristic)(obs), actions), active.astype(jnp.int32))
+def registered(name: str) -> Kind | None:
+    """The kind of that name, or None: of results whose kind is not known here."""
+    _register_installed()
+    return _KINDS.get(name)
 
 
-def _unlabelled(name: str, act) -> Guidance:
-    """A guidance that learns nothing and never asks."""
+def find(name: str) -> Kind:
+    """The kind of that name, or that `package.module:NAME` leads to.
 
-    def init(key: PRNGKeyArray) -> GuidanceModel:
-        return GuidanceModel({}, jnp.array(False))
-
-    def label(key: PRNGKeyArray, action: jax.Array, best: jax.Array, scalars: Scalars) -> tuple[jax.Array, jax.Array]:
-        return jnp.zeros(2), jnp.array(False)
-
-    def fit(key: PRNGKeyArray, env: Environment, labels: Label, scalars: Scalars) -> GuidanceModel:
-        return init(key)
-
-    return Guidance(name, False, init, label, fit, act)
-
-
-def _relative(sizes: Sizes, obs_size: int) -> Guidance:
-    """The paper's method: a model of relative feedback that refines the agent's actions.
-
-    The network predicts in units of eps, so that a small eps fits as easily as a large one: phi = eps * network.
+    Raises:
+        UserError: there is none.
     """
-    network = feedback_network(sizes.feedback_layers)
-    predict = applied(network)
-
-    def init_params(key: PRNGKeyArray):
-        return network.init(key, jnp.zeros(obs_size), jnp.zeros(2))
-
-    def init(key: PRNGKeyArray) -> GuidanceModel:
-        return GuidanceModel(init_params(key), jnp.array(False))
-
-    def label(key: PRNGKeyArray, action: jax.Array, best: jax.Array, scalars: Scalars) -> tuple[jax.Array, jax.Array]:
-        h, answered = feedback.human_answer(key, action, best, scalars)
-        return feedback.relative_target(action, h, scalars.radians("eps")), answered
-
-    def act(
-        model: GuidanceModel,
-        env: Environment,
-        obs: Float[Array, "batch obs"],
-        actions: Float[Array, "batch 2"],
-        active: Bool[Array, " batch"],
-        scalars: Scalars,
-    ) -> Refined:
-        return refine(
-            lambda current: scalars.radians("eps") * predict(model.params, obs, current),
-            actions,
-            active & model.fitted,
-            tau=scalars.radians("tau"),
-            tau_max=scalars.radians("tau_max"),
-            k_max=scalars.k_max,
+    if ":" in name:
+        return register(load(name, Kind, "a kind of guidance"))
+    _register_installed()
+    if name not in _KINDS:
+        raise UserError(
+            f"unknown guidance {name!r}{closest(name, _KINDS)} (one of your own is named as package.module:NAME)"
         )
+    return _KINDS[name]
 
-    def fit(key: PRNGKeyArray, env: Environment, labels: Label, scalars: Scalars) -> GuidanceModel:
-        scaled = labels.replace(target=labels.target / scalars.radians("eps"))
-        return feedback.fit(key, env, scaled, scalars, init=init_params, apply=predict, sizes=sizes)
 
-    return Guidance("relative", True, init, label, fit, act)
+def possible(env: Any, taught: bool) -> tuple[str, ...]:
+    """Names of the kinds that an environment can have; `taught`: is there a teacher to ask?"""
+    fitting = (kind for kind in known() if (taught or not kind.asks) and all(offers(env, need) for need in kind.needs))
+    return tuple(kind.name for kind in fitting)
+
+
+def make(name: str, sizes: GuideSizes, env: Any) -> Guidance:
+    """A kind's bundle for an environment (shapes in place of arrays will do); the same one for the same sizes.
+
+    Raises:
+        UserError: no such kind, or the environment lacks what it needs.
+    """
+    kind = find(name)
+    for need in kind.needs:
+        if not offers(env, need):
+            raise UserError(f"guidance {kind.name!r} needs an environment with a {need}, which this task's is not")
+    return made_for(kind, sizes, spaces_of(env))
+
+
+@cache
+def made_for(kind: Kind, sizes: GuideSizes, spaces: Spaces) -> Guidance:
+    """A kind's bundle for an observation and action space; the same one for the same sizes and spaces."""
+    made = kind.make(sizes, spaces)
+    if made.form != kind.form or made.name != kind.name:
+        raise ValueError(f"guidance {kind.name!r} was made with another name or form of answers than its kind has")
+    return made
+
+
+@cache
+def _register_installed() -> None:
+    for point in metadata.entry_points(group=ENTRY_POINTS):
+        register(load(point.value, Kind, "a kind of guidance"))
+
+
+def listed(kinds: Sequence[Kind] | None = None) -> str:
+    """Names with what they are, for help pages."""
+    return "; ".join(f"{kind.name}: {kind.about}" for kind in (known() if kinds is None else kinds))

@@ -22,37 +22,29 @@ it, until the next such line (a run resumed on other hardware adds one). In Parq
 
 from __future__ import annotations
 
-import json
-import math
 import os
-import shlex
-import subprocess
-import sys
-import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from importlib import metadata
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-import pyarrow.parquet as pq
 
 from cuelearner_jax.errors import UserError
+from cuelearner_jax.records import table as tables
+from cuelearner_jax.records.table import PathLike
 
-JSONL = "results.jsonl"
-PARQUET = "results.parquet"
-TAIL = 1 << 16  # more than the longest row [bytes]
-REQUIRED = ("run", "task", "guidance", "labels", "seed", "step", "split", "config_hash")
-STRINGS = ("run", "task", "guidance", "split", "config_hash", "commit", "versions", "hardware", "command")
-INTEGERS = ("labels", "seed", "step")
+SCHEMA = tables.Schema(
+    stem="results",
+    mark="step",
+    required=("run", "task", "guidance", "labels", "seed", "step", "split", "config_hash"),
+    strings=("run", "task", "guidance", "split", "config_hash", "commit", "versions", "hardware", "command"),
+    integers=("labels", "seed", "step"),
+    remedy="is corrupt: restore it or run again",
+)
+JSONL, PARQUET = SCHEMA.jsonl, SCHEMA.parquet
 
-PathLike = str | os.PathLike[str]
-Row = dict[str, Any]
 
-
-class ResultsWriter:
+class ResultsWriter(tables.TableWriter):
     """Appends rows to the JSONL file of one run; every append is on the disk when the call returns.
 
     Opening an existing file continues it: a torn last line, left by a crash, is dropped first, and a table that was
@@ -67,65 +59,13 @@ class ResultsWriter:
             folder: folder of the run.
             constants: columns with one value for all rows to come, for instance `run`, `task` and `**provenance()`.
         """
-        self.path = Path(folder) / JSONL
-        self._columns = set(constants)
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        _reopen(self.path)
-        header = {name: _plain(value) for name, value in constants.items()}
-        last = _rewrite(self.path, keep=lambda row: True) if self.path.exists() else None
-        self._file = self.path.open("a", encoding="utf-8")
-        if header != last:
-            self._write([{"constants": header}])
-
-    def append(self, **columns: Any) -> None:
-        """Appends one row for each lane.
-
-        Args:
-            columns: scalars, which hold for all lanes, or arrays of shape (lanes,); all arrays of one length. For
-                instance `append(step=1000, split="validation", seed=seeds, labels=budgets, reward=rewards)`.
-
-        Raises:
-            ValueError: if a required column is missing or the lengths differ.
-        """
-        missing = [name for name in REQUIRED if name not in columns and name not in self._columns]
-        if missing:
-            raise ValueError(f"a row of results needs the columns {', '.join(missing)}")
-        # tolist() turns NumPy and JAX values into plain Python ones, in one transfer for each column.
-        values = {name: np.asarray(value).tolist() for name, value in columns.items()}
-        lengths = {len(value) for value in values.values() if isinstance(value, list)}
-        if len(lengths) > 1:
-            raise ValueError(f"columns of one append must have one length, got {sorted(lengths)}")
-        lanes = lengths.pop() if lengths else 1
-        self._write(
-            {name: _plain(value[lane] if isinstance(value, list) else value) for name, value in values.items()}
-            for lane in range(lanes)
-        )
-
-    def close(self) -> None:
-        """Closes the file; the table stays JSONL until `finish`."""
-        self._file.close()
-
-    def __enter__(self) -> ResultsWriter:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def _write(self, lines: Iterable[Row]) -> None:
-        self._file.write("".join(json.dumps(line, allow_nan=False) + "\n" for line in lines))
-        self._file.flush()
-        os.fsync(self._file.fileno())
+        super().__init__(folder, SCHEMA, constants)
 
 
 def last_step(folder: PathLike) -> int:
     """Step of the newest complete row of a table that is still being written; 0 where there is none."""
-    try:
-        with (Path(folder) / JSONL).open("rb") as file:
-            file.seek(max(0, file.seek(0, os.SEEK_END) - TAIL))
-            lines = file.read().split(b"\n")[:-1]
-    except FileNotFoundError:
-        return 0
-    return json.loads(lines[-1]).get("step", 0) if lines else 0
+    row = tables.last_row(folder, SCHEMA)
+    return row["step"] if row else 0
 
 
 def truncate_after(folder: PathLike, step: int) -> None:
@@ -135,10 +75,7 @@ def truncate_after(folder: PathLike, step: int) -> None:
         folder: folder of the run, or its `results.jsonl`; without results nothing happens.
         step: environment steps of a seed at the checkpoint; rows at this step stay.
     """
-    path = _jsonl(folder)
-    _reopen(path)
-    if path.exists():
-        _rewrite(path, keep=lambda row: row["step"] <= step)
+    tables.truncate(folder, SCHEMA, keep=lambda row: row["step"] <= step)
 
 
 def finish(folder: PathLike) -> Path:
@@ -148,24 +85,9 @@ def finish(folder: PathLike) -> Path:
         folder: folder of the run, or its `results.jsonl`. A table that is finished already is left as it is.
 
     Raises:
-        UserError: if there is no table or it cannot be read.
+        UserError: if there is no table, a run without an evaluation, or it cannot be read.
     """
-    path = _jsonl(folder)
-    target = path.with_name(PARQUET)
-    if path.exists():
-        table = _read_file(path)
-        if table.num_rows == 0:
-            raise UserError(f"{path} has no rows: a run without an evaluation cannot be finished")
-        temporary = target.with_name(target.name + ".tmp")
-        with temporary.open("wb") as file:
-            pq.write_table(table, file, compression="zstd")
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, target)
-        path.unlink()
-    elif not target.exists():
-        raise UserError(f"no results in {path.parent}: expected {JSONL} or {PARQUET}")
-    return target
+    return tables.finish(folder, SCHEMA)
 
 
 def find(paths: PathLike | Sequence[PathLike]) -> list[Path]:
@@ -205,12 +127,12 @@ def read(paths: PathLike | Sequence[PathLike], task: str | None = None) -> pa.Ta
         UserError: if a path is missing, holds no rows, is corrupt, or the runs are of several tasks.
     """
     files = find(paths)
-    tables = []
+    parts = []
     for file in files:
-        part = _read_file(file)
+        part = tables.read(file, SCHEMA)
         folder = pa.repeat(pa.scalar(file.parent.as_posix()), part.num_rows)
-        tables.append(part.append_column("folder", folder))
-    table = pa.concat_tables(tables, promote_options="permissive")
+        parts.append(part.append_column("folder", folder))
+    table = pa.concat_tables(parts, promote_options="permissive")
     if table.num_rows == 0:
         raise UserError(f"no rows yet in {', '.join(map(str, files))}: wait for the first evaluation")
     tasks = sorted(set(table["task"].to_pylist()))
@@ -225,150 +147,4 @@ def read(paths: PathLike | Sequence[PathLike], task: str | None = None) -> pa.Ta
 
 def metrics(table: pa.Table) -> list[str]:
     """The names of the metric columns of a table of results."""
-    return [name for name in table.column_names if name not in (*STRINGS, *INTEGERS, "wall_s", "folder")]
-
-
-def provenance() -> dict[str, str]:
-    """The columns `commit`, `versions`, `hardware` and `command` of this process.
-
-    `commit` is empty where the package does not come from a git checkout.
-    """
-    import jax
-
-    packages = ("cuelearner-jax", "jax", "jaxlib", "flax", "optax", "numpy")
-    found = [(name, _version(name)) for name in packages]
-    kinds = [device.device_kind for device in jax.devices()]
-    return {
-        "commit": _commit(),
-        "versions": ", ".join([f"python {sys.version.split()[0]}", *(f"{n} {v}" for n, v in found if v)]),
-        "hardware": ", ".join(f"{kinds.count(kind)} x {kind}" for kind in dict.fromkeys(kinds)),
-        "command": shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),
-    }
-
-
-def _version(package: str) -> str:
-    try:
-        return metadata.version(package)
-    except metadata.PackageNotFoundError:
-        return ""
-
-
-def _commit() -> str:
-    root = Path(__file__).resolve().parents[2]
-    if not (root / ".git").exists():  # an installed package may lie inside somebody else's repository
-        return ""
-    git = ["git", "-C", str(root), "--no-optional-locks"]  # nothing is written to the repository
-    asked = (["rev-parse", "--short=12", "HEAD"], ["status", "--porcelain", "--untracked-files=no"])
-    try:
-        with warnings.catch_warnings():
-            # JAX warns of any fork; this one becomes git at once.
-            warnings.filterwarnings("ignore", message=r"os\.fork", category=RuntimeWarning)
-            told = [
-                subprocess.run([*git, *words], capture_output=True, text=True, timeout=10, check=True).stdout.strip()
-                for words in asked
-            ]
-    except (OSError, subprocess.SubprocessError):
-        return ""
-    return told[0] + ("-dirty" if told[1] else "")
-
-
-def _plain(value: Any) -> Any:
-    """A JSON value: strict JSON has no NaN and no infinity, so they become null; a success is 1.0, not true."""
-    value = value.item() if isinstance(value, np.generic) else value
-    value = float(value) if isinstance(value, bool) else value
-    return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def _jsonl(path: PathLike) -> Path:
-    path = Path(path)
-    return path.with_name(JSONL) if path.name in (JSONL, PARQUET) else path / JSONL
-
-
-def _lines(path: Path) -> Iterator[Row]:
-    """The lines of a JSONL file, parsed, without a torn last one."""
-    try:
-        lines = path.read_bytes().splitlines()
-    except OSError as error:
-        raise UserError(f"cannot read {path}: {error.strerror}") from error
-    for number, line in enumerate(lines, start=1):
-        try:
-            parsed = json.loads(line)
-        except ValueError as error:  # also what UnicodeDecodeError is
-            if number == len(lines):
-                return
-            raise UserError(f"{path}, line {number}, is not JSON: repair or remove this line") from error
-        if not isinstance(parsed, dict) or not ("constants" in parsed or "step" in parsed):
-            raise UserError(f"{path}, line {number}, is not a row of results: repair or remove this line")
-        yield parsed
-
-
-def _rewrite(path: Path, keep: Callable[[Row], bool]) -> Row | None:
-    """Rewrites a JSONL file with the rows to keep, atomically; returns the constants that hold at its end."""
-    constants = None
-    temporary = path.with_name(path.name + ".tmp")
-    with temporary.open("w", encoding="utf-8") as file:
-        for line in _lines(path):
-            constants = line.get("constants", constants)
-            if "constants" in line or keep(line):
-                file.write(json.dumps(line) + "\n")
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(temporary, path)
-    return constants
-
-
-def _reopen(path: Path) -> None:
-    """Turns a finished table back into JSONL, so that a run can be continued."""
-    whole = path.with_name(PARQUET)
-    if not whole.exists():
-        return
-    if not path.exists():
-        temporary = path.with_name(path.name + ".tmp")
-        with temporary.open("w", encoding="utf-8") as file:
-            for row in _read_file(whole).to_pylist():
-                file.write(json.dumps({name: value for name, value in row.items() if value is not None}) + "\n")
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    whole.unlink()
-
-
-def _type(name: str) -> pa.DataType:
-    return pa.string() if name in STRINGS else pa.int64() if name in INTEGERS else pa.float64()
-
-
-def _read_file(path: Path) -> pa.Table:
-    """One results file as a table with the types of this module; no rows, no columns where a run has just begun.
-
-    Raises:
-        UserError: if the file is corrupt or is no table of results.
-    """
-    if path.suffix != ".parquet" and not path.exists():
-        path = path.with_name(PARQUET)  # the run was finished since the file was found
-    try:
-        table = pa.table(_columns(path)) if path.suffix != ".parquet" else pq.read_table(path)
-        table = table.cast(pa.schema([(name, _type(name)) for name in table.column_names]))
-    except (OSError, TypeError, pa.ArrowException) as error:
-        reason = (str(error).splitlines() or [""])[0]
-        raise UserError(f"{path} is corrupt: restore it or run again ({reason})") from error
-    missing = [name for name in REQUIRED if name not in table.column_names]
-    if missing and table.num_rows:
-        raise UserError(f"{path} lacks the columns {', '.join(missing)}: it is not a table of results of this package")
-    return table
-
-
-def _columns(path: Path) -> dict[str, pa.Array]:
-    """The columns of a JSONL file, constants included."""
-    constants: Row = {}
-    columns: dict[str, list[Any]] = {}
-    count = 0
-    for line in _lines(path):
-        if "constants" in line:
-            constants = line["constants"]
-            continue
-        for name, value in (constants | line).items():
-            column = columns.setdefault(name, [])
-            column.extend([None] * (count - len(column)))  # a column that earlier rows lacked
-            column.append(value)
-        count += 1
-    return {name: pa.array(column + [None] * (count - len(column)), _type(name)) for name, column in columns.items()}
+    return [name for name in table.column_names if name not in (*SCHEMA.strings, *SCHEMA.integers, "wall_s", "folder")]

@@ -8,7 +8,6 @@ table), `curves.csv` (what the curves show), `curves.png/.svg` and, where there 
 from __future__ import annotations
 
 import csv
-import json
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -19,11 +18,11 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.records import results
-from cuelearner_jax.report.figures import Group, draw_curves, draw_label_efficiency, save_figure
+from cuelearner_jax.records import formats, results
+from cuelearner_jax.records.folders import in_use
+from cuelearner_jax.report.figures import Variant, draw_curves, draw_label_efficiency, save_figure
 from cuelearner_jax.report.statistics import curve, interval, mean_over_curve, steps_to_reach, stretches_apart
 from cuelearner_jax.runs import shards
-from cuelearner_jax.runs.grid import in_use
 
 
 def report(
@@ -63,15 +62,15 @@ def report(
             f"{out} exists already: choose another folder (--out), or allow it to be overwritten (--overwrite)"
         )
     table, invalid = _select(results.read(folders, task), metric, split)
-    groups = _groups(table, metric)
-    missing = _missing(folders, table, groups)
+    variants = _variants(table, metric)
+    missing = _missing(folders, table, variants)
     if invalid:
         missing.append(f"{invalid:,} {split} rows have no finite {metric}; the steps of these rows are left out")
-    rows = summary(groups, lower_is_better)
-    title = f"{table['task'][0].as_py()}: {split} {metric.replace('_', ' ')}, {_seed_count(groups)}"
-    figures = {"curves": draw_curves(groups, title, metric)}
-    if len({group.labels for group in groups if group.labels}) > 1:
-        figures["label_efficiency"] = draw_label_efficiency(groups, title, metric)
+    rows = summary(variants, lower_is_better)
+    title = f"{table['task'][0].as_py()}: {split} {metric.replace('_', ' ')}, {_seed_count(variants)}"
+    figures = {"curves": draw_curves(variants, title, metric)}
+    if len({variant.labels for variant in variants if variant.labels}) > 1:
+        figures["label_efficiency"] = draw_label_efficiency(variants, title, metric)
 
     out.mkdir(parents=True, exist_ok=True)
     for name in ("curves", "label_efficiency"):  # a figure of an earlier report that this one lacks must not stay
@@ -80,13 +79,13 @@ def report(
     for name, figure in figures.items():
         save_figure(figure, out / name)
     _write_csv(out / "summary.csv", rows)
-    _write_csv(out / "curves.csv", _curve_rows(groups))
+    _write_csv(out / "curves.csv", _curve_rows(variants))
     text = _markdown(title, rows, list(figures), missing, _provenance(table, command))
     (out / "report.md").write_text(text, encoding="utf-8")
     return out / "report.md"
 
 
-# --- from rows to groups ---------------------------------------------------------------------------------------------
+# --- from rows to variants -------------------------------------------------------------------------------------------
 
 
 def _select(table: pa.Table, metric: str, split: str) -> tuple[pa.Table, int]:
@@ -103,24 +102,24 @@ def _select(table: pa.Table, metric: str, split: str) -> tuple[pa.Table, int]:
     return table, rows.num_rows - table.num_rows
 
 
-def _groups(table: pa.Table, metric: str) -> list[Group]:
-    """The groups in the order of the legend: unguided, then by guidance and label budget."""
+def _variants(table: pa.Table, metric: str) -> list[Variant]:
+    """The variants in the order of the legend: unguided, then by guidance and label budget."""
     guidance, labels = np.array(table["guidance"].to_pylist()), table["labels"].to_numpy()
     keys = set(zip(guidance.tolist(), labels.tolist(), strict=True))
     raw = {}
     for key in sorted(keys, key=lambda key: (key[0] != "none", key[0], key[1])):
         raw[key] = _matrix(table.filter(pa.array((guidance == key[0]) & (labels == key[1]))), metric, key)
     shared = min(steps[-1] for _, steps, _ in raw.values())
-    groups = []
+    variants = []
     for (kind, budget), (seeds, steps, values) in raw.items():
         until = max(1, int(np.searchsorted(steps, shared, side="right")))
         mean = interval(mean_over_curve(steps[:until], values[:, :until]))
-        groups.append(Group(kind, budget, seeds, values, curve(steps, values), mean))
-    return groups
+        variants.append(Variant(kind, budget, seeds, values, curve(steps, values), mean))
+    return variants
 
 
 def _matrix(table: pa.Table, metric: str, key: tuple[str, int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Seeds (seeds,), steps (steps,) and values (seeds, steps) of one group, at the steps that all seeds have."""
+    """Seeds (seeds,), steps (steps,) and values (seeds, steps) of one variant, at the steps that all seeds have."""
     seeds, row = np.unique(table["seed"].to_numpy(), return_inverse=True)
     steps, column = np.unique(table["step"].to_numpy(), return_inverse=True)
     count = np.zeros((len(seeds), len(steps)), int)
@@ -143,14 +142,14 @@ def _matrix(table: pa.Table, metric: str, key: tuple[str, int]) -> tuple[np.ndar
     return seeds, steps[whole], values[:, whole]
 
 
-def _seed_count(groups: Sequence[Group]) -> str:
-    counts = sorted({len(group.seeds) for group in groups})
+def _seed_count(variants: Sequence[Variant]) -> str:
+    counts = sorted({len(variant.seeds) for variant in variants})
     return (
         f"{counts[0]} seed{'s' if counts[0] > 1 else ''}" if len(counts) == 1 else f"{counts[0]} to {counts[-1]} seeds"
     )
 
 
-def _missing(folders: Sequence[str | os.PathLike[str]], table: pa.Table, groups: Sequence[Group]) -> list[str]:
+def _missing(folders: Sequence[str | os.PathLike[str]], table: pa.Table, variants: Sequence[Variant]) -> list[str]:
     """One line for everything that a reader of the report would otherwise take to be there."""
     lines = []
     names, reached = np.array(table["folder"].to_pylist()), table["step"].to_numpy()
@@ -171,17 +170,17 @@ def _missing(folders: Sequence[str | os.PathLike[str]], table: pa.Table, groups:
         lines += [f"{path.as_posix()}: no results of {kind} guidance" for kind in planned if kind not in found]
         if not found and not planned:
             lines.append(f"{path.as_posix()}: no results")
-    for group in groups:
-        furthest = int(reached[(guidance == group.guidance) & (labels == group.labels)].max())
-        if furthest > group.curve.steps[-1]:
+    for variant in variants:
+        furthest = int(reached[(guidance == variant.guidance) & (labels == variant.labels)].max())
+        if furthest > variant.curve.steps[-1]:
             lines.append(
-                f"{group.name}: some seeds have reached step {furthest:,}; shown to {group.curve.steps[-1]:,}, where "
-                "all of them are"
+                f"{variant.name}: some seeds have reached step {furthest:,}; shown to {variant.curve.steps[-1]:,}, "
+                "where all of them are"
             )
-        if len(group.seeds) == 1:
-            lines.append(f"{group.name}: one seed, so no interval")
-    if len({int(group.curve.steps[-1]) for group in groups}) > 1:
-        shared = min(int(group.curve.steps[-1]) for group in groups)
+        if len(variant.seeds) == 1:
+            lines.append(f"{variant.name}: one seed, so no interval")
+    if len({int(variant.curve.steps[-1]) for variant in variants}) > 1:
+        shared = min(int(variant.curve.steps[-1]) for variant in variants)
         lines.append(f"curves end at different steps; means over the curve are taken to step {shared:,}, shared by all")
     hashes = sorted(set(table["config_hash"].to_pylist()))
     if len(hashes) > 1:
@@ -191,52 +190,51 @@ def _missing(folders: Sequence[str | os.PathLike[str]], table: pa.Table, groups:
 
 def _config(folder: Path) -> dict[str, Any]:
     try:
-        config = json.loads((folder / "config.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        return formats.read("config", folder / "config.json")
+    except UserError:
         return {}
-    return config if isinstance(config, dict) else {}
 
 
 # --- tables ----------------------------------------------------------------------------------------------------------
 
 
-def summary(groups: Sequence[Group], lower_is_better: bool = False) -> list[dict[str, str | int | float]]:
-    """One row for each group, numbers unrounded; the columns are those of `summary.csv`.
+def summary(variants: Sequence[Variant], lower_is_better: bool = False) -> list[dict[str, str | int | float]]:
+    """One row for each variant, numbers unrounded; the columns are those of `summary.csv`.
 
-    `reaches_unguided_final` is the first step at which the group's interquartile mean is as good as the unguided one's
-    at its last step. The stretches `above_unguided` and `below_unguided` are those of `stretches_apart`.
+    `reaches_unguided_final` is the first step at which the variant's interquartile mean is as good as the unguided
+    one's at its last step. The stretches `above_unguided` and `below_unguided` are those of `stretches_apart`.
     """
-    unguided = next((group for group in groups if group.guidance == "none"), None)
+    unguided = next((variant for variant in variants if variant.guidance == "none"), None)
     sign = -1.0 if lower_is_better else 1.0
     rows = []
-    for group in groups:
-        goodness = sign * group.curve.estimate
-        steps, best = group.curve.steps, int(goodness.argmax())
-        row: dict[str, str | int | float] = {"guidance": group.guidance, "labels": group.labels}
-        row |= {"seeds": len(group.seeds), "last_step": int(steps[-1])}
-        row |= {"final": group.curve.estimate[-1], "final_lower": group.curve.lower[-1]}
-        row |= {"final_upper": group.curve.upper[-1], "mean": float(group.mean.estimate)}
-        row |= {"mean_lower": float(group.mean.lower), "mean_upper": float(group.mean.upper)}
-        row |= {"best_step": int(steps[best]), "best": group.curve.estimate[best]}
+    for variant in variants:
+        goodness = sign * variant.curve.estimate
+        steps, best = variant.curve.steps, int(goodness.argmax())
+        row: dict[str, str | int | float] = {"guidance": variant.guidance, "labels": variant.labels}
+        row |= {"seeds": len(variant.seeds), "last_step": int(steps[-1])}
+        row |= {"final": variant.curve.estimate[-1], "final_lower": variant.curve.lower[-1]}
+        row |= {"final_upper": variant.curve.upper[-1], "mean": float(variant.mean.estimate)}
+        row |= {"mean_lower": float(variant.mean.lower), "mean_upper": float(variant.mean.upper)}
+        row |= {"best_step": int(steps[best]), "best": variant.curve.estimate[best]}
         row |= {"reaches_unguided_final": "", "above_unguided": "", "below_unguided": ""}
         if unguided is not None:
             reached = steps_to_reach(steps, goodness[None], sign * unguided.curve.estimate[-1])[0]
             row["reaches_unguided_final"] = int(reached) if np.isfinite(reached) else "never"
             for column, apart in (
-                ("above_unguided", stretches_apart(group.curve, unguided.curve)),
-                ("below_unguided", stretches_apart(unguided.curve, group.curve)),
+                ("above_unguided", stretches_apart(variant.curve, unguided.curve)),
+                ("below_unguided", stretches_apart(unguided.curve, variant.curve)),
             ):
-                row[column] = "; ".join(f"{start}-{end}" for start, end in apart) if group is not unguided else ""
+                row[column] = "; ".join(f"{start}-{end}" for start, end in apart) if variant is not unguided else ""
         rows.append({name: value.item() if isinstance(value, np.generic) else value for name, value in row.items()})
     return rows
 
 
-def _curve_rows(groups: Sequence[Group]) -> list[dict[str, str | int | float]]:
+def _curve_rows(variants: Sequence[Variant]) -> list[dict[str, str | int | float]]:
     return [
-        {"guidance": group.guidance, "labels": group.labels, "seeds": len(group.seeds), "step": int(step)}
+        {"guidance": variant.guidance, "labels": variant.labels, "seeds": len(variant.seeds), "step": int(step)}
         | {"iqm": float(estimate), "lower": float(lower), "upper": float(upper)}
-        for group in groups
-        for step, estimate, lower, upper in zip(*group.curve, strict=True)
+        for variant in variants
+        for step, estimate, lower, upper in zip(*variant.curve, strict=True)
     ]
 
 

@@ -1,4 +1,4 @@
-"""Figures of recorded results: learning curves, and what a label budget buys. The same groups give the same bytes."""
+"""Figures of recorded results: learning curves, and what a label budget buys. The same variants give the same bytes."""
 
 from __future__ import annotations
 
@@ -15,11 +15,10 @@ from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
+from cuelearner_jax.guidance import registry
 from cuelearner_jax.report.statistics import Curve, Interval
 
-# Okabe and Ito's palette: one hue for each guidance, told apart with any colour vision.
-COLOURS = {"none": "#4d4d4d", "relative": "#0072B2", "heuristic": "#D55E00", "demonstration": "#009E73"}
-COLOURS |= {"scalar": "#CC79A7"}
+# Okabe and Ito's palette, told apart with any colour vision: what its own kinds of guidance leave of it.
 OTHER_COLOURS = ("#E69F00", "#56B4E9", "#B8A600", "#000000")
 AXIS_NAMES = {"reward": "reward a step", "success": "success rate", "collision": "collision rate"}
 STYLE: dict[Any, Any] = {
@@ -35,7 +34,7 @@ STYLE: dict[Any, Any] = {
 }
 
 
-class Group(NamedTuple):
+class Variant(NamedTuple):
     """All seeds under one kind of guidance with one label budget, at the steps that all of them have reached."""
 
     guidance: str
@@ -43,26 +42,27 @@ class Group(NamedTuple):
     seeds: Int[np.ndarray, "seeds"]
     values: Float[np.ndarray, "seeds steps"]
     curve: Curve
-    mean: Interval  # of the mean over the curve, up to the last step that all groups share
+    mean: Interval  # of the mean over the curve, up to the last step that all variants share
 
     @property
     def name(self) -> str:
+        """What the legend says."""
         name = _guidance_name(self.guidance)
         return f"{name}, {self.labels:,} labels" if self.labels else name
 
 
-def draw_curves(groups: Sequence[Group], title: str, metric: str) -> Figure:
+def draw_curves(variants: Sequence[Variant], title: str, metric: str) -> Figure:
     """Learning curves: interquartile means with their intervals as bands, each named at its right end."""
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(8, 4.5), layout="constrained")
         axes = figure.add_subplot()
-        colours = _colours(groups)
-        for group, colour in zip(groups, colours, strict=True):
-            steps, estimate, lower, upper = group.curve
+        colours = _colours(variants)
+        for variant, colour in zip(variants, colours, strict=True):
+            steps, estimate, lower, upper = variant.curve
             marker = "o" if len(steps) == 1 else ""
-            axes.fill_between(steps, lower, upper, color=colour, alpha=0.18 if len(groups) < 6 else 0.12, linewidth=0)
+            axes.fill_between(steps, lower, upper, color=colour, alpha=0.18 if len(variants) < 6 else 0.12, linewidth=0)
             axes.plot(steps, estimate, color=colour, linewidth=1.8, marker=marker, solid_capstyle="round")
-        end = max(int(group.curve.steps[-1]) for group in groups)
+        end = max(int(variant.curve.steps[-1]) for variant in variants)
         axes.set_xlim(0, max(end, 1))
         axes.set_xlabel("environment steps of a seed")
         axes.set_ylabel(_axis_name(metric))
@@ -70,18 +70,18 @@ def draw_curves(groups: Sequence[Group], title: str, metric: str) -> Figure:
         axes.set_title(title, fontweight="bold", fontsize=11, pad=20)
         note = "interquartile mean over seeds, band: its 95% bootstrap interval"
         axes.text(0, 1.025, note, transform=axes.transAxes, color="#595959", fontsize=9)
-        _name_ends(axes, groups, colours)
+        _name_ends(axes, variants, colours)
     return figure
 
 
-def draw_label_efficiency(groups: Sequence[Group], title: str, metric: str) -> Figure:
+def draw_label_efficiency(variants: Sequence[Variant], title: str, metric: str) -> Figure:
     """Interquartile means against the label budget; what takes no labels is a level with a band."""
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(8, 4.2), layout="constrained")
         left, right = figure.subplots(1, 2, sharey=True)
-        last = [Interval(*(values[-1] for values in group.curve[1:])) for group in groups]
-        _draw_budgets(left, groups, last, "last evaluation")
-        _draw_budgets(right, groups, [group.mean for group in groups], "mean over the curve")
+        last = [Interval(*(values[-1] for values in variant.curve[1:])) for variant in variants]
+        _draw_budgets(left, variants, last, "last evaluation")
+        _draw_budgets(right, variants, [variant.mean for variant in variants], "mean over the curve")
         left.set_ylabel(_axis_name(metric))
         handles, names = left.get_legend_handles_labels()
         figure.legend(handles, names, loc="outside lower center", ncols=len(names))
@@ -89,11 +89,12 @@ def draw_label_efficiency(groups: Sequence[Group], title: str, metric: str) -> F
     return figure
 
 
-def _draw_budgets(axes: Axes, groups: Sequence[Group], intervals: Sequence[Interval], panel: str) -> None:
-    kinds = list(dict.fromkeys(group.guidance for group in groups))
+def _draw_budgets(axes: Axes, variants: Sequence[Variant], intervals: Sequence[Interval], panel: str) -> None:
+    kinds = list(dict.fromkeys(variant.guidance for variant in variants))
     for place, kind in enumerate(kinds):
-        colour, name = _colour(kind), _guidance_name(kind)
-        points = [(group.labels, *at) for group, at in zip(groups, intervals, strict=True) if group.guidance == kind]
+        colour, name = colour_of(kind), _guidance_name(kind)
+        pairs = zip(variants, intervals, strict=True)
+        points = [(variant.labels, *at) for variant, at in pairs if variant.guidance == kind]
         for _, estimate, lower, upper in (point for point in points if not point[0]):
             axes.axhspan(float(lower), float(upper), color=colour, alpha=0.12, linewidth=0)
             axes.axhline(float(estimate), color=colour, label=name, linewidth=1.5, linestyle="--")
@@ -103,7 +104,7 @@ def _draw_budgets(axes: Axes, groups: Sequence[Group], intervals: Sequence[Inter
             beside = 1.04 ** (place - (len(kinds) - 1) / 2)
             bars = np.nan_to_num([estimate - lower, upper - estimate])
             axes.errorbar(labels * beside, estimate, bars, color=colour, label=name, marker="o", capsize=3)
-    budgets = sorted({group.labels for group in groups if group.labels})
+    budgets = sorted({variant.labels for variant in variants if variant.labels})
     axes.set_xscale("log")
     axes.set_xticks(budgets, [f"{budget:,}" for budget in budgets])
     axes.minorticks_off()
@@ -119,38 +120,41 @@ def save_figure(figure: Figure, stem: Path) -> None:
 
 
 def _guidance_name(guidance: str) -> str:
-    return "no guidance" if guidance == "none" else guidance
+    kind = registry.registered(guidance)
+    return kind.title if kind and kind.title else guidance
 
 
-def _colour(guidance: str) -> str:
-    return COLOURS.get(guidance) or OTHER_COLOURS[sum(guidance.encode()) % len(OTHER_COLOURS)]
+def colour_of(guidance: str) -> str:
+    """The hue of a kind of guidance, of one that is not known here too."""
+    kind = registry.registered(guidance)
+    return kind.colour if kind and kind.colour else OTHER_COLOURS[sum(guidance.encode()) % len(OTHER_COLOURS)]
 
 
-def _colours(groups: Sequence[Group]) -> list[tuple[float, ...]]:
+def _colours(variants: Sequence[Variant]) -> list[tuple[float, ...]]:
     """The hue of the guidance, the paler the smaller the label budget is among those of its guidance."""
     colours = []
-    for group in groups:
-        budgets = [other.labels for other in groups if other.guidance == group.guidance]
-        pale = 0.6 * (1 - (budgets.index(group.labels) + 1) / len(budgets))
-        colours.append(tuple((1 - pale) * channel + pale for channel in to_rgb(_colour(group.guidance))))
+    for variant in variants:
+        budgets = [other.labels for other in variants if other.guidance == variant.guidance]
+        pale = 0.6 * (1 - (budgets.index(variant.labels) + 1) / len(budgets))
+        colours.append(tuple((1 - pale) * channel + pale for channel in to_rgb(colour_of(variant.guidance))))
     return colours
 
 
-def _name_ends(axes: Axes, groups: Sequence[Group], colours: Sequence[tuple[float, ...]]) -> None:
+def _name_ends(axes: Axes, variants: Sequence[Variant], colours: Sequence[tuple[float, ...]]) -> None:
     """Writes each curve's name right of the axes, at the height of its end, moved apart where names would overlap."""
     low, high = axes.get_ylim()
     axes.set_ylim(low, high)
-    ends = np.array([group.curve.estimate[-1] for group in groups])
-    gap = min((high - low) / len(groups), 0.055 * (high - low))
-    order, rank = np.argsort(ends, kind="stable"), gap * np.arange(len(groups))
+    ends = np.array([variant.curve.estimate[-1] for variant in variants])
+    gap = min((high - low) / len(variants), 0.055 * (high - low))
+    order, rank = np.argsort(ends, kind="stable"), gap * np.arange(len(variants))
     # Heights that keep the order, lie a gap apart and move least are an isotonic regression of the ends less the gaps.
     heights = scipy.optimize.isotonic_regression(ends[order] - rank).x
     heights = np.clip(heights, low, high - rank[-1]) + rank
     for place, height in zip(order, heights, strict=True):
-        group, colour = groups[place], colours[place]
+        variant, colour = variants[place], colours[place]
         axes.annotate(
-            group.name,
-            xy=(float(group.curve.steps[-1]), ends[place]),
+            variant.name,
+            xy=(float(variant.curve.steps[-1]), ends[place]),
             xytext=(1.03, height),
             textcoords=axes.get_yaxis_transform(),
             color=tuple(0.85 * channel for channel in colour),

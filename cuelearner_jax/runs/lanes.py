@@ -1,4 +1,4 @@
-"""The lanes of one kind of guidance: their blocks, the memory they need, and what of them is kept in a checkpoint."""
+"""The lanes of one kind of guidance: their blocks, and what is done with all of them."""
 
 from __future__ import annotations
 
@@ -6,23 +6,24 @@ import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
-from pathlib import Path
 from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
+from jaxtyping import PRNGKeyArray
 
-from cuelearner_jax.agent.choice import looked_at
+from cuelearner_jax.asking import label_slots
 from cuelearner_jax.config import RunConfig
-from cuelearner_jax.devices import BY_LANE, lane_mesh, place, portions
-from cuelearner_jax.errors import UserError
-from cuelearner_jax.records.checkpoint import Checkpoints, checkpoints
-from cuelearner_jax.runs.free_memory import free_bytes
+from cuelearner_jax.devices import BY_LANE, lane_mesh, place
+from cuelearner_jax.environment import Environment, actions_of
+from cuelearner_jax.evaluate import evaluate_lanes
+from cuelearner_jax.guidance.bundle import Guidance
+from cuelearner_jax.loop import Program, make_program
+from cuelearner_jax.policies import Policy
 from cuelearner_jax.runs.grid import Grid
-from cuelearner_jax.train import Program, label_slots, make_program, start_clock
-from cuelearner_jax.types import Clock, Guidance, TrainState
+from cuelearner_jax.types import Clock, Label, Teacher, TrainState
 
 CACHE_BYTES = 4_000_000  # of the action-value weights of a CPU's block: beyond, they leave the cache between two steps
 CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
@@ -30,7 +31,7 @@ CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os
 T = TypeVar("T")
 
 
-class Group:
+class LaneGroup:
     """The lanes of one kind of guidance: one compiled program, its lanes cut into equal blocks."""
 
     def __init__(self, config: RunConfig, env: Any, guidance: Guidance, grid: Grid, mesh: Mesh | None = None) -> None:
@@ -71,7 +72,7 @@ class Group:
         """Lanes of a block: on accelerators all; on one CPU device what fits its cache, and a block for each core."""
         if jax.default_backend() != "cpu" or self.mesh.size > 1:
             return len(self.seeds)
-        widths = [self.env.obs_size + 2, *self.config.sizes.q_layers, 1]
+        widths = [self.env.obs_size + actions_of(self.env).size, *self.config.sizes.q_layers, 1]
         weights = 4 * sum(a * b for a, b in pairwise(widths))
         return max(1, min(CACHE_BYTES // weights, -(-len(self.seeds) // CORES)))
 
@@ -101,84 +102,52 @@ class Group:
             for rows in cut
         ]
 
-    def lanes(self, blocks: list[Any]) -> dict[str, np.ndarray]:
+    def train(
+        self, clock: Clock, blocks: list[TrainState], iterations: int
+    ) -> tuple[Clock, list[TrainState], list[dict[str, jax.Array]]]:
+        """So many iterations of all lanes, done when this returns: (clock, blocks, each block's means (lanes,))."""
+        config = self.config
+        done = self.each(
+            lambda block: self.program.train(self.env, config.scalars, config.schedule, clock, block, iterations),
+            blocks,
+        )
+        after = jax.block_until_ready(done[0][0])
+        return after, [block for _, block, _ in done], [measured for _, _, measured in done]
+
+    def label_round(self, teacher: Teacher, clock: Clock, blocks: list[TrainState]) -> tuple[Clock, list[TrainState]]:
+        """One round of questions to a simulated teacher, and the fit that follows it."""
+        done = self.each(
+            lambda block: self.program.label_round(self.env, teacher, self.config.scalars, clock, block), blocks
+        )
+        return jax.block_until_ready(done[0][0]), [block for _, block in done]
+
+    def take_labels(self, labels: list[Label], blocks: list[TrainState]) -> list[TrainState]:
+        """Labels (lanes, slots, ...) of each block that were given elsewhere, and the fit to them."""
+        return self.each(
+            lambda rows, block: self.program.take_labels(self.env, self.config.scalars, rows, block), labels, blocks
+        )
+
+    def evaluate(
+        self,
+        policy_of: Callable[[TrainState], Policy],
+        env: Environment,
+        key: PRNGKeyArray,
+        num_envs: int,
+        steps: int,
+        blocks: list[TrainState],
+    ) -> dict[str, np.ndarray]:
+        """Metrics (lanes,) of a policy of each block on the same episodes."""
+        return self.columns(
+            self.each(
+                lambda block: evaluate_lanes(
+                    env, policy_of(block), key, mesh=self.mesh, num_envs=num_envs, steps=steps
+                ),
+                blocks,
+            )
+        )
+
+    def columns(self, blocks: list[Any]) -> dict[str, np.ndarray]:
         """Columns of one row a lane from per-block dictionaries of (lanes,) arrays."""
         return {
             name: np.concatenate([np.asarray(block[name]) for block in blocks])[: len(self.seeds)] for name in blocks[0]
         }
-
-
-def state_bytes(tree: Any) -> int:
-    """Memory of a tree of arrays or shapes [bytes]."""
-    return sum(int(np.prod(leaf.shape)) * leaf.dtype.itemsize for leaf in jax.tree.leaves(tree))
-
-
-def memory_report(group: Group) -> str:
-    """One line on the memory that the lanes need on each device. Raises UserError if it is more than there is."""
-    shapes = group.shapes()
-    sizes, lanes, devices = group.config.sizes, len(group.seeds), group.mesh.size
-    padded = sum(len(seeds) for seeds, _ in group.blocks())
-    kept = sum(state_bytes(block) for block in shapes) // devices
-    # Activations of the widest pass: the argmax while acting, that inside targets, or a batch with its gradient.
-    widest = max(*sizes.q_layers, *sizes.feedback_layers)
-    looked = looked_at(sizes)
-    rows = max(
-        min(sizes.num_envs * looked, max(portions().actions, looked)), 3 * sizes.batch_size * len(sizes.q_layers)
-    )
-    if group.config.bootstraps:
-        rows = max(rows, sizes.batch_size * sizes.target_directions * (2 if sizes.n_step > 1 else 1))
-    working = 4 * 4 * widest * rows * (padded // len(shapes) // devices)
-    each = f" on each of {devices} devices" if devices > 1 else ""
-    available = free_bytes()
-    limit = f", {available / 1e9:.1f} GB are free" if available else ""
-    if available and kept + working > available:
-        fitting = max(int((available - working) // (kept / padded)), 0)
-        raise UserError(
-            f"{lanes} lanes need {(kept + working) / 1e9:.1f} GB{each}, {available / 1e9:.1f} GB are free: "
-            f"train at most {fitting} at once, or lower --sizes.replay-capacity"
-        )
-    return (
-        f"{group.guidance.name}: {lanes} lanes, {kept * devices / padded / 1e6:.1f} MB a seed at rest, "
-        f"{(kept + working) / 1e9:.2f} GB in all while training{each}{limit}"
-    )
-
-
-def items(blocks: list[TrainState], clock: Clock, wall: float) -> dict[str, Any]:
-    """A run's state as the items of a checkpoint: acting needs the first alone; the last says how lanes are cut."""
-    return {
-        "policy": [{"params": block.params, "guidance": block.guidance} for block in blocks],
-        "rest": [block.replace(params=None, guidance=None) for block in blocks],
-        "clock": {
-            "clock": clock,
-            "wall_s": np.float32(wall),
-            "cut": np.array([len(blocks), blocks[0].key.shape[0]], np.int32),
-        },
-    }
-
-
-def restore(group: Group, saved: Checkpoints, *names: str) -> dict[str, Any]:
-    """Items of the newest checkpoint by name, and "clock". Blocks are cut as they were when it was written.
-
-    Raises UserError if there is no readable checkpoint or it holds other lanes.
-    """
-    shapes = items(group.shapes(), jax.eval_shape(start_clock), 0.0)
-    clock = saved.restore({"clock": shapes["clock"]})["clock"]
-    count, size = (int(number) for number in clock["cut"])
-    if size < 1 or count * size < len(group.seeds):
-        raise UserError(f"the checkpoint holds {count * size} lanes, the run has {len(group.seeds)}: start it anew")
-    cut = np.minimum(np.arange(count * size), len(group.seeds) - 1).reshape(count, size)
-    shapes = items(group.shapes_of(cut), jax.eval_shape(start_clock), 0.0)
-    return {**saved.restore({name: shapes[name] for name in names}), "clock": clock}
-
-
-def restore_policies(group: Group, folder: Path) -> tuple[dict[str, Any], int]:
-    """What the lanes of a run's folder act with: ({"params": ..., "guidance": ...}, leading axis: lanes; their step).
-
-    Raises UserError if there is no readable checkpoint.
-    """
-    if not (folder / "checkpoints").is_dir():
-        raise UserError(f"no checkpoint in {folder}: train first, or give a run folder that has one")
-    with checkpoints(folder / "checkpoints", read_only=True) as saved:
-        found = restore(group, saved, "policy")
-    policies = jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[: len(group.seeds)], *found["policy"])
-    return policies, int(found["clock"]["clock"].step)

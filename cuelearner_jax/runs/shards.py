@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from pathlib import Path
 from typing import NamedTuple
@@ -10,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cuelearner_jax.errors import UserError
+from cuelearner_jax.records import formats
 
 
 class Shard(NamedTuple):
@@ -59,8 +59,8 @@ def missing(configurations: list[Path]) -> list[str]:
     begun: dict[tuple[Path, int], set[int]] = {}
     for path in configurations:
         try:
-            shard = Shard(*json.loads(path.read_text())["shard"])
-        except (OSError, ValueError, KeyError, TypeError):
+            shard = Shard(*formats.read("config", path)["shard"])
+        except (UserError, KeyError, TypeError):
             continue
         begun.setdefault((path.parent.parent, shard.count), set()).add(shard.index)
     lines = []

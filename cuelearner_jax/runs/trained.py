@@ -1,4 +1,4 @@
-"""Policies by name: of a trained run's lanes, or of a task alone; evaluated and recorded."""
+"""Policies by name: of a trained run's lanes, or of a task alone; evaluated, or one of them picked out."""
 
 from __future__ import annotations
 
@@ -12,80 +12,23 @@ import jax
 import numpy as np
 
 from cuelearner_jax.config import RunConfig, to_json
-from cuelearner_jax.environment import Environment
+from cuelearner_jax.devices import lane_mesh
+from cuelearner_jax.environment import actions_of, offers
 from cuelearner_jax.errors import UserError, closest
-from cuelearner_jax.evaluate import (
-    Policy,
-    agent_policy,
-    corrected_policy,
-    each_lane,
-    episodes,
-    guided_policy,
-    heuristic_policy,
-    rollout,
-    teacher_policy,
-    uniform_policy,
-)
+from cuelearner_jax.evaluate import Rollout, episodes, evaluate_lanes, evaluate_policy, one_lane
 from cuelearner_jax.guidance import registry as guidances
-from cuelearner_jax.records import results
+from cuelearner_jax.guidance.bundle import Guidance
+from cuelearner_jax.policies import Agent, Corrected, Guided, Heuristic, Policy, Taught, Uniform, uniform_in
+from cuelearner_jax.records.provenance import provenance
 from cuelearner_jax.runs.grid import Grid
-from cuelearner_jax.runs.lanes import Group, restore_policies
-from cuelearner_jax.tasks.registry import Task, shape_of
-from cuelearner_jax.types import Guidance, Teacher
-
-# The agent; guidance of uniform actions; guidance of the agent's actions; the teacher's own corrections of them.
-TRAINED = ("agent", "guide", "guided", "corrected")
-UNTRAINED = ("teacher", "heuristic", "uniform")
-TAUGHT = ("teacher", "corrected")  # these ask the teacher
+from cuelearner_jax.runs.kept import restore_policies
+from cuelearner_jax.runs.lanes import LaneGroup
+from cuelearner_jax.task import Task, shape_of
+from cuelearner_jax.types import Teacher
 
 
 @dataclass(frozen=True)
-class Subject:
-    """What evaluate and render work on: a run folder, or a task alone."""
-
-    task: Task
-    config: RunConfig
-    grid: Grid | None
-    folder: Path
-
-    def on(self, robot: str | None) -> Subject:
-        """The same with another robot of the task's (None: its own). Raises UserError if it has no such robot."""
-        if robot is None:
-            return self
-        robots = self.task.robots
-        if not robots:
-            raise UserError(f"{self.task.name} has no robots to choose from: leave out --robot")
-        if robot not in robots:
-            raise UserError(f"unknown robot {robot!r}{closest(robot, robots)}")
-        record, still, animate = robots[robot].pictures()
-        changed = {"environment": robots[robot].environment, "record": record, "still": still, "animate": animate}
-        return replace(self, task=replace(self.task, **changed))
-
-    def engine(self, robot: str | None, name: str | None) -> Callable[..., dict[str, Any]] | None:
-        """A robot's roll-out in other physics (no name: its own). Raises UserError if it has no such engine."""
-        if name is None:
-            return None
-        if robot is None:
-            raise UserError(f"--engine {name} needs --robot: choose one of {', '.join(self.task.robots) or 'none'}")
-        engines = self.task.robots[robot].engines
-        if name not in engines:
-            raise UserError(f"unknown engine {name!r}{closest(name, engines)}")
-        return engines[name]
-
-    def check(self, policy: str, changed: Any) -> None:
-        """Raises UserError unless the policy can be had and acts in the changed world."""
-        known = (TRAINED if self.grid else ()) + UNTRAINED
-        if policy not in TRAINED + UNTRAINED:
-            raise UserError(f"unknown policy {policy!r}{closest(policy, TRAINED + UNTRAINED)}")
-        if policy not in known:
-            raise UserError(f"policy {policy!r} needs a trained run: give a run folder, or one of {', '.join(known)}")
-        before, after = (shape_of(self.task, world).obs_size for world in (self.config.task, changed))
-        if before != after:
-            raise UserError(f"the run's observations have {before} entries, this world's {after}: keep its structure")
-
-
-@dataclass(frozen=True)
-class Trained:
+class Lanes:
     """The lanes of one kind of guidance, as their newest checkpoint has them."""
 
     guidance: Guidance
@@ -95,41 +38,110 @@ class Trained:
     step: int
 
 
-def load_lanes(subject: Subject, kinds: tuple[str, ...]) -> list[Trained]:
-    """The lanes of a run's kinds of guidance (none named: all). Raises UserError for a kind the run does not have."""
-    assert subject.grid is not None  # Subject.check has seen to it
-    env = shape_of(subject.task, subject.config.task)
-    loaded = []
-    for kind in kinds or subject.grid.guidance:
-        if kind not in subject.grid.guidance:
+class Parts(NamedTuple):
+    """What a named policy may be made of. `lanes` is None for a task alone."""
+
+    config: RunConfig
+    env: Any
+    teacher: Teacher | None
+    lanes: Lanes | None
+
+    @property
+    def agent(self) -> Agent:
+        """The lanes' agents."""
+        assert self.lanes is not None
+        return Agent(self.lanes.policies["params"], self.config.sizes, actions_of(self.env))
+
+    def guided(self, base: Policy) -> Guided:
+        """A policy under the lanes' guidance."""
+        assert self.lanes is not None
+        return Guided(base, self.lanes.policies["guidance"], self.env, self.config.scalars, self.lanes.guidance)
+
+    def corrected(self, base: Policy) -> Corrected:
+        """A policy under the teacher's own corrections."""
+        assert self.teacher is not None
+        return Corrected(base, self.teacher, self.config.scalars, actions_of(self.env))
+
+    def taught(self) -> Taught:
+        """The teacher itself."""
+        assert self.teacher is not None
+        return Taught(self.teacher)
+
+
+class Named(NamedTuple):
+    """A policy that can be asked for by name."""
+
+    about: str
+    make: Callable[[Parts], Policy]
+    trained: bool = False  # does it need a run?
+    taught: bool = False  # does it ask the teacher?
+    needs: tuple[str, ...] = ()  # optional members of an environment without which there is none
+
+
+POLICIES: dict[str, Named] = {
+    "agent": Named("the trained agent", lambda parts: parts.agent, trained=True),
+    "guide": Named("guidance of uniform actions", lambda parts: parts.guided(uniform_in(parts.env)), trained=True),
+    "guided": Named("guidance of the agent's actions", lambda parts: parts.guided(parts.agent), trained=True),
+    "corrected": Named(
+        "the teacher's own feedback on the agent's actions",
+        lambda parts: parts.corrected(parts.agent),
+        trained=True,
+        taught=True,
+    ),
+    "teacher": Named("the teacher", lambda parts: parts.taught(), taught=True),
+    "heuristic": Named("the task's obvious action", lambda parts: Heuristic(parts.env), needs=("heuristic",)),
+    "uniform": Named("chance", lambda parts: Uniform(actions_of(parts.env))),
+}
+
+
+@dataclass(frozen=True)
+class PolicySource:
+    """Where policies come from: a run folder, or a task alone."""
+
+    task: Task
+    config: RunConfig
+    grid: Grid | None
+    folder: Path
+
+    def on(self, robot: str | None) -> PolicySource:
+        """The same with another robot of the task's (None: its own). Raises UserError if it has no such robot."""
+        return replace(self, task=self.task.on(robot))
+
+    def check(self, policy: str, changed: Any) -> None:
+        """Raises UserError unless the policy can be had and acts in the changed world."""
+        if policy not in POLICIES:
+            raise UserError(f"unknown policy {policy!r}{closest(policy, POLICIES)}")
+        if POLICIES[policy].trained and not self.grid:
+            untrained = ", ".join(name for name, named in POLICIES.items() if not named.trained)
+            raise UserError(f"policy {policy!r} needs a trained run: give a run folder, or one of {untrained}")
+        before, after = (shape_of(self.task, world) for world in (self.config.task, changed))
+        for need in POLICIES[policy].needs:
+            if not offers(after, need):
+                raise UserError(f"{self.task.name} has no {need}: choose another policy")
+        if before.obs_size != after.obs_size:
             raise UserError(
-                f"{subject.folder} has no guidance {kind!r}: choose among {', '.join(subject.grid.guidance)}"
+                f"the run's observations have {before.obs_size} entries, this world's {after.obs_size}: "
+                "keep its structure"
             )
-        made = guidances.make(kind, subject.config.sizes, env.obs_size)
-        group = Group(subject.config, env, made, subject.grid)
-        policies, step = restore_policies(group, subject.folder / kind)
-        loaded.append(Trained(group.guidance, group.seeds, group.budgets, policies, step))
-    return loaded
 
-
-def trained_policy(
-    name: str, lanes: Trained, lane: Any, config: RunConfig, env: Environment, teacher: Teacher | None
-) -> Policy:
-    """One lane's policy. `lane` is its entry of `lanes.policies`."""
-    agent = agent_policy(config.sizes, lane["params"])
-    if name == "agent":
-        return agent
-    if teacher is not None:
-        return corrected_policy(agent, teacher, config.scalars)
-    base = uniform_policy() if name == "guide" else agent
-    return guided_policy(base, lanes.guidance, lane["guidance"], env, config.scalars)
-
-
-def untrained_policy(name: str, env: Environment, teacher: Teacher | None) -> Policy:
-    """A policy that needs no run: the task's teacher or heuristic, or chance."""
-    if teacher is not None:
-        return teacher_policy(teacher)
-    return heuristic_policy(env) if name == "heuristic" else uniform_policy()
+    def load(self, kinds: tuple[str, ...] = ()) -> list[Lanes]:
+        """The lanes of a run's kinds of guidance (none named: all). Raises UserError for one the run does not have."""
+        assert self.grid is not None  # `check` has seen to it
+        env = shape_of(self.task, self.config.task)
+        loaded = []
+        for kind in kinds or self.grid.guidance:
+            name = guidances.find(kind).name if ":" in kind else kind
+            if name not in self.grid.guidance:
+                raise UserError(f"{self.folder} has no guidance {kind!r}: choose among {', '.join(self.grid.guidance)}")
+            if guidances.registered(name) is None:
+                raise UserError(
+                    f"{self.folder} has lanes of a guidance from outside, {name!r}: name its code by "
+                    "--guidance package.module:NAME, if you trust that code"
+                )
+            group = LaneGroup(self.config, env, guidances.make(name, self.config.sizes, env), self.grid)
+            policies, step = restore_policies(group, self.folder / name)
+            loaded.append(Lanes(group.guidance, group.seeds, group.budgets, policies, step))
+        return loaded
 
 
 class Measured(NamedTuple):
@@ -143,65 +155,56 @@ class Measured(NamedTuple):
 
 
 def evaluate(
-    subject: Subject,
+    source: PolicySource,
     world: Any,
     name: str,
     kinds: tuple[str, ...],
     num_envs: int,
     steps: int,
-    engine: Callable[..., dict[str, Any]] | None = None,
+    engine: Rollout | None = None,
 ) -> list[Measured]:
     """Metrics of a policy on validation episodes of a world (a task configuration), for each guidance and budget.
 
-    `engine` is a roll-out in other physics (`tasks.Robot.engines`); without one the environment's own are used.
+    `engine` is a roll-out in other physics; without one the environment's own are used.
     """
-    env = subject.task.environment(world, "validation")
-    key = episodes()
-    teacher = subject.task.teacher(world, env) if name in TAUGHT else None
-    if name in UNTRAINED:
-
-        def measure_it(env: Environment, teacher: Teacher | None) -> dict[str, Any]:
-            return (engine or rollout)(untrained_policy(name, env, teacher), env, key, num_envs, steps)
-
-        # As arguments: what is closed over becomes a constant of the program.
-        found = (measure_it if engine else jax.jit(measure_it))(env, teacher)
+    named, key = POLICIES[name], episodes()
+    env = source.task.environment(world, "validation")
+    teacher = source.task.make_teacher(world, env) if named.taught else None
+    if not named.trained:
+        policy = named.make(Parts(source.config, env, teacher, None))
+        found = (engine or _compiled)(policy, env, key, num_envs, steps)
         metrics = {metric: np.asarray(value)[None] for metric, value in found.items()}
         return [Measured("-", 0, 0, np.zeros(1, int), metrics)]
     rows = []
-    for lanes in load_lanes(subject, kinds):
-
-        def measure(env: Environment, teacher: Teacher | None, policies: Any, lanes: Trained = lanes) -> Any:
-            def one(lane: Any) -> dict[str, jax.Array]:
-                policy = trained_policy(name, lanes, lane, subject.config, env, teacher)
-                return (engine or rollout)(policy, env, key, num_envs, steps)
-
-            return _one_by_one(one, policies) if engine else each_lane(one, policies)
-
-        found = (measure if engine else jax.jit(measure))(env, teacher, lanes.policies)
-        found = {metric: np.asarray(values) for metric, values in found.items()}
+    for lanes in source.load(kinds):
+        policy = named.make(Parts(source.config, env, teacher, lanes))
+        if engine:
+            each = [engine(one_lane(policy, lane), env, key, num_envs, steps) for lane in range(len(lanes.seeds))]
+            found = {metric: np.stack([measured[metric] for measured in each]) for metric in each[0]}
+        else:
+            mesh = lane_mesh(jax.local_devices()[:1])
+            found = evaluate_lanes(env, policy, key, mesh=mesh, num_envs=num_envs, steps=steps)
         for budget in np.unique(lanes.budgets):
             own = lanes.budgets == budget
-            metrics = {metric: values[own] for metric, values in found.items()}
+            metrics = {metric: np.asarray(values)[own] for metric, values in found.items()}
             rows.append(Measured(lanes.guidance.name, int(budget), lanes.step, lanes.seeds[own], metrics))
     return rows
 
 
-def _one_by_one(one: Callable[[Any], dict[str, Any]], lanes: Any) -> dict[str, np.ndarray]:
-    """`each_lane` for what can't be compiled."""
-    count = jax.tree.leaves(lanes)[0].shape[0]
-    found = [one(jax.tree.map(lambda leaf, number=number: leaf[number], lanes)) for number in range(count)]
-    return {name: np.stack([measured[name] for measured in found]) for name in found[0]}
+def _compiled(policy: Policy, env: Any, key: Any, num_envs: int, steps: int) -> dict[str, Any]:
+    return evaluate_policy(env, policy, key, num_envs, steps)
 
 
 def one_policy(
-    subject: Subject, env: Environment, world: Any, name: str, kind: str | None, labels: int | None, seed: int | None
+    source: PolicySource, env: Any, world: Any, name: str, kind: str | None, labels: int | None, seed: int | None
 ) -> Policy:
     """A single policy: of one lane of a run, or of the task. Raises UserError if the run has no such lane."""
-    teacher = subject.task.teacher(world, env) if name in TAUGHT else None
-    if name in UNTRAINED:
-        return untrained_policy(name, env, teacher)
-    assert subject.grid is not None  # Subject.check has seen to it
-    lanes = load_lanes(subject, (kind or subject.grid.guidance[-1],))[0]
+    named = POLICIES[name]
+    teacher = source.task.make_teacher(world, env) if named.taught else None
+    if not named.trained:
+        return named.make(Parts(source.config, env, teacher, None))
+    assert source.grid is not None  # `check` has seen to it
+    lanes = source.load((kind or source.grid.guidance[-1],))[0]
     budget = int(lanes.budgets.max()) if labels is None else labels
     seed = int(lanes.seeds[0]) if seed is None else seed
     index = np.flatnonzero((lanes.seeds == seed) & (lanes.budgets == budget))
@@ -210,8 +213,7 @@ def one_policy(
             f"no lane with seed {seed} and {budget} labels: the run has seeds {_listed(lanes.seeds)} "
             f"and labels {_listed(lanes.budgets)}"
         )
-    lane = jax.tree.map(lambda leaf: leaf[index[0]], lanes.policies)
-    return trained_policy(name, lanes, lane, subject.config, env, teacher)
+    return one_lane(named.make(Parts(source.config, env, teacher, lanes)), int(index[0]))
 
 
 def _listed(values: np.ndarray) -> str:
@@ -223,7 +225,7 @@ def _listed(values: np.ndarray) -> str:
 
 def write(
     path: Path,
-    subject: Subject,
+    source: PolicySource,
     world: Any,
     policy: str,
     num_envs: int,
@@ -243,13 +245,13 @@ def write(
         for row in measured
     ]
     contents = {
-        "subject": subject.folder.name,
-        "world": {"name": subject.task.name, **to_json(world)},
+        "subject": source.folder.name,
+        "world": {"name": source.task.name, **to_json(world)},
         "policy": policy,
         **body,
         "envs": num_envs,
         "steps": steps,
-        **results.provenance(),
+        **provenance(),
         "rows": rows,
     }
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -1,35 +1,17 @@
-"""A learned teacher: action values fitted far from the 1:1 recipe of the compared agents.
-
-Many environments in parallel, states visited by the teacher's own play, many directions tried in each, large batches.
-It serves tasks whose value of an action is its immediate reward (discount 0), because then any number of actions may be
-tried in one state.
-"""
+"""A learned teacher: the best direction by a network's values of what the environment's features show."""
 
 from __future__ import annotations
 
-import json
-import shutil
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import flax.linen as nn
-import jax
 import jax.numpy as jnp
-import optax
 from flax import struct
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float
 
 from cuelearner_jax import actions as geometry
-from cuelearner_jax.config import from_json
-from cuelearner_jax.environment import random_symmetries
-from cuelearner_jax.errors import UserError
-from cuelearner_jax.records.checkpoint import checkpoints
 from cuelearner_jax.types import Params
-
-SHARPNESS = 0.05  # values that differ by this are told apart when promising directions are drawn
 
 
 @dataclass(frozen=True)
@@ -93,178 +75,3 @@ class LearnedTeacher(struct.PyTreeNode):
         """The direction with the largest value."""
         values = self.values(obs, geometry.evenly_spaced(self.directions))
         return geometry.best_direction(values, self.aim_error, self.habit)
-
-
-class TeacherState(struct.PyTreeNode):
-    """Everything of a teacher's training."""
-
-    params: Params
-    average: Params  # exponential moving average: what becomes the teacher
-    opt_state: Any
-    obs: Float[Array, "memory tables obs"]  # states of the last rounds
-    tried: Float[Array, "memory tables tries 2"]
-    rewards: Float[Array, "memory tables tries"]
-    env: Any  # leading axis: tables
-    current: Float[Array, "tables obs"]
-    key: PRNGKeyArray
-    round: jax.Array
-
-
-class TeacherProgram(NamedTuple):
-    """Jitted functions."""
-
-    init: Callable[..., TeacherState]  # (env, key) -> state
-    train: Callable[..., tuple[TeacherState, dict[str, jax.Array]]]  # (env, state, rounds) -> state, metrics
-
-
-def make_program(config: TeacherConfig) -> TeacherProgram:
-    """The training of a teacher; see the module's docstring."""
-    training = _Training(config)
-    return TeacherProgram(
-        jax.jit(training.init),
-        jax.jit(training.train, static_argnames="rounds", donate_argnames="state"),
-    )
-
-
-def finished(config: TeacherConfig, env: Any, state: TeacherState) -> LearnedTeacher:
-    """The teacher that a training has led to: it aims perfectly and has no habit."""
-    return LearnedTeacher(env, state.average, 0.0, 0.0, config.layers, config.directions)
-
-
-class _Training(NamedTuple):
-    config: TeacherConfig
-
-    @property
-    def optimizer(self) -> optax.GradientTransformation:
-        c = self.config
-        schedule = optax.warmup_cosine_decay_schedule(
-            0.0, c.learning_rate, min(500, c.rounds * c.updates // 10), c.rounds * c.updates
-        )
-        return optax.chain(optax.clip_by_global_norm(1.0), optax.adam(schedule))
-
-    def value(self, env: Any, params: Params, obs: jax.Array, actions: jax.Array) -> jax.Array:
-        return jnp.asarray(ValueNetwork(self.config.layers).apply(params, env.features(obs, actions)))
-
-    def init(self, env: Any, key: PRNGKeyArray) -> TeacherState:
-        c = self.config
-        k_params, k_env, key = jax.random.split(key, 3)
-        env_state, obs = jax.vmap(env.reset)(jax.random.split(k_env, c.tables))
-        params = ValueNetwork(c.layers).init(k_params, env.features(obs[0], jnp.array([1.0, 0.0])))
-        return TeacherState(
-            params=params,
-            average=jax.tree.map(jnp.copy, params),
-            opt_state=self.optimizer.init(params),
-            obs=jnp.zeros((c.memory, c.tables, env.obs_size)),
-            tried=jnp.ones((c.memory, c.tables, c.tries, 2)),
-            rewards=jnp.zeros((c.memory, c.tables, c.tries)),
-            env=env_state,
-            current=obs,
-            key=key,
-            round=jnp.zeros((), jnp.int32),
-        )
-
-    def propose(self, env: Any, params: Params, obs: jax.Array, key: PRNGKeyArray) -> jax.Array:
-        """Directions to try in one state (tries, 2): the best, promising ones, two uniform ones."""
-        c = self.config
-        k_turn, k_draw, k_width, k_noise, k_uniform = jax.random.split(key, 5)
-        turn = jax.random.uniform(k_turn, maxval=2 * jnp.pi / c.search)
-        options = geometry.rotate(geometry.evenly_spaced(c.search), turn)
-        values = self.value(env, params, obs, options)
-        best = jnp.argmax(values)
-        promising = jax.random.categorical(k_draw, values / SHARPNESS, shape=(c.tries - 3,))
-        width = jnp.deg2rad(c.spread_deg) * jax.random.uniform(k_width, (c.tries - 3,))
-        near = geometry.rotate(options[promising], width * jax.random.normal(k_noise, (c.tries - 3,)))
-        return jnp.concatenate([options[best][None], near, geometry.uniform(k_uniform, (2,))])
-
-    def play(self, env: Any, state: TeacherState) -> tuple[TeacherState, jax.Array]:
-        """One round: every table tries its directions, then goes on from one of them."""
-        c = self.config
-        k_propose, k_try, k_choice, key = jax.random.split(state.key, 4)
-        tried = jax.vmap(partial(self.propose, env, state.params))(state.current, jax.random.split(k_propose, c.tables))
-        keys = jax.random.split(k_try, (c.tables, c.tries))
-        outcomes, steps = jax.vmap(jax.vmap(env.step, (0, None, 0)))(keys, state.env, tried)
-        # The best direction comes first and the last one is uniform.
-        choice = jnp.where(jax.random.bernoulli(k_choice, c.explore_probability, (c.tables,)), c.tries - 1, 0)
-        taken = jax.tree.map(lambda leaf: leaf[jnp.arange(c.tables), choice], (outcomes, steps.obs))
-        slot = state.round % c.memory
-        put = partial(jax.lax.dynamic_update_index_in_dim, index=slot, axis=0)
-        state = state.replace(
-            obs=put(state.obs, state.current),
-            tried=put(state.tried, tried),
-            rewards=put(state.rewards, steps.reward),
-            env=taken[0],
-            current=taken[1],
-            key=key,
-            round=state.round + 1,
-        )
-        return state, steps.reward[:, 0].mean()
-
-    def learn(self, env: Any, state: TeacherState, key: PRNGKeyArray) -> tuple[TeacherState, jax.Array]:
-        """One gradient step on tries drawn from memory, each under a random symmetry of the environment."""
-        c = self.config
-        k_round, k_table, k_try, k_mirror = jax.random.split(key, 4)
-        shape = (c.batch_size,)
-        filled = jnp.minimum(state.round, c.memory)
-        where = (jax.random.randint(k_round, shape, 0, filled), jax.random.randint(k_table, shape, 0, c.tables))
-        attempt = jax.random.randint(k_try, shape, 0, c.tries)
-        obs, action, reward = state.obs[where], state.tried[(*where, attempt)], state.rewards[(*where, attempt)]
-        obs, action = random_symmetries(k_mirror, env, c.batch_size)(obs, action)
-
-        def loss(params: Params) -> jax.Array:
-            values = jax.vmap(partial(self.value, env, params))(obs, action)
-            return jnp.mean(jnp.square(values - reward))
-
-        error, gradient = jax.value_and_grad(loss)(state.params)
-        updates, opt_state = self.optimizer.update(gradient, state.opt_state, state.params)
-        params = optax.apply_updates(state.params, updates)
-        # The average forgets its random start first, then covers about a thousand steps.
-        rate = jnp.maximum(1.0 / (1.0 + state.round), 1e-3)
-        average = optax.incremental_update(params, state.average, rate)
-        return state.replace(params=params, average=average, opt_state=opt_state), error
-
-    def train(self, env: Any, state: TeacherState, rounds: int) -> tuple[TeacherState, dict[str, jax.Array]]:
-        """`rounds` rounds of play with their gradient steps; mean reward of its own best directions, mean loss."""
-
-        def one_round(state: TeacherState, _: None) -> tuple[TeacherState, tuple[jax.Array, jax.Array]]:
-            state, reward = self.play(env, state)
-            key, k_learn = jax.random.split(state.key)
-            state, errors = jax.lax.scan(
-                lambda state, key: self.learn(env, state, key),
-                state.replace(key=key),
-                jax.random.split(k_learn, self.config.updates),
-            )
-            return state, (reward, errors.mean())
-
-        state, (reward, error) = jax.lax.scan(one_round, state, length=rounds)
-        return state, {"reward": reward.mean(), "loss": error.mean()}
-
-
-def save(folder: Path, teacher: LearnedTeacher, about: dict[str, Any]) -> None:
-    """Writes a teacher: its network in half precision, and teacher.json: what it is and how it was made.
-
-    `about` must hold the `config` (a TeacherConfig's fields) under that name.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    if (folder / "network").exists():  # an earlier teacher's, which would be kept
-        shutil.rmtree(folder / "network")
-    params = jax.tree.map(lambda leaf: leaf.astype(jnp.float16), teacher.params)
-    with checkpoints(folder / "network") as saved:
-        saved.save(0, {"params": params})
-    (folder / "teacher.json").write_text(json.dumps(about, indent=1) + "\n")
-
-
-def load(folder: Path, env: Any, aim_error: Any, habit: Any) -> LearnedTeacher:
-    """A teacher that `save` wrote. Raises UserError if there is none, or one of another task."""
-    if not (folder / "teacher.json").is_file():
-        raise UserError(f"no teacher in {folder}: train one with `cuelearner teacher train`, or use the search teacher")
-    try:
-        config = from_json(TeacherConfig, json.loads((folder / "teacher.json").read_text())["config"])
-    except (ValueError, KeyError, TypeError) as error:
-        raise UserError(f"{folder / 'teacher.json'} is damaged: restore it, or train the teacher anew") from error
-    template = jax.eval_shape(_Training(config).init, env, jax.random.key(0)).params
-    halves = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, jnp.float16), template)
-    with checkpoints(folder / "network", read_only=True) as saved:
-        params = saved.restore({"params": halves})["params"]
-    params = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), params)
-    aim = jnp.asarray(aim_error, jnp.float32), jnp.asarray(habit, jnp.float32)
-    return LearnedTeacher(env, params, *aim, config.layers, config.directions)

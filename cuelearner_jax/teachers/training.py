@@ -13,14 +13,17 @@ import numpy as np
 
 from cuelearner_jax import config as configuration
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.evaluate import episodes, rollout, teacher_policy
-from cuelearner_jax.records import results
+from cuelearner_jax.evaluate import episodes, evaluate_policy
+from cuelearner_jax.policies import Taught
 from cuelearner_jax.records.checkpoint import checkpoints
-from cuelearner_jax.runs.grid import check_folder, in_use, prepare_folder
-from cuelearner_jax.runs.sweep import Interrupted, interruptible, progress_bars
-from cuelearner_jax.tasks.registry import Task
-from cuelearner_jax.teachers import learned as teacher
+from cuelearner_jax.records.folders import check_folder, in_use, prepare_folder
+from cuelearner_jax.records.formats import FORMATS
+from cuelearner_jax.records.provenance import provenance
+from cuelearner_jax.task import Task
+from cuelearner_jax.teachers import stored
 from cuelearner_jax.teachers.learned import LearnedTeacher, TeacherConfig
+from cuelearner_jax.teachers.program import TeacherProgram, finished, make_program
+from cuelearner_jax.terminal import Interrupted, interruptible, progress_bars
 
 ROUNDS_A_STRETCH = 50  # in one jitted call
 SECONDS_BETWEEN_CHECKPOINTS = 60.0
@@ -64,34 +67,35 @@ def train(
     if not hasattr(env, "features"):
         raise UserError(f"{task.name} gives a teacher no features to learn from")
     described = {"config": configuration.to_json(config), "task": {"name": task.name, **configuration.to_json(world)}}
+    asked = {"format": FORMATS["config"], **described, "seed": seed}
     if not resume and in_use(out):
         raise UserError(f"{out} is not empty: give --resume to go on with an interrupted training, or another --out")
     if resume:
-        check_folder(out, {**described, "seed": seed}, resume=True, overwrite=False)
-    prepare_folder(out, {**described, "seed": seed}, clean=False)
-    history = _learn(teacher.make_program(config), env, config, out, seed)
+        check_folder(out, asked, resume=True, overwrite=False)
+    prepare_folder(out, asked, clean=False)
+    history = _learn(make_program(config), env, config, out, seed)
     with checkpoints(out / TRAINING, read_only=True) as saved:
-        shapes = jax.eval_shape(teacher.make_program(config).init, env, jax.random.key(seed))
+        shapes = jax.eval_shape(make_program(config).init, env, jax.random.key(seed))
         state = saved.restore({"state": shapes})["state"]
-    made = teacher.finished(config, env, state)
+    made = finished(config, env, state)
     reward = validate(made, env, eval_steps)
     about = {
         **described,
         "seed": seed,
         "reward": round(reward, 4),
         "eval_steps": eval_steps,
-        **results.provenance(),
+        **provenance(),
         "command": command,
         "history": {"columns": ["round", "wall_s", "reward", "loss"], "rows": history[:: max(1, len(history) // 50)]},
     }
-    teacher.save(out, made, about)
+    stored.save(out, made, about)
     shutil.rmtree(out / TRAINING)
     (out / HISTORY).unlink()
     (out / "config.json").unlink()
     return reward
 
 
-def _learn(program: teacher.TeacherProgram, env: Any, config: TeacherConfig, out: Path, seed: int) -> list[list[float]]:
+def _learn(program: TeacherProgram, env: Any, config: TeacherConfig, out: Path, seed: int) -> list[list[float]]:
     """All rounds, from wherever the folder's newest checkpoint is. Returns (round, wall_s, reward, loss) a stretch."""
     file = out / HISTORY
     with checkpoints(out / TRAINING) as saved, interruptible() as stopping, progress_bars() as bars:
@@ -119,7 +123,5 @@ def _learn(program: teacher.TeacherProgram, env: Any, config: TeacherConfig, out
 
 def validate(made: LearnedTeacher, env: Any, steps: int) -> float:
     """Reward a step of a teacher's own choices on validation episodes."""
-    key = episodes()
-    envs = min(100, steps)
-    measure = jax.jit(lambda made, env: rollout(teacher_policy(made), env, key, envs, steps))
-    return float(np.asarray(measure(made, env)["reward"]))
+    found = evaluate_policy(env, Taught(made), episodes(), min(100, steps), steps)
+    return float(np.asarray(found["reward"]))

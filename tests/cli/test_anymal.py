@@ -91,6 +91,12 @@ def test_its_episodes_are_filmed_from_above_and_from_the_side(opengl, tmp_path):
     assert imageio.imread(tmp_path / "navigation_agent-anymal-agent.png").std() > 10
 
 
+def test_a_question_about_it_is_drawn_from_above_without_opengl(tmp_path):
+    command = ["render", "navigation", "--robot", "anymal", "--question", "--task.worlds", "8", "--out", str(tmp_path)]
+    assert main(command) == 0
+    assert imageio.imread(tmp_path / "navigation-anymal-heuristic-question.png").std() > 10
+
+
 def test_where_nothing_can_be_rendered_one_line_says_what_to_install(monkeypatch, refused, tmp_path):
     def missing():
         raise ImportError("no libEGL")

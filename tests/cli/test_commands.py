@@ -1,4 +1,5 @@
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -90,6 +91,35 @@ def test_render_makes_a_film_and_a_still(run_folder, tmp_path, film):
     still, filmed = (tmp_path / f"small-agent.{end}" for end in ("png", film))
     assert imageio.imread(still).std() > 1
     assert filmed.stat().st_size > 1000
+
+
+def test_render_makes_the_picture_of_a_question(run_folder, refused, tmp_path):
+    command = ["render", str(run_folder), "--question", "--scenario", "turned_strike", "--out", str(tmp_path)]
+    assert main(command) == 0
+    assert [path.name for path in tmp_path.iterdir()] == ["small-turned_strike-agent-question.png"]
+    assert imageio.imread(tmp_path / "small-turned_strike-agent-question.png").std() > 1
+    refused(command, "give --overwrite to replace it", tmp_path)
+
+
+def test_the_overview_has_a_line_for_each_command_and_the_version_can_be_asked_for(capsys):
+    assert main(["--help"]) == 0
+    told = capsys.readouterr().out
+    for name in ("train", "sweep", "evaluate", "report", "render", "teacher train", "bench", "locomotion evaluate"):
+        assert re.search(rf"^  {name} +[A-Z].*\.$", told, re.MULTILINE), name
+    assert main(["--version"]) == 0
+    assert re.fullmatch(r"cuelearner \d+\.\d+\.\d+\n", capsys.readouterr().out)
+
+
+def test_the_task_may_be_named_by_an_option(run_folder, tmp_path):
+    """The same run either way; a run folder beside its own task is no contradiction."""
+    out = tmp_path / "one"
+    command = ["train", "--preset", "quickstart", *SMALL, "--guidance", "none", "--seed", "2000"]
+    assert main([*command, "--task", "billiards", "--out", str(out)]) == 0
+    rewards = [row["reward"] for row in results.read(out).to_pylist()]
+    beside = [row["reward"] for row in results.read(run_folder / "none").to_pylist() if row["seed"] == 2000]
+    assert rewards == beside
+    given = ["--task", "billiards", "--policy", "uniform", "--steps", "20", "--envs", "10"]
+    assert main(["evaluate", str(run_folder), *given]) == 0
 
 
 def test_labels_of_a_run_train_another(run_folder, tmp_path):

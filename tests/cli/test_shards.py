@@ -15,7 +15,7 @@ from small_runs import SMALL
 from cuelearner_jax.cli import main
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.records import results
-from cuelearner_jax.runs.grid import claimed
+from cuelearner_jax.records.folders import claimed
 from cuelearner_jax.runs.shards import Shard
 
 ENTRY = [str(Path(sys.executable).with_name("cuelearner"))]

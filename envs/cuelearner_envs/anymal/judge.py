@@ -71,7 +71,7 @@ class Judge:
         with ThreadPoolExecutor(os.cpu_count()) as pool:  # MuJoCo lets go of Python's lock
             list(pool.map(partial(self._control, targets), up, chunksize=max(1, len(up) // 8)))
 
-    def _control(self, targets: Float[np.ndarray, "robots 12"], number: int) -> None:
+    def _control(self, targets: Float[np.ndarray, "robots 12"], number: int | np.integer) -> None:
         model, data = self.models[number], self.data[number]
         data.ctrl[:] = targets[number]
         mujoco.mj_step(model, data, nstep=self.steps)

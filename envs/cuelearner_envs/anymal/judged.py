@@ -9,19 +9,18 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import PRNGKeyArray
+from jaxtyping import Array, Key, PRNGKeyArray
 
 from cuelearner_envs.anymal.environment import LeggedNavigation, LeggedWalker
 from cuelearner_envs.anymal.judge import Judge
 from cuelearner_envs.anymal.model import planar_pose
 from cuelearner_envs.navigation.environment import latest_first
 from cuelearner_jax.actions import rotate
-
-Policy = Callable[[PRNGKeyArray, Any, jax.Array], jax.Array]  # (key, states, observations) -> directions
+from cuelearner_jax.types import Policy
 
 
 @jax.jit
-def _begin(env: LeggedNavigation, keys: PRNGKeyArray) -> tuple[LeggedWalker, jax.Array]:
+def _begin(env: LeggedNavigation, keys: Key[Array, " robots"]) -> tuple[LeggedWalker, jax.Array]:
     return jax.vmap(env.reset)(keys)
 
 
@@ -61,7 +60,7 @@ def _after(
 class Course:
     """Robots in C MuJoCo, each in an episode of an environment."""
 
-    def __init__(self, env: LeggedNavigation, keys: PRNGKeyArray):
+    def __init__(self, env: LeggedNavigation, keys: Key[Array, " robots"]):
         """As many robots as keys, each at the start that `env.reset` gives for its key."""
         self.env = env
         self.state, self.obs = _begin(env, keys)
@@ -104,7 +103,7 @@ def rollout(
     """
     k_reset, k_run = jax.random.split(key)
     course = Course(env, jax.random.split(k_reset, num_envs))
-    choose = jax.jit(policy)
+    choose = jax.jit(policy.act)
     running, outcomes = np.ones(num_envs, bool), []
     for index in range(steps // num_envs):
         k_act, _ = jax.random.split(jax.random.fold_in(k_run, index))

@@ -37,11 +37,15 @@ class WalkingPolicy(struct.PyTreeNode):
 
     def __call__(self, obs: Float[Array, "... 48"]) -> Float[Array, "... 12"]:
         """Any leading axes."""
-        x = (obs - self.mean) / self.std
+
+        def for_each(vector: Float[Array, " n"]) -> Float[Array, "... n"]:
+            return jnp.broadcast_to(vector, (*obs.shape[:-1], *vector.shape))
+
+        x = (obs - for_each(self.mean)) / for_each(self.std)
         for kernel, bias in self.layers[:-1]:
-            x = jax.nn.swish(x @ kernel + bias)
+            x = jax.nn.swish(x @ kernel + for_each(bias))
         kernel, bias = self.layers[-1]
-        return jnp.tanh(x @ kernel + bias)
+        return jnp.tanh(x @ kernel + for_each(bias))
 
 
 def observe(

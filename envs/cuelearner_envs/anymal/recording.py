@@ -18,11 +18,12 @@ from jaxtyping import Bool, Float, PRNGKeyArray
 from cuelearner_envs import film
 from cuelearner_envs.anymal import model as robot
 from cuelearner_envs.anymal.environment import LeggedNavigation
-from cuelearner_envs.anymal.judged import Course, Policy
+from cuelearner_envs.anymal.judged import Course
 from cuelearner_envs.anymal.scene import AZIMUTH, Picture, Studio, above, beside, furnished, unobstructed
 from cuelearner_envs.navigation.lidar import BEAM_ANGLES
 from cuelearner_envs.navigation.recording import ENDS
 from cuelearner_envs.navigation.world import World
+from cuelearner_jax.types import Policy
 
 VIEW = (400, 400)  # width and height of each view [dots]; a film shows two side by side
 STILL = (960, 540)
@@ -47,7 +48,7 @@ def record(
     env: LeggedNavigation, policy: Policy, key: PRNGKeyArray, steps: int
 ) -> tuple[list[LeggedFrame], list[float]]:
     """Frames and rewards of `steps` steps of a policy in C MuJoCo; a new episode follows the end of one."""
-    choose, see = jax.jit(policy), jax.jit(_perceived)
+    choose, see = jax.jit(policy.act), jax.jit(_perceived)
     frames, rewards, course, episode = [], [], None, -1
     for number in range(steps):
         if course is None:

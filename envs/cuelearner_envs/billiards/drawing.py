@@ -22,7 +22,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, FancyArrowPatch, FancyBboxPatch, Rectangle
 
 from cuelearner_envs import film
-from cuelearner_envs.billiards.physics import Path, positions_at
+from cuelearner_envs.billiards.physics import Trajectory, positions_at
 from cuelearner_envs.billiards.table import Table, corner_gap, cushions, pockets
 
 CLOTH, CUSHION, RAIL, RAIL_EDGE, HOLE = "#2f7f5f", "#1d5741", "#6d4a32", "#4b3222", "#15110e"
@@ -42,7 +42,7 @@ def draw_table(
     pocketed: Bool[ArrayLike, "balls"],
     *,
     angle: float | None = None,
-    path: Path | None = None,
+    path: Trajectory | None = None,
 ) -> None:
     """Draws a table and its balls, filling the axes.
 
@@ -62,7 +62,7 @@ def draw_table(
         _arrow(axes, table).set_positions(*_arrow_ends(table, np.asarray(positions)[0], angle))
 
 
-def still(table: Table, path: Path, file: str | os.PathLike[str], dpi: int = 160) -> None:
+def still(table: Table, path: Trajectory, file: str | os.PathLike[str], dpi: int = 160) -> None:
     """Writes a picture of one shot: pale balls where it began, the way of each, solid balls where they came to rest.
 
     Args:
@@ -76,12 +76,35 @@ def still(table: Table, path: Path, file: str | os.PathLike[str], dpi: int = 160
     start = np.asarray(path.positions[0])
     _Balls(axes, table, ghosts=True).place(start, np.asarray(path.pocketed[0]))
     _arrow(axes, table).set_positions(*_arrow_ends(table, start[0], _angle(path)))
-    with matplotlib.rc_context({"svg.hashsalt": "cuelearner"}):  # with no date: the same shot, the same bytes
-        figure.savefig(file, dpi=dpi, metadata={"Date": None} if str(file).endswith(".svg") else None)
+    _save(figure, file, dpi)
+
+
+def question(
+    table: Table,
+    positions: Float[ArrayLike, "balls 2"],
+    pocketed: Bool[ArrayLike, "balls"],
+    action: Float[ArrayLike, "2"],
+    file: str | os.PathLike[str],
+    dpi: int = 160,
+) -> None:
+    """Writes a picture of balls at rest and of the shot in question as an arrow, for somebody to judge it.
+
+    Args:
+        table: one table (no batch).
+        positions: places of the balls [m], ball 0 is the cue ball.
+        pocketed: balls that are off the table.
+        action: direction of the shot.
+        file: a name that ends in .png, .svg or .pdf.
+        dpi: dots per inch of a .png; the picture is 8 inches wide.
+    """
+    figure, axes = _figure(table, dpi)
+    x, y = np.asarray(action, dtype=float)
+    draw_table(axes, table, positions, pocketed, angle=math.atan2(y, x))
+    _save(figure, file, dpi)
 
 
 def animate(
-    table: Table, shots: Sequence[Path], file: str | os.PathLike[str], fps: float = 30.0, speed: float = 1.0
+    table: Table, shots: Sequence[Trajectory], file: str | os.PathLike[str], fps: float = 30.0, speed: float = 1.0
 ) -> None:
     """Writes an animation of shots, one after the other; before each, an arrow shows its direction.
 
@@ -124,6 +147,12 @@ def _figure(table: Table, dpi: float) -> tuple[Figure, Axes]:
     figure = Figure(figsize=(dots / dpi, 2 * round(dots * (top - bottom) / (right - left) / 2) / dpi), dpi=dpi)
     FigureCanvasAgg(figure)
     return figure, figure.add_axes((0, 0, 1, 1))
+
+
+def _save(figure: Figure, file: str | os.PathLike[str], dpi: float) -> None:
+    """Writes a picture with no date: the same drawing, the same bytes."""
+    with matplotlib.rc_context({"svg.hashsalt": "cuelearner"}):
+        figure.savefig(file, dpi=dpi, metadata={"Date": None} if str(file).endswith(".svg") else None)
 
 
 def _draw_room(axes: Axes, table: Table) -> None:
@@ -205,7 +234,7 @@ def _ball_colour(ball: int) -> str:
     return CUE if ball == 0 else TARGETS[(ball - 1) % len(TARGETS)]
 
 
-def _angle(path: Path) -> float:
+def _angle(path: Trajectory) -> float:
     x, y = np.asarray(path.velocities[0, 0], dtype=float)
     return math.atan2(y, x)
 
@@ -225,7 +254,7 @@ def _arrow_ends(table: Table, cue: np.ndarray, angle: float) -> tuple[tuple[floa
     return (x0, y0), (x1, y1)
 
 
-def _draw_tracks(axes: Axes, table: Table, path: Path) -> None:
+def _draw_tracks(axes: Axes, table: Table, path: Trajectory) -> None:
     """One line for each ball that moves, from its start to where it rests or falls."""
     times, positions, pocketed = np.asarray(path.times), np.asarray(path.positions), np.asarray(path.pocketed)
     for ball in range(table.balls):
@@ -244,7 +273,7 @@ def _draw_tracks(axes: Axes, table: Table, path: Path) -> None:
 
 
 def _frames(
-    table: Table, shots: Sequence[Path], fps: float, speed: float
+    table: Table, shots: Sequence[Trajectory], fps: float, speed: float
 ) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
     """Pictures of the shots at a fixed rate. The table is drawn once; each frame draws only what moves over it."""
     figure, axes = _figure(table, dpi=100)
@@ -272,7 +301,7 @@ def _frames(
 
 
 def _film(
-    table: Table, path: Path, fps: float, speed: float
+    table: Table, path: Trajectory, fps: float, speed: float
 ) -> tuple[Float[np.ndarray, "frames balls 2"], Bool[np.ndarray, "frames balls"], int]:
     """Positions [m] and pocketed balls of one shot's frames, at rest before and after it; the frames before it."""
     held, after = round(HOLD_BEFORE * fps), round(HOLD_AFTER * fps)

@@ -103,7 +103,7 @@ class Billiards(WholeObservations, struct.PyTreeNode):
         Pocketed targets come first: they stand beside the table, in the order of their row and not of their number, so
         that equal positions look equal. No sensor looks there: their places have no bias.
         """
-        seen = balls.positions + jnp.asarray(self.observation_bias)
+        seen = balls.positions + jnp.asarray(self.observation_bias)[None]
         entries = jnp.concatenate([seen, jnp.where(balls.pocketed, FLAG, -FLAG)[:, None]], axis=-1)
         return jnp.concatenate([entries[0], self._sorted(entries[1:]).ravel()])
 
@@ -118,12 +118,12 @@ class Billiards(WholeObservations, struct.PyTreeNode):
     def heuristic(self, obs: Float[Array, " obs"]) -> Float[Array, "2"]:
         """Straight at the closest target on the table."""
         balls = obs.reshape(-1, 3)
-        offsets = balls[1:, :2] - balls[0, :2]
+        offsets = balls[1:, :2] - balls[:1, :2]
         distance = jnp.where(balls[1:, 2] > 0, jnp.inf, jnp.linalg.norm(offsets, axis=-1))
         return retract(offsets[jnp.argmin(distance)])
 
     def mirror(
-        self, which: Int[Array, ""], obs: Float[Array, " obs"], vector: Float[Array, "2"]
+        self, which: Int[Array, ""] | int, obs: Float[Array, " obs"], vector: Float[Array, "2"]
     ) -> tuple[Float[Array, " obs"], Float[Array, "2"]]:
         """0: as it is; 1: x reversed; 2: y reversed; 3: both. Exact for the shot's result in the unchanged world.
 
@@ -147,14 +147,15 @@ class Billiards(WholeObservations, struct.PyTreeNode):
         leading = action.shape[:-1]
         frame = jnp.stack([action, rotate(action, jnp.asarray(jnp.pi / 2))], axis=-2)  # (..., 2, 2): along, across
         # Precise on accelerators too: they round the factors of a matrix product.
-        apart = targets[:, :2] - balls[0, :2]
+        apart = targets[:, :2] - balls[:1, :2]
         offsets = jnp.einsum("...ij,tj->...ti", frame, apart, precision=jax.lax.Precision.HIGHEST)
         cut = jnp.arctan(offsets[..., 1:] / (2.0 * self.table.ball_radius))
         on_table = jnp.broadcast_to(targets[:, 2:] < 0, (*leading, targets.shape[0], 1)).astype(jnp.float32)
         place = jnp.broadcast_to(targets[:, :2] / scale, (*leading, targets.shape[0], 2))
         seen = jnp.concatenate([offsets / scale, cut, place], axis=-1) * on_table
         each = jnp.concatenate([seen, on_table], axis=-1).reshape(*leading, -1)
-        own = jnp.concatenate([jnp.broadcast_to(cue, (*leading, 2)), action, cue * action, cue[::-1] * action], axis=-1)
+        cue = jnp.broadcast_to(cue, (*leading, 2))
+        own = jnp.concatenate([cue, action, cue * action, cue[..., ::-1] * action], axis=-1)
         return jnp.concatenate([own, each], axis=-1)
 
 
@@ -162,7 +163,7 @@ def _jittered_rack(key: PRNGKeyArray, table: Table) -> Float[Array, "balls 2"]:
     """The rack, its targets displaced; of several draws the first in which no two balls overlap (else the loosest)."""
     standing = rack(table)
     noise = table.rack_jitter * jax.random.normal(key, (PLACEMENTS, table.balls - 1, 2))
-    draws = jnp.concatenate([jnp.broadcast_to(standing[:1], (PLACEMENTS, 1, 2)), standing[1:] + noise], axis=1)
+    draws = jnp.concatenate([jnp.broadcast_to(standing[:1], (PLACEMENTS, 1, 2)), standing[None, 1:] + noise], axis=1)
     clearance = jax.vmap(_smallest_distance)(draws) - 2 * table.ball_radius
     return draws[jnp.argmax(jnp.where(clearance > 0, 1.0, clearance))]
 

@@ -17,10 +17,10 @@ SOFT_SPEED = 1e-3  # [m/s] slower impacts are elastic: else balls that lie toget
 
 
 def normal_impulse(
-    approach: Float[Array, "*any"],
-    unseen: Float[Array, "*any"],
+    approach: Float[Array, "*any"] | float,
+    unseen: Float[Array, "*any"] | float,
     restitution: Scalar,
-    discs: Float[Array, "*any"],
+    discs: Float[Array, "*any"] | float,
 ) -> Float[Array, "*any"]:
     """Impulse along the normal: (1 + e) * approach / discs (Newton's restitution); `discs` = 1 or 2 movable bodies.
 
@@ -33,10 +33,10 @@ def normal_impulse(
 
 
 def tangential_impulse(
-    slip: Float[Array, "*any"],
-    normal: Float[Array, "*any"],
+    slip: Float[Array, "*any"] | float,
+    normal: Float[Array, "*any"] | float,
     friction: Scalar,
-    discs: Float[Array, "*any"],
+    discs: Float[Array, "*any"] | float,
 ) -> Float[Array, "*any"]:
     """Impulse along the tangent: it ends the slip, or is clamped to Coulomb's cone (as in Chipmunk's arbiter)."""
     most = friction * normal

@@ -11,12 +11,13 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from cuelearner_envs.billiards.contacts import next_on_edge, time_to_circle
 from cuelearner_envs.billiards.impacts import RIM_PER_IMPULSE, normal_impulse, tangential_impulse
-from cuelearner_envs.billiards.table import Table, as_arrays, parking_place
+from cuelearner_envs.billiards.table import Scalar, Table, as_arrays, parking_place
 
 BEND = 1e-5  # largest departure of a flight between two kicks from the true parabola [m]
 
@@ -33,7 +34,7 @@ class Shot:
 
 
 @struct.dataclass
-class Path:
+class Trajectory:
     """A shot between its events, for drawing: from each knot on, balls fly straight in warped time."""
 
     times: Float[Array, "knots"]  # [s]; knots = max_events + 1, the last one repeated once the shot is over
@@ -121,7 +122,7 @@ def next_contact(table: Table, motion: Motion) -> Contact:
     return Contact(wait, a, b, of(edge.centre_x, a), of(edge.centre_y, a), jnp.any(edge.falls & a) & ~jnp.any(b))
 
 
-def time_to_stop(table: Table, motion: Motion, unseen: Float[Array, ""]) -> Float[Array, ""]:
+def time_to_stop(table: Table, motion: Motion, unseen: Scalar) -> Float[Array, ""]:
     """Warped time until every ball is slower than the stop speed; exact while no ball changes direction.
 
     Along its direction a ball obeys dv/dt = a - lambda v, `unseen` being the kick due since the last one applied.
@@ -145,7 +146,7 @@ def of(value: Float[Array, "balls"], ball: Bool[Array, "balls"]) -> Float[Array,
 # ------------------------------------------------------------------------------------------------------------- the step
 
 
-def impact(table: Table, motion: Motion, contact: Contact, unseen: Float[Array, ""]) -> Motion:
+def impact(table: Table, motion: Motion, contact: Contact, unseen: Scalar) -> Motion:
     """Apply the impulses of a contact that is now, between balls a and b or between a and a cushion."""
     a, b, paired = contact.a, contact.b, jnp.any(contact.b)
     discs = jnp.where(paired, 2.0, 1.0)
@@ -243,7 +244,10 @@ def strike(
 
 
 def simulate(
-    table: Table, positions: Float[Array, "balls 2"], pocketed: Bool[Array, "balls"], angle: Float[Array, ""]
+    table: Table,
+    positions: Float[ArrayLike, "balls 2"],
+    pocketed: Bool[ArrayLike, "balls"],
+    angle: Float[ArrayLike, ""],
 ) -> Shot:
     """Play one shot: strike the cue ball in the direction `angle` [rad] and wait until all balls rest.
 
@@ -267,9 +271,9 @@ def simulate(
 
 def simulate_many(
     table: Table,
-    positions: Float[Array, "shots balls 2"],
-    pocketed: Bool[Array, "shots balls"],
-    angles: Float[Array, "shots"],
+    positions: Float[Array | np.ndarray, "shots balls 2"],
+    pocketed: Bool[Array | np.ndarray, "shots balls"],
+    angles: Float[Array | np.ndarray, "shots"],
     block: int = 4096,
 ) -> Shot:
     """`vmap(simulate)` in blocks: working memory stays in cache, and a long shot holds up only its block.
@@ -297,8 +301,11 @@ def simulate_many(
 
 
 def trace(
-    table: Table, positions: Float[Array, "balls 2"], pocketed: Bool[Array, "balls"], angle: Float[Array, ""]
-) -> Path:
+    table: Table,
+    positions: Float[ArrayLike, "balls 2"],
+    pocketed: Bool[ArrayLike, "balls"],
+    angle: Float[ArrayLike, ""],
+) -> Trajectory:
     """The same shot as `simulate` plays, with every event kept. For drawing: it always takes max_events steps."""
     positions = jnp.asarray(positions)
     table = as_arrays(table, positions.dtype)
@@ -310,7 +317,7 @@ def trace(
 
     _, after = jax.lax.scan(keep, start, None, length=table.max_events)
     knots = jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), start, after)
-    return Path(
+    return Trajectory(
         times=unwarp(drag(table), knots.warped),
         positions=jnp.stack([knots.x, knots.y], axis=-1),
         velocities=jnp.stack([knots.ux, knots.uy], axis=-1),
@@ -319,7 +326,7 @@ def trace(
 
 
 def positions_at(
-    table: Table, path: Path, times: Float[Array, "times"]
+    table: Table, path: Trajectory, times: Float[ArrayLike, "times"]
 ) -> tuple[Float[Array, "times balls 2"], Bool[Array, "times balls"]]:
     """Where the balls are [m], and which are pocketed, at given times since the strike [s]; at rest after the shot."""
     table = as_arrays(table, path.positions.dtype)

@@ -2,31 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
-
 import jax
 from jaxtyping import PRNGKeyArray
 
 from cuelearner_envs.billiards.environment import Balls, Billiards
-from cuelearner_envs.billiards.physics import Path, trace
+from cuelearner_envs.billiards.physics import Trajectory, trace
 from cuelearner_jax.actions import to_angle
+from cuelearner_jax.types import Policy
 
 
-def record(
-    env: Billiards, policy: Callable[[PRNGKeyArray, Any, jax.Array], jax.Array], key: PRNGKeyArray, shots: int
-) -> tuple[list[Path], list[float]]:
+def record(env: Billiards, policy: Policy, key: PRNGKeyArray, shots: int) -> tuple[list[Trajectory], list[float]]:
     """Paths and rewards of `shots` shots of a policy; a new rack follows the end of an episode.
 
     Args:
-        policy: (key, states (n, ...), observations (n, obs)) -> directions (n, 2).
+        policy: who acts.
     """
 
     @jax.jit
-    def play(key: PRNGKeyArray, state: Balls, obs: jax.Array) -> tuple[Balls, jax.Array, jax.Array, Path]:
+    def play(key: PRNGKeyArray, state: Balls, obs: jax.Array) -> tuple[Balls, jax.Array, jax.Array, Trajectory]:
         k_act, k_step = jax.random.split(key)
         states = jax.tree.map(lambda leaf: leaf[None], state)
-        action = policy(k_act, states, obs[None])[0]
+        action = policy.act(k_act, states, obs[None])[0]
         path = trace(env.table, state.positions, state.pocketed, to_angle(action) + env.action_turn)
         after, step = env.step(k_step, state, action)
         return after, step.obs, step.reward, path

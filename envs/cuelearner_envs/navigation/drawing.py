@@ -38,6 +38,7 @@ WORDS = {
     "fall": "fell after",
     "timeout": "out of time after",
 }
+CHOSEN, ASKED = "direction chosen", "direction in question"  # what an arrow means
 FLOOR, LOW, TALL = "#fbfaf7", "#c9ccd1", "#5d636b"
 LOWEST, TALLEST = 0.6, 1.5  # heights that have the colours `LOW` and `TALL` [m]
 WIDTH_INCHES, STRIP_INCHES, MARGIN = 7.0, 0.4, 0.35  # the strip below the floor is for words; margin in [m]
@@ -94,8 +95,28 @@ def still(robot: Robot, frames: Sequence[Frame], file: str | os.PathLike[str], d
     words = WORDS.get(last.outcome, "still walking after")
     length = np.linalg.norm(np.diff(way[:, :2], axis=0), axis=-1).sum()
     _caption(strip).set(text=f"{words} {last.seconds:.1f} s, {length:.1f} m", color=_outcome_colour(last))
-    with matplotlib.rc_context({"svg.hashsalt": "cuelearner"}):  # with no date: the same episode, the same bytes
-        figure.savefig(file, dpi=dpi, metadata={"Date": None} if str(file).endswith(".svg") else None)
+    _save(figure, file, dpi)
+
+
+def question(robot: Robot, frame: Frame, file: str | os.PathLike[str], dpi: int = 160) -> None:
+    """Writes a picture of one situation and of the direction in question as an arrow, for somebody to judge it.
+
+    Args:
+        robot: gives the outline of the body.
+        frame: from `recording.situation`.
+        file: a name that ends in .png, .svg or .pdf.
+        dpi: dots per inch of a .png; the picture is 7 inches wide.
+    """
+    figure, axes, strip = _figure(np.asarray(frame.world.extent), dpi)
+    draw_world(axes, frame.world)
+    _draw_goal(axes, frame)
+    _draw_strip(strip, frame.world, ("goal", "lidar", ASKED))
+    _Lidar(axes).place(frame)
+    _Body(axes, robot).place(frame.pose)
+    _arrow(axes).set_positions(*_arrow_ends(frame))
+    away = float(np.linalg.norm(np.asarray(frame.goal) - frame.pose[:2]))
+    _caption(strip).set(text=f"{away:.1f} m from the goal", color=INK)
+    _save(figure, file, dpi)
 
 
 def animate(robot: Robot, frames: Sequence[Frame], file: str | os.PathLike[str], fps: float = 10.0) -> None:
@@ -156,8 +177,7 @@ def overview(
             axes.plot(*goal, marker="*", markersize=7, color=GOAL, markeredgewidth=0, zorder=3)
         if titles:
             axes.set_title(titles[number], fontsize=10, pad=3)
-    with matplotlib.rc_context({"svg.hashsalt": "cuelearner"}):
-        figure.savefig(file, dpi=160, metadata={"Date": None} if str(file).endswith(".svg") else None)
+    _save(figure, file, 160)
 
 
 def shade(height: float) -> str:
@@ -216,31 +236,45 @@ def _figure(extent: Float[np.ndarray, "2"], dpi: float) -> tuple[Figure, Axes, A
     return figure, axes, strip
 
 
-def _draw_course(axes: Axes, frame: Frame) -> None:
-    """Everything that stays as it is in an episode: the world, the goal, and the start, which is the frame's pose."""
-    draw_world(axes, frame.world)
+def _save(figure: Figure, file: str | os.PathLike[str], dpi: float) -> None:
+    """Writes a picture with no date: the same drawing, the same bytes."""
+    with matplotlib.rc_context({"svg.hashsalt": "cuelearner"}):
+        figure.savefig(file, dpi=dpi, metadata={"Date": None} if str(file).endswith(".svg") else None)
+
+
+def _draw_goal(axes: Axes, frame: Frame) -> None:
     x, y = np.asarray(frame.goal, float)
     axes.add_patch(Circle((x, y), frame.goal_radius, facecolor=GOAL + "33", edgecolor=GOAL, linewidth=1.2, zorder=2))
     axes.plot(x, y, marker="*", markersize=11, color=GOAL, markeredgewidth=0, zorder=3)
+
+
+def _draw_course(axes: Axes, frame: Frame) -> None:
+    """Everything that stays as it is in an episode: the world, the goal, and the start, which is the frame's pose."""
+    draw_world(axes, frame.world)
+    _draw_goal(axes, frame)
     axes.plot(*frame.pose[:2], marker="o", markersize=6, color="white", markeredgecolor=START, zorder=3)
 
 
-def _draw_strip(strip: Axes, world: World) -> None:
-    """The key to the signs, and a scale."""
+def _draw_strip(strip: Axes, world: World, shown: Sequence[str] = ("start", "goal", "lidar", CHOSEN)) -> None:
+    """The key to the signs that are shown, and a scale."""
     length = 2.0 if float(world.extent[0]) > 12.0 else 1.0
     right = float(world.extent[0]) / 2
     strip.plot([right - length, right], [0.3, 0.3], color=INK, linewidth=2, solid_capstyle="butt")
     strip.text(right - length / 2, 0.42, f"{length:g} m", ha="center", va="bottom", fontsize=8, color=INK)
+    arrow = {"marker": r"$\rightarrow$", "color": ARROW, "markersize": 13, "markeredgewidth": 0}
     signs = {
         "start": {"marker": "o", "color": "white", "markeredgecolor": START, "markersize": 6},
         "goal": {"marker": "*", "color": GOAL, "markeredgewidth": 0, "markersize": 11},
         "lidar": {"marker": "o", "color": HITS, "markersize": 3},
-        "direction chosen": {"marker": r"$\rightarrow$", "color": ARROW, "markersize": 13, "markeredgewidth": 0},
+        CHOSEN: arrow,
+        ASKED: arrow,
     }
-    handles = [Line2D([], [], linestyle="none", label=name, **look) for name, look in signs.items()]
+    handles = [Line2D([], [], linestyle="none", label=name, **signs[name]) for name in shown]
     place = 0.98 - (length + MARGIN) / (float(world.extent[0]) + 2 * MARGIN)
     look: dict[str, Any] = {"frameon": False, "borderpad": 0, "handletextpad": 0.1, "columnspacing": 0.9}
-    strip.legend(handles=handles, loc="center right", bbox_to_anchor=(place, 0.5), ncols=4, fontsize=7.5, **look)
+    strip.legend(
+        handles=handles, loc="center right", bbox_to_anchor=(place, 0.5), ncols=len(handles), fontsize=7.5, **look
+    )
 
 
 def _caption(strip: Axes, animated: bool = False) -> Any:

@@ -10,7 +10,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from flax import struct
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray
 
 from cuelearner_envs.navigation.lidar import BEAMS, Lidar
 from cuelearner_envs.navigation.robot import Motion, Robot, collides, walk
@@ -62,8 +62,8 @@ class Navigation(Described, struct.PyTreeNode):
         """Identity, and left and right exchanged: body, lidar and motion are symmetric, worlds are as likely as not."""
         return 2 if self.mirrors else 1
 
-    def world(self, index: Int[Array, ""]) -> World:
-        """One of the worlds."""
+    def world(self, index: Int[ArrayLike, "*n"]) -> World:
+        """One of the worlds, or as many as there are indices."""
         return jax.tree.map(lambda leaf: leaf[index], self.worlds)
 
     def reset(self, key: PRNGKeyArray) -> tuple[AnyWalker, Float[Array, " obs"]]:
@@ -167,25 +167,25 @@ class Navigation(Described, struct.PyTreeNode):
         return obs[BEAMS : BEAMS + 2]
 
     def mirror(
-        self, which: Int[Array, ""], obs: Float[Array, " obs"], vector: Float[Array, "2"]
+        self, which: Int[Array, ""] | int, obs: Float[Array, " obs"], vector: Float[Array, "2"]
     ) -> tuple[Float[Array, " obs"], Float[Array, "2"]]:
         """0: as it is; 1: left and right exchanged. Exact unless the sensor is turned."""
         sign = jnp.array([1.0, -1.0])
         goal, distance, previous = obs[BEAMS : BEAMS + 2], obs[BEAMS + 2], obs[BEAMS + 3 :].reshape(REMEMBERED, 2)
-        image = jnp.concatenate([obs[:BEAMS][::-1], goal * sign, distance[None], (previous * sign).ravel()])
+        image = jnp.concatenate([obs[:BEAMS][::-1], goal * sign, distance[None], (previous * sign[None]).ravel()])
         return jnp.where(which == 1, image, obs), jnp.where(which == 1, vector * sign, vector)
 
-    def remember(self, state: AnyWalker, obs: Float[Array, " obs"]) -> Float[Array, "12"]:
-        """Place, goal, previous actions and number of the world: what `observe` looks at."""
+    def remember(self, state: AnyWalker, obs: Float[Array, " obs"]) -> Float[Array, " memory"]:
+        """Place, goal, previous actions and number of the world: what `observe` looks at, 9 entries and the place's."""
         world = state.world[None].astype(jnp.float32)
         return jnp.concatenate([self.place(state), state.goal, state.previous.ravel(), world])
 
-    def recall(self, memory: Float[Array, "12"]) -> Float[Array, " obs"]:
+    def recall(self, memory: Float[Array, " memory"]) -> Float[Array, " obs"]:
         """The observation, its lidar scanned anew."""
         return self.observe(self.placed(*_remembered(memory)))
 
     def recall_next(
-        self, memory: Float[Array, "12"], action: Float[Array, "2"], aftermath: Float[Array, "3"]
+        self, memory: Float[Array, " memory"], action: Float[Array, "2"], aftermath: Float[Array, " place"]
     ) -> Float[Array, " obs"]:
         """The observation after the action, at the place `aftermath`."""
         _, goal, previous, world, route = _remembered(memory)

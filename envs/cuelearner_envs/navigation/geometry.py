@@ -11,7 +11,7 @@ from cuelearner_envs.navigation.world import World
 
 def in_frame(boxes: Float[Array, "boxes 5"], point: Float[Array, "2"]) -> Float[Array, "boxes 2"]:
     """A point in the frame of each box [m]."""
-    offset = point - boxes[:, :2]
+    offset = point[None] - boxes[:, :2]
     cos, sin = jnp.cos(boxes[:, 2]), jnp.sin(boxes[:, 2])
     return jnp.stack([cos * offset[:, 0] + sin * offset[:, 1], cos * offset[:, 1] - sin * offset[:, 0]], axis=-1)
 
@@ -21,7 +21,7 @@ def clearance(world: World, point: Float[Array, "2"]) -> Float[Array, ""]:
     beyond = jnp.abs(in_frame(world.boxes, point)) - world.boxes[:, 3:]
     outside = jnp.sqrt(jnp.sum(jnp.square(jnp.maximum(beyond, 0.0)), -1))
     to_boxes = outside + jnp.minimum(beyond.max(-1), 0.0)
-    to_circles = jnp.sqrt(jnp.sum(jnp.square(point - world.circles[:, :2]), -1)) - world.circles[:, 2]
+    to_circles = jnp.sqrt(jnp.sum(jnp.square(point[None] - world.circles[:, :2]), -1)) - world.circles[:, 2]
     return jnp.minimum(to_boxes.min(), to_circles.min())
 
 
@@ -50,7 +50,7 @@ def _box_to_line(half: Float[Array, "2"], start: Float[Array, "2"], end: Float[A
     """
     signs = jnp.array([[1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]])
     corners = jax.vmap(lambda sign: _point_to_line(sign * half, start, end))(signs).min()
-    beyond = jnp.maximum(jnp.abs(jnp.stack([start, end])) - half, 0.0)
+    beyond = jnp.maximum(jnp.abs(jnp.stack([start, end])) - half[None], 0.0)
     ends = jnp.sqrt(jnp.sum(jnp.square(beyond), -1)).min()
     return jnp.where(_meets(half, start, end), 0.0, jnp.minimum(corners, ends))
 

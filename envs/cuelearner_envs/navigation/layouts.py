@@ -146,8 +146,8 @@ def _layout(
     """Obstacles with outer walls, filled up to the common size."""
     half = extent / 2
     walls = jnp.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
-    centres = walls * (half + WALL)
-    shape = jnp.where(jnp.abs(walls) > 0, WALL, half + 2 * WALL)
+    centres = walls * (half + WALL)[None]
+    shape = jnp.where(jnp.abs(walls) > 0, WALL, half[None] + 2 * WALL)
     outer = jnp.concatenate([centres, jnp.zeros((4, 1)), shape], axis=-1)
     boxes = jnp.concatenate([outer, boxes, _unused(BOXES - 4 - boxes.shape[0], 5)])
     circles = jnp.concatenate([circles, _unused(CIRCLES - circles.shape[0], 3)])

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from cuelearner_envs.navigation.geometry import in_frame
 from cuelearner_envs.navigation.world import World
@@ -36,7 +36,7 @@ class Lidar(struct.PyTreeNode):
     noise: Scalar = 0.0  # standard deviation of a beam's error [m]
     dropout: Scalar = 0.0  # probability that a beam reads `max_range` whatever it meets
 
-    def read(self, world: World, pose: Float[Array, "3"]) -> Float[Array, "271"]:
+    def read(self, world: World, pose: Float[ArrayLike, "3"]) -> Float[Array, "271"]:
         """Distances that the robot perceives at a pose [m]; without faults they are `scan`'s.
 
         Noise and drop-outs are drawn from the pose's bits, so that the same reading can be made again.
@@ -59,7 +59,7 @@ class Lidar(struct.PyTreeNode):
         return jax.lax.cond(has_faults, drawn, lambda: ranges)
 
 
-def scan(world: World, pose: Float[Array, "3"], max_range: Scalar = MAX_RANGE) -> Float[Array, "271"]:
+def scan(world: World, pose: Float[ArrayLike, "3"], max_range: Scalar = MAX_RANGE) -> Float[Array, "271"]:
     """Distance along each beam to the first surface [m], from -135 deg to +135 deg, counterclockwise.
 
     The sensor sits at the robot's centre, below the top of every solid. From inside a solid a beam reads the way out,
@@ -70,7 +70,7 @@ def scan(world: World, pose: Float[Array, "3"], max_range: Scalar = MAX_RANGE) -
         pose: x, y, yaw [m, rad].
         max_range: what a beam reads that meets nothing nearer [m].
     """
-    pose = jnp.asarray(pose)
+    world, pose = jax.tree.map(jnp.asarray, world), jnp.asarray(pose)
     beams = rotate(from_angle(jnp.asarray(BEAM_ANGLES)), pose[2])
     boxes, circles = _boxes(world.boxes, pose[:2], beams), _circles(world.circles, pose[:2], beams)
     return 1.0 / jnp.maximum(jnp.maximum(boxes.max(0), circles.max(0)), 1.0 / max_range)
@@ -92,13 +92,13 @@ def scan_tilted(
     """
     ahead = from_angle(jnp.asarray(BEAM_ANGLES))
     # Sums, not a matrix product: an accelerator rounds the factors of those.
-    beams = ahead[:, :1] * turn[:, 0] + ahead[:, 1:] * turn[:, 1]
+    beams = ahead[:, :1] * turn[None, :, 0] + ahead[:, 1:] * turn[None, :, 1]
     level = jnp.sqrt(jnp.sum(jnp.square(beams[:, :2]), -1))  # cosine of each beam's slope
     flat, rise = beams[:, :2] / level[:, None], beams[:, 2] / level
 
     def met(inverse: Float[Array, "solids beams"], heights: Float[Array, " solids"]) -> Float[Array, " beams"]:
         """The nearest solid's that is high enough where the beam is: height + rise / inverse <= top."""
-        return jnp.where(rise <= (heights[:, None] - origin[2]) * inverse, inverse, 0.0).max(0)
+        return jnp.where(rise[None] <= (heights[:, None] - origin[2]) * inverse, inverse, 0.0).max(0)
 
     boxes = met(_boxes(world.boxes, origin[:2], flat), world.box_heights)
     circles = met(_circles(world.circles, origin[:2], flat), world.circle_heights)
@@ -128,7 +128,7 @@ def _boxes(
     def products(factor: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Both axes' inverse distances along every beam: (boxes, beams) each."""
         normals = factor[..., None] * axes
-        along = normals[:, :, 0, None] * beams[:, 0] + normals[:, :, 1, None] * beams[:, 1]
+        along = normals[:, :, :1] * beams[None, None, :, 0] + normals[:, :, 1:] * beams[None, None, :, 1]
         return along[:, 0], along[:, 1]
 
     in_x, in_y = products(enter)
@@ -148,12 +148,12 @@ def _circles(
 
     The two crossings multiply to |centre|^2 - radius^2, which turns the division into one for each circle.
     """
-    centre, radius = circles[:, :2] - origin, circles[:, 2]
+    centre, radius = circles[:, :2] - origin[None], circles[:, 2]
     power = jnp.sum(jnp.square(centre), -1) - jnp.square(radius)
     power = jnp.where(jnp.abs(power) < 1e-9, 1e-9, power)
     other = jnp.where(power > 0, 1.0, -1.0)
-    along = centre[:, 0, None] * beams[:, 0] + centre[:, 1, None] * beams[:, 1]
-    across = centre[:, 0, None] * beams[:, 1] - centre[:, 1, None] * beams[:, 0]
+    along = centre[:, :1] * beams[None, :, 0] + centre[:, 1:] * beams[None, :, 1]
+    across = centre[:, :1] * beams[None, :, 1] - centre[:, 1:] * beams[None, :, 0]
     depth = jnp.square(radius)[:, None] - jnp.square(across)
     seen = (along + other[:, None] * jnp.sqrt(jnp.maximum(depth, 0.0))) / power[:, None]
     return jnp.where(depth >= 0, seen, 0.0)

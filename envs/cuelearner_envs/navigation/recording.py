@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, PRNGKeyArray
+from jaxtyping import ArrayLike, Float, PRNGKeyArray
 
 from cuelearner_envs.navigation.environment import Navigation
 from cuelearner_envs.navigation.world import World
+from cuelearner_jax.types import Policy
 
 ENDS = ("success", "collision", "fall", "timeout")
 
@@ -32,13 +32,40 @@ class Frame(NamedTuple):
     episode: int  # counted from 0
 
 
-def record(
-    env: Navigation, policy: Callable[[PRNGKeyArray, Any, jax.Array], jax.Array], key: PRNGKeyArray, steps: int
-) -> tuple[list[Frame], list[float]]:
+def situation(env: Navigation, state: Any, action: Float[ArrayLike, "2"]) -> Frame:
+    """What a picture needs of a state that has not been left yet, with an action in question."""
+    seen = jax.device_get(_seen(env, state))
+    return Frame(
+        world=seen["world"],
+        goal=seen["goal"],
+        goal_radius=float(env.goal_radius),
+        pose=seen["pose"],
+        ranges=seen["ranges"],
+        max_range=float(env.lidar.max_range),
+        action=np.asarray(action),
+        next_pose=seen["pose"],
+        seconds=float(seen["seconds"]),
+        outcome="",
+        episode=0,
+    )
+
+
+@jax.jit
+def _seen(env: Navigation, state: Any) -> dict[str, Any]:
+    return {
+        "world": env.world(state.world),
+        "goal": state.goal,
+        "pose": state.pose,
+        "ranges": env.ranges(state),
+        "seconds": state.steps * jnp.asarray(env.period),
+    }
+
+
+def record(env: Navigation, policy: Policy, key: PRNGKeyArray, steps: int) -> tuple[list[Frame], list[float]]:
     """Frames and rewards of `steps` steps of a policy; a new episode follows the end of one.
 
     Args:
-        policy: (key, states (n, ...), observations (n, obs)) -> directions (n, 2).
+        policy: who acts.
     """
 
     @jax.jit
@@ -49,7 +76,7 @@ def record(
             state, obs = carry
             k_act, k_step = jax.random.split(jax.random.fold_in(k_play, number))
             states = jax.tree.map(lambda leaf: leaf[None], state)
-            action = policy(k_act, states, obs[None])[0]
+            action = policy.act(k_act, states, obs[None])[0]
             moved = env.moved(state, action)
             following, step = env.step(k_step, state, action)
             seconds = moved.steps * jnp.asarray(env.period)

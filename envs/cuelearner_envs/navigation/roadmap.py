@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from cuelearner_envs.navigation.environment import Navigation, Walker
+from cuelearner_envs.navigation.environment import AnyWalker, Navigation
 from cuelearner_envs.navigation.geometry import clearance, line_clearance
 from cuelearner_envs.navigation.robot import Robot
 from cuelearner_envs.navigation.world import World
@@ -41,23 +41,23 @@ def build(key: PRNGKeyArray, world: World, robot: Robot) -> RoadMap:
     k_place, k_order = jax.random.split(key)
     candidates, rank = _candidates(k_place, world, robot.reach + NODE_MARGIN)
     free = jax.vmap(partial(clearance, world))(candidates) >= robot.reach + NODE_MARGIN - 1e-4
-    inside = (jnp.abs(candidates) < world.extent / 2).all(-1)
+    inside = (jnp.abs(candidates) < world.extent[None] / 2).all(-1)
     order = jnp.argsort(jnp.where(free & inside, rank + jax.random.uniform(k_order, rank.shape), jnp.inf))[:NODES]
     nodes, useful = candidates[order], (free & inside)[order]
     clear = jax.vmap(lambda a: jax.vmap(lambda b: line_clearance(world, a, b))(nodes))(nodes)
-    joined = (clear >= robot.reach + LINE_MARGIN) & useful[:, None] & useful
-    apart = jnp.linalg.norm(nodes[:, None] - nodes, axis=-1)
+    joined = (clear >= robot.reach + LINE_MARGIN) & useful[:, None] & useful[None]
+    apart = jnp.linalg.norm(nodes[:, None] - nodes[None], axis=-1)
     return RoadMap(nodes, jnp.where(joined, apart, jnp.inf))
 
 
 def distances(roadmap: RoadMap, world: World, robot: Robot, goal: Float[Array, "2"]) -> Float[Array, " nodes"]:
     """Length of the shortest way from each node to a goal [m]; infinite where there is none (Bellman and Ford)."""
-    direct = jnp.linalg.norm(roadmap.nodes - goal, axis=-1)
+    direct = jnp.linalg.norm(roadmap.nodes - goal[None], axis=-1)
     useful = jnp.isfinite(roadmap.lengths).any(-1)
     start = jnp.where(useful & (_view(roadmap, world, robot, goal) >= 0), direct, jnp.inf)
 
     def relax(length: jax.Array) -> jax.Array:
-        return jnp.minimum(length, (roadmap.lengths + length).min(-1))
+        return jnp.minimum(length, (roadmap.lengths + length[None]).min(-1))
 
     def more(carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         return carry[1], relax(carry[1])
@@ -87,7 +87,7 @@ def way(
     rest = jnp.append(to_goal, 0.0)
     room = jnp.append(_view(roadmap, world, robot, position), _room(world, robot, position, goal))
     penalty = jnp.where(room >= 0, 0.0, BLOCKED * (1.0 - room))
-    lengths = jnp.linalg.norm(places - position, axis=-1) + rest + penalty
+    lengths = jnp.linalg.norm(places - position[None], axis=-1) + rest + penalty
     best = jnp.argmin(lengths)
     return places[best], lengths[best]
 
@@ -111,20 +111,20 @@ def _candidates(
     sides = jnp.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
 
     def of_box(box: Float[Array, "5"]) -> tuple[jax.Array, jax.Array]:
-        corners = signs * (box[3:] + away / 2**0.5)
-        beside = sides * (box[3:] + away)
-        return tuple(box[:2] + rotate(points, box[2]) for points in (corners, beside))  # pyright: ignore
+        corners = signs * (box[None, 3:] + away / 2**0.5)
+        beside = sides * (box[None, 3:] + away)
+        return tuple(box[None, :2] + rotate(points, box[2]) for points in (corners, beside))  # pyright: ignore
 
     def of_circle(circle: Float[Array, "3"], turn: Float[Array, ""]) -> jax.Array:
         # A polygon round the circle whose sides keep the distance, not only its corners.
         radius = (circle[2] + away) / jnp.cos(jnp.pi / ROUND)
-        return circle[:2] + radius * from_angle(turn + jnp.arange(ROUND) * (2 * jnp.pi / ROUND))
+        return circle[None, :2] + radius * from_angle(turn + jnp.arange(ROUND) * (2 * jnp.pi / ROUND))
 
     k_turn, k_anywhere = jax.random.split(key)
     corners, beside = jax.vmap(of_box)(world.boxes)
     turns = jax.random.uniform(k_turn, (world.circles.shape[0],), maxval=2 * jnp.pi)
     rounds = jax.vmap(of_circle)(world.circles, turns)
-    anywhere = jax.random.uniform(k_anywhere, (UNIFORM, 2), minval=-0.5, maxval=0.5) * world.extent
+    anywhere = jax.random.uniform(k_anywhere, (UNIFORM, 2), minval=-0.5, maxval=0.5) * world.extent[None]
     kinds = [corners.reshape(-1, 2), rounds.reshape(-1, 2), beside.reshape(-1, 2), anywhere]
     ranks = [jnp.full(len(kind), rank) for kind, rank in zip(kinds, (0.0, 0.4, 0.8, 1.0), strict=True)]
     return jnp.concatenate(kinds), jnp.concatenate(ranks)
@@ -137,7 +137,7 @@ class RoadMapTeacher(struct.PyTreeNode):
     maps: RoadMap  # leading axis: worlds
     to_goals: Float[Array, "worlds routes nodes"]  # `distances` of each route's goal
 
-    def best_action(self, state: Walker, obs: Float[Array, " obs"]) -> Float[Array, "2"]:
+    def best_action(self, state: AnyWalker, obs: Float[Array, " obs"]) -> Float[Array, "2"]:
         """The direction of the shortest way to the goal, in the body's frame. Looks at the true state."""
         world = self.env.world(state.world)
         roadmap = jax.tree.map(lambda leaf: leaf[state.world], self.maps)

@@ -59,7 +59,7 @@ def walk(robot: Robot, motion: Motion, direction: Float[Array, "2"], duration: S
 def discs(robot: Robot, pose: Float[Array, "3"]) -> Float[Array, "3 2"]:
     """Centres of the body's discs: rear, middle, front [m]."""
     along = jnp.array([-1.0, 0.0, 1.0]) * robot.disc_offset
-    return pose[:2] + along[:, None] * from_angle(pose[2])
+    return pose[None, :2] + along[:, None] * from_angle(pose[2])[None]
 
 
 def collides(robot: Robot, world: World, pose: Float[Array, "3"]) -> Bool[Array, ""]:

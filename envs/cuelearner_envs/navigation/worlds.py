@@ -44,11 +44,11 @@ def generate(key: PRNGKeyArray, style: str = "clutter", routes: int = ROUTES) ->
         k_layout, k_routes = jax.random.split(key)
         return _with_routes(k_routes, STYLES[style](k_layout), routes)
 
-    def again(carry: tuple[PRNGKeyArray, World, Bool[Array, ""]]) -> tuple[PRNGKeyArray, World, Bool[Array, ""]]:
-        key, next_key = jax.random.split(carry[0])
+    def again(key: PRNGKeyArray) -> tuple[PRNGKeyArray, World, Bool[Array, ""]]:
+        key, next_key = jax.random.split(key)
         return next_key, *attempt(key)
 
-    _, world, _ = jax.lax.while_loop(lambda carry: ~carry[2], again, again((key, None, None)))  # pyright: ignore
+    _, world, _ = jax.lax.while_loop(lambda carry: ~carry[2], lambda carry: again(carry[0]), again(key))
     return world
 
 
@@ -74,7 +74,7 @@ def free_space(world: World) -> Float[Array, "cells cells"]:
     """Distance from each cell's middle to the nearest solid [m]; negative outside the walls."""
     centres = cell_centres()
     distance = jax.vmap(jax.vmap(lambda centre: clearance(world, centre)))(centres)
-    return jnp.where((jnp.abs(centres) < world.extent / 2).all(-1), distance, -1.0)
+    return jnp.where((jnp.abs(centres) < world.extent[None, None] / 2).all(-1), distance, -1.0)
 
 
 def flood(passable: Bool[Array, "cells cells"], seed: Bool[Array, "cells cells"]) -> Bool[Array, "cells cells"]:
@@ -115,7 +115,7 @@ def _route(usable: Bool[Array, " all"], key: PRNGKeyArray) -> tuple[jax.Array, j
     k_goal, k_start, k_jitter = jax.random.split(key, 3)
     centres = cell_centres().reshape(-1, 2)
     goal = jax.random.categorical(k_goal, jnp.where(usable, 0.0, -jnp.inf))
-    distance = jnp.linalg.norm(centres - centres[goal], axis=-1)
+    distance = jnp.linalg.norm(centres - centres[goal][None], axis=-1)
     slack = 2 * JITTER * 2**0.5
     partners = usable & (distance >= NEAREST + slack) & (distance <= FARTHEST - slack)
     start = jax.random.categorical(k_start, jnp.where(partners, 0.0, -jnp.inf))

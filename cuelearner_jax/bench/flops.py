@@ -1,0 +1,66 @@
+"""Floating point operations of training, counted from the sizes of its networks: a multiply and an add are two.
+
+Counted is the matrix arithmetic of the action values alone. The environment, the guidance, the optimiser (a few
+operations a weight, against 6 a weight and row of a batch) and activations are not, so that a share of the machine's
+matmul rate is what the networks get of it. Of an argmax near peaks, the values that are taken are counted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import NamedTuple
+
+from cuelearner_jax.agent.choice import looked_at
+from cuelearner_jax.config import Sizes
+from cuelearner_jax.environment import Spaces
+
+
+class Operations(NamedTuple):
+    """Floating point operations of one environment step of one seed, with the gradient steps that follow it."""
+
+    acting: int  # the values among which the argmax is taken
+    gradient: int  # forward and backward through the batch
+    targets: int  # the argmax inside targets and the value of its choice; 0 where nothing bootstraps
+
+    @property
+    def total(self) -> int:
+        """All of them together."""
+        return sum(self)
+
+
+def step_operations(sizes: Sizes, spaces: Spaces, bootstraps: bool) -> Operations:
+    """Operations of one environment step.
+
+    Args:
+        sizes: layers, directions, batch, n-step returns and gradient steps a step are taken from here.
+        spaces: of the environment.
+        bootstraps: whether targets look at the next observation.
+    """
+    rows = sizes.batch_size * (2 if sizes.n_step > 1 else 1) if bootstraps else 0
+    target = forward(sizes.q_layers, spaces, sizes.target_directions) + forward(sizes.q_layers, spaces, 1)
+    return Operations(
+        acting=forward(sizes.q_layers, spaces, looked_at(sizes)),
+        gradient=sizes.updates_per_step * sizes.batch_size * forward_and_backward(sizes.q_layers, spaces),
+        targets=sizes.updates_per_step * rows * target,
+    )
+
+
+def forward(layers: Sequence[int], spaces: Spaces, actions: int) -> int:
+    """Values of so many actions in one state. The observation's share of the first layer is computed once a state."""
+    first, later = _weights(layers, spaces)
+    return 2 * (spaces.obs_size * layers[0] + actions * (first + later))
+
+
+def forward_and_backward(layers: Sequence[int], spaces: Spaces) -> int:
+    """The value of one action and its gradient: 2 a weight forward, 4 backward (gradients of weights and of inputs).
+
+    Nobody asks for the gradient of the first layer's inputs.
+    """
+    first, later = _weights(layers, spaces)
+    return 4 * (spaces.obs_size * layers[0] + first) + 6 * later
+
+
+def _weights(layers: Sequence[int], spaces: Spaces) -> tuple[int, int]:
+    """Weights from the entries of an action to the first layer, and of all later layers with the output."""
+    return spaces.actions.size * layers[0], sum(a * b for a, b in pairwise([*layers, 1]))

@@ -1,0 +1,193 @@
+"""Reading the command line: the task, preset or run named first, then options as a dataclass; refusals in one line."""
+
+from __future__ import annotations
+
+import contextlib
+import inspect
+import io
+import re
+from pathlib import Path
+from typing import Any
+
+import tyro
+from rich.console import Console
+
+from cuelearner_jax.errors import UserError, closest
+from cuelearner_jax.guidance import registry as guidances
+from cuelearner_jax.runs import grid as runs
+from cuelearner_jax.runs.trained import POLICIES, PolicySource
+from cuelearner_jax.task import Preset, Task
+from cuelearner_jax.tasks import registry
+
+HELP = ("-h", "--help")
+
+out = Console(highlight=False, soft_wrap=True)
+
+
+def summary(kind: type) -> str:
+    """What a command does, in one line: the beginning of its options' docstring."""
+    return " ".join(inspect.cleandoc(kind.__doc__ or "").split("\n\n")[0].split())
+
+
+def parse(kind: Any, arguments: list[str], program: str, default: Any = None, about: str | None = None) -> Any:
+    """Arguments as a dataclass. Raises UserError with tyro's message in one line.
+
+    Args:
+        kind: the dataclass.
+        arguments: what was typed after the command and its task.
+        program: the command, as the help shows it.
+        default: an instance whose values hold where nothing was typed.
+        about: the text above the options (default: the docstring of the dataclass).
+    """
+    errors = io.StringIO()
+    keywords = {} if default is None else {"default": default}
+    try:
+        with contextlib.redirect_stderr(errors):
+            return tyro.cli(kind, args=arguments, prog=f"cuelearner {program}", description=about, **keywords)
+    except SystemExit as stop:
+        if not stop.code:
+            raise
+        lines = [re.sub(r"^[│╭╰─\s]+|[│╮╯─\s]+$", "", line) for line in errors.getvalue().splitlines()]
+        told = " ".join(line for line in lines[1:] if line)
+        told = re.split(r"For full helptext|Argument helptext", told)[0].strip()
+        told = told.replace("Perhaps you meant:", "; perhaps you meant")
+        told = re.sub(r"\s+", " ", told).replace(" ;", ";")[:400]
+        raise UserError(f"{told}; see cuelearner {program} --help") from None
+
+
+def taken(arguments: list[str], option: str, choices: str) -> tuple[str | None, list[str]]:
+    """The value of an option (None: not given) and the other arguments. Raises UserError unless it is given once."""
+    places = [i for i, argument in enumerate(arguments) if argument == option or argument.startswith(f"{option}=")]
+    if not places:
+        return None, list(arguments)
+    if len(places) > 1:
+        raise UserError(f"{option} is given twice: give it once")
+    (place,) = places
+    if "=" in arguments[place]:
+        return arguments[place].partition("=")[2], arguments[:place] + arguments[place + 1 :]
+    if place + 1 == len(arguments):
+        raise UserError(f"{option} needs a name: choose one of {choices}")
+    return arguments[place + 1], arguments[:place] + arguments[place + 2 :]
+
+
+def task_of(arguments: list[str], command: str, kind: type) -> tuple[Task, list[str]]:
+    """The task named first, or by --task, and the other arguments. Raises UserError if it cannot be had."""
+    given, rest = _task_option(arguments)
+    if given is None:
+        if not rest or rest[0] in HELP:
+            print(f"usage: cuelearner {command} TASK [--preset NAME] [OPTIONS]\n\n{summary(kind)}\n\n{_tasks()}\n")
+            print(f"options and their defaults: cuelearner {command} TASK --help")
+            raise SystemExit(0 if arguments else 2)
+        given, rest = rest[0], rest[1:]
+    elif rest and not rest[0].startswith("-"):
+        raise UserError(f"the task is named twice, {rest[0]!r} and {given!r}: name it once")
+    return registry.resolve(given), rest
+
+
+def preset_of(task: Task, arguments: list[str]) -> tuple[str, Preset, list[str]]:
+    """The preset, by default `paper` or else the first, and the other arguments. Raises UserError if there is none."""
+    if not task.presets:
+        raise UserError(f"{task.name} has no preset to start from: give its Task one")
+    name, rest = taken(arguments, "--preset", ", ".join(task.presets))
+    if name is None:
+        name = "paper" if "paper" in task.presets else next(iter(task.presets))
+    if name not in task.presets:
+        raise UserError(f"unknown preset {name!r}{closest(name, task.presets)}")
+    return name, task.presets[name], rest
+
+
+def source_of(arguments: list[str], command: str, kind: type) -> tuple[PolicySource, list[str]]:
+    """The run folder or task named first, and the other arguments; --task makes a task from outside known.
+
+    Raises:
+        UserError: there is no such run or task, or it cannot be had.
+    """
+    given, rest = _task_option(arguments)
+    known = None if given is None else registry.resolve(given)
+    if known is None and (not rest or rest[0] in HELP):
+        print(f"usage: cuelearner {command} RUN_FOLDER|TASK [OPTIONS]\n\n{summary(kind)}\n\n{_tasks()}\n")
+        print(f"options and their defaults: cuelearner {command} {registry.names()[0]} --help")
+        raise SystemExit(0 if arguments else 2)
+    if rest and (known is None or not rest[0].startswith("-")):
+        name, rest = rest[0], rest[1:]
+        folder = Path(name)
+        if (folder / "config.json").exists() or (folder.exists() and name not in registry.names()):
+            return _run(folder, known), rest
+        if known is not None:
+            raise UserError(f"{name!r} is no run folder of the task {known.name}: give one, or leave it out")
+        if ":" not in name and name not in registry.names():
+            raise UserError(f"{name!r} is neither a run folder nor a task ({', '.join(registry.names())})")
+        known = registry.resolve(name)
+    assert known is not None  # otherwise the first argument was taken for its name
+    _, preset, rest = preset_of(known, rest)
+    return PolicySource(known, preset.config, None, Path(known.name)), rest
+
+
+def world_of(source: PolicySource, arguments: list[str]) -> Any:
+    """The source's world, changed as --scenario says; options on top of it are read from the same arguments later.
+
+    Raises:
+        UserError: there is no such scenario.
+    """
+    name, _ = taken(arguments, "--scenario", ", ".join(source.task.scenarios) or "none")
+    return source.config.task if name is None else source.task.scenario(name).applied(source.config.task)
+
+
+def about(kind: type, task: Task, policies: bool = False) -> str:
+    """The text above a command's options: what it does, and what there is to choose from."""
+    groups = {"guidance (--guidance; your own as package.module:NAME)": {k.name: k.about for k in guidances.known()}}
+    if policies:
+        trained = {name: named.about for name, named in POLICIES.items() if named.trained}
+        untrained = {name: named.about for name, named in POLICIES.items() if not named.trained}
+        groups |= {"policies of a run (--policy)": trained, "policies of a run or a task alone": untrained}
+    told = [summary(kind), _choices(task), *(f"{title}:\n{_rows(rows)}" for title, rows in groups.items())]
+    return "\n\n".join(told)
+
+
+def _task_option(arguments: list[str]) -> tuple[str | None, list[str]]:
+    return taken(arguments, "--task", f"{', '.join(registry.names())}, or package.module:name")
+
+
+def _run(folder: Path, known: Task | None) -> PolicySource:
+    """A run folder. Raises UserError if it is none, or of another task than the one named beside it."""
+    task, config, grid = runs.load(folder, registry.find)
+    if known is not None and known.name != task.name:
+        raise UserError(f"{folder} is a run of {task.name}, not of {known.name}: leave out --task")
+    return PolicySource(task, config, grid, folder)
+
+
+def _tasks() -> str:
+    """Every task with what there is to choose from."""
+    told = []
+    for name in registry.names():
+        try:
+            task = registry.find(name)
+        except UserError as error:  # of a package that is damaged: the others can still be named
+            told.append(f"task {name}: {error}\n")
+            continue
+        told.append(f"task {name}: {task.about}\n\n{_choices(task)}\n")
+    return "\n".join([*told, "a task of your own: package.module:NAME, also as --task package.module:NAME"])
+
+
+def _choices(task: Task) -> str:
+    """A task's presets, changed worlds and other bodies, a line each."""
+    scenarios = {name: f"{one.about} ({_as_options(one.changes)})" for name, one in task.scenarios.items()}
+    bodies = {body.name: body.about for body in task.bodies} if len(task.bodies) > 1 else {}
+    groups = {
+        "presets (--preset)": {name: preset.about for name, preset in task.presets.items()},
+        "changed worlds (--scenario of evaluate and render)": scenarios,
+        "robots (--robot of evaluate and render)": bodies,
+    }
+    # A line that is not indented would be taken for the end of the one above: the groups stand apart.
+    return "\n\n".join(f"{title}:\n{_rows(rows)}" for title, rows in groups.items() if rows)
+
+
+def _as_options(changes: dict[str, Any]) -> str:
+    """Fields of a configuration as they are typed."""
+    typed = {name: value if isinstance(value, tuple) else (value,) for name, value in changes.items()}
+    return " ".join(f"--task.{name.replace('_', '-')} {' '.join(map(str, value))}" for name, value in typed.items())
+
+
+def _rows(told: dict[str, str]) -> str:
+    width = max(map(len, told), default=0) + 2
+    return "\n".join(f"  {name:<{width}}{text}" for name, text in told.items())

@@ -1,0 +1,71 @@
+"""`cuelearner render`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Generic
+
+from cuelearner_jax.cli.parsing import about, out, parse, source_of, world_of
+from cuelearner_jax.cli.shared_options import Flag, TaskT
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.runs import filming, trained
+
+
+@dataclass(frozen=True)
+class Render(Generic[TaskT]):
+    """A still and a film of a policy at work, or the picture of a question."""
+
+    task: TaskT
+    out: Path
+    """Folder for the pictures; films and stills of the same name are not overwritten."""
+    policy: str = "agent"
+    """Who acts, see above."""
+    guidance: str | None = None
+    """Kind of guidance of the run (default: its last)."""
+    labels: int | None = None
+    """Label budget of the lane (default: the largest)."""
+    seed: int | None = None
+    """Seed of the lane (default: the first)."""
+    steps: int = 4
+    """Steps to film; a new episode follows the end of one."""
+    episode: int = 0
+    """Which random start."""
+    robot: str | None = None
+    """Another robot, see above (default: the task's own)."""
+    scenario: str | None = None
+    """The changed world of this name, see above; options of the task (--task.…) come on top of it."""
+    question: Flag[bool] = False
+    """Instead: the situation that the episode begins with and the policy's action, as a person is asked about it."""
+    film: str = "gif"
+    """gif or mp4."""
+    overwrite: Flag[bool] = False
+    """Replace pictures of the same name."""
+
+
+OPTIONS = {"render": Render}
+
+
+def run(arguments: list[str]) -> None:
+    """Runs the command. Raises UserError for what cannot be drawn."""
+    source, rest = source_of(arguments, "render", Render)
+    kind = Render[source.task.config]  # pyright: ignore[reportInvalidTypeArguments]
+    default = kind(world_of(source, rest), Path("pictures"), policy="agent" if source.grid else "heuristic")
+    asked = parse(kind, rest, f"render {source.folder}", default, about(Render, source.task, policies=True))
+    source = source.on(asked.robot)
+    source.check(asked.policy, asked.task)
+    if asked.steps < 1:
+        raise UserError(f"--steps is {asked.steps}: give a positive number")
+    names = [source.folder.name, asked.robot, asked.scenario, asked.policy]
+    files = filming.files(asked.out, "-".join(name for name in names if name), asked.film)
+    wanted = (files.question,) if asked.question else (files.film, files.still)
+    filming.check_free(*wanted, overwrite=asked.overwrite)
+    pictures = source.task.pictures()
+    env = source.task.environment(asked.task, "validation")
+    policy = trained.one_policy(source, env, asked.task, asked.policy, asked.guidance, asked.labels, asked.seed)
+    if asked.question:
+        filming.question(pictures, env, policy, asked.episode, files.question)
+        out.print(f"wrote {files.question}")
+        return
+    rewards = filming.film(pictures, env, policy, asked.episode, asked.steps, files)
+    out.print(f"rewards {' '.join(f'{reward:g}' for reward in rewards)}; wrote {files.film} and {files.still}")

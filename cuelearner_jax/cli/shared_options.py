@@ -1,0 +1,66 @@
+"""What several commands share of their options: a field is an option, the text below it its help."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Generic, TypeVar
+
+import tyro
+
+from cuelearner_jax.config import RunConfig
+from cuelearner_jax.guidance import registry as guidances
+from cuelearner_jax.runs.grid import Grid
+from cuelearner_jax.runs.order import Order
+from cuelearner_jax.runs.shards import Shard
+from cuelearner_jax.task import Preset, Task, shape_of
+
+TaskT = TypeVar("TaskT")
+Flag = tyro.conf.FlagCreatePairsOff
+
+
+@dataclass(frozen=True)
+class Training(Generic[TaskT]):
+    """What train and sweep share."""
+
+    run: Annotated[RunConfig[TaskT], tyro.conf.arg(name="")]
+    out: Path
+    """Folder for results and checkpoints."""
+    resume: Flag[bool] = False
+    """Go on with an interrupted run."""
+    overwrite: Flag[bool] = False
+    """Delete what an earlier run left in the folder."""
+    labels_from: Path | None = None
+    """Use the labels of this file instead of asking the teacher."""
+    tuning: Flag[bool] = False
+    """Evaluate on episodes set aside for choosing settings, not on those of reported figures."""
+
+    def order(self, task: Task, grid: Grid, shard: Shard | None = None) -> Order:
+        """What is asked for, of a task and a grid."""
+        return Order(
+            task,
+            self.run,
+            grid,
+            self.out,
+            resume=self.resume,
+            overwrite=self.overwrite,
+            labels_from=self.labels_from,
+            shard=shard,
+            split="tuning" if self.tuning else "validation",
+        )
+
+    @property
+    def done(self) -> str:
+        """What is told at the end."""
+        return f"done: {self.out} (see it with: cuelearner report {self.out} --out {self.out}/report)"
+
+
+def preset_kinds(task: Task, preset: Preset) -> tuple[str, ...]:
+    """The kinds of guidance that a preset compares: those it names, or all that the task can have."""
+    return preset.guidance or guidances.possible(shape_of(task, preset.config.task), taught=task.teacher is not None)
+
+
+def asking_kind(kinds: tuple[str, ...]) -> str:
+    """The first of the kinds that asks a teacher, or else the first."""
+    asking = [kind for kind in kinds if guidances.find(kind).asks]
+    return (asking or list(kinds))[0]

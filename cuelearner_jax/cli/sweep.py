@@ -1,0 +1,69 @@
+"""`cuelearner sweep`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Generic, Literal
+
+from cuelearner_jax.cli.parsing import about, out, parse, preset_of, task_of
+from cuelearner_jax.cli.shared_options import TaskT, Training, preset_kinds
+from cuelearner_jax.runs import submission, sweep
+from cuelearner_jax.runs.cluster import Job
+from cuelearner_jax.runs.grid import Grid
+from cuelearner_jax.runs.order import Plan, planned
+from cuelearner_jax.runs.shards import Shard
+
+
+@dataclass(frozen=True)
+class Sweep(Training[TaskT], Generic[TaskT]):
+    """Train seeds x label budgets x kinds of guidance in one process."""
+
+    guidance: tuple[str, ...] = ()
+    """Kinds of guidance, see above."""
+    labels: tuple[int, ...] = (500,)
+    """Label budgets; guidance without labels runs once a seed."""
+    seeds: int = 5
+    """Number of seeds."""
+    first_seed: int = 0
+    """The first seed; the others follow."""
+    shard: str | None = None
+    """Only piece i of n, as i/n: its share of the seeds, in a folder of its own below --out. Goes on by itself where it
+    was interrupted."""
+    cluster: Literal["slurm", "local"] | None = None
+    """Run the sweep as jobs, one a piece: slurm submits them as a job array and returns, local runs them on this
+    machine and waits. The same command again goes on with the pieces that are not finished. Needs submitit."""
+    shards: int | None = None
+    """With --cluster: number of pieces, and so of jobs."""
+    job: Job = field(default_factory=Job)
+
+
+OPTIONS = {"sweep": Sweep}
+
+
+def run(arguments: list[str]) -> None:
+    """Runs the command. Raises what `sweep.run` and `submission.submit` raise."""
+    task, rest = task_of(arguments, "sweep", Sweep)
+    name, preset, rest = preset_of(task, rest)
+    kind = Sweep[task.config]  # pyright: ignore[reportInvalidTypeArguments]
+    default = kind(
+        preset.config,
+        out=Path("runs") / f"{task.name}-{name}",
+        guidance=preset_kinds(task, preset),
+        labels=preset.labels,
+        seeds=preset.seeds,
+        first_seed=preset.first_seed,
+    )
+    asked = parse(kind, rest, f"sweep {task.name}", default, about(Sweep, task))
+    grid = Grid(asked.guidance, tuple(range(asked.first_seed, asked.first_seed + asked.seeds)), asked.labels)
+    submission.check(asked.cluster, asked.shards, asked.job, asked.shard, asked.overwrite, asked.out)
+    if asked.cluster:
+
+        def plan(shard: Shard) -> Plan:
+            return planned(asked.order(task, grid, shard))
+
+        submission.submit(asked.cluster, asked.shards, asked.job, asked.out, arguments, plan, out.print)
+        return
+    shard = Shard.parse(asked.shard) if asked.shard else None
+    sweep.run(asked.order(task, grid, shard))
+    out.print(asked.done)

@@ -1,0 +1,116 @@
+"""Policies to call: on one observation or on many, from a folder or of one's own making."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from cuelearner_jax.environment import Quantity
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.face.worlds import World
+from cuelearner_jax.policies import Opaque, Policy
+from cuelearner_jax.runs import trained
+from cuelearner_jax.runs.grid import load
+from cuelearner_jax.task import Task, shape_of
+from cuelearner_jax.tasks import registry
+from cuelearner_jax.types import EnvState
+
+
+@jax.jit
+def _act(policy: Policy, key: PRNGKeyArray, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
+    return policy.act(key, None, obs)
+
+
+@dataclasses.dataclass(frozen=True)
+class CallablePolicy:
+    """A policy that can be called: `policy(obs)` on an observation (obs,), or on a batch (n, obs).
+
+    `policy.policy` is the pytree behind it, `policy.act(key, states, obs)` what evaluation calls.
+    """
+
+    policy: Policy
+    observation: tuple[Quantity, ...] = ()  # what it expects to see; empty: not known
+
+    def __call__(self, obs: Any, key: PRNGKeyArray | None = None) -> np.ndarray:
+        """Actions for observations.
+
+        Args:
+            obs: (obs,) or (n, obs), as `observation` orders them.
+            key: for a policy that acts at random (default: always the same).
+
+        Returns:
+            Unit vectors (2,) or (n, 2).
+
+        Raises:
+            UserError: observations of another size, or numbers that are not finite.
+        """
+        rows = np.asarray(obs, np.float32)
+        batch = rows[None] if rows.ndim == 1 else rows
+        wanted = sum(quantity.size for quantity in self.observation) or batch.shape[-1]
+        if batch.ndim != 2 or batch.shape[1] != wanted:
+            raise UserError(f"observations have shape {rows.shape}: give ({wanted},) or (n, {wanted})")
+        if not np.isfinite(batch).all():
+            raise UserError("an observation holds numbers that are not finite")
+        chosen = np.asarray(_act(self.policy, jax.random.key(0) if key is None else key, jnp.asarray(batch)))
+        return chosen[0] if rows.ndim == 1 else chosen
+
+    def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
+        """As `types.Policy` has it."""
+        return self.policy.act(key, states, obs)
+
+
+def as_policy(given: Any) -> Policy:
+    """Anything that acts as a policy: a `CallablePolicy`, a policy, or a function of a batch of observations in NumPy.
+
+    Raises UserError for what is none of them.
+    """
+    if isinstance(given, CallablePolicy):
+        return given.policy
+    if hasattr(given, "act"):
+        return given
+    if isinstance(given, Callable):
+        return Opaque(given, on_host=True)
+    raise UserError(f"a {type(given).__name__} is no policy: give a function of observations (n, obs), or load one")
+
+
+def load_policy(
+    folder: str | Path,
+    *,
+    policy: str = "agent",
+    guidance: str | None = None,
+    labels: int | None = None,
+    seed: int | None = None,
+    task: Task | str | None = None,
+    world: World | None = None,
+) -> CallablePolicy:
+    """What a lane of a finished run acts with.
+
+    Args:
+        folder: of the run.
+        policy: "agent", "guided" or another that `cuelearner evaluate --help` lists.
+        guidance: kind of guidance of the lane (default: the run's last).
+        labels: its label budget (default: the largest).
+        seed: its seed (default: the first).
+        task: needed for a run of a task from outside the package, whose code is not loaded because a file names it.
+        world: where it is to act, for policies that look at more than observations (default: as it was trained).
+
+    Raises:
+        UserError: no such run, lane or policy.
+    """
+    if isinstance(task, str):
+        task = registry.resolve(task)
+    path = Path(folder)
+    known, config, grid = load(path, lambda name: task if task and task.name == name else registry.find(name))
+    source = trained.PolicySource(known, config, grid, path)
+    changed = world.config if world else config.task
+    source.check(policy, changed)
+    env = known.environment(changed)
+    found = trained.one_policy(source, env, changed, policy, guidance, labels, seed)
+    return CallablePolicy(found, shape_of(known, changed).observation)

@@ -1,0 +1,220 @@
+"""A feedback model of one's own labels, and policies refined by it: in rounds and within a bound by default.
+
+A model knows the actions that it was shown. Labels about a policy's own actions alone say nothing of what refinement
+then leads to; followed far, such a model makes the policy worse without a word. So `ask` questions in rounds, about
+actions refined by the model so far (DAgger), and `refine` goes no farther than labels reach unless it is told to.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import os
+import warnings
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from cuelearner_jax import asking
+from cuelearner_jax.actions import DIRECTIONS
+from cuelearner_jax.config import GuideSizes, Scalars, check_guide
+from cuelearner_jax.environment import Spaces, spaces_of
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.face.acting import CallablePolicy, as_policy
+from cuelearner_jax.face.worlds import World
+from cuelearner_jax.guidance import registry
+from cuelearner_jax.guidance.answers import RELATIVE
+from cuelearner_jax.guidance.bundle import Guidance
+from cuelearner_jax.guidance.relative import KIND
+from cuelearner_jax.policies import Guided
+from cuelearner_jax.records import label_files
+from cuelearner_jax.types import GuidanceModel, Label, Teacher
+
+REACH_QUANTILE = 0.95  # of the distances between labelled actions and a policy's own: how far labels reach from it
+ANSWERS = (-1.0, 0.0, 1.0)
+UNIT_ERROR = 1e-3  # of an action's length
+SIZES = GuideSizes(feedback_layers=(128, 128), fit_steps=400, fit_batch_size=64)  # seconds a fit on a CPU
+
+
+class Labels(NamedTuple):
+    """Labels as arrays: what was seen, the action asked about, and the answer."""
+
+    obs: Float[np.ndarray, "labels obs"]
+    action: Float[np.ndarray, "labels 2"]  # unit vectors
+    answer: Float[np.ndarray, "labels"]  # h: +1 counterclockwise ("more to the left"), 0 already right, -1 clockwise
+
+
+@dataclasses.dataclass(frozen=True)
+class FeedbackModel:
+    """A model of relative feedback, fitted by `fit_feedback` or `ask`."""
+
+    guidance: Guidance
+    model: GuidanceModel
+    scalars: Scalars  # eps of the labels, and how actions are refined
+    labels: Labels
+
+
+def fit_feedback(
+    labels: Labels | str | os.PathLike[str],
+    *,
+    eps_deg: float | None = None,
+    sizes: GuideSizes | None = None,
+    scalars: Scalars | None = None,
+    seed: int = 0,
+) -> FeedbackModel:
+    """Fits a feedback model to relative labels (paper, Eq. 3).
+
+    Args:
+        labels: arrays, or a label file (its first seed's).
+        eps_deg: strength of an answer [deg]; of arrays 5 if not given, of a file the file's.
+        sizes: of the network and its fitting (default: small ones, the paper's are `config.GuideSizes()`).
+        scalars: of the fitting and of refinement.
+        seed: of the network.
+
+    Raises:
+        UserError: labels or settings that make no sense.
+    """
+    if not isinstance(labels, Labels):
+        file = label_files.read(Path(labels))
+        if file.answers != RELATIVE.name:
+            raise UserError(f"{labels} holds {file.answers} answers: give a file of {RELATIVE.name} ones")
+        if eps_deg is not None and not math.isclose(eps_deg, file.eps_deg or 0.0, rel_tol=1e-6):
+            raise UserError(f"{labels} holds answers of {file.eps_deg:g} degrees: leave out eps_deg")
+        own = file.seeds == file.seeds[0]
+        eps_deg = file.eps_deg
+        rows = jax.tree.map(lambda leaf: np.asarray(leaf)[own], file.labels)
+        labels = Labels(rows.obs, rows.action, rows.answer[:, 0])
+    labels = _checked(labels)
+    sizes, scalars = _settings(sizes, scalars, eps_deg)
+    guidance = _relative(sizes, Spaces(labels.obs.shape[1], DIRECTIONS))
+    valid = np.ones(len(labels.obs), bool)
+    rows = Label(*(jnp.asarray(part) for part in (labels.obs, labels.action, labels.answer[:, None], valid)))
+    k_init, k_fit = jax.random.split(jax.random.key(seed))
+    fit = jax.jit(lambda key, rows, former, scalars: guidance.fit(key, None, rows, former, scalars))
+    return FeedbackModel(guidance, fit(k_fit, rows, guidance.init(k_init), scalars), scalars, labels)
+
+
+def ask(
+    policy: Any,
+    world: World,
+    teacher: Teacher,
+    *,
+    labels: int,
+    bound_deg: float = 45.0,
+    eps_deg: float | None = None,
+    sizes: GuideSizes | None = None,
+    scalars: Scalars | None = None,
+    seed: int = 0,
+) -> FeedbackModel:
+    """Asks a teacher about a policy's actions in rounds, each about actions refined by the model so far (DAgger).
+
+    Args:
+        policy: what is to be corrected: a policy, or any function of a batch of observations in NumPy.
+        world: where it acts.
+        teacher: who answers.
+        labels: number of questions.
+        bound_deg: refined actions that are asked about stay within this of the policy's own [deg].
+        eps_deg: strength of an answer [deg] (default: the scalars').
+        sizes: of the network, its fitting, and the labels of a round.
+        scalars: of the fitting, of refinement and of the teacher's faults.
+        seed: of everything random.
+
+    Raises:
+        UserError: settings that make no sense.
+    """
+    if labels < 1:
+        raise UserError(f"labels is {labels}: give at least 1")
+    sizes, scalars = _settings(sizes, scalars, eps_deg)
+    scalars = _bounded(scalars, bound_deg)
+    base, env = as_policy(policy), world.env
+    guidance = _relative(sizes, spaces_of(env))
+    k_model, k_env, k_lane = jax.random.split(jax.random.key(seed), 3)
+    slots = asking.label_slots(labels, sizes)
+    guide = asking.start(guidance, env, slots, labels, k_model, k_env)
+
+    @jax.jit
+    def one_round(env: Any, teacher: Teacher, base: Any, scalars: Scalars, guide: Any, number: jax.Array) -> Any:
+        return asking.label_round(guidance, sizes, env, teacher, scalars, base, guide, k_lane, number)
+
+    for number in range(slots // sizes.labels_per_round):
+        guide = one_round(env, teacher, base, scalars, guide, jnp.asarray(number))
+    given = jax.device_get(guide.labels)
+    asked = Labels(*(np.asarray(part)[given.valid] for part in (given.obs, given.action, given.answer[:, 0])))
+    return FeedbackModel(guidance, guide.model, scalars, asked)
+
+
+def refine(policy: Any, model: FeedbackModel, bound_deg: float | None = None) -> CallablePolicy:
+    """A policy's actions refined by a feedback model, within a bound (paper, Eqs. 2 to 5).
+
+    Args:
+        policy: as for `ask`.
+        model: from `ask` or `fit_feedback`.
+        bound_deg: how far refinement may lead from the policy's own actions [deg]. By default as far as the labels
+            reach: the distance within which 95% of the actions asked about lie from the policy's own, at least eps.
+            A larger one is a warning: there the model was shown nothing.
+
+    Raises:
+        UserError: a bound that is no positive angle.
+    """
+    base = as_policy(policy)
+    reach = max(_reach(base, model), model.scalars.eps_deg)
+    if bound_deg is not None and bound_deg > reach * 1.05 and bound_deg > model.scalars.eps_deg:
+        warnings.warn(
+            f"the labels lie within {reach:.1f} degrees of this policy's own actions, and refinement may lead up to "
+            f"{bound_deg:g} away, where the model was shown nothing and may make the policy worse: ask in rounds "
+            "(cuelearner_jax.ask), or leave out bound_deg",
+            stacklevel=2,
+        )
+    scalars = _bounded(model.scalars, reach if bound_deg is None else bound_deg)
+    observation = policy.observation if isinstance(policy, CallablePolicy) else ()
+    return CallablePolicy(Guided(base, model.model, None, scalars, model.guidance), observation)
+
+
+def _reach(base: Any, model: FeedbackModel) -> float:
+    """How far from a policy's own actions the labels lie [deg]."""
+    own = CallablePolicy(base)(model.labels.obs)
+    away = np.asarray(DIRECTIONS.distance(jnp.asarray(own), jnp.asarray(model.labels.action)))
+    return float(np.degrees(np.quantile(away, REACH_QUANTILE)))
+
+
+def _relative(sizes: GuideSizes, spaces: Spaces) -> Guidance:
+    return registry.made_for(KIND, sizes, spaces)
+
+
+def _settings(sizes: GuideSizes | None, scalars: Scalars | None, eps_deg: float | None) -> tuple[GuideSizes, Scalars]:
+    sizes, scalars = sizes or SIZES, scalars or Scalars()
+    if eps_deg is not None:
+        scalars = dataclasses.replace(scalars, eps_deg=eps_deg)
+    check_guide(sizes, scalars)
+    return sizes, scalars
+
+
+def _bounded(scalars: Scalars, bound_deg: float) -> Scalars:
+    if not 0 < bound_deg <= 180:
+        raise UserError(f"bound_deg is {bound_deg}: give an angle above 0 and up to 180")
+    return dataclasses.replace(scalars, tau_max_deg=bound_deg)
+
+
+def _checked(labels: Labels) -> Labels:
+    """Labels of floats, in the shapes that are needed. Raises UserError for what makes no sense."""
+    obs, action, answer = (np.asarray(part, np.float32) for part in labels)
+    answer = answer[:, 0] if answer.ndim == 2 and answer.shape[1] == 1 else answer
+    if obs.ndim != 2 or action.shape != (len(obs), 2) or answer.shape != (len(obs),):
+        raise UserError(
+            f"labels have shapes {obs.shape}, {action.shape}, {answer.shape}: give observations (n, obs), "
+            "actions (n, 2) and answers (n,)"
+        )
+    if len(obs) < 2:
+        raise UserError(f"{len(obs)} labels teach nothing: give more")
+    for name, rows in (("observations", obs), ("actions", action), ("answers", answer)):
+        if not np.isfinite(rows).all():
+            raise UserError(f"the labels' {name} hold numbers that are not finite")
+    if np.abs(np.linalg.norm(action, axis=-1) - 1.0).max() > UNIT_ERROR:
+        raise UserError("the labels' actions are no unit vectors: divide each by its length")
+    if not np.isin(answer, ANSWERS).all():
+        raise UserError("an answer is -1 (turn clockwise), 0 (already right) or 1 (turn counterclockwise)")
+    return Labels(obs, action, answer)

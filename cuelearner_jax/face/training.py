@@ -1,0 +1,139 @@
+"""Training from Python: what `cuelearner sweep` does, with the results in memory and nothing on the disk."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import numpy as np
+import pyarrow as pa
+
+from cuelearner_jax import config as configuration
+from cuelearner_jax.config import RunConfig
+from cuelearner_jax.devices import SHARED, lane_mesh, place
+from cuelearner_jax.environment import actions_of
+from cuelearner_jax.errors import UserError, closest
+from cuelearner_jax.evaluate import one_lane
+from cuelearner_jax.face.acting import CallablePolicy
+from cuelearner_jax.face.worlds import World
+from cuelearner_jax.guidance import registry
+from cuelearner_jax.policies import Agent
+from cuelearner_jax.runs.grid import Grid, check_grid
+from cuelearner_jax.runs.lanes import LaneGroup
+from cuelearner_jax.runs.memory_report import memory_report
+from cuelearner_jax.runs.training import Training
+from cuelearner_jax.terminal import progress_bars
+from cuelearner_jax.types import Teacher
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """What a training has led to."""
+
+    world: World
+    config: RunConfig
+    results: pa.Table  # a row a lane and evaluation: guidance, labels, seed, step, wall_s and metrics
+    trainings: dict[str, Training]  # by kind of guidance, at their end
+
+    def policy(self, guidance: str | None = None, labels: int | None = None, seed: int | None = None) -> CallablePolicy:
+        """One lane's trained agent.
+
+        Args:
+            guidance: kind of guidance (default: the last).
+            labels: label budget (default: the largest).
+            seed: seed (default: the first).
+
+        Raises:
+            UserError: there is no such lane.
+        """
+        name = guidance or list(self.trainings)[-1]
+        if name not in self.trainings:
+            raise UserError(f"no guidance {name!r} was trained{closest(name, self.trainings)}")
+        training = self.trainings[name]
+        group = training.group
+        budget = int(group.budgets.max()) if labels is None else labels
+        wanted = int(group.seeds[0]) if seed is None else seed
+        found = np.flatnonzero((group.seeds == wanted) & (group.budgets == budget))
+        if not len(found):
+            raise UserError(f"no lane with seed {wanted} and {budget} labels was trained")
+        params = [block.agent.params for block in training.blocks]
+        joined = jax.tree.map(lambda *leaves: np.concatenate([np.asarray(leaf) for leaf in leaves]), *params)
+        agents = Agent(joined, self.config.sizes, actions_of(group.env))
+        return CallablePolicy(one_lane(agents, int(found[0])), self.world.observation)
+
+
+def train(
+    world: World,
+    teacher: Teacher | None = None,
+    config: RunConfig | str = "quickstart",
+    *,
+    guidance: Sequence[str] = (),
+    labels: Sequence[int] = (100,),
+    seeds: int | Sequence[int] = 8,
+    split: str = "validation",
+    progress: bool = True,
+) -> Run:
+    """Trains seeds x label budgets x kinds of guidance, as `cuelearner sweep` does: the same numbers.
+
+    Args:
+        world: where.
+        teacher: who answers; needed by kinds of guidance that ask.
+        config: everything else, or the name of one of the task's presets; its world is the one given.
+        guidance: kinds of guidance (default: all that the world can have with what is given).
+        labels: label budgets.
+        seeds: their number (0, 1, ...), or the seeds.
+        split: episodes of the evaluations: "validation", or "tuning" for choosing settings.
+        progress: show progress bars on standard error.
+
+    Raises:
+        UserError: settings that make no sense, no teacher where one is asked, or too little memory.
+    """
+    run_config = dataclasses.replace(_config(world, config), task=world.config)
+    configuration.check(run_config)
+    asked = guidance or registry.possible(world.env, taught=teacher is not None)
+    names = tuple(registry.find(kind).name for kind in asked)
+    grid = Grid(names, tuple(range(seeds)) if isinstance(seeds, int) else tuple(seeds), tuple(labels))
+    check_grid(grid)
+    mesh = lane_mesh()
+    env = place(mesh, world.env, SHARED)
+    kinds = [registry.make(kind, run_config.sizes, env) for kind in names]
+    asking = [kind.name for kind in kinds if kind.asks]
+    if asking and teacher is None:
+        raise UserError(f"guidance {asking[0]!r} asks a teacher: give one, for instance teacher_of(world)")
+    groups = [LaneGroup(run_config, env, kind, grid) for kind in kinds]
+    for group in groups:
+        memory_report(group)
+    examined, rows, trainings = world.environment(split), [], {}
+    with progress_bars(shown=progress) as bars:
+        for group in groups:
+            training = Training(group, examined, split)
+            training.begin()
+            if not training.labelled:
+                bar = bars.add_task(f"{group.guidance.name}: labels", total=group.rounds, note="")
+                for done in training.label_rounds(place(mesh, teacher, SHARED)):
+                    bars.update(bar, completed=done)
+            bar = bars.add_task(group.guidance.name, total=run_config.schedule.total_steps, note="")
+            for row in training.stretches():
+                rows.append(_table(group, row))
+                bars.update(bar, completed=training.step, note=f"reward {np.mean(row['reward']):.3f}")
+            trainings[group.guidance.name] = training
+    return Run(world, run_config, pa.concat_tables(rows, promote_options="permissive"), trainings)
+
+
+def _config(world: World, config: RunConfig | str) -> RunConfig:
+    if isinstance(config, RunConfig):
+        return config
+    presets = world.task.presets
+    if config not in presets:
+        raise UserError(f"unknown preset {config!r}{closest(config, presets)}")
+    return presets[config].config
+
+
+def _table(group: LaneGroup, row: dict[str, Any]) -> pa.Table:
+    """The columns of one evaluation, with a row for each lane."""
+    lanes = len(group.seeds)
+    columns = {name: np.broadcast_to(np.asarray(value), (lanes,)) for name, value in row.items()}
+    names = pa.array([group.guidance.name] * lanes)
+    return pa.table({"guidance": names, **{name: pa.array(values) for name, values in columns.items()}})

@@ -1,0 +1,125 @@
+"""What a form of guidance is: a bundle of pure functions, chosen in Python before tracing.
+
+What a teacher *said* (its answer, kept in labels) and what a network is to *predict* of it (the target) are two things.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple, Protocol, runtime_checkable
+
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
+
+from cuelearner_jax.config import GuideScalars, Scalars
+from cuelearner_jax.guidance.refining import Refined
+from cuelearner_jax.types import EnvState, GuidanceModel, Label, Teacher
+
+
+@runtime_checkable
+class AnswerFunction(Protocol):
+    """What a simulated teacher with the faults of `scalars` says about an action in a situation."""
+
+    def __call__(
+        self,
+        key: PRNGKeyArray,
+        teacher: Teacher,
+        state: EnvState,
+        obs: Float[Array, " obs"],
+        action: Float[Array, " action"],
+        scalars: Scalars,
+    ) -> tuple[Float[Array, " answer"], Bool[Array, ""]]:
+        """(answer, answered)."""
+        ...
+
+
+class AnswerForm(NamedTuple):
+    """A form of answer. Label files are marked with its name; every guidance of the same form can use them."""
+
+    name: str
+    width: int  # entries of an answer
+    meaning: str  # of an entry, in a few words
+    answer: AnswerFunction
+
+
+@runtime_checkable
+class InitFunction(Protocol):
+    """An unfitted model."""
+
+    def __call__(self, key: PRNGKeyArray) -> GuidanceModel:
+        """The model."""
+        ...
+
+
+@runtime_checkable
+class QuestionFunction(Protocol):
+    """Which action to ask about in a situation."""
+
+    def __call__(
+        self,
+        key: PRNGKeyArray,
+        model: GuidanceModel,
+        env: Any,
+        obs: Float[Array, " obs"],
+        base: Float[Array, " action"],
+        scalars: GuideScalars,
+    ) -> Float[Array, " action"]:
+        """The action; `base` is what the base policy would do."""
+        ...
+
+
+@runtime_checkable
+class TargetFunction(Protocol):
+    """What the model is to predict of one label."""
+
+    def __call__(self, label: Label, scalars: GuideScalars) -> Float[Array, " outputs"]:
+        """The target."""
+        ...
+
+
+@runtime_checkable
+class FitFunction(Protocol):
+    """The model of labels (slots, ...)."""
+
+    def __call__(
+        self, key: PRNGKeyArray, env: Any, labels: Label, former: GuidanceModel, scalars: GuideScalars
+    ) -> GuidanceModel:
+        """A model; `former` is the one before, which fitting from scratch does not look at."""
+        ...
+
+
+@runtime_checkable
+class ActFunction(Protocol):
+    """What to execute in place of a batch of actions."""
+
+    def __call__(
+        self,
+        model: GuidanceModel,
+        env: Any,
+        obs: Float[Array, "n obs"],
+        actions: Float[Array, "n action"],
+        active: Bool[Array, " n"],
+        scalars: GuideScalars,
+    ) -> Refined:
+        """Rows that are not active stay as they are."""
+        ...
+
+
+class Guidance(NamedTuple):
+    """One form of guidance for one lane: pure functions over an explicit model."""
+
+    name: str
+    form: AnswerForm | None  # of the answers that it asks for; None: it never asks
+    init: InitFunction
+    question: QuestionFunction
+    target: TargetFunction
+    fit: FitFunction
+    act: ActFunction
+
+    @property
+    def asks(self) -> bool:
+        """Does it ask a teacher?"""
+        return self.form is not None
+
+    @property
+    def answer_width(self) -> int:
+        """Entries of one answer; 0 where nothing is asked."""
+        return self.form.width if self.form else 0

@@ -1,0 +1,108 @@
+"""Fitting a model to labels by least squares (paper, Eq. 3), whatever the form of their answers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import struct
+from jaxtyping import Array, Bool, Float, Key, PRNGKeyArray
+
+from cuelearner_jax.config import GuideScalars, GuideSizes
+from cuelearner_jax.environment import Environment, random_symmetries
+from cuelearner_jax.guidance.bundle import TargetFunction
+from cuelearner_jax.types import GuidanceModel, Label, Params
+
+VALIDATION_STRIDE = 5  # every fifth label is a validation label: the 80/20 split of the paper's public code
+
+
+class Lesson(struct.PyTreeNode):
+    """What a network is to predict of one label."""
+
+    obs: Float[Array, " obs"]
+    action: Float[Array, " action"]
+    target: Float[Array, " outputs"]
+    valid: Bool[Array, ""]
+
+
+def lessons(labels: Label, target: TargetFunction, scalars: GuideScalars) -> Lesson:
+    """Labels (slots, ...) with what their answers mean to a network."""
+    targets = jax.vmap(lambda label: target(label, scalars))(labels)
+    # Rounded here, whatever is computed of them next: fused with that, their last bits would hang on the compiler.
+    return Lesson(labels.obs, labels.action, jax.lax.optimization_barrier(targets), labels.valid)
+
+
+def _subset(valid: Bool[Array, " labels"]) -> Callable[[PRNGKeyArray, int], jax.Array]:
+    """Sampler of indices, with replacement, among the true rows of `valid`."""
+    order = jnp.argsort(~valid, stable=True)
+    count = jnp.maximum(valid.sum(), 1)
+    return lambda key, size: order[jax.random.randint(key, (size,), 0, count)]
+
+
+def fit_least_squares(
+    key: PRNGKeyArray,
+    env: Environment | None,
+    rows: Lesson,
+    scalars: GuideScalars,
+    *,
+    init: Callable[[PRNGKeyArray], Params],
+    apply: Callable[[Params, jax.Array, jax.Array], jax.Array],
+    sizes: GuideSizes,
+) -> GuidanceModel:
+    """Fits a model from scratch by least squares (paper, Eq. 3) and keeps the parameters that validated best.
+
+    A fixed number of Adam steps, so that vmapped seeds take equally long. Lessons are multiplied by the environment's
+    symmetries where it offers them (a target is then a vector like an action). With fewer than five nothing validates:
+    the last parameters are kept.
+
+    Args:
+        env: whose symmetries they are; None: there is none, and nothing multiplies them.
+        rows: lessons (slots, ...), of which the valid ones count.
+        init: parameters from a key.
+        apply: (params, obs (n, obs), actions (n, action)) -> predictions (n, outputs).
+
+    Returns:
+        The model; its `fitted` is False if there was no valid label to train on.
+    """
+    held_out = (jnp.arange(rows.valid.shape[0]) % VALIDATION_STRIDE) == VALIDATION_STRIDE - 1
+    validation = rows.valid & held_out
+    training = rows.valid & ~held_out
+    draw = _subset(training)
+    key_init, key_steps = jax.random.split(key)
+    optimizer = optax.chain(
+        optax.clip_by_global_norm(scalars.max_grad_norm), optax.adam(scalars.feedback_learning_rate)
+    )
+
+    def loss(params: Params, batch: Lesson) -> jax.Array:
+        error = apply(params, batch.obs, batch.action) - batch.target
+        return jnp.mean(jnp.sum(jnp.square(error), -1))
+
+    def step(carry: tuple[Params, optax.OptState], key: PRNGKeyArray) -> tuple[tuple[Params, optax.OptState], None]:
+        params, opt_state = carry
+        key_draw, key_mirror = jax.random.split(key)
+        batch = jax.tree.map(lambda leaf: leaf[draw(key_draw, sizes.fit_batch_size)], rows)
+        image = random_symmetries(key_mirror, env, sizes.fit_batch_size)
+        (obs, action), (_, target) = image(batch.obs, batch.action), image(batch.obs, batch.target)
+        batch = batch.replace(obs=obs, action=action, target=target)
+        updates, opt_state = optimizer.update(jax.grad(loss)(params, batch), opt_state, params)
+        return (optax.apply_updates(params, updates), opt_state), None
+
+    def validate(params: Params) -> jax.Array:
+        error = apply(params, rows.obs, rows.action) - rows.target
+        return jnp.sum(jnp.sum(jnp.square(error), -1), where=validation)
+
+    def stretch(carry: tuple, keys: Key[Array, " steps"]) -> tuple[tuple, None]:
+        running, best, best_loss = carry
+        running, _ = jax.lax.scan(step, running, keys)
+        score = validate(running[0])
+        better = (score < best_loss) | ~validation.any()
+        best = jax.tree.map(lambda new, old: jnp.where(better, new, old), running[0], best)
+        return (running, best, jnp.where(better, score, best_loss)), None
+
+    params = init(key_init)
+    keys = jax.random.split(key_steps, (sizes.fit_steps // sizes.validate_every, sizes.validate_every))
+    start = ((params, optimizer.init(params)), params, jnp.inf)
+    (_, best, _), _ = jax.lax.scan(stretch, start, keys)
+    return GuidanceModel(best, training.any())

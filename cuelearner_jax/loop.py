@@ -1,0 +1,203 @@
+"""The one training loop, whatever the guidance: policy -> guidance.act -> environment -> replay -> update.
+
+Written for one lane (one seed with one label budget); `vmap` over lanes happens once, in `make_program`. Random numbers
+come from the lane's own key folded with the shared counters, so a lane's result does not depend on its neighbours.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.sharding import Mesh
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+
+from cuelearner_jax import asking
+from cuelearner_jax.agent.learning import Learner, learner, stored_step
+from cuelearner_jax.asking import label_slots
+from cuelearner_jax.config import RunConfig, Scalars, Schedule, Sizes
+from cuelearner_jax.devices import BY_LANE, SHARED, compiler_options, each_lane, lane_mesh, over_lanes
+from cuelearner_jax.environment import Environment
+from cuelearner_jax.guidance.bundle import Guidance
+from cuelearner_jax.guidance.refining import Refined, untouched
+from cuelearner_jax.policies import Uniform
+from cuelearner_jax.types import Clock, Label, Stream, Teacher, TrainState
+
+
+class Program(NamedTuple):
+    """Jitted functions over a block of lanes (leading axis of `state`). They donate the state they are given.
+
+    The clock is not donated: blocks share it.
+    """
+
+    # (env, seeds (lanes,), budgets (lanes,), root key) -> state
+    init: Callable[[Any, Array, Array, PRNGKeyArray], TrainState]
+    # (env, teacher, scalars, clock, state) -> clock, state
+    label_round: Callable[[Any, Teacher, Scalars, Clock, TrainState], tuple[Clock, TrainState]]
+    # (env, scalars, labels (lanes, slots, ...) that were given elsewhere, state) -> state
+    take_labels: Callable[[Any, Scalars, Label, TrainState], TrainState]
+    # (env, scalars, schedule, clock, state, iterations) -> clock, state, metrics (lanes,)
+    train: Callable[[Any, Scalars, Schedule, Clock, TrainState, int], tuple[Clock, TrainState, dict[str, Array]]]
+
+
+def start_clock() -> Clock:
+    """All counters at zero."""
+    return Clock(jnp.zeros((), jnp.int32), jnp.zeros((), jnp.int32), jnp.zeros((), jnp.int32))
+
+
+def make_program(
+    config: RunConfig,
+    guidance: Guidance,
+    env: Environment,
+    largest_budget: int,
+    mesh: Mesh | None = None,
+    lanes: int = 1,
+) -> Program:
+    """Compiles (on first use) the loop for one kind of guidance.
+
+    Args:
+        config: sizes and whether targets bootstrap are taken from here; scalars and schedule are passed at each call.
+        env: gives shapes; any environment of the same structure may be passed at the calls.
+        largest_budget: labels that the largest lane may use.
+        mesh: devices that share the lanes, whose number they must divide into (default: the first device alone).
+        lanes: that each device is expected to take at once; how fast it is may hang on it, nothing else.
+    """
+    mesh = mesh or lane_mesh(jax.local_devices()[:1])
+    lane = make_lane(config, guidance, env, largest_budget)
+
+    def init(env, seeds, budgets, root):
+        keys = jax.vmap(lambda seed: jax.random.fold_in(root, seed))(seeds)
+        return each_lane(partial(lane.init, env))(keys, budgets)
+
+    def label_round(env, teacher, scalars, clock, state):
+        state = each_lane(partial(lane.label_round, env, teacher, scalars, clock.round))(state)
+        return clock.replace(round=clock.round + 1), state
+
+    def take_labels(env, scalars, labels, state):
+        return each_lane(partial(lane.take_labels, env, scalars))(labels, state)
+
+    def train(env, scalars, schedule, clock, state, iterations):
+        def run(state):
+            def iteration(carry, _):
+                clock, state = carry
+                state, metrics = lane.iterate(env, scalars, schedule, clock, state)
+                return (lane.advance(clock, schedule), state), metrics
+
+            (after, state), metrics = jax.lax.scan(iteration, (clock, state), length=iterations)
+            return after, state, jax.tree.map(lambda leaf: leaf.mean(0), metrics)
+
+        return each_lane(run, gives=(None, 0, 0))(state)
+
+    def stretch(env, scalars, schedule, clock, state, iterations):
+        whole = over_lanes(
+            mesh, partial(train, iterations=iterations), (*(SHARED,) * 4, BY_LANE), (SHARED, BY_LANE, BY_LANE)
+        )
+        return whole(env, scalars, schedule, clock, state)
+
+    init = over_lanes(mesh, init, (SHARED, BY_LANE, BY_LANE, SHARED), BY_LANE)
+    label_round = over_lanes(mesh, label_round, (*(SHARED,) * 4, BY_LANE), (SHARED, BY_LANE))
+    take_labels = over_lanes(mesh, take_labels, (SHARED, SHARED, BY_LANE, BY_LANE), BY_LANE)
+    return Program(
+        init=jax.jit(init),
+        label_round=jax.jit(label_round, donate_argnums=4),
+        take_labels=jax.jit(take_labels, donate_argnums=3),
+        train=jax.jit(
+            stretch, donate_argnames="state", static_argnames="iterations", compiler_options=compiler_options(lanes)
+        ),
+    )
+
+
+class Lane(NamedTuple):
+    """The loop of one lane."""
+
+    sizes: Sizes
+    guidance: Guidance
+    learner: Learner
+    largest_budget: int
+
+    def init(self, env: Environment, key: PRNGKeyArray, budget: Int[Array, ""]) -> TrainState:
+        """A fresh lane. Budgets do not touch the random numbers: lanes of one seed start alike."""
+        k_q, k_guidance, k_ask, k_env = jax.random.split(jax.random.fold_in(key, Stream.INIT), 4)
+        slots = label_slots(self.largest_budget, self.sizes)
+        return TrainState(
+            agent=self.learner.init(env, k_q, k_env),
+            guide=asking.start(self.guidance, env, slots, budget, k_guidance, k_ask),
+            key=key,
+        )
+
+    def label_round(
+        self, env: Environment, teacher: Teacher, scalars: Scalars, number: Int[Array, ""], state: TrainState
+    ) -> TrainState:
+        """One round of questions to a simulated teacher, uniform actions their base (see `asking.label_round`)."""
+        base = Uniform(self.learner.actions)
+        guide = asking.label_round(
+            self.guidance, self.sizes, env, teacher, scalars, base, state.guide, state.key, number
+        )
+        return state.replace(guide=guide)
+
+    def take_labels(self, env: Environment, scalars: Scalars, labels: Label, state: TrainState) -> TrainState:
+        """Labels that were given elsewhere, in place of questions, and the model fitted to them."""
+        return state.replace(guide=asking.take_labels(self.guidance, env, scalars, labels, state.guide, state.key))
+
+    def advance(self, clock: Clock, schedule: Schedule) -> Clock:
+        """The clock after one iteration."""
+        steps = self.sizes.num_envs
+        updates = jnp.where(clock.step + steps >= schedule.learn_after, steps * self.sizes.updates_per_step, 0)
+        return clock.replace(step=clock.step + steps, update=clock.update + updates)
+
+    def iterate(
+        self, env: Environment, scalars: Scalars, schedule: Schedule, clock: Clock, state: TrainState
+    ) -> tuple[TrainState, dict[str, Float[Array, ""]]]:
+        """One step in each of the lane's environments, then as many gradient steps."""
+        key = jax.random.fold_in(jax.random.fold_in(state.key, Stream.TRAIN), clock.step)
+        k_act, k_env, k_guided, k_learn = jax.random.split(key, 4)
+        action, passes = self.act(env, scalars, schedule, clock, state, k_act)
+        agent, bootstraps = state.agent, self.learner.bootstraps
+        remembered = jax.vmap(env.remember)(agent.env, agent.obs)
+        env_state, step = jax.vmap(env.step)(jax.random.split(k_env, self.sizes.num_envs), agent.env, action)
+        done = step.terminated | step.truncated
+        redrawn = jax.random.bernoulli(k_guided, scalars.guided_probability, done.shape)
+        stored = jax.vmap(partial(stored_step, bootstraps=bootstraps))(remembered, action, step)
+        agent = agent.replace(
+            replay=self.learner.buffer.add(agent.replay, clock.step, stored),
+            env=env_state,
+            obs=step.obs,
+            guided=jnp.where(done, redrawn, agent.guided),
+        )
+        agent, loss = jax.lax.cond(
+            clock.step + self.sizes.num_envs >= schedule.learn_after,
+            lambda agent: self.learner.learn(env, scalars, schedule, clock, agent, k_learn),
+            lambda agent: (agent, jnp.zeros(())),
+            agent,
+        )
+        metrics = {"reward": step.reward.mean(), "loss": loss, "passes": passes.astype(jnp.float32).mean()}
+        return state.replace(agent=agent), metrics
+
+    def act(
+        self, env: Environment, scalars: Scalars, schedule: Schedule, clock: Clock, state: TrainState, key: PRNGKeyArray
+    ) -> Refined:
+        """Actions to execute (num_envs, action), and how often guidance moved each.
+
+        Uniform at first, then greedy; in guided episodes refined by the guidance until the cut-off. The branches hang
+        on the shared clock alone, so they stay branches under vmap.
+        """
+        agent = state.agent
+        base = jax.lax.cond(
+            clock.step < schedule.random_steps,
+            lambda: self.learner.actions.uniform(key, (self.sizes.num_envs,)),
+            lambda: self.learner.greedy(agent),
+        )
+        guides = (clock.step >= schedule.random_steps) & (clock.step < schedule.guidance_until)
+        return jax.lax.cond(
+            guides,
+            lambda: self.guidance.act(state.guide.model, env, agent.obs, base, agent.guided, scalars),
+            lambda: untouched(base),
+        )
+
+
+def make_lane(config: RunConfig, guidance: Guidance, env: Environment, largest_budget: int) -> Lane:
+    """The loop of one lane for an environment, whose shapes alone are looked at."""
+    return Lane(config.sizes, guidance, learner(config.sizes, config.bootstraps, env), largest_budget)

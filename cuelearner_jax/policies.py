@@ -1,0 +1,239 @@
+"""Policies: pytrees that act. What evaluation, pictures, labelling and adaptation are about.
+
+A policy's `act` sees many environments at once. Its `axes` say which of its leaves a block of lanes has one of each
+(`evaluate.evaluate_lanes` maps over them); what lanes share is there once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Protocol, runtime_checkable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from cuelearner_jax import types
+from cuelearner_jax.actions import DIRECTIONS, Actions
+from cuelearner_jax.agent.choice import greedy_actions
+from cuelearner_jax.config import AgentSizes, GuideScalars
+from cuelearner_jax.devices import portions
+from cuelearner_jax.environment import actions_of
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.guidance.answers import relative_feedback
+from cuelearner_jax.guidance.bundle import Guidance
+from cuelearner_jax.guidance.refining import refine
+from cuelearner_jax.types import EnvState, GuidanceModel, Params, Teacher
+
+SHARED, BY_LANE = None, 0  # of a leaf: the same for all lanes, or one for each
+
+
+@runtime_checkable
+class Policy(types.Policy, Protocol):
+    """A policy of which a block of lanes may have one each."""
+
+    @property
+    def axes(self) -> Any:
+        """The policy with `BY_LANE` or `SHARED` in place of fields: what a block of lanes has one of each."""
+        ...
+
+
+class Agent(struct.PyTreeNode):
+    """The greedy choice of an action-value network."""
+
+    params: Params
+    sizes: AgentSizes = struct.field(pytree_node=False)
+    actions: Actions = struct.field(pytree_node=False, default=DIRECTIONS)
+
+    def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
+        """The action with the largest value."""
+        return greedy_actions(self.sizes, self.actions, self.params, obs)
+
+    @property
+    def axes(self) -> Agent:
+        """Each lane has its own network."""
+        return self.replace(params=BY_LANE)
+
+
+class Uniform(struct.PyTreeNode):
+    """Uniform actions."""
+
+    actions: Actions = struct.field(pytree_node=False, default=DIRECTIONS)
+
+    def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
+        """Drawn anew each time (paper, Eq. 6)."""
+        return self.actions.uniform(key, (obs.shape[0],))
+
+    @property
+    def axes(self) -> Uniform:
+        """It has nothing."""
+        return self
+
+
+class Taught(struct.PyTreeNode):
+    """What a teacher holds for best."""
+
+    teacher: Teacher
+
+    def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
+        """The teacher's own actions."""
+        return best_actions(self.teacher, states, obs)
+
+    @property
+    def axes(self) -> Taught:
+        """One teacher for all."""
+        return self.replace(teacher=SHARED)
+
+
+class Heuristic(struct.PyTreeNode):
+    """The environment's own obvious action."""
+
+    env: Any
+
+    def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
+        """It needs no learning."""
+        return jax.vmap(self.env.heuristic)(obs)
+
+    @property
+    def axes(self) -> Heuristic:
+        """One environment for all."""
+        return self.replace(env=SHARED)
+
+
+class Guided(struct.PyTreeNode):
+    """Another policy's actions, every one of them under guidance."""
+
+    base: Any  # a policy
+    model: GuidanceModel
+    env: Any
+    scalars: GuideScalars
+    guidance: Guidance = struct.field(pytree_node=False)
+
+    def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
+        """The base's actions as the guidance has them."""
+        everywhere = jnp.ones(obs.shape[0], bool)
+        base = self.base.act(key, states, obs)
+        return self.guidance.act(self.model, self.env, obs, base, everywhere, self.scalars).actions
+
+    @property
+    def axes(self) -> Guided:
+        """Each lane has its own base and model."""
+        return self.replace(base=self.base.axes, model=BY_LANE, env=SHARED, scalars=SHARED)
+
+
+class Corrected(struct.PyTreeNode):
+    """Another policy's actions, refined by the teacher's own relative feedback instead of a model of it."""
+
+    base: Any  # a policy
+    teacher: Teacher
+    scalars: GuideScalars
+    actions: Actions = struct.field(pytree_node=False, default=DIRECTIONS)
+
+    def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
+        """The base's actions, told the way until they are right."""
+        best, eps = best_actions(self.teacher, states, obs), self.scalars.radians("eps")
+
+        def told(action: Array, best: Array) -> Array:
+            return self.actions.toward(action, relative_feedback(action, best, eps), eps) - action
+
+        return refine(
+            lambda current: jax.vmap(told)(current, best),
+            self.base.act(key, states, obs),
+            jnp.ones(obs.shape[0], bool),
+            space=self.actions,
+            tau=self.scalars.radians("tau"),
+            tau_max=self.scalars.radians("tau_max"),
+            k_max=self.scalars.k_max,
+        ).actions
+
+    @property
+    def axes(self) -> Corrected:
+        """Each lane has its own base; the teacher is one for all."""
+        return self.replace(base=self.base.axes, teacher=SHARED, scalars=SHARED)
+
+
+class Residual(struct.PyTreeNode):
+    """Another policy's actions plus what a function adds to them, once, within a bound."""
+
+    base: Any  # a policy
+    params: Params
+    bound: Float[Array, ""] | float  # [rad]
+    residual: Callable[[Params, Array, Array], Array] = struct.field(pytree_node=False)  # (params, obs, actions)
+    actions: Actions = struct.field(pytree_node=False, default=DIRECTIONS)
+
+    def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
+        """The base's actions, corrected."""
+        base = self.base.act(key, states, obs)
+        moved = self.actions.retract(base + self.residual(self.params, obs, base))
+        return self.actions.clip(moved, base, self.bound)
+
+    @property
+    def axes(self) -> Residual:
+        """Each lane has its own base and parameters."""
+        return self.replace(base=self.base.axes, params=BY_LANE, bound=SHARED)
+
+
+class Opaque(struct.PyTreeNode):
+    """Any function of a batch of observations: of JAX arrays, or, `on_host`, of NumPy arrays in plain Python.
+
+    What it returns (n, 2) is made unit vectors. A function on the host is called back from compiled programs
+    (`jax.pure_callback`): it must give the same for the same observations.
+    """
+
+    function: Callable[[Any], Any] = struct.field(pytree_node=False)
+    on_host: bool = struct.field(pytree_node=False, default=False)
+    actions: Actions = struct.field(pytree_node=False, default=DIRECTIONS)
+
+    def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
+        """What the function gives. Raises UserError if that has another shape."""
+        if self.on_host:
+            # Asked once while tracing: a complaint from inside a compiled program would be pages long.
+            self._called(np.zeros(obs.shape, obs.dtype))
+            shape = jax.ShapeDtypeStruct((obs.shape[0], self.actions.size), jnp.float32)
+            chosen = jax.pure_callback(self._called, shape, obs, vmap_method="expand_dims")
+        else:
+            chosen = jnp.asarray(self.function(obs))
+            self._check(chosen.shape, obs.shape[0])
+        return self.actions.retract(chosen)
+
+    def _called(self, obs: Any) -> np.ndarray:
+        """The function of a batch with any leading axes."""
+        rows = np.asarray(obs)
+        flat = rows.reshape(-1, rows.shape[-1])
+        chosen = np.asarray(self.function(flat), np.float32)
+        self._check(chosen.shape, len(flat))
+        return chosen.reshape(*rows.shape[:-1], self.actions.size)
+
+    def _check(self, shape: tuple[int, ...], rows: int) -> None:
+        if shape != (rows, self.actions.size):
+            wanted = (rows, self.actions.size)
+            raise UserError(f"a policy returned actions of shape {shape} for {rows} observations: return {wanted}")
+
+    @property
+    def axes(self) -> Opaque:
+        """It has nothing that JAX knows of."""
+        return self
+
+
+class Teaching(struct.PyTreeNode):
+    """A policy as a teacher (`types.Teacher`): a finished agent, for instance, teaches what it does itself."""
+
+    policy: Any
+
+    def best_action(self, state: EnvState, obs: Float[Array, " obs"]) -> Float[Array, " action"]:
+        """What the policy does; one that acts at random always draws the same."""
+        states = jax.tree.map(lambda leaf: leaf[None], state)
+        return self.policy.act(jax.random.key(0), states, obs[None])[0]
+
+
+def best_actions(teacher: Teacher, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
+    """A teacher's actions in n situations; few at a time, for one by search simulates hundreds of actions of each."""
+    ask = lambda pair: teacher.best_action(*pair)  # noqa: E731
+    return jax.lax.map(ask, (states, obs), batch_size=min(len(obs), portions().states))
+
+
+def uniform_in(env: Any) -> Uniform:
+    """Uniform actions of an environment's space."""
+    return Uniform(actions_of(env))

@@ -1,0 +1,102 @@
+"""Format numbers of the files that outlive the program that wrote them, and the one way in which older ones are read.
+
+| kind      | file                   | values                                                                  |
+|-----------|------------------------|-------------------------------------------------------------------------|
+| `config`  | `config.json` of a run | its contents                                                            |
+| `labels`  | a label file           | what it says of itself, and its columns under `columns` as NumPy arrays |
+| `teacher` | `teacher.json`         | its contents                                                            |
+
+A file tells its number under `format`; one without a number is of format 0. A change of what is written raises the
+number here and adds a step that leads there from the number before; readers know the current format only.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cuelearner_jax.errors import UserError
+
+FORMATS = {"config": 1, "labels": 1, "teacher": 1}
+REMEDIES = {  # what a message says of a damaged file, after its path
+    "config": "is damaged or of another program: restore it, or start anew with --overwrite",
+    "labels": "is not a label file of cuelearner, or it is damaged: restore it, or write it anew",
+    "teacher": "is damaged: restore it, or train the teacher anew",
+}
+
+Values = dict[str, Any]
+
+
+def damaged(kind: str, path: Path) -> UserError:
+    """What is raised for a file that makes no sense."""
+    return UserError(f"{path} {REMEDIES[kind]}")
+
+
+def read(kind: str, path: Path) -> Values:
+    """A JSON file in the current format of its kind. Raises UserError if it is damaged or newer than this program."""
+    try:
+        values = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise damaged(kind, path) from error
+    return upgrade(kind, values, path)
+
+
+def upgrade(kind: str, values: Any, path: Path) -> Values:
+    """The values of a file of any format in the current one; those given are left as they are.
+
+    Args:
+        kind: a key of `FORMATS`.
+        values: what the file holds.
+        path: the file, for messages.
+
+    Raises:
+        UserError: the file was written by a newer program, or makes no sense.
+    """
+    number = values.get("format", 0) if isinstance(values, dict) else None
+    if not isinstance(number, int) or isinstance(number, bool) or number < 0:
+        raise damaged(kind, path)
+    if number > FORMATS[kind]:
+        raise UserError(
+            f"{path} was written by a newer cuelearner: update, or use the one that wrote it "
+            f"(its format is {number}, this program knows up to {FORMATS[kind]})"
+        )
+    for before in range(number, FORMATS[kind]):
+        try:
+            values = {**STEPS[kind, before](values), "format": before + 1}
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            raise damaged(kind, path) from error
+    return values
+
+
+def _only_numbered(values: Values) -> Values:
+    """The first number changed nothing else."""
+    return values
+
+
+def _answers_of_targets(values: Values) -> Values:
+    """Labels held what the model of relative feedback was to predict, rotate(action, h * eps) - action; now h."""
+    kept = {name: value for name, value in values.items() if name not in ("guidance", "columns")}
+    columns = dict(values["columns"])
+    if values["guidance"] != "relative":
+        raise ValueError("labels of format 0 are relative ones")
+    action = np.asarray(columns["action"], np.float64)
+    turned = action + columns.pop("target")
+    angle = np.arctan2(
+        action[:, 0] * turned[:, 1] - action[:, 1] * turned[:, 0], (action * turned).sum(axis=-1)
+    )  # [rad], counterclockwise
+    h = np.round(angle / np.deg2rad(values["eps_deg"])) + 0.0  # no negative zero
+    if not (np.abs(h) <= 1).all():
+        raise ValueError("a label turns an action by more than eps")
+    columns["answer"] = h[:, None].astype(np.float32)
+    return {**kept, "answers": "relative", "columns": columns}
+
+
+STEPS: dict[tuple[str, int], Callable[[Values], Values]] = {
+    ("config", 0): _only_numbered,
+    ("labels", 0): _answers_of_targets,
+    ("teacher", 0): _only_numbered,
+}

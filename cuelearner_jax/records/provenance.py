@@ -1,0 +1,54 @@
+"""Where numbers come from: what every recorded file says of the program and the machine that wrote it."""
+
+from __future__ import annotations
+
+import shlex
+import subprocess
+import sys
+import warnings
+from importlib import metadata
+from pathlib import Path
+
+
+def provenance() -> dict[str, str]:
+    """The columns `commit`, `versions`, `hardware` and `command` of this process.
+
+    `commit` is empty where the package does not come from a git checkout.
+    """
+    import jax
+
+    packages = ("cuelearner-jax", "jax", "jaxlib", "flax", "optax", "numpy")
+    found = [(name, _version(name)) for name in packages]
+    kinds = [device.device_kind for device in jax.devices()]
+    return {
+        "commit": _commit(),
+        "versions": ", ".join([f"python {sys.version.split()[0]}", *(f"{n} {v}" for n, v in found if v)]),
+        "hardware": ", ".join(f"{kinds.count(kind)} x {kind}" for kind in dict.fromkeys(kinds)),
+        "command": shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),
+    }
+
+
+def _version(package: str) -> str:
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return ""
+
+
+def _commit() -> str:
+    root = Path(__file__).resolve().parents[2]
+    if not (root / ".git").exists():  # an installed package may lie inside somebody else's repository
+        return ""
+    git = ["git", "-C", str(root), "--no-optional-locks"]  # nothing is written to the repository
+    asked = (["rev-parse", "--short=12", "HEAD"], ["status", "--porcelain", "--untracked-files=no"])
+    try:
+        with warnings.catch_warnings():
+            # JAX warns of any fork; this one becomes git at once.
+            warnings.filterwarnings("ignore", message=r"os\.fork", category=RuntimeWarning)
+            told = [
+                subprocess.run([*git, *words], capture_output=True, text=True, timeout=10, check=True).stdout.strip()
+                for words in asked
+            ]
+    except (OSError, subprocess.SubprocessError):
+        return ""
+    return told[0] + ("-dirty" if told[1] else "")

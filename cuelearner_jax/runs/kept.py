@@ -1,0 +1,75 @@
+"""What of a group of lanes is kept in a checkpoint, and how it comes back."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.loop import start_clock
+from cuelearner_jax.records.checkpoint import Checkpoints, checkpoints
+from cuelearner_jax.runs.lanes import LaneGroup
+from cuelearner_jax.types import Clock, TrainState
+
+
+def items(blocks: list[TrainState], clock: Clock, wall: float) -> dict[str, Any]:
+    """A run's state as the items of a checkpoint: acting needs the first alone; the last says how lanes are cut."""
+    return {
+        "policy": [{"params": block.agent.params, "guidance": block.guide.model} for block in blocks],
+        "rest": [
+            block.replace(agent=block.agent.replace(params=None), guide=block.guide.replace(model=None))
+            for block in blocks
+        ],
+        "clock": {
+            "clock": clock,
+            "wall_s": np.float32(wall),
+            "cut": np.array([len(blocks), blocks[0].key.shape[0]], np.int32),
+        },
+    }
+
+
+def restore(group: LaneGroup, saved: Checkpoints, *names: str) -> dict[str, Any]:
+    """Items of the newest checkpoint by name, and "clock". Blocks are cut as they were when it was written.
+
+    Raises UserError if there is no readable checkpoint or it holds other lanes.
+    """
+    shapes = items(group.shapes(), jax.eval_shape(start_clock), 0.0)
+    clock = saved.restore({"clock": shapes["clock"]})["clock"]
+    count, size = (int(number) for number in clock["cut"])
+    if size < 1 or count * size < len(group.seeds):
+        raise UserError(f"the checkpoint holds {count * size} lanes, the run has {len(group.seeds)}: start it anew")
+    cut = np.minimum(np.arange(count * size), len(group.seeds) - 1).reshape(count, size)
+    shapes = items(group.shapes_of(cut), jax.eval_shape(start_clock), 0.0)
+    return {**saved.restore({name: shapes[name] for name in names}), "clock": clock}
+
+
+def restore_blocks(group: LaneGroup, saved: Checkpoints) -> tuple[list[TrainState], Clock, float]:
+    """Blocks in this group's cut, counters and seconds of training, of the newest checkpoint.
+
+    Raises UserError if there is no readable checkpoint or it holds other lanes.
+    """
+    found = restore(group, saved, "policy", "rest")
+    blocks = [
+        rest.replace(
+            agent=rest.agent.replace(params=policy["params"]), guide=rest.guide.replace(model=policy["guidance"])
+        )
+        for policy, rest in zip(found["policy"], found["rest"], strict=True)
+    ]
+    return group.recut(blocks), found["clock"]["clock"], float(found["clock"]["wall_s"])
+
+
+def restore_policies(group: LaneGroup, folder: Path) -> tuple[dict[str, Any], int]:
+    """What the lanes of a run's folder act with: ({"params": ..., "guidance": ...}, leading axis: lanes; their step).
+
+    Raises UserError if there is no readable checkpoint.
+    """
+    if not (folder / "checkpoints").is_dir():
+        raise UserError(f"no checkpoint in {folder}: train first, or give a run folder that has one")
+    with checkpoints(folder / "checkpoints", read_only=True) as saved:
+        found = restore(group, saved, "policy")
+    policies = jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[: len(group.seeds)], *found["policy"])
+    return policies, int(found["clock"]["clock"].step)

@@ -1,0 +1,112 @@
+"""What is asked of a sweep, and whether it makes sense: nothing here writes anything."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from cuelearner_jax import config as configuration
+from cuelearner_jax.asking import label_slots
+from cuelearner_jax.config import RunConfig
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.guidance import registry as guidances
+from cuelearner_jax.records import label_files, results
+from cuelearner_jax.records.folders import check_folder
+from cuelearner_jax.runs.grid import Grid, check_grid, describe
+from cuelearner_jax.runs.shards import Shard
+from cuelearner_jax.task import Task, shape_of
+
+
+@dataclass(frozen=True)
+class Order:
+    """What is asked for: a grid of runs of one task in one folder."""
+
+    task: Task
+    config: RunConfig
+    grid: Grid
+    out: Path
+    resume: bool = False
+    overwrite: bool = False
+    labels_from: Path | None = None  # a label file in place of the teacher
+    shard: Shard | None = None  # its share of the seeds alone, in its own folder below `out`
+    split: str = "validation"  # episodes of the evaluations
+
+
+@dataclass(frozen=True)
+class Plan:
+    """An order that was found to make sense; nothing has been written."""
+
+    order: Order  # of this piece: its seeds, its folder
+    described: dict[str, Any]  # the contents of config.json
+    labels: label_files.LabelFile | None
+
+    @property
+    def finished(self) -> bool:
+        """Is there nothing left to do?"""
+        return self.done == 1
+
+    @property
+    def done(self) -> float:
+        """Share of the steps that have been taken, as its results say."""
+        folders = [self.order.out / kind for kind in self.order.grid.guidance]
+        total = self.described["total_steps"]
+        shares = [1 if (f / results.PARQUET).exists() else 0.99 * results.last_step(f) / total for f in folders]
+        return sum(shares) / len(shares)
+
+
+def planned(order: Order) -> Plan:
+    """What `run` does with an order. Raises UserError for what it would refuse, but for too little memory."""
+    configuration.check(order.config)
+    names = tuple(guidances.find(kind).name for kind in order.grid.guidance)  # one of one's own is named by its module
+    order = dataclasses.replace(order, grid=dataclasses.replace(order.grid, guidance=names))
+    check_grid(order.grid)
+    if order.shard:
+        order.shard.check_sweep(order.out)
+        folder = order.shard.folder(order.out)
+        begun = not order.overwrite and (folder / "config.json").is_file()
+        grid = dataclasses.replace(order.grid, seeds=order.shard.seeds(order.grid.seeds))
+        order = dataclasses.replace(order, grid=grid, out=folder, resume=order.resume or begun)
+    env = shape_of(order.task, order.config.task)
+    for kind in order.grid.guidance:
+        guidances.make(kind, order.config.sizes, env)
+    labels = read_labels(order) if order.labels_from else None
+    described = describe(order.task, order.config, order.grid, order.split, order.labels_from, order.shard)
+    check_folder(order.out, described, order.resume, order.overwrite)
+    return Plan(order, described, labels)
+
+
+def read_labels(order: Order) -> label_files.LabelFile:
+    """A label file that fits the task and the grid. Raises UserError if it does not."""
+    path, config, grid = order.labels_from, order.config, order.grid
+    assert path is not None
+    file = label_files.read(path)
+    env = shape_of(order.task, config.task)
+    if file.task.get("name") != order.task.name or file.labels.obs.shape[1] != env.obs_size:
+        raise UserError(
+            f"{path} holds labels of {file.task.get('name')} with {file.labels.obs.shape[1]} observations, "
+            f"this run is {order.task.name} with {env.obs_size}: give labels of the same task"
+        )
+    made = [guidances.make(kind, config.sizes, env) for kind in grid.guidance]
+    asking = [guidance for guidance in made if guidance.form is not None]
+    if not asking:
+        fitting = [kind.name for kind in guidances.known() if kind.form and kind.form.name == file.answers]
+        raise UserError(f"--labels-from needs a guidance that uses labels: add --guidance {' or '.join(fitting)}")
+    for guidance in asking:
+        assert guidance.form is not None
+        if guidance.form.name != file.answers:
+            raise UserError(
+                f"{path} holds {file.answers} answers, guidance {guidance.name} needs {guidance.form.name} ones: "
+                "give fitting labels"
+            )
+    if file.eps_deg is not None and not math.isclose(file.eps_deg, config.scalars.eps_deg, rel_tol=1e-6):
+        raise UserError(
+            f"{path} holds labels of {file.eps_deg:g} degrees, the run's are of {config.scalars.eps_deg:g}: "
+            f"give --scalars.eps-deg {file.eps_deg:g}, or other labels"
+        )
+    for guidance in asking:
+        seeds, budgets = grid.lanes(guidance)
+        label_files.for_lanes(file, seeds, budgets, label_slots(int(budgets.max()), config.sizes))
+    return file

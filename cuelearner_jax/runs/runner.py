@@ -1,0 +1,127 @@
+"""One group of lanes trained into a run's folder: labels, rows and checkpoints, from wherever it stands."""
+
+from __future__ import annotations
+
+import threading
+from typing import Any
+
+import numpy as np
+from rich.progress import Progress
+
+from cuelearner_jax import config as configuration
+from cuelearner_jax.environment import Environment
+from cuelearner_jax.records import label_files, provenance, results
+from cuelearner_jax.records.checkpoint import Checkpoints, checkpoints
+from cuelearner_jax.runs.grid import config_hash
+from cuelearner_jax.runs.kept import items, restore_blocks
+from cuelearner_jax.runs.lanes import LaneGroup
+from cuelearner_jax.runs.order import Order
+from cuelearner_jax.runs.training import Training
+from cuelearner_jax.terminal import Interrupted, console
+from cuelearner_jax.types import Teacher
+
+ROUNDS_A_CHUNK = 10  # label rounds between two checkpoints
+
+
+class Runner:
+    """Keeps on disk what a `Training` does."""
+
+    def __init__(
+        self,
+        group: LaneGroup,
+        examined: Environment,
+        order: Order,
+        described: dict[str, Any],
+        stopping: threading.Event,
+        bars: Progress,
+    ) -> None:
+        """Nothing is done yet; `described` is what config.json says, `stopping` is set by Ctrl-C."""
+        self.training = Training(group, examined, order.split)
+        self.group, self.order, self.described = group, order, described
+        self.stopping, self.bars = stopping, bars
+        self.folder = order.out / group.guidance.name
+
+    def run(self, teacher: Teacher | None, labels: label_files.LabelFile | None) -> None:
+        """From wherever the group stands to its end.
+
+        Raises Interrupted once it was asked to stop and everything is saved.
+        """
+        if (self.folder / results.PARQUET).exists():
+            console.print(f"{self.group.guidance.name}: finished before, left as it is")
+            return
+        with checkpoints(self.folder / "checkpoints") as saved:
+            self._restore(saved)
+            with results.ResultsWriter(self.folder, **self._constants()) as writer:
+                self._label(saved, teacher, labels)
+                self._train(saved, writer)
+        results.finish(self.folder)
+
+    def _constants(self) -> dict[str, Any]:
+        return {
+            "run": self.order.out.name,
+            "task": self.order.task.name,
+            "guidance": self.group.guidance.name,
+            "split": self.order.split,
+            "config_hash": config_hash(self.described),
+            **provenance.provenance(),
+        }
+
+    def _restore(self, saved: Checkpoints) -> None:
+        """The newest checkpoint, or a fresh start; rows past it are dropped."""
+        if saved.latest() is None:
+            self.training.begin()
+            results.truncate_after(self.folder, -1)
+            return
+        self.training.go_on(*restore_blocks(self.group, saved))
+        # A checkpoint of the labels alone comes before the rows of step 0.
+        results.truncate_after(self.folder, self.training.step or -1)
+
+    def _save(self, saved: Checkpoints) -> None:
+        now = self.training
+        saved.save(now.round + now.step, items(now.blocks, now.clock, now.wall))
+
+    def _stop_if_asked(self, saved: Checkpoints) -> None:
+        if self.stopping.is_set():
+            self._save(saved)
+            raise Interrupted(
+                f"stopped at step {self.training.step} of {self.group.guidance.name}; "
+                "go on with the same command and --resume"
+            )
+
+    def _label(self, saved: Checkpoints, teacher: Teacher | None, labels: label_files.LabelFile | None) -> None:
+        """Asks the teacher, or takes the labels of a file."""
+        now, name, written = self.training, self.group.guidance.name, self.folder / "labels.parquet"
+        if not self.group.guidance.asks or (now.labelled and written.exists()):
+            return
+        bar = self.bars.add_task(f"{name}: labels", total=self.group.rounds, note="", completed=now.round)
+        if labels is not None and not now.labelled:
+            now.take(labels)
+        if not now.labelled:
+            assert teacher is not None  # asked for where no file was given
+            for done in now.label_rounds(teacher):
+                self.bars.update(bar, completed=done)
+                if done % ROUNDS_A_CHUNK == 0:
+                    self._save(saved)
+                self._stop_if_asked(saved)
+        self._write_labels()
+        self._save(saved)
+
+    def _write_labels(self) -> None:
+        form, config = self.group.guidance.form, self.group.config
+        assert form is not None
+        task = {"name": self.order.task.name, **configuration.to_json(config.task)}
+        seeds, labels = self.training.labels()
+        eps = config.scalars.eps_deg
+        label_files.write(self.folder / "labels.parquet", task, form.name, eps, seeds, labels, form.meaning)
+
+    def _train(self, saved: Checkpoints, writer: results.ResultsWriter) -> None:
+        now, schedule = self.training, self.group.config.schedule
+        bar = self.bars.add_task(self.group.guidance.name, total=schedule.total_steps, note="", completed=now.step)
+        for row in now.stretches():
+            writer.append(**row)
+            if now.step == 0:
+                continue
+            self.bars.update(bar, completed=now.step, note=f"reward {np.mean(row['reward']):.3f}")
+            if now.step % schedule.checkpoint_every == 0 or now.step >= schedule.total_steps:
+                self._save(saved)
+            self._stop_if_asked(saved)

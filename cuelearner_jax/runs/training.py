@@ -1,0 +1,128 @@
+"""The lanes of one kind of guidance on their way from the first label to the last step; nothing here touches a disk."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from cuelearner_jax.asking import label_slots
+from cuelearner_jax.devices import SHARED, place
+from cuelearner_jax.environment import Environment, actions_of
+from cuelearner_jax.evaluate import episodes
+from cuelearner_jax.loop import start_clock
+from cuelearner_jax.policies import Agent, Guided, Policy, uniform_in
+from cuelearner_jax.records import label_files
+from cuelearner_jax.runs.lanes import LaneGroup
+from cuelearner_jax.types import Clock, Label, Teacher, TrainState
+
+
+class Training:
+    """Where a group of lanes stands, and its next stretches.
+
+    Between two of them its `clock`, `blocks` and `wall` are all there is to keep.
+    """
+
+    def __init__(self, group: LaneGroup, examined: Environment, split: str) -> None:
+        """At the beginning.
+
+        Args:
+            group: the lanes.
+            examined: the environment of evaluations.
+            split: of the episodes of evaluations, see `evaluate.SPLITS`.
+        """
+        self.group, self.split = group, split
+        self.examined = place(group.mesh, examined, SHARED)
+        self.clock: Clock = place(group.mesh, start_clock(), SHARED)
+        self.blocks: list[TrainState] = []
+        self.wall = 0.0  # seconds of labelling and training
+
+    def begin(self) -> None:
+        """Fresh lanes."""
+        self.blocks = self.group.start()
+
+    def go_on(self, blocks: list[TrainState], clock: Clock, wall: float) -> None:
+        """From where others stood."""
+        self.blocks, self.wall = blocks, wall
+        self.clock = place(self.group.mesh, clock, SHARED)
+
+    @property
+    def step(self) -> int:
+        """Environment steps of each lane so far."""
+        return int(self.clock.step)
+
+    @property
+    def round(self) -> int:
+        """Label rounds so far."""
+        return int(self.clock.round)
+
+    @property
+    def labelled(self) -> bool:
+        """Has every question been asked?"""
+        return not self.group.guidance.asks or self.round >= self.group.rounds
+
+    def label_rounds(self, teacher: Teacher) -> Iterator[int]:
+        """Asks a simulated teacher, a round at a time; gives the number of rounds made."""
+        while not self.labelled:
+            started = time.perf_counter()
+            self.clock, self.blocks = self.group.label_round(teacher, self.clock, self.blocks)
+            self.wall += time.perf_counter() - started
+            yield self.round
+
+    def take(self, file: label_files.LabelFile) -> None:
+        """Labels of a file in place of questions, fitted once."""
+        group = self.group
+        slots = label_slots(group.largest_budget, group.config.sizes)
+        rows = [
+            jax.tree.map(jnp.asarray, label_files.for_lanes(file, seeds, budgets, slots))
+            for seeds, budgets in group.blocks()
+        ]
+        self.blocks = group.take_labels(rows, self.blocks)
+        taken = self.clock.replace(round=jnp.asarray(group.rounds, jnp.int32))
+        self.clock = place(group.mesh, taken, SHARED)
+
+    def labels(self) -> tuple[np.ndarray, Label]:
+        """Seeds (lanes,) and labels (lanes, slots, ...) of the largest budget: other lanes hold the first of these."""
+        group = self.group
+        labels = [jax.device_get(block.guide.labels) for block in self.blocks]
+        rows = jax.tree.map(lambda *leaves: np.concatenate(leaves)[: len(group.seeds)], *labels)
+        largest = group.budgets == group.largest_budget
+        return group.seeds[largest], jax.tree.map(lambda leaf: leaf[largest], rows)
+
+    def stretches(self) -> Iterator[dict[str, Any]]:
+        """Trains to the end; gives the columns of each evaluation: before the first step, then after every stretch."""
+        group, schedule = self.group, self.group.config.schedule
+        if self.step == 0:
+            yield {**self.evaluation(), **self.guide_alone()}
+        iterations = schedule.eval_every // group.config.sizes.num_envs
+        while self.step < schedule.total_steps:
+            started = time.perf_counter()
+            self.clock, self.blocks, metrics = group.train(self.clock, self.blocks, iterations)
+            self.wall += time.perf_counter() - started
+            trained = group.columns([{f"train_{name}": v for name, v in block.items()} for block in metrics])
+            yield {**self.evaluation(), **trained}
+
+    def evaluation(self) -> dict[str, Any]:
+        """The columns of one evaluation of all agents: scalars, or (lanes,)."""
+        group = self.group
+        own = {"seed": group.seeds, "labels": group.budgets, "step": self.step, "wall_s": self.wall}
+        actions = actions_of(group.env)
+        return {**own, **self._measured(lambda lane: Agent(lane.agent.params, group.config.sizes, actions))}
+
+    def guide_alone(self) -> dict[str, np.ndarray]:
+        """Metrics (lanes,) of uniform actions under guidance; for unguided lanes that is chance."""
+        group, base = self.group, uniform_in(self.group.env)
+
+        def guide(lane: TrainState) -> Policy:
+            return Guided(base, lane.guide.model, self.examined, group.config.scalars, group.guidance)
+
+        return {f"guide_{name}": values for name, values in self._measured(guide).items()}
+
+    def _measured(self, policy_of: Any) -> dict[str, np.ndarray]:
+        schedule = self.group.config.schedule
+        key = episodes(self.split)
+        return self.group.evaluate(policy_of, self.examined, key, schedule.eval_envs, schedule.eval_steps, self.blocks)

@@ -1,0 +1,163 @@
+"""What a task is to the method: configuration, bodies, teacher, presets, changed worlds and pictures. Types only."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from cuelearner_jax.config import RunConfig
+from cuelearner_jax.environment import Environment
+from cuelearner_jax.errors import UserError, closest
+from cuelearner_jax.types import EnvState, Teacher
+
+# (policy, environment, key, environments, steps) -> metrics by name, as `evaluate.rollout`
+Rollout = Callable[[Any, Any, PRNGKeyArray, int, int], dict[str, Any]]
+
+
+@dataclass(frozen=True)
+class Preset:
+    """A named starting point: a configuration and the lanes that a sweep runs by default."""
+
+    about: str
+    config: RunConfig
+    guidance: tuple[str, ...] = ()  # kinds that it compares; none named: all that the task can have
+    labels: tuple[int, ...] = (500, 1000)
+    seeds: int = 5
+    first_seed: int = 0
+
+
+class Pictures(NamedTuple):
+    """How a body is drawn."""
+
+    # (environment, policy, key, steps) -> what the next two draw, a frame a step; the reward of each step
+    record: Callable[[Any, Any, PRNGKeyArray, int], tuple[list[Any], list[float]]]
+    still: Callable[[Any, list[Any], Path], None]  # (environment, frames, file): one picture of them
+    animate: Callable[[Any, list[Any], Path], None]  # (environment, frames, file): a film of all, .gif or .mp4
+    # (environment, state, observation (obs,), action (action,), file): the situation as a person is asked about it,
+    # with the action in question as an arrow; a PNG
+    question: Callable[[Any, EnvState, Float[Array, " obs"], Float[Array, " action"], Path], None]
+
+
+@dataclass(frozen=True)
+class Body:
+    """What acts in a task. To agents all bodies of a task are the same: policies act on each unchanged."""
+
+    name: str
+    about: str
+    environment: Callable[[Any, str], Environment]  # (configuration, split); for the splits see `evaluate.SPLITS`
+    engines: dict[str, Rollout] = field(default_factory=dict)  # roll-outs in other physics, by name
+    pictures: Callable[[], Pictures] | None = None  # loads what draws, when called; None: nothing draws it
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """A changed world: what a finished policy may meet, and is adapted to."""
+
+    about: str
+    changes: dict[str, Any]  # fields of the task's configuration
+    bound_deg: float | None = None  # suggested bound of an adapted policy's corrections [deg]
+
+    def applied(self, config: Any) -> Any:
+        """The configuration with the changes in it."""
+        return dataclasses.replace(config, **self.changes)
+
+
+@dataclass(frozen=True)
+class Task:
+    """One task. Raises ValueError where its parts do not fit together."""
+
+    name: str
+    about: str
+    config: type  # its configuration: a dataclass, one line of help a field
+    bodies: tuple[Body, ...]  # its own first
+    teacher: Callable[[Any, Any], Teacher] | None = None  # (configuration, environment); None: nobody answers
+    presets: dict[str, Preset] = field(default_factory=dict)
+    scenarios: dict[str, Scenario] = field(default_factory=dict)
+    origin: str = ""  # "package.module:name" where it was taken from outside, by whoever resolved that
+
+    def __post_init__(self) -> None:
+        """Raises ValueError for the first thing that cannot be."""
+        if not self.name.isidentifier():
+            raise ValueError(f"task {self.name!r}: the name must be an identifier, as in Python")
+        if not (isinstance(self.config, type) and dataclasses.is_dataclass(self.config)):
+            raise ValueError(f"task {self.name}: config must be a dataclass, not {self.config!r}")
+        fields = {entry.name for entry in dataclasses.fields(self.config)}
+        if "name" in fields:
+            raise ValueError(f"task {self.name}: a field of {self.config.__name__} may not be called 'name'")
+        names = [body.name for body in self.bodies]
+        if not names or len(set(names)) < len(names):
+            raise ValueError(f"task {self.name}: it needs at least one body, each of another name, not {names}")
+        for name, preset in self.presets.items():
+            if not isinstance(preset.config.task, self.config):
+                kind = type(preset.config.task).__name__
+                raise ValueError(f"task {self.name}: preset {name!r} configures {kind}, not {self.config.__name__}")
+        for name, scenario in self.scenarios.items():
+            unknown = sorted(set(scenario.changes) - fields)
+            if unknown:
+                raise ValueError(
+                    f"task {self.name}: scenario {name!r} changes {unknown[0]!r}, no field of {self.config.__name__}"
+                )
+            try:
+                for base in [preset.config.task for preset in self.presets.values()] or [self.config()]:
+                    scenario.applied(base)
+            except Exception as error:
+                raise ValueError(f"task {self.name}: scenario {name!r} makes no configuration ({error})") from error
+
+    def environment(self, config: Any, split: str = "training") -> Environment:
+        """The world of a configuration with the first body in it, for the episodes of a split."""
+        return self.bodies[0].environment(config, split)
+
+    def make_teacher(self, config: Any, env: Environment) -> Teacher:
+        """Who answers in a world. Raises UserError if the task has no teacher."""
+        if self.teacher is None:
+            raise UserError(f"{self.name} has no teacher to ask: give --labels-from, or a guidance without labels")
+        return self.teacher(config, env)
+
+    def on(self, body: str | None) -> Task:
+        """The task with that body first (None: as it is). Raises UserError if it has no such body."""
+        if body is None:
+            return self
+        if len(self.bodies) == 1:
+            raise UserError(f"{self.name} has no robots to choose from: leave out --robot")
+        known = {one.name: one for one in self.bodies}
+        if body not in known:
+            raise UserError(f"unknown robot {body!r}{closest(body, known)}")
+        others = tuple(one for one in self.bodies if one.name != body)
+        return dataclasses.replace(self, bodies=(known[body], *others))
+
+    def engine(self, name: str | None) -> Rollout | None:
+        """The first body's roll-out in other physics (None: its own). Raises UserError if it has no such engine."""
+        if name is None:
+            return None
+        engines = self.bodies[0].engines
+        if not engines:
+            others = [body.name for body in self.bodies if body.engines]
+            raise UserError(f"--engine {name} needs --robot: choose one of {', '.join(others) or 'none'}")
+        if name not in engines:
+            raise UserError(f"unknown engine {name!r}{closest(name, engines)}")
+        return engines[name]
+
+    def pictures(self) -> Pictures:
+        """How the first body is drawn. Raises UserError if nothing draws it."""
+        if self.bodies[0].pictures is None:
+            raise UserError(f"{self.name} has no pictures of {self.bodies[0].name}: evaluate it instead")
+        return self.bodies[0].pictures()
+
+    def scenario(self, name: str) -> Scenario:
+        """The changed world of that name. Raises UserError if there is none."""
+        if not self.scenarios:
+            raise UserError(f"{self.name} has no scenarios to choose from: leave out --scenario")
+        if name not in self.scenarios:
+            raise UserError(f"unknown scenario {name!r}{closest(name, self.scenarios)}")
+        return self.scenarios[name]
+
+
+def shape_of(task: Task, config: Any) -> Any:
+    """The environment of a configuration with shapes in place of arrays: costs next to nothing."""
+    return jax.eval_shape(lambda: task.environment(config))

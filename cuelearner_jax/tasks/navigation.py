@@ -1,0 +1,135 @@
+"""Navigation as a task: its bodies, presets, changed worlds and pictures."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+from cuelearner_envs.navigation.config import NavigationConfig, make_environment
+from cuelearner_envs.navigation.roadmap import make_teacher
+from cuelearner_jax.config import RunConfig, Scalars, Schedule, Sizes
+from cuelearner_jax.environment import Environment
+from cuelearner_jax.task import Body, Pictures, Preset, Scenario, Task
+
+NAVIGATION_SIZES = Sizes(
+    directions=360,
+    target_directions=18,
+    n_step=30,
+    num_envs=10,
+    replay_capacity=100_000,
+)
+
+# The paper's step size, discount and eps. The bound on the gradient's norm (0.5) and the target network's rate (0.005)
+# of its billiards code learn more slowly here, see docs/results.md.
+NAVIGATION_SCALARS = Scalars(learning_rate=0.001, discount=0.995, eps_deg=20.0, max_grad_norm=10.0, polyak=0.05)
+
+
+def _pictures() -> Pictures:
+    from cuelearner_envs.navigation import drawing  # takes seconds to load
+    from cuelearner_envs.navigation.recording import record, situation
+
+    return Pictures(
+        record=record,
+        still=lambda env, frames, file: drawing.still(env.robot, frames, file),
+        animate=lambda env, frames, file: drawing.animate(env.robot, frames, file),
+        question=lambda env, state, obs, action, file: drawing.question(env.robot, situation(env, state, action), file),
+    )
+
+
+def _legged(config: NavigationConfig, split: str) -> Environment:
+    from cuelearner_envs.anymal.environment import make_environment  # MuJoCo's loading is not for every command
+
+    return make_environment(config, split)
+
+
+def _judged(*arguments: Any) -> dict[str, Any]:
+    from cuelearner_envs.anymal.judged import rollout
+
+    return rollout(*arguments)
+
+
+def _legged_pictures() -> Pictures:
+    from cuelearner_envs.anymal import recording
+
+    return Pictures(
+        record=recording.record,
+        still=lambda env, frames, file: recording.still(frames, file),
+        animate=lambda env, frames, file: recording.animate(frames, file),
+        question=_pictures().question,  # from above, as the simple robot: it has a pose and the same lidar
+    )
+
+
+SIMPLE = Body("simple", "a motion that follows its command with a lag", make_environment, pictures=_pictures)
+ANYMAL = Body("anymal", "a quadruped with full physics", _legged, {"mujoco": _judged}, _legged_pictures)
+
+# The worlds of the paper's section on adaptation after training.
+SCENARIOS = {
+    "turned_lidar": Scenario("the lidar is mounted turned by 15 degrees", {"lidar_rotation_deg": 15.0}, bound_deg=60.0),
+    "rooms": Scenario("rooms, doorways and thin obstacles", {"style": "rooms"}, bound_deg=180.0),
+    "corridor": Scenario(
+        "a corridor of obstacles, each to be passed left or right", {"style": "corridor"}, bound_deg=60.0
+    ),
+}
+
+NAVIGATION = Task(
+    name="navigation",
+    about="reach a goal without a map, by a lidar",
+    config=NavigationConfig,
+    bodies=(SIMPLE, ANYMAL),
+    teacher=lambda config, env: make_teacher(env),
+    scenarios=SCENARIOS,
+    presets={
+        "paper": Preset(
+            "the paper's figure: cluttered halls, its networks, 1 million steps a seed",
+            RunConfig(
+                NavigationConfig(),
+                NAVIGATION_SIZES,
+                NAVIGATION_SCALARS,
+                Schedule(
+                    total_steps=1_000_000,
+                    random_steps=1_000,
+                    learn_after=1_000,
+                    guidance_until=500_000,
+                    eval_every=50_000,
+                    eval_steps=50_000,
+                    eval_envs=250,
+                    checkpoint_every=100_000,
+                ),
+            ),
+            labels=(100, 350, 500),
+            seeds=16,
+        ),
+        "quickstart": Preset(
+            "few worlds, small networks: minutes on two CPU cores",
+            RunConfig(
+                NavigationConfig(worlds=128),
+                dataclasses.replace(
+                    NAVIGATION_SIZES,
+                    q_layers=(128, 128),
+                    feedback_layers=(128, 128),
+                    directions=36,
+                    target_directions=12,
+                    batch_size=64,
+                    replay_capacity=50_000,
+                    fit_steps=400,
+                    fit_batch_size=64,
+                ),
+                dataclasses.replace(NAVIGATION_SCALARS, learning_rate=0.003),
+                Schedule(
+                    total_steps=6_000,
+                    random_steps=1_000,
+                    learn_after=1_000,
+                    guidance_until=6_000,
+                    eval_every=1_000,
+                    eval_steps=10_000,
+                    eval_envs=50,
+                    checkpoint_every=3_000,
+                ),
+            ),
+            guidance=("none", "relative"),
+            labels=(350,),
+            seeds=4,
+            first_seed=1000,  # the settings were chosen on seeds below
+        ),
+    },
+)

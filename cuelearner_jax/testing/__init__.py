@@ -1,0 +1,11 @@
+"""Conformance checks for the parts of one's own: each raises AssertionError with one line that says what to mend.
+
+A check compiles once or twice and takes seconds; call it from a test, with a world as small as there is.
+"""
+
+from cuelearner_jax.testing.environments import check_environment
+from cuelearner_jax.testing.guidances import check_guidance
+from cuelearner_jax.testing.policies import check_policy
+from cuelearner_jax.testing.tasks import check_task
+
+__all__ = ["check_environment", "check_guidance", "check_policy", "check_task"]

@@ -1,0 +1,170 @@
+"""The laws of a kind of guidance (`cuelearner_jax.guidance.kind.Kind`), held against it in one environment."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jaxtyping import Array, Float
+
+from cuelearner_jax.config import GuideScalars, GuideSizes, Scalars
+from cuelearner_jax.environment import Environment, actions_of, offers, spaces_of
+from cuelearner_jax.guidance.bundle import AnswerForm, Guidance
+from cuelearner_jax.guidance.kind import Kind
+from cuelearner_jax.testing.laws import Laws, Traced, changed
+from cuelearner_jax.types import EnvState, GuidanceModel, Label
+
+SMALL = GuideSizes(feedback_layers=(8, 8), labels_per_round=4, fit_steps=8, fit_batch_size=4, validate_every=4)
+ROWS = 6  # situations, of which every second is guided; as many labels
+
+
+class Steady(struct.PyTreeNode):
+    """A teacher that always holds one action for best."""
+
+    action: Float[Array, " action"]
+
+    def best_action(self, state: EnvState, obs: Float[Array, " obs"]) -> Float[Array, " action"]:
+        """That action."""
+        return self.action
+
+
+def check_guidance(kind: Kind, env: Environment, sizes: GuideSizes = SMALL, tolerance: float = 1e-5) -> None:
+    """Holds a kind of guidance against its laws.
+
+    Args:
+        kind: the kind.
+        env: an environment that it can be had in.
+        sizes: of its model, small.
+        tolerance: relative and absolute, of actions.
+
+    Raises:
+        AssertionError: the first law that is broken.
+    """
+    laws = Laws(f"guidance {kind.name}", tolerance)
+    for need in kind.needs:
+        laws.hold(offers(env, need), f"it needs a {need}, which {type(env).__name__} lacks: check it in another one")
+    with laws.attempted("`make`", "it gets GuideSizes and Spaces, and returns a Guidance"):
+        guidance = kind.make(sizes, spaces_of(env))
+    laws.hold(guidance.name == kind.name, f"its bundle is called {guidance.name!r}: give both one name")
+    laws.hold(guidance.form == kind.form, "its bundle has another form of answers than its kind: give both the same")
+    key = jax.random.key(0)
+    model = _unfitted(laws, guidance, key)
+    states, obs = jax.vmap(env.reset)(jax.random.split(key, ROWS))
+    actions = actions_of(env).uniform(key, (ROWS,))
+    if guidance.form is not None:
+        labels = _answered(laws, guidance, guidance.form, env, states, obs, actions)
+        fitted = _fitted(laws, guidance, env, model, labels)
+    else:
+        fitted = model
+    _check_act(laws, guidance, env, model, fitted, obs, actions)
+    _check_question(laws, guidance, env, fitted, obs, actions)
+
+
+def _unfitted(laws: Laws, guidance: Guidance, key: Array) -> GuidanceModel:
+    with laws.attempted("`init`", "it gets a key and returns a GuidanceModel"):
+        model = guidance.init(key)
+    laws.hold(isinstance(model, GuidanceModel), f"`init` returns a {type(model).__name__}: return a GuidanceModel")
+    laws.hold(
+        np.shape(model.fitted) == () and not np.asarray(model.fitted),
+        "`init` returns a fitted model: `fitted` is one False until labels have been fitted",
+    )
+    laws.hold(laws.same(model, guidance.init(key)), "`init` of one key gives two models: draw from the key alone")
+    return model
+
+
+def _answered(
+    laws: Laws, guidance: Guidance, form: AnswerForm, env: Any, states: Any, obs: Array, actions: Array
+) -> Label:
+    """Labels (rows, ...) by a simulated teacher."""
+    named = re.fullmatch(r"[a-z][a-z0-9_-]*", form.name) and form.meaning
+    laws.hold(named, f"its form {form.name!r} lacks a name in lower case or a meaning: label files tell both")
+    laws.hold(form.width > 0, f"answers of its form have {form.width} entries: give a positive width")
+    teacher = Steady(actions_of(env).spread(8)[3])
+
+    def each(key: Array, state: Any, obs: Array, action: Array) -> tuple[Array, Array]:
+        return form.answer(key, teacher, state, obs, action, Scalars())
+
+    with laws.attempted("its form's `answer`", "it returns (answer, answered), in jax.numpy"):
+        answers, answered = jax.jit(jax.vmap(each))(jax.random.split(jax.random.key(1), ROWS), states, obs, actions)
+    laws.hold(
+        answers.shape == (ROWS, form.width), f"an answer has shape {answers.shape[1:]}: its form says ({form.width},)"
+    )
+    laws.hold(answered.shape == (ROWS,) and answered.dtype == bool, "`answered` is no bool: say whether it answered")
+    labels = Label(obs, actions, answers, answered)
+    with laws.attempted("`target` under vmap", "it gets one Label and GuideScalars, and returns a vector"):
+        targets = jax.vmap(lambda label: guidance.target(label, GuideScalars()))(labels)
+    laws.hold(
+        targets.ndim == 2 and np.isfinite(targets).all(),
+        f"`target` of one label has shape {targets.shape[1:]} or is not finite: return one finite vector",
+    )
+    return labels
+
+
+def _fitted(laws: Laws, guidance: Guidance, env: Any, model: GuidanceModel, labels: Label) -> GuidanceModel:
+    """The model of labels, fitted beside a lane that has none."""
+    lanes = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), labels)
+    lanes = lanes.replace(valid=lanes.valid.at[1].set(False))
+    former = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), model)
+    keys = jax.random.split(jax.random.key(2), 2)
+
+    def fit(key: Array, labels: Label, former: GuidanceModel, env: Any, scalars: GuideScalars) -> GuidanceModel:
+        return guidance.fit(key, env, labels, former, scalars)
+
+    with laws.attempted("`fit` under jit and vmap", "it is one lane's: no Python branch may look at a value"):
+        fits = jax.jit(jax.vmap(fit, (0, 0, 0, None, None)))(keys, lanes, former, env, GuideScalars())
+    shapes = [[np.shape(leaf) for leaf in jax.tree.leaves(tree)] for tree in (fits, former)]
+    same = jax.tree.structure(fits) == jax.tree.structure(former) and shapes[0] == shapes[1]
+    laws.hold(same, "`fit` returns a model of other fields or shapes than `init`: lanes carry it through a scan")
+    laws.hold(fits.fitted[0], "`fit` of valid labels returns an unfitted model: set `fitted`")
+    laws.hold(not fits.fitted[1], "`fit` without a valid label returns a fitted model: `fitted` must be False there")
+    one = jax.tree.map(lambda leaf: leaf[0], fits)
+    finite = all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(one.params))
+    laws.hold(finite, "`fit` returns parameters that are not finite")
+    return one
+
+
+def _check_act(
+    laws: Laws,
+    guidance: Guidance,
+    env: Any,
+    unfitted: GuidanceModel,
+    fitted: GuidanceModel,
+    obs: Array,
+    actions: Array,
+) -> None:
+    """What it does to a batch of actions."""
+    active, act = jnp.arange(ROWS) % 2 == 0, Traced(guidance.act)
+    scalars = GuideScalars()
+    with laws.attempted("`act` under jit", "it gets a batch of rows and returns Refined(actions, passes)"):
+        refined = act(fitted, env, obs, actions, active, scalars)
+        act(fitted, env, obs, actions, active, changed(scalars))
+        passes = refined.passes
+    laws.hold(act.traces == 1, "`act` is traced anew for other scalars: no Python branch may look at them")
+    laws.hold(refined.actions.shape == actions.shape, f"`act` returns actions of shape {refined.actions.shape}")
+    laws.actions(actions_of(env), refined.actions, "an action that `act` returns")
+    laws.hold(
+        passes.shape == (ROWS,) and jnp.issubdtype(passes.dtype, jnp.integer),
+        "`act` returns passes that are no count for each row: how often was each moved?",
+    )
+    exact = Laws(laws.subject, 0.0)
+    laws.hold(
+        exact.same(refined.actions[~active], actions[~active]),
+        "`act` changes rows that are not active: keep them by jnp.where(active[:, None], ...)",
+    )
+    if guidance.asks:
+        everywhere = jnp.ones(ROWS, bool)
+        alone = act(unfitted, env, obs, actions, everywhere, scalars).actions
+        laws.hold(
+            exact.same(alone, actions), "`act` of an unfitted model changes actions: guide only active & model.fitted"
+        )
+
+
+def _check_question(laws: Laws, guidance: Guidance, env: Any, model: GuidanceModel, obs: Array, actions: Array) -> None:
+    with laws.attempted("`question` under jit", "it gets one situation and the base policy's action there"):
+        asked = jax.jit(guidance.question)(jax.random.key(3), model, env, obs[0], actions[0], GuideScalars())
+    laws.hold(asked.shape == actions[0].shape, f"`question` returns shape {asked.shape}: ask about one action")
+    laws.actions(actions_of(env), asked, "what `question` asks about")

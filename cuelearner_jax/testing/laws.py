@@ -1,0 +1,120 @@
+"""What the checks share: a law that holds or is told in one line, equal arrays, actions of a space, counted traces."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from cuelearner_jax.actions import Actions
+
+
+class Laws:
+    """Laws of one subject."""
+
+    def __init__(self, subject: Any, tolerance: float) -> None:
+        """`subject`: what messages begin with, a string or an object whose class is named."""
+        self.subject = subject if isinstance(subject, str) else type(subject).__name__
+        self.tolerance = tolerance
+
+    def hold(self, law: Any, broken: str) -> None:
+        """Raises AssertionError with what is broken, and how to mend it, unless the law holds."""
+        if not law:
+            raise AssertionError(f"{self.subject}: {broken}")
+
+    @contextmanager
+    def attempted(self, deed: str, mend: str) -> Iterator[None]:
+        """Raises AssertionError in one line in place of whatever the subject's own code raises."""
+        try:
+            yield
+        except AssertionError:
+            raise
+        except Exception as error:
+            told = (str(error).strip().splitlines() or [""])[0][:160]
+            raise AssertionError(f"{self.subject}: {deed} fails ({type(error).__name__}: {told}): {mend}") from error
+
+    def same(self, one: Any, other: Any) -> bool:
+        """Are two trees of arrays equal, within the tolerance? Keys are compared by their words."""
+        pairs = zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True)
+        return all(
+            np.shape(a) == np.shape(b) and np.allclose(a, b, self.tolerance, self.tolerance, equal_nan=True)
+            for a, b in ((_numbers(a), _numbers(b)) for a, b in pairs)
+        )
+
+    def actions(self, space: Actions, actions: Any, called: str) -> None:
+        """Raises AssertionError unless rows (..., size) are actions of a space."""
+        shape = np.shape(actions)
+        self.hold(
+            shape[-1:] == (space.size,), f"{called} has shape {shape}: an action has {space.size} entries, in one axis"
+        )
+        self.hold(np.isfinite(actions).all(), f"{called} is not finite everywhere: give an action in every situation")
+        self.hold(
+            self.same(space.retract(jnp.asarray(actions)), actions),
+            f"{called} is no action of the space: pass it through the space's `retract` (directions: unit length)",
+        )
+
+
+class Traced:
+    """A function compiled by `jax.jit` that counts how often it was traced."""
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        """Compiles nothing yet."""
+        self.traces = 0
+
+        def counted(*arguments: Any) -> Any:
+            self.traces += 1
+            return function(*arguments)
+
+        self._compiled = jax.jit(counted)
+
+    def __call__(self, *arguments: Any) -> Any:
+        """The function's result."""
+        return self._compiled(*arguments)
+
+
+def pytree(laws: Laws, subject: Any, called: str) -> None:
+    """Raises AssertionError unless something is a pytree of numbers whose static fields can be compared."""
+    leaves, tree = jax.tree.flatten(subject)
+    laws.hold(
+        not (len(leaves) == 1 and leaves[0] is subject),
+        f"{called} is no pytree: derive its class from flax.struct.PyTreeNode",
+    )
+    for path, leaf in jax.tree_util.tree_leaves_with_path(subject):
+        laws.hold(
+            isinstance(leaf, jax.Array | np.ndarray | np.generic | bool | int | float),
+            f"field {jax.tree_util.keystr(path).lstrip('.')} is of type {type(leaf).__name__}, which is not traced: "
+            "make it an array, or static by struct.field(pytree_node=False)",
+        )
+    with laws.attempted("hashing its static fields", "a static field must be hashable: a number, a string, a tuple"):
+        for static in _statics(tree):
+            hash(static)
+        again = jax.tree.structure(subject)
+        laws.hold(tree == again, f"{called} differs from itself: static fields must compare equal to themselves")
+
+
+def changed(tree: Any) -> Any:
+    """The same with another value of every float: what a changed world is to a compiled program."""
+
+    def other(leaf: Any) -> Any:
+        return leaf * 1.01 if jnp.issubdtype(jnp.asarray(leaf).dtype, jnp.floating) else leaf
+
+    return jax.tree.map(other, tree)
+
+
+def _statics(tree: Any) -> Iterator[Any]:
+    """What the static fields hold, of all nodes of a tree's structure that are not Python's own containers."""
+    node = tree.node_data()
+    if node is not None and node[0] not in (dict, list, tuple):
+        yield node[1]
+    for child in tree.children():
+        yield from _statics(child)
+
+
+def _numbers(leaf: Any) -> np.ndarray:
+    if jnp.issubdtype(getattr(leaf, "dtype", np.float32), jax.dtypes.prng_key):
+        leaf = jax.random.key_data(leaf)
+    return np.asarray(leaf)

@@ -1,0 +1,73 @@
+"""The laws of a policy (`cuelearner_jax.policies.Policy`), held against it in one environment."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from cuelearner_jax.environment import Environment, actions_of
+from cuelearner_jax.policies import BY_LANE, SHARED, Policy
+from cuelearner_jax.testing.laws import Laws, Traced, changed, pytree
+
+ROWS = 9
+
+
+def check_policy(policy: Policy, env: Environment, tolerance: float = 1e-5) -> None:
+    """Holds a policy against its laws.
+
+    Args:
+        policy: one policy, as `evaluate.evaluate_policy` takes it.
+        env: the environment that it acts in.
+        tolerance: relative and absolute, of actions.
+
+    Raises:
+        AssertionError: the first law that is broken.
+    """
+    laws = Laws(policy, tolerance)
+    pytree(laws, policy, "the policy")
+    leaves, tree = jax.tree.flatten(policy)
+    with laws.attempted("rebuilding it from its leaves", "its constructor must take whatever stands for its fields"):
+        policy = jax.tree.unflatten(tree, leaves)
+    _check_axes(laws, policy)
+    keys = jax.random.split(jax.random.key(0), ROWS)
+    states, obs = jax.vmap(env.reset)(keys)
+    act = Traced(lambda policy, key, states, obs: policy.act(key, states, obs))
+    with laws.attempted("`act` under jit", "it gets a key, states and observations (n, obs), all traced"):
+        actions = act(policy, keys[0], states, obs)
+        other = act(policy, keys[1], states, obs)
+        again = act(policy, keys[0], states, obs)
+        act(changed(policy), keys[0], states, obs)
+    laws.hold(act.traces == 1, "other values of its floats are traced anew: keep them out of static fields")
+    size = actions_of(env).size
+    shape = np.shape(actions)
+    laws.hold(shape == (ROWS, size), f"`act` returns shape {shape} for {ROWS} observations: return {(ROWS, size)}")
+    laws.actions(actions_of(env), actions, "an action that `act` returns")
+    laws.hold(laws.same(actions, again), "the same key gives other actions: draw all random numbers from the key")
+    first = jax.tree.map(lambda leaf: leaf[:1], states)
+    with laws.attempted("`act` of one observation", "n may be 1"):
+        alone = act(policy, keys[0], first, obs[:1])
+    laws.hold(
+        np.shape(alone) == (1, size), f"`act` returns shape {np.shape(alone)} for 1 observation: return {(1, size)}"
+    )
+    laws.actions(actions_of(env), alone, "the action for one observation")
+    if laws.same(actions, other):  # where actions are drawn, rows of another order are drawn anew
+        order = jnp.roll(jnp.arange(ROWS), 4)
+        turned = act(policy, keys[0], jax.tree.map(lambda leaf: leaf[order], states), obs[order])
+        laws.hold(
+            laws.same(turned, actions[order]) and laws.same(alone, actions[:1]),
+            "the action in one situation depends on the others of the batch: rows must not look at each other",
+        )
+
+
+def _check_axes(laws: Laws, policy: Any) -> None:
+    """`axes` is a prefix of the policy, with `BY_LANE` or `SHARED` in place of fields."""
+
+    def known(axis: Any, part: Any) -> bool:
+        return axis is SHARED or (isinstance(axis, int) and axis == BY_LANE) or axis is part
+
+    with laws.attempted("`axes`", "give the policy with BY_LANE or SHARED in place of its fields: self.replace(...)"):
+        found = jax.tree.map(known, policy.axes, policy, is_leaf=lambda leaf: leaf is None)
+    laws.hold(all(jax.tree.leaves(found)), "`axes` holds something else than BY_LANE and SHARED: replace every field")

@@ -1,0 +1,115 @@
+"""The laws of a task (`cuelearner_jax.task.Task`): what its presets, scenarios, teacher and pictures must be."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from cuelearner_jax.config import check
+from cuelearner_jax.environment import actions_of
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.evaluate import SPLITS
+from cuelearner_jax.guidance import registry
+from cuelearner_jax.policies import uniform_in
+from cuelearner_jax.runs import filming
+from cuelearner_jax.runs.grid import Grid, check_grid
+from cuelearner_jax.task import Task, shape_of
+from cuelearner_jax.testing.environments import check_environment
+from cuelearner_jax.testing.laws import Laws
+
+FILMED = 3  # steps
+
+
+def check_task(
+    task: Task, small: Any = None, steps: int = 64, pictures: Path | None = None, tolerance: float = 1e-5
+) -> None:
+    """Holds a task against its laws. Without a small world nothing is compiled.
+
+    Args:
+        task: the task.
+        small: a configuration of it that compiles quickly: its environment is checked, its teacher asked.
+        steps: of that environment's roll-out.
+        pictures: an empty folder, for pictures of the small world (default: none are drawn).
+        tolerance: as `check_environment` has it.
+
+    Raises:
+        AssertionError: the first law that is broken.
+    """
+    laws = Laws(f"task {task.name}", tolerance)
+    laws.hold(task.about, "it says nothing of itself: fill `about`, for help pages")
+    for name, preset in task.presets.items():
+        with laws.attempted(f"preset {name!r}", "its values must pass cuelearner_jax.config.check"):
+            check(preset.config)
+            check_grid(Grid(preset.guidance or ("none",), (preset.first_seed,), preset.labels))
+        env = _shapes(laws, task, preset.config.task, f"preset {name!r}")
+        possible = registry.possible(env, taught=task.teacher is not None)
+        odd = [kind for kind in preset.guidance if registry.find(kind).name not in possible]
+        laws.hold(not odd, f"preset {name!r} compares guidance {odd[:1]}, which it cannot have: of {list(possible)}")
+        _check_splits(laws, task, preset.config.task, name)
+        _check_scenarios(laws, task, preset.config.task, env.obs_size)
+    if small is not None:
+        laws.hold(isinstance(small, task.config), f"`small` is a {type(small).__name__}: give a {task.config.__name__}")
+        check_environment(task.environment(small), steps, tolerance=tolerance)
+        _check_teacher(laws, task, small)
+    if pictures is not None:
+        laws.hold(small is not None, "pictures are of the small world: give `small`")
+        _check_pictures(laws, task, small, pictures)
+
+
+def _shapes(laws: Laws, task: Task, config: Any, called: str) -> Any:
+    with laws.attempted(f"the environment of {called}", "it must follow from the configuration alone"):
+        return shape_of(task, config)
+
+
+def _check_splits(laws: Laws, task: Task, config: Any, name: str) -> None:
+    """Training, tuning and validation are one compiled program."""
+
+    def seen(split: str) -> Any:
+        env = jax.eval_shape(lambda: task.environment(config, split))
+        return jax.tree.structure(env), [(leaf.shape, leaf.dtype) for leaf in jax.tree.leaves(env)]
+
+    with laws.attempted(f"an environment of the splits of preset {name!r}", f"make one of training and of {[*SPLITS]}"):
+        same = all(seen(split) == seen("training") for split in SPLITS)
+    laws.hold(same, f"preset {name!r} has environments of other shapes for other splits: only values may differ")
+
+
+def _check_scenarios(laws: Laws, task: Task, config: Any, obs_size: int) -> None:
+    for name, scenario in task.scenarios.items():
+        world = _shapes(laws, task, scenario.applied(config), f"scenario {name!r}")
+        laws.hold(
+            world.obs_size == obs_size,
+            f"scenario {name!r} has observations of {world.obs_size} entries, not {obs_size}: policies must act in it",
+        )
+
+
+def _check_teacher(laws: Laws, task: Task, config: Any) -> None:
+    if task.teacher is None:
+        return
+    env = task.environment(config)
+
+    @jax.jit
+    def asked(env: Any, key: jax.Array) -> jax.Array:
+        return task.make_teacher(config, env).best_action(*env.reset(key))
+
+    with laws.attempted("its teacher's best_action", "it gets one state and its observation, in jax.numpy"):
+        action = asked(env, jax.random.key(0))
+    laws.hold(action.ndim == 1, f"its teacher answers an action of shape {action.shape}: give one action")
+    laws.actions(actions_of(env), action, "its teacher's best action")
+
+
+def _check_pictures(laws: Laws, task: Task, config: Any, folder: Path) -> None:
+    """A film, a still and a question of a few random steps."""
+    try:
+        drawn = task.pictures()
+    except UserError as error:
+        raise AssertionError(f"{laws.subject}: {error}") from error
+    env = task.environment(config, "validation")
+    policy, files = uniform_in(env), filming.files(folder, task.name, "gif")
+    with laws.attempted("drawing", "see cuelearner_jax.task.Pictures for what each of its functions gets"):
+        rewards = filming.film(drawn, env, policy, 0, FILMED, files)
+        filming.question(drawn, env, policy, 0, files.question)
+    laws.hold(len(rewards) == FILMED, f"`record` returns {len(rewards)} rewards of {FILMED} steps: one a step")
+    for file in files:
+        laws.hold(file.is_file() and file.stat().st_size, f"{file.name} was not written: write the file that is named")

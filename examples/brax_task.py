@@ -1,0 +1,90 @@
+"""A brax environment as a task: an inverted pendulum on a cart, pushed left or right by the x of a direction.
+
+Nobody answers here, so kinds of guidance that ask a teacher are refused; the obvious action, pushing to where the pole
+leans, can guide. Run in the folder above this one:
+
+    cuelearner train examples.brax_task:TASK --guidance heuristic --out runs/pendulum
+    cuelearner evaluate runs/pendulum --task examples.brax_task:TASK --envs 10 --steps 2000
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+from brax import envs
+from jaxtyping import Array, Float
+
+from cuelearner_jax.brax_bridge.adapter import BraxTask, from_brax
+from cuelearner_jax.config import RunConfig, Scalars, Schedule, Sizes
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.task import Body, Preset, Task
+
+
+@dataclass(frozen=True)
+class PendulumConfig:
+    """An inverted pendulum. Every field is an option `--task.…`, the line below it its help."""
+
+    max_steps: int = 200
+    """Steps after which an episode is truncated."""
+    backend: Literal["spring", "positional", "generalized"] = "spring"
+    """Which of brax's physics."""
+
+
+@cache
+def _made(backend: str) -> envs.Env:
+    """One object for each physics: it is a constant of what is compiled, and another one is compiled anew."""
+    with jax.ensure_compile_time_eval():  # it holds arrays, and may be asked for while something is traced
+        return envs.get_environment("inverted_pendulum", backend=backend)
+
+
+def toward_the_lean(obs: Float[Array, " obs"]) -> Float[Array, "2"]:
+    """The obvious action: push the cart to where the pole leans (the second entry is its angle)."""
+    return jnp.stack([jnp.where(obs[1] > 0, 1.0, -1.0), jnp.zeros(())])
+
+
+def make_environment(config: PendulumConfig, split: str = "training") -> BraxTask:
+    """The environment of a configuration."""
+    if config.max_steps < 1:
+        raise UserError(f"task.max_steps is {config.max_steps}: give a positive number")
+    return from_brax(_made(config.backend), max_steps=config.max_steps, heuristic=toward_the_lean)
+
+
+TASK = Task(
+    name="pendulum",
+    about="brax's inverted pendulum: a push a step keeps the pole up",
+    config=PendulumConfig,
+    bodies=(Body("cart", "brax's own", make_environment),),
+    presets={
+        "quickstart": Preset(
+            "small networks: a minute or two on two CPU cores",
+            RunConfig(
+                PendulumConfig(),
+                Sizes(
+                    q_layers=(64, 64),
+                    directions=12,
+                    target_directions=12,
+                    num_envs=10,
+                    batch_size=64,
+                    replay_capacity=20_000,
+                    optimizer="adam",
+                ),
+                Scalars(learning_rate=0.003, discount=0.95, max_grad_norm=10.0, polyak=0.05),
+                Schedule(
+                    total_steps=4_000,
+                    random_steps=500,
+                    learn_after=500,
+                    guidance_until=2_000,
+                    eval_every=1_000,
+                    eval_steps=2_000,
+                    eval_envs=10,
+                    checkpoint_every=2_000,
+                ),
+            ),
+            seeds=2,
+        )
+    },
+)

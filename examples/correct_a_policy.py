@@ -1,0 +1,40 @@
+"""Any function of observations, corrected by a teacher's "more to the left", "more to the right", "already right".
+
+    python examples/correct_a_policy.py
+
+The policy walks to the goal with a compass that is 40 degrees off. Prints its success rate and that of the refined one
+over validation episodes. Two to three minutes on 2 cores.
+"""
+
+import numpy as np
+
+import cuelearner_jax as cl
+from cuelearner_jax.evaluate import episodes, evaluate_policy
+from cuelearner_jax.face.acting import as_policy
+
+ANGLE = np.radians(40.0)
+TURN = np.array([[np.cos(ANGLE), -np.sin(ANGLE)], [np.sin(ANGLE), np.cos(ANGLE)]])
+
+
+def compass(obs):
+    """Directions (n, 2) for observations (n, 280): entries 271 and 272 point to the goal."""
+    return obs[:, 271:273] @ TURN.T
+
+
+def main(worlds=64, labels=200, episodes_measured=100):
+    """Success rates before and after so many answers."""
+    world = cl.make("navigation", style="clutter", worlds=worlds)
+    teacher = cl.teacher_of(world)
+    model = cl.ask(compass, world, teacher, labels=labels, eps_deg=20.0, bound_deg=90.0)
+    better = cl.refine(compass, model)
+    env, key = world.environment("validation"), episodes()
+    rates = []
+    for name, policy in (("compass", as_policy(compass)), ("refined", better.policy)):
+        found = evaluate_policy(env, policy, key, episodes_measured, 200 * episodes_measured)
+        rates.append(float(found["success"]))
+        print(f"{name}: success {rates[-1]:.2f}, collision {float(found['collision']):.2f}")
+    return rates
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,136 @@
+"""A task of the user's own, in a file beside: trained, evaluated, and never loaded because a run folder names it."""
+
+import importlib
+import json
+import sys
+
+import pytest
+
+from cuelearner_jax.cli import main
+from cuelearner_jax.records import results
+from cuelearner_jax.tasks import registry
+
+OWN = """
+import dataclasses
+from probes import CONFIG, make_task
+from cuelearner_jax.task import Preset, Scenario
+
+TASK = dataclasses.replace(
+    make_task(),
+    presets={"small": Preset("seconds", CONFIG, labels=(10,))},
+    scenarios={"narrow": Scenario("a narrow window", {"half_width_deg": 5.0})},
+)
+MUTE = dataclasses.replace(TASK, name="mute", teacher=None)
+"""
+EVALUATE = ["--policy", "uniform", "--steps", "20", "--envs", "10"]
+
+
+def forget():
+    registry._registered.clear()
+    sys.modules.pop("own_window", None)
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("home")
+    (folder / "own_window.py").write_text(OWN)
+    return folder
+
+
+@pytest.fixture(autouse=True)
+def there(home, monkeypatch):
+    """In the folder of the file, in a process that has not met the task."""
+    monkeypatch.chdir(home)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    forget()
+    yield
+    forget()
+
+
+@pytest.fixture
+def run(home):
+    """A finished run of the task."""
+    out = home / "run"
+    if not out.exists():
+        assert main(["train", "own_window:TASK", "--guidance", "none", "--out", str(out)]) == 0
+        forget()
+    return out
+
+
+def test_a_run_says_where_its_task_is_from(run):
+    described = json.loads((run / "config.json").read_text())
+    assert described["task"] == {"name": "window", "from": "own_window:TASK", "half_width_deg": 28.0}
+    assert results.read(run).to_pylist()[0]["task"] == "window"
+
+
+def test_a_file_does_not_have_code_loaded(run, refused, tmp_path):
+    for command in ("evaluate", "render"):
+        says = "not loaded because a file names it: add --task own_window:TASK if you trust that code"
+        refused([command, run, *(["--out", tmp_path / "new"] if command == "render" else [])], says, run)
+    assert "own_window" not in sys.modules
+    assert main(["evaluate", str(run), "--task", "own_window:TASK", *EVALUATE]) == 0
+    assert main(["evaluate", str(run), *EVALUATE]) == 0  # known to this process now
+
+
+def test_what_names_code_in_a_file_must_look_like_it(run, refused, tmp_path):
+    described = json.loads((run / "config.json").read_text())
+    described["task"]["from"] = "x; rm -r ~"
+    (tmp_path / "config.json").write_text(json.dumps(described))
+    refused(["evaluate", tmp_path], "damaged or of another program", tmp_path)
+
+
+def test_a_run_goes_on_wherever_its_task_has_moved(run, home):
+    (home / "own_moved.py").write_text(OWN)
+    command = ["--guidance", "none", "--out", str(run), "--resume"]
+    assert main(["train", "--task", "own_moved:TASK", *command]) == 0
+    assert json.loads((run / "config.json").read_text())["task"]["from"] == "own_window:TASK"
+
+
+def test_where_a_task_is_from_changes_no_hash(run, home, tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(home)
+    registry.register(importlib.import_module("own_window").TASK)
+    assert main(["train", "window", "--guidance", "none", "--out", str(tmp_path / "again")]) == 0
+    assert "from" not in json.loads((tmp_path / "again" / "config.json").read_text())["task"]
+    here, there = ({row["config_hash"] for row in results.read(out).to_pylist()} for out in (run, tmp_path / "again"))
+    assert here == there
+
+
+def test_a_scenario_is_the_ground_for_options(run, tmp_path):
+    worlds = []
+    for number, option in enumerate(([], ["--scenario", "narrow"], ["--task.half-width-deg", "9"])):
+        out = tmp_path / f"{number}.json"
+        given = [*option, *(["--scenario=narrow"] if number == 2 else [])]
+        assert main(["evaluate", "--task=own_window:TASK", *EVALUATE, *given, "--out", str(out)]) == 0
+        worlds.append(json.loads(out.read_text()))
+    assert [world["world"]["half_width_deg"] for world in worlds] == [28.0, 5.0, 9.0]
+    assert [world.get("scenario") for world in worlds] == [None, "narrow", "narrow"]
+    assert [world["subject"] for world in worlds] == ["window"] * 3
+
+
+def test_what_cannot_be_is_refused(run, refused, tmp_path):
+    new = ["--out", tmp_path / "new"]
+    refused(["render", "own_window:TASK", "--policy", "uniform", *new], "window has no pictures of point", tmp_path)
+    refused(["train", "own_window:MUTE", "--guidance", "relative", *new], "mute has no teacher to ask", tmp_path)
+    refused(["train", "own_window:TASKS", *new], "own_window has no 'TASKS', did you mean 'TASK'", tmp_path)
+    refused(["train", "billiards", "--task", "navigation", *new], "the task is named twice", tmp_path)
+    refused(["train", "--task", "billiards", "--task", "navigation", *new], "--task is given twice", tmp_path)
+    refused(["train", "--task"], "--task needs a name", tmp_path)
+    refused(["evaluate", "own_window:TASK", "--scenario", "narow"], "did you mean 'narrow'", tmp_path)
+    forget()
+    refused(["evaluate", run, "--task", "own_window:MUTE"], "add --task own_window:TASK", run)
+    registry.resolve("own_window:TASK")
+    refused(["evaluate", run, "--task", "own_window:MUTE"], "is a run of window, not of mute: leave out --task", run)
+
+
+def test_help_names_what_there_is_to_choose_from(capsys):
+    for command in ("train", "sweep", "evaluate", "render"):
+        with pytest.raises(SystemExit) as stop:
+            main([command, "own_window:TASK", "--help"])
+        assert stop.value.code == 0
+        told = capsys.readouterr().out
+        for text in (
+            "  small  seconds",
+            "  narrow  a narrow window (--task.half-width-deg 5.0)",
+            "  relative   a model of",
+        ):
+            assert text in told

@@ -1,0 +1,238 @@
+"""Navigation by the quadruped: the contract of the simple robot's environment, its sensor, C MuJoCo's own episodes."""
+
+import importlib.util
+import math
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from cuelearner_envs.anymal import judged
+from cuelearner_envs.anymal import model as robot
+from cuelearner_envs.anymal.environment import SENSOR_NOISE, make_environment
+from cuelearner_envs.navigation.config import NavigationConfig
+from cuelearner_envs.navigation.config import make_environment as make_simple
+from cuelearner_envs.navigation.lidar import scan, scan_tilted
+from cuelearner_envs.navigation.world import World
+from cuelearner_jax import actions
+from cuelearner_jax.policies import Heuristic
+
+WALKERS = 4
+CONFIG = NavigationConfig(worlds=8, max_steps=3)
+
+begin = jax.jit(lambda env, keys: jax.vmap(env.reset)(keys))
+look = jax.jit(scan_tilted)
+
+
+@pytest.fixture(scope="module")
+def env():
+    return make_environment(CONFIG)
+
+
+@pytest.fixture(scope="module")
+def walked(env):
+    """Four quadrupeds after two steps straight ahead: one usual, one at its goal, one in a wall, one on its side."""
+    state, _ = begin(env, jax.random.split(jax.random.key(0), WALKERS))
+    qpos = np.array(state.body.qpos)
+    qpos[2, 0] = 50.0
+    qpos[3, 3:7] = np.cos(0.8), np.sin(0.8), 0, 0
+    state = state.replace(
+        body=state.body.replace(qpos=jnp.asarray(qpos)), goal=state.goal.at[1].set(state.body.qpos[1, :2])
+    )
+    told = jnp.tile(jnp.array([1.0, 0.0]), (WALKERS, 1))
+    step = jax.jit(jax.vmap(env.step))
+    keys = jax.random.split(jax.random.key(1), WALKERS)
+    following, first = step(keys, state, told)
+    later, second = step(keys, following, told)
+    last, third = step(keys, later, told)
+    return [state, following, later, last], [first, second, third]
+
+
+def test_agents_see_the_same_as_on_the_simple_robot(env):
+    assert env.obs_size == make_simple(CONFIG).obs_size
+    _, obs = begin(env, jax.random.split(jax.random.key(0), WALKERS))
+    assert obs.shape == (WALKERS, env.obs_size)
+
+
+def test_every_end_has_its_name(walked):
+    _, (first, _, _) = walked
+    outcome = {name: np.asarray(value).tolist() for name, value in first.outcome.items() if name != "duration"}
+    assert outcome == {
+        "success": [0, 1, 0, 0],
+        "collision": [0, 0, 1, 0],
+        "fall": [0, 0, 0, 1],
+        "timeout": [0, 0, 0, 0],
+    }
+    np.testing.assert_allclose(first.reward, [0, 10, -10, -10])
+    assert np.asarray(first.terminated).tolist() == [False, True, True, True]
+
+
+def test_time_runs_out_without_a_termination(walked):
+    _, (_, _, third) = walked
+    assert bool(third.truncated[0])
+    assert not bool(third.terminated[0])
+    assert float(third.outcome["duration"][0]) == pytest.approx(0.6)
+
+
+def test_told_straight_ahead_it_walks_straight_ahead(walked):
+    (before, _, after, _), _ = walked
+    start, end = before.body.qpos[0], after.body.qpos[0]
+    ahead = actions.from_angle(robot.planar_pose(start)[2])
+    way = float(jnp.sum((end[:2] - start[:2]) * ahead))
+    aside = float(jnp.abs(jnp.sum((end[:2] - start[:2]) * actions.rotate(ahead, math.pi / 2))))
+    assert 0.15 < way < 0.42  # 0.4 s at up to 1 m/s, from rest
+    assert aside < 0.1
+
+
+def test_after_an_end_an_episode_begins_anew_standing_on_a_route(env, walked):
+    (_, following, _, _), _ = walked
+    for number in (1, 2, 3):
+        start = env.worlds.starts[following.world[number], following.route[number]]
+        np.testing.assert_allclose(following.body.qpos[number, :2], start)
+        assert int(following.steps[number]) == 0
+        assert not bool(following.fallen[number])
+    assert int(following.steps[0]) == 1
+
+
+def test_replay_recalls_what_was_seen(env, walked):
+    states, steps = walked
+    state = jax.tree.map(lambda leaf: leaf[0], states[1])
+    seen = steps[0].obs[0]
+    memory = env.remember(state, seen)
+    np.testing.assert_allclose(jax.jit(env.recall)(memory), seen, atol=1e-6)
+    after = jax.jit(env.recall_next)(memory, jnp.array([1.0, 0.0]), steps[1].aftermath[0])
+    np.testing.assert_allclose(after, steps[1].final_obs[0], atol=1e-6)
+
+
+def test_all_that_is_carried_is_small(walked):
+    (state, *_), _ = walked
+    body = sum(leaf.size for leaf in jax.tree.leaves(state.body)) // WALKERS
+    assert body == 19 + 18 + 18
+    assert sum(leaf.size for leaf in jax.tree.leaves(state)) // WALKERS < 90
+
+
+def test_commands_lead_where_the_direction_points(env, walked):
+    body = jax.tree.map(lambda leaf: leaf[0], walked[0][0].body)
+    yaw = robot.planar_pose(body.qpos)[2]
+    for turn, turning in ((0.0, 0.0), (0.15, 0.5), (1.0, 1.5), (-2.0, -1.5)):
+        wanted = np.array([math.cos(turn), math.sin(turn), turning])
+        heading = actions.from_angle(yaw + turn)
+        np.testing.assert_allclose(env.command(body, jnp.asarray(wanted), heading), wanted, atol=1e-4)
+        told = jnp.zeros(3)
+        for _ in range(10):  # the steps of control of 0.2 s, in which the bounds allow 1.6 m/s and 4 rad/s
+            told = env.command(body, told, heading)
+        np.testing.assert_allclose(told, wanted, atol=1e-4)
+
+
+def test_commands_change_no_faster_than_legs_can_follow(env, walked):
+    body = jax.tree.map(lambda leaf: leaf[0], walked[0][0].body)
+    yaw = robot.planar_pose(body.qpos)[2]
+    forward, back = jnp.array([1.0, 0.0, 1.5]), actions.from_angle(yaw + math.pi - 0.01)
+    np.testing.assert_allclose(env.command(body, forward, -back), forward.at[2].set(1.5 - 0.4), atol=0.02)
+    np.testing.assert_allclose(env.command(body, -forward, back), [-1.0, 0.0, -1.5 + 0.4], atol=0.02)
+    np.testing.assert_allclose(env.command(body, forward, back)[0], 1.0 - 8.0 * 0.02, atol=1e-3)
+
+
+# ----------------------------------------------------------------------------------------------------------- the sensor
+
+
+def tilted(yaw=0.0, pitch=0.0, roll=0.0):
+    return Rotation.from_euler("ZYX", [yaw, pitch, roll]).as_matrix().astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def one_world(env):
+    return jax.tree.map(lambda leaf: leaf[0], env.worlds)
+
+
+def test_a_level_sensor_reads_what_the_simple_robots_does(one_world):
+    for yaw in (0.0, 1.0, -2.5):
+        flat = scan(one_world, jnp.array([1.0, -2.0, yaw]))
+        level = look(one_world, jnp.array([1.0, -2.0, 0.5]), jnp.asarray(tilted(yaw)))
+        np.testing.assert_allclose(level, flat, rtol=2e-5)
+
+
+def test_beams_that_point_down_meet_the_floor():
+    nowhere = World(
+        boxes=jnp.array([[1000.0, 1000.0, 0.0, 0.01, 0.01]]),
+        box_heights=jnp.ones(1),
+        circles=jnp.array([[1000.0, 1000.0, 0.01]]),
+        circle_heights=jnp.ones(1),
+        extent=jnp.array([40.0, 40.0]),
+        starts=jnp.zeros((1, 2)),
+        goals=jnp.zeros((1, 2)),
+    )
+    pitch = 0.1  # nose down
+    ranges = look(nowhere, jnp.array([0.0, 0.0, 0.5]), jnp.asarray(tilted(0.3, pitch)))
+    assert float(ranges[135]) == pytest.approx(0.5 / math.sin(pitch), rel=1e-5)
+    assert float(ranges[135 + 90]) == pytest.approx(10.0)  # to the left: level
+    assert float(ranges[270]) == pytest.approx(10.0)  # behind: up
+
+
+def test_beams_pass_over_what_is_too_low():
+    low = World(
+        boxes=jnp.array([[3.0, 0.0, 0.0, 0.1, 1.0], [6.0, 0.0, 0.0, 0.1, 1.0]]),
+        box_heights=jnp.array([0.6, 2.0]),
+        circles=jnp.array([[1000.0, 1000.0, 0.01]]),
+        circle_heights=jnp.ones(1),
+        extent=jnp.array([40.0, 40.0]),
+        starts=jnp.zeros((1, 2)),
+        goals=jnp.zeros((1, 2)),
+    )
+    for pitch, met in ((0.0, 2.9), (-0.03, 2.9), (-0.04, 5.9)):  # 0.5 + 2.9 tan 0.03 = 0.587, tan 0.04: 0.616
+        ranges = look(low, jnp.array([0.0, 0.0, 0.5]), jnp.asarray(tilted(0.0, pitch)))
+        assert float(ranges[135]) == pytest.approx(met / math.cos(pitch), rel=1e-5)
+
+
+def test_a_tilted_sensor_reads_what_mujocos_rays_do(env):
+    path = Path(__file__).parents[3] / "benchmarks" / "mujoco_world.py"
+    spec = importlib.util.spec_from_file_location("mujoco_world", path)
+    engine = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(engine)
+    rng, equal = np.random.default_rng(0), []
+    for number in range(4):
+        world = jax.tree.map(lambda leaf, number=number: np.asarray(leaf[number]), env.worlds)
+        model = engine.model(world)
+        data = engine.settled(model)
+        for start in world.starts[:4]:
+            turn = tilted(rng.uniform(-3, 3), *rng.uniform(-0.08, 0.08, 2))
+            origin = np.array([*start, 0.52])
+            ours = np.asarray(look(world, jnp.asarray(origin, jnp.float32), jnp.asarray(turn)))
+            beams = np.stack([np.cos(engine.ANGLES), np.sin(engine.ANGLES), np.zeros(271)], -1) @ turn.T.astype(float)
+            hit = np.zeros(1, np.int32)
+            found = np.array([mujoco.mj_ray(model, data, origin, beam, None, 1, -1, hit) for beam in beams])
+            down = np.where(beams[:, 2] < 0, -0.52 / np.minimum(beams[:, 2], -1e-9), np.inf)  # the floor
+            theirs = np.minimum(np.minimum(np.where(found < 0, np.inf, found), down), 10.0)
+            equal.append(np.abs(ours - theirs) < 2e-3)
+    assert np.mean(equal) > 0.997  # the rest: beams at an edge, and ones that come down onto a top
+
+
+def test_the_sensor_has_noise_of_its_own(env):
+    assert float(env.lidar.noise) == pytest.approx(SENSOR_NOISE)
+    more = make_environment(NavigationConfig(worlds=8, lidar_noise=0.1))
+    assert float(more.lidar.noise) == pytest.approx(math.hypot(0.1, SENSOR_NOISE))
+
+
+# -------------------------------------------------------------------------------------------------------- in C MuJoCo
+
+
+def test_in_c_mujoco_walking_toward_the_goal_reaches_it_or_meets_something():
+    env = make_environment(NavigationConfig(worlds=8, max_steps=100))
+    found = judged.rollout(Heuristic(env), env, jax.random.key(0), 6, 600)
+    assert float(found["finished"]) == 1
+    ends = [float(found[name]) for name in ("success", "collision", "fall", "timeout")]
+    assert sum(ends) == pytest.approx(1)
+    assert float(found["success"]) > 0
+    assert 2.0 < float(found["duration"]) <= 20.0
+
+
+def test_in_c_mujoco_episodes_begin_where_those_in_mjx_do(env):
+    keys = jax.random.split(jax.random.key(5), WALKERS)
+    course = judged.Course(env, keys)
+    state, obs = begin(env, keys)
+    np.testing.assert_allclose(course.judge.qpos, state.body.qpos, atol=1e-6)
+    np.testing.assert_allclose(course.obs, obs, atol=1e-5)

@@ -1,0 +1,180 @@
+"""Billiards drawings, looked at pixel by pixel: balls are where they should be, films last as long as the shots."""
+
+import math
+from typing import Any
+from xml.etree import ElementTree
+
+import imageio.v2 as imageio
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+from PIL import Image, ImageSequence
+
+from cuelearner_envs.billiards import Table, drawing, trace
+
+TABLE = Table.one_ball().replace(max_events=24)
+FRAME = 0.03  # of a GIF at 30 frames a second [s]
+
+
+@pytest.fixture(scope="module")
+def shot():
+    """The cue ball at (0.1, -0.1) drives the target at (0.3, 0.1) along the diagonal into the corner (0.4, 0.2)."""
+    positions = jnp.array([[0.1, -0.1], [0.3, 0.1]])
+    path = jax.jit(trace)(TABLE, positions, jnp.zeros(2, bool), math.pi / 4)
+    assert path.pocketed[-1].tolist() == [False, True]
+    return path
+
+
+def drawn(draw):
+    """Draws on axes of their own; returns these, the picture and a function that looks it up in table coordinates."""
+    figure = Figure(figsize=(8, 5), dpi=100)
+    canvas = FigureCanvasAgg(figure)
+    axes = figure.add_axes((0, 0, 1, 1))
+    draw(axes)
+    canvas.draw()
+    image = np.asarray(canvas.buffer_rgba())[..., :3] / 255
+
+    def pixel(x, y):
+        column, row = axes.transData.transform((x, y))
+        return image[image.shape[0] - 1 - int(row), int(column)]
+
+    return axes, image, pixel
+
+
+def is_colour(found, name, tolerance=0.02):
+    return np.abs(np.asarray(found) - to_rgb(name)).max() < tolerance
+
+
+def test_balls_lie_where_they_are_and_a_pocketed_one_not_on_the_cloth():
+    off = 0.6 * 0.02  # beside the number, inside the ball
+    positions = np.array([[-0.2, 0.0], [0.2, 0.1]])
+
+    _, _, pixel = drawn(lambda axes: drawing.draw_table(axes, TABLE, positions, np.array([False, False])))
+    assert is_colour(pixel(-0.2, 0.0), drawing.CUE)
+    assert is_colour(pixel(0.2, 0.1 + off), drawing.TARGETS[0])
+    assert is_colour(pixel(0.0, 0.0), drawing.CLOTH)
+    assert is_colour(pixel(0.0, 0.2), drawing.CUSHION)
+    assert is_colour(pixel(0.41, 0.21), drawing.HOLE)
+
+    axes, image, pixel = drawn(lambda axes: drawing.draw_table(axes, TABLE, positions, np.array([False, True])))
+    assert is_colour(pixel(0.2, 0.1 + off), drawing.CLOTH)
+    rows, _ = np.nonzero(np.abs(image - to_rgb(drawing.TARGETS[0])).max(axis=-1) < 0.02)
+    edge = image.shape[0] - axes.transData.transform((0, -0.2))[1]
+    assert len(rows) > 50
+    assert rows.min() > edge  # all of the ball is below the table
+
+
+def test_numbers_name_the_targets_only():
+    axes, _, _ = drawn(lambda axes: drawing.draw_table(axes, Table.easy(), np.zeros((4, 2)), np.zeros(4, bool)))
+    texts = [text.get_text() for text in axes.texts if text.get_text() != "pocketed"]
+    assert texts == ["", "1", "2", "3"]
+
+
+@pytest.mark.parametrize("angle", [0.0, 1.0, -2.5])
+def test_arrow_points_from_the_cue_ball_along_the_angle(angle):
+    positions = np.array([[-0.1, 0.02], [0.3, 0.1]])
+    _, _, pixel = drawn(lambda axes: drawing.draw_table(axes, TABLE, positions, np.array([False, False]), angle=angle))
+    along = positions[0] + 0.05 * np.array([math.cos(angle), math.sin(angle)])
+    assert is_colour(pixel(*along), drawing.ARROW, 0.1)
+
+
+def test_tracks_end_at_rest_or_where_the_ball_falls(shot):
+    axes, _, _ = drawn(lambda axes: drawing.draw_table(axes, TABLE, shot.positions[-1], shot.pocketed[-1], path=shot))
+    cue, target = (np.asarray(line.get_xydata()) for line in axes.lines)
+    np.testing.assert_allclose(cue[0], [0.1, -0.1], atol=1e-6)
+    np.testing.assert_allclose(cue[-1], shot.positions[-1, 0], atol=1e-6)
+    np.testing.assert_allclose(target[0], [0.3, 0.1], atol=1e-6)
+    np.testing.assert_allclose(target[-1], [0.4, 0.2], atol=3e-3)
+
+
+@pytest.mark.parametrize("angle", [1.0, -2.5])
+def test_a_question_shows_the_balls_and_the_shot_as_an_arrow(tmp_path, angle):
+    positions, ahead = np.array([[-0.1, 0.02], [0.3, 0.1]]), np.array([math.cos(angle), math.sin(angle)])
+    drawing.question(TABLE, positions, np.array([False, False]), ahead, tmp_path / "question.png")
+    image = imageio.imread(tmp_path / "question.png")[..., :3] / 255
+    assert image.shape[1] == 1280
+    left, right, _, top = drawing._limits(TABLE)
+
+    def pixel(place):
+        dots = image.shape[1] / (right - left)  # in a metre
+        return image[int((top - place[1]) * dots), int((place[0] - left) * dots)]
+
+    assert is_colour(pixel(positions[0]), drawing.CUE)
+    assert is_colour(pixel(positions[1] + [0.0, 0.012]), drawing.TARGETS[0])
+    assert is_colour(pixel(positions[0] + 0.05 * ahead), drawing.ARROW, 0.1)
+    assert is_colour(pixel(positions[0] - 0.05 * ahead), drawing.CLOTH)
+
+
+@pytest.mark.parametrize("suffix", ["png", "svg"])
+def test_still_is_a_picture_and_repeats(shot, tmp_path, suffix):
+    files = [tmp_path / f"{name}.{suffix}" for name in ("one", "two")]
+    for file in files:
+        drawing.still(TABLE, shot, file)
+    assert files[0].read_bytes() == files[1].read_bytes()
+    if suffix == "svg":
+        assert ElementTree.parse(files[0]).getroot().tag.endswith("svg")
+        return
+    image = imageio.imread(files[0])[..., :3] / 255
+    assert image.shape[1] == 1280
+    for name, least in ((drawing.CLOTH, 0.3), (drawing.ARROW, 1e-4), (drawing.TARGETS[0], 1e-3)):
+        assert np.mean(np.abs(image - to_rgb(name)).max(axis=-1) < 0.02) > least
+
+
+def film(file):
+    """Pictures of a GIF and how long each stands [s]."""
+    with Image.open(file) as image:
+        pictures, durations = [], []
+        for frame in ImageSequence.Iterator(image):
+            pictures.append(np.asarray(frame.convert("RGB")) / 255)
+            durations.append(frame.info["duration"] / 1000)
+    return pictures, np.array(durations)
+
+
+def test_gif_has_the_frames_of_the_shot_and_lasts_as_long(shot, tmp_path):
+    duration = float(shot.times[-1])
+    held = round(drawing.HOLD_BEFORE / FRAME) + round(drawing.HOLD_AFTER / FRAME)
+    for speed in (1.0, 2.0):
+        drawing.animate(TABLE, [shot], tmp_path / "shot.gif", speed=speed)
+        pictures, durations = film(tmp_path / "shot.gif")
+        moving = math.ceil(duration / speed / FRAME) + 1
+        assert durations.sum() == pytest.approx((held + moving) * FRAME)
+        assert 0.6 * moving < len(pictures) <= moving + 2  # equal pictures are stored once
+        assert {picture.shape for picture in pictures} == {pictures[0].shape}
+        assert durations[0] == pytest.approx(drawing.HOLD_BEFORE, abs=1.1 * FRAME)
+
+    def share(picture, name):
+        return np.mean(np.abs(picture - to_rgb(name)).max(axis=-1) < 0.06)
+
+    assert share(pictures[0], drawing.ARROW) > 1e-4  # before the shot only
+    assert share(pictures[-1], drawing.ARROW) < 2e-5
+    assert pictures[-1][-1, -1].tolist() == [1, 1, 1]  # white stays white on a page
+    below = pictures[0].shape[0] * 0.88  # the tray: empty at first, then with the target
+    assert share(pictures[0][int(below) :], drawing.TARGETS[0]) == 0
+    assert share(pictures[-1][int(below) :], drawing.TARGETS[0]) > 1e-3
+    assert share(pictures[-1][: int(below)], drawing.TARGETS[0]) == 0
+
+
+@pytest.mark.filterwarnings("ignore:os.fork:RuntimeWarning")  # by the reader of this test
+def test_mp4_has_even_sides_and_every_frame_of_both_shots(shot, tmp_path):
+    drawing.animate(TABLE, [shot, shot], tmp_path / "shots.mp4", fps=25, speed=3.0)
+    movie: Any = imageio.get_reader(tmp_path / "shots.mp4")
+    with movie as reader:
+        size, frames = reader.get_meta_data()["size"], sum(1 for _ in reader.iter_data())
+    held = round(drawing.HOLD_BEFORE * 25) + round(drawing.HOLD_AFTER * 25)
+    assert frames == 2 * (held + math.ceil(float(shot.times[-1]) / 3 * 25) + 1)
+    assert size[0] == 800
+    assert size[1] % 2 == 0
+
+
+def test_animate_says_what_it_cannot_do(shot, tmp_path):
+    with pytest.raises(ValueError, match=r"\.gif or \.mp4"):
+        drawing.animate(TABLE, [shot], tmp_path / "shot.avi")
+    with pytest.raises(ValueError, match="at least one shot"):
+        drawing.animate(TABLE, [], tmp_path / "shot.gif")
+    with pytest.raises(ValueError, match="positive"):
+        drawing.animate(TABLE, [shot], tmp_path / "shot.gif", speed=0.0)
+    assert list(tmp_path.iterdir()) == []

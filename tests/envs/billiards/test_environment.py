@@ -1,0 +1,333 @@
+from typing import Literal
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import probes
+import pytest
+from billiards_scenes import (
+    BATCH,
+    EASY,
+    KEY,
+    SCENE,
+    balls,
+    observe,
+    random_states,
+    reset_many,
+    step_many,
+    toward,
+)
+
+from cuelearner_envs.billiards import simulate
+from cuelearner_envs.billiards.config import BilliardsConfig, make_environment
+from cuelearner_envs.billiards.environment import Billiards
+from cuelearner_envs.billiards.recording import record
+from cuelearner_envs.billiards.table import Table, rack
+from cuelearner_jax import actions
+from cuelearner_jax.environment import Environment
+from cuelearner_jax.policies import Heuristic
+
+TABLES: list[Literal["one_ball", "easy", "regulation"]] = ["one_ball", "easy", "regulation"]
+ONE = make_environment(BilliardsConfig("one_ball"))
+
+step = jax.jit(lambda env, key, state, action: env.step(key, state, action))
+reset = jax.jit(lambda env, key: env.reset(key))
+shoot = jax.jit(simulate)
+
+
+def repeated(state):
+    return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (BATCH, *leaf.shape)), state)
+
+
+CORNER = balls([(0.2, 0.0), (0.35, 0.15), (-0.3, 0.1), (-0.3, -0.1)])  # ball 1 lies between the cue ball and a corner
+FOUL = balls([(0.3, 0.1), (-0.2, 0.0), (-0.3, 0.1), (-0.3, -0.1)])  # nothing lies between the cue ball and a corner
+CORNERWARDS, NOWHERE = toward(45.0), toward(90.0)  # NOWHERE: in all these scenes the cue ball stays on a line across
+PARKED = [
+    (-0.32, 0.26),
+    (-0.26, 0.26),
+    (-0.20, 0.26),
+]  # beside the easy table: 1.5 diameters apart, as far above the edge
+
+
+# --------------------------------------------------------------------------------------------------------- observation
+
+
+def test_the_observation_lists_the_cue_ball_then_targets_from_the_top_and_from_the_left():
+    expected = [-0.2, 0.0, -0.5, 0.0, 0.1, -0.5, 0.3, 0.1, -0.5, 0.1, -0.1, -0.5]
+    np.testing.assert_allclose(observe(EASY, SCENE), expected, atol=1e-7)
+
+
+def test_pocketed_balls_come_first_and_stand_in_a_row_beside_the_table():
+    seen = observe(EASY, balls([(-0.2, 0.0), (0.1, -0.1), (9.0, -9.0), (9.0, 9.0)], (False, False, True, True)))
+    expected = [(-0.2, 0.0, -0.5), (*PARKED[0], 0.5), (*PARKED[1], 0.5), (0.1, -0.1, -0.5)]
+    np.testing.assert_allclose(seen, np.ravel(expected), atol=1e-7)
+
+
+def test_equal_positions_look_equal_whichever_balls_fell():
+    places = np.array([(-0.2, 0.0), (0.1, -0.1), (0.3, 0.1), (9.0, 9.0)])
+    first = observe(EASY, balls(places, (False, False, False, True)))
+    for order in ([0, 3, 1, 2], [0, 1, 3, 2], [0, 2, 3, 1]):
+        fallen = tuple(number == 3 for number in order)
+        np.testing.assert_array_equal(first, observe(EASY, balls(places[order], fallen)))
+    two = [
+        observe(EASY, balls(places[[0, *order]], (False, *(n != 1 for n in order)))) for order in ([1, 2, 3], [3, 2, 1])
+    ]
+    np.testing.assert_array_equal(*two)
+
+
+def test_a_sensor_bias_shifts_the_balls_on_the_table_and_not_those_beside_it():
+    biased = make_environment(BilliardsConfig("easy", observation_bias=(0.0071, 0.003)))
+    state = balls(SCENE.positions, (False, False, False, True))
+    seen = np.asarray(observe(biased, state) - observe(EASY, state)).reshape(4, 3)
+    shifted = [0.0071, 0.003, 0.0]
+    np.testing.assert_allclose(seen, [shifted, [0.0, 0.0, 0.0], shifted, shifted], atol=1e-7)
+
+
+# --------------------------------------------------------------------------------------------------------------- rules
+
+
+def test_a_ball_shot_into_a_corner_is_worth_one():
+    after, result = step(EASY, KEY, CORNER, CORNERWARDS)
+    assert float(result.reward) == 1.0
+    assert after.pocketed.tolist() == [False, True, False, False]
+    assert {name: float(value) for name, value in result.metrics.items()} == {"scored": 1, "foul": 0, "exhausted": 0}
+    assert (bool(result.terminated), bool(result.truncated), int(after.shots)) == (False, False, 1)
+
+
+def test_the_reward_counts_the_balls_of_this_shot_alone():
+    _, result = step(EASY, KEY, balls(CORNER.positions, (False, False, False, True)), CORNERWARDS)
+    assert float(result.reward) == 1.0  # another one has fallen before
+    scene = balls([(0.2, 0.0), (0.33, 0.16), (0.37, 0.14), (-0.3, -0.1)])  # two before the same corner
+    after, result = step(EASY, KEY, scene, toward(47.0))  # 45.7 .. 48.0
+    assert float(result.reward) == 2.0
+    assert after.pocketed.tolist() == [False, True, True, False]
+
+
+def test_a_shot_that_pockets_nothing_is_worth_nothing():
+    after, result = step(EASY, KEY, CORNER, NOWHERE)
+    assert float(result.reward) == 0.0
+    assert float(result.metrics["foul"]) == float(result.metrics["scored"]) == 0.0
+    np.testing.assert_array_equal(after.positions[1:], CORNER.positions[1:])
+
+
+def test_a_foul_puts_every_ball_back_and_the_cue_ball_somewhere_free_on_the_left():
+    after, result = step_many(EASY, jax.random.split(KEY, BATCH), repeated(FOUL), jnp.tile(CORNERWARDS, (BATCH, 1)))
+    assert (result.metrics["foul"] == 1).all()
+    assert (result.reward == 0).all()
+    assert (after.shots == 1).all()
+    np.testing.assert_array_equal(after.positions[:, 1:], jnp.tile(FOUL.positions[1:], (BATCH, 1, 1)))
+    cue, edge = np.asarray(after.positions[:, 0]), 0.02 + 0.004  # a ball's and a cushion's radius
+    assert (cue >= [-0.4 + edge - 1e-6, -0.2 + edge - 1e-6]).all()
+    assert (cue <= [-0.2, 0.2 - edge + 1e-6]).all()
+    gaps = np.linalg.norm(cue[:, None] - np.asarray(FOUL.positions[1:]), axis=-1)
+    assert gaps.min() >= 2 * 0.02 - 1e-6
+    assert (cue.max(0) - cue.min(0) > [0.16, 0.33]).all()  # all over the quarter of 0.176 m x 0.352 m
+
+
+def test_a_foul_takes_back_what_the_same_shot_pocketed():
+    scene = balls([(0.28, 0.1), (0.355, 0.15), (-0.3, 0.1), (-0.3, -0.1)], (False, False, True, False))
+    angle = jnp.deg2rad(58.8)  # 58.3 .. 59.3
+    assert shoot(EASY.table, scene.positions, scene.pocketed, angle).pocketed.tolist() == [True, True, True, False]
+    after, result = step(EASY, KEY, scene, actions.from_angle(angle))
+    assert (float(result.metrics["foul"]), float(result.reward)) == (1, 0)
+    assert after.pocketed.tolist() == [False, False, True, False]
+    np.testing.assert_array_equal(after.positions[1:], scene.positions[1:])
+
+
+# ------------------------------------------------------------------------------------------------------------ episodes
+
+
+def test_a_cleared_table_terminates_and_a_new_rack_follows():
+    for shots in (3, 9):  # 9: also the last shot of the episode
+        last = balls(CORNER.positions, (False, False, True, True), shots)
+        after, result = step(EASY, KEY, last, CORNERWARDS)
+        assert float(result.reward) == 1.0
+        assert (bool(result.terminated), bool(result.truncated)) == (True, False)
+        final = np.asarray(result.final_obs).reshape(4, 3)
+        np.testing.assert_allclose(final[1:], [(*place, 0.5) for place in PARKED], atol=1e-7)
+        assert not after.pocketed.any()
+        assert int(after.shots) == 0
+        np.testing.assert_allclose(after.positions, rack(EASY.table), atol=0.01)
+        np.testing.assert_array_equal(result.obs, observe(EASY, after))
+
+
+def test_an_episode_is_truncated_after_its_last_shot():
+    (state, obs), ends = reset(EASY, KEY), []
+    np.testing.assert_array_equal(obs, observe(EASY, state))
+    for number in range(11):
+        before = state
+        state, result = step(EASY, jax.random.fold_in(KEY, number), state, NOWHERE)
+        ends.append((bool(result.terminated), bool(result.truncated)))
+        if number == 9:
+            np.testing.assert_allclose(state.positions[0], [-0.2, 0.0], atol=1e-6)  # a new rack ...
+            assert int(state.shots) == 0
+            np.testing.assert_array_equal(result.obs, observe(EASY, state))
+            left = np.asarray(result.final_obs).reshape(4, 3)  # ... while the shot led elsewhere
+            assert abs(left[0, 1]) > 0.01
+            np.testing.assert_array_equal(left[1:], observe(EASY, before).reshape(4, 3)[1:])
+        else:
+            np.testing.assert_array_equal(result.obs, result.final_obs)
+    assert ends == [(False, number == 9) for number in range(11)]
+
+
+def test_one_shot_is_an_episode_with_one_ball_and_ten_elsewhere():
+    assert [make_environment(BilliardsConfig(name)).max_shots for name in TABLES] == [1, 10, 10]
+    tidy = ONE.replace(table=ONE.table.replace(rack_jitter=0.0))
+    state, obs = reset(tidy, KEY)
+    for degrees, reward in ((36.0, 1), (90.0, 0)):
+        after, result = step(tidy, KEY, state, toward(degrees))
+        assert (float(result.reward), bool(result.terminated), bool(result.truncated)) == (
+            reward,
+            reward == 1,
+            reward == 0,
+        )
+        np.testing.assert_array_equal(result.obs, obs)
+        assert not np.array_equal(result.final_obs, obs)
+        assert int(after.shots) == 0
+
+
+# ---------------------------------------------------------------------------------------------------------------- rack
+
+
+def test_the_rack_is_a_triangle_a_quarter_from_either_end():
+    spacing = 1.05 * 2 * 0.01125
+    deep = 0.22 + spacing * np.sqrt(3) / 2
+    expected = [(-0.22, 0.0), (0.22, 0.0), (deep, -spacing / 2), (deep, spacing / 2)]
+    state, _ = reset(Billiards(Table.regulation().replace(rack_jitter=0.0)), KEY)
+    np.testing.assert_allclose(state.positions, expected, atol=1e-7)
+    state, _ = reset(Billiards(Table.one_ball().replace(rack_jitter=0.0)), KEY)
+    np.testing.assert_allclose(state.positions, [(-0.2, 0.0), (0.2, 0.0)], atol=1e-7)
+
+
+def smallest_gap(places):
+    apart = np.linalg.norm(places[:, :, None] - places[:, None], axis=-1)
+    return (apart + np.eye(places.shape[1])).min((1, 2))
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_racked_balls_are_displaced_a_little_and_never_overlap(name):
+    env = make_environment(BilliardsConfig(name))
+    standing, jitter, diameter = np.asarray(rack(env.table)), float(env.table.rack_jitter), 2 * env.table.ball_radius
+    states, _ = reset_many(env, jax.random.split(KEY, 2000))
+    places = np.asarray(states.positions)
+    assert smallest_gap(places).min() >= diameter
+    moved = places - standing
+    assert (moved[:, 0] == 0).all()  # the cue ball stands still
+    # Displacements are Gaussian but for the overlapping ones, which are drawn again: 6% narrower with three targets.
+    draws = (
+        np.random.default_rng(0).normal(0.0, jitter, (20_000, *standing.shape))
+        * (np.arange(len(standing)) > 0)[:, None]
+    )
+    expected = draws[smallest_gap(standing + draws) > diameter][:, 1:]
+    np.testing.assert_allclose(moved[:, 1:].std((0, 1)), expected.std((0, 1)), rtol=0.04)
+    np.testing.assert_allclose(moved[:, 1:].mean(0), expected.mean(0), atol=0.1 * jitter)
+
+
+# ------------------------------------------------------------------------------------------------------ changed worlds
+
+
+def test_a_turned_strike_is_the_turned_action():
+    turned = make_environment(BilliardsConfig("easy", action_turn_deg=0.8))
+    for degrees in (17.0, -100.0, 179.8):
+        after, _ = step(turned, KEY, SCENE, toward(degrees))
+        same, _ = step(EASY, KEY, SCENE, toward(degrees + 0.8))
+        other, _ = step(EASY, KEY, SCENE, toward(degrees))
+        np.testing.assert_allclose(after.positions, same.positions, atol=1e-4)
+        assert float(jnp.abs(after.positions - other.positions).max()) > 1e-3
+
+
+def test_a_tilt_moves_resting_balls_along_it():
+    tilted = make_environment(BilliardsConfig("easy", acceleration=(0.0, 0.005)))
+    after, _ = step(tilted, KEY, SCENE, toward(-160.0))
+    moved = np.asarray(after.positions - SCENE.positions)[1:]
+    np.testing.assert_allclose(moved[:, 0], 0.0, atol=1e-6)
+    assert (moved[:, 1] > 0.02).all()
+    level, _ = step(EASY, KEY, SCENE, toward(-160.0))
+    np.testing.assert_array_equal(level.positions[1:], SCENE.positions[1:])
+
+
+def test_a_sensor_bias_leaves_the_world_as_it_is():
+    biased = make_environment(BilliardsConfig("easy", observation_bias=(0.0071, 0.0071)))
+    states, strikes = random_states()
+    plain = step_many(EASY, jax.random.split(KEY, BATCH), states, strikes)
+    seen = step_many(biased, jax.random.split(KEY, BATCH), states, strikes)
+    chex.assert_trees_all_equal(plain[0], seen[0])
+    np.testing.assert_array_equal(plain[1].reward, seen[1].reward)
+    assert (plain[1].obs != seen[1].obs).any(-1).all()
+
+
+def test_changed_worlds_compile_nothing_new():
+    chex.clear_trace_counter()  # it counts by hash, which a function of an earlier test may have had
+    counted = jax.jit(chex.assert_max_traces(lambda env, state, action: env.step(KEY, state, action), n=1))
+    worlds = [
+        EASY,
+        make_environment(BilliardsConfig("easy", action_turn_deg=0.8)),
+        make_environment(BilliardsConfig("easy", observation_bias=(0.0071, 0.0))),
+        make_environment(BilliardsConfig("easy", acceleration=(0.0, 0.005))),
+        EASY.replace(table=EASY.table.replace(friction=0.0)),
+        EASY.replace(table=EASY.table.replace(speed_kept=0.5, strike_speed=0.6, ball_radius=0.021, hole_width=0.06)),
+    ]
+    seen = [tuple(np.asarray(counted(world, SCENE, toward(26.0))[1].obs).tolist()) for world in worlds]
+    assert len(set(seen)) == len(worlds)  # each changed value has its effect
+    with pytest.raises(AssertionError, match="traced"):
+        counted(ONE, balls(SCENE.positions[:2], (False, False)), CORNERWARDS)
+
+
+# ----------------------------------------------------------------------------------------------- interface, recordings
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_the_environment_fulfils_the_protocol(name):
+    env: Environment = make_environment(BilliardsConfig(name))
+    action = jax.ShapeDtypeStruct((2,), jnp.float32)
+    state, obs = jax.eval_shape(env.reset, KEY)
+    after, result = jax.eval_shape(env.step, KEY, state, action)
+    assert obs.shape == result.obs.shape == result.final_obs.shape == (env.obs_size,)
+    chex.assert_trees_all_equal_shapes_and_dtypes(state, after)  # a step can be scanned
+    assert result.reward.shape == result.terminated.shape == result.truncated.shape == ()
+    assert (obs.dtype, result.reward.dtype) == (jnp.float32, jnp.float32)
+    assert (result.terminated.dtype, result.truncated.dtype) == (bool, bool)
+    assert all((value.shape, value.dtype) == ((), jnp.float32) for value in result.metrics.values())
+    assert jax.eval_shape(env.heuristic, obs).shape == (2,)
+    chex.assert_trees_all_equal_shapes_and_dtypes(
+        jax.eval_shape(env.mirror, jax.ShapeDtypeStruct((), jnp.int32), obs, action), (obs, action)
+    )
+
+
+def test_a_batch_plays_as_one_table_does():
+    states, strikes = random_states()
+    keys = jax.random.split(jax.random.key(7), BATCH)
+    after, result = step_many(EASY, keys, states, strikes)
+    for number in (0, 5, 10):
+        alone = step(EASY, keys[number], jax.tree.map(lambda leaf, n=number: leaf[n], states), strikes[number])
+        one_of_many = jax.tree.map(lambda leaf, n=number: leaf[n], (after, result))
+        chex.assert_trees_all_close(alone, one_of_many, atol=1e-5)
+
+
+def test_records_hold_the_path_of_every_shot_and_what_the_environment_paid():
+    paths, rewards = record(EASY, Heuristic(EASY), jax.random.key(2), 12)
+    assert len(paths) == len(rewards) == 12
+    assert sum(rewards) > 0
+    for number, (path, reward) in enumerate(zip(paths, rewards, strict=True)):
+        state = balls(path.positions[0], tuple(path.pocketed[0].tolist()))
+        _, result = step(EASY, KEY, state, actions.retract(jnp.asarray(path.velocities[0, 0])))
+        assert float(result.reward) == reward
+        fallen = path.pocketed[-1] & ~path.pocketed[0]
+        assert reward == (0 if fallen[0] else fallen.sum())
+        if number > 0 and not paths[number - 1].pocketed[-1][0] and path.pocketed[0].any():
+            np.testing.assert_allclose(path.positions[0], paths[number - 1].positions[-1], atol=1e-6)
+
+
+def test_a_recorded_policy_sees_the_state_and_its_strikes_are_turned():
+    turned = make_environment(BilliardsConfig("one_ball", action_turn_deg=30.0))
+
+    def policy(key, states, obs):
+        assert states.positions.shape == (1, 2, 2)
+        return actions.retract(states.positions[:, 1] - states.positions[:, 0])
+
+    paths, _ = record(turned, probes.Acting(policy), KEY, 2)
+    for path in paths:
+        aim = actions.to_angle(jnp.asarray(path.positions[0, 1] - path.positions[0, 0]))
+        struck = actions.to_angle(jnp.asarray(path.velocities[0, 0]))
+        assert float(struck - aim) == pytest.approx(np.deg2rad(30.0), abs=1e-5)

@@ -1,0 +1,130 @@
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from cuelearner_envs.billiards.config import BilliardsConfig, make_environment
+from cuelearner_envs.billiards.teacher import SearchTeacher
+from cuelearner_jax import actions
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.evaluate import episodes, rollout
+from cuelearner_jax.policies import Taught
+from cuelearner_jax.tasks.billiards import SHIPPED_TEACHERS, make_teacher
+from cuelearner_jax.teachers.learned import LearnedTeacher
+
+RACKS, DIRECTIONS = 50, 1440
+ONE = make_environment(BilliardsConfig("one_ball"))
+STATES, OBS = jax.jit(jax.vmap(ONE.reset))(jax.random.split(jax.random.key(3), RACKS))
+AIM, HABIT = jnp.deg2rad(0.5), jnp.array(0.2)
+best = jax.jit(lambda teacher, states, obs: jax.lax.map(lambda pair: teacher.best_action(*pair), (states, obs)))
+play = jax.jit(lambda env, states, actions: jax.vmap(env.step, (None, 0, 0))(jax.random.key(0), states, actions)[1])
+
+
+def degrees(directions):
+    return np.rad2deg(np.asarray(actions.to_angle(directions)))
+
+
+def margins(wins, directions):
+    """How many winning directions lie to the right and to the left of each of the directions chosen."""
+    found = []
+    for row, index in zip(wins, np.round(degrees(directions) / 360 * DIRECTIONS).astype(int), strict=True):
+        assert row[index % DIRECTIONS]
+        found.append([next(n for n in range(100) if not row[(index + s * n) % DIRECTIONS]) for s in (-1, 1)])
+    return np.array(found)
+
+
+@pytest.fixture(scope="module")
+def chosen():
+    return best(SearchTeacher(ONE, AIM, HABIT), STATES, OBS)
+
+
+@pytest.fixture(scope="module")
+def wins():
+    teacher = SearchTeacher(ONE, AIM, HABIT)
+    return np.asarray(jax.jit(lambda states: jax.lax.map(teacher.rewards, states))(STATES)) > 0
+
+
+def test_search_finds_a_winning_direction_where_few_win(chosen, wins):
+    assert wins.shape == (RACKS, DIRECTIONS)
+    assert float(play(ONE, STATES, chosen).reward.mean()) > 0.9  # 1.0 measured
+    assert 0 < wins.mean() < 0.03  # the reward of uniform directions; 0.008 measured
+    np.testing.assert_allclose(jnp.linalg.norm(chosen, axis=-1), 1.0, atol=1e-6)
+
+
+def test_rewards_are_those_of_the_directions_in_order(wins):
+    directions = actions.evenly_spaced(DIRECTIONS)
+    for rack in (0, 1):
+        hit, missed = np.flatnonzero(wins[rack])[:3], np.flatnonzero(~wins[rack])[::30][:47]
+        tried = np.concatenate([hit, missed])
+        state = jax.tree.map(lambda leaf, n=rack: jnp.repeat(leaf[n : n + 1], RACKS, axis=0), STATES)
+        np.testing.assert_array_equal(play(ONE, state, directions[tried]).reward, wins[rack][tried])
+
+
+def test_a_habit_makes_the_teacher_consistent(chosen):
+    assert np.ptp(degrees(chosen)) < 5  # 2 measured
+    jumping = degrees(best(SearchTeacher(ONE, AIM, jnp.array(0.0)), STATES, OBS))
+    left, right = jumping[jumping > 0], jumping[jumping < 0]  # mirror-image windows
+    assert min(len(left), len(right)) > RACKS / 10
+    assert left.min() - right.max() > 50
+
+
+def test_an_imperfect_aim_prefers_wide_windows_and_their_middle(chosen, wins):
+    right, left = margins(wins, chosen).T
+    assert (np.abs(left - right) <= 1).mean() > 0.9
+    perfect = margins(wins, best(SearchTeacher(ONE, jnp.array(0.0), HABIT), STATES, OBS)).sum(1)
+    assert (left + right >= perfect).all()
+    assert (left + right > perfect).mean() > 0.3  # a perfect aim is content with a narrow window that comes first
+
+
+def test_it_looks_at_the_table_and_not_at_the_sensor(chosen):
+    biased = make_environment(BilliardsConfig("one_ball", observation_bias=(0.05, 0.05)))
+    seen = jax.vmap(biased.observe)(STATES)
+    assert (seen != OBS).any()
+    np.testing.assert_array_equal(best(SearchTeacher(biased, AIM, HABIT), STATES, seen), chosen)
+
+
+def test_it_knows_of_a_changed_world(chosen):
+    turned = make_environment(BilliardsConfig("one_ball", action_turn_deg=3.0))
+    answers = best(SearchTeacher(turned, AIM, HABIT), STATES, OBS)
+    assert np.median(degrees(answers) - degrees(chosen)) == pytest.approx(-3.0, abs=0.25)
+    assert float(play(turned, STATES, answers).reward.mean()) > 0.9
+    assert float(play(turned, STATES, chosen).reward.mean()) < 0.5
+
+
+def test_a_configuration_names_the_teacher():
+    config = BilliardsConfig("one_ball", aim_error_deg=2.0, habit=0.1, search_directions=90)
+    teacher = make_teacher(config, ONE)
+    assert isinstance(teacher, SearchTeacher)
+    assert (teacher.env, teacher.directions) == (ONE, 90)
+    assert float(teacher.aim_error) == pytest.approx(np.deg2rad(2.0))
+    assert float(teacher.habit) == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize(("table", "least"), [("easy", 0.75), ("regulation", 0.45)])
+def test_the_shipped_teachers_play_well(table, least):
+    config = BilliardsConfig(table, teacher="learned")
+    env = make_environment(config)
+    teacher = make_teacher(config, env)
+    assert isinstance(teacher, LearnedTeacher)
+    coarse = teacher.replace(directions=1440)  # for speed
+    measured = jax.jit(lambda teacher: rollout(Taught(teacher), env, episodes("tuning"), 30, 300))(coarse)
+    assert float(measured["reward"]) > least  # over 10,000 steps with their 3,600 directions: see teacher.json
+
+
+@pytest.mark.parametrize(("table", "preset", "least"), [("easy", "easy", 0.75), ("regulation", "paper", 0.45)])
+def test_the_shipped_teachers_tell_how_they_were_made(table, preset, least):
+    told = json.loads((SHIPPED_TEACHERS / table / "teacher.json").read_text())
+    assert least < told["reward"] < 1.0
+    assert told["eval_steps"] == 10_000
+    assert told["command"].startswith(f"cuelearner teacher train billiards --preset {preset}")
+    assert len(told["commit"]) >= 7
+    assert "jax" in told["versions"]
+    assert (told["task"]["name"], told["task"]["table"]) == ("billiards", table)
+
+
+def test_a_table_without_a_shipped_teacher_says_what_to_do():
+    config = BilliardsConfig("one_ball", teacher="learned")
+    with pytest.raises(UserError, match=r"cuelearner teacher train.*search teacher"):
+        make_teacher(config, make_environment(config))

@@ -1,0 +1,296 @@
+"""Navigation over whole episodes: how they end and begin, what replay makes of them, and their mirror images."""
+
+import math
+from functools import partial
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import probes
+import pytest
+
+from cuelearner_envs.navigation.environment import Navigation
+from cuelearner_envs.navigation.lidar import Lidar
+from cuelearner_envs.navigation.robot import collides
+from cuelearner_envs.navigation.worlds import generate_many
+from cuelearner_jax import actions
+from cuelearner_jax.agent.learning import learner, stored_step
+
+KEY = jax.random.key(0)
+LEFT = jnp.array([0.0, 1.0])
+PREVIOUS = slice(274, 280)
+FAULTLESS = Lidar(*map(jnp.float32, (10.0, 0.0, 0.0, 0.0)))
+FAULTS = Lidar(*map(jnp.float32, (10.0, 0.26, 0.05, 0.1)))
+
+reset = jax.jit(lambda env, key: env.reset(key))
+reset_many = jax.jit(lambda env, keys: jax.vmap(env.reset)(keys))
+observe_many = jax.jit(lambda env, states: jax.vmap(env.observe)(states))
+ranges = jax.jit(lambda env, states: jax.vmap(env.ranges)(states))
+recall = jax.jit(lambda env, memory: jax.vmap(env.recall)(memory))
+recall_next = jax.jit(lambda env, *parts: jax.vmap(env.recall_next)(*parts))
+step_many = jax.jit(lambda env, *parts: jax.vmap(env.step)(jax.random.split(KEY, 200), *parts))
+
+# Short episodes and wide goals, so that a few dozen steps see every kind of end.
+EIGHT = generate_many(jax.random.key(1), 8)  # as many as other tests have compiled
+WORLDS = Navigation(
+    worlds=jax.tree.map(lambda leaf: leaf[:3], EIGHT),
+    lidar=FAULTLESS,
+    max_steps=jnp.int32(25),
+    goal_radius=jnp.float32(4.5),
+)
+
+
+# --- episodes --------------------------------------------------------------------------------------------------------
+
+
+def assert_begun(env, states):
+    """All at rest at the start of a route of their world, at its goal's route."""
+    states = jax.device_get(states)
+    starts, goals = np.asarray(env.worlds.starts), np.asarray(env.worlds.goals)
+    np.testing.assert_array_equal(states.pose[:, :2], starts[states.world, states.route])
+    np.testing.assert_array_equal(states.goal, goals[states.world, states.route])
+    for still in (states.velocity, states.previous, states.steps):
+        np.testing.assert_array_equal(still, 0)
+
+
+def test_episodes_begin_at_rest_at_the_start_of_every_route_turned_any_way():
+    states, _ = reset_many(WORLDS, jax.random.split(KEY, 600))
+    assert_begun(WORLDS, states)
+    routes = np.asarray(states.world * 16 + states.route)
+    counts = np.bincount(routes, minlength=48)
+    assert counts.min() >= 2  # 12.5 each, standard deviation 3.5
+    assert counts.max() <= 28
+    quarters = np.histogram(np.asarray(states.pose[:, 2]), 4, (-math.pi, math.pi))[0]
+    assert quarters.sum() == 600
+    assert quarters.min() > 110  # 150 each, standard deviation 10.6
+
+
+def test_starts_and_goals_are_free_whichever_way_the_body_is_turned_and_5_to_15_m_apart():
+    touches = jax.jit(jax.vmap(jax.vmap(jax.vmap(collides, (None, None, 0)), (None, None, 0)), (None, 0, 0)))
+    for places in (WORLDS.worlds.starts, WORLDS.worlds.goals):
+        yaws = jnp.linspace(0, math.pi, 9)
+        poses = jnp.concatenate(
+            [
+                jnp.broadcast_to(places[:, :, None], (3, 16, 9, 2)),
+                jnp.broadcast_to(yaws[:, None], (3, 16, 9, 1)),
+            ],
+            -1,
+        )
+        assert not touches(WORLDS.robot, WORLDS.worlds, poses).any()
+    apart = np.linalg.norm(WORLDS.worlds.goals - WORLDS.worlds.starts, axis=-1)
+    assert apart.min() >= 5
+    assert apart.max() <= 15
+
+
+@jax.jit
+def played(env, key):
+    """60 steps of 16 environments that blunder toward their goals: states before, actions, steps, states after."""
+
+    def advance(carry, number):
+        states, obs = carry
+        k_turn, k_step = jax.random.split(jax.random.fold_in(key, number))
+        action = actions.rotate(jax.vmap(env.heuristic)(obs), jax.random.normal(k_turn, (16,)))
+        memory = jax.vmap(env.remember)(states, obs)
+        following, result = jax.vmap(env.step)(jax.random.split(k_step, 16), states, action)
+        return (following, result.obs), (states, obs, memory, action, result, following)
+
+    start = jax.vmap(env.reset)(jax.random.split(key, 16))
+    return jax.lax.scan(advance, start, jnp.arange(60))[1]
+
+
+def flat(tree):
+    return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), tree)
+
+
+KINDS = {"plain": FAULTLESS, "faulty": FAULTS}
+
+
+@pytest.fixture(scope="module")
+def plays():
+    return {name: (env := WORLDS.replace(lidar=lidar), played(env, KEY)) for name, lidar in KINDS.items()}
+
+
+def test_an_end_is_followed_by_a_new_episode_of_any_world_and_nothing_else_is(plays):
+    env, (states, _, _, action, result, following) = plays["plain"]
+    ended = np.asarray(result.terminated | result.truncated)
+    for end in (result.outcome["success"] > 0, result.outcome["collision"] > 0, result.truncated):
+        assert end.sum() >= 5
+    assert_begun(env, jax.tree.map(lambda leaf: leaf[ended], following))
+    assert len(set(np.asarray(following.world)[ended].tolist())) == 3
+    went_on = jax.tree.map(lambda leaf: leaf[~ended], following)
+    expected = jax.tree.map(lambda leaf: leaf[~ended], jax.vmap(jax.vmap(env.moved))(states, action))
+    chex.assert_trees_all_close(went_on, expected, atol=1e-5)
+    np.testing.assert_array_equal(np.asarray(following.steps), np.where(ended, 0, states.steps + 1))
+
+
+def test_each_step_has_one_end_at_most_and_pays_accordingly(plays):
+    _, (_, _, _, _, result, _) = plays["plain"]
+    ends = np.stack([np.asarray(result.outcome[name]) for name in ("success", "collision", "timeout")])
+    assert set(ends.sum(0).ravel().tolist()) == {0.0, 1.0}
+    np.testing.assert_array_equal(result.reward, 10 * ends[0] - 10 * ends[1])
+    np.testing.assert_array_equal(result.terminated, ends[0] + ends[1] > 0)
+    np.testing.assert_array_equal(result.truncated, ends[2] > 0)
+
+
+# --- replay ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_remembered_steps_rebuild_what_was_seen_before_and_after(plays, kind):
+    env, played_steps = plays[kind]
+    _, obs, memory, action, result, _ = flat(played_steps)
+    np.testing.assert_allclose(recall(env, memory), obs, atol=2e-6)
+    recalled = recall_next(env, memory, action, result.aftermath)
+    np.testing.assert_allclose(recalled, result.final_obs, atol=2e-6)
+    ended = np.asarray(result.terminated | result.truncated)
+    assert ended.sum() > 20
+    assert np.abs(recalled - result.obs)[ended].max(-1).min() > 1e-3  # what a reset shows is something else
+    np.testing.assert_array_equal(recalled[:, PREVIOUS], result.final_obs[:, PREVIOUS])
+
+
+def test_a_faulty_reading_is_made_again_and_not_drawn_again(plays):
+    """Beside the test above: the faults are there, and they differ from place to place."""
+    faulty, played_steps = plays["faulty"]
+    states = flat(played_steps[0])
+    turned = faulty.replace(lidar=FAULTLESS.replace(rotation=FAULTS.rotation))
+    sensed, true = np.asarray(ranges(faulty, states)), np.asarray(ranges(turned, states))
+    lost = (sensed == 10) & (true < 9.5)
+    assert lost[true < 9.5].mean() == pytest.approx(0.1, abs=0.005)
+    seen = ~lost & (true > 0.3) & (true < 9.5)
+    assert np.std((sensed - true)[seen]) == pytest.approx(0.05, rel=0.02)
+    assert np.mean((sensed - true)[seen]) == pytest.approx(0, abs=0.001)
+    errors = (sensed - true)[:400]
+    alike = np.mean(np.abs(errors[:-1] - errors[1:]) < 1e-4, axis=-1)
+    assert alike.max() < 0.3
+    np.testing.assert_array_equal(ranges(faulty, states), sensed)
+
+
+def test_a_stored_transition_takes_80_bytes():
+    for env in (WORLDS, WORLDS.replace(lidar=FAULTS, mirrors=True)):
+        rows = learner(probes.SIZES, True, env).buffer.empty(10)
+        assert rows.nbytes / 10 <= 80
+
+
+@jax.jit
+def through(env, memory, action, result):
+    """The last 320 of 960 steps as a ring buffer of that many rows gives them back, oldest first."""
+    agent = learner(probes.SIZES, True, env)
+    buffer, stored = agent.buffer, partial(stored_step, bootstraps=True)
+
+    def add(rows, item):
+        number, *parts = item
+        return buffer.add(rows, number * 16, jax.vmap(stored)(*parts)), None
+
+    rows, _ = jax.lax.scan(add, buffer.empty(320), (jnp.arange(60), memory, action, result))
+    return agent.one_step(env, buffer.read(rows, jnp.arange(320)))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_ring_buffer_gives_back_the_transitions_that_were_made(plays, kind):
+    env, (_, obs, memory, action, result, _) = plays[kind]
+    found = through(env, memory, action, result)
+    obs, action, result = flat(jax.tree.map(lambda leaf: leaf[40:], (obs, action, result)))  # what fits in, in order
+    np.testing.assert_allclose(found.obs, obs, atol=2e-6)
+    np.testing.assert_allclose(found.next_obs, result.final_obs, atol=2e-6)
+    np.testing.assert_array_equal(found.action, action)
+    np.testing.assert_array_equal(found.reward, result.reward)
+    np.testing.assert_array_equal(found.discount, np.where(result.terminated, 0, 1))
+    assert result.truncated.any()
+    assert result.terminated.any()
+
+
+def test_the_number_of_a_world_survives_being_stored(plays):
+    env, (states, obs, *_) = plays["plain"]
+    state = jax.tree.map(lambda leaf: leaf[0, 0], states)
+    for number in (0, 1023, 2**20 + 1):
+        memory = env.remember(state.replace(world=jnp.int32(number)), obs[0, 0])
+        assert memory.dtype == jnp.float32
+        assert int(memory[11]) == number
+
+
+# --- mirrors ---------------------------------------------------------------------------------------------------------
+
+
+SIGNS = jnp.array([1.0, -1.0, -1.0, 1.0, 1.0])  # of x, y, yaw and two lengths when left and right are exchanged
+
+
+def mirrored_worlds(worlds):
+    """Every world with y turned round."""
+    return worlds.replace(
+        boxes=worlds.boxes * SIGNS[None, None],
+        circles=worlds.circles * SIGNS[None, None, jnp.array([0, 1, 3])],
+        starts=worlds.starts * SIGNS[None, None, :2],
+        goals=worlds.goals * SIGNS[None, None, :2],
+    )
+
+
+def mirrored_states(states):
+    return states.replace(
+        pose=states.pose * SIGNS[None, :3],
+        velocity=states.velocity * SIGNS[None, :2],
+        goal=states.goal * SIGNS[None, :2],
+        previous=states.previous * SIGNS[None, None, :2],
+    )
+
+
+def test_a_mirrored_world_looks_mirrored_and_a_mirrored_step_leads_to_the_mirrored_place(plays):
+    env, played_steps = plays["plain"]
+    states, obs, _, action, result, _ = jax.tree.map(lambda leaf: leaf[:200], flat(played_steps))
+    image_env = env.replace(worlds=mirrored_worlds(env.worlds))
+    image = jax.jit(jax.vmap(env.mirror, (None, 0, 0)))
+    expected, image_action = image(1, obs, action)
+    # A beam that grazes a corner may see either side of it.
+    assert_mostly_close(observe_many(image_env, mirrored_states(states)), expected)
+    _, image_result = step_many(image_env, mirrored_states(states), image_action)
+    assert_mostly_close(image_result.final_obs, image(1, result.final_obs, action)[0])
+    np.testing.assert_array_equal(image_result.reward, result.reward)
+    np.testing.assert_array_equal(image_result.terminated, result.terminated)
+    assert np.abs(expected - obs).max(-1).min() > 1e-3  # none of these looks like its own image
+
+
+def assert_mostly_close(found, expected):
+    apart = np.abs(np.asarray(found) - np.asarray(expected))
+    np.testing.assert_allclose(np.sort(apart, axis=-1)[:, :-2], 0, atol=1e-4)
+    assert (apart > 1e-4).mean() < 1e-3
+
+
+def test_mirroring_twice_or_under_the_identity_changes_nothing(plays):
+    _, played_steps = plays["plain"]
+    obs, action = flat(played_steps)[1][:50], flat(played_steps)[3][:50]
+    image = jax.vmap(WORLDS.mirror, (None, 0, 0))
+    chex.assert_trees_all_equal(image(0, obs, action), (obs, action))
+    chex.assert_trees_all_equal(image(1, *image(1, obs, action)), (obs, action))
+    np.testing.assert_array_equal(image(1, obs, action)[1], action * SIGNS[None, :2])
+
+
+# --- changes ---------------------------------------------------------------------------------------------------------
+
+
+def test_the_robot_walks_as_before_with_a_faulty_sensor(plays):
+    states, _, _, action, plain, _ = jax.tree.map(lambda leaf: leaf[:200], flat(plays["plain"][1]))
+    _, faulty = step_many(plays["faulty"][0], states, action)
+    np.testing.assert_allclose(faulty.aftermath, plain.aftermath, atol=1e-5)
+    np.testing.assert_array_equal(faulty.reward, plain.reward)
+    assert np.abs(faulty.final_obs - plain.final_obs).max(-1).min() > 1e-3
+
+
+def test_changed_worlds_compile_nothing_new():
+    chex.clear_trace_counter()  # it counts by hash, which a function of an earlier test may have had
+    counted = jax.jit(chex.assert_max_traces(lambda env, state, action: env.step(KEY, state, action), n=1))
+    env = WORLDS.replace(
+        robot=jax.tree.map(jnp.float32, WORLDS.robot),
+    )
+    lidars = [
+        env.lidar.replace(**{name: jnp.float32(value)})
+        for name, value in (("max_range", 3.0), ("rotation", 0.2), ("noise", 0.1), ("dropout", 0.2))
+    ]
+    changed = [env, *(env.replace(lidar=lidar) for lidar in lidars)]
+    changed += [
+        env.replace(worlds=mirrored_worlds(env.worlds)),
+        env.replace(robot=env.robot.replace(speed=jnp.float32(0.5))),
+        env.replace(max_steps=jnp.int32(1)),
+    ]
+    state, _ = reset(env, KEY)
+    seen = [tuple(np.asarray(counted(one, state, LEFT)[1].obs).tolist()) for one in changed]
+    assert len(set(seen)) == len(changed)

@@ -1,0 +1,283 @@
+"""The lidar reads what geometry by hand and MuJoCo's rays say, and its faults are those that were asked for."""
+
+import importlib.util
+import math
+from pathlib import Path
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from cuelearner_envs.navigation import BEAM_ANGLES, World, generate, scan
+from cuelearner_envs.navigation.lidar import Lidar
+from cuelearner_envs.navigation.world import FAR_AWAY
+
+AHEAD = 135  # number of the middle beam; neighbours are a degree apart
+UNUSED_BOX, UNUSED_CIRCLE = [FAR_AWAY, FAR_AWAY, 0.0, 0.01, 0.01], [FAR_AWAY, FAR_AWAY, 0.01]
+
+generate_one = jax.jit(generate, static_argnames=("style", "routes"))
+scan_one = jax.jit(scan)
+scan_many = jax.jit(jax.vmap(scan, (None, 0)))
+read = jax.jit(Lidar.read)
+read_many = jax.jit(jax.vmap(Lidar.read, (None, None, 0)))
+
+
+def world(boxes=(), circles=(), walls=0.0):
+    """A world of up to two boxes and two circles, with walls round a square of so many metres if any."""
+    walled = [[s * (walls / 2 + 0.1), 0.0, 0.0, 0.1, walls] for s in (1, -1)]
+    walled += [[0.0, s * (walls / 2 + 0.1), 0.0, walls, 0.1] for s in (1, -1)]
+    rows = [*(walled if walls else [UNUSED_BOX] * 4), *boxes]
+    return World(
+        boxes=jnp.array(rows + [UNUSED_BOX] * (6 - len(rows))),
+        box_heights=jnp.ones(6),
+        circles=jnp.array([*circles] + [UNUSED_CIRCLE] * (2 - len(circles))),
+        circle_heights=jnp.ones(2),
+        extent=jnp.array([40.0, 40.0]),
+        starts=jnp.zeros((1, 2)),
+        goals=jnp.zeros((1, 2)),
+    )
+
+
+def ranges(solids, x=0.0, y=0.0, yaw=0.0, max_range=10.0):
+    return np.asarray(scan_one(solids, jnp.array([x, y, yaw]), max_range), float)
+
+
+# -------------------------------------------------------------------------------------------------------------- by hand
+
+
+def test_beams_go_from_right_behind_counterclockwise_a_degree_apart():
+    np.testing.assert_allclose(np.rad2deg(BEAM_ANGLES), np.arange(-135, 136), atol=1e-4)
+
+
+def test_nothing_in_range_reads_the_range():
+    np.testing.assert_allclose(ranges(world()), 10.0, rtol=1e-6)
+    np.testing.assert_allclose(ranges(world(), max_range=3.5), 3.5, rtol=1e-6)
+
+
+def test_a_wall_ahead_reads_its_distance_over_the_cosine():
+    # The near face lies at x = 3 and reaches 4 m to either side: 53.1 degrees.
+    seen = ranges(world(boxes=[[3.5, 0.0, 0.0, 0.5, 4.0]]))
+    degrees = np.arange(-135, 136)
+    on_it = np.abs(degrees) <= 53
+    np.testing.assert_allclose(seen[on_it], 3.0 / np.cos(np.deg2rad(degrees[on_it])), rtol=2e-6)
+    np.testing.assert_allclose(seen[~on_it], 10.0, rtol=1e-6)
+
+
+def test_a_room_is_seen_from_off_its_middle_and_turned():
+    # 8 m by 8 m, seen from (1, -2), facing along y: 6 m ahead, 3 m to the right, 5 m to the left.
+    seen = ranges(world(walls=8.0), 1.0, -2.0, math.pi / 2)
+    assert seen[AHEAD] == pytest.approx(6.0, rel=1e-6)
+    assert seen[AHEAD - 90] == pytest.approx(3.0, rel=1e-6)
+    assert seen[AHEAD + 90] == pytest.approx(5.0, rel=1e-6)
+    assert seen[AHEAD + 45] == pytest.approx(5.0 * math.sqrt(2), rel=1e-6)  # the left wall comes before the one ahead
+    assert seen[AHEAD + 135] == pytest.approx(2.0 * math.sqrt(2), rel=1e-6)  # the wall behind
+
+
+def test_an_oriented_box_shows_its_corner_and_its_flanks():
+    # A square of half-side 1 turned by 45 degrees: its corner points at us from (4 - sqrt 2, 0).
+    seen = ranges(world(boxes=[[4.0, 0.0, math.pi / 4, 1.0, 1.0]]))
+    assert seen[AHEAD] == pytest.approx(4.0 - math.sqrt(2), abs=2e-5)
+    # Its flanks are |y| = x - (4 - sqrt 2); a beam at angle a meets the left one where x tan a = x - (4 - sqrt 2).
+    for degrees in (-15, -5, 5, 15):
+        angle = math.radians(abs(degrees))
+        expected = (4.0 - math.sqrt(2)) / (math.cos(angle) - math.sin(angle))
+        assert seen[AHEAD + degrees] == pytest.approx(expected, rel=1e-5)
+    # The outermost corners are at (4, +-sqrt 2), 19.47 degrees to either side.
+    assert seen[AHEAD + 19] < 5.0
+    assert seen[AHEAD + 20] == pytest.approx(10.0)
+
+
+def test_half_length_lies_along_the_yaw_of_a_box():
+    long_toward_us = ranges(world(boxes=[[5.0, 0.0, 0.0, 2.0, 0.5]]))
+    long_across = ranges(world(boxes=[[5.0, 0.0, math.pi / 2, 2.0, 0.5]]))
+    assert long_toward_us[AHEAD] == pytest.approx(3.0, rel=1e-5)
+    assert long_across[AHEAD] == pytest.approx(4.5, rel=1e-5)
+    slanted = ranges(world(boxes=[[5.0, 0.0, math.radians(30), 3.0, 0.1]]))
+    # A slat that rises to the left behind: its near face lies 0.1 / sin 30 = 0.2 m before the middle, as it is seen.
+    assert slanted[AHEAD] == pytest.approx(5.0 - 0.2, rel=1e-5)
+    assert slanted[AHEAD + 10] > slanted[AHEAD] > slanted[AHEAD - 10]
+
+
+def test_a_circle_is_hit_off_centre_as_the_closed_form_says():
+    x, y, radius = 3.0, 0.4, 0.5
+    seen = ranges(world(circles=[[x, y, radius]]))
+    for number, angle in enumerate(np.deg2rad(np.arange(-135, 136))):
+        along, across = x * math.cos(angle) + y * math.sin(angle), x * math.sin(angle) - y * math.cos(angle)
+        hit = abs(across) < radius and along > 0
+        expected = along - math.sqrt(radius**2 - across**2) if hit else 10.0
+        assert seen[number] == pytest.approx(expected, abs=1e-4)
+    assert seen[AHEAD] == pytest.approx(3.0 - 0.3, rel=1e-6)  # 0.4 off the middle of 0.5: 0.3 before the centre
+
+
+def test_a_grazing_beam_meets_a_solid_by_a_hair_or_misses_it_by_one():
+    # A beam along x at y = 0; a box whose side is at y = +-1e-4, a circle of radius 0.5 whose lowest point is there.
+    for over, expected in ((-1e-4, 4.0), (1e-4, 10.0)):
+        assert ranges(world(boxes=[[5.0, 0.5 + over, 0.0, 1.0, 0.5]]))[AHEAD] == pytest.approx(expected, rel=1e-5)
+    assert ranges(world(circles=[[5.0, 0.5 + 1e-4, 0.5]]))[AHEAD] == pytest.approx(10.0)
+    # Just inside by d the chord begins sqrt(2 r d) before the centre: 0.01 m.
+    assert ranges(world(circles=[[5.0, 0.5 - 1e-4, 0.5]]))[AHEAD] == pytest.approx(4.99, abs=1e-3)
+
+
+def test_a_beam_parallel_to_a_face_beside_it_runs_past():
+    seen = ranges(world(boxes=[[0.0, 0.6, 0.0, 3.0, 0.1]]))
+    assert seen[AHEAD] == pytest.approx(10.0)
+    assert seen[AHEAD + 90] == pytest.approx(0.5, rel=1e-6)
+    assert seen[AHEAD + 1] == pytest.approx(10.0)  # 0.5 / tan 1 degree = 28.6 m: past the end
+    assert seen[AHEAD + 10] == pytest.approx(0.5 / math.sin(math.radians(10)), rel=1e-5)
+
+
+def test_solids_behind_are_not_seen_ahead():
+    seen = ranges(world(boxes=[[-3.0, 0.0, 0.0, 0.5, 0.5]], circles=[[-3.0, 3.0, 0.5]]))
+    np.testing.assert_allclose(seen[AHEAD - 90 : AHEAD + 91], 10.0, rtol=1e-6)
+    assert seen[AHEAD + 135] == pytest.approx(3 * math.sqrt(2) - 0.5, rel=1e-5)
+
+
+def test_the_nearest_of_several_solids_is_seen():
+    seen = ranges(world(boxes=[[6.0, 0.0, 0.0, 0.5, 2.0]], circles=[[3.0, 0.0, 0.5], [8.0, 0.0, 0.5]], walls=18.0))
+    assert seen[AHEAD] == pytest.approx(2.5, rel=1e-6)
+    assert seen[AHEAD + 15] == pytest.approx(5.5 / math.cos(math.radians(15)), rel=1e-5)
+    assert seen[AHEAD - 25] == pytest.approx(9.0 / math.cos(math.radians(25)), rel=1e-5)  # the wall, past all of them
+
+
+def test_from_inside_a_solid_beams_read_the_way_out():
+    box = ranges(world(boxes=[[0.2, 0.0, 0.0, 1.0, 2.0]]))
+    assert box[AHEAD] == pytest.approx(1.2, rel=1e-6)
+    assert box[AHEAD + 90] == pytest.approx(2.0, rel=1e-6)
+    circle = ranges(world(circles=[[0.3, 0.0, 0.5]]))
+    assert circle[AHEAD] == pytest.approx(0.8, rel=1e-6)
+    assert circle[AHEAD + 90] == pytest.approx(0.4, rel=1e-6)
+
+
+def test_a_reading_never_exceeds_the_range_and_cuts_what_lies_nearer_nowhere():
+    solids = world(boxes=[[3.5, 0.0, 0.0, 0.5, 4.0]], circles=[[-1.0, 2.0, 0.5]])
+    far, near = ranges(solids, max_range=10.0), ranges(solids, max_range=3.2)
+    np.testing.assert_allclose(near, np.minimum(far, 3.2), rtol=1e-6)
+    assert (near < 3.19).any()
+    assert (far > 3.3).any()
+
+
+# ------------------------------------------------------------------------------------------------------------- faults
+
+
+def test_a_turned_sensor_shifts_the_beams():
+    # Turned 15 degrees counterclockwise, its beam n looks where beam n + 15 of a true sensor looks.
+    solids, pose = world(boxes=[[3.5, 0.5, 0.3, 0.5, 1.0]], circles=[[1.0, -2.0, 0.5]], walls=9.0), jnp.zeros(3)
+    true = np.asarray(read(Lidar(), solids, pose))
+    turned = np.asarray(read(Lidar(rotation=math.radians(15)), solids, pose))
+    np.testing.assert_allclose(turned[:-15], true[15:], rtol=1e-4)
+    assert np.abs(turned - true).max() > 1.0
+    column = world(circles=[[3.0 * math.cos(math.radians(15)), 3.0 * math.sin(math.radians(15)), 0.5]])
+    assert int(np.argmin(read(Lidar(), column, pose))) == AHEAD + 15
+    assert int(np.argmin(read(Lidar(rotation=math.radians(15)), column, pose))) == AHEAD
+
+
+def test_without_faults_a_reading_is_a_scan():
+    solids, pose = world(walls=9.0, circles=[[1.0, -2.0, 0.5]]), jnp.array([0.3, 0.2, 1.0])
+    np.testing.assert_allclose(read(Lidar(), solids, pose), scan_one(solids, pose), rtol=1e-6)
+
+
+def some_poses(count, seed=0):
+    return jnp.asarray(np.random.default_rng(seed).uniform(-1, 1, (count, 3)), jnp.float32)
+
+
+def test_noise_has_the_deviation_asked_for_and_no_bias():
+    solids, poses = world(walls=12.0), some_poses(200)
+    true = np.asarray(read_many(Lidar(), solids, poses), float)
+    error = np.asarray(read_many(Lidar(noise=0.05), solids, poses), float) - true
+    error = error[true < 9.5]  # nearer the range it is cut
+    assert error.size > 50_000
+    assert error.std() == pytest.approx(0.05, rel=0.02)  # its standard error is 0.3%
+    assert abs(error.mean()) < 5 * 0.05 / math.sqrt(error.size)
+    assert (np.abs(error) < 0.05).mean() == pytest.approx(0.6827, abs=0.01)
+
+
+def test_noise_differs_between_beams_and_poses():
+    solids, poses = world(walls=12.0), some_poses(50)
+    error = np.asarray(read_many(Lidar(noise=0.05), solids, poses) - read_many(Lidar(), solids, poses), float)
+    between_beams = np.corrcoef(error[:, 0:200:2].ravel(), error[:, 1:200:2].ravel())[0, 1]
+    between_poses = np.corrcoef(error[:25].ravel(), error[25:].ravel())[0, 1]
+    assert abs(between_beams) < 0.06
+    assert abs(between_poses) < 0.06
+    nudged = poses[0].at[0].set(np.nextafter(np.float32(poses[0, 0]), np.float32(2)))
+    again = np.asarray(read(Lidar(noise=0.05), solids, nudged), float) - np.asarray(read(Lidar(), solids, nudged))
+    assert np.abs(again - error[0]).max() > 0.05  # the last bit of a pose is another draw
+
+
+def test_the_same_pose_reads_the_same():
+    solids, poses = world(walls=12.0), some_poses(5)
+    lidar = Lidar(noise=0.05, dropout=0.1)
+    first, second = (np.asarray(read_many(lidar, solids, poses)) for _ in range(2))
+    np.testing.assert_array_equal(first, second)
+    np.testing.assert_allclose(np.asarray(read(lidar, solids, poses[3])), first[3], rtol=1e-6)
+
+
+def test_drop_outs_read_the_range_at_the_share_asked_for():
+    solids, poses = world(walls=12.0), some_poses(200)
+    true = np.asarray(read_many(Lidar(), solids, poses))
+    seen = np.asarray(read_many(Lidar(dropout=0.2), solids, poses))
+    assert (true < 9.9).all()
+    gone = seen == 10.0
+    assert gone.mean() == pytest.approx(0.2, abs=0.01)  # its standard error is 0.17%
+    np.testing.assert_allclose(seen[~gone], true[~gone], rtol=1e-6)
+    blind = np.asarray(read_many(Lidar(dropout=1.0, max_range=7.0), solids, poses))
+    np.testing.assert_array_equal(blind, 7.0)
+
+
+def test_a_faulty_reading_stays_between_zero_and_the_range():
+    solids, poses = world(walls=4.0), some_poses(100)
+    seen = np.asarray(read_many(Lidar(noise=2.0, dropout=0.1, max_range=3.0), solids, poses))
+    assert seen.min() == 0.0
+    assert seen.max() == 3.0
+
+
+def test_changed_faults_need_no_new_trace():
+    chex.clear_trace_counter()
+    counted = jax.jit(chex.assert_max_traces(lambda lidar, pose: lidar.read(world(walls=9.0), pose), n=1))
+    changes = [{}, {"rotation": 0.2}, {"noise": 0.1}, {"dropout": 0.3}, {"max_range": 2.0}]
+    for change in changes:
+        values = {"max_range": 10.0, "rotation": 0.0, "noise": 0.0, "dropout": 0.0, **change}
+        counted(Lidar(**{name: jnp.float32(value) for name, value in values.items()}), jnp.zeros(3))
+
+
+# ---------------------------------------------------------------------------------------------------- another engine
+
+
+@pytest.fixture(scope="module")
+def engine():
+    """Worlds in MuJoCo, a file shared with the benchmarks."""
+    path = Path(__file__).parents[3] / "benchmarks" / "mujoco_world.py"
+    spec = importlib.util.spec_from_file_location("mujoco_world", path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.parametrize("style", ["clutter", "rooms", "corridor"])
+def test_beams_end_where_mujocos_rays_do(engine, style):
+    rng = np.random.default_rng(0)
+    ours, theirs = [], []
+    for number in range(8):
+        solids = generate_one(jax.random.fold_in(jax.random.key(5), number), style=style)
+        poses = engine.poses(rng, solids, 4)
+        model = engine.model(solids)
+        data = engine.settled(model)
+        ours.append(scan_many(solids, jnp.asarray(poses)))
+        theirs.append([engine.scan(model, data, pose, 10.0) for pose in poses])
+    apart = np.abs(np.asarray(ours, float) - np.array(theirs))
+    assert (np.array(theirs) < 10.0).mean() > 0.5  # else it says little
+    assert (apart <= 1e-3).mean() >= 0.999  # `benchmarks/lidar_parity.py` does this at length
+
+
+def test_beams_end_where_mujocos_rays_do_in_a_room_by_hand(engine):
+    solids = world(
+        boxes=[[2.0, 1.0, 0.4, 0.8, 0.3], [-2.0, -1.5, 2.0, 0.5, 0.05]],
+        circles=[[1.0, -2.0, 0.6], [-1.2, 2.1, 0.1]],
+        walls=8.0,
+    )
+    model = engine.model(solids)
+    assert model.ngeom == 8
+    for pose in ([0.0, 0.0, 0.0], [0.0, 0.0, 2.5], [2.1, 1.0, -1.0], [1.2, -2.1, 0.7]):  # the last two inside a solid
+        theirs = engine.scan(model, engine.settled(model), np.float32(pose), 10.0)
+        np.testing.assert_allclose(ranges(solids, *pose), theirs, atol=1e-4)

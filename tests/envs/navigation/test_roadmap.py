@@ -1,0 +1,369 @@
+"""The road map against networkx and NumPy's own geometry, and the teacher that reads it."""
+
+import math
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import networkx
+import numpy as np
+import pytest
+
+from cuelearner_envs.navigation import World
+from cuelearner_envs.navigation.environment import Navigation, Walker
+from cuelearner_envs.navigation.layouts import BOXES, CIRCLES
+from cuelearner_envs.navigation.roadmap import BLOCKED, LINE_MARGIN, NODE_MARGIN, RoadMapTeacher, make_teacher, way
+from cuelearner_envs.navigation.world import FAR_AWAY
+from cuelearner_envs.navigation.worlds import generate_many
+from cuelearner_jax import evaluate
+from cuelearner_jax.actions import difference, from_angle
+from cuelearner_jax.config import Scalars, Sizes
+from cuelearner_jax.guidance import registry as guidances
+from cuelearner_jax.guidance.answers import human_answer, relative_answer
+from cuelearner_jax.policies import Taught
+from cuelearner_jax.types import Label
+
+REACH = 0.465  # from the middle of the body to its farthest point [m]
+NEEDED = REACH + LINE_MARGIN
+ROUNDING = 2e-5  # of the map's float32 against float64 here [m]
+STYLES = ("clutter", "rooms", "corridor")
+ASKED = 40  # places in each world that the teacher is asked about
+ROUTES = (0, 5, 11)  # of each world
+
+
+# --- geometry in float64, by other means than the map's --------------------------------------------------------------
+
+
+def to_segments(points, starts, ends):
+    """Distances from points to segments (..., 2)."""
+    along = ends - starts
+    length = np.maximum(np.sum(along**2, -1), 1e-30)
+    share = np.clip(np.sum((points - starts) * along, -1) / length, 0, 1)
+    return np.linalg.norm(points - starts - share[..., None] * along, axis=-1)
+
+
+def cross(a, b):
+    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+
+
+def between(a, b, c, d):
+    """Distances between the segments ab and cd: zero where they cross, else from an end of one to the other."""
+    ends = [to_segments(a, c, d), to_segments(b, c, d), to_segments(c, a, b), to_segments(d, a, b)]
+    crossing = (cross(b - a, c - a) * cross(b - a, d - a) < 0) & (cross(d - c, a - c) * cross(d - c, b - c) < 0)
+    return np.where(crossing, 0, np.min(ends, axis=0))
+
+
+def solids(world):
+    """Corners (boxes, 4, 2) in turn, and circles (circles, 3)."""
+    boxes, circles = np.asarray(world.boxes, float), np.asarray(world.circles, float)
+    corners = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * boxes[:, None, 3:]
+    cos, sin = np.cos(boxes[:, 2])[:, None], np.sin(boxes[:, 2])[:, None]
+    x, y = corners[..., 0], corners[..., 1]
+    return boxes[:, None, :2] + np.stack([cos * x - sin * y, sin * x + cos * y], -1), circles
+
+
+def room(world, starts, ends):
+    """Distance of lines (lines, 2) that begin outside all solids to the nearest solid [m]."""
+    corners, circles = solids(world)
+    starts, ends = np.asarray(starts, float), np.asarray(ends, float)
+    gaps = [to_segments(circle[:2], starts, ends) - circle[2] for circle in circles]
+    gaps += [between(starts, ends, box[side], box[(side + 1) % 4]) for box in corners for side in range(4)]
+    return np.min(gaps, axis=0)
+
+
+def clear_of(world, points):
+    """Distance from points (points, 2) to the nearest solid; 0 inside a box."""
+    corners, _ = solids(world)
+    points = np.asarray(points, float)
+    sides = np.roll(corners, -1, axis=1) - corners
+    inside = (cross(sides, points[:, None, None] - corners) > 0).all(-1).any(-1)
+    return np.where(inside, 0, room(world, points, points))
+
+
+# --- worlds and their maps -------------------------------------------------------------------------------------------
+
+
+def gate(side):
+    """16 m by 12 m, cut in two at x = 0 by a wall with one gap of 2 m: to the left (1) or to the right (-1)."""
+    walls = [[8.1, 0, 0, 0.1, 6.2], [-8.1, 0, 0, 0.1, 6.2], [0, 6.1, 0, 8.2, 0.1], [0, -6.1, 0, 8.2, 0.1]]
+    # From one side wall to 3 m beyond the middle, and from 5 m to the other side wall.
+    pieces = [[0.0, -1.5 * side, 0, 0.1, 4.5], [0.0, 5.5 * side, 0, 0.1, 0.5]]
+    unused = [[FAR_AWAY, FAR_AWAY, 0.0, 0.01, 0.01]] * (BOXES - 6)
+    return World(
+        boxes=jnp.array(walls + pieces + unused, jnp.float32),
+        box_heights=jnp.full(BOXES, 1.5),
+        circles=jnp.array([[FAR_AWAY, FAR_AWAY, 0.01]] * CIRCLES),
+        circle_heights=jnp.ones(CIRCLES),
+        extent=jnp.array([16.0, 12.0]),
+        starts=jnp.tile(jnp.array([[-4.0, 0.0], [4.0, -3.0]]), (8, 1)),
+        goals=jnp.tile(jnp.array([[4.0, 0.0], [4.0, 3.0]]), (8, 1)),
+    )
+
+
+WORLDS = range(2 * len(STYLES))
+GATES = {6: 1, 7: -1}  # worlds with the gap on the left and on the right
+
+
+@pytest.fixture(scope="module")
+def teacher() -> RoadMapTeacher:
+    """Two worlds of each style, then the two gates."""
+    made = [generate_many(jax.random.key(3), 8, style) for style in STYLES]  # eight, as other tests have compiled
+    worlds = [jax.tree.map(lambda leaf: leaf[:2], many) for many in made]
+    worlds += [jax.tree.map(lambda leaf: leaf[None], gate(side)) for side in GATES.values()]
+    together = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *worlds)
+    return make_teacher(Navigation(worlds=together, max_steps=jnp.int32(160)))
+
+
+def one(tree, index):
+    return jax.tree.map(lambda leaf: np.asarray(leaf[index]), tree)
+
+
+def graph_of(roadmap):
+    """The very map as a graph of networkx."""
+    graph = networkx.Graph()
+    graph.add_nodes_from(range(len(roadmap.nodes)))
+    joined = np.argwhere(np.triu(np.isfinite(roadmap.lengths), 1))
+    graph.add_weighted_edges_from((int(a), int(b), float(roadmap.lengths[a, b])) for a, b in joined)
+    return graph
+
+
+def lengths_to(graph, roadmap, goal, seen):
+    """Lengths of the shortest ways from all nodes to a goal that is seen from some."""
+    graph = graph.copy()
+    direct = np.linalg.norm(roadmap.nodes - goal, axis=-1)
+    graph.add_weighted_edges_from(("goal", int(node), float(direct[node])) for node in np.flatnonzero(seen))
+    found = networkx.single_source_dijkstra_path_length(graph, "goal") if "goal" in graph else {}
+    return np.array([found.get(node, math.inf) for node in range(len(roadmap.nodes))])
+
+
+def useful(roadmap):
+    return np.isfinite(roadmap.lengths).any(-1)
+
+
+@pytest.mark.parametrize("index", WORLDS)
+def test_lengths_to_goals_are_those_of_dijkstra_on_the_same_graph(teacher, index):
+    world, roadmap = one(teacher.env.worlds, index), one(teacher.maps, index)
+    graph, reached = graph_of(roadmap), 0
+    for route in ROUTES:
+        goal, found = world.goals[route], np.asarray(teacher.to_goals[index, route])
+        gaps = np.full(len(roadmap.nodes), -1.0)
+        gaps[useful(roadmap)] = room(world, np.tile(goal, (useful(roadmap).sum(), 1)), roadmap.nodes[useful(roadmap)])
+        # Lines within rounding of what is needed may or may not be edges.
+        shortest = lengths_to(graph, roadmap, goal, gaps >= NEEDED - ROUNDING)
+        longest = lengths_to(graph, roadmap, goal, gaps >= NEEDED + ROUNDING)
+        assert (found >= shortest - 1e-3).all()
+        assert (found <= longest + 1e-3).all()
+        reached += np.isfinite(found).sum()
+        assert np.isfinite(found[useful(roadmap)]).mean() > 0.9
+    assert reached > 100
+
+
+@pytest.mark.parametrize("index", WORLDS)
+def test_nodes_are_joined_where_the_inflated_body_can_walk_and_nowhere_else(teacher, index):
+    world, roadmap = one(teacher.env.worlds, index), one(teacher.maps, index)
+    nodes = np.flatnonzero(useful(roadmap))
+    assert len(nodes) > 60
+    places = roadmap.nodes[nodes].astype(float)
+    assert clear_of(world, places).min() >= REACH + NODE_MARGIN - 2e-4
+    assert (np.abs(places) < world.extent / 2).all()
+    np.testing.assert_array_equal(roadmap.lengths, roadmap.lengths.T)
+    a, b = np.triu_indices(len(nodes), 1)
+    gaps, lengths = room(world, places[a], places[b]), roadmap.lengths[nodes[a], nodes[b]]
+    joined = np.isfinite(lengths)
+    assert gaps[joined].min() >= NEEDED - ROUNDING
+    assert gaps[~joined].max() <= NEEDED + ROUNDING
+    np.testing.assert_allclose(lengths[joined], np.linalg.norm(places[a] - places[b], axis=-1)[joined], atol=1e-5)
+    assert 0.02 < joined.mean() < 0.9
+
+
+@jax.jit
+def ways(teacher, index, route, positions):
+    """The next place and the length of the way from positions (n, 2) of a world to a route's goal."""
+    world, roadmap = jax.tree.map(lambda leaf: leaf[index], (teacher.env.worlds, teacher.maps))
+    ask = partial(way, roadmap, world, teacher.env.robot, teacher.to_goals[index, route])
+    return jax.vmap(lambda position: ask(position, world.goals[route]))(positions)
+
+
+def free_places(world, seed, count=ASKED, spare=0.01):
+    """Random places at which the body may turn and a line need not come closer to a solid."""
+    rng = np.random.default_rng(seed)
+    places = rng.uniform(-0.5, 0.5, (2000, 2)) * world.extent
+    return places[clear_of(world, places) >= NEEDED + spare][:count].astype(np.float32)
+
+
+@pytest.mark.parametrize("index", WORLDS)
+def test_a_way_is_the_straight_line_where_the_goal_is_in_view_and_else_leads_over_the_best_node_in_view(teacher, index):
+    world, roadmap = one(teacher.env.worlds, index), one(teacher.maps, index)
+    places, nodes = free_places(world, index), np.flatnonzero(useful(roadmap))
+    assert len(places) == ASKED
+    views = np.full((ASKED, len(roadmap.nodes)), -1.0)
+    views[:, nodes] = [room(world, np.tile(place, (len(nodes), 1)), roadmap.nodes[nodes]) for place in places]
+    away = np.linalg.norm(places[:, None] - roadmap.nodes, axis=-1)
+    kinds = []
+    for route in ROUTES:
+        goal, rest = world.goals[route], np.asarray(teacher.to_goals[index, route])
+        following, lengths = map(np.asarray, ways(teacher, index, route, places))
+        straight = np.linalg.norm(places - goal, axis=-1)
+        direct = room(world, places, np.tile(goal, (ASKED, 1)))
+        assert (lengths >= straight - 1e-4).all()
+        sees, blind = direct >= NEEDED + ROUNDING, direct < NEEDED - ROUNDING
+        np.testing.assert_allclose(lengths[sees], straight[sees], atol=1e-4)
+        np.testing.assert_array_equal(following[sees], np.tile(goal, (sees.sum(), 1)))
+        # Round a solid: a node in line of sight, on a way as short as any.
+        least = np.min(np.where(views >= NEEDED - ROUNDING, away + rest, math.inf), -1)
+        most = np.min(np.where(views >= NEEDED + ROUNDING, away + rest, math.inf), -1)
+        known = blind & np.isfinite(most)
+        assert known.sum() >= 0.95 * blind.sum()
+        assert (lengths >= least - 1e-3)[known].all()
+        assert (lengths <= most + 1e-3)[known].all()
+        for place, length, view, near in zip(following[known], lengths[known], views[known], away[known], strict=True):
+            node = int(np.argmin(np.linalg.norm(roadmap.nodes - place, axis=-1)))
+            np.testing.assert_array_equal(roadmap.nodes[node], place)
+            assert view[node] >= NEEDED - ROUNDING
+            assert length == pytest.approx(near[node] + rest[node], abs=1e-3)
+        kinds.append((sees.sum(), known.sum()))
+    assert np.sum(kinds, axis=0).min() >= 10
+
+
+@pytest.mark.parametrize("index", WORLDS)
+def test_a_way_gets_shorter_by_what_is_walked_along_it(teacher, index):
+    world = one(teacher.env.worlds, index)
+    for route in ROUTES[:2]:
+        places = free_places(world, 100 + index)
+        following, lengths = map(np.asarray, ways(teacher, index, route, places))
+        part = (0.7 * places + 0.3 * following).astype(np.float32)
+        _, later = map(np.asarray, ways(teacher, index, route, part))
+        known = lengths < BLOCKED
+        assert known.mean() > 0.9
+        walked = np.linalg.norm(part - places, axis=-1)
+        assert (later <= lengths - walked + 2e-3)[known].all()  # shorter still where a better node comes in view
+
+
+def test_every_route_has_a_way(teacher):
+    for index in WORLDS:
+        world = one(teacher.env.worlds, index)
+        for route in range(16):
+            _, length = ways(teacher, index, route, jnp.tile(world.starts[route], (ASKED, 1)))
+            straight = np.linalg.norm(world.goals[route] - world.starts[route])
+            assert straight - 1e-4 <= length[0] < BLOCKED
+
+
+# --- the teacher -----------------------------------------------------------------------------------------------------
+
+
+best = jax.jit(lambda teacher, states: jax.vmap(lambda state: teacher.best_action(state, jnp.zeros(280)))(states))
+observe = jax.jit(lambda env, states: jax.vmap(env.observe)(states))
+
+
+def walkers(world, index, route, places, yaws):
+    count = len(places)
+    number = partial(jnp.full, (count,), dtype=jnp.int32)
+    poses = jnp.concatenate([jnp.asarray(places), jnp.asarray(yaws, jnp.float32)[:, None]], -1)
+    goals = jnp.tile(world.goals[route], (count, 1))
+    nothing = jnp.zeros((count, 3, 2))
+    return Walker(poses, jnp.zeros((count, 2)), goals, nothing, number(index), number(route), number(0))
+
+
+@pytest.mark.parametrize("index", WORLDS)
+def test_the_teacher_points_at_the_next_place_in_the_bodys_frame(teacher, index):
+    world, route = one(teacher.env.worlds, index), ROUTES[0]
+    places = free_places(world, 200 + index)
+    yaws = np.linspace(-3, 3, ASKED)
+    states = walkers(world, index, route, places, yaws)
+    answers = np.asarray(best(teacher, states), float)
+    np.testing.assert_allclose(np.linalg.norm(answers, axis=-1), 1, atol=1e-5)
+    following, _ = ways(teacher, index, route, places)
+    offset = np.asarray(following, float) - places
+    expected = np.arctan2(offset[:, 1], offset[:, 0]) - yaws
+    np.testing.assert_allclose(answers, np.stack([np.cos(expected), np.sin(expected)], -1), atol=1e-4)
+    sees = room(world, places, np.tile(world.goals[route], (ASKED, 1))) >= NEEDED + ROUNDING
+    assert sees.any()
+    toward = jax.vmap(teacher.env.heuristic)(observe(teacher.env, states))
+    np.testing.assert_allclose(answers[sees], np.asarray(toward)[sees], atol=1e-4)
+
+
+def test_whoever_follows_the_teacher_arrives(teacher):
+    measure = jax.jit(lambda teacher, key: evaluate.rollout(Taught(teacher), teacher.env, key, 24, 24 * 160))
+    found = {name: float(value) for name, value in measure(teacher, jax.random.key(5)).items()}
+    assert found["finished"] == 1
+    assert found["success"] >= 23 / 24
+    assert found["duration"] < 20
+
+
+# --- what the teacher says -------------------------------------------------------------------------------------------
+
+
+SCALARS = Scalars(eps_deg=20.0)
+told, asked = jax.jit(human_answer), jax.jit(relative_answer)
+
+
+def answer(teacher, index, pose, goal, action_deg, scalars=SCALARS):
+    """h and the angle by which the label turns the action [deg]."""
+    world = one(teacher.env.worlds, index)
+    state = walkers(world, index, goal, np.array([pose[:2]], np.float32), [math.radians(pose[2])])
+    action = from_angle(jnp.deg2rad(jnp.float32(action_deg)))
+    key, wanted, obs = jax.random.key(0), best(teacher, state)[0], observe(teacher.env, state)[0]
+    h, _ = told(key, action, wanted, scalars)
+    relative = guidances.make("relative", Sizes(feedback_layers=(8,)), teacher.env)
+    where = jax.tree.map(lambda leaf: leaf[0], state)
+    said, answered = asked(key, teacher, where, obs, action, scalars)
+    assert bool(answered)
+    assert said.tolist() == [float(h)]
+    target = relative.target(Label(obs, action, said, answered), scalars)
+    return int(h), round(math.degrees(float(difference(action, action + target))), 3)
+
+
+@pytest.mark.parametrize(
+    ("pose", "action_deg", "h"),
+    [
+        # The goal (4, 3) stands in view, to the left of a body that faces along x: 90 degrees.
+        ((4.0, -3.0, 0.0), 0.0, 1),
+        ((4.0, -3.0, 0.0), 79.0, 1),
+        ((4.0, -3.0, 0.0), 81.0, 0),
+        ((4.0, -3.0, 0.0), 99.0, 0),
+        ((4.0, -3.0, 0.0), 101.0, -1),
+        ((4.0, -3.0, 0.0), 180.0, -1),
+        ((4.0, -3.0, 0.0), -89.0, 1),
+        ((4.0, -3.0, 0.0), -91.0, -1),
+        # The body turned: ahead, behind and to the right.
+        ((4.0, -3.0, 90.0), 0.0, 0),
+        ((4.0, -3.0, 90.0), 20.0, -1),
+        ((4.0, -3.0, -90.0), 170.5, 0),
+        ((4.0, -3.0, -90.0), -160.0, -1),
+        ((4.0, -3.0, -90.0), 160.0, 1),
+        ((4.0, -3.0, 180.0), -90.0, 0),
+        ((4.0, -3.0, 180.0), 0.0, -1),
+    ],
+)
+def test_a_goal_in_view_is_left_or_right_of_the_action_or_right_there(teacher, pose, action_deg, h):
+    for index in GATES:
+        assert answer(teacher, index, pose, 1, action_deg) == (h, pytest.approx(20 * h, abs=0.01))
+
+
+@pytest.mark.parametrize("yaw", [0.0, 120.0, -75.0])
+def test_straight_at_a_goal_behind_a_wall_the_answer_is_the_side_of_the_gap(teacher, yaw):
+    for index, side in GATES.items():
+        # Straight toward the goal, and at the gap's middle (0, 4), 45 degrees aside, from which the wall's end differs.
+        assert answer(teacher, index, (-4.0, 0.0, yaw), 0, -yaw) == (side, pytest.approx(20 * side, abs=0.01))
+        beyond = -yaw + side * 80.0
+        assert answer(teacher, index, (-4.0, 0.0, yaw), 0, beyond) == (-side, pytest.approx(-20 * side, abs=0.01))
+        assert answer(teacher, index, (-4.0, 0.0, yaw), 0, -yaw + side * 43.0)[0] == 0
+
+
+def test_the_way_through_the_gap_is_as_long_as_it_has_to_be(teacher):
+    # The shortest that keeps a line's distance: tangents of sqrt(3.9^2 + 3^2 - 0.545^2) m to an arc round either corner
+    # of the wall's end, 0.2 m between the arcs, which together turn by twice 43.93 degrees.
+    shortest = 2 * math.sqrt(3.9**2 + 3.0**2 - NEEDED**2) + 0.2 + NEEDED * math.radians(2 * 43.93)
+    for index, side in GATES.items():
+        places = jnp.tile(jnp.array([-4.0, 0.0]), (ASKED, 1))
+        following, length = ways(teacher, index, 0, places)
+        assert shortest - 1e-3 < float(length[0]) < 1.1 * shortest
+        assert 3.0 < side * float(following[0, 1]) < 5.0
+
+
+def test_faults_turn_answers_round_or_keep_them_back(teacher):
+    wrong = Scalars(eps_deg=20.0, mistake_probability=1.0)
+    assert answer(teacher, 6, (4.0, -3.0, 0.0), 1, 0.0, wrong) == (-1, pytest.approx(-20.0, abs=0.01))
+    biased = Scalars(eps_deg=20.0, teacher_bias_deg=40.0)
+    assert answer(teacher, 6, (4.0, -3.0, 0.0), 1, 90.0, biased)[0] == 1
+    assert answer(teacher, 6, (4.0, -3.0, 0.0), 1, 130.0, biased)[0] == 0

@@ -1,0 +1,222 @@
+"""The examples: what their docstrings tell to type, at a tiny scale, and what is refused of them."""
+
+import contextlib
+import dataclasses
+import importlib
+import json
+import re
+import shlex
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from cuelearner_jax.cli import main
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.guidance import registry as guidances
+from cuelearner_jax.records import results
+from cuelearner_jax.tasks import registry as tasks
+from cuelearner_jax.testing import check_environment, check_guidance, check_policy, check_task
+
+ROOT = Path(__file__).resolve().parents[2]
+TINY = shlex.split("""
+    --sizes.q-layers 8 --sizes.feedback-layers 8 --sizes.directions 6 --sizes.target-directions 6 --sizes.fit-steps 20
+    --sizes.labels-per-round 5 --schedule.total-steps 40 --schedule.random-steps 10 --schedule.learn-after 10
+    --schedule.guidance-until 20 --schedule.eval-every 20 --schedule.eval-steps 40 --schedule.eval-envs 4
+    --schedule.checkpoint-every 40
+""")
+SMALL = {
+    "train": [*TINY, "--labels", "5"],
+    "sweep": [*TINY, "--labels", "5", "--seeds", "2"],
+    "evaluate": ["--steps", "40", "--envs", "4"],
+    "render": ["--steps", "2"],
+    "report": [],
+}
+
+
+@contextlib.contextmanager
+def stranger():
+    """A process that knows no task, kind or module of the examples, and forgets them again."""
+    kinds, known = dict(guidances._KINDS), dict(tasks._registered)
+    modules = {name: sys.modules.pop(name) for name in list(sys.modules) if name.split(".")[0] == "examples"}
+    guidances._KINDS.pop("clone", None)
+    tasks._registered.clear()
+    try:
+        yield
+    finally:
+        for table, before in ((guidances._KINDS, kinds), (tasks._registered, known)):
+            table.clear()
+            table.update(before)
+        for name in [name for name in sys.modules if name.split(".")[0] == "examples"]:
+            del sys.modules[name]
+        sys.modules.update(modules)
+
+
+@pytest.fixture(autouse=True)
+def there(monkeypatch):
+    """In the folder above the examples."""
+    monkeypatch.chdir(ROOT)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    with stranger():
+        yield
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory):
+    return tmp_path_factory.mktemp("examples")
+
+
+def documented(name):
+    """The commands of an example's docstring."""
+    text = (ROOT / "examples" / f"{name}.py").read_text().split('"""')[1]
+    return [shlex.split(line)[1:] for line in re.findall(r"^    (cuelearner .*)$", text, re.MULTILINE)]
+
+
+def at_home(command, home, small=True):
+    """A documented command with its folders at `home`, at a tiny scale (options typed later win)."""
+    moved = [re.sub(r"^(runs|pictures)\b", lambda found: str(home / found[0]), part) for part in command]
+    given = set(re.findall(r"--\S+", " ".join(moved)))
+    options = SMALL[command[0]] if small else []
+    pairs = [[option, value] for option, value in zip(options[::2], options[1::2], strict=True)]
+    return moved + [part for pair in pairs if pair[0] not in given for part in pair]
+
+
+def run(name, home):
+    """Runs what an example documents, each command as a process of its own would."""
+    for command in documented(name):
+        with stranger():
+            assert main(at_home(command, home)) == 0, command
+
+
+@pytest.fixture(scope="module")
+def runs(home):
+    """The folders that the documented commands leave."""
+    before = Path.cwd()
+    with contextlib.chdir(ROOT):
+        for name in ("reach", "clone", "brax_task"):
+            with stranger():
+                run(name, home)
+    assert Path.cwd() == before
+    return home / "runs"
+
+
+def test_the_documented_commands_run(runs, home):
+    assert [len(documented(name)) for name in ("reach", "clone", "brax_task", "policy")] == [5, 3, 2, 0]
+    assert {row["guidance"] for row in results.read(runs / "reach").to_pylist()} == {"none", "relative"}
+    assert {row["guidance"] for row in results.read(runs / "clone").to_pylist()} == {"none", "clone"}
+    assert {row["task"] for row in results.read(runs / "pendulum").to_pylist()} == {"pendulum"}
+    assert (runs / "reach" / "report").is_dir()
+    for name, size in (("reach-agent.png", (480, 480)), ("reach-agent-question.png", (480, 480))):
+        picture = np.asarray(Image.open(home / "pictures" / name).convert("RGB"))
+        assert picture.shape[:2] == size
+        assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 10
+    with Image.open(home / "pictures" / "reach-agent.gif") as film:
+        assert film.n_frames >= 2
+
+
+def refused(capsys, command, says):
+    capsys.readouterr()
+    with stranger():
+        assert main([str(part) for part in command]) == 2
+    told = [line for line in capsys.readouterr().err.splitlines() if " lanes, " not in line]
+    assert len(told) == 1, told
+    assert says in told[0], told[0]
+
+
+def test_a_run_folder_alone_loads_no_code(runs, capsys):
+    refused(capsys, ["evaluate", runs / "reach"], "add --task examples.reach:TASK if you trust that code")
+    refused(capsys, ["render", runs / "clone"], "add --task examples.reach:TASK if you trust that code")
+
+
+def test_a_kind_from_outside_must_be_named_again(runs, capsys):
+    command = ["evaluate", runs / "clone", "--task", "examples.reach:TASK"]
+    refused(capsys, command, "--guidance package.module:NAME")
+    refused(capsys, [*command, "--guidance", "clone"], "--guidance package.module:NAME")
+    refused(capsys, ["render", *command[1:], "--out", runs / "new"], "--guidance package.module:NAME")
+    assert not (runs / "new").exists()
+    with stranger():
+        assert main([*map(str, command), "--guidance", "none", *SMALL["evaluate"]]) == 0  # the other lanes need no code
+
+
+def test_a_kind_that_asks_needs_a_teacher(home, capsys):
+    for kind in ("relative", "examples.clone:KIND"):
+        command = ["train", "examples.brax_task:TASK", *TINY, "--guidance", kind, "--out", home / "new"]
+        refused(capsys, command, "pendulum has no teacher to ask")
+    assert not (home / "new").exists()
+
+
+def test_a_run_goes_on_with_the_same_command(runs, home):
+    described = (runs / "clone" / "config.json").read_text()
+    rows = results.read(runs / "clone").num_rows
+    command = at_home(documented("clone")[0], home)
+    with stranger():
+        assert main([*command, "--resume"]) == 0
+    assert ((runs / "clone" / "config.json").read_text(), results.read(runs / "clone").num_rows) == (described, rows)
+    assert json.loads(described)["grid"]["guidance"] == ["none", "clone"]
+
+
+def test_the_parts_keep_the_laws(tmp_path):
+    reach, clone, brax, policy = (
+        importlib.import_module(f"examples.{name}") for name in ("reach", "clone", "brax_task", "policy")
+    )
+    config = reach.ReachConfig(max_steps=8, mirrors=True)
+    check_task(reach.TASK, config, pictures=tmp_path)
+    env = reach.make_environment(config)
+    check_guidance(clone.KIND, env)
+    for one in policy.policies(env).values():
+        check_policy(one, env)
+    check_task(brax.TASK)
+    check_environment(brax.make_environment(brax.PendulumConfig(max_steps=4)), steps=12, tolerance=1e-4)
+    with pytest.raises(UserError, match=r"task\.wind is -1"):
+        reach.make_environment(dataclasses.replace(config, wind=-1))
+
+
+def test_the_skipper_makes_straight_for_the_buoy():
+    """Its way never leaves the line from the start to the buoy, and the rudder is allowed for."""
+    reach = importlib.import_module("examples.reach")
+    jax = importlib.import_module("jax")
+    for rudder in (0.0, 25.0):
+        env = reach.make_environment(reach.ReachConfig(rudder_deg=rudder))
+        state, _ = env.reset(jax.random.key(3))
+        line = np.asarray(state.buoy)
+        for _ in range(5):
+            state = env.moved(state, reach.Skipper(env).best_action(state, env.observe(state)))
+            x, y = np.asarray(state.place)
+            assert abs(x * line[1] - y * line[0]) < 1e-5
+        assert x * line[0] + y * line[1] > 0
+
+
+def test_policies_of_ones_own_reach_the_buoy(tmp_path, capsys):
+    policy = importlib.import_module("examples.policy")
+    found = policy.main([str(tmp_path)], steps=8_000)
+    assert sorted(found) == sorted(policy.policies(None))
+    for metrics in found.values():
+        assert metrics["success"] > 0.9
+    for name in ("leaning.gif", "leaning.png"):
+        assert (tmp_path / name).stat().st_size > 1000
+    assert "wrote" in capsys.readouterr().out
+
+
+def test_a_kind_of_ones_own_that_asks_needs_labels(tmp_path, capsys):
+    command = [
+        "sweep",
+        "examples.reach:TASK",
+        *TINY,
+        "--guidance",
+        "examples.clone:KIND",
+        "--out",
+        str(tmp_path / "run"),
+    ]
+    assert main([*command, "--labels", "0"]) == 2
+    assert "a label budget of 0 teaches nothing" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
+
+
+def test_any_function_is_corrected(capsys):
+    from examples.correct_a_policy import main as correct
+
+    rates = correct(worlds=4, labels=10, episodes_measured=4)
+    assert [line.split(":")[0] for line in capsys.readouterr().out.splitlines()] == ["compass", "refined"]
+    assert all(rate in (0.0, 0.25, 0.5, 0.75, 1.0) for rate in rates)

@@ -1,0 +1,199 @@
+"""The append-only table: columns of every type, what a table says of itself, and what a crash leaves."""
+
+import json
+import os
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.records import table as tables
+
+SCHEMA = tables.Schema(
+    stem="catches",
+    mark="fish",
+    required=("fish", "weights"),
+    strings=("fish",),
+    integers=("count",),
+    lists=("weights",),
+    checksums=True,
+    remedy="is wet: dry it",
+)
+ABOUT = {"lake": "Como", "depth": None}
+
+
+def written(folder, *fish, about=ABOUT, **constants):
+    with tables.TableWriter(folder, SCHEMA, constants or None, about) as writer:
+        for index, name in enumerate(fish):
+            writer.append(fish=name, weights=[index, 0.1], count=index, length=0.5)
+    return folder / SCHEMA.jsonl
+
+
+def read(folder):
+    return tables.read(SCHEMA.growing(folder), SCHEMA)
+
+
+def test_columns_have_their_types(tmp_path):
+    written(tmp_path, "pike", "eel")
+    table = read(tmp_path)
+    assert {field.name: field.type for field in table.schema} == {
+        "fish": pa.string(),
+        "weights": pa.list_(pa.float32()),
+        "count": pa.int64(),
+        "length": pa.float64(),
+    }
+    assert table["weights"].to_pylist() == [[0.0, np.float32(0.1)], [1.0, np.float32(0.1)]]
+    assert table["count"].to_pylist() == [0, 1]
+
+
+def test_one_list_holds_for_all_rows_and_an_array_has_one_a_row(tmp_path):
+    with tables.TableWriter(tmp_path, SCHEMA) as writer:
+        writer.append(fish=["pike", "eel"], weights=np.arange(4.0).reshape(2, 2), spots=[1.0, float("inf")])
+        writer.append(fish=["carp", "perch"], weights=[5.0, float("nan")])
+        with pytest.raises(ValueError, match="one length"):
+            writer.append(fish=["pike", "eel"], weights=np.zeros((3, 2)))
+        with pytest.raises(ValueError, match="a row of catches needs the columns weights"):
+            writer.append(fish="pike")
+    table = read(tmp_path)
+    assert table["weights"].to_pylist() == [[0.0, 1.0], [2.0, 3.0], [5.0, None], [5.0, None]]
+    assert table["spots"].to_pylist() == [1.0, None, None, None]
+
+
+def test_a_32_bit_float_comes_back_bit_by_bit(tmp_path):
+    values = np.random.default_rng(0).normal(size=(50, 3)).astype(np.float32)
+    with tables.TableWriter(tmp_path, SCHEMA) as writer:
+        writer.append(fish=["pike"] * 50, weights=values)
+    np.testing.assert_array_equal(np.array(read(tmp_path)["weights"].to_pylist(), np.float32), values)
+    tables.finish(tmp_path, SCHEMA)
+    whole = tables.read(tmp_path / SCHEMA.parquet, SCHEMA)
+    np.testing.assert_array_equal(np.array(whole["weights"].to_pylist(), np.float32), values)
+
+
+def test_what_a_table_is_stays_with_it_through_every_change(tmp_path):
+    written(tmp_path, "pike")
+    assert tables.about_of(read(tmp_path)) == ABOUT
+    written(tmp_path, "eel", about={"lake": "Garda"})  # a table that exists keeps its own
+    tables.truncate(tmp_path, SCHEMA, keep=lambda row: row["fish"] != "pike")
+    path = tables.finish(tmp_path, SCHEMA)
+    table = tables.read(path, SCHEMA)
+    assert (tables.about_of(table), table["fish"].to_pylist()) == (ABOUT, ["eel"])
+    written(tmp_path, "carp")
+    assert not path.exists()
+    assert (tables.about_of(read(tmp_path)), read(tmp_path)["fish"].to_pylist()) == (ABOUT, ["eel", "carp"])
+    assert (tmp_path / SCHEMA.jsonl).read_text().count("about") == 1
+
+
+def test_a_table_that_says_nothing_of_itself(tmp_path):
+    written(tmp_path, "pike", about=None)
+    assert tables.about_of(read(tmp_path)) is None
+    assert tables.read(tables.finish(tmp_path, SCHEMA), SCHEMA).schema.metadata is None
+
+
+def test_constants_hold_until_the_next_ones(tmp_path):
+    written(tmp_path, "pike", boat=1.0)
+    written(tmp_path, "eel", boat=1.0)
+    written(tmp_path, "carp", boat=2.0)
+    assert read(tmp_path)["boat"].to_pylist() == [1.0, 1.0, 2.0]
+    assert (tmp_path / SCHEMA.jsonl).read_text().count("constants") == 2
+
+
+@pytest.mark.parametrize("torn", [b'{"fish": "ca', b"\x00\x00", b'{"fish": "\xc3'])
+def test_a_torn_last_line_is_dropped_by_whoever_continues(tmp_path, torn):
+    path = written(tmp_path, "pike", "eel")
+    with path.open("ab") as file:
+        file.write(torn)
+    assert read(tmp_path)["fish"].to_pylist() == ["pike", "eel"]
+    assert (tables.last_row(tmp_path, SCHEMA) or {})["fish"] == "eel"
+    written(tmp_path, "carp")
+    assert read(tmp_path)["fish"].to_pylist() == ["pike", "eel", "carp"]
+
+
+def test_a_line_is_on_the_disk_before_append_returns(tmp_path, monkeypatch):
+    written(tmp_path)
+    synced, usual = [], os.fsync
+
+    def fsync(descriptor):
+        synced.append((tmp_path / SCHEMA.jsonl).read_text().count("\n"))
+        usual(descriptor)
+
+    with tables.TableWriter(tmp_path, SCHEMA) as writer:
+        monkeypatch.setattr(os, "fsync", fsync)
+        writer.append(fish="pike", weights=[1.0])
+    assert synced == [2]  # what the table is, and the row
+
+
+def test_the_newest_row(tmp_path):
+    assert tables.last_row(tmp_path, SCHEMA) is None
+    written(tmp_path)
+    assert tables.last_row(tmp_path, SCHEMA) is None
+    written(tmp_path, "pike", "eel")
+    assert tables.last_row(tmp_path, SCHEMA) == {"fish": "eel", "weights": [1.0, 0.1], "count": 1, "length": 0.5}
+
+
+@pytest.mark.parametrize("name", ["", "catches.jsonl", "catches.parquet"])
+def test_a_table_is_named_by_its_folder_or_either_file(tmp_path, name):
+    assert SCHEMA.growing(tmp_path / name) == tmp_path / "catches.jsonl"
+
+
+def test_a_failed_write_leaves_the_file_before(tmp_path, monkeypatch):
+    path = tmp_path / "whole.parquet"
+    tables.write(path, pa.table({"fish": ["pike"], "weights": [[1.0]]}), SCHEMA)
+    before = path.read_bytes()
+
+    def full(*_, **__):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(pq, "write_table", full)
+    with pytest.raises(OSError, match="No space"):
+        tables.write(path, pa.table({"fish": ["eel"], "weights": [[1.0]]}), SCHEMA)
+    assert path.read_bytes() == before
+
+
+def test_checksums_are_written_where_asked(tmp_path):
+    table = pa.table({"fish": ["pike"] * 200, "weights": np.random.default_rng(0).normal(size=(200, 2)).tolist()})
+    sizes = []
+    for checksums in (False, True):
+        schema = tables.Schema("catches", "fish", (), strings=("fish",), lists=("weights",), checksums=checksums)
+        tables.write(tmp_path / "whole.parquet", table, schema)
+        sizes.append((tmp_path / "whole.parquet").stat().st_size)
+    assert sizes[1] > sizes[0]
+
+
+def test_files_are_told_apart_by_name_or_by_their_first_bytes(tmp_path):
+    path = written(tmp_path, "pike")
+    copy = tmp_path / "copy"
+    copy.write_bytes(path.read_bytes())
+    assert tables.read(copy, SCHEMA)["fish"].to_pylist() == ["pike"]
+    copy.write_bytes(tables.finish(tmp_path, SCHEMA).read_bytes())
+    assert tables.read(copy, SCHEMA)["fish"].to_pylist() == ["pike"]
+    # A table that was finished since its file was found.
+    assert tables.read(path, SCHEMA)["fish"].to_pylist() == ["pike"]
+
+
+def test_what_cannot_be_read_is_said_in_one_line(tmp_path):
+    def message(content, name=SCHEMA.jsonl):
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(UserError) as caught:
+            tables.read(tmp_path / name, SCHEMA)
+        assert "\n" not in str(caught.value)
+        return str(caught.value)
+
+    row = json.dumps({"fish": "pike", "weights": [1.0]}).encode()
+    assert "line 1, is not JSON" in message(b"{\n" + row + b"\n")
+    assert "line 1, is not a row of catches" in message(b'{"bird": 1}\n')
+    assert "line 1, is not a row of catches" in message(b"[]\n")
+    assert "is wet: dry it" in message(b'{"fish": "pike", "weights": 3}\n')
+    assert "is wet: dry it" in message(b"PAR1 and then rubbish", SCHEMA.parquet)
+    (tmp_path / SCHEMA.parquet).unlink()
+    assert "lacks the columns weights" in message(b'{"fish": "pike"}\n')
+
+
+def test_an_empty_table_cannot_be_finished_and_a_missing_one_neither(tmp_path):
+    with pytest.raises(UserError, match=r"no catches in .*: expected catches.jsonl or catches.parquet"):
+        tables.finish(tmp_path, SCHEMA)
+    written(tmp_path)
+    with pytest.raises(UserError, match="no rows"):
+        tables.finish(tmp_path, SCHEMA)
+    assert [file.name for file in tmp_path.iterdir()] == [SCHEMA.jsonl]

@@ -1,0 +1,169 @@
+"""Reports: a known difference is found and shown, what is missing is said, and nothing is overwritten unasked."""
+
+import csv
+import json
+from collections.abc import Sequence
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from matplotlib.image import imread
+
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.records import results
+from cuelearner_jax.report.document import report
+
+STEPS = np.arange(0, 101, 10)
+
+
+def write(folder, guidance, level, labels=0, *, seeds: Sequence[int] = range(8), steps=STEPS, **constants):
+    """Seeds that all stand at 0 until step 30 and at `level`, give or take 0.02, from step 40 on."""
+    constants = {"run": folder.name, "task": "one_ball", "guidance": guidance, "config_hash": "0f"} | constants
+    rng = np.random.default_rng(len(seeds))  # variants of one size differ in nothing but their level
+    with results.ResultsWriter(folder, commit="abc", versions="jax 0", hardware="1 x cpu", **constants) as writer:
+        for step in steps:
+            reward = (step > 30) * level + rng.uniform(-0.02, 0.02, len(seeds))
+            writer.append(step=step, split="validation", seed=np.array(seeds), labels=labels, reward=reward, wall_s=1.0)
+    (folder / "config.json").write_text(json.dumps({"total_steps": int(STEPS[-1])}))
+
+
+def summary(out):
+    with (out / "summary.csv").open() as file:
+        return {(row["guidance"], int(row["labels"])): row for row in csv.DictReader(file)}
+
+
+def picture(path):
+    return imread(path)[..., :3]
+
+
+@pytest.fixture
+def runs(tmp_path):
+    write(tmp_path / "runs" / "unguided", "none", 0.2)
+    for labels, level in ((100, 0.3), (500, 0.6)):
+        write(tmp_path / "runs" / f"relative-{labels}", "relative", level, labels)
+    results.finish(tmp_path / "runs" / "unguided")
+    return tmp_path / "runs"
+
+
+def test_a_known_difference_is_found(runs, tmp_path):
+    out = tmp_path / "report"
+    text = report(runs, out, command="cuelearner report runs").read_text()
+    table = summary(out)
+    assert list(table) == [("none", 0), ("relative", 100), ("relative", 500)]
+    best = table["relative", 500]
+    assert float(best["final"]) == pytest.approx(0.6, abs=0.02)
+    assert float(best["final_lower"]) <= float(best["final"]) <= float(best["final_upper"])
+    # Trapezoids: level for the six intervals from 40 to 100 and half of it from 30 to 40, over a span of 100.
+    assert float(best["mean"]) == pytest.approx(0.6 * 0.65, abs=0.01)
+    assert best["above_unguided"] == "40-100"
+    assert best["below_unguided"] == ""
+    assert best["reaches_unguided_final"] == "40"
+    assert best["seeds"] == "8"
+    for line in ("nothing: all runs are complete", "`cuelearner report runs`", "`0f`", "`abc`", "jax 0", "1 x cpu"):
+        assert line in text
+
+
+def test_figures_show_something_and_repeat_byte_for_byte(runs, tmp_path):
+    for out in ("one", "two"):
+        report(runs, tmp_path / out)
+    names = {"curves.png", "curves.svg", "label_efficiency.png", "label_efficiency.svg"}
+    assert {path.name for path in (tmp_path / "one").iterdir()} == names | {"report.md", "summary.csv", "curves.csv"}
+    for path in (tmp_path / "one").iterdir():
+        assert path.read_bytes() == (tmp_path / "two" / path.name).read_bytes(), path.name
+        if path.suffix == ".svg":
+            assert ElementTree.parse(path).getroot().tag.endswith("svg")
+        elif path.suffix == ".png":
+            image = picture(path)
+            assert image.shape[0] > 600
+            assert 0.01 < np.mean(image.min(axis=-1) < 0.9) < 0.6
+    # The blue of the relative curves is on the picture.
+    blue = np.array([0, 0x72, 0xB2]) / 255
+    assert (np.abs(picture(tmp_path / "one" / "curves.png") - blue).max(axis=-1) < 0.02).sum() > 500
+
+
+def test_curve_data_has_a_row_for_each_variant_and_step(runs, tmp_path):
+    report(runs, tmp_path / "report")
+    with (tmp_path / "report" / "curves.csv").open() as file:
+        assert len(list(csv.DictReader(file))) == 3 * len(STEPS)
+
+
+def test_one_budget_needs_no_label_figure_and_stale_ones_go(runs, tmp_path):
+    out = tmp_path / "report"
+    report(runs, out)
+    report([runs / "unguided", runs / "relative-500"], out, overwrite=True)
+    assert not (out / "label_efficiency.png").exists()
+    assert "label_efficiency" not in (out / "report.md").read_text()
+
+
+def test_refuses_to_overwrite_and_leaves_what_is_there(runs, tmp_path):
+    out = tmp_path / "report"
+    out.mkdir()
+    (out / "notes.txt").write_text("mine")
+    with pytest.raises(UserError, match="exists already"):
+        report(runs, out)
+    assert [path.name for path in out.iterdir()] == ["notes.txt"]
+    report(runs, out, overwrite=True)
+    assert (out / "notes.txt").read_text() == "mine"
+
+
+def test_of_collisions_the_fewest_are_best(tmp_path):
+    for kind, values in (("none", (0.8, 0.5, 0.4)), ("heuristic", (0.8, 0.3, 0.35))):
+        constants = {"run": kind, "task": "hall", "guidance": kind, "config_hash": "0f", "labels": 0}
+        with results.ResultsWriter(tmp_path / "runs" / kind, **constants) as writer:
+            for step, value in zip((0, 10, 20), values, strict=True):
+                writer.append(step=step, split="validation", seed=[0, 1], collision=[value, value])
+    found = {}
+    for lower in (True, False):
+        report(tmp_path / "runs", tmp_path / str(lower), "collision", lower_is_better=lower)
+        row = summary(tmp_path / str(lower))["heuristic", 0]
+        found[lower] = (float(row["best"]), int(row["best_step"]), row["reaches_unguided_final"])
+    assert found == {True: (0.3, 10, "10"), False: (0.8, 0, "0")}
+
+
+def test_says_what_is_missing(runs, tmp_path):
+    write(runs / "scalar-a", "scalar", 0.2, 100, seeds=[0, 1], steps=STEPS[:6])
+    write(runs / "scalar-b", "scalar", 0.2, 100, seeds=[2], steps=STEPS)
+    write(runs / "heuristic", "heuristic", 0.2, seeds=[0], config_hash="1e")
+    (runs / "planned").mkdir()
+    (runs / "planned" / "config.json").write_text("{}")
+    write(runs / "sweep" / "demonstration", "demonstration", 0.2, 100, steps=STEPS[:9])
+    (runs / "sweep" / "demonstration" / "config.json").unlink()
+    grid = {"guidance": ["none", "demonstration"]}
+    (runs / "sweep" / "config.json").write_text(json.dumps({"total_steps": 100, "grid": grid}))
+    text = report(runs, tmp_path / "report").read_text()
+    missing = text.split("## Missing")[1].split("## Where")[0]
+    assert "scalar-a: at step 50 of 100 (50%)" in missing
+    assert "scalar, 100 labels: some seeds have reached step 100; shown to 50" in missing
+    assert "heuristic: one seed, so no interval" in missing
+    assert "nan" not in text
+    assert "planned: no results" in missing
+    assert "sweep/demonstration: at step 80 of 100 (80%)" in missing
+    assert "sweep: no results of none guidance" in missing
+    assert "no results of demonstration" not in missing
+    assert "configurations 0f, 1e" in missing
+    assert "means over the curve are taken to step 50" in missing
+    assert "scalar-b: at step" not in missing
+    # The mean over the curve of a finished variant ends with the shortest: half of 30..40 and 40..50, over 50.
+    assert float(summary(tmp_path / "report")["relative", 500]["mean"]) == pytest.approx(0.6 * 15 / 50, abs=0.01)
+
+
+def test_a_metric_that_is_not_finite_is_left_out_and_said(tmp_path):
+    constants = {"run": "a", "task": "one_ball", "guidance": "none", "config_hash": "0f", "labels": 0}
+    with results.ResultsWriter(tmp_path / "a", **constants) as writer:
+        for step, second in ((0, 0.1), (10, float("nan")), (20, 0.3)):
+            writer.append(step=step, split="validation", seed=[0, 1], reward=[0.1, second])
+    text = report(tmp_path / "a", tmp_path / "report").read_text()
+    assert "1 validation rows have no finite reward" in text
+    assert float(summary(tmp_path / "report")["none", 0]["final"]) == pytest.approx(0.2)
+
+
+def test_errors_are_clear_and_leave_no_folder(runs, tmp_path):
+    out = tmp_path / "report"
+    with pytest.raises(UserError, match="there are reward"):
+        report(runs, out, "success")
+    with pytest.raises(UserError, match="there are validation rows"):
+        report(runs, out, split="training")
+    write(runs / "again", "relative", 0.3, 100, seeds=[5])
+    with pytest.raises(UserError, match=r"seed 5 of relative guidance with 100 labels occurs twice, in .*again and"):
+        report(runs, out)
+    assert not out.exists()

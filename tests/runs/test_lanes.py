@@ -1,0 +1,80 @@
+"""Blocks of lanes: how they are cut, what memory they need."""
+
+import dataclasses
+
+import chex
+import jax
+import numpy as np
+import pytest
+from probes import CONFIG, SIZES, Window, compilations
+
+from cuelearner_jax.devices import SHARED, compiler_options, place
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.guidance import registry as guidance
+from cuelearner_jax.loop import start_clock
+from cuelearner_jax.runs import lanes
+from cuelearner_jax.runs.grid import Grid
+from cuelearner_jax.runs.memory_report import memory_report
+
+
+def group_of(seeds, kind="none", **sizes):
+    config = dataclasses.replace(CONFIG, sizes=dataclasses.replace(SIZES, **sizes))
+    env = Window()
+    made = guidance.make(kind, config.sizes, env)
+    return lanes.LaneGroup(config, env, made, Grid((kind,), tuple(range(seeds)), (10, 20)))
+
+
+def test_blocks_are_equal_and_the_last_is_filled_with_repeats():
+    group = group_of(5, lanes_per_block=2)
+    assert [list(seeds) for seeds, _ in group.blocks()] == [[0, 1], [2, 3], [4, 4]]
+    columns = group.columns([{"reward": seeds * 1.0} for seeds, _ in group.blocks()])
+    np.testing.assert_array_equal(columns["reward"], [0.0, 1.0, 2.0, 3.0, 4.0])
+
+
+def test_a_program_is_made_for_the_lanes_that_a_device_takes_at_once(monkeypatch):
+    made = []
+    monkeypatch.setattr(lanes, "make_program", lambda *arguments, lanes: made.append(lanes))
+    group_of(5, lanes_per_block=2)
+    group_of(40, lanes_per_block=40)
+    assert made == [2, 40]
+    assert compiler_options(40) == {}
+    with monkeypatch.context() as patch:
+        patch.setattr(jax, "default_backend", lambda: "gpu")
+        few, many = (compiler_options(lanes) for lanes in made)
+    assert (few["xla_gpu_enable_triton_gemm"], many["xla_gpu_enable_triton_gemm"]) == (True, False)
+    assert jax.jit(lambda x: x + 1, compiler_options=many)(1) == 2  # XLA refuses names that it does not know
+
+
+def test_lanes_are_seeds_for_each_budget_where_labels_are_asked_for():
+    asking = group_of(2, "relative")
+    assert list(zip(asking.seeds.tolist(), asking.budgets.tolist(), strict=True)) == [
+        (0, 10),
+        (1, 10),
+        (0, 20),
+        (1, 20),
+    ]
+    assert group_of(2, "heuristic").budgets.tolist() == [0, 0]
+
+
+def test_memory_is_told_before_and_too_much_is_refused():
+    assert "3 lanes" in memory_report(group_of(3))
+    with pytest.raises(UserError, match="train at most 0 at once"):
+        memory_report(group_of(3, replay_capacity=10**12))
+
+
+def test_blocks_of_another_cut_are_cut_anew(monkeypatch):
+    monkeypatch.setattr(lanes, "CORES", 1)
+    before, after = group_of(5, lanes_per_block=2), group_of(5)
+    blocks = before.start()
+    (joined,) = after.recut(blocks)
+    chex.assert_trees_all_equal(joined, *after.start())
+    chex.assert_trees_all_equal(after.recut([joined]), [joined])
+
+
+def test_training_is_compiled_once():
+    group, config = group_of(1), CONFIG
+    clock = place(group.mesh, start_clock(), SHARED)
+    (state,) = group.start()
+    for _ in range(2):
+        clock, state, _ = group.program.train(Window(), config.scalars, config.schedule, clock, state, 4)
+    assert compilations(group.program.train) == [1]

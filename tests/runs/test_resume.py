@@ -1,0 +1,320 @@
+"""Runs that were stopped or killed and resumed: bitwise the run that was left alone."""
+
+import threading
+from contextlib import contextmanager
+
+import jax
+import numpy as np
+import probes
+import pytest
+
+from cuelearner_jax.asking import label_slots
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.guidance import registry as guidances
+from cuelearner_jax.loop import make_program, start_clock
+from cuelearner_jax.records import label_files, results
+from cuelearner_jax.records.checkpoint import checkpoints
+from cuelearner_jax.runs import lanes, runner, sweep, training
+from cuelearner_jax.runs.grid import Grid
+from cuelearner_jax.runs.kept import items
+from cuelearner_jax.runs.order import Order
+from cuelearner_jax.terminal import Interrupted
+
+# Bootstraps, so that target network, next observations and Adam's moments are in the checkpoint as well.
+CONFIG = probes.config(
+    sizes={"q_layers": (16,), "feedback_layers": (16,), "lanes_per_block": 2, "fit_steps": 100, "replay_capacity": 40},
+    scalars={"discount": 0.5, "silence_probability": 0.05},
+    schedule={"total_steps": 96, "guidance_until": 64, "eval_every": 16, "checkpoint_every": 32},
+)
+GRID = Grid(("relative", "none"), seeds=(3, 5), labels=(35, 60))  # 6 rounds; 4 lanes in 2 blocks of 2
+TASK = probes.make_task()
+VOLATILE = ("wall_s", "commit", "command", "folder")
+
+
+class Killed(Exception):
+    """Stands for a kill: nothing that comes after it in the program runs."""
+
+
+@pytest.fixture(autouse=True, scope="module")
+def compiled_once():
+    """Every run makes the same programs: compile them once. And two rounds of labels between checkpoints."""
+    programs = {}
+
+    def made(config, guidance, env, largest_budget, mesh=None, lanes=1):
+        known = (config.sizes, config.bootstraps, guidance, label_slots(largest_budget, config.sizes))
+        if known not in programs:
+            programs[known] = make_program(config, guidance, env, largest_budget, mesh, lanes)
+        return programs[known]
+
+    def committed(make):
+        # As arrays from a checkpoint are: JAX compiles separately for those that are tied to no device.
+        return lambda *arguments: jax.device_put(make(*arguments), jax.devices()[0])
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(lanes.LaneGroup, "start", committed(lanes.LaneGroup.start))
+        patch.setattr(training, "start_clock", committed(start_clock))
+        patch.setattr(lanes, "make_program", made)
+        patch.setattr(runner, "ROUNDS_A_CHUNK", 2)
+        yield
+
+
+@contextmanager
+def stopping_at(when):
+    """Ctrl-C at the given look at the event (each round of labels and each stretch of steps looks once)."""
+
+    class Event(threading.Event):
+        looks = 0
+
+        def is_set(self):
+            Event.looks += 1
+            return Event.looks == when
+
+    @contextmanager
+    def interruptible():
+        yield Event()
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sweep, "interruptible", interruptible)
+        yield
+
+
+@contextmanager
+def killed_at(when, method):
+    """A kill in place of the given call of a method of the runner."""
+    calls = 0
+    usual = getattr(runner.Runner, method)
+
+    def counted(self, *arguments):
+        nonlocal calls
+        calls += 1
+        if calls == when:
+            raise Killed
+        return usual(self, *arguments)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(runner.Runner, method, counted)
+        yield
+
+
+def run(out, **options):
+    sweep.run(Order(TASK, CONFIG, GRID, out, **options))
+
+
+def newest(out, kind, grid=GRID):
+    """The newest checkpoint's arrays and number."""
+    env = TASK.environment(CONFIG.task)
+    group = lanes.LaneGroup(CONFIG, env, guidances.make(kind, CONFIG.sizes, env), grid)
+    like = items(group.shapes(), jax.eval_shape(start_clock), 0.0)
+    with checkpoints(out / kind / "checkpoints", read_only=True) as saved:
+        found = saved.restore(like)
+        del found["clock"]["wall_s"]
+        return found, saved.latest()
+
+
+def rows(out):
+    table = results.read(out)
+    return table.drop_columns([name for name in VOLATILE if name in table.column_names]).to_pylist()
+
+
+def read_labels(out):
+    file = label_files.read(out / "relative" / "labels.parquet")
+    return [file.seeds, file.labels.obs, file.labels.action, file.labels.answer]
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """A run that nothing disturbed."""
+    out = tmp_path_factory.mktemp("whole") / "run"
+    run(out)
+    return out
+
+
+def assert_same_run(out, whole):
+    for kind in GRID.guidance:
+        (mine, number), (expected, last) = newest(out, kind), newest(whole, kind)
+        assert number == last
+        assert jax.tree.structure(mine) == jax.tree.structure(expected)
+        for one, other in zip(jax.tree.leaves(mine), jax.tree.leaves(expected), strict=True):
+            assert one.dtype == other.dtype
+            assert np.asarray(probes.words(one)).tobytes() == np.asarray(probes.words(other)).tobytes()
+        assert not (out / kind / results.JSONL).exists()
+    assert rows(out) == rows(whole)
+    for mine, expected in zip(read_labels(out), read_labels(whole), strict=True):
+        np.testing.assert_array_equal(mine, expected)
+
+
+def test_a_run_leaves_a_row_for_each_lane_and_evaluation(whole):
+    table = rows(whole)
+    steps = list(range(0, 97, 16))
+    for kind, budgets in (("relative", (35, 60)), ("none", (0,))):
+        found = sorted((row["labels"], row["seed"], row["step"]) for row in table if row["guidance"] == kind)
+        assert found == sorted((budget, seed, step) for budget in budgets for seed in GRID.seeds for step in steps)
+    last = [row for row in table if row["step"] == 96]
+    assert len({row["train_loss"] for row in last}) == 6  # six lanes, six results
+    assert all(row["guide_reward"] is not None for row in table if row["step"] == 0)
+    assert {row["config_hash"] for row in table} == {table[0]["config_hash"]}
+    state, number = newest(whole, "relative")
+    assert number == 6 + 96
+    assert state["rest"][0].agent.target_params is not None
+    assert int(state["clock"]["clock"].update) == 96
+
+
+def test_the_same_command_gives_the_same_run(whole, tmp_path):
+    run(tmp_path / "run")
+    assert_same_run(tmp_path / "run", whole)
+
+
+def test_stopped_and_killed_while_labelling(whole, tmp_path):
+    out = tmp_path / "run"
+    with stopping_at(3), pytest.raises(Interrupted, match="--resume"):
+        run(out)
+    assert newest(out, "relative")[1] == 3
+    # Round 4 is saved, round 5 is asked, then the process dies.
+    with killed_at(2, "_stop_if_asked"), pytest.raises(Killed):
+        run(out, resume=True)
+    assert newest(out, "relative")[1] == 4
+    assert not (out / "relative" / "labels.parquet").exists()
+    run(out, resume=True)
+    assert_same_run(out, whole)
+
+
+def test_stopped_and_killed_while_training(whole, tmp_path):
+    out = tmp_path / "run"
+    with stopping_at(6 + 3), pytest.raises(Interrupted, match="step 48 of relative"):
+        run(out)
+    assert newest(out, "relative")[1] == 6 + 48
+    # The row of step 80 is on disk, its checkpoint (at 64) is not the newest state.
+    with killed_at(2, "_stop_if_asked"), pytest.raises(Killed):
+        run(out, resume=True)
+    assert newest(out, "relative")[1] == 6 + 64
+    assert max(row["step"] for row in rows(out)) == 80
+    # And once more in the other kind, after the row and before the checkpoint of its first saved step.
+    with killed_at(3, "_save"), pytest.raises(Killed):
+        run(out, resume=True)
+    assert (out / "relative" / results.PARQUET).exists()
+    assert newest(out, "none")[1] == 32
+    assert max(row["step"] for row in rows(out) if row["guidance"] == "none") == 64
+    run(out, resume=True)
+    assert_same_run(out, whole)
+
+
+def test_killed_before_anything_was_saved(whole, tmp_path):
+    out = tmp_path / "run"
+    with killed_at(1, "_label"), pytest.raises(Killed):
+        run(out)
+    run(out, resume=True)
+    assert_same_run(out, whole)
+
+
+def test_killed_between_the_labels_and_the_first_row(whole, tmp_path):
+    out = tmp_path / "run"
+    with killed_at(1, "_train"), pytest.raises(Killed):
+        run(out)
+    with killed_at(1, "_stop_if_asked"), pytest.raises(Killed):
+        run(out, resume=True)
+    assert {row["step"] for row in rows(out)} == {0, 16}
+    run(out, resume=True)
+    assert_same_run(out, whole)
+
+
+def test_stopped_in_the_last_round_of_labels(whole, tmp_path):
+    out = tmp_path / "run"
+    with stopping_at(6), pytest.raises(Interrupted):
+        run(out)
+    run(out, resume=True)
+    assert_same_run(out, whole)
+
+
+def test_stopped_after_the_last_step(whole, tmp_path):
+    out = tmp_path / "run"
+    with stopping_at(6 + 6), pytest.raises(Interrupted):
+        run(out)
+    run(out, resume=True)
+    assert_same_run(out, whole)
+
+
+def test_resuming_a_finished_run_changes_nothing(whole):
+    before = probes.files_of(whole)
+    run(whole, resume=True)
+    assert probes.files_of(whole) == before
+
+
+def test_a_torn_last_row_is_written_anew(whole, tmp_path):
+    out = tmp_path / "run"
+    with stopping_at(6 + 3), pytest.raises(Interrupted):
+        run(out)
+    with (out / "relative" / results.JSONL).open("a") as file:
+        file.write('{"step": 48, "se')
+    run(out, resume=True)
+    assert_same_run(out, whole)
+
+
+def test_a_block_filled_up_with_repeats_has_a_row_for_each_seed(whole, tmp_path):
+    out = tmp_path / "run"
+    sweep.run(Order(TASK, CONFIG, Grid(("none",), (3, 5, 7), ()), out))  # blocks of 3, 5 and of 7, 7
+    table = rows(out)
+    assert [row["seed"] for row in table if row["step"] == 96] == [3, 5, 7]
+    expected = [row for row in rows(whole) if row["guidance"] == "none"]
+    assert [row for row in table if row["seed"] != 7] == expected
+
+
+# Labels from a file.
+
+
+def test_labels_of_a_file_are_used_exactly(tmp_path):
+    rng = np.random.default_rng(0)
+    angle = rng.uniform(-np.pi, np.pi, (2, 2, 60))
+    obs, action = np.stack([np.cos(angle), np.sin(angle)], -1).astype(np.float32)
+    answer = rng.integers(-1, 2, size=(2, 60, 1)).astype(np.float32)
+    given = probes.label_set(obs, action, answer, np.ones((2, 60), bool))
+    path = tmp_path / "given.parquet"
+    label_files.write(path, {"name": "window"}, "relative", CONFIG.scalars.eps_deg, np.array([3, 5]), given)
+    grid = Grid(("relative",), seeds=(5, 3), labels=(35, 60))
+    out = tmp_path / "run"
+
+    def refuse(config, env):
+        raise AssertionError("a teacher was made although the labels are given")
+
+    task = probes.make_task()
+    object.__setattr__(task, "teacher", refuse)
+    with stopping_at(2), pytest.raises(Interrupted):
+        sweep.run(Order(task, CONFIG, grid, out, labels_from=path))
+    sweep.run(Order(task, CONFIG, grid, out, labels_from=path, resume=True))
+    state, _ = newest(out, "relative", grid)
+    labels = jax.tree.map(lambda *leaves: np.concatenate(leaves), *(block.guide.labels for block in state["rest"]))
+    for lane, (seed, budget) in enumerate([(1, 35), (0, 35), (1, 60), (0, 60)]):
+        np.testing.assert_array_equal(labels.valid[lane], np.arange(60) < budget)
+        for name in ("obs", "action", "answer"):
+            np.testing.assert_array_equal(getattr(labels, name)[lane, :budget], getattr(given, name)[seed, :budget])
+    assert all(bool(block["guidance"].fitted.all()) for block in state["policy"])
+    copied = label_files.read(out / "relative" / "labels.parquet")
+    assert copied.seeds.tolist() == [5] * 60 + [3] * 60
+    np.testing.assert_array_equal(copied.labels.answer, np.concatenate([answer[1], answer[0]]))
+
+
+def test_the_labels_that_a_run_wrote_give_its_guidance_again(whole, tmp_path):
+    # Silent answers are not written, so budgets are of what was answered.
+    written = label_files.read(whole / "relative" / "labels.parquet")
+    counts = [int((written.seeds == seed).sum()) for seed in GRID.seeds]
+    assert all(50 < count < 60 for count in counts)
+    grid = Grid(("relative",), GRID.seeds, (min(counts),))
+    sweep.run(Order(TASK, CONFIG, grid, tmp_path / "run", labels_from=whole / "relative" / "labels.parquet"))
+    again = label_files.read(tmp_path / "run" / "relative" / "labels.parquet")
+    for seed in GRID.seeds:
+        mine, theirs = (file.labels.obs[file.seeds == seed][: min(counts)] for file in (again, written))
+        np.testing.assert_array_equal(mine, theirs)
+
+
+def test_a_damaged_checkpoint_is_refused_and_the_one_before_serves(whole, tmp_path):
+    out = tmp_path / "run"
+    with stopping_at(6 + 3), pytest.raises(Interrupted):
+        run(out)
+    newest_folder = out / "relative" / "checkpoints" / str(6 + 48)
+    for path in (newest_folder / "rest").rglob("*"):
+        if path.is_file():
+            path.write_bytes(b"")
+    with pytest.raises(UserError, match="cannot be read"):
+        run(out, resume=True)
+    newest_folder.rename(tmp_path / "damaged")
+    run(out, resume=True)
+    assert_same_run(out, whole)

@@ -1,0 +1,210 @@
+"""What a run says of itself, grids that make no sense, and runs that are refused."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import probes
+import pytest
+
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.guidance import registry as guidances
+from cuelearner_jax.records import results
+from cuelearner_jax.records.folders import check_folder, prepare_folder
+from cuelearner_jax.runs import grid as runs
+from cuelearner_jax.runs import sweep
+from cuelearner_jax.runs.grid import Grid
+from cuelearner_jax.runs.order import Order
+
+ROOT = Path(__file__).resolve().parents[2]
+TASK = probes.make_task()
+GRID = Grid(("none", "relative"), seeds=(4, 9), labels=(10, 15))
+
+
+def described(config=probes.CONFIG, grid=GRID, split="tuning", task=TASK):
+    return runs.describe(task, config, grid, split)
+
+
+def find(name):
+    """The one task that is known here."""
+    if name != TASK.name:
+        raise UserError(f"unknown task {name!r}")
+    return TASK
+
+
+@pytest.fixture
+def out(tmp_path):
+    """The folder of an interrupted run."""
+    folder = tmp_path / "run"
+    prepare_folder(folder, described(), clean=False)
+    (folder / "none").mkdir()
+    (folder / "none" / "results.jsonl").write_text("{}\n")
+    return folder
+
+
+# What it says of itself.
+
+
+def test_a_run_comes_back_from_its_description(out):
+    config = probes.config(sizes={"q_layers": (8, 4)}, scalars={"eps_deg": 7.5}, schedule={"random_steps": 4})
+    prepare_folder(out, described(config), clean=True)
+    task, found, grid = runs.load(out, find)
+    assert task is TASK
+    assert found == config
+    assert isinstance(found.sizes.q_layers, tuple)
+    assert grid == GRID
+
+
+@pytest.mark.parametrize(
+    ("name", "config", "grid", "options"),
+    [
+        ("sizes.directions", probes.config(sizes={"directions": 32}), GRID, {}),
+        ("sizes.q_layers", probes.config(sizes={"q_layers": (32,)}), GRID, {}),
+        ("scalars.eps_deg", probes.config(scalars={"eps_deg": 6.0}), GRID, {}),
+        ("schedule.guidance_until", probes.config(schedule={"guidance_until": 32}), GRID, {}),
+        ("grid.seeds", probes.CONFIG, Grid(("none", "relative"), (4, 8), (10, 15)), {}),
+        ("grid.labels", probes.CONFIG, Grid(("none", "relative"), (4, 9), (10,)), {}),
+        ("grid.guidance", probes.CONFIG, Grid(("none",), (4, 9), (10, 15)), {}),
+        ("split", probes.CONFIG, GRID, {"split": "validation"}),
+        ("task.name", probes.CONFIG, GRID, {"task": probes.make_task("another")}),
+    ],
+)
+def test_everything_that_determines_results_is_described(out, name, config, grid, options):
+    check_folder(out, described(), resume=True, overwrite=False)
+    with pytest.raises(UserError, match=rf"was run with another {name}: give the same options"):
+        check_folder(out, described(config, grid, **options), resume=True, overwrite=False)
+
+
+@pytest.mark.parametrize("folder", ["quickstart", "billiards_paper/shard-1-of-3", "navigation/relative-500"])
+def test_the_hash_of_a_configuration_is_that_of_its_recorded_results(folder):
+    recorded = ROOT / "docs" / "data" / folder
+    values = json.loads((recorded / "config.json").read_text())
+    hashes = set(results.read(recorded)["config_hash"].to_pylist())
+    assert hashes == {runs.config_hash(values)} == {runs.config_hash({**values, "format": 1})}
+    assert runs.config_hash({**values, "split": "other"}) not in hashes
+
+
+def test_runs_described_before_formats_had_numbers_are_resumed_and_loaded(out):
+    assert described()["format"] == 1
+    probes.edit_json(out / "config.json", lambda values: values.pop("format"))
+    check_folder(out, described(), resume=True, overwrite=False)
+    assert runs.load(out, find)[1] == probes.CONFIG
+    probes.edit_json(out / "config.json", lambda values: values.update(format=2))
+    not_loaded(out, "written by a newer cuelearner")
+
+
+def not_loaded(folder, message):
+    before = probes.files_of(folder)
+    with pytest.raises(UserError, match=message) as refusal:
+        runs.load(folder, find)
+    assert "\n" not in str(refusal.value)
+    assert probes.files_of(folder) == before
+
+
+def test_a_folder_that_is_no_run_is_not_loaded(tmp_path):
+    not_loaded(tmp_path, "no run folder")
+    not_loaded(tmp_path / "missing", "no run folder")
+
+
+@pytest.mark.parametrize("content", [b"", b"{", b"\xff\xfe\x00", b"[]", b"3", b"null"])
+def test_a_damaged_description_is_not_loaded(out, content):
+    (out / "config.json").write_bytes(content)
+    not_loaded(out, "damaged or of another program")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda values: values.pop("grid"), "damaged or of another program"),
+        (lambda values: values["grid"].pop("seeds"), "damaged or of another program"),
+        (lambda values: values.update(grid=[1]), "damaged or of another program"),
+        (lambda values: values["grid"].update(seeds=3), "damaged or of another program"),
+        (lambda values: values.pop("schedule"), "damaged or of another program"),
+        (lambda values: values.update(sizes=3), "damaged or of another program"),
+        (lambda values: values["task"].pop("name"), "damaged or of another program"),
+        (lambda values: values["task"].update(name="tennis"), "unknown task 'tennis'"),
+        (lambda values: values["scalars"].update(colour=1), "unknown field 'colour' for Scalars"),
+    ],
+)
+def test_the_description_of_another_program_is_not_loaded(out, change, message):
+    probes.edit_json(out / "config.json", change)
+    not_loaded(out, message)
+
+
+def test_the_learned_teachers_description_is_no_run(out):
+    (out / "config.json").write_text(json.dumps({"config": {"layers": [3]}, "task": {"name": "window"}, "seed": 0}))
+    not_loaded(out, "damaged or of another program")
+
+
+# Grids.
+
+
+@pytest.mark.parametrize(
+    ("grid", "message"),
+    [
+        (Grid(("relativ",), (0,), (10,)), "unknown guidance 'relativ'"),
+        (Grid((), (0,), (10,)), "give each kind once, and at least one"),
+        (Grid(("none", "none"), (0,), (10,)), "give each kind once, and at least one"),
+        (Grid(("none",), (), (10,)), "seeds must be different numbers"),
+        (Grid(("none",), (3, 3), (10,)), "seeds must be different numbers"),
+        (Grid(("none",), (-1,), (10,)), "seeds must be different numbers"),
+        (Grid(("none",), (runs.LARGEST_SEED,), (10,)), "seeds must be different numbers"),
+        (Grid(("relative",), (0,), ()), "--labels: give each budget once"),
+        (Grid(("relative",), (0,), (10, 10)), "--labels: give each budget once"),
+        (Grid(("relative",), (0,), (10, 0)), "a label budget of 0 teaches nothing"),
+        (Grid(("relative",), (0,), (-5,)), "a label budget of -5 teaches nothing"),
+    ],
+)
+def test_grids_that_make_no_sense_are_refused(grid, message, tmp_path):
+    with pytest.raises(UserError, match=message):
+        runs.check_grid(grid)
+    with pytest.raises(UserError, match=message):
+        sweep.run(Order(TASK, probes.CONFIG, grid, tmp_path / "run"))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_grids_that_make_sense():
+    runs.check_grid(GRID)
+    runs.check_grid(Grid(("none", "heuristic"), (0, runs.LARGEST_SEED - 1), ()))
+    runs.check_grid(Grid(("none",), (0,), (10, 10)))  # budgets that nobody uses
+
+
+def test_lanes_are_seeds_times_budgets_and_one_a_seed_without_labels():
+    relative, none = (guidances.make(kind, probes.SIZES, probes.Window()) for kind in ("relative", "none"))
+    seeds, budgets = GRID.lanes(relative)
+    assert list(zip(seeds.tolist(), budgets.tolist(), strict=True)) == [(4, 10), (9, 10), (4, 15), (9, 15)]
+    seeds, budgets = GRID.lanes(none)
+    assert list(zip(seeds.tolist(), budgets.tolist(), strict=True)) == [(4, 0), (9, 0)]
+    assert seeds.dtype == budgets.dtype == np.int32
+
+
+# The same through `sweep.run`: nothing is changed on disk by what is refused.
+
+
+@pytest.mark.parametrize(
+    ("config", "grid", "options", "message"),
+    [
+        (probes.CONFIG, GRID, {}, "not empty"),
+        (probes.CONFIG, GRID, {"resume": True, "overwrite": True}, "give one of them"),
+        (probes.config(scalars={"k_max": 3}), GRID, {"resume": True}, r"another scalars\.k_max"),
+        (probes.config(sizes={"batch_size": 0}), GRID, {"overwrite": True}, r"sizes\.batch_size is 0"),
+        (probes.CONFIG, Grid(("none",), (), ()), {"overwrite": True}, "seeds must be"),
+        (probes.config(sizes={"replay_capacity": 10**12}), GRID, {"overwrite": True}, "are free"),
+    ],
+)
+def test_a_refused_run_changes_nothing(out, config, grid, options, message):
+    before = probes.files_of(out.parent)
+    with pytest.raises(UserError, match=message):
+        sweep.run(Order(TASK, config, grid, out, split="tuning", **options))
+    assert probes.files_of(out.parent) == before
+
+
+def test_a_missing_teacher_is_said_before_anything_is_deleted(out):
+    def no_teacher(config, env):
+        raise UserError("no teacher")
+
+    task = TASK.__class__(**{**TASK.__dict__, "teacher": no_teacher})
+    before = probes.files_of(out.parent)
+    with pytest.raises(UserError, match="no teacher"):
+        sweep.run(Order(task, probes.CONFIG, GRID, out, overwrite=True, split="tuning"))
+    assert probes.files_of(out.parent) == before

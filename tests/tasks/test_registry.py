@@ -1,0 +1,142 @@
+"""Tasks by name: loaded when asked for, from packages and from files that the user names."""
+
+import subprocess
+import sys
+from importlib.metadata import EntryPoint
+
+import probes
+import pytest
+
+from cuelearner_jax.config import RunConfig
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.tasks import registry
+
+OWN = "from probes import make_task\nTASK = make_task('{name}')\nNUMBER = 3\n"
+
+
+@pytest.fixture(autouse=True)
+def apart(monkeypatch, tmp_path):
+    """A folder to import from, and nothing of it left afterwards."""
+    monkeypatch.setattr(registry, "_registered", {})
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    monkeypatch.chdir(tmp_path)
+    before = set(sys.modules)
+    yield
+    for name in set(sys.modules) - before:
+        if name.startswith("own_"):
+            del sys.modules[name]
+
+
+def install(monkeypatch, folder, **tasks):
+    """As if a package with these entry points were installed in a folder."""
+    monkeypatch.syspath_prepend(folder)
+    entries = [EntryPoint(name, value, registry.GROUP) for name, value in tasks.items()]
+    monkeypatch.setattr(registry, "entry_points", lambda group: entries if group == registry.GROUP else [])
+
+
+def loads(code):
+    """What of the environments a new process loads to run some code."""
+    code += "\nimport sys; print(sorted(name for name in sys.modules if name.startswith('cuelearner_envs.')))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    return done.stdout.splitlines()[-1]
+
+
+def test_a_task_is_loaded_when_it_is_asked_for():
+    found = loads("from cuelearner_jax.tasks import registry; registry.names(); registry.find('billiards')")
+    assert "cuelearner_envs.billiards.environment" in found
+    assert "navigation" not in found
+    assert "anymal" not in found
+
+
+def test_a_report_loads_no_environment():
+    code = "import cuelearner_jax.cli.dispatch, cuelearner_jax.cli.report, cuelearner_jax.report.document"
+    assert loads(code) == "[]"
+
+
+@pytest.mark.parametrize("name", registry.BUILT_IN)
+def test_the_packages_own_tasks_can_be_had(name):
+    task = registry.find(name)
+    assert task.name == name
+    assert task.origin == ""
+    assert registry.resolve(name) is task
+    assert {"paper", "quickstart"} <= set(task.presets)
+    assert all(isinstance(preset.config, RunConfig) for preset in task.presets.values())
+
+
+def test_the_papers_changed_worlds():
+    worlds = {name: registry.find(name).scenarios for name in registry.BUILT_IN}
+    bounds = {scenario: one.bound_deg for own in worlds.values() for scenario, one in own.items()}
+    assert bounds == {
+        **{"turned_strike": 1.0, "shifted_balls": 0.3, "tilted_table": 0.3},
+        **{"turned_lidar": 60.0, "rooms": 180.0, "corridor": 60.0},
+    }
+    assert worlds["billiards"]["shifted_balls"].changes == {"observation_bias": (0.0071, 0.0071)}
+    assert worlds["navigation"]["turned_lidar"].changes == {"lidar_rotation_deg": 15.0}
+
+
+def test_a_task_from_outside_is_known_once_it_is_named(tmp_path):
+    (tmp_path / "own_one.py").write_text(OWN.format(name="mine"))
+    task = registry.resolve("own_one:TASK")
+    assert (task.name, task.origin) == ("mine", "own_one:TASK")
+    assert registry.find("mine") is task
+    assert registry.names() == (*registry.BUILT_IN, "mine")
+    assert registry.resolve("own_one:TASK") == task  # named again
+
+
+REFUSED = [
+    ("own_here:TASKK", "own_here has no 'TASKK', did you mean 'TASK'?"),
+    ("own_here:NUMBER", "own_here:NUMBER is of type int: a task is a cuelearner_jax.task.Task"),
+    ("own_nowhere:TASK", "no module 'own_nowhere' for own_nowhere:TASK: run in the folder that holds it"),
+    ("own_here.part:TASK", "no module 'own_here.part' for own_here.part:TASK"),
+    ("own_broken:TASK", "own_broken fails to import (ZeroDivisionError: division by zero): mend it first"),
+    ("own_poor:TASK", "own_poor fails to import (ModuleNotFoundError: No module named 'own_missing')"),
+    ("own_leaving:TASK", "own_leaving fails to import (SystemExit: 3)"),
+    ("own_taken:TASK", "there is a task 'billiards' already: give this one another name"),
+    ("own_here:", "does not name a task: give package.module:NAME"),
+    ("own here:TASK", "does not name a task: give package.module:NAME"),
+    ("billards", "unknown task 'billards', did you mean 'billiards'?"),
+]
+
+
+@pytest.mark.parametrize(("text", "says"), REFUSED, ids=[text for text, _ in REFUSED])
+def test_what_names_no_task_is_refused_in_one_line(tmp_path, text, says):
+    (tmp_path / "own_here.py").write_text(OWN.format(name="mine"))
+    (tmp_path / "own_taken.py").write_text(OWN.format(name="billiards"))
+    (tmp_path / "own_broken.py").write_text("1 / 0\n")
+    (tmp_path / "own_poor.py").write_text("import own_missing\n")
+    (tmp_path / "own_leaving.py").write_text("import sys; sys.exit(3)\n")
+    with pytest.raises(UserError) as refusal:
+        registry.resolve(text)
+    assert says in str(refusal.value)
+    assert "\n" not in str(refusal.value)
+    assert registry.names() == tuple(registry.BUILT_IN)
+
+
+def test_two_tasks_of_one_name_are_refused(tmp_path):
+    for file in ("own_one", "own_two"):
+        (tmp_path / f"{file}.py").write_text(OWN.format(name="mine"))
+    registry.resolve("own_one:TASK")
+    with pytest.raises(UserError, match="there is a task 'mine' already"):
+        registry.resolve("own_two:TASK")
+
+
+def test_an_installed_package_offers_tasks(tmp_path, monkeypatch):
+    (tmp_path / "own_packed.py").write_text(OWN.format(name="packed"))
+    install(monkeypatch, tmp_path, packed="own_packed:TASK", billiards="own_evil:TASK")
+    assert registry.names() == (*registry.BUILT_IN, "packed")
+    assert "own_packed" not in sys.modules  # known by name, and not loaded
+    task = registry.find("packed")
+    assert (task.name, task.origin) == ("packed", "")
+    assert registry.resolve("own_packed:TASK") == task
+    assert registry.find("billiards").teacher is not None  # the package's own
+    with pytest.raises(UserError, match="there is a task 'packed' already"):
+        registry.register(probes.make_task("packed"))
+
+
+def test_an_installed_task_that_cannot_be_had_is_refused(tmp_path, monkeypatch):
+    (tmp_path / "own_packed.py").write_text(OWN.format(name="other"))
+    install(monkeypatch, tmp_path, packed="own_packed:TASK", gone="own_gone:TASK")
+    with pytest.raises(UserError, match="the installed task 'packed' calls itself 'other'"):
+        registry.find("packed")
+    with pytest.raises(UserError, match="no module 'own_gone'"):
+        registry.find("gone")

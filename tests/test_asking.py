@@ -1,0 +1,174 @@
+"""A label's way: asking one by one, as a page does, is asking in rounds; what counts as a label; whose actions."""
+
+import dataclasses
+from functools import partial
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import probes
+import pytest
+
+from cuelearner_jax import actions, asking
+from cuelearner_jax.guidance import registry as guidances
+from cuelearner_jax.loop import start_clock
+from cuelearner_jax.policies import Heuristic, Taught, Uniform
+
+ENV, EXPERT = probes.Window(), probes.Expert(probes.Window())
+RELATIVE = guidances.make("relative", probes.SIZES, ENV)
+ROUND = probes.SIZES.labels_per_round
+FAULTY = dataclasses.replace(
+    probes.SCALARS, mistake_probability=0.2, silence_probability=0.2, refined_fraction=0.7, teacher_bias_deg=5.0
+)
+LANE_KEY = jax.random.key(11)
+
+label_round = jax.jit(partial(asking.label_round, RELATIVE, probes.SIZES))
+# What a page calls, each compiled by itself.
+question = jax.jit(partial(asking.question, RELATIVE))
+record = jax.jit(asking.record)
+proceed = jax.jit(asking.proceed)
+fit = jax.jit(partial(asking.fit, RELATIVE))
+said = jax.jit(RELATIVE.form.answer)
+
+
+def begun(budget=2 * ROUND, env=ENV, guidance=RELATIVE):
+    slots = asking.label_slots(budget, probes.SIZES)
+    return asking.start(guidance, env, slots, budget, jax.random.key(1), jax.random.key(2))
+
+
+def asked_one_by_one(guide, number, base, scalars, env=ENV, teacher=EXPERT):
+    """A round of questions, the answers to which somebody types."""
+    for position in range(number * ROUND, (number + 1) * ROUND):
+        keys = asking.question_keys(LANE_KEY, position)
+        action = question(env, scalars, base, guide, keys)
+        answer, answered = said(keys.answer, teacher, guide.env, guide.obs, action, scalars)
+        typed = np.asarray(answer), bool(answered)
+        guide = proceed(env, record(guide, position, action, *typed), action, keys)
+    return fit(env, scalars, guide, LANE_KEY, jnp.asarray(number))
+
+
+@pytest.mark.parametrize("base", [Uniform(), Heuristic(ENV)], ids=["uniform", "heuristic"])
+def test_asking_one_by_one_is_bitwise_a_round(base):
+    rounds = typed = begun(budget=17)
+    for number in range(2):
+        rounds = label_round(ENV, EXPERT, FAULTY, base, rounds, LANE_KEY, jnp.asarray(number))
+        typed = asked_one_by_one(typed, number, base, FAULTY)
+        chex.assert_trees_all_equal(typed, rounds)
+    valid = np.asarray(rounds.labels.valid)
+    assert not valid[17:].any()
+    assert 5 < valid[:17].sum() < 17  # some answers were kept back
+    assert bool(rounds.model.fitted)
+
+
+def test_a_lanes_round_in_the_training_program_is_this_round_of_uniform_actions():
+    program = probes.window_program("relative", 2 * ROUND)
+    state = probes.start(program, [3], [2 * ROUND])
+    guide, key = jax.tree.map(lambda leaf: jnp.copy(leaf[0]), (state.guide, state.key))
+    clock = start_clock()
+    for number in range(2):
+        clock, state = program.label_round(ENV, EXPERT, FAULTY, clock, state)
+        guide = label_round(ENV, EXPERT, FAULTY, Uniform(), guide, key, jnp.asarray(number))
+    chex.assert_trees_all_equal(probes.lane(state.guide, 0), jax.tree.map(np.asarray, guide))
+
+
+def test_questions_are_about_what_the_base_policy_does():
+    for base, turn in ((Heuristic(ENV), -1.0), (Taught(EXPERT), 0.6)):
+        labels = label_round(ENV, EXPERT, probes.SCALARS, base, begun(), LANE_KEY, jnp.asarray(0)).labels
+        np.testing.assert_allclose(actions.difference(labels.obs, labels.action)[:ROUND], turn, atol=1e-5)
+        assert len(np.unique(np.asarray(labels.obs)[:ROUND], axis=0)) > 1
+        # 1.6 rad short of the best direction, or right there.
+        assert set(np.asarray(labels.answer)[:ROUND, 0]) == {1.0 if turn < 0 else 0.0}
+    uniform = label_round(ENV, EXPERT, probes.SCALARS, Uniform(), begun(), LANE_KEY, jnp.asarray(0)).labels
+    keys = [asking.question_keys(LANE_KEY, position).base for position in range(ROUND)]
+    drawn = np.concatenate([actions.uniform(key, (1,)) for key in keys])
+    np.testing.assert_allclose(uniform.action[:ROUND], drawn, atol=1e-6)
+
+
+def test_an_unguided_question_is_the_base_policys_own_action():
+    none = guidances.make("none", probes.SIZES, ENV)
+    guide = begun(guidance=none)
+    keys = asking.question_keys(LANE_KEY, 0)
+    action = asking.question(none, ENV, probes.SCALARS, Heuristic(ENV), guide, keys)
+    np.testing.assert_array_equal(action, ENV.heuristic(guide.obs))
+    with pytest.raises(ValueError, match="'none' asks nothing"):
+        asking.ask(none, ENV, EXPERT, probes.SCALARS, Uniform(), guide, LANE_KEY, jnp.asarray(0))
+
+
+def test_after_a_question_comes_what_its_action_leads_to():
+    env = probes.Chain(jnp.array(False))
+    guide = begun(env=env)
+    keys = asking.question_keys(LANE_KEY, 0)
+    action = jnp.array([0.0, 1.0])
+    after = asking.proceed(env, guide, action, keys)
+    np.testing.assert_array_equal(guide.obs, env.observe(0))
+    np.testing.assert_array_equal(after.obs, env.observe(1))
+    assert int(after.env) == 1
+    chex.assert_trees_all_equal((after.model, after.labels, after.budget), (guide.model, guide.labels, guide.budget))
+    state, step = ENV.step(keys.env, ENV.reset(jax.random.key(4))[0], action)  # by the question's own random numbers
+    moved = asking.proceed(ENV, begun().replace(env=ENV.reset(jax.random.key(4))[0]), action, keys)
+    np.testing.assert_array_equal(moved.env, state)
+    np.testing.assert_array_equal(moved.obs, step.obs)
+
+
+def test_an_answer_stands_in_its_row_and_changes_nothing_else():
+    guide = begun()
+    told = record(guide, 3, jnp.array([0.6, 0.8]), jnp.array([-1.0]), True)
+    row = jax.tree.map(lambda leaf: np.asarray(leaf[3]), told.labels)
+    np.testing.assert_array_equal(row.obs, guide.obs)
+    np.testing.assert_array_equal(row.action, np.array([0.6, 0.8], np.float32))
+    assert (row.answer.tolist(), bool(row.valid)) == ([-1.0], True)
+    others = np.arange(2 * ROUND) != 3
+    rest = [jax.tree.map(lambda leaf: np.asarray(leaf)[others], one.labels) for one in (told, guide)]
+    chex.assert_trees_all_equal(*rest)
+    chex.assert_trees_all_equal(told.replace(labels=None), guide.replace(labels=None))
+
+
+def test_answers_past_the_budget_do_not_count():
+    guide = begun(budget=4)
+    for position in range(6):
+        guide = record(guide, position, jnp.array([1.0, 0.0]), jnp.array([1.0]), True)
+    assert np.asarray(guide.labels.valid).tolist() == [True] * 4 + [False] * (ROUND - 4)
+    # The round beyond a spent budget leaves everything as it is, the model too.
+    spent = label_round(ENV, EXPERT, probes.SCALARS, Uniform(), begun(budget=ROUND), LANE_KEY, jnp.asarray(0))
+    after = label_round(ENV, EXPERT, probes.SCALARS, Uniform(), spent, LANE_KEY, jnp.asarray(1))
+    chex.assert_trees_all_equal(after, spent)
+
+
+def test_questions_without_an_answer_do_not_count():
+    guide = begun()
+    for position in range(ROUND):
+        guide = record(guide, position, jnp.array([1.0, 0.0]), jnp.array([1.0]), False)
+    assert not np.asarray(guide.labels.valid).any()
+    assert not bool(fit(ENV, probes.SCALARS, guide, LANE_KEY, jnp.asarray(0)).model.fitted)
+    once = record(guide, ROUND, jnp.array([1.0, 0.0]), jnp.array([1.0]), True)
+    assert bool(fit(ENV, probes.SCALARS, once, LANE_KEY, jnp.asarray(0)).model.fitted)
+
+
+def test_answers_that_do_not_count_teach_nothing():
+    guide = label_round(ENV, EXPERT, probes.SCALARS, Uniform(), begun(budget=ROUND + 2), LANE_KEY, jnp.asarray(0))
+    position = ROUND + 1
+    one, other = (record(guide, position, jnp.array([1.0, 0.0]), jnp.array([h]), False) for h in (1.0, -1.0))
+    fits = [fit(ENV, probes.SCALARS, told, LANE_KEY, jnp.asarray(1)).model for told in (one, other)]
+    chex.assert_trees_all_equal(*fits)
+    counted = record(guide, position, jnp.array([1.0, 0.0]), jnp.array([1.0]), True)
+    assert counted.labels.valid[position]
+    learned = fit(ENV, probes.SCALARS, counted, LANE_KEY, jnp.asarray(1)).model
+    assert not np.array_equal(jax.tree.leaves(learned.params)[1], jax.tree.leaves(fits[0].params)[1])
+
+
+def test_each_question_and_each_fit_has_random_numbers_of_its_own():
+    drawn = [asking.question_keys(LANE_KEY, position) for position in range(3)]
+    words = {tuple(np.asarray(jax.random.key_data(key)).tolist()) for keys in drawn for key in keys}
+    assert len(words) == 3 * 4
+    guide = label_round(ENV, EXPERT, probes.SCALARS, Uniform(), begun(), LANE_KEY, jnp.asarray(0))
+    models = [fit(ENV, probes.SCALARS, guide, LANE_KEY, jnp.asarray(number)).model for number in (0, 0, 1)]
+    chex.assert_trees_all_equal(models[0], models[1], guide.model)
+    assert not np.array_equal(jax.tree.leaves(models[0].params)[1], jax.tree.leaves(models[2].params)[1])
+
+
+def test_labels_given_elsewhere_are_fitted_once():
+    labels = label_round(ENV, EXPERT, probes.SCALARS, Uniform(), begun(), LANE_KEY, jnp.asarray(0)).labels
+    taken = jax.jit(partial(asking.take_labels, RELATIVE))(ENV, probes.SCALARS, labels, begun(), LANE_KEY)
+    chex.assert_trees_all_equal(taken, fit(ENV, probes.SCALARS, begun().replace(labels=labels), LANE_KEY))
+    assert bool(taken.model.fitted)

@@ -1,0 +1,31 @@
+"""The checker of shapes itself: it is in force, and lets through what JAX does with pytrees."""
+
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import pytest
+from checked import LOOSE_RANKS
+from jaxtyping import TypeCheckError
+
+from cuelearner_envs.billiards import Table
+from cuelearner_envs.navigation.geometry import in_frame
+from cuelearner_envs.navigation.robot import Robot
+
+
+def test_an_array_of_another_shape_than_the_signatures_is_refused():
+    assert in_frame(jnp.zeros((3, 5)), jnp.zeros(2)).shape == (3, 2)
+    with pytest.raises(TypeCheckError, match="boxes"):
+        in_frame(jnp.zeros((3, 4)), jnp.zeros(2))
+    with pytest.raises(TypeCheckError):
+        jax.eval_shape(in_frame, jnp.zeros((3, 5)), jnp.zeros(3))
+
+
+def test_pytrees_may_hold_what_stands_for_arrays():
+    assert jax.tree.map(lambda _: None, Table.easy()).width is None
+    assert jax.eval_shape(lambda robot: robot, Robot()).speed.shape == ()
+    assert jax.vmap(lambda robot: robot.speed, (Robot(0, *[None] * 4),))(Robot(jnp.ones(3))).shape == (3,)
+
+
+def test_the_folders_of_loose_ranks_exist():
+    assert all((Path(__file__).parent / folder).exists() for folder in LOOSE_RANKS)

@@ -1,0 +1,122 @@
+"""Lanes over four devices, forced on a CPU: what they learn is what one device's lanes learn."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import chex
+import jax
+import jax.numpy as jnp
+import many_devices
+import numpy as np
+import pytest
+
+from cuelearner_jax.devices import BY_LANE, SHARED, each_lane, lane_mesh, over_lanes
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.records import results
+from cuelearner_jax.runs.grid import load
+from cuelearner_jax.runs.trained import PolicySource
+
+SCRIPT = Path(many_devices.__file__)
+
+
+def on_four(*arguments):
+    settings = {**os.environ, "JAX_NUM_CPU_DEVICES": "4", "JAX_PLATFORMS": "cpu"}
+    command = [sys.executable, str(SCRIPT), *(str(argument) for argument in arguments)]
+    done = subprocess.run(command, env=settings, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-2000:]
+    return done.stdout.strip(), done.stderr
+
+
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("one") / "run"
+    many_devices.run(folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def shared(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("four") / "run"
+    return folder, on_four("run", folder)[1]
+
+
+def test_empty_arrays_do_not_enter_the_shared_program():
+    double = over_lanes(lane_mesh(), lambda by, lanes: jax.tree.map(by.__mul__, lanes), (SHARED, BY_LANE), BY_LANE)
+    two, lanes = jnp.asarray(2.0), {"labels": jnp.zeros((4, 0)), "values": jnp.arange(4.0)}
+    (call,) = jax.make_jaxpr(double)(two, lanes).eqns
+    assert [value.aval.shape for value in call.invars] == [(), (4,)]
+    chex.assert_trees_all_equal(double(two, lanes), {"labels": jnp.zeros((4, 0)), "values": 2 * jnp.arange(4.0)})
+
+
+@pytest.mark.parametrize("lanes", [1, 3])
+def test_a_lane_alone_is_computed_without_the_axis_and_given_back_with_it(lanes):
+    def product(left, right):
+        return jnp.asarray(left.ndim), {"product": left @ right}
+
+    left, right = jax.random.normal(jax.random.key(0), (2, lanes, 5, 5))
+    mapped = each_lane(product, gives=(None, 0))
+    dimensions, found = mapped(left, right)
+    assert dimensions == 2  # what all lanes have in common
+    np.testing.assert_allclose(found["product"], np.matmul(left, right), rtol=1e-4, atol=1e-5)
+    (made,) = [step for step in jax.make_jaxpr(mapped)(left, right).eqns if step.primitive.name == "dot_general"]
+    assert made.outvars[0].aval.ndim == (2 if lanes == 1 else 3)
+
+
+def measured(folder):
+    rows = sorted(
+        results.read(folder).to_pylist(), key=lambda row: (row["guidance"], row["labels"], row["seed"], row["step"])
+    )
+    names = [name for name in rows[0] if isinstance(rows[0][name], int | float) and name != "wall_s"]
+    return {name: np.array([np.nan if row[name] is None else row[name] for row in rows], float) for name in names}
+
+
+def assert_alike(one, other):
+    assert one.keys() == other.keys()
+    for name, values in one.items():
+        np.testing.assert_allclose(other[name], values, rtol=1e-5, atol=1e-6, err_msg=name)
+
+
+def test_four_devices_learn_what_one_does(alone, shared):
+    assert_alike(measured(alone), measured(shared[0]))
+    assert "on each of 4 devices" in shared[1]
+
+
+def test_no_device_waits_for_another():
+    assert on_four("communication")[0] == "4 []"
+
+
+def test_a_run_begun_on_four_devices_goes_on_with_one(alone, tmp_path):
+    out = tmp_path / "run"
+    on_four("run", out, 5)  # three rounds of labels, then in the middle of training
+    many_devices.run(out, resume=True)
+    assert_alike(measured(alone), measured(out))
+
+
+def test_a_run_begun_on_one_device_goes_on_with_four(alone, tmp_path):
+    out = tmp_path / "run"
+    many_devices.run(out, 2)  # amid the labels
+    on_four("resume", out)
+    assert_alike(measured(alone), measured(out))
+
+
+def test_policies_of_four_devices_are_those_of_one(alone, shared):
+    found = []
+    for folder in (alone, shared[0]):
+        task = many_devices.probes.make_task()
+        _, config, grid = load(folder, {task.name: task}.__getitem__)
+        found.append(PolicySource(task, config, grid, folder).load(("relative",))[0])
+    one, four = found
+    np.testing.assert_array_equal(one.seeds, four.seeds)
+    leaves = zip(*(many_devices.jax.tree.leaves(lanes.policies["params"]) for lanes in found), strict=True)
+    for mine, theirs in leaves:
+        np.testing.assert_allclose(mine, theirs, rtol=1e-4, atol=1e-6)
+
+
+def test_a_checkpoint_of_fewer_lanes_is_refused(shared):
+    task = many_devices.probes.make_task()
+    _, config, _ = load(shared[0], {task.name: task}.__getitem__)
+    grid = many_devices.Grid(("relative",), tuple(range(9)), (30,))
+    with pytest.raises(UserError, match="holds 8 lanes, the run has 9"):
+        PolicySource(task, config, grid, shared[0]).load(("relative",))

@@ -1,0 +1,149 @@
+"""What an environment may offer beside what it must, and what follows from its named slices."""
+
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import probes
+import pytest
+
+from cuelearner_jax.actions import DIRECTIONS, difference, evenly_spaced, rotate
+from cuelearner_jax.brax_bridge.adapter import from_brax, to_brax
+from cuelearner_jax.environment import (
+    Described,
+    Quantity,
+    WholeObservations,
+    actions_of,
+    offers,
+    random_symmetries,
+    spaces_of,
+    symmetries_of,
+)
+from cuelearner_jax.task import shape_of
+from cuelearner_jax.tasks import registry
+
+ROWS = 200
+PROBES = {
+    "window": probes.Window(),
+    "mirrored window": probes.Window(mirrors=True),
+    "chain": probes.Chain(),
+    "chain through brax": from_brax(to_brax(probes.Chain())),
+}
+SHAPES = {
+    **{
+        f"{task.name} {name}": shape_of(task, p.config.task)
+        for task in map(registry.find, registry.BUILT_IN)
+        for name, p in task.presets.items()
+    },
+    **PROBES,
+}
+
+
+# Slices of an observation.
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_an_observation_has_as_many_entries_as_its_slices_together(name):
+    env = SHAPES[name]
+    slices = env.observation
+    assert env.obs_size == sum(quantity.size for quantity in slices) > 0
+    _, obs = jax.eval_shape(lambda env, key: env.reset(key), env, jax.random.key(0))
+    assert obs.shape == (env.obs_size,)
+    assert len({quantity.name for quantity in slices}) == len(slices)
+    assert all(quantity.name and quantity.unit and quantity.size > 0 for quantity in slices)
+
+
+def test_the_size_follows_from_the_slices():
+    class Two(Described):
+        observation = (Quantity("place", 3, "m"), Quantity("speed", 4, "m/s", "along and across"))
+
+    assert Two().obs_size == 7
+
+
+def test_whole_observations_come_back_as_they_are():
+    class Plain(WholeObservations):
+        observation = (Quantity("place", 2, "m"),)
+
+    obs, following = jnp.array([1.0, 2.0]), jnp.array([3.0, 4.0])
+    kept = Plain().remember(None, obs)
+    assert Plain().recall(kept) is obs
+    assert Plain().recall_next(kept, obs, following) is following
+
+
+# What is optional.
+
+
+def test_what_an_environment_offers_is_what_it_has():
+    everything = [offers(probes.Window(), name) for name in ("heuristic", "mirror", "features")]
+    little = [offers(probes.Chain(), name) for name in ("heuristic", "mirror", "features")]
+    assert everything == [True, True, True]
+    assert little == [True, False, False]
+
+
+def test_a_member_that_is_none_is_not_offered():
+    class Silent(probes.Window):
+        heuristic = None
+        mirror = None
+
+    assert not offers(Silent(mirrors=True), "heuristic")
+    assert symmetries_of(Silent(mirrors=True)) == 1  # of four announced
+
+
+def test_shapes_in_place_of_arrays_offer_the_same():
+    shapes = jax.eval_shape(lambda: probes.Window(mirrors=True))
+    assert offers(shapes, "heuristic")
+    assert symmetries_of(shapes) == 4
+    assert spaces_of(shapes) == spaces_of(probes.Window())
+
+
+def test_environments_without_a_mirror_have_the_identity_alone():
+    assert [symmetries_of(env) for env in PROBES.values()] == [1, 4, 1, 1]
+
+
+def test_actions_are_directions_where_nothing_else_is_said():
+    assert actions_of(probes.Window()) is DIRECTIONS
+    assert spaces_of(probes.Chain()) == (2, DIRECTIONS)
+
+    class Other(probes.Chain):
+        actions = DIRECTIONS._replace(size=5)
+
+    assert actions_of(Other()).size == 5
+    assert spaces_of(Other()).actions.size == 5
+
+
+# Symmetries.
+
+
+@pytest.mark.parametrize("env", [probes.Window(), probes.Chain()], ids=["not asked for", "none"])
+def test_without_symmetries_rows_stay_the_very_arrays(env):
+    rows, vectors = np.ones((ROWS, 2), np.float32), np.zeros((ROWS, 2), np.float32)
+    image = random_symmetries(jax.random.key(0), env, ROWS)
+    assert image(rows, vectors)[0] is rows
+    assert image(rows, vectors)[1] is vectors
+
+
+def test_every_symmetry_is_drawn_and_maps_a_row_as_a_whole():
+    rng = np.random.default_rng(0)
+    obs, action, other = jnp.array(rng.normal(size=(3, ROWS, 2)), jnp.float32)
+    image = random_symmetries(jax.random.key(0), probes.Window(mirrors=True), ROWS)
+    seen, moved = image(obs, action)
+    quarters = np.round(np.asarray(difference(obs, seen)) / (math.pi / 2)).astype(int) % 4
+    assert np.bincount(quarters, minlength=4).min() > 30  # 50 each, standard deviation 6
+    turns = jnp.array(quarters * math.pi / 2)
+    np.testing.assert_allclose(seen, rotate(obs, turns), atol=1e-5)
+    np.testing.assert_allclose(moved, rotate(action, turns), atol=1e-5)
+    # The same symmetry for whatever else belongs to a row.
+    again, further = image(obs, other)
+    np.testing.assert_array_equal(again, seen)
+    np.testing.assert_allclose(further, rotate(other, turns), atol=1e-5)
+
+
+def test_a_key_always_draws_the_same_symmetries_and_another_key_others():
+    obs = jnp.tile(evenly_spaced(4), (ROWS // 4, 1))
+    one, same, other = (
+        np.asarray(random_symmetries(jax.random.key(seed), probes.Window(mirrors=True), ROWS)(obs, obs)[0])
+        for seed in (0, 0, 1)
+    )
+    np.testing.assert_array_equal(one, same)
+    assert (np.abs(one - other).max(-1) > 0.5).mean() > 0.5

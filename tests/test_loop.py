@@ -1,0 +1,467 @@
+"""The training loop on probes: values known by hand, who acts when, and what lanes owe each other (nothing)."""
+
+import dataclasses
+import itertools
+import math
+from functools import cache, partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import probes
+import pytest
+
+from cuelearner_jax import actions, asking, evaluate, loop
+from cuelearner_jax.agent.learning import mirrored
+from cuelearner_jax.agent.networks import applied, q_network
+from cuelearner_jax.devices import lane_mesh
+from cuelearner_jax.guidance import registry as guidances
+from cuelearner_jax.policies import Agent, Guided, Uniform
+from cuelearner_jax.types import Label, Transition
+
+ENV, EXPERT = probes.Window(), probes.Expert(probes.Window())
+MESH = lane_mesh()
+DEG = math.pi / 180
+q = applied(q_network(probes.SIZES.q_layers))
+
+
+LARGEST = 60  # labels of the largest budget
+STRETCH = 12  # iterations of one call, always the same: another number compiles again
+
+
+def replaced(**values):
+    return dataclasses.replace(probes.SCHEDULE, **values)
+
+
+def run(program, scalars, schedule, clock, state, stretches=1):
+    """Trains for some stretches; the metrics of the last one."""
+    metrics = {}
+    for _ in range(stretches):
+        clock, state, metrics = program.train(ENV, scalars, schedule, clock, state, STRETCH)
+    return clock, state, metrics
+
+
+# Learning values that are known.
+
+
+def test_the_agent_learns_a_bandit_by_itself():
+    program = probes.window_program("none")
+    state = probes.start(program, [0], [0])
+    before = reward_of(state.agent.params)
+    schedule = replaced(random_steps=400, learn_after=32)
+    _, state, metrics = run(program, probes.SCALARS, schedule, loop.start_clock(), state, stretches=34)
+    assert reward_of(state.agent.params)[0] == 1.0
+    assert before[0] < 0.8
+    assert metrics["loss"].shape == (1,)
+    # The value of a direction is its chance to win: 1 inside the window and 0 outside.
+    obs = actions.evenly_spaced(4)
+    inside = jax.vmap(lambda obs: q(probes.lane(state.agent.params, 0), obs, ENV.best(obs))[0])(obs)
+    outside = jax.vmap(lambda obs: q(probes.lane(state.agent.params, 0), obs, -ENV.best(obs))[0])(obs)
+    np.testing.assert_allclose(inside, 1, atol=0.15)
+    np.testing.assert_allclose(outside, 0, atol=0.15)
+
+
+def reward_of(params):
+    key = jax.random.key(7)
+    agents = Agent(params, probes.SIZES)
+    measured = evaluate.evaluate_lanes(ENV, agents, key, mesh=MESH, num_envs=40, steps=80)
+    np.testing.assert_array_equal(measured["reward"], measured["hit"])
+    return np.asarray(measured["reward"])
+
+
+CHAIN = probes.config(
+    sizes={"num_envs": 2},
+    scalars={"discount": 0.5, "polyak": 0.05, "learning_rate": 5e-3},
+    schedule={"random_steps": 2000, "learn_after": 50, "target_every": 1},
+)
+
+
+@cache
+def chain_program():
+    env = probes.Chain(jnp.array(False))
+    return loop.make_program(CHAIN, guidances.make("heuristic", CHAIN.sizes, env), env, 0)
+
+
+def chain_values(truncates, schedule=CHAIN.schedule):
+    """Learned values at both places of east, north, west and south; and the state."""
+    env = probes.Chain(jnp.array(truncates))
+    state = probes.start(chain_program(), [3], [0], env)
+    assert state.agent.target_params is not None
+    _, state, _ = chain_program().train(env, CHAIN.scalars, schedule, loop.start_clock(), state, 1000)
+    params = probes.lane(state.agent.params, 0)
+    values = [np.asarray(q(params, env.observe(place), actions.evenly_spaced(4)))[:, 0] for place in (0, 1)]
+    return values, state
+
+
+def test_values_of_a_chain_that_terminates():
+    # Q(1, a) = a_x; Q(0, a) = a_y / 2 + 0.5 * 1.
+    (start, end), _ = chain_values(truncates=False)
+    np.testing.assert_allclose(end, [1, 0, -1, 0], atol=0.06)
+    np.testing.assert_allclose(start, [0.5, 1.0, 0.5, 0.0], atol=0.06)
+
+
+def test_values_of_a_chain_that_is_truncated():
+    # Place 1 goes on as if it had no end: Q(1, a) = a_x + 0.5 / (1 - 0.5); Q(0, a) = a_y / 2 + 0.5 * 2.
+    # Had the observation after the reset been used, the largest value at 1 would be 5 / 3 and not 2.
+    (start, end), _ = chain_values(truncates=True)
+    np.testing.assert_allclose(end, [2, 1, 0, 1], atol=0.1)
+    np.testing.assert_allclose(start, [1.0, 1.5, 1.0, 0.5], atol=0.1)
+
+
+def test_the_target_network_follows_every_so_many_updates():
+    _, never = chain_values(False, dataclasses.replace(CHAIN.schedule, target_every=10**6))
+    fresh = probes.start(chain_program(), [3], [0], probes.Chain(jnp.array(False)))
+    before, after = (jax.tree.leaves(state.agent.target_params) for state in (fresh, never))
+    for one, other in zip(after, before, strict=True):
+        np.testing.assert_array_equal(one, other)
+    _, always = chain_values(False)
+    assert np.abs(jax.tree.leaves(always.agent.target_params)[1] - before[1]).max() > 1e-3
+
+
+def test_replay_keeps_what_each_step_led_to():
+    _, state = chain_values(truncates=False)
+    terminated = probes.stored(state, 0, 2000)
+    _, state = chain_values(truncates=True)
+    truncated = probes.stored(state, 0, 2000)
+    at_end = np.repeat(np.tile([False, True], 500), 2)  # two environments in step with each other
+    np.testing.assert_array_equal(terminated["obs"][:, 1] == 1, at_end)
+    np.testing.assert_array_equal(terminated["discount"], np.where(at_end, 0, 1))
+    np.testing.assert_array_equal(truncated["discount"], 1)
+    np.testing.assert_array_equal(truncated["next_obs"], np.tile([0.0, 1.0], (2000, 1)))  # never after the reset
+    expected = np.where(at_end, terminated["action"][:, 0], 0.5 * terminated["action"][:, 1])
+    np.testing.assert_allclose(terminated["reward"], expected, atol=1e-6)
+
+
+# Who acts when.
+
+
+def acted(kind, scalars=probes.SCALARS, stretches=1, **schedule):
+    """What one lane's environments met and did, and its parameters; nothing is learned."""
+    program = probes.window_program(kind, LARGEST if kind == "relative" else 0)
+    state = probes.start(program, [0], [0])
+    schedule = replaced(learn_after=10**9, **schedule)
+    clock, state, _ = run(program, scalars, schedule, loop.start_clock(), state, stretches)
+    assert int(clock.step) == 48 * stretches
+    assert int(clock.update) == 0
+    return probes.stored(state, 0, 48 * stretches), probes.lane(state.agent.params, 0)
+
+
+def test_first_uniform_then_guided_then_greedy():
+    always = dataclasses.replace(probes.SCALARS, guided_probability=1.0)
+    met, params = acted("heuristic", scalars=always)
+    greedy = probes.greedy_actions(q, params, met["obs"])
+    turned = np.asarray(ENV.heuristic(met["obs"]))
+    options = np.asarray(actions.evenly_spaced(probes.SIZES.directions))
+    among = np.abs(met["action"][:, None] - options).max(-1).min(-1)
+    assert among[:8].min() > 1e-4  # a uniform direction is none of the sixteen
+    np.testing.assert_allclose(met["action"][8:24], turned[8:24], atol=1e-6)
+    np.testing.assert_array_equal(met["action"][24:], greedy[24:])
+    assert np.abs(turned - greedy).max(-1).min() > 1e-3  # so the three can be told apart
+
+
+def test_guided_with_probability_zero_is_greedy_after_the_random_steps():
+    met, params = acted("heuristic", scalars=dataclasses.replace(probes.SCALARS, guided_probability=0.0))
+    np.testing.assert_array_equal(met["action"][8:], probes.greedy_actions(q, params, met["obs"])[8:])
+
+
+def test_none_is_greedy_whatever_the_probability():
+    met, params = acted("none", scalars=dataclasses.replace(probes.SCALARS, guided_probability=1.0))
+    np.testing.assert_array_equal(met["action"][8:], probes.greedy_actions(q, params, met["obs"])[8:])
+
+
+def test_guidance_that_is_not_fitted_leaves_the_greedy_actions():
+    met, params = acted("relative", scalars=dataclasses.replace(probes.SCALARS, guided_probability=1.0))
+    np.testing.assert_array_equal(met["action"][8:], probes.greedy_actions(q, params, met["obs"])[8:])
+
+
+def test_about_half_of_the_episodes_are_guided():
+    met, params = acted("heuristic", stretches=30, guidance_until=10**6)
+    guided = np.abs(met["action"] - np.asarray(ENV.heuristic(met["obs"]))).max(-1) < 1e-5
+    greedy = (met["action"] == probes.greedy_actions(q, params, met["obs"])).all(-1)
+    assert (guided ^ greedy)[8:].all()
+    assert guided[8:].mean() == pytest.approx(0.5, abs=0.06)  # standard deviation 0.0125
+
+
+def test_an_episode_is_guided_as_a_whole():
+    env = probes.Chain(jnp.array(False))
+    state = probes.start(chain_program(), [0], [0], env)
+    schedule = replaced(random_steps=2, learn_after=10**9, guidance_until=2000)
+    _, state, _ = chain_program().train(env, CHAIN.scalars, schedule, loop.start_clock(), state, 1000)
+    met = probes.stored(state, 0, 2000)
+    turned = np.abs(met["action"] - np.asarray(env.heuristic(None))).max(-1) < 1e-6
+    by_episode = turned.reshape(-1, 2, 2)[1:]  # (episodes, its two steps, environments)
+    np.testing.assert_array_equal(by_episode[:, 0], by_episode[:, 1])
+    assert by_episode.mean() == pytest.approx(0.5, abs=0.08)
+
+
+@pytest.mark.parametrize(("learn_after", "updates"), [(49, 0), (48, 4), (45, 4), (44, 8), (0, 48)])
+def test_learning_begins_after_learn_after(learn_after, updates):
+    program = probes.window_program("none")
+    state = probes.start(program, [0], [0])
+    before = probes.lane(state.agent.params, 0)
+    clock, state, _ = run(program, probes.SCALARS, replaced(learn_after=learn_after), loop.start_clock(), state)
+    assert int(clock.update) == updates  # one for each of four environments, from the iteration that reaches the step
+    same = [
+        np.array_equal(*pair)
+        for pair in zip(*map(jax.tree.leaves, (before, probes.lane(state.agent.params, 0))), strict=True)
+    ]
+    assert not any(same) if updates else all(same)
+
+
+# Relative guidance.
+
+BUDGETS = [15, 15, LARGEST, LARGEST]
+SEEDS = [1, 2, 1, 2]
+PARTS = ("obs", "action", "answer")
+
+
+def labelled(program, seeds, budgets, rounds=LARGEST // 10, scalars=probes.SCALARS):
+    clock, state = loop.start_clock(), probes.start(program, seeds, budgets)
+    for _ in range(rounds):
+        clock, state = program.label_round(ENV, EXPERT, scalars, clock, state)
+    return clock, state
+
+
+def test_labels_fill_each_lanes_budget_and_say_what_the_teacher_would():
+    clock, state = labelled(probes.window_program("relative", LARGEST), SEEDS, BUDGETS)
+    assert int(clock.round) == 6
+    labels = jax.tree.map(np.asarray, state.guide.labels)
+    assert labels.obs.shape == (4, LARGEST, 2)
+    target = partial(guidances.make("relative", probes.SIZES, ENV).target, scalars=probes.SCALARS)
+    targets = np.asarray(jax.vmap(jax.vmap(target))(labels))
+    for lane, budget in enumerate(BUDGETS):
+        np.testing.assert_array_equal(labels.valid[lane], np.arange(LARGEST) < budget)
+        obs, action, answer = (getattr(labels, name)[lane, :budget].astype(np.float64) for name in PARTS)
+        best = np.arctan2(obs[:, 1], obs[:, 0]) + 0.6
+        angle = np.arctan2(action[:, 1], action[:, 0])
+        error = np.angle(np.exp(1j * (best - angle)))
+        h = np.where(np.abs(error) <= 10 * DEG, 0, np.sign(error))
+        np.testing.assert_array_equal(answer, h[:, None])
+        turned = angle + h * 20 * DEG
+        np.testing.assert_allclose(
+            action + targets[lane, :budget], np.stack([np.cos(turned), np.sin(turned)], -1), atol=1e-5
+        )
+        assert set(h) == {-1, 0, 1}
+    assert state.guide.model.fitted.all()
+
+
+def test_the_first_labels_of_a_larger_budget_are_those_of_a_smaller():
+    _, state = labelled(probes.window_program("relative", LARGEST), SEEDS, BUDGETS)
+    for small, large in ((0, 2), (1, 3)):
+        for name in PARTS:
+            rows = np.asarray(getattr(state.guide.labels, name))
+            np.testing.assert_allclose(rows[small, :15], rows[large, :15], atol=1e-6)
+
+
+def test_questions_before_the_first_fit_are_uniform_and_later_ones_refined():
+    program, seeds, budgets = probes.window_program("relative", LARGEST), [1, 2, 3, 4], [LARGEST] * 4
+    refined = labelled(program, seeds, budgets)[1].guide.labels
+    error = np.abs(actions.difference(ENV.best(refined.obs), refined.action))
+    assert error[:, :10].mean() == pytest.approx(math.pi / 2, abs=0.4)  # standard deviation 0.14
+    assert error[:, 30:].mean() < 0.6
+    plain = dataclasses.replace(probes.SCALARS, refined_fraction=0.0)
+    uniform = labelled(program, seeds, budgets, scalars=plain)[1].guide.labels
+    np.testing.assert_array_equal(uniform.action[:, :10], refined.action[:, :10])
+    assert np.abs(actions.difference(ENV.best(uniform.obs), uniform.action))[:, 30:].mean() > 1.2
+
+
+def test_silent_teachers_use_up_the_budget():
+    silent = dataclasses.replace(probes.SCALARS, silence_probability=1.0)
+    _, state = labelled(probes.window_program("relative", LARGEST), SEEDS, BUDGETS, scalars=silent)
+    assert not state.guide.labels.valid.any()
+    assert not state.guide.model.fitted.any()
+
+
+def test_a_lane_whose_budget_is_spent_stays_as_it_is():
+    program = probes.window_program("relative", LARGEST)
+    _, two = labelled(program, SEEDS, BUDGETS, 2)
+    _, three = labelled(program, SEEDS, BUDGETS)
+    assert_equal(probes.lane(two, 0), probes.lane(three, 0))
+    assert not np.array_equal(two.guide.labels.obs[2], three.guide.labels.obs[2])
+
+
+def assert_equal(one, other):
+    for mine, yours in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
+        np.testing.assert_array_equal(mine, yours)
+
+
+def assert_close(one, other, rtol=1e-4, atol=1e-5):
+    for mine, yours in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
+        np.testing.assert_allclose(mine, yours, rtol=rtol, atol=atol)
+
+
+def test_refined_uniform_actions_win_far_more_often_than_chance():
+    _, state = labelled(probes.window_program("relative", LARGEST), SEEDS, BUDGETS)
+    guidance = guidances.make("relative", probes.SIZES, ENV)
+
+    def reward(model):
+        guide = Guided(Uniform(), model, ENV, probes.SCALARS, guidance)
+        found = evaluate.evaluate_lanes(ENV, guide, jax.random.key(3), mesh=MESH, num_envs=100, steps=1000)
+        return np.asarray(found["reward"])
+
+    guided = reward(state.guide.model)
+    chance = reward(state.guide.model.replace(fitted=jnp.zeros(4, bool)))
+    np.testing.assert_allclose(chance, 1 / (2 * math.pi), atol=0.05)
+    assert guided[2:].min() > 0.5
+    assert guided[2:].mean() > 0.75
+    assert (guided[2:] > guided[:2]).all()  # sixty labels against fifteen
+
+
+def test_labels_given_elsewhere_replace_those_asked_for_and_the_earlier_model_is_forgotten():
+    program = probes.window_program("relative", LARGEST)
+    _, asked = labelled(program, SEEDS, BUDGETS)
+    labels = jax.tree.map(jnp.copy, asked.guide.labels)
+    fresh = program.take_labels(ENV, probes.SCALARS, labels, probes.start(program, SEEDS, BUDGETS))
+    again = program.take_labels(ENV, probes.SCALARS, labels, asked)
+    assert_equal(fresh.guide.model, again.guide.model)
+    assert fresh.guide.model.fitted.all()
+    assert_equal(fresh.guide.labels, labels)
+    other = labels.replace(answer=-labels.answer)
+    assert not np.array_equal(
+        jax.tree.leaves(program.take_labels(ENV, probes.SCALARS, other, again).guide.model)[0],
+        jax.tree.leaves(fresh.guide.model)[0],
+    )
+
+
+# Lanes.
+
+
+def trained(program, seeds, budgets):
+    """Labels, then training through random, guided and greedy steps with gradient steps."""
+    clock, state = labelled(program, seeds, budgets, -(-max(budgets) // 10))
+    _, state, metrics = run(program, probes.SCALARS, probes.SCHEDULE, clock, state)
+    return state, metrics
+
+
+@pytest.fixture(scope="module")
+def grid():
+    return trained(probes.window_program("relative", LARGEST), SEEDS, BUDGETS)
+
+
+def test_every_seed_differs(grid):
+    state, _ = grid
+    fresh = probes.start(probes.window_program("relative", LARGEST), SEEDS, BUDGETS)
+    for one, other in itertools.combinations([0, 1], 2):
+        for tree in (fresh.agent.params, fresh.guide.model.params, state.agent.params, state.guide.model.params):
+            mine, yours = jax.tree.leaves(probes.lane(tree, one)), jax.tree.leaves(probes.lane(tree, other))
+            assert all(not np.array_equal(a, b) for a, b in zip(mine, yours, strict=True) if a.any())
+        assert not np.array_equal(state.agent.replay[one], state.agent.replay[other])
+        assert not np.array_equal(state.guide.labels.action[one], state.guide.labels.action[other])
+
+
+def test_many_seeds_differ_pairwise():
+    program = probes.window_program("relative", LARGEST)
+    states = [probes.start(program, seeds, [LARGEST] * 4) for seeds in ([0, 1, 2, 3], [4, 5, 6, 7])]
+    state = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *states)
+    weights = np.asarray(jax.tree.leaves(state.agent.params)[1]).reshape(8, -1)
+    for one, other in itertools.combinations(range(8), 2):
+        assert np.abs(weights[one] - weights[other]).max() > 0.01
+        assert not np.array_equal(jax.random.key_data(state.key)[one], jax.random.key_data(state.key)[other])
+
+
+def test_lanes_of_one_seed_start_alike_and_differ_by_their_budget(grid):
+    state, _ = grid
+    fresh = probes.start(probes.window_program("relative", LARGEST), SEEDS, BUDGETS)
+    assert_equal(probes.lane(fresh.agent.params, 0), probes.lane(fresh.agent.params, 2))
+    assert not np.array_equal(
+        jax.tree.leaves(state.guide.model.params)[1][0], jax.tree.leaves(state.guide.model.params)[1][2]
+    )
+
+
+def test_a_lane_alone_is_the_lane_beside_others(grid):
+    state, metrics = grid
+    alone, measured = trained(probes.window_program("relative", LARGEST), SEEDS[3:], BUDGETS[3:])
+    assert_same_lane(state, 3, alone)
+    assert_close(probes.lane(metrics, 3), probes.lane(measured, 0))
+
+
+def test_the_smaller_budget_is_the_sweep_of_that_budget_alone(grid):
+    state, _ = grid
+    small, _ = trained(probes.window_program("relative", 15), [2], [15])
+    assert small.guide.labels.obs.shape[1] == 20
+    assert_same_lane(state, 1, small)
+
+
+def assert_same_lane(state, lane, alone):
+    """Up to the order of summation in float32."""
+    together, single = probes.lane(state, lane), probes.lane(alone, 0)
+    budget = int(single.guide.budget)
+    met, met_alone = probes.stored(state, lane, 48), probes.stored(alone, 0, 48)
+    np.testing.assert_array_equal(met["obs"], met_alone["obs"])
+    np.testing.assert_array_equal(met["reward"], met_alone["reward"])
+    np.testing.assert_allclose(met["action"], met_alone["action"], atol=1e-4)
+    for name in (*PARTS, "valid"):
+        rows, rows_alone = (getattr(one.guide.labels, name)[:budget] for one in (together, single))
+        np.testing.assert_allclose(rows, rows_alone, atol=1e-4)
+    assert_close(together.agent.params, single.agent.params, atol=1e-4)
+    assert_close(together.guide.model, single.guide.model, atol=1e-3)
+    for part in (lambda one: one.key, lambda one: one.agent.guided, lambda one: one.guide.obs):
+        assert_equal(part(together), part(single))
+
+
+def test_one_stretch_of_steps_is_two_of_half_the_length():
+    program = probes.window_program("none")
+    results = []
+    for iterations in ((STRETCH,), (STRETCH // 2, STRETCH // 2)):
+        clock, state = loop.start_clock(), probes.start(program, [0], [0])
+        for count in iterations:
+            clock, state, _ = program.train(ENV, probes.SCALARS, probes.SCHEDULE, clock, state, count)
+        results.append(jax.tree.map(np.asarray, (clock, state.replace(key=jax.random.key_data(state.key)))))
+    assert_equal(*results)
+
+
+# Compiling once.
+
+
+def test_other_scalars_schedules_worlds_and_times_compile_nothing(grid):
+    program = probes.window_program("relative", LARGEST)
+    functions = (program.init, program.label_round, program.train)
+    before = probes.compilations(*functions)
+    clock, state = loop.start_clock(), probes.start(program, [7, 8, 9, 10], [1, 11, 33, LARGEST])
+    for index in range(3):
+        env = probes.Window(0.1 * index, 0.2 * index)
+        scalars = dataclasses.replace(
+            probes.SCALARS, learning_rate=0.01 * index, eps_deg=5.0 + index, k_max=10 + index, guided_probability=0.2
+        )
+        schedule = replaced(random_steps=index, learn_after=4 * index, guidance_until=20 + index)
+        clock, state = program.label_round(env, probes.Expert(env), scalars, clock, state)
+        clock, state, _ = program.train(env, scalars, schedule, clock, state, STRETCH)
+    assert probes.compilations(*functions) == before
+
+
+def test_evaluation_compiles_once_for_all_parameters_and_worlds():
+    before = probes.compilations(evaluate._evaluate)[0]
+    for index in range(3):
+        params = probes.start(probes.window_program("none"), [index], [0]).agent.params
+        env = probes.Window(0.1 * index, 0.6)
+        agents = Agent(params, probes.SIZES)
+        evaluate.evaluate_lanes(env, agents, jax.random.key(index), mesh=MESH, num_envs=3, steps=6)
+    assert probes.compilations(evaluate._evaluate) == [before + 1]
+
+
+def test_transitions_are_mirrored_as_a_whole():
+    rng = np.random.default_rng(0)
+    obs, action, following = jnp.array(rng.normal(size=(3, 64, 2)), jnp.float32)
+    batch = Transition(obs, action, jnp.arange(64.0), jnp.ones(64), following)
+    image = mirrored(jax.random.key(0), probes.Window(mirrors=True), batch)
+    quarters = np.round(np.asarray(actions.difference(obs, image.obs)) / (math.pi / 2)).astype(int) % 4
+    assert set(quarters) == {0, 1, 2, 3}
+    for name in ("obs", "action", "next_obs"):
+        expected = actions.rotate(getattr(batch, name), jnp.array(quarters * math.pi / 2))
+        np.testing.assert_allclose(getattr(image, name), expected, atol=1e-5)
+    np.testing.assert_array_equal(image.reward, batch.reward)
+    without = mirrored(jax.random.key(0), probes.Window(mirrors=True), batch.replace(next_obs=following[:, :0]))
+    np.testing.assert_array_equal(without.obs, image.obs)
+    same = mirrored(jax.random.key(0), ENV, batch)
+    assert all(one is other for one, other in zip(jax.tree.leaves(same), jax.tree.leaves(batch), strict=True))
+
+
+def test_label_slots_are_whole_rounds():
+    assert [asking.label_slots(budget, probes.SIZES) for budget in (1, 10, 11, 100)] == [10, 10, 20, 100]
+
+
+def test_empty_label_sets_have_the_shape_of_the_largest_budget():
+    labels = probes.start(probes.window_program("relative", 15), [0], [15]).guide.labels
+    assert isinstance(labels, Label)
+    assert (labels.obs.shape, labels.action.shape, labels.answer.shape) == ((1, 20, 2), (1, 20, 2), (1, 20, 1))
+    assert not labels.valid.any()

@@ -1,0 +1,266 @@
+"""Policies on the bandit, whose best direction is known; and blocks of them, a lane of which is itself."""
+
+import dataclasses
+from functools import cache
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import probes
+import pytest
+
+from cuelearner_jax import actions
+from cuelearner_jax.agent.networks import applied, q_network, residual_network
+from cuelearner_jax.devices import lane_mesh
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.evaluate import evaluate_lanes, evaluate_policy, one_lane, rollout
+from cuelearner_jax.guidance import registry as guidances
+from cuelearner_jax.loop import start_clock
+from cuelearner_jax.policies import (
+    Agent,
+    Corrected,
+    Guided,
+    Heuristic,
+    Opaque,
+    Residual,
+    Taught,
+    Teaching,
+    Uniform,
+    best_actions,
+)
+
+ENV, EXPERT = probes.Window(), probes.Expert(probes.Window())
+OBS = actions.evenly_spaced(40)
+STATES = OBS  # the bandit's state is what it shows
+BEST = actions.rotate(OBS, 0.6)
+KEY = jax.random.key(5)
+Q = q_network(probes.SIZES.q_layers)
+AGENT = Agent(Q.init(jax.random.key(1), jnp.zeros(2), jnp.zeros(2)), probes.SIZES)
+LANES, MESH = 3, lane_mesh()
+PHI = residual_network((8,), 2)
+
+
+def act(policy, key=KEY, obs=OBS):
+    return np.asarray(policy.act(key, obs, obs))
+
+
+# What each does.
+
+
+def test_the_agent_takes_the_direction_of_the_largest_value():
+    expected = probes.greedy_actions(applied(Q), AGENT.params, OBS)
+    np.testing.assert_array_equal(act(AGENT), expected)
+    assert len(np.unique(expected, axis=0)) > 2
+    np.testing.assert_array_equal(act(AGENT, jax.random.key(6)), expected)  # whatever the key
+
+
+def test_uniform_actions_are_drawn_anew_with_each_key():
+    many = act(Uniform(), obs=jnp.tile(OBS, (50, 1)))
+    np.testing.assert_allclose(np.linalg.norm(many, axis=-1), 1, atol=1e-6)
+    counts = np.histogram(np.arctan2(many[:, 1], many[:, 0]), 8, (-np.pi, np.pi))[0]
+    assert counts.min() > 180  # 250 each, standard deviation 15
+    np.testing.assert_array_equal(act(Uniform()), act(Uniform()))
+    assert np.abs(act(Uniform()) - act(Uniform(), jax.random.key(6))).max() > 0.1
+
+
+def test_the_taught_policy_does_what_its_teacher_holds_for_best():
+    np.testing.assert_allclose(act(Taught(EXPERT)), BEST, atol=1e-6)
+    np.testing.assert_allclose(best_actions(EXPERT, STATES, OBS), BEST, atol=1e-6)
+
+
+def test_the_heuristic_is_the_environments():
+    np.testing.assert_allclose(act(Heuristic(ENV)), actions.rotate(OBS, -1.0), atol=1e-6)
+
+
+@pytest.mark.parametrize("base", [AGENT, Uniform(), Taught(EXPERT)], ids=["agent", "uniform", "taught"])
+def test_under_no_guidance_a_policy_is_itself(base):
+    none = guidances.make("none", probes.SIZES, ENV)
+    guided = Guided(base, none.init(KEY), ENV, probes.SCALARS, none)
+    np.testing.assert_array_equal(act(guided), act(base))
+
+
+def test_under_the_heuristic_every_action_is_its():
+    heuristic = guidances.make("heuristic", probes.SIZES, ENV)
+    guided = Guided(AGENT, heuristic.init(KEY), ENV, probes.SCALARS, heuristic)
+    np.testing.assert_array_equal(act(guided), act(Heuristic(ENV)))
+
+
+def test_under_relative_guidance_every_action_is_refined_once_the_model_is_fitted():
+    relative = guidances.make("relative", probes.SIZES, ENV)
+    model = relative.init(KEY)
+    guided = Guided(AGENT, model, ENV, probes.SCALARS, relative)
+    np.testing.assert_array_equal(act(guided), act(AGENT))
+    model = model.replace(fitted=jnp.array(True))
+    everywhere = jnp.ones(len(OBS), bool)
+    refined = relative.act(model, ENV, OBS, AGENT.act(KEY, OBS, OBS), everywhere, probes.SCALARS)
+    np.testing.assert_array_equal(act(guided.replace(model=model)), refined.actions)
+    assert np.abs(act(guided) - np.asarray(refined.actions)).max(-1).min() > 0
+
+
+@pytest.mark.parametrize("base", [AGENT, Uniform(), Heuristic(ENV)], ids=["agent", "uniform", "heuristic"])
+@pytest.mark.parametrize("eps_deg", [5.0, 20.0])
+def test_corrections_end_within_half_eps_of_the_teachers_best(base, eps_deg):
+    scalars = dataclasses.replace(probes.SCALARS, eps_deg=eps_deg)
+    error = np.rad2deg(np.abs(actions.difference(BEST, act(Corrected(base, EXPERT, scalars)))))
+    assert error.max() <= eps_deg / 2 + 1e-2
+    assert np.rad2deg(np.abs(actions.difference(BEST, act(base)))).max() > eps_deg
+
+
+def test_corrections_keep_to_the_bound():
+    scalars = dataclasses.replace(probes.SCALARS, tau_max_deg=30.0)
+    moved = actions.difference(act(Heuristic(ENV)), act(Corrected(Heuristic(ENV), EXPERT, scalars)))
+    np.testing.assert_allclose(np.rad2deg(moved), 30.0, atol=1e-2)  # 92 degrees short, so as far as allowed
+
+
+def test_a_residual_adds_to_the_base_and_stays_within_its_bound():
+    def add(params, obs, base):
+        return params * actions.rotate(base, np.pi / 2) + 0.0 * obs
+
+    def moved(size, bound):
+        return np.asarray(actions.difference(act(AGENT), act(Residual(AGENT, jnp.array(size), bound, add))))
+
+    np.testing.assert_allclose(moved(0.3, 1.0), np.arctan(0.3), atol=1e-5)
+    np.testing.assert_allclose(moved(-0.3, 1.0), -np.arctan(0.3), atol=1e-5)
+    np.testing.assert_allclose(moved(0.3, 0.1), 0.1, atol=1e-5)
+    np.testing.assert_allclose(moved(0.0, 1.0), 0.0, atol=1e-6)
+    np.testing.assert_allclose(moved(5.0, 0.0), 0.0, atol=1e-6)
+    wild = Residual(AGENT, jnp.array(1.0), 0.25, lambda params, obs, base: 100 * (BEST + params))
+    away = np.abs(actions.difference(act(AGENT), act(wild)))
+    assert away.max() <= 0.25 + 1e-5
+    assert away.max() > 0.2
+
+
+# Functions of one's own.
+
+
+def turned(obs):
+    """A function of JAX or NumPy arrays, not of unit length: the observation turned, and an eighth stretched."""
+    x, y = obs[..., 0], obs[..., 1]
+    cos, sin = np.float32(np.cos(0.5)), np.float32(np.sin(0.5))
+    return 2.5 * (jnp if isinstance(obs, jax.Array) else np).stack([cos * x - sin * y, sin * x + cos * y], -1)
+
+
+OPAQUE = {"in JAX": Opaque(turned), "on the host": Opaque(turned, on_host=True)}
+
+
+@pytest.mark.parametrize("name", OPAQUE)
+def test_a_function_is_called_whatever_surrounds_it(name):
+    policy = OPAQUE[name]
+    called = turned(np.asarray(OBS))
+    direct = called / np.linalg.norm(called, axis=-1, keepdims=True)
+    np.testing.assert_allclose(direct, actions.rotate(OBS, 0.5), atol=1e-6)
+    np.testing.assert_allclose(act(policy), direct, atol=1e-6)
+    compiled = jax.jit(lambda policy, obs: policy.act(KEY, obs, obs))
+    np.testing.assert_allclose(compiled(policy, OBS), direct, atol=1e-6)
+    lanes = OBS.reshape(4, 10, 2)
+    many = jax.jit(jax.vmap(lambda obs: policy.act(KEY, obs, obs)))
+    np.testing.assert_allclose(many(lanes), direct.reshape(4, 10, 2), atol=1e-6)
+
+
+def test_a_function_rolls_out_the_same_in_jax_and_on_the_host():
+    # 0.1 rad off the best direction, and 1.1 rad off it: always right, never right.
+    for offset, reward in ((0.6, 1.0), (1.6, 0.0)):
+        env = probes.Window(offset=offset)
+        found = {name: evaluate_policy(env, policy, KEY, 10, 40) for name, policy in OPAQUE.items()}
+        assert {name: float(metrics["reward"]) for name, metrics in found.items()} == dict.fromkeys(OPAQUE, reward)
+    one, other = (evaluate_policy(probes.Chain(), policy, KEY, 10, 40)["reward"] for policy in OPAQUE.values())
+    assert float(one) == pytest.approx(float(other), abs=1e-6)
+
+
+@pytest.mark.parametrize("on_host", [False, True])
+@pytest.mark.parametrize(
+    ("function", "shape"),
+    [
+        (lambda obs: obs[..., :1], r"\(40, 1\)"),
+        (lambda obs: obs[:3], r"\(3, 2\)"),
+        (lambda obs: obs[:, 0], r"\(40,\)"),
+        (lambda obs: obs[None], r"\(1, 40, 2\)"),
+    ],
+)
+def test_a_wrong_shape_is_refused_in_one_line(on_host, function, shape):
+    policy = Opaque(function, on_host=on_host)
+    says = rf"a policy returned actions of shape {shape} for 40 observations: return \(40, 2\)"
+    for call in (act, jax.jit(lambda policy: policy.act(KEY, OBS, OBS))):
+        with pytest.raises(UserError, match=says) as refusal:
+            call(policy)
+        assert "\n" not in str(refusal.value)
+    with pytest.raises(UserError, match="for 10 observations"):
+        rollout(Opaque(lambda obs: obs[:, :1], on_host=on_host), ENV, KEY, 10, 20)
+
+
+# Teachers.
+
+
+def test_a_finished_agent_teaches_what_it_does():
+    teacher = Teaching(AGENT)
+    expected = act(AGENT)
+    one = np.stack([teacher.best_action(state, state) for state in OBS[:5]])
+    np.testing.assert_array_equal(one, expected[:5])
+    np.testing.assert_array_equal(act(Taught(teacher)), expected)
+    # A policy that looks at the state sees it.
+    np.testing.assert_allclose(act(Taught(Teaching(Taught(EXPERT)))), BEST, atol=1e-6)
+    corrected = act(Corrected(Uniform(), teacher, probes.SCALARS))
+    assert np.rad2deg(np.abs(actions.difference(expected, corrected))).max() <= probes.SCALARS.eps_deg / 2 + 1e-2
+
+
+# Blocks of lanes.
+
+
+@cache
+def block():
+    """Three lanes of one program, each with its own network and its own fitted model."""
+    program = probes.window_program("relative", 10)
+    state = probes.start(program, [0, 1, 2], [10] * LANES)
+    _, state = program.label_round(ENV, EXPERT, probes.SCALARS, start_clock(), state)
+    return state
+
+
+def guided(base):
+    relative = guidances.make("relative", probes.SIZES, ENV)
+    return Guided(base, block().guide.model, ENV, probes.SCALARS, relative)
+
+
+def residual(params, obs, base):
+    return jnp.asarray(PHI.apply(params, obs, base))
+
+
+def agents():
+    return Agent(block().agent.params, probes.SIZES)
+
+
+BLOCKS = {
+    "agent": agents,
+    "guided agent": lambda: guided(agents()),
+    "guided uniform": lambda: guided(Uniform()),
+    "guided heuristic": lambda: guided(Heuristic(ENV)),
+    "corrected agent": lambda: Corrected(agents(), EXPERT, dataclasses.replace(probes.SCALARS, tau_max_deg=60.0)),
+    "residual of uniform": lambda: Residual(
+        Uniform(),
+        jax.vmap(lambda key: PHI.init(key, jnp.zeros(2), jnp.zeros(2)))(jax.random.split(KEY, LANES)),
+        1.0,
+        residual,
+    ),
+}
+
+
+@pytest.mark.parametrize("name", BLOCKS)
+def test_a_block_is_evaluated_as_each_of_its_lanes(name):
+    policy = BLOCKS[name]()
+    together = evaluate_lanes(ENV, policy, KEY, mesh=MESH, num_envs=20, steps=400)
+    alone = [evaluate_policy(ENV, one_lane(policy, lane), KEY, 20, 400) for lane in range(LANES)]
+    assert together.keys() == alone[0].keys()
+    for metric, values in together.items():
+        assert values.shape == (LANES,)
+        np.testing.assert_allclose(values, [found[metric] for found in alone], atol=1e-6)
+    assert len(set(np.asarray(together["reward"]).tolist())) > 1  # lanes differ
+
+
+def test_one_lane_has_its_own_leaves_and_what_all_share():
+    policy = guided(agents())
+    one = one_lane(policy, 2)
+    chex.assert_trees_all_equal(one.base.params, jax.tree.map(lambda leaf: leaf[2], policy.base.params))
+    chex.assert_trees_all_equal(one.model, jax.tree.map(lambda leaf: leaf[2], policy.model))
+    chex.assert_trees_all_equal((one.env, one.scalars), (policy.env, policy.scalars))
+    assert one.guidance is policy.guidance
+    assert one.base.sizes == policy.base.sizes

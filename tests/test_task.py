@@ -1,0 +1,113 @@
+"""What a task refuses to be, and how its bodies, scenarios and teacher are chosen."""
+
+import dataclasses
+import re
+from dataclasses import dataclass
+
+import jax
+import probes
+import pytest
+
+from cuelearner_jax.config import RunConfig
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.task import Body, Preset, Scenario, shape_of
+
+PRESET = Preset("small", probes.CONFIG)
+TASK = dataclasses.replace(
+    probes.make_task(), presets={"small": PRESET}, scenarios={"narrow": Scenario("hard", {"half_width_deg": 5.0}, 20.0)}
+)
+
+
+def wide(config, split):
+    """Twice as easy."""
+    return probes.Window(jax.numpy.deg2rad(2 * config.half_width_deg))
+
+
+WIDE = Body("wide", "twice as easy", wide, {"abacus": lambda *arguments: {"reward": 1.0}})
+TWO = dataclasses.replace(TASK, bodies=(*TASK.bodies, WIDE))
+
+
+@dataclass(frozen=True)
+class Named:
+    """A configuration with a field that config.json has another use for."""
+
+    name: str = ""
+
+
+@dataclass(frozen=True)
+class Picky:
+    """A configuration that checks itself."""
+
+    width: float = 1.0
+
+    def __post_init__(self):
+        if self.width < 0:
+            raise ValueError("width is negative")
+
+
+CANNOT_BE = [
+    ({"name": "my task"}, "task 'my task': the name must be an identifier"),
+    ({"config": int}, "config must be a dataclass"),
+    ({"config": Named, "presets": {}, "scenarios": {}}, "a field of Named may not be called 'name'"),
+    ({"bodies": ()}, "at least one body"),
+    ({"bodies": (WIDE, WIDE)}, "each of another name, not ['wide', 'wide']"),
+    ({"presets": {"x": Preset("", RunConfig(Picky()))}}, "preset 'x' configures Picky, not WindowConfig"),
+    ({"scenarios": {"x": Scenario("", {"half_with_deg": 1.0})}}, "scenario 'x' changes 'half_with_deg', no field of"),
+    (
+        {"config": Picky, "presets": {}, "scenarios": {"x": Scenario("", {"width": -1.0})}},
+        "scenario 'x' makes no configuration (width is negative)",
+    ),
+]
+
+
+@pytest.mark.parametrize(("changes", "says"), CANNOT_BE, ids=[says for _, says in CANNOT_BE])
+def test_parts_that_do_not_fit_together_are_refused_at_once(changes, says):
+    with pytest.raises(ValueError, match=re.escape(says)):
+        dataclasses.replace(TASK, **changes)
+
+
+def test_a_body_takes_the_first_place_and_keeps_all_else():
+    changed = TWO.on("wide")
+    assert [body.name for body in changed.bodies] == ["wide", "point"]
+    assert float(changed.environment(probes.WindowConfig(10.0)).half_width) == pytest.approx(0.349, abs=1e-3)
+    assert float(TWO.environment(probes.WindowConfig(10.0)).half_width) == pytest.approx(0.1745, abs=1e-3)
+    assert TWO.on(None) is TWO
+    assert changed.on("point") == TWO
+    assert changed.presets == TWO.presets
+
+
+def test_bodies_and_engines_that_are_not_there_are_refused():
+    with pytest.raises(UserError, match="unknown robot 'wid', did you mean 'wide'"):
+        TWO.on("wid")
+    with pytest.raises(UserError, match="window has no robots to choose from: leave out --robot"):
+        TASK.on("wide")
+    assert TWO.engine(None) is None
+    assert TWO.on("wide").engine("abacus") is WIDE.engines["abacus"]
+    with pytest.raises(UserError, match="--engine abacus needs --robot: choose one of wide"):
+        TWO.engine("abacus")
+    with pytest.raises(UserError, match="unknown engine 'abakus', did you mean 'abacus'"):
+        TWO.on("wide").engine("abakus")
+    with pytest.raises(UserError, match="window has no pictures of point"):
+        TWO.pictures()
+
+
+def test_a_scenario_changes_its_fields_alone():
+    assert TASK.scenario("narrow").applied(probes.WindowConfig(28.0)) == probes.WindowConfig(5.0)
+    with pytest.raises(UserError, match="unknown scenario 'narow', did you mean 'narrow'"):
+        TASK.scenario("narow")
+    with pytest.raises(UserError, match="window has no scenarios"):
+        probes.make_task().scenario("narrow")
+
+
+def test_a_task_without_a_teacher_says_so_when_one_is_needed():
+    mute = dataclasses.replace(TASK, teacher=None)
+    env = mute.environment(probes.WindowConfig())
+    with pytest.raises(UserError, match="window has no teacher to ask"):
+        mute.make_teacher(probes.WindowConfig(), env)
+    assert TASK.make_teacher(probes.WindowConfig(), env).env is env
+
+
+def test_shapes_stand_in_for_arrays():
+    shapes = jax.tree.leaves(shape_of(TASK, probes.WindowConfig()))
+    assert shapes
+    assert all(isinstance(leaf, jax.ShapeDtypeStruct) for leaf in shapes)
