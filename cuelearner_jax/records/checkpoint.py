@@ -58,12 +58,21 @@ def _unflat(flat: dict[str, Any], like: Any) -> Any:
     return jax.tree_util.tree_map_with_path(leaf, like)
 
 
+# What is said of a checkpoint that cannot be read.
+OTHERS = "it is of another configuration, or of another version of the program: go on with that one, or start anew"
+DAMAGED = "it is damaged; delete its folder to go back to the checkpoint before, or start the run anew"
+
+
+class _OfAnother(ValueError):
+    """A checkpoint holds other leaves, or of other shapes, than are wanted."""
+
+
 def _compare(stored: dict[str, Any], wanted: dict[str, jax.ShapeDtypeStruct]) -> None:
-    """Raises ValueError unless an item on disk has the leaves that are wanted, of their shapes (both by path)."""
+    """Raises _OfAnother unless an item on disk has the leaves that are wanted, of their shapes (both by path)."""
     for path in {**stored, **wanted}:
         there, here = (tuple(tree[path].shape) if path in tree else "none" for tree in (stored, wanted))
         if there != here:
-            raise ValueError(f"{path} is {there}, expected {here}")
+            raise _OfAnother(f"{path} is {there}, expected {here}")
 
 
 def _collect_quietly() -> None:
@@ -136,10 +145,10 @@ class Checkpoints:
             return {name: _unflat(restored[name], like[name]) for name in like}
         except Exception as error:  # Orbax and TensorStore raise many kinds for one cause: the files do not fit
             reason = str(error).strip().splitlines()[0][:160] if str(error).strip() else type(error).__name__
+            other = isinstance(error, _OfAnother)
         _collect_quietly()
         raise UserError(
-            f"checkpoint {number} in {self._folder} cannot be read ({reason}): it is damaged or of another "
-            "program; delete that checkpoint's folder to go back to the one before, or start the run anew"
+            f"checkpoint {number} in {self._folder} cannot be read ({reason}): {OTHERS if other else DAMAGED}"
         )
 
     def close(self) -> None:
