@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -18,9 +17,6 @@ from cuelearner_jax.policies import Policy
 
 # Folded into the root key: episodes for reported figures only, and episodes for choosing settings.
 SPLITS = {"validation": 1_000_003, "tuning": 1_000_001}
-
-# (policy, env, key, environments, steps) -> metrics: `rollout`, or the same in other physics
-Rollout = Callable[[Policy, Any, PRNGKeyArray, int, int], dict[str, Any]]
 
 
 def episodes(split: str = "validation") -> PRNGKeyArray:

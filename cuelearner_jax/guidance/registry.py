@@ -6,7 +6,6 @@ name it as `package.module:NAME` wherever the name of a kind is asked for.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import cache
 from importlib import metadata
 from typing import Any
@@ -91,8 +90,3 @@ def made_for(kind: Kind, sizes: GuideSizes, spaces: Spaces) -> Guidance:
 def _register_installed() -> None:
     for point in metadata.entry_points(group=ENTRY_POINTS):
         register(load(point.value, Kind, "a kind of guidance"))
-
-
-def listed(kinds: Sequence[Kind] | None = None) -> str:
-    """Names with what they are, for help pages."""
-    return "; ".join(f"{kind.name}: {kind.about}" for kind in (known() if kinds is None else kinds))

@@ -15,15 +15,15 @@ from cuelearner_jax.config import RunConfig, to_json
 from cuelearner_jax.devices import lane_mesh
 from cuelearner_jax.environment import actions_of, offers
 from cuelearner_jax.errors import UserError, closest
-from cuelearner_jax.evaluate import Rollout, episodes, evaluate_lanes, evaluate_policy, one_lane
+from cuelearner_jax.evaluate import episodes, evaluate_lanes, evaluate_policy, one_lane
 from cuelearner_jax.guidance import registry as guidances
 from cuelearner_jax.guidance.bundle import Guidance
-from cuelearner_jax.policies import Agent, Corrected, Guided, Heuristic, Policy, Taught, Uniform, uniform_in
+from cuelearner_jax.policies import Agent, Corrected, Guided, Heuristic, Policy, Taught, uniform_in
 from cuelearner_jax.records.provenance import provenance
 from cuelearner_jax.runs.grid import Grid
 from cuelearner_jax.runs.kept import restore_policies
 from cuelearner_jax.runs.lanes import LaneGroup
-from cuelearner_jax.task import Task, shape_of
+from cuelearner_jax.task import Rollout, Task, shape_of
 from cuelearner_jax.types import Teacher
 
 
@@ -90,7 +90,7 @@ POLICIES: dict[str, Named] = {
     ),
     "teacher": Named("the teacher", lambda parts: parts.taught(), taught=True),
     "heuristic": Named("the task's obvious action", lambda parts: Heuristic(parts.env), needs=("heuristic",)),
-    "uniform": Named("chance", lambda parts: Uniform(actions_of(parts.env))),
+    "uniform": Named("chance", lambda parts: uniform_in(parts.env)),
 }
 
 
