@@ -9,6 +9,7 @@ from __future__ import annotations
 import errno
 import gc
 import logging
+import re
 import shutil
 import sys
 import time
@@ -144,7 +145,9 @@ class Checkpoints:
             )
             return {name: _unflat(restored[name], like[name]) for name in like}
         except Exception as error:  # Orbax and TensorStore raise many kinds for one cause: the files do not fit
-            reason = str(error).strip().splitlines()[0][:160] if str(error).strip() else type(error).__name__
+            # Orbax means to print TensorStore's details and prints the method that has them.
+            told = re.sub(r"\.? See full TensorStore details.*", "", str(error), flags=re.DOTALL).strip()
+            reason = told.splitlines()[0][:160] if told else type(error).__name__
             other = isinstance(error, _OfAnother)
         _collect_quietly()
         raise UserError(

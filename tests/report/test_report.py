@@ -195,7 +195,13 @@ HOSTILE = "=cmd()|![x](http://a.b)<script>alert(1)</script>`\n| relative | 9,000
 def test_names_are_only_names_in_markdown_csv_and_figures(tmp_path):
     """A folder, a kind of guidance, a task, a command and a version that try to be tags, rows, links and formulas."""
     folder = tmp_path / "runs" / "a|b<img src=x>`[c](d)\n- done"
-    constants = {"task": HOSTILE, "command": HOSTILE, "versions": HOSTILE, "hardware": "@SUM(1)", "commit": "`<b>`"}
+    constants: dict[str, Any] = {
+        "task": HOSTILE,
+        "command": HOSTILE,
+        "versions": HOSTILE,
+        "hardware": "@SUM(1)",
+        "commit": "`<b>`",
+    }
     write(folder, HOSTILE, -0.5, 100, steps=STEPS[:-1], **constants)
     write(tmp_path / "runs" / "plain", "_under", 0.5, 100, seeds=[0, 1], **constants)
     text = report(tmp_path / "runs", tmp_path / "out", command=f"cuelearner report '{folder}'").read_text()
