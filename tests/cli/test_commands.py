@@ -157,6 +157,9 @@ def test_the_installed_command_explains_itself(command):
     assert done.returncode == 0
     assert "--out" in done.stdout
     assert done.stderr == ""
+    if command in ("train", "sweep", "evaluate", "render"):
+        assert "(--preset; paper where none is given)" in done.stdout
+        assert re.search(r"^  quickstart  .*minutes on 2 cores\)$", done.stdout, re.MULTILINE)
 
 
 def test_the_installed_command_fails_in_one_line(tmp_path):
