@@ -1,7 +1,8 @@
 """Checkpoints: the only file that knows Orbax.
 
-A checkpoint holds three items: `policy` (what acting needs, so that evaluation never reads a replay buffer), `rest` and
-`clock`. Orbax writes to a temporary folder and renames it, so a kill leaves the last complete checkpoint in place.
+A run's checkpoint holds four items: `policy` (what acting needs, so that evaluation never reads a replay buffer),
+`rest`, `failed` (which lanes have; older checkpoints lack it) and `clock`. Orbax writes to a temporary folder and
+renames it, so a kill leaves the last complete checkpoint in place.
 """
 
 from __future__ import annotations
@@ -106,6 +107,10 @@ class Checkpoints:
     def latest(self) -> int | None:
         """Number of the newest complete checkpoint."""
         return self._manager.latest_step()
+
+    def holds(self, name: str) -> bool:
+        """Has the newest complete checkpoint an item of that name?"""
+        return (self._manager.directory / str(self.latest()) / name).is_dir()
 
     def save(self, number: int, items: dict[str, Any]) -> None:
         """Writes a checkpoint; returns once it is complete on disk. Raises OSError where there is no room for it."""
