@@ -14,6 +14,7 @@ from matplotlib import ticker
 from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from cuelearner_jax.guidance import registry
 from cuelearner_jax.report.statistics import Curve, Interval
@@ -43,6 +44,7 @@ class Variant(NamedTuple):
     values: Float[np.ndarray, "seeds steps"]
     curve: Curve
     mean: Interval  # of the mean over the curve, up to the last step that all variants share
+    failed: Int[np.ndarray, "lanes"]  # steps by which other lanes had failed, of which nothing else is here
 
     @property
     def name(self) -> str:
@@ -62,6 +64,12 @@ def draw_curves(variants: Sequence[Variant], title: str, metric: str) -> Figure:
             marker = "o" if len(steps) == 1 else ""
             axes.fill_between(steps, lower, upper, color=colour, alpha=0.18 if len(variants) < 6 else 0.12, linewidth=0)
             axes.plot(steps, estimate, color=colour, linewidth=1.8, marker=marker, solid_capstyle="round")
+            if len(variant.failed):
+                at = np.minimum(variant.failed, steps[-1])
+                axes.plot(at, np.interp(at, steps, estimate), "x", color=colour, markersize=8, clip_on=False)
+        if any(len(variant.failed) for variant in variants):
+            cross = Line2D([], [], linestyle="", marker="x", color="#595959", label="a seed failed, and is left out")
+            axes.legend(handles=[cross], loc="best", fontsize=9)
         end = max(int(variant.curve.steps[-1]) for variant in variants)
         axes.set_xlim(0, max(end, 1))
         axes.set_xlabel("environment steps of a seed")
