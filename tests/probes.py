@@ -15,7 +15,7 @@ import numpy as np
 from flax import struct
 
 from cuelearner_jax.actions import difference, evenly_spaced, from_angle, rotate
-from cuelearner_jax.config import RunConfig, Scalars, Schedule, Sizes
+from cuelearner_jax.config import RunConfig, Scalars, Schedule, Sizes, digest
 from cuelearner_jax.environment import Quantity, WholeObservations
 from cuelearner_jax.guidance import registry as guidances
 from cuelearner_jax.loop import make_program
@@ -218,7 +218,8 @@ def files_of(folder):
 
 
 def edit_json(path, change):
-    """Rewrites a JSON file by a function of its values."""
+    """Rewrites a JSON file by a function of its values; one with a digest gets that of the new ones."""
     values = json.loads(path.read_text())
+    sealed = values.pop("digest", None) is not None
     change(values)
-    path.write_text(json.dumps(values))
+    path.write_text(json.dumps({**values, "digest": digest(values)} if sealed else values))

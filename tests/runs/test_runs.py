@@ -80,16 +80,16 @@ def test_the_hash_of_a_configuration_is_that_of_its_recorded_results(folder):
     recorded = ROOT / "docs" / "data" / folder
     values = json.loads((recorded / "config.json").read_text())
     hashes = set(results.read(recorded)["config_hash"].to_pylist())
-    assert hashes == {runs.config_hash(values)} == {runs.config_hash({**values, "format": 1})}
+    assert hashes == {runs.config_hash(values)} == {runs.config_hash({**values, "format": 2})}
     assert runs.config_hash({**values, "split": "other"}) not in hashes
 
 
 def test_runs_described_before_formats_had_numbers_are_resumed_and_loaded(out):
-    assert described()["format"] == 1
+    assert described()["format"] == 2
     probes.edit_json(out / "config.json", lambda values: values.pop("format"))
     check_folder(out, described(), resume=True, overwrite=False)
     assert runs.load(out, find)[1] == probes.CONFIG
-    probes.edit_json(out / "config.json", lambda values: values.update(format=2))
+    probes.edit_json(out / "config.json", lambda values: values.update(format=3))
     not_loaded(out, "written by a newer cuelearner")
 
 
