@@ -1,8 +1,9 @@
 """Checkpoints: the only file that knows Orbax.
 
-A checkpoint holds three items: `policy` (what acting needs, so that evaluation never reads a replay buffer), `rest` and
-`clock`; and the `digests` of their arrays: Orbax would read many a changed bit without a word. Older ones have none.
-Orbax writes to a temporary folder and renames it, so a kill leaves the last complete checkpoint in place.
+A run's checkpoint holds four items: `policy` (what acting needs, so that evaluation never reads a replay buffer),
+`rest`, `failed` (which lanes have; older checkpoints lack it) and `clock`; and the `digests` of their arrays: Orbax
+would read many a changed bit without a word. Older ones have none. Orbax writes to a temporary folder and renames it,
+so a kill leaves the last complete checkpoint in place.
 """
 
 from __future__ import annotations
@@ -139,6 +140,11 @@ class Checkpoints:
     def latest(self) -> int | None:
         """Number of the newest complete checkpoint."""
         return self._manager.latest_step()
+
+    def holds(self, name: str) -> bool:
+        """Has the newest complete checkpoint an item of that name, or at least should it have? Older ones lack some."""
+        folder = self._manager.directory / str(self.latest())
+        return (folder / name).exists() or (folder / DIGESTS).exists()
 
     def save(self, number: int, items: dict[str, Any]) -> None:
         """Writes a checkpoint; returns once it is complete on disk. Raises OSError where there is no room for it."""

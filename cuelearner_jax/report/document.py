@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import csv
 import os
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +23,9 @@ from cuelearner_jax.records.folders import in_use
 from cuelearner_jax.report import escaping, extent
 from cuelearner_jax.report.figures import Variant, draw_curves, draw_label_efficiency, save_figure
 from cuelearner_jax.report.statistics import curve, interval, mean_over_curve, steps_to_reach, stretches_apart
+from cuelearner_jax.runs import failures
+
+Row = dict[str, str | int | float]  # of the summary
 
 
 def report(
@@ -52,7 +56,7 @@ def report(
 
     Raises:
         UserError: if `out` is there already, or the results are missing, corrupt, of several tasks, lack the metric or
-            the split, or hold a seed twice.
+            the split, hold a seed twice, or are of failed lanes alone.
     """
     folders = [folders] if isinstance(folders, str | os.PathLike) else list(folders)
     out = Path(out)
@@ -60,12 +64,13 @@ def report(
         raise UserError(
             f"{out} exists already: choose another folder (--out), or allow it to be overwritten (--overwrite)"
         )
-    table, invalid = _select(results.read(folders, task), metric, split)
-    variants = _variants(table, metric)
-    missing = _missing(folders, table, variants)
+    table, failed, invalid = _select(results.read(folders, task), metric, split)
+    variants = _variants(table, metric, results.failures(failed))
+    missing = _failed_lanes(failed, variants) + _missing(folders, pa.concat_tables([table, failed]), variants)
     if invalid:
         missing.append(f"{invalid:,} {split} rows have no finite {metric}; the steps of these rows are left out")
     rows = summary(variants, lower_is_better)
+    rows += _of_failed_alone(rows, failed)
     title = f"{table['task'][0].as_py()}: {split} {metric.replace('_', ' ')}, {_seed_count(variants)}"
     figures = {"curves": draw_curves(variants, title, metric)}
     if len({variant.labels for variant in variants if variant.labels}) > 1:
@@ -79,7 +84,7 @@ def report(
         save_figure(figure, out / name)
     _write_csv(out / "summary.csv", rows)
     _write_csv(out / "curves.csv", _curve_rows(variants))
-    text = _markdown(title, rows, list(figures), missing, _provenance(table, command))
+    text = _markdown(title, rows, list(figures), missing, _provenance(pa.concat_tables([table, failed]), command))
     (out / "report.md").write_text(text, encoding="utf-8")
     return out / "report.md"
 
@@ -87,21 +92,27 @@ def report(
 # --- from rows to variants -------------------------------------------------------------------------------------------
 
 
-def _select(table: pa.Table, metric: str, split: str) -> tuple[pa.Table, int]:
-    """The rows to report, and how many rows of the split were left out because the metric is not finite."""
+def _select(table: pa.Table, metric: str, split: str) -> tuple[pa.Table, pa.Table, int]:
+    """The rows to report, all rows of lanes that failed, and how many rows were left out for a metric not finite."""
     if metric not in results.metrics(table):
         raise UserError(f"no metric {metric!r} in the results: there are {', '.join(results.metrics(table))}")
     splits = sorted(set(table["split"].to_pylist()))
     if split not in splits:
         raise UserError(f"no {split} rows in the results: there are {', '.join(splits)} rows")
     rows = table.filter(pc.field("split") == split)
+    marked = results.failures(rows)
+    lanes = zip(*(rows[name].to_pylist() for name in results.LANE), strict=True) if marked else ()
+    of_failed = np.array([lane in marked for lane in lanes] or [False] * rows.num_rows, bool)
+    rows, failed = rows.filter(pa.array(~of_failed)), rows.filter(pa.array(of_failed))
+    if failed.num_rows and not rows.num_rows:
+        raise UserError(f"nothing to report, {failures.summary(failed)}: train again with other settings")
     table = rows.filter(pc.field(metric).is_valid())
     if table.num_rows == 0:
         raise UserError(f"the metric {metric!r} has no finite value in the {split} rows: choose another metric")
-    return table, rows.num_rows - table.num_rows
+    return table, failed, rows.num_rows - table.num_rows
 
 
-def _variants(table: pa.Table, metric: str) -> list[Variant]:
+def _variants(table: pa.Table, metric: str, failed: Mapping[results.LaneKey, int]) -> list[Variant]:
     """The variants in the order of the legend: unguided, then by guidance and label budget."""
     guidance, labels = np.array(table["guidance"].to_pylist()), table["labels"].to_numpy()
     keys = set(zip(guidance.tolist(), labels.tolist(), strict=True))
@@ -113,7 +124,8 @@ def _variants(table: pa.Table, metric: str) -> list[Variant]:
     for (kind, budget), (seeds, steps, values) in raw.items():
         until = max(1, int(np.searchsorted(steps, shared, side="right")))
         mean = interval(mean_over_curve(steps[:until], values[:, :until]))
-        variants.append(Variant(kind, budget, seeds, values, curve(steps, values), mean))
+        lost = np.array([step for lane, step in failed.items() if lane[:2] == (kind, budget)], int)
+        variants.append(Variant(kind, budget, seeds, values, curve(steps, values), mean, lost))
     return variants
 
 
@@ -148,6 +160,24 @@ def _seed_count(variants: Sequence[Variant]) -> str:
     )
 
 
+def _failed_lanes(failed: pa.Table, variants: Sequence[Variant]) -> list[str]:
+    """One line for each variant of which lanes have failed, given all rows of such lanes."""
+    left = {(variant.guidance, variant.labels): len(variant.seeds) for variant in variants}
+    return [
+        f"{failures.variant_name(*key)}: {seeds} failed, no longer finite: "
+        + (f"curve and means are over the other {left[key]}" if key in left else "no lane is left")
+        for key, seeds in failures.told(failed).items()
+    ]
+
+
+def _of_failed_alone(rows: Sequence[Row], failed: pa.Table) -> list[Row]:
+    """Rows of the summary, beside those that there are, for variants of which every lane has failed."""
+    there = {(row["guidance"], row["labels"]) for row in rows}
+    lanes = Counter(key[:2] for key in results.failures(failed) if key[:2] not in there)
+    blank = dict.fromkeys(rows[0], "")
+    return [{**blank, "guidance": key[0], "labels": key[1], "seeds": 0, "failed": n} for key, n in lanes.items()]
+
+
 def _missing(folders: Sequence[str | os.PathLike[str]], table: pa.Table, variants: Sequence[Variant]) -> list[str]:
     """One line for everything that a reader of the report would otherwise take to be there."""
     lines = extent.missing(folders, table)
@@ -164,7 +194,10 @@ def _missing(folders: Sequence[str | os.PathLike[str]], table: pa.Table, variant
             lines.append(f"{variant.name}: one seed, so no interval")
     if len({int(variant.curve.steps[-1]) for variant in variants}) > 1:
         shared = min(int(variant.curve.steps[-1]) for variant in variants)
-        lines.append(f"curves end at different steps; means over the curve are taken to step {shared:,}, shared by all")
+        lines.append(
+            "curves end at different steps, so their final values are no comparison; "
+            f"means over the curve are taken to step {shared:,}, shared by all"
+        )
     hashes = sorted(set(table["config_hash"].to_pylist()))
     if len(hashes) > 1:
         lines.append(f"the runs differ in more than guidance, labels and seed: configurations {', '.join(hashes)}")
@@ -174,7 +207,7 @@ def _missing(folders: Sequence[str | os.PathLike[str]], table: pa.Table, variant
 # --- tables ----------------------------------------------------------------------------------------------------------
 
 
-def summary(variants: Sequence[Variant], lower_is_better: bool = False) -> list[dict[str, str | int | float]]:
+def summary(variants: Sequence[Variant], lower_is_better: bool = False) -> list[Row]:
     """One row for each variant, numbers unrounded; the columns are those of `summary.csv`.
 
     `reaches_unguided_final` is the first step at which the variant's interquartile mean is as good as the unguided
@@ -186,8 +219,8 @@ def summary(variants: Sequence[Variant], lower_is_better: bool = False) -> list[
     for variant in variants:
         goodness = sign * variant.curve.estimate
         steps, best = variant.curve.steps, int(goodness.argmax())
-        row: dict[str, str | int | float] = {"guidance": variant.guidance, "labels": variant.labels}
-        row |= {"seeds": len(variant.seeds), "last_step": int(steps[-1])}
+        row: Row = {"guidance": variant.guidance, "labels": variant.labels}
+        row |= {"seeds": len(variant.seeds), "failed": len(variant.failed), "last_step": int(steps[-1])}
         row |= {"final": variant.curve.estimate[-1], "final_lower": variant.curve.lower[-1]}
         row |= {"final_upper": variant.curve.upper[-1], "mean": float(variant.mean.estimate)}
         row |= {"mean_lower": float(variant.mean.lower), "mean_upper": float(variant.mean.upper)}
@@ -205,7 +238,7 @@ def summary(variants: Sequence[Variant], lower_is_better: bool = False) -> list[
     return rows
 
 
-def _curve_rows(variants: Sequence[Variant]) -> list[dict[str, str | int | float]]:
+def _curve_rows(variants: Sequence[Variant]) -> list[Row]:
     return [
         {"guidance": variant.guidance, "labels": variant.labels, "seeds": len(variant.seeds), "step": int(step)}
         | {"iqm": float(estimate), "lower": float(lower), "upper": float(upper)}
@@ -214,7 +247,7 @@ def _curve_rows(variants: Sequence[Variant]) -> list[dict[str, str | int | float
     ]
 
 
-def _write_csv(path: Path, rows: Sequence[dict[str, str | int | float]]) -> None:
+def _write_csv(path: Path, rows: Sequence[Row]) -> None:
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
         writer.writeheader()
@@ -235,7 +268,7 @@ def _provenance(table: pa.Table, command: str) -> list[str]:
 
 def _markdown(
     title: str,
-    rows: Sequence[dict[str, str | int | float]],
+    rows: Sequence[Row],
     figures: Sequence[str],
     missing: Sequence[str],
     provenance: Sequence[str],
@@ -245,8 +278,13 @@ def _markdown(
     lines = [f"# {escaping.markdown(title)}", "", *(f"![{name.replace('_', ' ')}]({name}.png)\n" for name in figures)]
     lines += [f"| {' | '.join(header)} |", "|" + "---|" * len(header)]
     for row in rows:
-        reached = row["reaches_unguided_final"]
-        cells = [escaping.markdown(row["guidance"]), f"{row['labels']:,}", row["seeds"], f"{row['last_step']:,}"]
+        reached, failed = row["reaches_unguided_final"], int(row["failed"])
+        seeds = f"{row['seeds']} of {int(row['seeds']) + failed}, {failed} failed" if failed else row["seeds"]
+        cells = [escaping.markdown(row["guidance"]), f"{row['labels']:,}", seeds]
+        if not row["seeds"]:
+            lines.append(f"| {' | '.join(map(str, cells))} |" + " |" * (len(header) - len(cells)))
+            continue
+        cells.append(f"{row['last_step']:,}")
         for key in ("final", "mean"):
             bounds = f" [{row[f'{key}_lower']:.3f}, {row[f'{key}_upper']:.3f}]" if int(row["seeds"]) > 1 else ""
             cells.append(f"{row[key]:.3f}{bounds}")

@@ -14,6 +14,7 @@ from matplotlib import ticker
 from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from cuelearner_jax.guidance import registry
 from cuelearner_jax.report.escaping import one_line
@@ -47,6 +48,7 @@ class Variant(NamedTuple):
     values: Float[np.ndarray, "seeds steps"]
     curve: Curve
     mean: Interval  # of the mean over the curve, up to the last step that all variants share
+    failed: Int[np.ndarray, "lanes"]  # steps by which other lanes had failed, of which nothing else is here
 
     @property
     def name(self) -> str:
@@ -69,6 +71,7 @@ def draw_curves(variants: Sequence[Variant], title: str, metric: str) -> Figure:
         end = max(int(variant.curve.steps[-1]) for variant in variants)
         axes.set_xlim(0, max(end, 1))
         left_out = _scale(axes, variants)
+        _mark_failed(axes, variants, colours)
         axes.set_xlabel("environment steps of a seed")
         axes.set_ylabel(_axis_name(metric))
         axes.xaxis.set_major_formatter(ticker.EngFormatter(sep=""))
@@ -84,14 +87,21 @@ def draw_label_efficiency(variants: Sequence[Variant], title: str, metric: str) 
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(8, 4.2), layout="constrained")
         left, right = figure.subplots(1, 2, sharey=True)
-        last = [Interval(*(values[-1] for values in variant.curve[1:])) for variant in variants]
-        _draw_budgets(left, variants, last, "last evaluation")
+        shared = min(int(variant.curve.steps[-1]) for variant in variants)
+        last = [_at(variant.curve, shared) for variant in variants]
+        _draw_budgets(left, variants, last, f"at step {shared:,}, the last of all")
         _draw_budgets(right, variants, [variant.mean for variant in variants], "mean over the curve")
         left.set_ylabel(_axis_name(metric))
         handles, names = left.get_legend_handles_labels()
         figure.legend(handles, names, loc="outside lower center", ncols=len(names))
         figure.suptitle(one_line(title), x=0.01, ha="left", fontweight="bold", fontsize=11)
     return figure
+
+
+def _at(known: Curve, step: int) -> Interval:
+    """The last evaluation up to a step: later ones of some would be compared with earlier ones of others."""
+    place = max(0, int(np.searchsorted(known.steps, step, side="right")) - 1)
+    return Interval(*(values[place] for values in known[1:]))
 
 
 def _draw_budgets(axes: Axes, variants: Sequence[Variant], intervals: Sequence[Interval], panel: str) -> None:
@@ -165,6 +175,21 @@ def _scale(axes: Axes, variants: Sequence[Variant]) -> str:
     steps = sorted({int(variant.curve.steps[0]) for variant in variants})
     where = f"step {steps[0]:,}" if len(steps) == 1 else "the first evaluations"
     return f"; {where} (from {least:.2g} to {most:.2g}) not on the scale"
+
+
+def _mark_failed(axes: Axes, variants: Sequence[Variant], colours: Sequence[tuple[float, ...]]) -> None:
+    """A cross for each lane that failed, on its variant's curve or at the edge of the scale."""
+    low, high = axes.get_ylim()
+    axes.set_ylim(low, high)
+    for variant, colour in zip(variants, colours, strict=True):
+        if not len(variant.failed):
+            continue
+        at = np.minimum(variant.failed, variant.curve.steps[-1])
+        heights = np.clip(np.interp(at, variant.curve.steps, variant.curve.estimate), low, high)
+        axes.plot(at, heights, "x", color=colour, markersize=8, clip_on=False)
+    if any(len(variant.failed) for variant in variants):
+        cross = Line2D([], [], linestyle="", marker="x", color="#595959", label="a seed failed, and is left out")
+        axes.legend(handles=[cross], loc="best", fontsize=9)
 
 
 def _extremes(rows: Sequence[np.ndarray]) -> tuple[float, float]:

@@ -16,7 +16,8 @@ def variant(guidance, labels, level, *, first=0.8, steps=11, spread=0.002):
     values = np.full((3, steps), level) + spread * np.array([[-1.0], [0.0], [1.0]])
     values[:, 0] = first
     known = curve(10_000 * np.arange(steps), values)
-    return Variant(guidance, labels, np.arange(3), values, known, Interval(*(row[-1] for row in known[1:])))
+    last = Interval(*(row[-1] for row in known[1:]))
+    return Variant(guidance, labels, np.arange(3), values, known, last, np.array([], int))
 
 
 def names(figure, axes):
@@ -37,6 +38,15 @@ def test_points_stand_on_their_ticks():
         assert len(drawn) == 2
         for labels in drawn:
             np.testing.assert_array_equal(labels, ticks)
+
+
+def test_budgets_are_compared_at_a_step_that_all_have():
+    rising = [variant("none", 0, 0.2), variant("relative", 100, 0.3), variant("relative", 500, 0.3)]
+    rising[1].curve.estimate[-1] = 0.9  # after the step at which the other was stopped
+    stopped = variant("heuristic", 0, 0.25, steps=9)
+    left = draw_label_efficiency([*rising, stopped], "title", "reward").axes[0]
+    assert left.get_title("left") == "at step 80,000, the last of all"
+    np.testing.assert_allclose(left.containers[0][0].get_ydata(), [0.3, 0.3])
 
 
 @pytest.mark.parametrize(("first", "left_out"), [(0.8, True), (0.05, False)])

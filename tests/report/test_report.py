@@ -231,6 +231,55 @@ def test_a_metric_that_is_not_finite_is_left_out_and_said(tmp_path):
     assert float(summary(tmp_path / "report")["none", 0]["final"]) == pytest.approx(0.2)
 
 
+def lose(folder, guidance, labels=0, seeds=(0, 1, 2), by=20):
+    """Appends lanes that had failed by a step: their values before then must not count, those after are null."""
+    constants = {"run": folder.name, "task": "one_ball", "guidance": guidance, "config_hash": "0f", "labels": labels}
+    with results.ResultsWriter(folder, **constants) as writer:
+        for step in STEPS:
+            reward = np.full(len(seeds), 7.0 if step < by else np.nan)
+            writer.append(step=step, split="validation", seed=seeds, reward=reward, failed=float(step >= by))
+
+
+def test_failed_lanes_count_in_no_mean_and_are_marked_everywhere(runs, tmp_path):
+    report(runs, tmp_path / "before")
+    lose(runs / "relative-500", "relative", 500, seeds=[8, 9, 10])
+    lose(runs / "scalar", "scalar", 100, seeds=[0, 1])
+    text = report(runs, tmp_path / "after").read_text()
+    before, after = summary(tmp_path / "before"), summary(tmp_path / "after")
+    assert {name: row for name, row in after["relative", 500].items() if name != "failed"} == {
+        name: row for name, row in before["relative", 500].items() if name != "failed"
+    }
+    assert [after[key]["failed"] for key in before] == ["0", "0", "3"]
+    assert (after["scalar", 100]["seeds"], after["scalar", 100]["failed"], after["scalar", 100]["final"]) == (
+        "0",
+        "2",
+        "",
+    )
+    assert "| relative | 500 | 8 of 11, 3 failed |" in text
+    assert "| scalar | 100 | 0 of 2, 2 failed | | | |" in text
+    assert (
+        "relative, 500 labels: seeds 8 (by step 20), 9 (by step 20), 10 (by step 20) failed, no longer finite: curve "
+        "and means are over the other 8"
+    ) in text
+    assert "scalar, 100 labels: seeds 0 (by step 20), 1 (by step 20) failed, no longer finite: no lane is left" in text
+    assert "all runs are complete" not in text
+    assert "rows have no finite" not in text  # they are counted once
+    for name in ("curves.csv", "label_efficiency.svg"):
+        assert (tmp_path / "after" / name).read_text() == (tmp_path / "before" / name).read_text()
+    marked, plain = ((tmp_path / out / "curves.svg").read_text() for out in ("after", "before"))
+    note = "a seed failed, and is left out"
+    assert note in marked
+    crosses = marked.count("<use ") - plain.count("<use ") - len(note)  # letters are drawn so too
+    assert crosses == 3 + 1  # one for each lane that a curve lacks, and the legend's
+
+
+def test_nothing_but_failed_lanes_is_refused(tmp_path):
+    lose(tmp_path / "a", "none", by=0)
+    with pytest.raises(UserError, match=r"3 of 3 lanes failed, no longer finite \(none: seeds 0 \(by step 0\)"):
+        report(tmp_path / "a", tmp_path / "report")
+    assert not (tmp_path / "report").exists()
+
+
 def test_errors_are_clear_and_leave_no_folder(runs, tmp_path):
     out = tmp_path / "report"
     with pytest.raises(UserError, match="there are reward"):
