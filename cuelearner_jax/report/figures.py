@@ -89,7 +89,7 @@ def draw_label_efficiency(variants: Sequence[Variant], title: str, metric: str) 
         left, right = figure.subplots(1, 2, sharey=True)
         shared = min(int(variant.curve.steps[-1]) for variant in variants)
         last = [_at(variant.curve, shared) for variant in variants]
-        _draw_budgets(left, variants, last, f"at step {shared:,}, the last of all")
+        _draw_budgets(left, variants, last, f"at step {shared:,}, reached by all")
         _draw_budgets(right, variants, [variant.mean for variant in variants], "mean over the curve")
         left.set_ylabel(_axis_name(metric))
         handles, names = left.get_legend_handles_labels()

@@ -45,7 +45,7 @@ def test_budgets_are_compared_at_a_step_that_all_have():
     rising[1].curve.estimate[-1] = 0.9  # after the step at which the other was stopped
     stopped = variant("heuristic", 0, 0.25, steps=9)
     left = draw_label_efficiency([*rising, stopped], "title", "reward").axes[0]
-    assert left.get_title("left") == "at step 80,000, the last of all"
+    assert left.get_title("left") == "at step 80,000, reached by all"
     np.testing.assert_allclose(left.containers[0][0].get_ydata(), [0.3, 0.3])
 
 
