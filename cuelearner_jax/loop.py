@@ -16,7 +16,7 @@ from jax.sharding import Mesh
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from cuelearner_jax import asking
-from cuelearner_jax.agent.learning import Learner, learner, stored_step
+from cuelearner_jax.agent.learning import Learner, all_finite, learner, stored_step
 from cuelearner_jax.asking import label_slots
 from cuelearner_jax.config import RunConfig, Scalars, Schedule, Sizes
 from cuelearner_jax.devices import BY_LANE, SHARED, compiler_options, each_lane, lane_mesh, over_lanes
@@ -24,7 +24,7 @@ from cuelearner_jax.environment import Environment
 from cuelearner_jax.guidance.bundle import Guidance
 from cuelearner_jax.guidance.refining import Refined, untouched
 from cuelearner_jax.policies import Uniform
-from cuelearner_jax.types import Clock, Label, Stream, Teacher, TrainState
+from cuelearner_jax.types import Clock, GuideState, Label, Stream, Teacher, TrainState
 
 
 class Program(NamedTuple):
@@ -86,8 +86,8 @@ def make_program(
                 state, metrics = lane.iterate(env, scalars, schedule, clock, state)
                 return (lane.advance(clock, schedule), state), metrics
 
-            (after, state), metrics = jax.lax.scan(iteration, (clock, state), length=iterations)
-            return after, state, jax.tree.map(lambda leaf: leaf.mean(0), metrics)
+            (after, trained), metrics = jax.lax.scan(iteration, (clock, state), length=iterations)
+            return after, lane.kept_finite(trained, state), jax.tree.map(lambda leaf: leaf.mean(0), metrics)
 
         return each_lane(run, gives=(None, 0, 0))(state)
 
@@ -126,6 +126,7 @@ class Lane(NamedTuple):
             agent=self.learner.init(env, k_q, k_env),
             guide=asking.start(self.guidance, env, slots, budget, k_guidance, k_ask),
             key=key,
+            failed=jnp.array(False),
         )
 
     def label_round(
@@ -136,11 +137,29 @@ class Lane(NamedTuple):
         guide = asking.label_round(
             self.guidance, self.sizes, env, teacher, scalars, base, state.guide, state.key, number
         )
-        return state.replace(guide=guide)
+        return self.guided(state, guide)
 
     def take_labels(self, env: Environment, scalars: Scalars, labels: Label, state: TrainState) -> TrainState:
         """Labels that were given elsewhere, in place of questions, and the model fitted to them."""
-        return state.replace(guide=asking.take_labels(self.guidance, env, scalars, labels, state.guide, state.key))
+        return self.guided(state, asking.take_labels(self.guidance, env, scalars, labels, state.guide, state.key))
+
+    def guided(self, state: TrainState, guide: GuideState) -> TrainState:
+        """The lane with a new guide; where that is not finite the lane fails, and keeps the one that it had."""
+        failed = state.failed | ~all_finite((guide.model, guide.labels))
+        kept = jax.tree.map(lambda new, old: jnp.where(failed, old, new), guide, state.guide)
+        return state.replace(guide=kept, failed=failed)
+
+    def kept_finite(self, state: TrainState, before: TrainState) -> TrainState:
+        """A lane after a stretch; one that has failed, in it or before, with what it had learned `before`.
+
+        Asked once a stretch, not at each gradient step: that would read all parameters once more.
+        """
+        learned = lambda lane: (lane.agent.params, lane.agent.target_params, lane.agent.opt_state)  # noqa: E731
+        failed = state.failed | ~all_finite(learned(state))
+        kept = jax.tree.map(lambda new, old: jnp.where(failed, old, new), learned(state), learned(before))
+        params, target_params, opt_state = kept
+        agent = state.agent.replace(params=params, target_params=target_params, opt_state=opt_state)
+        return state.replace(agent=agent, failed=failed)
 
     def advance(self, clock: Clock, schedule: Schedule) -> Clock:
         """The clock after one iteration."""
@@ -167,14 +186,14 @@ class Lane(NamedTuple):
             obs=step.obs,
             guided=jnp.where(done, redrawn, agent.guided),
         )
-        agent, loss = jax.lax.cond(
+        agent, loss, finite = jax.lax.cond(
             clock.step + self.sizes.num_envs >= schedule.learn_after,
             lambda agent: self.learner.learn(env, scalars, schedule, clock, agent, k_learn),
-            lambda agent: (agent, jnp.zeros(())),
+            lambda agent: (agent, jnp.zeros(()), jnp.array(True)),
             agent,
         )
         metrics = {"reward": step.reward.mean(), "loss": loss, "passes": passes.astype(jnp.float32).mean()}
-        return state.replace(agent=agent), metrics
+        return state.replace(agent=agent, failed=state.failed | ~finite), metrics
 
     def act(
         self, env: Environment, scalars: Scalars, schedule: Schedule, clock: Clock, state: TrainState, key: PRNGKeyArray

@@ -30,6 +30,7 @@ class Preset:
     labels: tuple[int, ...] = (500, 1000)
     seeds: int = 5
     first_seed: int = 0
+    takes: str = ""  # how long on which machine
 
 
 class Pictures(NamedTuple):

@@ -1,7 +1,8 @@
 """The command `cuelearner`: calls the file of a command, turns errors into one line and an exit status.
 
 Exit status: 0 done; 2 bad input, nothing changed; 130 stopped by Ctrl-C, everything saved;
-1 the disk is full or a job failed, everything up to the last checkpoint saved; 141 nobody reads the output any more.
+1 the disk is full or a job failed, everything up to the last checkpoint saved, or what was trained is not finite, all
+else saved; 141 nobody reads the output any more.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
 
 from cuelearner_jax import __version__
 from cuelearner_jax.cli.parsing import HELP, summary
-from cuelearner_jax.errors import UserError, closest, no_space
+from cuelearner_jax.errors import LanesFailed, UserError, closest, no_space
 from cuelearner_jax.runs.cluster import JobsFailed
 from cuelearner_jax.tasks import registry
 from cuelearner_jax.terminal import Interrupted
@@ -34,7 +35,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    except (Interrupted, JobsFailed) as error:
+    except (Interrupted, JobsFailed, LanesFailed) as error:
         print(str(error), file=sys.stderr)
         return error.status
     except BrokenPipeError:  # whoever read our output has gone, as `head` does

@@ -89,11 +89,15 @@ def preset_of(task: Task, arguments: list[str]) -> tuple[str, Preset, list[str]]
     if not task.presets:
         raise UserError(f"{task.name} has no preset to start from: give its Task one")
     name, rest = taken(arguments, "--preset", ", ".join(task.presets))
-    if name is None:
-        name = "paper" if "paper" in task.presets else next(iter(task.presets))
+    name = _default_preset(task) if name is None else name
     if name not in task.presets:
         raise UserError(f"unknown preset {name!r}{closest(name, task.presets)}")
     return name, task.presets[name], rest
+
+
+def _default_preset(task: Task) -> str:
+    """The same for every command, so that what is evaluated without a run is the world that is trained in."""
+    return "paper" if "paper" in task.presets else next(iter(task.presets))
 
 
 def source_of(arguments: list[str], command: str, kind: type) -> tuple[PolicySource, list[str]]:
@@ -173,8 +177,12 @@ def _choices(task: Task) -> str:
     """A task's presets, changed worlds and other bodies, a line each."""
     scenarios = {name: f"{one.about} ({_as_options(one.changes)})" for name, one in task.scenarios.items()}
     bodies = {body.name: body.about for body in task.bodies} if len(task.bodies) > 1 else {}
+    presets = {
+        name: f"{preset.about}{f' ({preset.takes})' if preset.takes else ''}" for name, preset in task.presets.items()
+    }
+    default = f"; {_default_preset(task)} where none is given" if presets else ""
     groups = {
-        "presets (--preset)": {name: preset.about for name, preset in task.presets.items()},
+        f"presets (--preset{default})": presets,
         "changed worlds (--scenario of evaluate and render)": scenarios,
         "robots (--robot of evaluate and render)": bodies,
     }

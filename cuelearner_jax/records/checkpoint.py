@@ -1,8 +1,9 @@
 """Checkpoints: the only file that knows Orbax.
 
-A checkpoint holds three items: `policy` (what acting needs, so that evaluation never reads a replay buffer), `rest` and
-`clock`; and the `digests` of their arrays: Orbax would read many a changed bit without a word. Older ones have none.
-Orbax writes to a temporary folder and renames it, so a kill leaves the last complete checkpoint in place.
+A run's checkpoint holds four items: `policy` (what acting needs, so that evaluation never reads a replay buffer),
+`rest`, `failed` (which lanes have; older checkpoints lack it) and `clock`; and the `digests` of their arrays: Orbax
+would read many a changed bit without a word. Older ones have none. Orbax writes to a temporary folder and renames it,
+so a kill leaves the last complete checkpoint in place.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import errno
 import gc
 import hashlib
 import logging
+import re
 import shutil
 import sys
 import time
@@ -139,6 +141,11 @@ class Checkpoints:
         """Number of the newest complete checkpoint."""
         return self._manager.latest_step()
 
+    def holds(self, name: str) -> bool:
+        """Has the newest complete checkpoint an item of that name, or at least should it have? Older ones lack some."""
+        folder = self._manager.directory / str(self.latest())
+        return (folder / name).exists() or (folder / DIGESTS).exists()
+
     def save(self, number: int, items: dict[str, Any]) -> None:
         """Writes a checkpoint; returns once it is complete on disk. Raises OSError where there is no room for it."""
         # Asked first: a write that fails halfway leaves Orbax's threads complaining for pages.
@@ -180,7 +187,9 @@ class Checkpoints:
                 self._verify({name: restored[name] for name in like}, restored[DIGESTS])
             return {name: _unflat(restored[name], like[name]) for name in like}
         except Exception as error:  # Orbax and TensorStore raise many kinds for one cause: the files do not fit
-            reason = str(error).strip().splitlines()[0][:160] if str(error).strip() else type(error).__name__
+            # Orbax means to print TensorStore's details and prints the method that has them.
+            told = re.sub(r"\.? See full TensorStore details.*", "", str(error), flags=re.DOTALL).strip()
+            reason = told.splitlines()[0][:160] if told else type(error).__name__
             remedy = OTHERS if isinstance(error, _OfAnother) else FORBIDDEN if _forbidden(error) else DAMAGED
         _collect_quietly()
         raise UserError(f"checkpoint {number} in {self._folder} cannot be read ({reason}): {remedy}")

@@ -99,9 +99,10 @@ NAVIGATION = Task(
             ),
             labels=(100, 350, 500),
             seeds=16,
+            takes="16 seeds under one guidance: half an hour on one H200; one: half a day on 2 cores, by arithmetic",
         ),
         "quickstart": Preset(
-            "few worlds, small networks: minutes on two CPU cores",
+            "few worlds, small networks, 6,000 steps a seed",
             RunConfig(
                 NavigationConfig(worlds=128),
                 dataclasses.replace(
@@ -131,6 +132,7 @@ NAVIGATION = Task(
             labels=(350,),
             seeds=4,
             first_seed=1000,  # the settings were chosen on seeds below
+            takes="4 seeds under two kinds of guidance: two to three minutes on 2 cores",
         ),
     },
 )

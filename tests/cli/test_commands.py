@@ -104,7 +104,8 @@ def test_render_makes_the_picture_of_a_question(run_folder, refused, tmp_path):
 def test_the_overview_has_a_line_for_each_command_and_the_version_can_be_asked_for(capsys):
     assert main(["--help"]) == 0
     told = capsys.readouterr().out
-    for name in ("train", "sweep", "evaluate", "report", "render", "teacher train", "bench", "locomotion evaluate"):
+    locomotion = ("locomotion train", "locomotion evaluate")
+    for name in ("train", "sweep", "evaluate", "report", "render", "teacher train", "bench", *locomotion):
         assert re.search(rf"^  {name} +[A-Z].*\.$", told, re.MULTILINE), name
     assert main(["--version"]) == 0
     assert re.fullmatch(r"cuelearner \d+\.\d+\.\d+\n", capsys.readouterr().out)
@@ -156,6 +157,9 @@ def test_the_installed_command_explains_itself(command):
     assert done.returncode == 0
     assert "--out" in done.stdout
     assert done.stderr == ""
+    if command in ("train", "sweep", "evaluate", "render"):
+        assert "(--preset; paper where none is given)" in done.stdout
+        assert re.search(r"^  quickstart  .*minutes on 2 cores\)$", done.stdout, re.MULTILINE)
 
 
 def test_the_installed_command_fails_in_one_line(tmp_path):

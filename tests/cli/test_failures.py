@@ -122,7 +122,7 @@ def test_labels_that_do_not_fit_are_refused(refused, copy, tmp_path):
     other = [*relative, "--labels", "20", "--seeds", "2", "--task.table", "easy", *new]
     refused(other, "labels of a world with another task.table (one_ball, this run's is easy)", copy)
     refused([*relative, "--labels", "500", "--seeds", "2", *new], "lower --labels or collect more", copy)
-    refused([*relative, "--labels", "20", "--seeds", "3", *new], "for seed 2002", copy)
+    refused([*relative, "--labels", "20", "--seeds", "3", *new], "seeds 2000, 2001, none for seed 2002", copy)
     refused([*QUICK, "--guidance", "none", "--labels-from", file, *new], "add --guidance relative", copy)
     file.write_bytes(b"PAR1 no more")
     refused([*relative, "--labels", "20", "--seeds", "2", *new], "not a label file", copy)
