@@ -210,10 +210,14 @@ def words(leaf):
 
 
 def files_of(folder):
-    """Every file at or below a folder with its bytes and time: equal before and after if nothing was changed."""
+    """Every file at or below a folder with its bytes and time: equal before and after if nothing was changed.
+
+    The mark of the process that wrote last is left out.
+    """
     return {
         path.relative_to(folder): (path.stat().st_mtime_ns, path.read_bytes() if path.is_file() else None)
         for path in sorted(folder.rglob("*"))
+        if path.name != ".lock"
     }
 
 

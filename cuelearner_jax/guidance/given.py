@@ -29,7 +29,7 @@ def check(labels: Label, spaces: Spaces, form: AnswerForm, named: str = "the lab
     widths = {"observations": spaces.obs_size, "actions": spaces.actions.size, "answers": form.width}
     for name, values in rows.items():
         if values.ndim != 2 or values.shape[1] != widths[name]:
-            raise UserError(f"{named}: {name} have {values.shape[1:]} entries, {widths[name]} are needed")
+            raise UserError(f"{named}: {name} have the shape {values.shape}, (labels, {widths[name]}) is needed")
         if not np.isfinite(values).all():
             raise UserError(f"{named}: {name} hold numbers that are not finite: leave these labels out")
     action = np.asarray(labels.action)

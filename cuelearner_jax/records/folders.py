@@ -81,8 +81,8 @@ def claimed(out: Path) -> Iterator[None]:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         os.close(descriptor)
-        by = holder(out) or "another process"
-        raise UserError(f"{out} is being written by {by}: wait for it, or give another --out") from None
+        by = f" ({found})" if (found := holder(out)) else ""
+        raise UserError(f"{out} is being written by another process{by}: wait for it, or give another --out") from None
     try:
         os.ftruncate(descriptor, 0)
         os.write(descriptor, f"process {os.getpid()} on {socket.gethostname()}".encode())

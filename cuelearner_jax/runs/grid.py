@@ -126,6 +126,8 @@ def load(folder: Path, find: Callable[[str], Task]) -> tuple[Task, RunConfig, Gr
 
 def _grid(values: dict[str, Any]) -> Grid:
     """Raises ValueError, TypeError or KeyError if it is none; that its guidance is known is not asked."""
+    if not all(isinstance(values[name], list) for name in ("guidance", "seeds", "labels")):
+        raise TypeError("a grid is made of lists")
     kinds, seeds, labels = (tuple(values[name]) for name in ("guidance", "seeds", "labels"))
     if not kinds or not all(isinstance(kind, str) for kind in kinds) or len(set(kinds)) < len(kinds):
         raise ValueError(f"{kinds} are no kinds of guidance")

@@ -128,7 +128,11 @@ def test_a_folder_inside_folders_is_made(tmp_path):
 
 def test_a_folder_is_kept_for_one_process_and_free_afterwards(tmp_path):
     out = tmp_path / "a" / "run"
-    with folders.claimed(out), pytest.raises(UserError, match=r"written by process [0-9]+ on "), folders.claimed(out):
+    with (
+        folders.claimed(out),
+        pytest.raises(UserError, match=r"another process \(process [0-9]+ on "),
+        folders.claimed(out),
+    ):
         pass
     with folders.claimed(out):
         assert not folders.in_use(out)  # but for the mark
