@@ -12,8 +12,8 @@ class UserError(Exception):
     """
 
 
-class LanesFailed(Exception):
-    """Some lanes stopped being finite: its message is one line that says which. Everything else was done and is kept.
+class NotFinite(Exception):
+    """What was trained, or some of it, stopped being finite: its message is one line that says what, and what is kept.
 
     The command line prints the message and exits with `status`.
     """

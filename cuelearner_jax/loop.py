@@ -1,7 +1,8 @@
 """The one training loop, whatever the guidance: policy -> guidance.act -> environment -> replay -> update.
 
-Written for one lane (one seed with one label budget); `vmap` over lanes happens once, in `make_program`. Random numbers
-come from the lane's own key folded with the shared counters, so a lane's result does not depend on its neighbours.
+Written for one lane (one seed with one label budget); lanes are put side by side once, in `make_program`. Random
+numbers come from the lane's own key folded with the shared counters, so a lane's result does not depend on its
+neighbours: not by a bit on a CPU, on an accelerator up to the order in which sums of matrix products are taken.
 """
 
 from __future__ import annotations
@@ -19,7 +20,15 @@ from cuelearner_jax import asking
 from cuelearner_jax.agent.learning import Learner, all_finite, learner, stored_step
 from cuelearner_jax.asking import label_slots
 from cuelearner_jax.config import RunConfig, Scalars, Schedule, Sizes
-from cuelearner_jax.devices import BY_LANE, SHARED, compiler_options, each_lane, lane_mesh, over_lanes
+from cuelearner_jax.devices import (
+    BY_LANE,
+    SHARED,
+    compiler_options,
+    each_lane,
+    each_lane_in_place,
+    lane_mesh,
+    over_lanes,
+)
 from cuelearner_jax.environment import Environment
 from cuelearner_jax.guidance.bundle import Guidance
 from cuelearner_jax.guidance.refining import Refined, untouched
@@ -73,11 +82,13 @@ def make_program(
         return each_lane(partial(lane.init, env))(keys, budgets)
 
     def label_round(env, teacher, scalars, clock, state):
-        state = each_lane(partial(lane.label_round, env, teacher, scalars, clock.round))(state)
-        return clock.replace(round=clock.round + 1), state
+        rest, agent = state.replace(agent=None), state.agent  # which is large, and has no part in it
+        asked = each_lane(partial(lane.label_round, env, teacher, scalars, clock.round))(rest)
+        return clock.replace(round=clock.round + 1), asked.replace(agent=agent)
 
     def take_labels(env, scalars, labels, state):
-        return each_lane(partial(lane.take_labels, env, scalars))(labels, state)
+        rest, agent = state.replace(agent=None), state.agent
+        return each_lane(partial(lane.take_labels, env, scalars))(labels, rest).replace(agent=agent)
 
     def train(env, scalars, schedule, clock, state, iterations):
         def run(state):
@@ -87,9 +98,10 @@ def make_program(
                 return (lane.advance(clock, schedule), state), metrics
 
             (after, trained), metrics = jax.lax.scan(iteration, (clock, state), length=iterations)
-            return after, lane.kept_finite(trained, state), jax.tree.map(lambda leaf: leaf.mean(0), metrics)
+            return lane.kept_finite(trained, state), after, jax.tree.map(lambda leaf: leaf.mean(0), metrics)
 
-        return each_lane(run, gives=(None, 0, 0))(state)
+        state, after, metrics = each_lane_in_place(run)(state)
+        return after, state, metrics
 
     def stretch(env, scalars, schedule, clock, state, iterations):
         whole = over_lanes(

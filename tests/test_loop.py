@@ -370,9 +370,12 @@ def test_lanes_of_one_seed_start_alike_and_differ_by_their_budget(grid):
 
 def test_a_lane_alone_is_the_lane_beside_others(grid):
     state, metrics = grid
-    alone, measured = trained(probes.window_program("relative", LARGEST), SEEDS[3:], BUDGETS[3:])
-    assert_same_lane(state, 3, alone)
-    assert_close(probes.lane(metrics, 3), probes.lane(measured, 0))
+    program = probes.window_program("relative", LARGEST)
+    alone, measured = trained(program, SEEDS[3:], BUDGETS[3:])
+    beside, _ = trained(program, [7, SEEDS[3]], [20, BUDGETS[3]])
+    assert_equal(probes.lane(state, 3), probes.lane(alone, 0))  # to the last bit
+    assert_equal(probes.lane(metrics, 3), probes.lane(measured, 0))
+    assert_equal(probes.lane(beside, 1), probes.lane(alone, 0))
 
 
 def test_the_smaller_budget_is_the_sweep_of_that_budget_alone(grid):

@@ -18,7 +18,7 @@ os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
 
 from cuelearner_jax import __version__
 from cuelearner_jax.cli.parsing import HELP, summary
-from cuelearner_jax.errors import LanesFailed, UserError, closest, no_space
+from cuelearner_jax.errors import NotFinite, UserError, closest, no_space
 from cuelearner_jax.runs.cluster import JobsFailed
 from cuelearner_jax.tasks import registry
 from cuelearner_jax.terminal import Interrupted
@@ -35,7 +35,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    except (Interrupted, JobsFailed, LanesFailed) as error:
+    except (Interrupted, JobsFailed, NotFinite) as error:
         print(str(error), file=sys.stderr)
         return error.status
     except BrokenPipeError:  # whoever read our output has gone, as `head` does

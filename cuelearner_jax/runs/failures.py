@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pyarrow as pa
 
-from cuelearner_jax.errors import LanesFailed
+from cuelearner_jax.errors import NotFinite
 from cuelearner_jax.records import results
 
 LISTED = 8  # lanes of one kind of guidance and budget that a message names
@@ -38,7 +38,7 @@ def summary(table: pa.Table) -> str:
 
 
 def check(out: Path, kinds: Iterable[str]) -> None:
-    """Raises LanesFailed if lanes of a run's kinds of guidance have failed, as its results say."""
+    """Raises NotFinite if lanes of a run's kinds of guidance have failed, as its results say."""
     found = summary(results.read([out / kind for kind in kinds]))
     if found:
-        raise LanesFailed(f"{found}: their rows in {out} are marked, and reports leave them out; all else is done")
+        raise NotFinite(f"{found}: their rows in {out} are marked, and reports leave them out; all else is done")

@@ -33,7 +33,7 @@ def memory_report(group: LaneGroup) -> str:
     )
     if group.config.bootstraps:
         rows = max(rows, sizes.batch_size * sizes.target_directions * (2 if sizes.n_step > 1 else 1))
-    working = 4 * 4 * widest * rows * (padded // len(shapes) // devices)
+    working = 4 * 4 * widest * rows * group.at_once
     each = f" on each of {devices} devices" if devices > 1 else ""
     available = free_bytes()
     limit = f", {available / 1e9:.1f} GB are free" if available else ""

@@ -22,7 +22,7 @@ def run(order: Order) -> None:
     Raises:
         UserError: bad configuration, a folder in use, too little memory; nothing has been changed then.
         Interrupted: Ctrl-C; everything is saved.
-        LanesFailed: all is done, but some lanes stopped being finite.
+        NotFinite: all is done, but some lanes stopped being finite.
     """
     plan = planned(order)
     order = plan.order
