@@ -28,10 +28,10 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from cuelearner_envs import film
+from cuelearner_envs.bounds import MOST_STEPS, check_number
 from cuelearner_jax.actions import from_angle, retract, rotate
 from cuelearner_jax.config import RunConfig, Scalars, Schedule, Sizes
 from cuelearner_jax.environment import Quantity, WholeObservations
-from cuelearner_jax.errors import UserError
 from cuelearner_jax.task import Body, Pictures, Preset, Scenario, Task
 from cuelearner_jax.types import Policy, Step
 
@@ -137,9 +137,10 @@ class Reach(WholeObservations, struct.PyTreeNode):
 
 def make_environment(config: ReachConfig, split: str = "training") -> Reach:
     """The lake of a configuration; its episodes are random, so that splits need differ in nothing."""
-    for name in ("wind", "speed", "max_steps"):
-        if getattr(config, name) < 0:
-            raise UserError(f"task.{name} is {getattr(config, name)}: give a number that is not negative")
+    check_number("wind", config.wind, 0, unit="m/s")
+    check_number("speed", config.speed, 0, unit="m/s")
+    check_number("rudder_deg", config.rudder_deg, unit="degrees")
+    check_number("max_steps", config.max_steps, 1, MOST_STEPS, whole=True)
     return Reach(
         wind=jnp.float32(config.wind),
         speed=jnp.float32(config.speed),

@@ -64,4 +64,4 @@ def test_an_episode_is_filmed(walked, tmp_path):
 
 def test_a_task_without_a_world_is_refused(refused, tmp_path):
     command = ["sweep", "navigation", "--preset", "quickstart", *SMALL, "--out", str(tmp_path / "none")]
-    refused([*command, "--task.worlds", "0"], "task.worlds is 0: give a positive number", tmp_path)
+    refused([*command, "--task.worlds", "0"], "task.worlds is 0: give a whole number from 1", tmp_path)
