@@ -77,6 +77,8 @@ class Task:
     config: type  # its configuration: a dataclass, one line of help a field
     bodies: tuple[Body, ...]  # its own first
     teacher: Callable[[Any, Any], Teacher] | None = None  # (configuration, environment); None: nobody answers
+    # configuration -> digests of the user's own files that it names, by field; raises UserError if one is not there
+    files: Callable[[Any], dict[str, str]] = lambda config: {}
     presets: dict[str, Preset] = field(default_factory=dict)
     scenarios: dict[str, Scenario] = field(default_factory=dict)
     origin: str = ""  # "package.module:name" where it was taken from outside, by whoever resolved that

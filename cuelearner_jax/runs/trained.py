@@ -247,6 +247,7 @@ def write(
     contents = {
         "subject": source.folder.name,
         "world": {"name": source.task.name, **to_json(world)},
+        **({"files": files} if POLICIES[policy].taught and (files := source.task.files(world)) else {}),
         "policy": policy,
         **body,
         "envs": num_envs,

@@ -139,16 +139,6 @@ def test_tuning_episodes_are_others_and_stay_out_of_reports(run_folder, tmp_path
     assert main(["report", str(out), "--split", "tuning", "--out", str(tmp_path / "report")]) == 0
 
 
-def test_a_tiny_teacher_is_trained(tmp_path):
-    out = tmp_path / "teacher"
-    command = ["teacher", "train", "billiards", "--preset", "quickstart", "--out", str(out), "--eval-steps", "20"]
-    sizes = ["--teacher.layers", "16", "--teacher.tables", "8", "--teacher.rounds", "20", "--teacher.batch-size", "64"]
-    assert main([*command, *sizes, "--teacher.search", "36", "--teacher.directions", "36"]) == 0
-    told = json.loads((out / "teacher.json").read_text())
-    assert told["command"].startswith("cuelearner teacher train billiards")
-    assert sorted(path.name for path in out.iterdir()) == ["network", "teacher.json"]
-
-
 @pytest.mark.parametrize("command", ["train", "sweep", "evaluate", "report", "render", "teacher", "bench"])
 def test_the_installed_command_explains_itself(command):
     task = {"teacher": ["train", "billiards"], "report": []}.get(command, ["billiards"])
