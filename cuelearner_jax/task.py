@@ -79,6 +79,8 @@ class Task:
     teacher: Callable[[Any, Any], Teacher] | None = None  # (configuration, environment); None: nobody answers
     # configuration -> digests of the user's own files that it names, by field; raises UserError if one is not there
     files: Callable[[Any], dict[str, str]] = lambda config: {}
+    # configuration -> steps of its longest episode, where episodes count (`Step.outcome`); None: steps count
+    longest: Callable[[Any], int] | None = None
     presets: dict[str, Preset] = field(default_factory=dict)
     scenarios: dict[str, Scenario] = field(default_factory=dict)
     origin: str = ""  # "package.module:name" where it was taken from outside, by whoever resolved that
@@ -120,6 +122,23 @@ class Task:
         if self.teacher is None:
             raise UserError(f"{self.name} has no teacher to ask: give --labels-from, or a guidance without labels")
         return self.teacher(config, env)
+
+    def check_whole(self, config: Any, envs: int, steps: int, envs_option: str, steps_option: str) -> None:
+        """Raises UserError if an episode of a world may outlast the steps of each of the environments that share them.
+
+        Means over the episodes that ended in time would be those of the short ones.
+        """
+        if self.longest is not None and steps // envs < self.longest(config):
+            raise UserError(
+                f"{steps_option} is {steps} for {envs} environments, {steps // envs} each, but an episode lasts up to "
+                f"{self.longest(config)}: give {steps_option} {envs * self.longest(config)}, or a lower {envs_option}"
+            )
+
+    def check_evaluations(self, config: RunConfig) -> None:
+        """Raises UserError unless the evaluations of a training see whole episodes."""
+        schedule = config.schedule
+        options = "--schedule.eval-envs", "--schedule.eval-steps"
+        self.check_whole(config.task, schedule.eval_envs, schedule.eval_steps, *options)
 
     def on(self, body: str | None) -> Task:
         """The task with that body first (None: as it is). Raises UserError if it has no such body."""

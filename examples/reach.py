@@ -272,6 +272,7 @@ TASK = Task(
     config=ReachConfig,
     bodies=(Body("boat", "goes where it is sent, and with the wind", make_environment, pictures=_pictures),),
     teacher=lambda config, env: Skipper(env),
+    longest=lambda config: config.max_steps,
     scenarios={
         "storm": Scenario("a wind that the boat barely makes way against", {"wind": 0.75}, bound_deg=60.0),
         "bent_rudder": Scenario("the boat heads 25 degrees too far left", {"rudder_deg": 25.0}, bound_deg=60.0),

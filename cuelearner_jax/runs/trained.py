@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 
 from cuelearner_jax.config import RunConfig, to_json
-from cuelearner_jax.devices import lane_mesh
 from cuelearner_jax.environment import actions_of, offers
 from cuelearner_jax.errors import UserError, closest
-from cuelearner_jax.evaluate import episodes, evaluate_lanes, evaluate_policy, one_lane
+from cuelearner_jax.evaluate import Tell, episodes, one_lane, untold, watched, watched_lanes
 from cuelearner_jax.guidance import registry as guidances
 from cuelearner_jax.guidance.bundle import Guidance
 from cuelearner_jax.policies import Agent, Corrected, Guided, Heuristic, Policy, Taught, uniform_in
@@ -162,37 +161,47 @@ def evaluate(
     num_envs: int,
     steps: int,
     engine: Rollout | None = None,
+    watch: Callable[[str], Tell] = lambda kind: untold,
 ) -> list[Measured]:
     """Metrics of a policy on validation episodes of a world (a task configuration), for each guidance and budget.
 
-    `engine` is a roll-out in other physics; without one the environment's own are used.
+    Args:
+        source: where the policy comes from.
+        world: a task configuration.
+        name: of the policy.
+        kinds: of guidance of the run (none named: all).
+        num_envs, steps: as `evaluate.rollout` has them.
+        engine: a roll-out in other physics (default: the environment's own).
+        watch: by kind of guidance, who is told how far its lanes are.
     """
     named, key = POLICIES[name], episodes()
     env = source.task.environment(world, "validation")
     teacher = source.task.make_teacher(world, env) if named.taught else None
     if not named.trained:
         policy = named.make(Parts(source.config, env, teacher, None))
-        found = (engine or _compiled)(policy, env, key, num_envs, steps)
+        tell = watch(name)
+        found = (
+            engine(policy, env, key, num_envs, steps) if engine else watched(env, policy, key, num_envs, steps, tell)
+        )
         metrics = {metric: np.asarray(value)[None] for metric, value in found.items()}
         return [Measured("-", 0, 0, np.zeros(1, int), metrics)]
     rows = []
     for lanes in source.load(kinds):
         policy = named.make(Parts(source.config, env, teacher, lanes))
+        tell = watch(lanes.guidance.name)
         if engine:
-            each = [engine(one_lane(policy, lane), env, key, num_envs, steps) for lane in range(len(lanes.seeds))]
+            each = []
+            for lane in range(len(lanes.seeds)):
+                tell(lane, len(lanes.seeds))
+                each.append(engine(one_lane(policy, lane), env, key, num_envs, steps))
             found = {metric: np.stack([measured[metric] for measured in each]) for metric in each[0]}
         else:
-            mesh = lane_mesh(jax.local_devices()[:1])
-            found = evaluate_lanes(env, policy, key, mesh=mesh, num_envs=num_envs, steps=steps)
+            found = watched_lanes(env, policy, key, num_envs, steps, tell)
         for budget in np.unique(lanes.budgets):
             own = lanes.budgets == budget
             metrics = {metric: np.asarray(values)[own] for metric, values in found.items()}
             rows.append(Measured(lanes.guidance.name, int(budget), lanes.step, lanes.seeds[own], metrics))
     return rows
-
-
-def _compiled(policy: Policy, env: Any, key: Any, num_envs: int, steps: int) -> dict[str, Any]:
-    return evaluate_policy(env, policy, key, num_envs, steps)
 
 
 def one_policy(
@@ -223,6 +232,10 @@ def _listed(values: np.ndarray) -> str:
     return ", ".join(str(value) for value in known)
 
 
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
 def write(
     path: Path,
     source: PolicySource,
@@ -240,7 +253,7 @@ def write(
             "labels": row.labels,
             "trained_steps": row.step,
             "seeds": row.seeds.tolist(),
-            **{metric: values.tolist() for metric, values in row.metrics.items()},
+            **{metric: [_finite(value) for value in values.tolist()] for metric, values in row.metrics.items()},
         }
         for row in measured
     ]

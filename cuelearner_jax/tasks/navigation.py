@@ -78,6 +78,7 @@ NAVIGATION = Task(
     bodies=(SIMPLE, ANYMAL),
     teacher=lambda config, env: make_teacher(env),
     scenarios=SCENARIOS,
+    longest=lambda config: config.max_steps,
     presets={
         "paper": Preset(
             "the paper's figure: cluttered halls, its networks, 1 million steps a seed",
