@@ -43,6 +43,9 @@ class Render(Generic[TaskT]):
     """Replace pictures of the same name."""
 
 
+MOST_STEPS = 100_000  # a frame each
+MOST_EPISODE = 2**32 - 1  # is folded into a key
+
 OPTIONS = {"render": Render}
 
 
@@ -54,8 +57,9 @@ def run(arguments: list[str]) -> None:
     asked = parse(kind, rest, f"render {source.folder}", default, about(Render, source.task, policies=True))
     source = source.on(asked.robot)
     source.check(asked.policy, asked.task)
-    if asked.steps < 1:
-        raise UserError(f"--steps is {asked.steps}: give a positive number")
+    for option, value, least, most in (("steps", asked.steps, 1, MOST_STEPS), ("episode", asked.episode, 0, MOST_EPISODE)):
+        if not least <= value <= most:
+            raise UserError(f"--{option} is {value}: give a number from {least} to {most:,}")
     names = [source.folder.name, asked.robot, asked.scenario, asked.policy]
     files = filming.files(asked.out, "-".join(name for name in names if name), asked.film)
     wanted = (files.question,) if asked.question else (files.film, files.still)

@@ -107,19 +107,22 @@ class PolicySource:
         return replace(self, task=self.task.on(robot))
 
     def check(self, policy: str, changed: Any) -> None:
-        """Raises UserError unless the policy can be had and acts in the changed world."""
+        """Raises UserError unless the policy can be had and acts in the changed world.
+
+        What was trained sees the observations that it was trained on; other policies act in any world.
+        """
         if policy not in POLICIES:
             raise UserError(f"unknown policy {policy!r}{closest(policy, POLICIES)}")
         if POLICIES[policy].trained and not self.grid:
             untrained = ", ".join(name for name, named in POLICIES.items() if not named.trained)
             raise UserError(f"policy {policy!r} needs a trained run: give a run folder, or one of {untrained}")
-        before, after = (shape_of(self.task, world) for world in (self.config.task, changed))
+        after = shape_of(self.task, changed)
         for need in POLICIES[policy].needs:
             if not offers(after, need):
                 raise UserError(f"{self.task.name} has no {need}: choose another policy")
-        if before.obs_size != after.obs_size:
+        if POLICIES[policy].trained and (size := shape_of(self.task, self.config.task).obs_size) != after.obs_size:
             raise UserError(
-                f"the run's observations have {before.obs_size} entries, this world's {after.obs_size}: "
+                f"the run's observations have {size} entries, this world's {after.obs_size}: "
                 "keep its structure"
             )
 
