@@ -57,7 +57,10 @@ def run(arguments: list[str]) -> None:
     asked = parse(kind, rest, f"render {source.folder}", default, about(Render, source.task, policies=True))
     source = source.on(asked.robot)
     source.check(asked.policy, asked.task)
-    for option, value, least, most in (("steps", asked.steps, 1, MOST_STEPS), ("episode", asked.episode, 0, MOST_EPISODE)):
+    for option, value, least, most in (
+        ("steps", asked.steps, 1, MOST_STEPS),
+        ("episode", asked.episode, 0, MOST_EPISODE),
+    ):
         if not least <= value <= most:
             raise UserError(f"--{option} is {value}: give a number from {least} to {most:,}")
     names = [source.folder.name, asked.robot, asked.scenario, asked.policy]

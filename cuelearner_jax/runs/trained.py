@@ -122,8 +122,7 @@ class PolicySource:
                 raise UserError(f"{self.task.name} has no {need}: choose another policy")
         if POLICIES[policy].trained and (size := shape_of(self.task, self.config.task).obs_size) != after.obs_size:
             raise UserError(
-                f"the run's observations have {size} entries, this world's {after.obs_size}: "
-                "keep its structure"
+                f"the run's observations have {size} entries, this world's {after.obs_size}: keep its structure"
             )
 
     def load(self, kinds: tuple[str, ...] = ()) -> list[Lanes]:

@@ -6,7 +6,6 @@ A teacher knows the world that it learned in. Who loads one for another world as
 from __future__ import annotations
 
 import hashlib
-import json
 import shutil
 from collections.abc import Collection
 from pathlib import Path
@@ -34,7 +33,7 @@ def save(folder: Path, teacher: LearnedTeacher, about: dict[str, Any]) -> None:
     params = jax.tree.map(lambda leaf: leaf.astype(jnp.float16), teacher.params)
     with checkpoints(folder / "network") as saved:
         saved.save(0, {"params": params})
-    (folder / "teacher.json").write_text(json.dumps({"format": formats.FORMATS["teacher"], **about}, indent=1) + "\n")
+    formats.write("teacher", folder / "teacher.json", about)
 
 
 def load(folder: Path, env: Any, aim_error: Any, habit: Any) -> LearnedTeacher:

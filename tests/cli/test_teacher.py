@@ -4,6 +4,7 @@ import json
 import shutil
 
 import pytest
+from probes import edit_json
 from small_runs import SMALL
 
 from cuelearner_jax.cli import main
@@ -39,8 +40,7 @@ def test_it_teaches_and_is_known_by_its_contents(trained, refused, tmp_path):
     assert main(["evaluate", str(run), "--policy", "teacher", *few, "--out", str(out)]) == 0
     assert json.loads(out.read_text())["files"] == described["files"]
     # Another teacher in the same place, then none.
-    about = json.loads((own / "teacher.json").read_text())
-    (own / "teacher.json").write_text(json.dumps({**about, "seed": 7}))
+    edit_json(own / "teacher.json", lambda about: about.update(seed=7))
     refused([*command, "--resume"], "was run with another files.teacher", run)
     shutil.rmtree(own)
     refused([*command, "--resume"], f"no teacher in {own}", run)
@@ -57,8 +57,7 @@ def test_a_teacher_that_does_not_fit_is_refused(trained, refused, tmp_path):
     refused([*RUN, "--task.teacher", trained, "--task.acceleration", "0", "0.005", *new], "this world's", tmp_path)
     navigation = tmp_path / "navigation"
     shutil.copytree(trained, navigation)
-    about = json.loads((trained / "teacher.json").read_text())
-    (navigation / "teacher.json").write_text(json.dumps({**about, "task": {"name": "navigation"}}))
+    edit_json(navigation / "teacher.json", lambda about: about.update(task={"name": "navigation"}))
     refused([*RUN, "--task.teacher", navigation, *new], "is one of navigation, not of billiards", tmp_path)
     tilted = ["evaluate", "billiards", "--preset", "easy", "--policy", "teacher", "--scenario", "tilted_table"]
     refused(tilted, "knows nothing of this world's --task.acceleration 0.0 0.005: use the search teacher", tmp_path)
