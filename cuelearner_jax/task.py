@@ -53,6 +53,9 @@ class Body:
     environment: Callable[[Any, str], Environment]  # (configuration, split); for the splits see `evaluate.SPLITS`
     engines: dict[str, Rollout] = field(default_factory=dict)  # roll-outs in other physics, by name
     pictures: Callable[[], Pictures] | None = None  # loads what draws, when called; None: nothing draws it
+    # a folder of the user's -> the body with what lies there; raises UserError if that is not for it; None: takes none
+    made_of: Callable[[Path], Body] | None = None
+    digest: str = ""  # of what lies in that folder
 
 
 @dataclass(frozen=True)
@@ -144,16 +147,24 @@ class Task:
         self.check_whole(config.task, schedule.eval_envs, schedule.eval_steps, *options)
 
     def on(self, body: str | None) -> Task:
-        """The task with that body first (None: as it is). Raises UserError if it has no such body."""
+        """The task with that body first (None: as it is); with what lies in a folder, if it is called NAME:FOLDER.
+
+        Raises UserError if it has no such body, or nothing for it lies there.
+        """
         if body is None:
             return self
+        body, _, folder = body.partition(":")
         if len(self.bodies) == 1:
             raise UserError(f"{self.name} has no robots to choose from: leave out --robot")
         known = {one.name: one for one in self.bodies}
         if body not in known:
             raise UserError(f"unknown robot {body!r}{closest(body, known)}")
-        others = tuple(one for one in self.bodies if one.name != body)
-        return dataclasses.replace(self, bodies=(known[body], *others))
+        others, found = tuple(one for one in self.bodies if one.name != body), known[body]
+        if folder:
+            if found.made_of is None:
+                raise UserError(f"{body} takes no folder: leave out {folder!r}")
+            found = found.made_of(Path(folder))
+        return dataclasses.replace(self, bodies=(found, *others))
 
     def engine(self, name: str | None) -> Rollout | None:
         """The first body's roll-out in other physics (None: its own). Raises UserError if it has no such engine."""

@@ -34,7 +34,8 @@ class Evaluate(Generic[TaskT]):
     envs: int | None = None
     """Environments that share the steps (default: 100)."""
     robot: str | None = None
-    """Another robot, see above (default: the task's own)."""
+    """Another robot, see above (default: the task's own); with a folder, as anymal:FOLDER, one with your own walking
+    policy."""
     engine: str | None = None
     """Other physics that the robot has; anymal: mujoco, for C MuJoCo at a finer step instead of MJX; first episodes
     only."""
@@ -71,12 +72,13 @@ def run(arguments: list[str]) -> None:
         measured = trained.evaluate(source, asked.task, asked.policy, asked.guidance, envs, steps, engine, watch)
     told = {"robot": asked.robot, "engine": asked.engine, "scenario": asked.scenario}
     told = {name: value for name, value in told.items() if value}
+    robot = {"robot_digest": digest} if (digest := source.task.bodies[0].digest) else {}
     amount = f"{steps:,} steps a lane" if source.task.longest is None else f"{envs:,} episodes a lane"
     out.print(_measurements(measured, ", ".join([asked.policy, *told.values(), amount])))
-    if any((row.metrics.get("finished", 1.0) < 1).any() for row in measured):
+    if any((row.metrics.get("finished", np.ones(1)) < 1).any() for row in measured):
         console.print("not every first episode has ended, so outcomes have no mean: give more --steps")
     if asked.out:
-        trained.write(asked.out, source, asked.task, asked.policy, envs, steps, measured, told)
+        trained.write(asked.out, source, asked.task, asked.policy, envs, steps, measured, {**told, **robot})
         out.print(f"wrote {asked.out}")
 
 
