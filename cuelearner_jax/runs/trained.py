@@ -16,25 +16,12 @@ from cuelearner_jax.environment import actions_of, offers
 from cuelearner_jax.errors import UserError, closest
 from cuelearner_jax.evaluate import Tell, episodes, one_lane, untold, watched, watched_lanes
 from cuelearner_jax.guidance import registry as guidances
-from cuelearner_jax.guidance.bundle import Guidance
 from cuelearner_jax.policies import Agent, Corrected, Guided, Heuristic, Policy, Taught, uniform_in
 from cuelearner_jax.records.provenance import provenance
 from cuelearner_jax.runs.grid import Grid
-from cuelearner_jax.runs.kept import restore_policies
-from cuelearner_jax.runs.lanes import LaneGroup
+from cuelearner_jax.runs.opened import Lanes, Piece, lanes_of, open_run
 from cuelearner_jax.task import Rollout, Task, shape_of
 from cuelearner_jax.types import Teacher
-
-
-@dataclass(frozen=True)
-class Lanes:
-    """The lanes of one kind of guidance, as their newest checkpoint has them."""
-
-    guidance: Guidance
-    seeds: np.ndarray  # (lanes,)
-    budgets: np.ndarray  # (lanes,)
-    policies: Any  # {"params", "guidance"}, leading axis: lanes
-    step: int
 
 
 class Parts(NamedTuple):
@@ -101,6 +88,13 @@ class PolicySource:
     config: RunConfig
     grid: Grid | None
     folder: Path
+    pieces: tuple[Piece, ...] = ()  # of a run; none named: all of it lies in its folder
+
+    @classmethod
+    def of_run(cls, folder: Path, find: Callable[[str], Task]) -> PolicySource:
+        """A run's, or those of a sweep in pieces; see `opened.open_run`."""
+        found = open_run(folder, find)
+        return cls(found.task, found.config, found.grid, folder, found.pieces)
 
     def on(self, robot: str | None) -> PolicySource:
         """The same with another robot of the task's (None: its own). Raises UserError if it has no such robot."""
@@ -126,9 +120,11 @@ class PolicySource:
             )
 
     def load(self, kinds: tuple[str, ...] = ()) -> list[Lanes]:
-        """The lanes of a run's kinds of guidance (none named: all). Raises UserError for one the run does not have."""
+        """The lanes of a run's kinds of guidance (none named: all), those at different steps apart.
+
+        Raises UserError for a kind that the run does not have, or without a checkpoint.
+        """
         assert self.grid is not None  # `check` has seen to it
-        env = shape_of(self.task, self.config.task)
         loaded = []
         for kind in kinds or self.grid.guidance:
             name = guidances.find(kind).name if ":" in kind else kind
@@ -139,9 +135,8 @@ class PolicySource:
                     f"{self.folder} has lanes of a guidance from outside, {name!r}: name its code by "
                     "--guidance package.module:NAME, if you trust that code"
                 )
-            group = LaneGroup(self.config, env, guidances.make(name, self.config.sizes, env), self.grid)
-            policies, step = restore_policies(group, self.folder / name)
-            loaded.append(Lanes(group.guidance, group.seeds, group.budgets, policies, step))
+            pieces = self.pieces or (Piece(self.folder, self.grid),)
+            loaded += lanes_of(self.task, self.config, pieces, name, sweep=pieces[0].folder != self.folder)
         return loaded
 
 
@@ -215,16 +210,18 @@ def one_policy(
     if not named.trained:
         return named.make(Parts(source.config, env, teacher, None))
     assert source.grid is not None  # `check` has seen to it
-    lanes = source.load((kind or source.grid.guidance[-1],))[0]
-    budget = int(lanes.budgets.max()) if labels is None else labels
-    seed = int(lanes.seeds[0]) if seed is None else seed
-    index = np.flatnonzero((lanes.seeds == seed) & (lanes.budgets == budget))
-    if not len(index):
-        raise UserError(
-            f"no lane with seed {seed} and {budget} labels: the run has seeds {_listed(lanes.seeds)} "
-            f"and labels {_listed(lanes.budgets)}"
-        )
-    return one_lane(named.make(Parts(source.config, env, teacher, lanes)), int(index[0]))
+    loaded = source.load((kind or source.grid.guidance[-1],))
+    seeds, budgets = (np.concatenate([getattr(lanes, of) for lanes in loaded]) for of in ("seeds", "budgets"))
+    budget = int(budgets.max()) if labels is None else labels
+    seed = int(seeds[0]) if seed is None else seed
+    for lanes in loaded:
+        index = np.flatnonzero((lanes.seeds == seed) & (lanes.budgets == budget))
+        if len(index):
+            return one_lane(named.make(Parts(source.config, env, teacher, lanes)), int(index[0]))
+    raise UserError(
+        f"no lane with seed {seed} and {budget} labels: the run has seeds {_listed(seeds)} "
+        f"and labels {_listed(budgets)}"
+    )
 
 
 def _listed(values: np.ndarray) -> str:
