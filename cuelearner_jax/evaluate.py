@@ -183,6 +183,11 @@ def untold(done: int, count: int) -> None:
     """Nobody watches."""
 
 
+def part_of(tell: Tell, number: int, parts: int) -> Tell:
+    """Who is told of part `number` (from 0) of as many equal ones, one after the other."""
+    return lambda done, count: tell(number * count + done, parts * count)
+
+
 def watched(
     env: Environment, policy: Policy, key: PRNGKeyArray, num_envs: int, steps: int, tell: Tell = untold
 ) -> dict[str, np.ndarray]:
@@ -203,7 +208,7 @@ def watched_lanes(
     for number, first in enumerate(firsts):
         rows = np.minimum(np.arange(first, first + size), lanes - 1)  # the last are repeated, which saves a compile
         part = [jnp.asarray(leaf)[rows] for leaf in each]
-        told = lambda done, count, number=number: tell(number * count + done, len(firsts) * count)  # noqa: E731
+        told = part_of(tell, number, len(firsts))
         found.append(_in_stretches(env, structure, part, shared, key, num_envs, steps, told))
     return {name: np.concatenate([part[name] for part in found])[:lanes] for name in found[0]}
 

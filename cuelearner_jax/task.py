@@ -16,8 +16,9 @@ from cuelearner_jax.environment import Environment
 from cuelearner_jax.errors import UserError, closest
 from cuelearner_jax.types import EnvState, Teacher
 
-# (policy, environment, key, environments, steps) -> metrics by name, as `evaluate.rollout`
-Rollout = Callable[[Any, Any, PRNGKeyArray, int, int], dict[str, Any]]
+# (policy, environment, key, environments, steps, tell) -> metrics by name, as `evaluate.rollout`; now and then it calls
+# `tell` with how far it is, and of how much
+Rollout = Callable[[Any, Any, PRNGKeyArray, int, int, Callable[[int, int], None]], dict[str, Any]]
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ import numpy as np
 from cuelearner_jax.config import RunConfig, to_json
 from cuelearner_jax.environment import actions_of, offers
 from cuelearner_jax.errors import UserError, closest
-from cuelearner_jax.evaluate import Tell, episodes, one_lane, untold, watched, watched_lanes
+from cuelearner_jax.evaluate import Tell, episodes, one_lane, part_of, untold, watched, watched_lanes
 from cuelearner_jax.guidance import registry as guidances
 from cuelearner_jax.policies import Agent, Corrected, Guided, Heuristic, Policy, Taught, uniform_in
 from cuelearner_jax.records.provenance import provenance
@@ -177,9 +177,10 @@ def evaluate(
     if not named.trained:
         policy = named.make(Parts(source.config, env, teacher, None))
         tell = watch(name)
-        found = (
-            engine(policy, env, key, num_envs, steps) if engine else watched(env, policy, key, num_envs, steps, tell)
-        )
+        if engine:
+            found = engine(policy, env, key, num_envs, steps, tell)
+        else:
+            found = watched(env, policy, key, num_envs, steps, tell)
         metrics = {metric: np.asarray(value)[None] for metric, value in found.items()}
         return [Measured("-", 0, 0, np.zeros(1, int), metrics)]
     rows = []
@@ -187,10 +188,9 @@ def evaluate(
         policy = named.make(Parts(source.config, env, teacher, lanes))
         tell = watch(lanes.guidance.name)
         if engine:
-            each = []
-            for lane in range(len(lanes.seeds)):
-                tell(lane, len(lanes.seeds))
-                each.append(engine(one_lane(policy, lane), env, key, num_envs, steps))
+            each, count = [], len(lanes.seeds)
+            for lane in range(count):
+                each.append(engine(one_lane(policy, lane), env, key, num_envs, steps, part_of(tell, lane, count)))
             found = {metric: np.stack([measured[metric] for measured in each]) for metric in each[0]}
         else:
             found = watched_lanes(env, policy, key, num_envs, steps, tell)

@@ -100,9 +100,16 @@ class Course:
 
 
 def rollout(
-    policy: Policy, env: LeggedNavigation, key: PRNGKeyArray, num_envs: int, steps: int
+    policy: Policy,
+    env: LeggedNavigation,
+    key: PRNGKeyArray,
+    num_envs: int,
+    steps: int,
+    tell: Callable[[int, int], None] = lambda done, count: None,
 ) -> dict[str, np.ndarray]:
     """`cuelearner_jax.evaluate.rollout` of first episodes alone, the same ones, in C MuJoCo.
+
+    `tell` is told how many steps of how many each robot has made.
 
     Returns:
         Means over the episodes (nan unless all have ended within `steps` shared by all), and "finished", the share that
@@ -113,6 +120,7 @@ def rollout(
     choose = jax.jit(policy.act)
     running, outcomes = np.ones(num_envs, bool), []
     for index in range(steps // num_envs):
+        tell(index, steps // num_envs)
         k_act, _ = jax.random.split(jax.random.fold_in(k_run, index))
         outcome, terminated, truncated = course.step(choose(k_act, course.state, course.obs))
         ended = running & (terminated | truncated)
