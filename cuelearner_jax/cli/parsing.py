@@ -14,7 +14,6 @@ from rich.console import Console
 
 from cuelearner_jax.errors import UserError, closest
 from cuelearner_jax.guidance import registry as guidances
-from cuelearner_jax.runs import grid as runs
 from cuelearner_jax.runs.trained import POLICIES, PolicySource
 from cuelearner_jax.task import Preset, Task
 from cuelearner_jax.tasks import registry
@@ -154,10 +153,10 @@ def _task_option(arguments: list[str]) -> tuple[str | None, list[str]]:
 
 def _run(folder: Path, known: Task | None) -> PolicySource:
     """A run folder. Raises UserError if it is none, or of another task than the one named beside it."""
-    task, config, grid = runs.load(folder, registry.find)
-    if known is not None and known.name != task.name:
-        raise UserError(f"{folder} is a run of {task.name}, not of {known.name}: leave out --task")
-    return PolicySource(task, config, grid, folder)
+    source = PolicySource.of_run(folder, registry.find)
+    if known is not None and known.name != source.task.name:
+        raise UserError(f"{folder} is a run of {source.task.name}, not of {known.name}: leave out --task")
+    return source
 
 
 def _tasks() -> str:

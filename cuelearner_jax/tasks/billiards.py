@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from cuelearner_envs import billiards
 from cuelearner_envs.billiards.config import BilliardsConfig, make_environment
-from cuelearner_envs.billiards.teacher import SearchTeacher
+from cuelearner_envs.billiards.teacher import SearchTeacher, Transferred
 from cuelearner_jax.config import RunConfig, Scalars, Schedule, Sizes
 from cuelearner_jax.task import Body, Pictures, Preset, Scenario, Task
 from cuelearner_jax.teachers import stored
@@ -18,13 +18,37 @@ from cuelearner_jax.types import Teacher
 SHIPPED_TEACHERS = Path(billiards.__file__).parent / "teachers"
 
 
+# Fields in which a learned teacher's world may differ from its own: who teaches and how, what multiplies data, and what
+# `Transferred` sees to.
+TEACHERS = ("teacher", "aim_error_deg", "habit", "search_directions")
+TRANSFERRED = (*TEACHERS, "mirrors", "action_turn_deg", "observation_bias")
+
+
+def teacher_folder(config: BilliardsConfig) -> Path | None:
+    """Where the teacher that a configuration names lies (None: it is none that was trained)."""
+    if config.teacher == "search":
+        return None
+    return SHIPPED_TEACHERS / config.table if config.teacher == "learned" else Path(config.teacher)
+
+
 def make_teacher(config: BilliardsConfig, env: Any) -> Teacher:
-    """The teacher that a configuration names. Raises UserError if the table has no shipped one."""
+    """The teacher that a configuration names.
+
+    Raises UserError if there is none, or if it knows nothing of a change in this world.
+    """
     aim_error = jnp.deg2rad(jnp.array(config.aim_error_deg, jnp.float32))
     habit = jnp.array(config.habit, jnp.float32)
-    if config.teacher == "search":
+    folder = teacher_folder(config)
+    if folder is None:
         return SearchTeacher(env, aim_error, habit, config.search_directions)
-    return stored.load(SHIPPED_TEACHERS / config.table, env, aim_error, habit)
+    own = make_environment(stored.world_of(folder, "billiards", config, TRANSFERRED))
+    return Transferred(stored.load(folder, own, aim_error, habit), own, env)
+
+
+def _files(config: BilliardsConfig) -> dict[str, str]:
+    """The user's own teacher, by its digest."""
+    folder = teacher_folder(config)
+    return {"teacher": stored.digest(folder)} if folder and config.teacher != "learned" else {}
 
 
 def _pictures() -> Pictures:
@@ -67,6 +91,7 @@ BILLIARDS = Task(
     config=BilliardsConfig,
     bodies=(PLAYER,),
     teacher=make_teacher,
+    files=_files,
     scenarios=SCENARIOS,
     labels_hold=("mirrors", "teacher", "aim_error_deg", "habit", "search_directions"),
     presets={

@@ -2,14 +2,17 @@ import json
 import re
 import subprocess
 import sys
+from io import StringIO
 from pathlib import Path
 from xml.etree import ElementTree
 
 import imageio.v2 as imageio
 import pytest
+from rich.console import Console
 from small_runs import SMALL
 
-from cuelearner_jax.cli import main
+from cuelearner_jax import terminal
+from cuelearner_jax.cli import evaluate, main
 from cuelearner_jax.records import results
 
 ENTRY = [str(Path(sys.executable).with_name("cuelearner"))]
@@ -57,6 +60,17 @@ def test_every_policy_is_evaluated(run_folder, tmp_path, capsys, policy):
     lanes = {("none", 0), ("relative", 10), ("relative", 20)}
     trained = policy in ("agent", "guide", "guided")
     assert {(row["guidance"], row["labels"]) for row in rows} == (lanes if trained else {("-", 0)})
+
+
+def test_an_evaluation_says_how_far_it_is(run_folder, monkeypatch):
+    """On a terminal: a bar for each kind of guidance, that moves between the first step and the last."""
+    shown = StringIO()
+    console = Console(file=shown, force_terminal=True, color_system=None, width=100)
+    for module in (terminal, evaluate):
+        monkeypatch.setattr(module, "console", console)
+    assert main(["evaluate", str(run_folder), "--steps", "100", "--envs", "10"]) == 0
+    for kind, lanes in (("none", 2), ("relative", 4)):
+        assert re.search(rf"{kind} .*{5 * lanes}/{5 * lanes} ", shown.getvalue())
 
 
 def test_a_changed_world_changes_the_measurement(run_folder, tmp_path):
@@ -138,16 +152,6 @@ def test_tuning_episodes_are_others_and_stay_out_of_reports(run_folder, tmp_path
     assert {row["split"] for row in results.read(out).to_pylist()} == {"tuning"}
     assert main(["report", str(out), "--out", str(tmp_path / "report")]) == 2
     assert main(["report", str(out), "--split", "tuning", "--out", str(tmp_path / "report")]) == 0
-
-
-def test_a_tiny_teacher_is_trained(tmp_path):
-    out = tmp_path / "teacher"
-    command = ["teacher", "train", "billiards", "--preset", "quickstart", "--out", str(out), "--eval-steps", "20"]
-    sizes = ["--teacher.layers", "16", "--teacher.tables", "8", "--teacher.rounds", "20", "--teacher.batch-size", "64"]
-    assert main([*command, *sizes, "--teacher.search", "36", "--teacher.directions", "36"]) == 0
-    told = json.loads((out / "teacher.json").read_text())
-    assert told["command"].startswith("cuelearner teacher train billiards")
-    assert sorted(path.name for path in out.iterdir()) == ["network", "teacher.json"]
 
 
 @pytest.mark.parametrize("command", ["train", "sweep", "evaluate", "report", "render", "teacher", "bench"])
