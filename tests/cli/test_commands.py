@@ -62,6 +62,19 @@ def test_every_policy_is_evaluated(run_folder, tmp_path, capsys, policy):
     assert {(row["guidance"], row["labels"]) for row in rows} == (lanes if trained else {("-", 0)})
 
 
+def test_a_task_alone_is_evaluated_and_drawn_on_any_of_its_tables(tmp_path, capsys):
+    """What needs no training fits whatever the world shows."""
+    table = ["billiards", "--task.table", "one_ball"]
+    assert main(["evaluate", *table, "--steps", "20", "--envs", "10"]) == 0
+    assert "heuristic, 20 steps a lane" in capsys.readouterr().out
+    assert main(["render", *table, "--question", "--out", str(tmp_path)]) == 0
+    for command in ("evaluate", "render"):
+        with pytest.raises(SystemExit) as stopped:
+            main([command, "billiards", "--help"])
+        assert not stopped.value.code
+        assert re.search(r"presets \(--preset\):\n  paper +.*\n  easy +.*\n  quickstart", capsys.readouterr().out)
+
+
 def test_an_evaluation_says_how_far_it_is(run_folder, monkeypatch):
     """On a terminal: a bar for each kind of guidance, that moves between the first step and the last."""
     shown = StringIO()
