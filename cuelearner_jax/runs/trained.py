@@ -20,6 +20,7 @@ from cuelearner_jax.guidance import registry as guidances
 from cuelearner_jax.guidance.bundle import Guidance
 from cuelearner_jax.policies import Agent, Corrected, Guided, Heuristic, Policy, Taught, uniform_in
 from cuelearner_jax.records.provenance import provenance
+from cuelearner_jax.runs.failures import without_failed
 from cuelearner_jax.runs.grid import Grid
 from cuelearner_jax.runs.kept import restore_policies
 from cuelearner_jax.runs.lanes import LaneGroup
@@ -176,7 +177,7 @@ def evaluate(
         metrics = {metric: np.asarray(value)[None] for metric, value in found.items()}
         return [Measured("-", 0, 0, np.zeros(1, int), metrics)]
     rows = []
-    for lanes in source.load(kinds):
+    for lanes in without_failed(source.load(kinds)):
         policy = named.make(Parts(source.config, env, teacher, lanes))
         if engine:
             each = [engine(one_lane(policy, lane), env, key, num_envs, steps) for lane in range(len(lanes.seeds))]
