@@ -14,6 +14,7 @@ import contextlib
 import csv
 import io
 import json
+import os
 import shutil
 import sys
 import tempfile
@@ -213,11 +214,14 @@ def _main() -> int:
     asked = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        make_runs(folder)
+        os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(folder / "compiled"))
+        os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.0")
+        with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:  # so that JAX starts with these settings
+            pool.submit(make_runs, folder).result()
         tried = cases(folder, asked.cases, asked.seed)
-        expected = baselines(folder, {(case.run, case.command) for case in tried})
         found = 0
         with ProcessPoolExecutor(asked.workers, mp_context=get_context("spawn")) as pool:
+            expected = pool.submit(baselines, folder, {(case.run, case.command) for case in tried}).result()
             outcomes = pool.map(partial(wrong, folder, expected), tried, chunksize=4)
             for number, (case, outcome) in enumerate(zip(tried, outcomes, strict=True), start=1):
                 if outcome:

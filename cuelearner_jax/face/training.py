@@ -96,6 +96,7 @@ def train(
     """
     run_config = dataclasses.replace(_config(world, config), task=world.config)
     configuration.check(run_config)
+    world.task.check_evaluations(run_config)
     asked = guidance or registry.possible(world.env, taught=teacher is not None)
     names = tuple(registry.find(kind).name for kind in asked)
     grid = Grid(names, tuple(range(seeds)) if isinstance(seeds, int) else tuple(seeds), tuple(labels))

@@ -12,6 +12,7 @@ import errno
 import gc
 import hashlib
 import logging
+import re
 import shutil
 import sys
 import time
@@ -186,7 +187,9 @@ class Checkpoints:
                 self._verify({name: restored[name] for name in like}, restored[DIGESTS])
             return {name: _unflat(restored[name], like[name]) for name in like}
         except Exception as error:  # Orbax and TensorStore raise many kinds for one cause: the files do not fit
-            reason = str(error).strip().splitlines()[0][:160] if str(error).strip() else type(error).__name__
+            # Orbax means to print TensorStore's details and prints the method that has them.
+            told = re.sub(r"\.? See full TensorStore details.*", "", str(error), flags=re.DOTALL).strip()
+            reason = told.splitlines()[0][:160] if told else type(error).__name__
             remedy = OTHERS if isinstance(error, _OfAnother) else FORBIDDEN if _forbidden(error) else DAMAGED
         _collect_quietly()
         raise UserError(f"checkpoint {number} in {self._folder} cannot be read ({reason}): {remedy}")

@@ -12,18 +12,18 @@ import os
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.records import formats, results
+from cuelearner_jax.records import results
 from cuelearner_jax.records.folders import in_use
+from cuelearner_jax.report import escaping, extent
 from cuelearner_jax.report.figures import Variant, draw_curves, draw_label_efficiency, save_figure
 from cuelearner_jax.report.statistics import curve, interval, mean_over_curve, steps_to_reach, stretches_apart
-from cuelearner_jax.runs import failures, shards
+from cuelearner_jax.runs import failures
 
 Row = dict[str, str | int | float]  # of the summary
 
@@ -180,25 +180,9 @@ def _of_failed_alone(rows: Sequence[Row], failed: pa.Table) -> list[Row]:
 
 def _missing(folders: Sequence[str | os.PathLike[str]], table: pa.Table, variants: Sequence[Variant]) -> list[str]:
     """One line for everything that a reader of the report would otherwise take to be there."""
-    lines = []
-    names, reached = np.array(table["folder"].to_pylist()), table["step"].to_numpy()
+    lines = extent.missing(folders, table)
     guidance, labels = np.array(table["guidance"].to_pylist()), table["labels"].to_numpy()
-    for folder in dict.fromkeys(names.tolist()):
-        # A run's config.json stands above the folders of its kinds of guidance.
-        config = _config(Path(folder)) or _config(Path(folder).parent)
-        last, total = int(reached[names == folder].max()), config.get("total_steps")
-        if total is not None and last < total:
-            lines.append(f"{folder}: at step {last:,} of {total:,} ({last / total:.0%})")
-        elif total is None and not (Path(folder) / results.PARQUET).exists():
-            lines.append(f"{folder}: not finished, at step {last:,}")
-    configurations = sorted({file for folder in folders for file in Path(folder).rglob("config.json")})
-    lines += shards.missing(configurations)
-    for path in (file.parent for file in configurations):
-        found = {str(kind) for name, kind in zip(names, guidance, strict=True) if Path(name).is_relative_to(path)}
-        planned = _config(path).get("grid", {}).get("guidance", [])
-        lines += [f"{path.as_posix()}: no results of {kind} guidance" for kind in planned if kind not in found]
-        if not found and not planned:
-            lines.append(f"{path.as_posix()}: no results")
+    reached = table["step"].to_numpy()
     for variant in variants:
         furthest = int(reached[(guidance == variant.guidance) & (labels == variant.labels)].max())
         if furthest > variant.curve.steps[-1]:
@@ -210,18 +194,14 @@ def _missing(folders: Sequence[str | os.PathLike[str]], table: pa.Table, variant
             lines.append(f"{variant.name}: one seed, so no interval")
     if len({int(variant.curve.steps[-1]) for variant in variants}) > 1:
         shared = min(int(variant.curve.steps[-1]) for variant in variants)
-        lines.append(f"curves end at different steps; means over the curve are taken to step {shared:,}, shared by all")
+        lines.append(
+            "curves end at different steps, so their final values are no comparison; "
+            f"means over the curve are taken to step {shared:,}, shared by all"
+        )
     hashes = sorted(set(table["config_hash"].to_pylist()))
     if len(hashes) > 1:
         lines.append(f"the runs differ in more than guidance, labels and seed: configurations {', '.join(hashes)}")
     return lines
-
-
-def _config(folder: Path) -> dict[str, Any]:
-    try:
-        return formats.read("config", folder / "config.json")
-    except UserError:
-        return {}
 
 
 # --- tables ----------------------------------------------------------------------------------------------------------
@@ -271,17 +251,18 @@ def _write_csv(path: Path, rows: Sequence[Row]) -> None:
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
         writer.writeheader()
-        writer.writerows(rows)
+        writer.writerows({name: escaping.cell(value) for name, value in row.items()} for row in rows)
 
 
 def _provenance(table: pa.Table, command: str) -> list[str]:
-    lines = [f"report made by: `{command}`"] if command else []
+    """Lines of Markdown."""
+    lines = [f"report made by: {escaping.code(command)}"] if command else []
     names = {"command": "runs made by", "config_hash": "configuration", "commit": "commit"}
     for column, name in (names | {"versions": "versions", "hardware": "hardware"}).items():
         values = set(table[column].to_pylist()) if column in table.column_names else set()
         known = sorted(value for value in values if value)
-        quote = "`" if column in ("command", "config_hash", "commit") else ""
-        lines += [f"{name}: {quote}{value}{quote}" for value in known] or [f"{name}: not recorded"]
+        escape = escaping.code if column in ("command", "config_hash", "commit") else escaping.markdown
+        lines += [f"{name}: {escape(value)}" for value in known] or [f"{name}: not recorded"]
     return lines
 
 
@@ -294,15 +275,16 @@ def _markdown(
 ) -> str:
     header = ["guidance", "labels", "seeds", "last step", "final", "mean over the curve", "best (at step)"]
     header += ["reaches the unguided final", "interval above the unguided", "interval below the unguided"]
-    lines = [f"# {title}", "", *(f"![{name.replace('_', ' ')}]({name}.png)\n" for name in figures)]
+    lines = [f"# {escaping.markdown(title)}", "", *(f"![{name.replace('_', ' ')}]({name}.png)\n" for name in figures)]
     lines += [f"| {' | '.join(header)} |", "|" + "---|" * len(header)]
     for row in rows:
         reached, failed = row["reaches_unguided_final"], int(row["failed"])
         seeds = f"{row['seeds']} of {int(row['seeds']) + failed}, {failed} failed" if failed else row["seeds"]
+        cells = [escaping.markdown(row["guidance"]), f"{row['labels']:,}", seeds]
         if not row["seeds"]:
-            lines.append(f"| {row['guidance']} | {row['labels']:,} | {seeds} |" + " |" * (len(header) - 3))
+            lines.append(f"| {' | '.join(map(str, cells))} |" + " |" * (len(header) - len(cells)))
             continue
-        cells = [row["guidance"], f"{row['labels']:,}", seeds, f"{row['last_step']:,}"]
+        cells.append(f"{row['last_step']:,}")
         for key in ("final", "mean"):
             bounds = f" [{row[f'{key}_lower']:.3f}, {row[f'{key}_upper']:.3f}]" if int(row["seeds"]) > 1 else ""
             cells.append(f"{row[key]:.3f}{bounds}")
@@ -318,6 +300,11 @@ def _markdown(
         "seeds such intervals are too narrow. Steps are environment steps of one seed. Intervals are compared at each "
         "evaluation by itself, so a short stretch may be chance.",
     ]
-    lines += ["", "## Missing", "", *(f"- {line}" for line in missing or ["nothing: all runs are complete"])]
+    lines += [
+        "",
+        "## Missing",
+        "",
+        *(f"- {escaping.markdown(line)}" for line in missing or ["nothing: all runs are complete"]),
+    ]
     lines += ["", "## Where the numbers come from", "", *(f"- {line}" for line in provenance), ""]
     return "\n".join(lines)
