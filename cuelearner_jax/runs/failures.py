@@ -64,8 +64,8 @@ def _listed(seeds: Sequence[str]) -> str:
     return ("seed " if len(seeds) == 1 else "seeds ") + ", ".join([*seeds[:LISTED], *more])
 
 
-def check(out: Path, kinds: Iterable[str]) -> None:
-    """Raises NotFinite if lanes of a run's kinds of guidance have failed, as its results say."""
-    found = summary(results.read([out / kind for kind in kinds]))
+def check(out: Path, folders: Iterable[Path]) -> None:
+    """Raises NotFinite if lanes of a run at `out` have failed, as the results in these folders of it say."""
+    found = summary(results.read(list(folders)))
     if found:
         raise NotFinite(f"{found}: their rows in {out} are marked, and reports leave them out; all else is done")

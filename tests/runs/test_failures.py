@@ -1,6 +1,8 @@
 """Runs of which lanes fail: they go on, name them, mark them and leave them out; and end with status 1."""
 
 import dataclasses
+from types import SimpleNamespace
+from typing import cast
 
 import jax
 import jax.numpy as jnp
@@ -12,9 +14,10 @@ import cuelearner_jax as cl
 from cuelearner_jax.cli import dispatch
 from cuelearner_jax.errors import NotFinite, UserError
 from cuelearner_jax.records import results
-from cuelearner_jax.runs import lanes, sweep, trained
+from cuelearner_jax.runs import lanes, submission, sweep, trained
+from cuelearner_jax.runs.cluster import Job
 from cuelearner_jax.runs.grid import Grid, load
-from cuelearner_jax.runs.order import Order
+from cuelearner_jax.runs.order import Order, Plan
 
 CONFIG = probes.config(
     sizes={"q_layers": (8, 8), "feedback_layers": (8,), "fit_steps": 20, "lanes_per_block": 3, "replay_capacity": 40},
@@ -107,6 +110,13 @@ def test_status_one_and_one_line(ended, capsys, monkeypatch):
     monkeypatch.setattr(dispatch, "_dispatch", lambda arguments: sweep.run(order(ended[0], resume=True)))
     assert dispatch.main(["sweep"]) == 1
     assert capsys.readouterr().err.strip().splitlines()[-1] == ended[3]
+
+
+def test_a_sweep_in_pieces_that_were_finished_before_says_it_too(ended):
+    plan = SimpleNamespace(finished=True, order=order(ended[0]))
+    with pytest.raises(NotFinite) as raised:
+        submission.submit("local", 1, Job(), ended[0], [], lambda shard: cast(Plan, plan), lambda line: None)
+    assert str(raised.value) == ended[3]
 
 
 def test_diverging_from_the_command_line_and_from_python(tmp_path):
