@@ -129,9 +129,7 @@ def test_a_policy_that_is_not_finite_is_not_written(tmp_path, monkeypatch):
             look(steps, None, [normaliser, {"params": jax.tree.map(lambda leaf, by=weight: leaf * by, layers)}])
 
     monkeypatch.setattr(locomotion, "_ppo", diverge)
-    with pytest.raises(
-        NotFinite, match=r"by step 2, and was not written; .* holds the policy of the meas"
-    ):
+    with pytest.raises(NotFinite, match=r"by step 2, and was not written; .* holds the policy of the meas"):
         locomotion.train(walker(), SMALL, tmp_path / "wild", 0, "the command", lambda line: None)
     assert len(json.loads((tmp_path / "wild" / "policy.json").read_text())["history"]["rows"]) == 2
 
