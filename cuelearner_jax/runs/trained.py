@@ -22,6 +22,7 @@ from cuelearner_jax.runs.failures import without_failed
 from cuelearner_jax.runs.grid import Grid
 from cuelearner_jax.runs.opened import Lanes, Piece, lanes_of, open_run
 from cuelearner_jax.task import Rollout, Task, shape_of
+from cuelearner_jax.terminal import console
 from cuelearner_jax.types import Teacher
 
 
@@ -218,6 +219,8 @@ def one_policy(
     for lanes in loaded:
         index = np.flatnonzero((lanes.seeds == seed) & (lanes.budgets == budget))
         if len(index):
+            if lanes.policies["failed"][index[0]]:
+                console.print(f"seed {seed} failed, no longer finite: this is its last finite state", markup=False)
             return one_lane(named.make(Parts(source.config, env, teacher, lanes)), int(index[0]))
     raise UserError(
         f"no lane with seed {seed} and {budget} labels: the run has seeds {_listed(seeds)} "
