@@ -41,19 +41,13 @@ def strict_ranks(request):
 # their own to wait for.
 SLOW = (
     *("bench", "brax_bridge", "cli", "envs/anymal", "examples", "face", "teachers", "testing"),
-    *("agent/test_choice.py", "agent/test_n_step.py", "records/test_checkpoint.py", "tasks/test_registry.py"),
-    *("runs/test_given_labels.py", "runs/test_lanes.py", "runs/test_resume.py", "runs/test_runs.py"),
+    *("agent/test_choice.py", "agent/test_n_step.py", "records/test_checkpoint.py", "runs/test_runs.py"),
+    *("runs/test_failures.py", "runs/test_given_labels.py", "runs/test_lanes.py", "runs/test_resume.py"),
     *("envs/billiards/test_environment.py", "envs/billiards/test_mirrors.py", "envs/billiards/test_parity.py"),
     *("envs/billiards/test_teacher.py", "envs/navigation/test_drawing.py", "envs/navigation/test_environment.py"),
     *("envs/navigation/test_episodes.py", "envs/navigation/test_roadmap.py", "envs/navigation/test_worlds.py"),
-    *(
-        "test_asking.py",
-        "test_devices.py",
-        "test_environment.py",
-        "test_evaluate.py",
-        "test_loop.py",
-        "test_policies.py",
-    ),
+    *("test_asking.py", "test_devices.py", "test_environment.py", "test_evaluate.py", "test_loop.py"),
+    *("tasks/test_registry.py", "test_policies.py"),
 )
 
 

@@ -18,8 +18,9 @@ import jax
 from jaxtyping import PRNGKeyArray
 
 from cuelearner_jax import config as configuration
-from cuelearner_jax.errors import UserError
-from cuelearner_jax.records.folders import in_use
+from cuelearner_jax.agent.learning import all_finite
+from cuelearner_jax.errors import NotFinite, UserError
+from cuelearner_jax.records.folders import claimed, in_use
 from cuelearner_jax.records.provenance import provenance
 from cuelearner_jax.terminal import Interrupted, interruptible
 
@@ -111,16 +112,33 @@ def train(
     Raises:
         UserError: bad configuration, or a folder in use; nothing has been changed then.
         Interrupted: Ctrl-C; the newest measured policy is saved.
+        NotFinite: the training diverged; the newest measured policy that was finite is saved.
     """
     check(config)
     if in_use(out):
         raise UserError(f"{out} is not empty: give another --out")
+    with claimed(out):
+        if in_use(out):  # nobody else can change it any more
+            raise UserError(f"{out} is not empty: give another --out")
+        return _trained(robot, config, out, seed, command, tell)
+
+
+def _trained(
+    robot: LocomotionTask, config: LocomotionConfig, out: Path, seed: int, command: str, tell: Callable[[str], None]
+) -> dict[str, Any]:
+    """`train` in a folder that is kept for it."""
     about = {"config": configuration.to_json(config), "seed": seed, **provenance(), "command": command}
     history: list[list[float]] = []
     key = jax.random.key(seed)
     began = time.perf_counter()
 
     def look(steps: int, _: Any, params: Any) -> None:
+        if not all_finite(params):
+            held = "holds the policy of the measurement before" if history and history[-1][0] else "holds no policy"
+            raise NotFinite(
+                f"the walking policy is no longer finite by step {steps:,}, and was not written; {out} {held}: train "
+                "with a smaller --train.learning-rate and another --out"
+            )
         policy = robot.policy(params)
         found = robot.measure(policy, jax.random.fold_in(key, 0), config.measured_robots)
         wall = time.perf_counter() - began

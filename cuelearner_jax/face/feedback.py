@@ -21,6 +21,7 @@ from jaxtyping import Float
 
 from cuelearner_jax import asking
 from cuelearner_jax.actions import DIRECTIONS
+from cuelearner_jax.agent.learning import all_finite
 from cuelearner_jax.config import GuideSizes, Scalars, check_guide
 from cuelearner_jax.environment import Spaces, spaces_of
 from cuelearner_jax.errors import UserError
@@ -74,7 +75,7 @@ def fit_feedback(
         seed: of the network.
 
     Raises:
-        UserError: labels or settings that make no sense.
+        UserError: labels or settings that make no sense, or with which the fit diverges.
     """
     if not isinstance(labels, Labels):
         file = label_files.read(Path(labels))
@@ -93,7 +94,7 @@ def fit_feedback(
     rows = Label(*(jnp.asarray(part) for part in (labels.obs, labels.action, labels.answer[:, None], valid)))
     k_init, k_fit = jax.random.split(jax.random.key(seed))
     fit = jax.jit(lambda key, rows, former, scalars: guidance.fit(key, None, rows, former, scalars))
-    return FeedbackModel(guidance, fit(k_fit, rows, guidance.init(k_init), scalars), scalars, labels)
+    return FeedbackModel(guidance, _finite(fit(k_fit, rows, guidance.init(k_init), scalars)), scalars, labels)
 
 
 def ask(
@@ -122,7 +123,7 @@ def ask(
         seed: of everything random.
 
     Raises:
-        UserError: settings that make no sense.
+        UserError: settings that make no sense, or with which the fit diverges.
     """
     if labels < 1:
         raise UserError(f"labels is {labels}: give at least 1")
@@ -142,7 +143,7 @@ def ask(
         guide = one_round(env, teacher, base, scalars, guide, jnp.asarray(number))
     given = jax.device_get(guide.labels)
     asked = Labels(*(np.asarray(part)[given.valid] for part in (given.obs, given.action, given.answer[:, 0])))
-    return FeedbackModel(guidance, guide.model, scalars, asked)
+    return FeedbackModel(guidance, _finite(guide.model), scalars, asked)
 
 
 def refine(policy: Any, model: FeedbackModel, bound_deg: float | None = None) -> CallablePolicy:
@@ -211,3 +212,10 @@ def _checked(labels: Labels) -> Labels:
     rows = Label(obs, action, answer[:, None], np.ones(len(obs), bool))  # pyright: ignore[reportArgumentType]
     given.check(rows, Spaces(obs.shape[1], DIRECTIONS), RELATIVE)
     return Labels(obs, action, answer)
+
+
+def _finite(model: GuidanceModel) -> GuidanceModel:
+    """A fitted model. Raises UserError if it is not finite."""
+    if not all_finite(model):
+        raise UserError("the fit of the feedback model diverged: lower scalars.feedback_learning_rate")
+    return model

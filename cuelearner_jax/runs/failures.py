@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import jax
+import numpy as np
 import pyarrow as pa
 
-from cuelearner_jax.errors import NotFinite
+from cuelearner_jax.errors import NotFinite, UserError
 from cuelearner_jax.records import results
+from cuelearner_jax.terminal import console
 
 LISTED = 8  # lanes of one kind of guidance and budget that a message names
 
@@ -23,11 +28,7 @@ def told(table: pa.Table) -> dict[tuple[str, int], str]:
     steps: dict[tuple[str, int], list[str]] = {}
     for (guidance, labels, seed), step in results.failures(table).items():
         steps.setdefault((guidance, labels), []).append(f"{seed} (by step {step:,})")
-    return {
-        variant: ("seed " if len(seeds) == 1 else "seeds ")
-        + ", ".join([*seeds[:LISTED], *([f"{len(seeds) - LISTED} more"] if len(seeds) > LISTED else [])])
-        for variant, seeds in steps.items()
-    }
+    return {variant: _listed(seeds) for variant, seeds in steps.items()}
 
 
 def summary(table: pa.Table) -> str:
@@ -37,8 +38,34 @@ def summary(table: pa.Table) -> str:
     return f"{len(failed)} of {results.lanes(table)} lanes failed, no longer finite ({which})" if failed else ""
 
 
-def check(out: Path, kinds: Iterable[str]) -> None:
-    """Raises NotFinite if lanes of a run's kinds of guidance have failed, as its results say."""
-    found = summary(results.read([out / kind for kind in kinds]))
+def without_failed(loaded: Sequence[Any]) -> list[Any]:
+    """Trained lanes (`trained.Lanes`) less those that have failed, which are named on the console.
+
+    Raises UserError if none is left.
+    """
+    left = []
+    for lanes in loaded:
+        failed = np.asarray(lanes.policies["failed"])
+        pairs = sorted(zip(lanes.budgets[failed].tolist(), lanes.seeds[failed].tolist(), strict=True))
+        for budget in sorted({budget for budget, _ in pairs}):
+            seeds = [str(seed) for own, seed in pairs if own == budget]
+            name = variant_name(lanes.guidance.name, budget)
+            console.print(f"{name}: {_listed(seeds)} failed, no longer finite, and left out", markup=False)
+        if not failed.all():
+            kept = jax.tree.map(lambda leaf, failed=failed: leaf[~failed], lanes.policies)
+            left.append(replace(lanes, seeds=lanes.seeds[~failed], budgets=lanes.budgets[~failed], policies=kept))
+    if not left:
+        raise UserError("all of these lanes failed: there is nothing to evaluate; train again with other settings")
+    return left
+
+
+def _listed(seeds: Sequence[str]) -> str:
+    more = [f"{len(seeds) - LISTED} more"] if len(seeds) > LISTED else []
+    return ("seed " if len(seeds) == 1 else "seeds ") + ", ".join([*seeds[:LISTED], *more])
+
+
+def check(out: Path, folders: Iterable[Path]) -> None:
+    """Raises NotFinite if lanes of a run at `out` have failed, as the results in these folders of it say."""
+    found = summary(results.read(list(folders)))
     if found:
         raise NotFinite(f"{found}: their rows in {out} are marked, and reports leave them out; all else is done")

@@ -9,7 +9,7 @@ from statistics import fmean
 import jax
 
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.runs import cluster
+from cuelearner_jax.runs import cluster, failures
 from cuelearner_jax.runs.cluster import Job
 from cuelearner_jax.runs.order import Plan
 from cuelearner_jax.runs.shards import Shard
@@ -58,6 +58,7 @@ def submit(
     Raises:
         UserError: what the sweep or the cluster refuses, before anything is written.
         JobsFailed: some piece did not come to its end (local).
+        NotFinite: all is done, but some lanes stopped being finite.
     """
     jax.config.update("jax_platforms", "cpu")  # the accelerator's memory is for the jobs
     plans = {shard: plan(shard) for shard in (Shard(index, shards) for index in range(1, shards + 1))}
@@ -75,4 +76,6 @@ def submit(
         return
     if pieces:
         cluster.run_locally(pieces, out, job, lambda: fmean(planned.done for planned in plans.values()))
+    orders = [planned.order for planned in plans.values()]
+    failures.check(out, [order.out / kind for order in orders for kind in order.grid.guidance])
     tell(f"done: {out} (see it with: {told})")

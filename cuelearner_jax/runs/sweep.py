@@ -43,4 +43,4 @@ def run(order: Order) -> None:
         prepare_folder(order.out, plan.described, order.overwrite and not order.resume)
         for group in groups:
             Runner(group, examined, order, plan.described, stopping, bars).run(teacher, plan.labels)
-    failures.check(order.out, [group.guidance.name for group in groups])
+    failures.check(order.out, [order.out / group.guidance.name for group in groups])

@@ -18,9 +18,11 @@ from cuelearner_jax.evaluate import Tell, episodes, one_lane, part_of, untold, w
 from cuelearner_jax.guidance import registry as guidances
 from cuelearner_jax.policies import Agent, Corrected, Guided, Heuristic, Policy, Taught, uniform_in
 from cuelearner_jax.records.provenance import provenance
+from cuelearner_jax.runs.failures import without_failed
 from cuelearner_jax.runs.grid import Grid
 from cuelearner_jax.runs.opened import Lanes, Piece, lanes_of, open_run
 from cuelearner_jax.task import Rollout, Task, shape_of
+from cuelearner_jax.terminal import console
 from cuelearner_jax.types import Teacher
 
 
@@ -184,7 +186,7 @@ def evaluate(
         metrics = {metric: np.asarray(value)[None] for metric, value in found.items()}
         return [Measured("-", 0, 0, np.zeros(1, int), metrics)]
     rows = []
-    for lanes in source.load(kinds):
+    for lanes in without_failed(source.load(kinds)):
         policy = named.make(Parts(source.config, env, teacher, lanes))
         tell = watch(lanes.guidance.name)
         if engine:
@@ -217,6 +219,8 @@ def one_policy(
     for lanes in loaded:
         index = np.flatnonzero((lanes.seeds == seed) & (lanes.budgets == budget))
         if len(index):
+            if lanes.policies["failed"][index[0]]:
+                console.print(f"seed {seed} failed, no longer finite: this is its last finite state", markup=False)
             return one_lane(named.make(Parts(source.config, env, teacher, lanes)), int(index[0]))
     raise UserError(
         f"no lane with seed {seed} and {budget} labels: the run has seeds {_listed(seeds)} "

@@ -177,7 +177,7 @@ def _learn(
         while (done := int(state.round)) < config.rounds:
             state, metrics = program.train(env, state, min(ROUNDS_A_STRETCH, config.rounds - done))
             if not metrics["finite"]:
-                raise NotFinite(_diverged(out, saved.latest(), done))
+                raise NotFinite(_diverged(out, saved.latest(), int(state.round)))
             reward, loss, now = float(metrics["reward"]), float(metrics["loss"]), time.perf_counter()
             history.append([int(state.round), round(before + now - started, 1), round(reward, 4), round(loss, 5)])
             bars.update(bar, completed=int(state.round), note=f"reward {reward:.3f} loss {loss:.4f}")
@@ -194,7 +194,7 @@ def _learn(
 def _diverged(out: Path, kept: int | None, done: int) -> str:
     held = "nothing was saved before" if kept is None else f"{out} holds the checkpoint of round {kept}"
     return (
-        f"the teacher is no longer finite after round {done:,}, and was not written; {held}: "
+        f"the teacher is no longer finite by round {done:,}, and was not written; {held}: "
         "train with a smaller --teacher.learning-rate and another --out"
     )
 

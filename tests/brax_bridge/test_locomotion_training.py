@@ -1,7 +1,7 @@
 """Training a walker by brax's PPO on a task that needs no physics: a point is told which velocity to have."""
 
 import json
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +11,8 @@ from small_runs import listing
 
 from cuelearner_jax.brax_bridge import walking as locomotion
 from cuelearner_jax.brax_bridge.walking import LocomotionConfig
-from cuelearner_jax.errors import UserError
+from cuelearner_jax.errors import NotFinite, UserError
+from cuelearner_jax.records.folders import claimed
 
 SMALL = LocomotionConfig(
     steps=20_000,
@@ -39,6 +40,13 @@ class Point(envs.Env):
 
     def step(self, state, action):
         return state.replace(reward=jnp.exp(-10 * jnp.sum(jnp.square(action - state.obs))))
+
+
+class Normaliser(NamedTuple):
+    """Of observations, as brax has it."""
+
+    mean: jax.Array
+    std: jax.Array
 
 
 def error(params):
@@ -106,6 +114,24 @@ def test_a_folder_in_use_is_left_alone(trained):
     with pytest.raises(UserError, match="not empty: give another --out"):
         locomotion.train(walker(), SMALL, out, 0, "again")
     assert listing(out) == before
+
+
+def test_a_folder_that_another_process_writes_in_is_left_alone(tmp_path):
+    with claimed(tmp_path), pytest.raises(UserError, match="is being written by"):
+        locomotion.train(walker(), SMALL, tmp_path, 0, "at the same time")
+
+
+def test_a_policy_that_is_not_finite_is_not_written(tmp_path, monkeypatch):
+    def diverge(robot, config, seed, look):
+        layers = {name: {"kernel": jnp.ones((1, 1)), "bias": jnp.zeros(1)} for name in ("hidden_0", "hidden_1")}
+        for steps, weight in enumerate((1.0, 1.0, jnp.nan)):
+            normaliser = Normaliser(jnp.zeros(1), jnp.ones(1))
+            look(steps, None, [normaliser, {"params": jax.tree.map(lambda leaf, by=weight: leaf * by, layers)}])
+
+    monkeypatch.setattr(locomotion, "_ppo", diverge)
+    with pytest.raises(NotFinite, match=r"by step 2, and was not written; .* holds the policy of the meas"):
+        locomotion.train(walker(), SMALL, tmp_path / "wild", 0, "the command", lambda line: None)
+    assert len(json.loads((tmp_path / "wild" / "policy.json").read_text())["history"]["rows"]) == 2
 
 
 def test_training_that_dies_leaves_the_newest_policy(tmp_path):

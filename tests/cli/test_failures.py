@@ -44,6 +44,9 @@ ARGUMENTS = [
     (["evaluate", "billiards", "--task.table", "one_ball", "--policy", "teacher"], "--task.teacher search"),
     (["teacher", "trian"], "cuelearner teacher train"),
     (["teacher", "train", "billiards", "--teacher.tries", "2"], "at least 4"),
+    (["teacher", "train", "billiards", "--teacher.learning-rate", "nan"], "teacher.learning_rate is nan"),
+    (["teacher", "train", "billiards", "--teacher.tables", "1000000000"], "GB are free: lower --teacher.tables"),
+    (["teacher", "train", "billiards", "--eval-steps", "0"], "--eval-steps is 0"),
 ]
 
 
@@ -83,6 +86,27 @@ def test_a_finished_run_is_resumed_to_no_effect(copy):
     before = listing(copy)
     assert main([*SWEEP, "--out", str(copy), "--resume"]) == 0
     assert listing(copy) == before
+
+
+def test_a_run_that_diverges_ends_with_status_one_and_is_no_success_for_any_command(refused, tmp_path, capsys):
+    command = [
+        *QUICK,
+        "--guidance",
+        "none",
+        "--seeds",
+        "1",
+        "--scalars.learning-rate",
+        "1e9",
+        "--out",
+        tmp_path / "wild",
+    ]
+    for options in ([], ["--resume"]):
+        assert main([*map(str, command), *options]) == 1
+        last = capsys.readouterr().err.strip().splitlines()[-1]
+        assert last.startswith("1 of 1 lanes failed, no longer finite (none: seed 2000 (by step "), last
+    refused(["report", tmp_path / "wild", "--out", tmp_path / "report"], "nothing to report, 1 of 1 lanes", tmp_path)
+    assert main(["evaluate", str(tmp_path / "wild")]) == 2
+    assert "all of these lanes failed" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("command", ["evaluate", "render"])

@@ -25,6 +25,7 @@ TEACHER = cl.teacher_of(WORLD)
 ERROR = 11.7  # of the policy that is to be corrected [deg]
 SIZES = GuideSizes(feedback_layers=(32, 32), fit_steps=200, fit_batch_size=32)
 SCALARS = dataclasses.replace(probes.SCALARS, eps_deg=5.0, tau_deg=0.5, k_max=50)
+WILD = dataclasses.replace(SCALARS, feedback_learning_rate=1e30)
 rng = np.random.default_rng(0)
 ANGLES = rng.integers(0, 4, 200) * (np.pi / 2)
 SEEN = np.stack([np.cos(ANGLES), np.sin(ANGLES)], -1).astype(np.float32)
@@ -148,6 +149,7 @@ NONSENSE = [
     (lambda: cl.fit_feedback(changed(answer=np.ones(7))), r"give observations \(n, obs\)"),
     (lambda: cl.fit_feedback(cl.Labels(SEEN[:1], SEEN[:1], np.ones(1))), "1 labels teach nothing"),
     (lambda: cl.fit_feedback(own_labels(), eps_deg=0.0), "eps_deg is 0.0"),
+    (lambda: cl.fit_feedback(own_labels(), sizes=SIZES, scalars=WILD), "the fit of the feedback model diverged"),
     (lambda: cl.fit_feedback("nowhere.parquet"), "no label file at nowhere.parquet"),
     (lambda: cl.ask(policy, WORLD, TEACHER, labels=0), "labels is 0"),
     (lambda: cl.ask(policy, WORLD, TEACHER, labels=5, bound_deg=200.0), "bound_deg is 200.0"),

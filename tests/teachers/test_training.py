@@ -141,7 +141,7 @@ def test_a_training_that_diverges_stops_and_keeps_what_was_finite(begun):
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(training, "make_program", lambda config: usual._replace(train=poisoned))
-        with pytest.raises(NotFinite, match=r"after round 2, and was not written; .* holds the checkpoint of round 2"):
+        with pytest.raises(NotFinite, match=r"by round 4, and was not written; .* holds the checkpoint of round 2"):
             train(begun, resume=True)
     assert probes.files_of(newest) == before
     assert not (begun / "teacher.json").exists()
