@@ -49,7 +49,7 @@ def run(arguments: list[str]) -> None:
     asked = parse(kind, rest, f"evaluate {source.folder}", default, about(Evaluate, source.task, policies=True))
     source = source.on(asked.robot)
     engine = source.task.engine(asked.engine)
-    source.check(asked.policy, asked.task)
+    source.check(asked.policy, asked.task, guidance=asked.guidance)
     if asked.steps < 1 or asked.envs < 1 or asked.steps % asked.envs:
         raise UserError(f"--steps is {asked.steps}: give a positive multiple of --envs ({asked.envs})")
     if asked.out and asked.out.exists():

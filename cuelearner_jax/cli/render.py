@@ -53,7 +53,7 @@ def run(arguments: list[str]) -> None:
     default = kind(world_of(source, rest), Path("pictures"), policy="agent" if source.grid else "heuristic")
     asked = parse(kind, rest, f"render {source.folder}", default, about(Render, source.task, policies=True))
     source = source.on(asked.robot)
-    source.check(asked.policy, asked.task)
+    source.check(asked.policy, asked.task, guidance=asked.guidance, labels=asked.labels, seed=asked.seed)
     if asked.steps < 1:
         raise UserError(f"--steps is {asked.steps}: give a positive number")
     names = [source.folder.name, asked.robot, asked.scenario, asked.policy]
