@@ -92,7 +92,7 @@ def check(config: LocomotionConfig) -> None:
 
 
 class _Enough(Exception):
-    """The time is over, or Ctrl-C was pressed."""
+    """The time is over, or somebody asked to stop."""
 
 
 def train(
@@ -110,7 +110,7 @@ def train(
 
     Raises:
         UserError: bad configuration, or a folder in use; nothing has been changed then.
-        Interrupted: Ctrl-C; the newest measured policy is saved.
+        Interrupted: Ctrl-C or SIGTERM; the newest measured policy is saved.
     """
     check(config)
     if in_use(out):
@@ -132,16 +132,19 @@ def train(
         if steps:  # what is still untrained is not worth keeping
             told = {"columns": list(COLUMNS), "rows": history}
             robot.save(out, jax.device_get(policy), {**about, "finished": False, "history": told})
-        if stopping.is_set() or (config.seconds and wall > config.seconds):
+        if stopping.is_set() or (steps and config.seconds and wall > config.seconds):
             raise _Enough
 
     tell(f"{jax.devices()[0].device_kind}: compiling takes a minute or so")
-    with interruptible() as stopping:
+    with interruptible("the next measurement") as stopping:
         try:
             _ppo(robot, config, seed, look)
         except _Enough:
             if stopping.is_set():
-                raise Interrupted(f"stopped; {out} holds the policy of the last measurement") from None
+                learned = (
+                    f"{out} holds the policy of the last measurement" if history[-1][0] else "nothing was learned yet"
+                )
+                raise Interrupted(f"stopped; {learned}") from None
     trained = time.perf_counter() - began
     figures = _examined(robot, robot.load(out), jax.random.fold_in(key, 1), config.measured_robots, tell)
     about |= {

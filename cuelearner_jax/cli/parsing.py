@@ -18,10 +18,20 @@ from cuelearner_jax.runs import grid as runs
 from cuelearner_jax.runs.trained import POLICIES, PolicySource
 from cuelearner_jax.task import Preset, Task
 from cuelearner_jax.tasks import registry
+from cuelearner_jax.terminal import PLAIN
 
 HELP = ("-h", "--help")
 
-out = Console(highlight=False, soft_wrap=True)
+
+class _Output(Console):
+    """Standard output."""
+
+    def on_broken_pipe(self) -> None:
+        """Raises BrokenPipeError: nobody reads what the command was to tell."""
+        raise BrokenPipeError
+
+
+out = _Output(**PLAIN)
 
 
 def summary(kind: type) -> str:

@@ -22,6 +22,7 @@ import jax.numpy as jnp
 import orbax.checkpoint as ocp
 
 from cuelearner_jax.errors import UserError
+from cuelearner_jax.signals import saving
 
 KEPT = 2  # the newest checkpoints of a run
 SETTLING_S = 0.2  # within which reads that are under way come to their end [s]
@@ -114,8 +115,9 @@ class Checkpoints:
         if shutil.disk_usage(self._folder).free < needed + ROOM_LEFT:
             raise OSError(errno.ENOSPC, f"{needed / 1e6:.0f} MB are needed", str(self._folder))
         args = {name: ocp.args.StandardSave(_flat(item)) for name, item in items.items()}
-        self._manager.save(number, args=ocp.args.Composite(**args))
-        self._manager.wait_until_finished()
+        with saving():
+            self._manager.save(number, args=ocp.args.Composite(**args))
+            self._manager.wait_until_finished()
 
     def restore(self, like: dict[str, Any]) -> dict[str, Any]:
         """The newest checkpoint's items named in `like` (trees of arrays or shapes), onto the default device.

@@ -19,7 +19,7 @@ def run(order: Order) -> None:
 
     Raises:
         UserError: bad configuration, a folder in use, too little memory; nothing has been changed then.
-        Interrupted: Ctrl-C; everything is saved.
+        Interrupted: Ctrl-C or SIGTERM; everything is saved.
     """
     plan = planned(order)
     order = plan.order
