@@ -18,7 +18,7 @@ os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
 
 from cuelearner_jax import __version__
 from cuelearner_jax.cli.parsing import HELP, summary
-from cuelearner_jax.errors import UserError, closest, no_space
+from cuelearner_jax.errors import UserError, blamed, closest
 from cuelearner_jax.runs.cluster import JobsFailed
 from cuelearner_jax.tasks import registry
 from cuelearner_jax.terminal import Interrupted, abandon, console
@@ -45,9 +45,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         abandon(sys.stdout)
         return 141
     except Exception as error:
-        if not no_space(error):
+        told = blamed(error)
+        if told is None:
             raise
-        console.print("error: the disk is full: free some, then go on with the same command and --resume")
+        console.print(f"error: {told}")
         return 1
     except KeyboardInterrupt:  # of a process that does more than this command: see `signals`
         console.print("stopped at once; what was saved before is safe")
@@ -55,6 +56,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _dispatch(arguments: list[str]) -> int:
+    for argument in arguments:
+        if not argument.isascii() and argument != argument.encode(errors="replace").decode():
+            raise UserError(f"{argument!r} is not encoded as UTF-8: results could not name it")
     if not arguments or arguments[0] in HELP:
         _overview()
         return 0 if arguments else 2

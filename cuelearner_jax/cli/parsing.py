@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import inspect
 import io
+import os
 import re
 from pathlib import Path
 from typing import Any
@@ -40,7 +41,7 @@ def summary(kind: type) -> str:
 
 
 def parse(kind: Any, arguments: list[str], program: str, default: Any = None, about: str | None = None) -> Any:
-    """Arguments as a dataclass. Raises UserError with tyro's message in one line.
+    """Arguments as a dataclass. Raises UserError with tyro's message in one line, or for an `out` that cannot be.
 
     Args:
         kind: the dataclass.
@@ -51,9 +52,10 @@ def parse(kind: Any, arguments: list[str], program: str, default: Any = None, ab
     """
     errors = io.StringIO()
     keywords = {} if default is None else {"default": default}
+    _check_given(arguments)
     try:
         with contextlib.redirect_stderr(errors):
-            return tyro.cli(kind, args=arguments, prog=f"cuelearner {program}", description=about, **keywords)
+            asked = tyro.cli(kind, args=arguments, prog=f"cuelearner {program}", description=about, **keywords)
     except SystemExit as stop:
         if not stop.code:
             raise
@@ -63,6 +65,39 @@ def parse(kind: Any, arguments: list[str], program: str, default: Any = None, ab
         told = told.replace("Perhaps you meant:", "; perhaps you meant")
         told = re.sub(r"\s+", " ", told).replace(" ;", ";")[:400]
         raise UserError(f"{told}; see cuelearner {program} --help") from None
+    for part in (asked, *vars(asked).values()):
+        if isinstance(place := getattr(part, "out", None), Path):
+            check_out(place)
+    return asked
+
+
+def _check_given(arguments: list[str]) -> None:
+    """Raises UserError for an option that is given an empty value, as an unset variable of the shell makes it."""
+    for before, argument in zip(["", *arguments], arguments, strict=False):
+        option, equals, value = argument.partition("=")
+        if argument == "" or (equals and option.startswith("--") and not value):
+            name = option or (before if before.startswith("--") else "an argument")
+            raise UserError(f"{name} is empty: give it a value, or leave it out")
+
+
+def check_out(place: Path) -> None:
+    """Raises UserError unless a file or folder is at a place or can be made there; nothing is made."""
+    for there in (place, *place.absolute().parents):
+        try:
+            there.stat()
+        except FileNotFoundError:
+            if not there.is_symlink():
+                continue
+            raise UserError(f"{there} is a link to nothing: give another --out") from None
+        except NotADirectoryError:
+            continue
+        except OSError as error:
+            raise UserError(f"{place}: {error.strerror}: give another --out") from None
+        if there != place and not there.is_dir():
+            raise UserError(f"{there} is a file, so nothing can lie below it: give another --out")
+        if not os.access(there, os.W_OK | (os.X_OK if there.is_dir() else 0)):
+            raise UserError(f"{there} may not be written to: give another --out, or have its permissions changed")
+        return
 
 
 def taken(arguments: list[str], option: str, choices: str) -> tuple[str | None, list[str]]:
