@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import inspect
 import io
 import os
 import re
+import stat
+import tempfile
 from pathlib import Path
 from typing import Any
 
 import tyro
 from rich.console import Console
 
-from cuelearner_jax.errors import UserError, closest
+from cuelearner_jax.errors import UserError, closest, no_space
 from cuelearner_jax.guidance import registry as guidances
 from cuelearner_jax.runs import grid as runs
 from cuelearner_jax.runs.trained import POLICIES, PolicySource
@@ -67,7 +70,8 @@ def parse(kind: Any, arguments: list[str], program: str, default: Any = None, ab
         raise UserError(f"{told}; see cuelearner {program} --help") from None
     for part in (asked, *vars(asked).values()):
         if isinstance(place := getattr(part, "out", None), Path):
-            check_out(place)
+            default = next(entry.default for entry in dataclasses.fields(part) if entry.name == "out")
+            check_out(place, folder=default is not None)  # what may be left out is a file
     return asked
 
 
@@ -80,24 +84,34 @@ def _check_given(arguments: list[str]) -> None:
             raise UserError(f"{name} is empty: give it a value, or leave it out")
 
 
-def check_out(place: Path) -> None:
-    """Raises UserError unless a file or folder is at a place or can be made there; nothing is made."""
-    for there in (place, *place.absolute().parents):
+def check_out(place: Path, folder: bool = True) -> None:
+    """Raises UserError unless a folder (or else a file) is at a place or can be made there; nothing is left there."""
+    place = Path(os.path.normpath(place.absolute()))
+    for there in (place, *place.parents):
         try:
-            there.stat()
-        except FileNotFoundError:
+            kept = there.stat()
+        except (FileNotFoundError, NotADirectoryError):
             if not there.is_symlink():
                 continue
             raise UserError(f"{there} is a link to nothing: give another --out") from None
-        except NotADirectoryError:
-            continue
         except OSError as error:
             raise UserError(f"{place}: {error.strerror}: give another --out") from None
-        if there != place and not there.is_dir():
-            raise UserError(f"{there} is a file, so nothing can lie below it: give another --out")
-        if not os.access(there, os.W_OK | (os.X_OK if there.is_dir() else 0)):
+        if (folder or there != place) and not stat.S_ISDIR(kept.st_mode):
+            raise UserError(f"{there} is no folder: give another --out")
+        if there == place and not os.access(there, os.W_OK):
             raise UserError(f"{there} may not be written to: give another --out, or have its permissions changed")
+        if there != place:
+            _try_folder(there)
         return
+
+
+def _try_folder(there: Path) -> None:
+    """Raises UserError unless something can be made in a folder, which permissions alone do not tell."""
+    try:
+        os.rmdir(tempfile.mkdtemp(prefix=".cuelearner-", dir=there))
+    except OSError as error:
+        if not no_space(error):
+            raise UserError(f"nothing can be made in {there} ({error.strerror}): give another --out") from None
 
 
 def taken(arguments: list[str], option: str, choices: str) -> tuple[str | None, list[str]]:

@@ -53,6 +53,35 @@ def test_bad_arguments_are_refused(refused, tmp_path, command, says):
     assert not (tmp_path / "new").exists()
 
 
+WITH_OUT = [
+    QUICK,
+    [*QUICK, "--cluster", "local", "--shards", "2"],
+    ["train", "billiards"],
+    ["teacher", "train", "billiards"],
+    ["locomotion", "train"],
+    ["locomotion", "evaluate"],
+    ["evaluate", "billiards"],
+    ["render", "billiards"],
+    ["report", "docs/data/navigation"],
+    ["bench"],
+]
+
+
+@pytest.mark.parametrize("command", WITH_OUT, ids=[" ".join(c[:2] + c[-2:-1]) for c in WITH_OUT])
+def test_an_out_that_cannot_be_is_refused_before_any_work(refused, tmp_path, command):
+    (tmp_path / "file").write_text("mine")
+    (tmp_path / "link").symlink_to("nowhere")
+    for out in (tmp_path / "file" / "run", tmp_path / "new" / ".." / "file" / "run"):
+        refused([*command, "--out", out], "file is no folder: give another --out", tmp_path)
+    refused([*command, "--out", tmp_path / "link"], "is a link to nothing", tmp_path)
+    refused([*command, "--out", tmp_path / ("x" * 300)], "File name too long", tmp_path)
+    refused([*command, "--out", "/proc/run"], "nothing can be made in /proc", tmp_path)
+    refused([*command, "--out", ""], "--out is empty", tmp_path)
+    refused([*command, "--out="], "--out is empty", tmp_path)
+    refused([*command, "--out", tmp_path / "\udcff"], "not encoded as UTF-8", tmp_path)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "link"]
+
+
 def test_a_folder_in_use_is_left_alone(refused, run_folder, tmp_path):
     refused([*SWEEP, "--out", run_folder], "--resume to go on, --overwrite", run_folder)
     (tmp_path / "thesis.txt").write_text("mine")
@@ -142,6 +171,7 @@ def test_reports_that_cannot_be_made_are_refused(refused, copy, tmp_path):
     out = ["--out", tmp_path / "report"]
     refused(["report", tmp_path / "nowhere", *out], "does not exist", tmp_path)
     refused(["report", empty, *out], "no results", tmp_path)
+    refused(["report", *out], "no folder to report on", tmp_path)
     refused(["report", copy, "--metric", "success", *out], "success", tmp_path)
     assert main(["report", str(copy), "--out", str(tmp_path / "report")]) == 0
     refused(["report", copy, *out], "overwrite", tmp_path)
