@@ -79,6 +79,7 @@ class Task:
     teacher: Callable[[Any, Any], Teacher] | None = None  # (configuration, environment); None: nobody answers
     presets: dict[str, Preset] = field(default_factory=dict)
     scenarios: dict[str, Scenario] = field(default_factory=dict)
+    labels_hold: tuple[str, ...] = ()  # fields of the configuration that labels of another world may differ in
     origin: str = ""  # "package.module:name" where it was taken from outside, by whoever resolved that
 
     def __post_init__(self) -> None:
@@ -93,6 +94,8 @@ class Task:
         names = [body.name for body in self.bodies]
         if not names or len(set(names)) < len(names):
             raise ValueError(f"task {self.name}: it needs at least one body, each of another name, not {names}")
+        if unknown := sorted(set(self.labels_hold) - fields):
+            raise ValueError(f"task {self.name}: labels_hold names {unknown[0]!r}, no field of {self.config.__name__}")
         for name, preset in self.presets.items():
             if not isinstance(preset.config.task, self.config):
                 kind = type(preset.config.task).__name__

@@ -15,7 +15,7 @@ import numpy as np
 from flax import struct
 
 from cuelearner_jax.actions import difference, evenly_spaced, from_angle, rotate
-from cuelearner_jax.config import RunConfig, Scalars, Schedule, Sizes
+from cuelearner_jax.config import RunConfig, Scalars, Schedule, Sizes, digest
 from cuelearner_jax.environment import Quantity, WholeObservations
 from cuelearner_jax.guidance import registry as guidances
 from cuelearner_jax.loop import make_program
@@ -210,15 +210,20 @@ def words(leaf):
 
 
 def files_of(folder):
-    """Every file at or below a folder with its bytes and time: equal before and after if nothing was changed."""
+    """Every file at or below a folder with its bytes and time: equal before and after if nothing was changed.
+
+    The mark of the process that wrote last is left out.
+    """
     return {
         path.relative_to(folder): (path.stat().st_mtime_ns, path.read_bytes() if path.is_file() else None)
         for path in sorted(folder.rglob("*"))
+        if path.name != ".lock"
     }
 
 
 def edit_json(path, change):
-    """Rewrites a JSON file by a function of its values."""
+    """Rewrites a JSON file by a function of its values; one with a digest gets that of the new ones."""
     values = json.loads(path.read_text())
+    sealed = values.pop("digest", None) is not None
     change(values)
-    path.write_text(json.dumps(values))
+    path.write_text(json.dumps({**values, "digest": digest(values)} if sealed else values))

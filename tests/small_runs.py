@@ -14,6 +14,10 @@ SWEEP += ["--guidance", "none", "relative"]
 
 
 def listing(folder: Path) -> dict[str, tuple[int, int]]:
-    """Every file below a folder with its size and time of change."""
-    files = [path for path in sorted(folder.rglob("*")) if path.is_file()] if folder.exists() else []
+    """Every file below a folder with its size and time of change, but for the mark of who wrote last."""
+    files = (
+        [path for path in sorted(folder.rglob("*")) if path.is_file() and path.name != ".lock"]
+        if folder.exists()
+        else []
+    )
     return {str(path): (path.stat().st_size, path.stat().st_mtime_ns) for path in files}

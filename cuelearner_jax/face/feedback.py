@@ -26,7 +26,7 @@ from cuelearner_jax.environment import Spaces, spaces_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.face.acting import CallablePolicy, as_policy
 from cuelearner_jax.face.worlds import World
-from cuelearner_jax.guidance import registry
+from cuelearner_jax.guidance import given, registry
 from cuelearner_jax.guidance.answers import RELATIVE
 from cuelearner_jax.guidance.bundle import Guidance
 from cuelearner_jax.guidance.relative import KIND
@@ -35,8 +35,6 @@ from cuelearner_jax.records import label_files
 from cuelearner_jax.types import GuidanceModel, Label, Teacher
 
 REACH_QUANTILE = 0.95  # of the distances between labelled actions and a policy's own: how far labels reach from it
-ANSWERS = (-1.0, 0.0, 1.0)
-UNIT_ERROR = 1e-3  # of an action's length
 SIZES = GuideSizes(feedback_layers=(128, 128), fit_steps=400, fit_batch_size=64)  # seconds a fit on a CPU
 
 
@@ -210,11 +208,6 @@ def _checked(labels: Labels) -> Labels:
         )
     if len(obs) < 2:
         raise UserError(f"{len(obs)} labels teach nothing: give more")
-    for name, rows in (("observations", obs), ("actions", action), ("answers", answer)):
-        if not np.isfinite(rows).all():
-            raise UserError(f"the labels' {name} hold numbers that are not finite")
-    if np.abs(np.linalg.norm(action, axis=-1) - 1.0).max() > UNIT_ERROR:
-        raise UserError("the labels' actions are no unit vectors: divide each by its length")
-    if not np.isin(answer, ANSWERS).all():
-        raise UserError("an answer is -1 (turn clockwise), 0 (already right) or 1 (turn counterclockwise)")
+    rows = Label(obs, action, answer[:, None], np.ones(len(obs), bool))  # pyright: ignore[reportArgumentType]
+    given.check(rows, Spaces(obs.shape[1], DIRECTIONS), RELATIVE)
     return Labels(obs, action, answer)

@@ -56,4 +56,5 @@ RELATIVE = AnswerForm(
     width=1,
     meaning="h: +1 turn it counterclockwise, 0 already right, -1 turn it clockwise, by eps",
     answer=relative_answer,
+    values=(-1.0, 0.0, 1.0),
 )

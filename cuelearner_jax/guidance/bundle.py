@@ -38,6 +38,7 @@ class AnswerForm(NamedTuple):
     width: int  # entries of an answer
     meaning: str  # of an entry, in a few words
     answer: AnswerFunction
+    values: tuple[float, ...] | None = None  # that an entry may have; None: any finite number
 
 
 @runtime_checkable

@@ -1,24 +1,28 @@
 """Checkpoints: the only file that knows Orbax.
 
 A checkpoint holds three items: `policy` (what acting needs, so that evaluation never reads a replay buffer), `rest` and
-`clock`. Orbax writes to a temporary folder and renames it, so a kill leaves the last complete checkpoint in place.
+`clock`; and the `digests` of their arrays: Orbax would read many a changed bit without a word. Older ones have none.
+Orbax writes to a temporary folder and renames it, so a kill leaves the last complete checkpoint in place.
 """
 
 from __future__ import annotations
 
 import errno
 import gc
+import hashlib
 import logging
 import shutil
 import sys
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import orbax.checkpoint as ocp
 
 from cuelearner_jax.errors import UserError
@@ -59,13 +63,41 @@ def _unflat(flat: dict[str, Any], like: Any) -> Any:
     return jax.tree_util.tree_map_with_path(leaf, like)
 
 
+def _digest(leaf: Any) -> str:
+    """SHA-256 of an array's shape, type and values, however it is cut among devices (along its first axis)."""
+    found = hashlib.sha256(f"{leaf.shape} {leaf.dtype}".encode())
+    pieces = {}
+    for shard in leaf.addressable_shards if isinstance(leaf, jax.Array) else ():
+        first = shard.index[0].start or 0 if shard.index else 0
+        pieces[first] = shard.data
+    for _, piece in sorted(pieces.items()) or [(0, leaf)]:
+        found.update(np.ascontiguousarray(piece).data)
+    return found.hexdigest()
+
+
+def _digests(flat: dict[str, Any]) -> dict[str, str]:
+    """Those of an item's leaves."""
+    with ThreadPoolExecutor() as pool:  # hashing lets other threads run
+        return dict(zip(flat, pool.map(_digest, flat.values()), strict=True))
+
+
 # What is said of a checkpoint that cannot be read.
 OTHERS = "it is of another configuration, or of another version of the program: go on with that one, or start anew"
 DAMAGED = "it is damaged; delete its folder to go back to the checkpoint before, or start the run anew"
+FORBIDDEN = "check the permissions of its files, nothing was changed"
+DIGESTS = "digests"
 
 
 class _OfAnother(ValueError):
     """A checkpoint holds other leaves, or of other shapes, than are wanted."""
+
+
+def _forbidden(error: BaseException | None) -> bool:
+    """Does an exception, or what it came from, say that a file may not be read? TensorStore says so in words alone."""
+    if error is None:
+        return False
+    told = isinstance(error, PermissionError) or "PERMISSION_DENIED" in str(error) or "Permission denied" in str(error)
+    return told or _forbidden(error.__cause__ or error.__context__)
 
 
 def _compare(stored: dict[str, Any], wanted: dict[str, jax.ShapeDtypeStruct]) -> None:
@@ -114,7 +146,9 @@ class Checkpoints:
         needed = sum(leaf.nbytes for leaf in jax.tree.leaves(items) if hasattr(leaf, "nbytes"))
         if shutil.disk_usage(self._folder).free < needed + ROOM_LEFT:
             raise OSError(errno.ENOSPC, f"{needed / 1e6:.0f} MB are needed", str(self._folder))
-        args = {name: ocp.args.StandardSave(_flat(item)) for name, item in items.items()}
+        flat = {name: _flat(item) for name, item in items.items()}
+        args: dict[str, Any] = {name: ocp.args.StandardSave(item) for name, item in flat.items()}
+        args[DIGESTS] = ocp.args.JsonSave({name: _digests(item) for name, item in flat.items()})
         with saving():
             self._manager.save(number, args=ocp.args.Composite(**args))
             self._manager.wait_until_finished()
@@ -140,18 +174,27 @@ class Checkpoints:
             folder, reader = self._manager.directory / str(number), ocp.StandardCheckpointHandler()
             for name, item in wanted.items():
                 _compare(reader.metadata(folder / name).tree, item)
-            restored = self._manager.restore(
-                number,
-                args=ocp.args.Composite(**{name: ocp.args.StandardRestore(item) for name, item in wanted.items()}),
-            )
+            args: dict[str, Any] = {name: ocp.args.StandardRestore(item) for name, item in wanted.items()}
+            if (folder / DIGESTS).exists():
+                args[DIGESTS] = ocp.args.JsonRestore()
+            restored = self._manager.restore(number, args=ocp.args.Composite(**args))
+            if DIGESTS in args:
+                self._verify({name: restored[name] for name in like}, restored[DIGESTS])
             return {name: _unflat(restored[name], like[name]) for name in like}
         except Exception as error:  # Orbax and TensorStore raise many kinds for one cause: the files do not fit
             reason = str(error).strip().splitlines()[0][:160] if str(error).strip() else type(error).__name__
-            other = isinstance(error, _OfAnother)
+            remedy = OTHERS if isinstance(error, _OfAnother) else FORBIDDEN if _forbidden(error) else DAMAGED
         _collect_quietly()
-        raise UserError(
-            f"checkpoint {number} in {self._folder} cannot be read ({reason}): {OTHERS if other else DAMAGED}"
-        )
+        raise UserError(f"checkpoint {number} in {self._folder} cannot be read ({reason}): {remedy}")
+
+    @staticmethod
+    def _verify(restored: dict[str, dict[str, Any]], digests: dict[str, dict[str, str]]) -> None:
+        """Raises ValueError unless items hold what was written."""
+        for name, item in restored.items():
+            told = digests[name]
+            changed = [path for path, found in _digests(item).items() if told[path] != found]
+            if changed:
+                raise ValueError(f"{name}{changed[0]} is not what was written")
 
     def close(self) -> None:
         """Releases Orbax's threads."""

@@ -3,7 +3,7 @@
 Folder of a run:
 
     config.json                  everything that determines the results
-    .lock                        held by the process that writes here
+    .lock                        held by the process that writes here, and says which
     <guidance>/checkpoints/      the newest states
     <guidance>/labels.parquet    what the teacher answered
     <guidance>/results.jsonl     one row a seed and evaluation; results.parquet once done
@@ -12,9 +12,9 @@ Folder of a run:
 from __future__ import annotations
 
 import fcntl
-import json
 import os
 import shutil
+import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -22,13 +22,16 @@ from typing import Any
 
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.records import formats
+from cuelearner_jax.records.whole import TEMPORARY
 
-LOCK = ".lock"  # says which process writes in a run's folder; left behind empty
+CONFIG = "config.json"
+LOCK = ".lock"  # held by the process that writes in a run's folder, and says which; it stays behind
+LEFT = (LOCK, CONFIG + TEMPORARY, "config.tmp")  # what a process leaves that ended before its first word
 
 
 def in_use(out: Path) -> bool:
     """Is there anything at `out`, the mark of a process that writes there apart?"""
-    return out.exists() and (not out.is_dir() or any(entry.name != LOCK for entry in out.iterdir()))
+    return out.exists() and (not out.is_dir() or any(entry.name not in LEFT for entry in out.iterdir()))
 
 
 def check_folder(out: Path, described: dict[str, Any], resume: bool, overwrite: bool) -> None:
@@ -36,11 +39,11 @@ def check_folder(out: Path, described: dict[str, Any], resume: bool, overwrite: 
     if resume and overwrite:
         raise UserError("--resume continues a run and --overwrite deletes it: give one of them")
     used = in_use(out)
-    ours = (out / "config.json").is_file()
+    ours = (out / CONFIG).is_file()
     if resume:
         if not ours:
             raise UserError(f"nothing to resume in {out}: give the --out of an interrupted run, or leave out --resume")
-        differing = sorted(_differences(formats.read("config", out / "config.json"), described))
+        differing = sorted(differences(formats.read("config", out / CONFIG), described))
         if differing:
             raise UserError(
                 f"{out} was run with another {', '.join(differing[:4])}: give the same options, or another --out"
@@ -51,13 +54,14 @@ def check_folder(out: Path, described: dict[str, Any], resume: bool, overwrite: 
         raise UserError(f"{out} is not a run folder, so --overwrite will not delete it: give another --out")
 
 
-def _differences(before: dict[str, Any], now: dict[str, Any], prefix: str = "") -> Iterator[str]:
+def differences(before: dict[str, Any], now: dict[str, Any], prefix: str = "") -> Iterator[str]:
+    """The names, as `part.field`, in which two descriptions of runs differ."""
     for name in {**before, **now}:
         if f"{prefix}{name}" == "task.from":  # where a task's code lies changes nothing in it
             continue
         old, new = before.get(name), now.get(name)
         if isinstance(old, dict) and isinstance(new, dict):
-            yield from _differences(old, new, f"{prefix}{name}.")
+            yield from differences(old, new, f"{prefix}{name}.")
         elif old != new:
             yield prefix + name
 
@@ -66,7 +70,8 @@ def _differences(before: dict[str, Any], now: dict[str, Any], prefix: str = "") 
 def claimed(out: Path) -> Iterator[None]:
     """Makes a run's folder and keeps it for this process alone; it is free again however the process ends.
 
-    The lock is on a file, not on the folder: that is what NFS passes on between machines.
+    The lock is on a file, not on the folder: that is what NFS passes on between machines. Whatever was found in the
+    folder before may have changed until it is kept: look again.
 
     Raises UserError if another process has it.
     """
@@ -76,21 +81,38 @@ def claimed(out: Path) -> Iterator[None]:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         os.close(descriptor)
-        raise UserError(f"{out} is being written by another process: wait for it, or give another --out") from None
+        by = f" ({found})" if (found := holder(out)) else ""
+        raise UserError(f"{out} is being written by another process{by}: wait for it, or give another --out") from None
     try:
+        os.ftruncate(descriptor, 0)
+        os.write(descriptor, f"process {os.getpid()} on {socket.gethostname()}".encode())
         yield
     finally:
+        os.ftruncate(descriptor, 0)
         os.close(descriptor)
 
 
+def holder(out: Path) -> str | None:
+    """Who keeps a folder, as "process N on MACHINE"; None: nobody, or nobody knows."""
+    try:
+        with (out / LOCK).open("rb") as file:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return (out / LOCK).read_text(encoding="utf-8", errors="replace") or None
+    except OSError:
+        pass
+    return None
+
+
 def prepare_folder(out: Path, described: dict[str, Any], clean: bool) -> None:
-    """Makes the folder and writes config.json, if it is not there; with `clean`, nothing else is left in it."""
+    """Makes the folder and writes config.json, if it is not there; with `clean`, nothing else is left in it.
+
+    Links are removed, what they lead to stays. config.json goes last: without it nothing here could be overwritten.
+    """
     out.mkdir(parents=True, exist_ok=True)
-    for entry in out.iterdir() if clean else ():
+    for entry in sorted(out.iterdir(), key=lambda entry: entry.name == CONFIG) if clean else ():
         if entry.name == LOCK:
             continue
-        shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
-    if not (out / "config.json").exists():
-        temporary = out / "config.tmp"  # in one step, so that a crash leaves no half of it
-        temporary.write_text(json.dumps(described, indent=1) + "\n")
-        temporary.replace(out / "config.json")
+        shutil.rmtree(entry) if entry.is_dir() and not entry.is_symlink() else entry.unlink()
+    if not (out / CONFIG).exists():
+        formats.write("config", out / CONFIG, described)

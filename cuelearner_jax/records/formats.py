@@ -8,6 +8,8 @@
 
 A file tells its number under `format`; one without a number is of format 0. A change of what is written raises the
 number here and adds a step that leads there from the number before; readers know the current format only.
+
+A JSON file carries a digest of its values, and is not read if they are others: a changed bit is no configuration.
 """
 
 from __future__ import annotations
@@ -19,9 +21,13 @@ from typing import Any
 
 import numpy as np
 
+from cuelearner_jax import config as configuration
 from cuelearner_jax.errors import UserError
+from cuelearner_jax.records.whole import replacing, unreadable
 
-FORMATS = {"config": 1, "labels": 1, "teacher": 1}
+DIGEST = "digest"  # the name under which a JSON file holds the digest of its other values
+FORMATS = {"config": 2, "labels": 1, "teacher": 2}
+SEALED_SINCE = 2  # the format from which on a JSON file must carry a digest
 REMEDIES = {  # what a message says of a damaged file, after its path
     "config": "is damaged or of another program: restore it, or start anew with --overwrite",
     "labels": "is not a label file of cuelearner, or it is damaged: restore it, or write it anew",
@@ -37,12 +43,30 @@ def damaged(kind: str, path: Path) -> UserError:
 
 
 def read(kind: str, path: Path) -> Values:
-    """A JSON file in the current format of its kind. Raises UserError if it is damaged or newer than this program."""
+    """A JSON file in the current format of its kind, without its digest.
+
+    Raises:
+        UserError: it cannot be read, is damaged, was changed since it was written, or is newer than this program.
+    """
     try:
         values = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+    except OSError as error:
+        raise unreadable(path, error) from error
+    except (ValueError, RecursionError) as error:
         raise damaged(kind, path) from error
+    if isinstance(values, dict):
+        number, told = values.get("format", 0), values.pop(DIGEST, None)
+        sealed = isinstance(number, int) and number >= SEALED_SINCE
+        if (sealed or told is not None) and told != configuration.digest(values):
+            raise damaged(kind, path)
     return upgrade(kind, values, path)
+
+
+def write(kind: str, path: Path, values: Values) -> None:
+    """Writes a JSON file of the current format with its digest, replacing `path` in one step."""
+    values = json.loads(json.dumps({**values, "format": FORMATS[kind]}))
+    with replacing(path) as file:
+        file.write(json.dumps({**values, DIGEST: configuration.digest(values)}, indent=1) + "\n")
 
 
 def upgrade(kind: str, values: Any, path: Path) -> Values:
@@ -77,6 +101,14 @@ def _only_numbered(values: Values) -> Values:
     return values
 
 
+def _pieces_with_seeds(values: Values) -> Values:
+    """A piece of a sweep told its number and the count; now the seeds of all pieces too, which are not known here."""
+    if "shard" not in values:
+        return values
+    index, count = values["shard"]
+    return {**values, "shard": {"index": index, "count": count, "seeds": None}}
+
+
 def _answers_of_targets(values: Values) -> Values:
     """Labels held what the model of relative feedback was to predict, rotate(action, h * eps) - action; now h."""
     kept = {name: value for name, value in values.items() if name not in ("guidance", "columns")}
@@ -97,6 +129,8 @@ def _answers_of_targets(values: Values) -> Values:
 
 STEPS: dict[tuple[str, int], Callable[[Values], Values]] = {
     ("config", 0): _only_numbered,
+    ("config", 1): _pieces_with_seeds,
     ("labels", 0): _answers_of_targets,
     ("teacher", 0): _only_numbered,
+    ("teacher", 1): _only_numbered,
 }

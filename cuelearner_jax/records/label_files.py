@@ -33,7 +33,6 @@ SCHEMA = tables.Schema(
     required=("seed", "obs", "action"),
     integers=("seed",),
     lists=("obs", "action", "answer", "target"),  # target: of files of format 0, in place of the answer
-    checksums=True,  # a label is a person's work: damage is to be noticed
     remedy=formats.REMEDIES["labels"],
 )
 JSONL, PARQUET = SCHEMA.jsonl, SCHEMA.parquet
@@ -173,6 +172,15 @@ def read(path: Path) -> LabelFile:
         return LabelFile(*named, None if eps is None else float(eps), columns["seed"], labels)
     except (KeyError, TypeError, ValueError) as error:
         raise formats.damaged("labels", path) from error
+
+
+def readable(path: Path) -> bool:
+    """Is there a label file that is whole?"""
+    try:
+        read(path)
+    except UserError:
+        return False
+    return True
 
 
 def digest(path: Path) -> str:

@@ -23,9 +23,11 @@ it, until the next such line (a run resumed on other hardware adds one). In Parq
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
@@ -39,7 +41,7 @@ SCHEMA = tables.Schema(
     required=("run", "task", "guidance", "labels", "seed", "step", "split", "config_hash"),
     strings=("run", "task", "guidance", "split", "config_hash", "commit", "versions", "hardware", "command"),
     integers=("labels", "seed", "step"),
-    remedy="is corrupt: restore it or run again",
+    remedy="is damaged: restore it, or delete its folder and give --resume, which trains these lanes anew",
 )
 JSONL, PARQUET = SCHEMA.jsonl, SCHEMA.parquet
 
@@ -88,6 +90,37 @@ def finish(folder: PathLike) -> Path:
         UserError: if there is no table, a run without an evaluation, or it cannot be read.
     """
     return tables.finish(folder, SCHEMA)
+
+
+def check_complete(folder: Path, seeds: np.ndarray, budgets: np.ndarray, steps: Sequence[int]) -> None:
+    """Whether a table has one row of each lane at each of the steps; other steps are not looked at.
+
+    Args:
+        folder: folder of the run.
+        seeds: of the lanes, (lanes,).
+        budgets: their label budgets, (lanes,).
+        steps: at which each was evaluated.
+
+    Raises:
+        UserError: rows are missing or there more than once, there is no table, or it cannot be read.
+    """
+    path = next((folder / name for name in (PARQUET, JSONL) if (folder / name).exists()), folder / JSONL)
+    found: Counter[tuple[int, int, int]] = Counter()
+    if path.exists():
+        table = tables.read(path, SCHEMA)
+        if table.num_rows:
+            table = table.filter(pc.field("step").isin(list(steps)))
+            found.update(zip(*(table[name].to_pylist() for name in ("seed", "labels", "step")), strict=True))
+    lanes = [(int(seed), int(budget)) for seed, budget in zip(seeds, budgets, strict=True)]
+    wanted = Counter((*lane, step) for lane in lanes for step in steps)
+    if found == wanted:
+        return
+    wrong = sorted((wanted - found) or (found - wanted))
+    raise UserError(
+        f"{path} {'lacks' if wanted - found else 'has too many'} rows: {len(wrong)}, the first of seed {wrong[0][0]} "
+        f"with {wrong[0][1]} labels at step {wrong[0][2]}; restore it, or delete {folder} and give --resume, which "
+        "trains these lanes anew"
+    )
 
 
 def find(paths: PathLike | Sequence[PathLike]) -> list[Path]:

@@ -8,26 +8,34 @@ Each line of the JSONL file is an object, of one of three kinds:
 
 A line is on the disk when the call that writes it returns. A kill can tear the last line only, which readers leave out
 and whoever continues the table drops. Whatever replaces a file does so in one step.
+
+A reader gives what was written or nothing: every line ends in a checksum of itself and of the lines before it, so that
+none can be changed or taken out of the middle; Parquet holds a digest of its contents. Files of before had neither.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 import os
+import re
+import zlib
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
 from cuelearner_jax.errors import UserError
+from cuelearner_jax.records.whole import replacing, unreadable
 
 META = b"cuelearner"  # the key under which Parquet holds what the table is
+DIGEST = b"cuelearner.sha256"  # and the one of the digest of its contents
+CHECKSUM = re.compile(rb', "crc": "([0-9a-f]{8})"}$')  # the end of a line
 TAIL = 1 << 16  # more than the longest row of most tables [bytes]
 
 PathLike = str | os.PathLike[str]
@@ -45,8 +53,7 @@ class Schema:
     strings: tuple[str, ...] = ()
     integers: tuple[str, ...] = ()
     lists: tuple[str, ...] = ()  # of 32-bit floats
-    checksums: bool = False  # does each page of the Parquet file carry one?
-    remedy: str = "is corrupt: restore it"  # what a message says of a damaged file, after its path
+    remedy: str = "is damaged: restore it"  # what a message says of a damaged file, after its path
 
     @property
     def jsonl(self) -> str:
@@ -94,7 +101,9 @@ class TableWriter:
         self._schema, self._columns = schema, set(constants or ())
         self.path.parent.mkdir(parents=True, exist_ok=True)
         _reopen(self.path, schema)
-        there, last = _rewrite(self.path, schema, keep=lambda row: True) if self.path.exists() else (None, None)
+        there, last, self._checksum = None, None, 0
+        if self.path.exists():
+            there, last, self._checksum = _rewrite(self.path, schema, keep=lambda row: True)
         header = None if constants is None else {name: _plain(value) for name, value in constants.items()}
         self._file = self.path.open("a", encoding="utf-8")
         if about is not None and there is None:
@@ -138,7 +147,9 @@ class TableWriter:
         self.close()
 
     def _write(self, lines: Iterable[Row]) -> None:
-        self._file.write("".join(json.dumps(line, allow_nan=False) + "\n" for line in lines))
+        for line in lines:
+            text, self._checksum = _sealed(line, self._checksum)
+            self._file.write(text)
         self._file.flush()
         os.fsync(self._file.fileno())
 
@@ -151,8 +162,14 @@ def last_row(path: PathLike, schema: Schema) -> Row | None:
             lines = file.read().split(b"\n")[:-1]
     except FileNotFoundError:
         return None
-    found = json.loads(lines[-1]) if lines else {}
-    return found if schema.mark in found else None
+    try:
+        found = json.loads(lines[-1]) if lines else {}
+    except ValueError:  # whoever reads the whole table says so
+        return None
+    if not isinstance(found, dict) or schema.mark not in found:
+        return None
+    found.pop("crc", None)
+    return found
 
 
 def truncate(path: PathLike, schema: Schema, keep: Callable[[Row], bool]) -> None:
@@ -194,10 +211,30 @@ def finish(path: PathLike, schema: Schema) -> Path:
 
 def write(path: Path, table: pa.Table, schema: Schema, about: Row | None = None) -> None:
     """Writes a whole table as Parquet, replacing `path` in one step; `about` is what the table is."""
-    if about is not None:
-        table = _described(table, about)
-    with _replacing(path, "wb") as file:
-        pq.write_table(table, file, compression="zstd", write_page_checksum=schema.checksums)
+    told = about_of(table) if about is None else about
+    table = _typed(table, schema)
+    told = {} if told is None else {META: json.dumps(told).encode()}
+    table = table.replace_schema_metadata({**told, DIGEST: digest(table, told.get(META, b"")).encode()})
+    with replacing(path, "wb") as file:
+        pq.write_table(table, file, compression="zstd", write_page_checksum=True)
+
+
+def digest(table: pa.Table, about: bytes = b"") -> str:
+    """SHA-256 of a table's columns: their names, types and values, in order; and of what it says of itself."""
+    found = hashlib.sha256(about)
+    for name in table.column_names:
+        column = table[name].combine_chunks()
+        found.update(json.dumps([name, str(column.type), len(column)]).encode())
+        if pa.types.is_list(column.type):
+            found.update(np.asarray(column.value_lengths().fill_null(-1)).tobytes())
+            column = column.flatten()
+        if pa.types.is_string(column.type):
+            column = column.dictionary_encode()
+            found.update(json.dumps(column.dictionary.to_pylist()).encode())
+            column = column.indices
+        found.update(np.asarray(column.is_null()).tobytes())
+        found.update(np.asarray(column.fill_null(0)).tobytes())
+    return found.hexdigest()
 
 
 def read(path: Path, schema: Schema) -> pa.Table:
@@ -209,12 +246,13 @@ def read(path: Path, schema: Schema) -> pa.Table:
     if path.suffix != ".parquet" and not path.exists():
         path = path.with_name(schema.parquet)  # the table was finished since the file was found
     try:
-        table = pq.read_table(path, page_checksum_verification=True) if _is_parquet(path) else _grown(path, schema)
-        types = [(name, schema.type(name)) for name in table.column_names]
-        table = table.cast(pa.schema(types, metadata=table.schema.metadata))
-    except (OSError, TypeError, pa.ArrowException) as error:
-        reason = (str(error).splitlines() or [""])[0]
-        raise UserError(f"{path} {schema.remedy} ({reason})") from error
+        table = _finished(path, schema) if _is_parquet(path) else _grown(path, schema)
+    except OSError as error:
+        if error.errno is None:  # Arrow's own
+            raise _damaged(path, schema, error) from error
+        raise unreadable(path, error) from error
+    except (TypeError, ValueError, MemoryError, OverflowError, pa.ArrowException) as error:
+        raise _damaged(path, schema, error) from error
     missing = [name for name in schema.required if name not in table.column_names]
     if missing and table.num_rows:
         raise UserError(
@@ -232,8 +270,24 @@ def about_of(table: pa.Table) -> Row | None:
     return about
 
 
-def _described(table: pa.Table, about: Row) -> pa.Table:
-    return table.replace_schema_metadata({META: json.dumps(about).encode()})
+def _damaged(path: Path, schema: Schema, reason: object) -> UserError:
+    return UserError(f"{path} {schema.remedy} ({(str(reason).splitlines() or [''])[0]})")
+
+
+def _typed(table: pa.Table, schema: Schema) -> pa.Table:
+    """With the columns' types, and what it says of itself."""
+    types = [(name, schema.type(name)) for name in table.column_names]
+    return table.cast(pa.schema(types, metadata=table.schema.metadata))
+
+
+def _finished(path: Path, schema: Schema) -> pa.Table:
+    """The table of a Parquet file. Raises ValueError if it is not what was written."""
+    table = _typed(pq.read_table(path, page_checksum_verification=True), schema)
+    metadata = table.schema.metadata or {}
+    told = metadata.get(DIGEST)
+    if told is not None and told.decode() != digest(table, metadata.get(META, b"")):
+        raise ValueError("its contents are not those that were written")
+    return table.replace_schema_metadata({META: metadata[META]} if META in metadata else None)
 
 
 def _is_parquet(path: Path) -> bool:
@@ -252,44 +306,57 @@ def _plain(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-@contextmanager
-def _replacing(path: Path, mode: str) -> Iterator[IO[Any]]:
-    """A file that takes the place of `path` once it is whole and on the disk."""
-    temporary = path.with_name(path.name + ".tmp")
-    with temporary.open(mode, encoding=None if "b" in mode else "utf-8") as file:
-        yield file
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(temporary, path)
+def _sealed(line: Row, before: int) -> tuple[str, int]:
+    """A line as it is written, its checksum at its end, and that checksum; `before`: that of the line before."""
+    text = json.dumps(line, allow_nan=False)
+    checksum = zlib.crc32(text.encode(), before)
+    return f'{text[:-1]}, "crc": "{checksum:08x}"}}\n', checksum
 
 
 def _lines(path: Path, schema: Schema) -> Iterator[Row]:
-    """The lines of a JSONL file, parsed, without a torn last one."""
+    """The lines of a JSONL file, parsed, without a torn last one. Raises UserError for one that is damaged."""
     try:
-        lines = path.read_bytes().splitlines()
+        lines = path.read_bytes().split(b"\n")
     except OSError as error:
-        raise UserError(f"cannot read {path}: {error.strerror}") from error
+        raise unreadable(path, error) from error
+    sealed, checksum = any(map(CHECKSUM.search, lines)), 0  # lines of before have no checksums
     for number, line in enumerate(lines, start=1):
         try:
-            parsed = json.loads(line)
-        except ValueError as error:  # also what UnicodeDecodeError is
-            if number == len(lines):
+            text, checksum = _opened(line, checksum) if sealed else (line, 0)
+            parsed = json.loads(text)
+            if not isinstance(parsed, dict) or not parsed.keys() & {"about", "constants", schema.mark}:
+                raise ValueError(f"it is not a row of {schema.stem}")
+        except (ValueError, RecursionError) as error:
+            if number == len(lines):  # what has no end was torn by a crash
                 return
-            raise UserError(f"{path}, line {number}, is not JSON: repair or remove this line") from error
-        if not isinstance(parsed, dict) or not parsed.keys() & {"about", "constants", schema.mark}:
-            raise UserError(f"{path}, line {number}, is not a row of {schema.stem}: repair or remove this line")
+            raise _damaged(path, schema, f"line {number}: {error}") from error
         yield parsed
 
 
-def _rewrite(path: Path, schema: Schema, keep: Callable[[Row], bool]) -> tuple[Row | None, Row | None]:
-    """Rewrites a JSONL file with the rows to keep; returns what it is and the constants that hold at its end."""
-    told, constants = None, None
-    with _replacing(path, "w") as file:
+def _opened(line: bytes, before: int) -> tuple[bytes, int]:
+    """A line without its checksum, and that; the inverse of `_sealed`. Raises ValueError if it was changed."""
+    found = CHECKSUM.search(line)
+    text = line[: found.start()] + b"}" if found else b""
+    checksum = zlib.crc32(text, before)
+    if not found or int(found[1], 16) != checksum:
+        raise ValueError("it, or a line before it, is not what was written")
+    return text, checksum
+
+
+def _rewrite(path: Path, schema: Schema, keep: Callable[[Row], bool]) -> tuple[Row | None, Row | None, int]:
+    """Rewrites a JSONL file with the rows to keep.
+
+    Returns:
+        What it is, the constants that hold at its end, and the checksum of its last line.
+    """
+    told, constants, checksum = None, None, 0
+    with replacing(path) as file:
         for line in _lines(path, schema):
             told, constants = line.get("about", told), line.get("constants", constants)
             if "about" in line or "constants" in line or keep(line):
-                file.write(json.dumps(line) + "\n")
-    return told, constants
+                text, checksum = _sealed(line, checksum)
+                file.write(text)
+    return told, constants, checksum
 
 
 def _reopen(path: Path, schema: Schema) -> None:
@@ -300,11 +367,13 @@ def _reopen(path: Path, schema: Schema) -> None:
     if not path.exists():
         table = read(whole, schema)
         told = about_of(table)
-        with _replacing(path, "w") as file:
-            if told is not None:
-                file.write(json.dumps({"about": told}) + "\n")
-            for row in table.to_pylist():
-                file.write(json.dumps({name: value for name, value in row.items() if value is not None}) + "\n")
+        lines = [] if told is None else [{"about": told}]
+        lines += [{name: value for name, value in row.items() if value is not None} for row in table.to_pylist()]
+        checksum = 0
+        with replacing(path) as file:
+            for line in lines:
+                text, checksum = _sealed(line, checksum)
+                file.write(text)
     whole.unlink()
 
 
@@ -326,4 +395,5 @@ def _grown(path: Path, schema: Schema) -> pa.Table:
     table = pa.table(
         {name: pa.array(column + [None] * (count - len(column)), schema.type(name)) for name, column in columns.items()}
     )
-    return table if told is None else _described(table, told)
+    table = _typed(table, schema)
+    return table if told is None else table.replace_schema_metadata({META: json.dumps(told).encode()})

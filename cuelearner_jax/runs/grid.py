@@ -21,6 +21,7 @@ from cuelearner_jax.runs.shards import Shard
 from cuelearner_jax.task import Task
 
 LARGEST_SEED = min(SPLITS.values())  # seeds and splits are folded into one key
+LARGEST_BUDGET = 1 << 31  # budgets are 32-bit integers
 
 
 @dataclass(frozen=True)
@@ -61,9 +62,9 @@ def describe(
     grid: Grid,
     split: str,
     labels_from: Path | None = None,
-    shard: Shard | None = None,
+    shard: dict[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """The contents of config.json."""
+    """The contents of config.json; `shard` is what a piece of a sweep says of itself."""
     origin = {"from": task.origin} if task.origin else {}  # no field of a configuration can be called so
     return {
         "format": formats.FORMATS["config"],
@@ -75,7 +76,7 @@ def describe(
         "split": split,
         "labels_from": f"{labels_from.name} {label_files.digest(labels_from)}" if labels_from else None,
         "total_steps": config.schedule.total_steps,
-        **({"shard": list(shard)} if shard else {}),
+        **({"shard": shard} if shard else {}),
     }
 
 
@@ -112,10 +113,30 @@ def load(folder: Path, find: Callable[[str], Task]) -> tuple[Task, RunConfig, Gr
             configuration.from_json(configuration.Scalars, values["scalars"]),
             configuration.from_json(configuration.Schedule, values["schedule"]),
         )
-        grid = Grid(*(tuple(values["grid"][name]) for name in ("guidance", "seeds", "labels")))
+        grid = _grid(values["grid"])
+        if "shard" in values:
+            Shard.of(values["shard"])
+        if values["split"] not in SPLITS or values["total_steps"] != config.schedule.total_steps:
+            raise ValueError("what it says of its evaluations makes no sense")
+        configuration.check(config)
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise formats.damaged("config", path) from error
     return task, config, grid
+
+
+def _grid(values: dict[str, Any]) -> Grid:
+    """Raises ValueError, TypeError or KeyError if it is none; that its guidance is known is not asked."""
+    if not all(isinstance(values[name], list) for name in ("guidance", "seeds", "labels")):
+        raise TypeError("a grid is made of lists")
+    kinds, seeds, labels = (tuple(values[name]) for name in ("guidance", "seeds", "labels"))
+    if not kinds or not all(isinstance(kind, str) for kind in kinds) or len(set(kinds)) < len(kinds):
+        raise ValueError(f"{kinds} are no kinds of guidance")
+    for name, numbers, end in (("seeds", seeds, LARGEST_SEED), ("budgets", labels, LARGEST_BUDGET)):
+        if not all(type(number) is int and 0 <= number < end for number in numbers) or len(set(numbers)) < len(numbers):
+            raise ValueError(f"{numbers} are no {name}")
+    if not seeds:
+        raise ValueError("there are no seeds")
+    return Grid(kinds, seeds, labels)
 
 
 def _known(find: Callable[[str], Task], name: str, origin: str | None, path: Path) -> Task:

@@ -1,4 +1,4 @@
-"""What of a group of lanes is kept in a checkpoint, and how it comes back."""
+"""What of a group of lanes is kept on disk, and how it comes back."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ import numpy as np
 
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.loop import start_clock
+from cuelearner_jax.records import label_files, results
+from cuelearner_jax.records import table as tables
 from cuelearner_jax.records.checkpoint import Checkpoints, checkpoints
 from cuelearner_jax.runs.lanes import LaneGroup
 from cuelearner_jax.types import Clock, TrainState
@@ -60,6 +62,33 @@ def restore_blocks(group: LaneGroup, saved: Checkpoints) -> tuple[list[TrainStat
         for policy, rest in zip(found["policy"], found["rest"], strict=True)
     ]
     return group.recut(blocks), found["clock"]["clock"], float(found["clock"]["wall_s"])
+
+
+def check_standing(group: LaneGroup, folder: Path) -> None:
+    """Whether a group can go on from what its folder holds: nothing lost, nothing changed.
+
+    Its rows must be there up to the newest checkpoint, or to the end if it is finished; what comes after the checkpoint
+    is made again.
+
+    Args:
+        group: the lanes.
+        folder: of the run and this kind of guidance.
+
+    Raises:
+        UserError: rows are missing, or a file cannot be read; nothing has been changed.
+    """
+    schedule, finished = group.config.schedule, (folder / results.PARQUET).exists()
+    step = schedule.total_steps if finished else 0
+    if not finished and (folder / "checkpoints").is_dir():
+        with checkpoints(folder / "checkpoints", read_only=True) as saved:
+            if saved.latest() is not None:
+                step = int(restore(group, saved)["clock"]["clock"].step)
+    if step:
+        results.check_complete(folder, group.seeds, group.budgets, range(0, step + 1, schedule.eval_every))
+    elif (folder / results.JSONL).exists():
+        tables.read(folder / results.JSONL, results.SCHEMA)
+    if finished and group.guidance.asks:
+        label_files.read(folder / label_files.PARQUET)
 
 
 def restore_policies(group: LaneGroup, folder: Path) -> tuple[dict[str, Any], int]:

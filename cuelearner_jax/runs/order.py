@@ -11,9 +11,11 @@ from typing import Any
 from cuelearner_jax import config as configuration
 from cuelearner_jax.asking import label_slots
 from cuelearner_jax.config import RunConfig
+from cuelearner_jax.environment import spaces_of
 from cuelearner_jax.errors import UserError
+from cuelearner_jax.guidance import given
 from cuelearner_jax.guidance import registry as guidances
-from cuelearner_jax.records import label_files, results
+from cuelearner_jax.records import formats, label_files, results
 from cuelearner_jax.records.folders import check_folder
 from cuelearner_jax.runs.grid import Grid, check_grid, describe
 from cuelearner_jax.runs.shards import Shard
@@ -63,8 +65,9 @@ def planned(order: Order) -> Plan:
     names = tuple(guidances.find(kind).name for kind in order.grid.guidance)  # one of one's own is named by its module
     order = dataclasses.replace(order, grid=dataclasses.replace(order.grid, guidance=names))
     check_grid(order.grid)
+    piece, sweep = None, order.out
     if order.shard:
-        order.shard.check_sweep(order.out)
+        piece = order.shard.described(order.grid.seeds)
         folder = order.shard.folder(order.out)
         begun = not order.overwrite and (folder / "config.json").is_file()
         grid = dataclasses.replace(order.grid, seeds=order.shard.seeds(order.grid.seeds))
@@ -73,9 +76,27 @@ def planned(order: Order) -> Plan:
     for kind in order.grid.guidance:
         guidances.make(kind, order.config.sizes, env)
     labels = read_labels(order) if order.labels_from else None
-    described = describe(order.task, order.config, order.grid, order.split, order.labels_from, order.shard)
+    described = describe(order.task, order.config, order.grid, order.split, order.labels_from, piece)
+    if order.shard:
+        order.shard.check_sweep(sweep, described)
     check_folder(order.out, described, order.resume, order.overwrite)
     return Plan(order, described, labels)
+
+
+def _check_world(path: Path, told: dict[str, Any], task: Task, world: Any) -> None:
+    """Raises UserError unless labels are of a run's world, as far as labels depend on it."""
+    values = {name: value for name, value in told.items() if name not in ("name", "from")}
+    try:
+        theirs = configuration.to_json(configuration.from_json(task.config, values))
+    except TypeError as error:
+        raise formats.damaged("labels", path) from error
+    ours = configuration.to_json(world)
+    apart = [name for name in ours if theirs[name] != ours[name] and name not in task.labels_hold]
+    if apart:
+        raise UserError(
+            f"{path} holds labels of a world with another task.{apart[0]} ({theirs[apart[0]]}, this run's is "
+            f"{ours[apart[0]]}): give labels of the same world"
+        )
 
 
 def read_labels(order: Order) -> label_files.LabelFile:
@@ -84,11 +105,10 @@ def read_labels(order: Order) -> label_files.LabelFile:
     assert path is not None
     file = label_files.read(path)
     env = shape_of(order.task, config.task)
-    if file.task.get("name") != order.task.name or file.labels.obs.shape[1] != env.obs_size:
-        raise UserError(
-            f"{path} holds labels of {file.task.get('name')} with {file.labels.obs.shape[1]} observations, "
-            f"this run is {order.task.name} with {env.obs_size}: give labels of the same task"
-        )
+    if file.task.get("name") != order.task.name:
+        name = file.task.get("name")
+        raise UserError(f"{path} holds labels of {name}, this run is {order.task.name}: give labels of the same task")
+    _check_world(path, file.task, order.task, config.task)
     made = [guidances.make(kind, config.sizes, env) for kind in grid.guidance]
     asking = [guidance for guidance in made if guidance.form is not None]
     if not asking:
@@ -101,6 +121,7 @@ def read_labels(order: Order) -> label_files.LabelFile:
                 f"{path} holds {file.answers} answers, guidance {guidance.name} needs {guidance.form.name} ones: "
                 "give fitting labels"
             )
+        given.check(file.labels, spaces_of(env), guidance.form, str(path))
     if file.eps_deg is not None and not math.isclose(file.eps_deg, config.scalars.eps_deg, rel_tol=1e-6):
         raise UserError(
             f"{path} holds labels of {file.eps_deg:g} degrees, the run's are of {config.scalars.eps_deg:g}: "

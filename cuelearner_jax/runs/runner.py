@@ -90,8 +90,8 @@ class Runner:
 
     def _label(self, saved: Checkpoints, teacher: Teacher | None, labels: label_files.LabelFile | None) -> None:
         """Asks the teacher, or takes the labels of a file."""
-        now, name, written = self.training, self.group.guidance.name, self.folder / "labels.parquet"
-        if not self.group.guidance.asks or (now.labelled and written.exists()):
+        now, name, written = self.training, self.group.guidance.name, self.folder / label_files.PARQUET
+        if not self.group.guidance.asks or (now.labelled and label_files.readable(written)):
             return
         bar = self.bars.add_task(f"{name}: labels", total=self.group.rounds, note="", completed=now.round)
         if labels is not None and not now.labelled:
@@ -112,7 +112,7 @@ class Runner:
         task = {"name": self.order.task.name, **configuration.to_json(config.task)}
         seeds, labels = self.training.labels()
         eps = config.scalars.eps_deg
-        label_files.write(self.folder / "labels.parquet", task, form.name, eps, seeds, labels, form.meaning)
+        label_files.write(self.folder / label_files.PARQUET, task, form.name, eps, seeds, labels, form.meaning)
 
     def _train(self, saved: Checkpoints, writer: results.ResultsWriter) -> None:
         now, schedule = self.training, self.group.config.schedule

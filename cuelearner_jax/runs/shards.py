@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from cuelearner_jax.errors import UserError
+from cuelearner_jax.evaluate import SPLITS
 from cuelearner_jax.records import formats
+from cuelearner_jax.records.folders import CONFIG, differences
+
+MOST_PIECES = min(SPLITS.values())  # one for each seed that there can be
+OWN = ("grid.seeds", "shard.index")  # of what config.json says, that which differs between pieces of one sweep
 
 
 class Shard(NamedTuple):
@@ -31,11 +36,19 @@ class Shard(NamedTuple):
         """Where the piece writes below the sweep's folder."""
         return out / f"shard-{self.index:0{len(str(self.count))}d}-of-{self.count}"
 
-    def check_sweep(self, out: Path) -> None:
-        """Raises UserError if the sweep's folder holds something else than pieces of this count."""
+    def check_sweep(self, out: Path, described: dict[str, Any]) -> None:
+        """Whether its piece belongs to the sweep that lies in a folder.
+
+        Args:
+            out: the sweep's folder.
+            described: what the piece's config.json is to say.
+
+        Raises:
+            UserError: the folder holds a whole run, pieces of another count, or of a sweep with other settings.
+        """
         if out.exists() and not out.is_dir():
             raise UserError(f"{out} is no folder: give another --out")
-        if (out / "config.json").exists():
+        if (out / CONFIG).exists():
             raise UserError(f"{out} holds a run that is not cut into pieces: give another --out")
         for folder in sorted(out.glob("shard-*-of-*")):
             if not folder.name.endswith(f"-of-{self.count}"):
@@ -43,6 +56,31 @@ class Shard(NamedTuple):
                     f"{folder} is a piece of another cut, whose seeds would count twice: "
                     f"cut into as many pieces as before, or give another --out"
                 )
+            if folder == self.folder(out) or not (folder / CONFIG).is_file():
+                continue
+            found = sorted({*differences(formats.read("config", folder / CONFIG), described)} - set(OWN))
+            if found:
+                raise UserError(
+                    f"{folder} is a piece of a sweep with another {', '.join(found[:4])}: give the same options for "
+                    "all pieces, or another --out"
+                )
+
+    def described(self, seeds: tuple[int, ...]) -> dict[str, Any]:
+        """What its config.json says of it: its number, and the seeds of all pieces."""
+        return {**self._asdict(), "seeds": list(seeds)}
+
+    @classmethod
+    def of(cls, described: dict[str, Any]) -> Shard:
+        """From what config.json says. Raises ValueError, TypeError or KeyError if that makes no sense."""
+        shard, seeds = cls(described["index"], described["count"]), described["seeds"]
+        if not all(type(number) is int for number in shard) or not 1 <= shard.index <= shard.count <= MOST_PIECES:
+            raise ValueError(f"{shard} is no piece")
+        if seeds is not None:  # pieces of before did not say
+            if not isinstance(seeds, list) or not all(type(seed) is int for seed in seeds):
+                raise TypeError(f"{seeds} are no seeds")
+            if shard.count > len(seeds):
+                raise ValueError(f"{len(seeds)} seeds do not make {shard.count} pieces")
+        return shard
 
     def seeds(self, seeds: tuple[int, ...]) -> tuple[int, ...]:
         """Its share of a sweep's seeds: as many as the other pieces have, or one less.
@@ -59,8 +97,8 @@ def missing(configurations: list[Path]) -> list[str]:
     begun: dict[tuple[Path, int], set[int]] = {}
     for path in configurations:
         try:
-            shard = Shard(*formats.read("config", path)["shard"])
-        except (UserError, KeyError, TypeError):
+            shard = Shard.of(formats.read("config", path)["shard"])
+        except (UserError, ValueError, KeyError, TypeError):
             continue
         begun.setdefault((path.parent.parent, shard.count), set()).add(shard.index)
     lines = []

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from cuelearner_jax.devices import SHARED, lane_mesh, place
 from cuelearner_jax.guidance import registry as guidances
-from cuelearner_jax.records.folders import claimed, prepare_folder
+from cuelearner_jax.records.folders import check_folder, claimed, prepare_folder
+from cuelearner_jax.runs.kept import check_standing
 from cuelearner_jax.runs.lanes import LaneGroup
 from cuelearner_jax.runs.memory_report import memory_report
 from cuelearner_jax.runs.order import Order, planned
@@ -34,6 +35,9 @@ def run(order: Order) -> None:
     teacher = place(mesh, task.make_teacher(config.task, env), SHARED) if asked else None
     examined = task.environment(config.task, order.split)
     with claimed(order.out), interruptible() as stopping, progress_bars() as bars:
+        check_folder(order.out, plan.described, order.resume, order.overwrite)  # nobody else can change it any more
+        for group in groups if order.resume else ():
+            check_standing(group, order.out / group.guidance.name)
         prepare_folder(order.out, plan.described, order.overwrite and not order.resume)
         for group in groups:
             Runner(group, examined, order, plan.described, stopping, bars).run(teacher, plan.labels)

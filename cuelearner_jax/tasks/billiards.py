@@ -68,6 +68,7 @@ BILLIARDS = Task(
     bodies=(PLAYER,),
     teacher=make_teacher,
     scenarios=SCENARIOS,
+    labels_hold=("mirrors", "teacher", "aim_error_deg", "habit", "search_directions"),
     presets={
         "paper": Preset(
             "the paper's figure: regulation table, its networks, 10 million steps a seed",

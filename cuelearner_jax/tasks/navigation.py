@@ -78,6 +78,7 @@ NAVIGATION = Task(
     bodies=(SIMPLE, ANYMAL),
     teacher=lambda config, env: make_teacher(env),
     scenarios=SCENARIOS,
+    labels_hold=("worlds", "world_seed", "max_steps", "mirrors"),  # a label is of what one scan shows
     presets={
         "paper": Preset(
             "the paper's figure: cluttered halls, its networks, 1 million steps a seed",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from pathlib import Path
 from typing import Any
@@ -29,7 +28,7 @@ def save(folder: Path, teacher: LearnedTeacher, about: dict[str, Any]) -> None:
     params = jax.tree.map(lambda leaf: leaf.astype(jnp.float16), teacher.params)
     with checkpoints(folder / "network") as saved:
         saved.save(0, {"params": params})
-    (folder / "teacher.json").write_text(json.dumps({"format": formats.FORMATS["teacher"], **about}, indent=1) + "\n")
+    formats.write("teacher", folder / "teacher.json", about)
 
 
 def load(folder: Path, env: Any, aim_error: Any, habit: Any) -> LearnedTeacher:

@@ -1,6 +1,6 @@
-import json
 import shutil
 
+import probes
 import pytest
 from small_runs import SMALL, SWEEP, listing
 
@@ -139,9 +139,7 @@ def test_a_damaged_checkpoint_is_refused(refused, copy):
 
 
 def test_a_checkpoint_of_another_run_is_refused(refused, copy):
-    config = json.loads((copy / "config.json").read_text())
-    config["sizes"]["q_layers"] = [24]
-    (copy / "config.json").write_text(json.dumps(config))
+    probes.edit_json(copy / "config.json", lambda values: values["sizes"].update(q_layers=[24]))
     refused(["evaluate", copy, "--guidance", "none"], "expected (1, 24)", copy)
 
 
@@ -154,9 +152,8 @@ def test_labels_that_do_not_fit_are_refused(refused, copy, tmp_path):
     file = copy / "relative" / "labels.parquet"
     new = ["--out", tmp_path / "new"]
     relative = [*QUICK, "--guidance", "relative", "--labels-from", file]
-    refused(
-        [*relative, "--labels", "20", "--seeds", "2", "--task.table", "easy", *new], "labels of the same task", copy
-    )
+    other = [*relative, "--labels", "20", "--seeds", "2", "--task.table", "easy", *new]
+    refused(other, "labels of a world with another task.table (one_ball, this run's is easy)", copy)
     refused([*relative, "--labels", "500", "--seeds", "2", *new], "lower --labels or collect more", copy)
     refused([*relative, "--labels", "20", "--seeds", "3", *new], "for seed 2002", copy)
     refused([*QUICK, "--guidance", "none", "--labels-from", file, *new], "add --guidance relative", copy)
@@ -187,7 +184,5 @@ def test_pictures_and_measurements_are_not_replaced_unasked(refused, copy, tmp_p
 
 
 def test_a_config_of_another_version_is_refused(refused, copy):
-    described = json.loads((copy / "config.json").read_text())
-    described["sizes"]["hidden"] = 3
-    (copy / "config.json").write_text(json.dumps(described))
+    probes.edit_json(copy / "config.json", lambda values: values["sizes"].update(hidden=3))
     refused(["evaluate", copy], "another version", copy)

@@ -141,7 +141,7 @@ def changed(**parts):
 
 
 NONSENSE = [
-    (lambda: cl.fit_feedback(changed(answer=np.full(200, 0.5))), "an answer is -1"),
+    (lambda: cl.fit_feedback(changed(answer=np.full(200, 0.5))), "an answer is none of -1, 0, 1"),
     (lambda: cl.fit_feedback(changed(action=np.zeros((200, 2)))), "no unit vectors"),
     (lambda: cl.fit_feedback(changed(action=np.full((200, 2), np.nan))), "actions hold numbers that are not finite"),
     (lambda: cl.fit_feedback(changed(obs=np.full((200, 2), np.inf))), "observations hold numbers that are not finite"),

@@ -1,15 +1,19 @@
 """Checkpoints: what was saved comes back bit by bit, and what cannot be read is said in one line."""
 
 import gc
+import hashlib
+import shutil
 import sys
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import orbax.checkpoint as ocp
 import probes
 import pytest
 
 from cuelearner_jax.errors import UserError
+from cuelearner_jax.records import checkpoint
 from cuelearner_jax.records.checkpoint import KEPT, checkpoints
 
 
@@ -131,6 +135,57 @@ def test_a_damaged_checkpoint_is_refused(tmp_path, change):
         change(path)
     with pytest.raises(UserError, match=r"checkpoint 5 in .* cannot be read"):
         restore(tmp_path)
+
+
+def test_no_changed_bit_of_a_checkpoint_goes_unnoticed(tmp_path):
+    """Orbax alone reads some of these without a word."""
+    save(tmp_path, 5)
+    rng = np.random.default_rng(0)
+    files = [path for path in (tmp_path / "5" / "policy").rglob("*") if path.is_file()]
+    largest = max(files, key=lambda path: path.stat().st_size)  # the numbers themselves
+    whole, refused = largest.read_bytes(), 0
+    for bit in rng.integers(0, 8 * len(whole), 12):
+        spoilt = bytearray(whole)
+        spoilt[bit // 8] ^= 1 << bit % 8
+        largest.write_bytes(spoilt)
+        try:
+            assert_bitwise(restore(tmp_path), {"policy": state(5)})
+        except UserError as error:
+            assert "damaged" in str(error)
+            refused += 1
+    assert refused > 6
+
+
+def test_numbers_that_others_put_in_place_are_refused(tmp_path):
+    save(tmp_path / "mine", 5)
+    save(tmp_path / "theirs", 6)
+    shutil.rmtree(tmp_path / "mine" / "5" / "policy")
+    shutil.copytree(tmp_path / "theirs" / "6" / "policy", tmp_path / "mine" / "5" / "policy")
+    with pytest.raises(UserError, match=r"policy\['block'\].* is not what was written.*it is damaged"):
+        restore(tmp_path / "mine")
+    shutil.rmtree(tmp_path / "mine" / "5" / "digests")  # older checkpoints had none
+    assert_bitwise(restore(tmp_path / "mine"), {"policy": state(6)})
+
+
+def test_a_checkpoint_that_may_not_be_read_is_not_called_damaged(tmp_path, monkeypatch):
+    save(tmp_path, 5)
+
+    def forbidden(*_, **__):
+        raise ValueError("PERMISSION_DENIED: Error opening file")
+
+    monkeypatch.setattr(ocp.CheckpointManager, "restore", forbidden)
+    with pytest.raises(UserError, match="check the permissions of its files, nothing was changed") as refusal:
+        restore(tmp_path)
+    assert "delete" not in str(refusal.value)
+
+
+def test_the_digest_of_an_array_is_that_of_its_values_however_it_is_cut():
+    values = np.arange(24, dtype=np.float32).reshape(8, 3)
+    digest = checkpoint._digest
+    expected = hashlib.sha256(b"(8, 3) float32" + values.tobytes()).hexdigest()
+    assert digest(values) == digest(jnp.asarray(values)) == expected
+    others = (values, values.T, values.astype(np.float64), values.reshape(-1), -values)
+    assert len({digest(other) for other in others}) == len(others)
 
 
 def other(change):

@@ -1,15 +1,18 @@
 """A run's folder: what may be done to it, and what is left in it."""
 
 import json
+import os
+import socket
 
 import probes
 import pytest
 
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.records import folders
+from cuelearner_jax.records import folders, formats
+from cuelearner_jax.records.formats import FORMATS
 
 DESCRIBED = {
-    "format": 1,
+    "format": FORMATS["config"],
     "task": {"name": "window", "half_width_deg": 28.0},
     "sizes": {"directions": 16, "batch_size": 32, "q_layers": [32, 32]},
     "scalars": {"eps_deg": 20.0, "k_max": 50},
@@ -105,14 +108,14 @@ def test_a_run_of_an_older_format_is_resumed_and_one_of_a_newer_is_not(out):
     probes.edit_json(out / "config.json", lambda values: values.pop("format"))
     folders.check_folder(out, DESCRIBED, resume=True, overwrite=False)
     refused(out, r"another scalars\.k_max: give", described(scalars={"k_max": 3}), resume=True)
-    probes.edit_json(out / "config.json", lambda values: values.update(format=2))
+    probes.edit_json(out / "config.json", lambda values: values.update(format=FORMATS["config"] + 1))
     refused(out, r"config\.json was written by a newer cuelearner: update", resume=True)
 
 
 def test_a_clean_start_deletes_the_run_and_any_other_keeps_it(out):
     folders.prepare_folder(out, described(split="validation"), clean=False)
     assert (out / "none" / "results.jsonl").exists()
-    assert json.loads((out / "config.json").read_text()) == DESCRIBED
+    assert formats.read("config", out / "config.json") == DESCRIBED
     folders.prepare_folder(out, described(split="validation"), clean=True)
     assert [path.name for path in out.iterdir()] == ["config.json"]
     assert json.loads((out / "config.json").read_text())["split"] == "validation"
@@ -120,15 +123,51 @@ def test_a_clean_start_deletes_the_run_and_any_other_keeps_it(out):
 
 def test_a_folder_inside_folders_is_made(tmp_path):
     folders.prepare_folder(tmp_path / "a" / "b", DESCRIBED, clean=True)
-    assert json.loads((tmp_path / "a" / "b" / "config.json").read_text()) == DESCRIBED
+    assert formats.read("config", tmp_path / "a" / "b" / "config.json") == DESCRIBED
 
 
 def test_a_folder_is_kept_for_one_process_and_free_afterwards(tmp_path):
     out = tmp_path / "a" / "run"
-    with folders.claimed(out), pytest.raises(UserError, match="written by another process"), folders.claimed(out):
+    with (
+        folders.claimed(out),
+        pytest.raises(UserError, match=r"another process \(process [0-9]+ on "),
+        folders.claimed(out),
+    ):
         pass
     with folders.claimed(out):
         assert not folders.in_use(out)  # but for the mark
+        assert folders.holder(out) == f"process {os.getpid()} on {socket.gethostname()}"
+    assert folders.holder(out) is None
     folders.prepare_folder(out, DESCRIBED, clean=True)
     assert sorted(path.name for path in out.iterdir()) == [folders.LOCK, "config.json"]
     assert folders.in_use(out)
+
+
+@pytest.mark.parametrize("left", ["config.json.tmp", "config.tmp"])
+def test_what_a_kill_leaves_before_the_first_word_stands_in_nobodys_way(tmp_path, left):
+    (tmp_path / left).write_text('{"task": {"na')
+    (tmp_path / folders.LOCK).write_text("process 1 on another")
+    folders.check_folder(tmp_path, DESCRIBED, resume=False, overwrite=False)
+    folders.prepare_folder(tmp_path, DESCRIBED, clean=False)
+    folders.check_folder(tmp_path, DESCRIBED, resume=True, overwrite=False)
+
+
+def test_a_clean_start_removes_links_and_never_what_they_lead_to(out, tmp_path):
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    (elsewhere / "photo.txt").write_text("mine")
+    (out / "a").symlink_to(elsewhere)
+    (out / "z").symlink_to(tmp_path / "nowhere")
+    folders.prepare_folder(out, DESCRIBED, clean=True)
+    assert [path.name for path in out.iterdir()] == ["config.json"]
+    assert (elsewhere / "photo.txt").read_text() == "mine"
+
+
+def test_a_clean_start_that_is_cut_short_can_be_made_again(out, monkeypatch):
+    def killed(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(folders.shutil, "rmtree", killed)
+    with pytest.raises(KeyboardInterrupt):
+        folders.prepare_folder(out, DESCRIBED, clean=True)
+    folders.check_folder(out, DESCRIBED, resume=False, overwrite=True)

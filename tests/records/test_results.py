@@ -181,9 +181,9 @@ def test_errors_are_one_clear_line(tmp_path):
 
     (tmp_path / "c").mkdir()
     (tmp_path / "c" / results.PARQUET).write_bytes(b"PAR1 and then rubbish")
-    assert "corrupt" in message(tmp_path / "c")
+    assert "is damaged" in message(tmp_path / "c")
     (tmp_path / "d").mkdir()
     (tmp_path / "d" / results.JSONL).write_text(json.dumps({"step": 1, "reward": 2.0}) + "\n")
     assert "lacks the columns" in message(tmp_path / "d")
     (tmp_path / "d" / results.JSONL).write_text(json.dumps({"step": "three"}) + "\n")
-    assert "corrupt" in message(tmp_path / "d")
+    assert "is damaged" in message(tmp_path / "d")

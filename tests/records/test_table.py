@@ -18,7 +18,6 @@ SCHEMA = tables.Schema(
     strings=("fish",),
     integers=("count",),
     lists=("weights",),
-    checksums=True,
     remedy="is wet: dry it",
 )
 ABOUT = {"lake": "Como", "depth": None}
@@ -88,7 +87,7 @@ def test_what_a_table_is_stays_with_it_through_every_change(tmp_path):
 def test_a_table_that_says_nothing_of_itself(tmp_path):
     written(tmp_path, "pike", about=None)
     assert tables.about_of(read(tmp_path)) is None
-    assert tables.read(tables.finish(tmp_path, SCHEMA), SCHEMA).schema.metadata is None
+    assert tables.about_of(tables.read(tables.finish(tmp_path, SCHEMA), SCHEMA)) is None
 
 
 def test_constants_hold_until_the_next_ones(tmp_path):
@@ -151,14 +150,75 @@ def test_a_failed_write_leaves_the_file_before(tmp_path, monkeypatch):
     assert path.read_bytes() == before
 
 
-def test_checksums_are_written_where_asked(tmp_path):
-    table = pa.table({"fish": ["pike"] * 200, "weights": np.random.default_rng(0).normal(size=(200, 2)).tolist()})
-    sizes = []
-    for checksums in (False, True):
-        schema = tables.Schema("catches", "fish", (), strings=("fish",), lists=("weights",), checksums=checksums)
-        tables.write(tmp_path / "whole.parquet", table, schema)
-        sizes.append((tmp_path / "whole.parquet").stat().st_size)
-    assert sizes[1] > sizes[0]
+def test_no_changed_bit_of_a_finished_table_goes_unnoticed(tmp_path):
+    rng = np.random.default_rng(0)
+    columns = {"fish": ["pike", "eel"] * 100, "weights": rng.normal(size=(200, 2)).tolist(), "length": rng.random(200)}
+    path = tmp_path / "whole.parquet"
+    tables.write(path, pa.table(columns), SCHEMA, about=ABOUT)
+    written, whole = tables.read(path, SCHEMA), path.read_bytes()
+    refused = 0
+    for bit in rng.integers(0, 8 * len(whole), 400):
+        spoilt = bytearray(whole)
+        spoilt[bit // 8] ^= 1 << bit % 8
+        path.write_bytes(spoilt)
+        try:
+            found = tables.read(path, SCHEMA)
+        except UserError as error:
+            assert "is wet: dry it" in str(error)
+            refused += 1
+        else:
+            assert found.equals(written)
+            assert tables.about_of(found) == ABOUT
+    assert refused > 300
+
+
+def test_a_table_that_was_written_anew_by_others_is_not_ours(tmp_path):
+    path = tmp_path / "whole.parquet"
+    tables.write(path, pa.table({"fish": ["pike", "eel"], "weights": [[1.0], [2.0]]}), SCHEMA)
+    pq.write_table(pq.read_table(path).slice(0, 1), path)  # keeps the digest
+    with pytest.raises(UserError, match="not those that were written"):
+        tables.read(path, SCHEMA)
+    pq.write_table(pq.read_table(path).replace_schema_metadata(None), path)  # as files of before were
+    assert tables.read(path, SCHEMA)["fish"].to_pylist() == ["pike"]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda lines: [*lines[:2], *lines[3:]],
+        lambda lines: lines[1:],
+        lambda lines: [lines[0], lines[2], lines[1], *lines[3:]],
+        lambda lines: [*lines[:2], lines[2].replace("0.5", "0.6"), *lines[3:]],
+        lambda lines: [*lines[:2], lines[2].split(', "crc"')[0] + "}", *lines[3:]],
+        lambda lines: [*lines[:-1], lines[-1].replace("0.5", "0.6"), ""],
+    ],
+)
+def test_no_line_can_be_changed_or_taken_out(tmp_path, change):
+    path = written(tmp_path, "pike", "eel", "carp")
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join(change(lines)) + "\n")
+    with pytest.raises(UserError, match="is wet: dry it"):
+        read(tmp_path)
+
+
+def test_lines_of_before_had_no_checksums(tmp_path):
+    path = written(tmp_path, "pike", "eel")
+    path.write_text("".join(line.split(', "crc"')[0] + "}\n" for line in path.read_text().splitlines()))
+    assert read(tmp_path)["fish"].to_pylist() == ["pike", "eel"]
+    written(tmp_path, "carp")  # who continues such a table gives it checksums
+    assert all('"crc"' in line for line in path.read_text().splitlines())
+    assert read(tmp_path)["fish"].to_pylist() == ["pike", "eel", "carp"]
+
+
+def test_a_table_that_may_not_be_read_is_not_called_damaged(tmp_path, monkeypatch):
+    path = tables.finish(written(tmp_path, "pike"), SCHEMA)
+
+    def forbidden(*_, **__):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(pq, "read_table", forbidden)
+    with pytest.raises(UserError, match=r"cannot be read \(Permission denied\): check its permissions"):
+        tables.read(path, SCHEMA)
 
 
 def test_files_are_told_apart_by_name_or_by_their_first_bytes(tmp_path):
@@ -181,9 +241,9 @@ def test_what_cannot_be_read_is_said_in_one_line(tmp_path):
         return str(caught.value)
 
     row = json.dumps({"fish": "pike", "weights": [1.0]}).encode()
-    assert "line 1, is not JSON" in message(b"{\n" + row + b"\n")
-    assert "line 1, is not a row of catches" in message(b'{"bird": 1}\n')
-    assert "line 1, is not a row of catches" in message(b"[]\n")
+    assert "(line 1: Expecting" in message(b"{\n" + row + b"\n")
+    assert "(line 1: it is not a row of catches)" in message(b'{"bird": 1}\n')
+    assert "(line 1: it is not a row of catches)" in message(b"[]\n")
     assert "is wet: dry it" in message(b'{"fish": "pike", "weights": 3}\n')
     assert "is wet: dry it" in message(b"PAR1 and then rubbish", SCHEMA.parquet)
     (tmp_path / SCHEMA.parquet).unlink()

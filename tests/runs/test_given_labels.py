@@ -1,5 +1,7 @@
 """Labels from a file: what fits a task and its grid is taken, anything else refused."""
 
+import dataclasses
+
 import numpy as np
 import probes
 import pytest
@@ -18,10 +20,15 @@ def path(tmp_path):
     return tmp_path / "labels.parquet"
 
 
-def written(path, task=None, answers="relative", eps_deg=EPS, obs_size=2):
+def written(path, task=None, answers="relative", eps_deg=EPS, obs_size=2, spoil=None):
     rng = np.random.default_rng(0)
     draw = lambda size: rng.normal(size=(2, 20, size)).astype(np.float32)  # noqa: E731
-    labels = probes.label_set(draw(obs_size), draw(2), np.sign(draw(1)), np.ones((2, 20), bool))
+    action = draw(2)
+    action /= np.linalg.norm(action, axis=-1, keepdims=True)
+    rows = {"obs": draw(obs_size), "action": action, "answer": np.sign(draw(1))}
+    if spoil:
+        rows[spoil[0]][1, 7] = spoil[1]
+    labels = probes.label_set(rows["obs"], rows["action"], rows["answer"], np.ones((2, 20), bool))
     label_files.write(path, task or TASK, answers, eps_deg, np.array([4, 9]), labels)
 
 
@@ -45,7 +52,7 @@ def test_labels_of_another_task_are_refused(path):
 
 def test_labels_of_other_observations_are_refused(path):
     written(path, obs_size=3)
-    with pytest.raises(UserError, match="3 observations"):
+    with pytest.raises(UserError, match=r"observations have the shape \(40, 3\), \(labels, 2\) is needed"):
         read_for(path)
 
 
@@ -71,3 +78,33 @@ def test_a_budget_beyond_the_file_is_refused(path):
     written(path)
     with pytest.raises(UserError, match="the budget is 21"):
         read_for(path, Grid(("relative",), seeds=(4, 9), labels=(10, 21)))
+
+
+@pytest.mark.parametrize(
+    ("spoil", "says"),
+    [
+        (("obs", np.nan), "observations hold numbers that are not finite"),
+        (("action", np.inf), "actions hold numbers that are not finite"),
+        (("answer", np.nan), "answers hold numbers that are not finite"),
+        (("action", 0.0), "actions are no unit vectors"),
+        (("action", (0.8, 0.8)), "actions are no unit vectors"),
+        (("answer", 0.5), "an answer is none of -1, 0, 1"),
+    ],
+)
+def test_labels_that_nobody_can_have_given_are_refused(path, spoil, says):
+    written(path, spoil=spoil)
+    with pytest.raises(UserError, match=says):
+        read_for(path)
+
+
+def test_labels_of_another_world_are_refused_but_for_what_they_do_not_depend_on(path):
+    written(path, task={"name": "window", "half_width_deg": 14.0})
+    with pytest.raises(UserError, match=r"another task.half_width_deg \(14.0, this run's is 28.0\)"):
+        read_for(path)
+    task = probes.make_task()
+    assert len(read_for(path, task=dataclasses.replace(task, labels_hold=("half_width_deg",))).seeds) == 40
+    with pytest.raises(ValueError, match="labels_hold names 'colour'"):
+        dataclasses.replace(task, labels_hold=("colour",))
+    written(path, task={"name": "window", "half_width_deg": "wide"})
+    with pytest.raises(UserError, match="damaged"):
+        read_for(path)

@@ -1,19 +1,24 @@
 """Runs that were stopped or killed and resumed: bitwise the run that was left alone."""
 
+import json
+import shutil
 import threading
 from contextlib import contextmanager
+from pathlib import Path
 
 import jax
 import numpy as np
 import probes
+import pyarrow.parquet as pq
 import pytest
 
 from cuelearner_jax.asking import label_slots
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guidance import registry as guidances
 from cuelearner_jax.loop import make_program, start_clock
-from cuelearner_jax.records import label_files, results
+from cuelearner_jax.records import formats, label_files, results
 from cuelearner_jax.records.checkpoint import checkpoints
+from cuelearner_jax.records.folders import prepare_folder
 from cuelearner_jax.runs import lanes, runner, sweep, training
 from cuelearner_jax.runs.grid import Grid
 from cuelearner_jax.runs.kept import items
@@ -318,3 +323,100 @@ def test_a_damaged_checkpoint_is_refused_and_the_one_before_serves(whole, tmp_pa
     newest_folder.rename(tmp_path / "damaged")
     run(out, resume=True)
     assert_same_run(out, whole)
+
+
+# What is lost or changed is said before anything goes on.
+
+
+def without_rows(table, drop):
+    """Rewrites a growing table without some rows, as somebody would who knows nothing of checksums."""
+    lines = [json.loads(line) for line in table.read_text().splitlines()]
+    kept = [{name: value for name, value in line.items() if name != "crc"} for line in lines if not drop(line)]
+    table.write_text("".join(json.dumps(line) + "\n" for line in kept))
+
+
+def refused(out, message):
+    before = probes.files_of(out)
+    with pytest.raises(UserError, match=message) as refusal:
+        run(out, resume=True)
+    assert "\n" not in str(refusal.value)
+    assert probes.files_of(out) == before
+
+
+@pytest.fixture(scope="module")
+def stopped(tmp_path_factory):
+    """A run that was stopped at step 48 of its first kind."""
+    out = tmp_path_factory.mktemp("stopped") / "run"
+    with stopping_at(6 + 3), pytest.raises(Interrupted):
+        run(out)
+    return out
+
+
+def copied(folder, tmp_path):
+    return Path(shutil.copytree(folder, tmp_path / "copy" / "run"))
+
+
+@pytest.mark.parametrize(
+    ("drop", "says"),
+    [
+        (lambda line: line.get("step") == 16 and line["seed"] == 5, "lacks rows: 2, the first of seed 5 with 35"),
+        (lambda line: line.get("step", 0) > 16, "lacks rows: 8, the first of seed 3 with 35 labels at step 32"),
+        (lambda line: "step" in line, "lacks rows: 16, the first of seed 3 with 35 labels at step 0"),
+    ],
+)
+def test_rows_that_were_lost_before_the_checkpoint_are_missed(stopped, tmp_path, drop, says):
+    out = copied(stopped, tmp_path)
+    without_rows(out / "relative" / results.JSONL, drop)
+    refused(out, says)
+
+
+def test_a_table_that_was_lost_is_missed_and_its_lanes_can_be_trained_anew(stopped, whole, tmp_path):
+    out = copied(stopped, tmp_path)
+    (out / "relative" / results.JSONL).unlink()
+    refused(out, "or delete .*relative and give --resume, which trains these lanes anew")
+    shutil.rmtree(out / "relative")  # as the message says
+    run(out, resume=True)
+    assert_same_run(out, whole)
+
+
+def test_a_finished_kind_is_looked_at_before_it_is_called_finished(whole, tmp_path):
+    out = copied(whole, tmp_path)
+    file = out / "relative" / results.PARQUET
+    content = file.read_bytes()
+    file.write_bytes(content[: len(content) // 2])
+    refused(out, "is damaged: restore it")
+    pq.write_table(pq.read_table(whole / "relative" / results.PARQUET).replace_schema_metadata(None).slice(1), file)
+    refused(out, "lacks rows: 1,")
+    file.write_bytes(content)
+    labels = out / "relative" / label_files.PARQUET
+    labels.write_bytes(labels.read_bytes()[:100])
+    refused(out, "not a label file of cuelearner, or it is damaged")
+
+
+def test_damaged_labels_of_a_run_that_goes_on_are_written_anew(stopped, whole, tmp_path):
+    out = copied(stopped, tmp_path)
+    (out / "relative" / label_files.PARQUET).write_bytes(b"PAR1")
+    run(out, resume=True)
+    assert_same_run(out, whole)
+
+
+@pytest.mark.parametrize(("resume", "says"), [(False, "not empty"), (True, "another scalars.eps_deg")])
+def test_a_folder_that_another_process_used_in_the_meantime_is_left_alone(stopped, tmp_path, resume, says):
+    out, other = copied(stopped, tmp_path), tmp_path / "other"
+    if resume:
+        prepare_folder(other, formats.read("config", out / "config.json"), clean=True)
+
+    @contextmanager
+    def late(folder):
+        """The folder becomes another run's between the first look and the lock."""
+        shutil.rmtree(folder, ignore_errors=True)
+        shutil.copytree(out, folder)
+        probes.edit_json(folder / "config.json", lambda values: values["scalars"].update(eps_deg=1.0))
+        yield
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sweep, "claimed", late)
+        with pytest.raises(UserError, match=says):
+            run(other, resume=resume)
+    assert formats.read("config", other / "config.json")["scalars"]["eps_deg"] == 1.0
+    assert read_labels(other)[0].shape == read_labels(out)[0].shape

@@ -1,5 +1,7 @@
 """What a run says of itself, grids that make no sense, and runs that are refused."""
 
+import copy
+import functools
 import json
 from pathlib import Path
 
@@ -7,9 +9,10 @@ import numpy as np
 import probes
 import pytest
 
+from cuelearner_jax import config as configuration
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guidance import registry as guidances
-from cuelearner_jax.records import results
+from cuelearner_jax.records import formats, results
 from cuelearner_jax.records.folders import check_folder, prepare_folder
 from cuelearner_jax.runs import grid as runs
 from cuelearner_jax.runs import sweep
@@ -80,16 +83,16 @@ def test_the_hash_of_a_configuration_is_that_of_its_recorded_results(folder):
     recorded = ROOT / "docs" / "data" / folder
     values = json.loads((recorded / "config.json").read_text())
     hashes = set(results.read(recorded)["config_hash"].to_pylist())
-    assert hashes == {runs.config_hash(values)} == {runs.config_hash({**values, "format": 1})}
+    assert hashes == {runs.config_hash(values)} == {runs.config_hash({**values, "format": 2})}
     assert runs.config_hash({**values, "split": "other"}) not in hashes
 
 
 def test_runs_described_before_formats_had_numbers_are_resumed_and_loaded(out):
-    assert described()["format"] == 1
+    assert described()["format"] == 2
     probes.edit_json(out / "config.json", lambda values: values.pop("format"))
     check_folder(out, described(), resume=True, overwrite=False)
     assert runs.load(out, find)[1] == probes.CONFIG
-    probes.edit_json(out / "config.json", lambda values: values.update(format=2))
+    probes.edit_json(out / "config.json", lambda values: values.update(format=3))
     not_loaded(out, "written by a newer cuelearner")
 
 
@@ -129,6 +132,43 @@ def test_a_damaged_description_is_not_loaded(out, content):
 def test_the_description_of_another_program_is_not_loaded(out, change, message):
     probes.edit_json(out / "config.json", change)
     not_loaded(out, message)
+
+
+JUNK = [None, -1, 1e30, 10**20, True, "", "mro", [], [None], {"a": 1}, float("nan"), [1, 10**9]]
+
+
+def leaves(values, path=()):
+    """The ways to every value of nested objects, the objects themselves included."""
+    for name, value in values.items():
+        yield (*path, name)
+        if isinstance(value, dict):
+            yield from leaves(value, (*path, name))
+
+
+def test_nonsense_in_a_description_is_refused_wherever_it_stands(out):
+    """And what is not refused is a run that the program could have described."""
+    path, taken = out / "config.json", []
+    whole = {**formats.read("config", path), "shard": {"index": 1, "count": 2, "seeds": [4, 9, 10, 11]}}
+    for way in leaves(whole):
+        for junk in JUNK:
+            values = copy.deepcopy(whole)
+            place = functools.reduce(dict.__getitem__, way[:-1], values)
+            place[way[-1]] = junk
+            path.write_text(json.dumps({**values, "digest": configuration.digest(values)}))
+            try:
+                _, config, grid = runs.load(out, find)
+            except UserError as error:
+                assert "\n" not in str(error)
+                continue
+            taken.append((way, junk))
+            configuration.check(config)
+            assert all(isinstance(kind, str) for kind in grid.guidance)
+            assert all(isinstance(number, int) for number in (*grid.seeds, *grid.labels))
+    assert {way for way, junk in taken if isinstance(junk, str)} <= {
+        ("grid", "guidance", "x"),
+        ("labels_from",),
+        ("format",),
+    }
 
 
 def test_the_learned_teachers_description_is_no_run(out):

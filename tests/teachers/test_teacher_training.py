@@ -14,6 +14,7 @@ from cuelearner_jax.config import to_json
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import rollout
 from cuelearner_jax.policies import Taught
+from cuelearner_jax.records import formats
 from cuelearner_jax.teachers import program as training_program
 from cuelearner_jax.teachers import stored
 from cuelearner_jax.teachers.learned import TeacherConfig
@@ -118,10 +119,10 @@ def test_saving_again_replaces_the_network(made, tmp_path):
 
 def test_its_description_has_a_format_and_a_newer_one_is_refused(made, tmp_path):
     stored.save(tmp_path, made, {"config": to_json(CONFIG)})
-    assert json.loads((tmp_path / "teacher.json").read_text()) == {"format": 1, "config": to_json(CONFIG)}
+    assert formats.read("teacher", tmp_path / "teacher.json") == {"format": 2, "config": to_json(CONFIG)}
     probes.edit_json(tmp_path / "teacher.json", lambda about: about.pop("format"))
     assert stored.load(tmp_path, ENV, 0.0, 0.0).layers == CONFIG.layers
-    probes.edit_json(tmp_path / "teacher.json", lambda about: about.update(format=2))
+    probes.edit_json(tmp_path / "teacher.json", lambda about: about.update(format=3))
     with pytest.raises(UserError, match="written by a newer cuelearner"):
         stored.load(tmp_path, ENV, 0.0, 0.0)
 
