@@ -200,7 +200,7 @@ class RunConfig(Generic[TaskT]):
 def check(config: RunConfig) -> None:
     """Raises UserError with one line for the first value that cannot work."""
     sizes, schedule = config.sizes, config.schedule
-    _check_whole(schedule, "schedule")
+    check_whole(schedule, "schedule")
     _check_sizes(sizes)
     check_guide(sizes, config.scalars)
     if config.scalars.discount >= 1:
@@ -225,7 +225,7 @@ def check(config: RunConfig) -> None:
     _check_multiple(schedule.eval_steps, schedule.eval_envs, "schedule.eval_steps", "schedule.eval_envs")
 
 
-def _check_whole(group: Any, prefix: str) -> None:
+def check_whole(group: Any, prefix: str) -> None:
     """Raises UserError for a whole number that 32 bits do not hold."""
     for field in dataclasses.fields(group):
         value = getattr(group, field.name)
@@ -237,7 +237,7 @@ def _check_whole(group: Any, prefix: str) -> None:
 
 
 def _check_sizes(sizes: Sizes) -> None:
-    _check_whole(sizes, "sizes")
+    check_whole(sizes, "sizes")
     positive = ("directions", "peaks", "target_directions", "num_envs", "batch_size", "replay_capacity")
     _check_positive(sizes, (*positive, "updates_per_step", "n_step"))
     if sizes.coarse_directions and (sizes.coarse_directions < 3 or sizes.directions % sizes.coarse_directions):
@@ -261,8 +261,8 @@ def _check_sizes(sizes: Sizes) -> None:
 
 def check_guide(sizes: GuideSizes, scalars: GuideScalars) -> None:
     """Raises UserError with one line for the first value of a guide's that cannot work."""
-    _check_whole(sizes, "sizes")
-    _check_whole(scalars, "scalars")
+    check_whole(sizes, "sizes")
+    check_whole(scalars, "scalars")
     _check_positive(sizes, ("labels_per_round", "fit_steps", "fit_batch_size", "validate_every"))
     if sizes.labels_per_round > LARGEST_ROUND:
         raise UserError(f"sizes.labels_per_round is {sizes.labels_per_round}: give at most {LARGEST_ROUND}")

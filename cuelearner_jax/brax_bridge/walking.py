@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -74,21 +75,35 @@ class LocomotionConfig:
     """Robots that a measurement watches for 20 s."""
 
 
+LARGEST_ROBOTS = 1 << 20  # each keeps some kilobytes of physics
+
+
 def check(config: LocomotionConfig) -> None:
     """Raises UserError for values that cannot work."""
+    configuration.check_whole(config, "train")
+    for name in ("robots", "measured_robots"):
+        if getattr(config, name) > LARGEST_ROBOTS:
+            raise UserError(f"train.{name} is {getattr(config, name)}: give at most {LARGEST_ROBOTS}")
     for field in dataclasses.fields(config):
         value = getattr(config, field.name)
         if field.name not in ("seconds", "entropy", "layers") and value <= 0:
             raise UserError(f"train.{field.name} is {value}: give a positive number")
     if config.seconds < 0 or config.entropy < 0:
         raise UserError("train.seconds and train.entropy can't be negative")
-    if not config.layers:
-        raise UserError("train.layers: give at least one layer")
+    if not all(math.isfinite(value) for value in dataclasses.asdict(config).values() if isinstance(value, float)):
+        raise UserError("train: give finite numbers")
+    if not config.layers or min(config.layers) < 1:
+        raise UserError("train.layers: give at least one layer of positive width")
     if config.batch_size * config.minibatches % config.robots:
         raise UserError(
             f"train.batch_size times train.minibatches is {config.batch_size * config.minibatches}: "
             f"give a multiple of train.robots ({config.robots})"
         )
+
+
+def _check_seed(seed: int) -> None:
+    if not 0 <= seed <= configuration.LARGEST:
+        raise UserError(f"--seed is {seed}: give a number from 0 to {configuration.LARGEST}")
 
 
 class _Enough(Exception):
@@ -113,6 +128,7 @@ def train(
         Interrupted: Ctrl-C or SIGTERM; the newest measured policy is saved.
     """
     check(config)
+    _check_seed(seed)
     if in_use(out):
         raise UserError(f"{out} is not empty: give another --out")
     about = {"config": configuration.to_json(config), "seed": seed, **provenance(), "command": command}
@@ -172,8 +188,9 @@ def evaluate(
     Raises:
         UserError: no policy there, or `out` exists.
     """
-    if robots < 1:
-        raise UserError(f"--robots is {robots}: give a positive number")
+    if not 1 <= robots <= LARGEST_ROBOTS:
+        raise UserError(f"--robots is {robots}: give a number from 1 to {LARGEST_ROBOTS}")
+    _check_seed(seed)
     if out and out.exists():
         raise UserError(f"{out} exists: give another --out")
     policy = robot.load(folder) if folder else robot.load()
