@@ -5,11 +5,12 @@ BIN := $(VENV)/bin
 UV := $(BIN)/python -m uv
 UV_VERSION := $(shell sed -n 's/^uv==\([0-9.]*\).*/\1/p' constraints.txt)
 
-.PHONY: help setup quickstart test test-quick lint format bench constraints clean
+.PHONY: help setup quickstart test test-quick fuzz lint format bench constraints clean
 help:
 	@echo "make quickstart   train, report and film the small billiards example (two to three minutes)"
 	@echo "make test         run the tests (about 13 minutes on 2 idle cores)"
 	@echo "make test-quick   those of them that compile next to nothing (under 3 minutes)"
+	@echo "make fuzz         damaged run folders by chance, CASES=2000 SEED=0 (hours on 2 cores)"
 	@echo "make lint         ruff and pyright"
 	@echo "make format       what ruff can put right by itself"
 	@echo "make bench        the benchmarks of this machine (some minutes)"
@@ -42,6 +43,11 @@ test: $(VENV)/.tested
 
 test-quick: $(VENV)/.tested
 	$(BIN)/python -m pytest -n 2 --dist loadfile -m "not slow"
+
+CASES ?= 2000
+SEED ?= 0
+fuzz: $(VENV)/.tested
+	PYTHONPATH=tests JAX_PLATFORMS=cpu $(BIN)/python tests/damaged_folders.py --cases $(CASES) --seed $(SEED)
 
 lint: $(VENV)/.tested
 	$(BIN)/ruff check .

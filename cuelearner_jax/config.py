@@ -82,7 +82,7 @@ class Sizes(GuideSizes, AgentSizes):
     """Static sizes: changing one compiles the program again."""
 
     lanes_per_block: int = 0
-    """Seeds trained in one vmapped block (0: on a CPU as many as its cache holds, on an accelerator all)."""
+    """Seeds trained in one block, side by side (0: all) on an accelerator, one by one (0: a block a core) on a CPU."""
 
 
 class _Degrees:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from itertools import compress
 from typing import Any, NamedTuple
 
@@ -82,28 +83,67 @@ def over_lanes(mesh: Mesh, function: Callable[..., Any], takes: tuple[Any, ...],
     return whole
 
 
-def each_lane(function: Callable[..., Any], gives: Any = 0) -> Callable[..., Any]:
-    """`jax.vmap` over lanes; one alone is computed without the axis, which slows XLA's matrix products on a CPU.
+def each_lane(function: Callable[..., Any]) -> Callable[..., Any]:
+    """`function` of each lane of a block: side by side on an accelerator, by `jax.vmap`; one by one on a CPU.
+
+    Products of many matrices at once are summed in another order than one alone. So on a CPU a lane's result does not
+    depend on how many there are, not by a bit; and a core is no slower at it.
 
     Args:
         function: of one lane's trees of arrays.
-        gives: `out_axes` of `jax.vmap`: 0, or None for what all lanes have in common.
 
     Returns:
         The function of blocks: every leaf with a leading axis of lanes.
     """
 
     def mapped(*blocks: Any) -> Any:
-        if any(leaf.shape[0] > 1 for leaf in jax.tree.leaves(blocks)):
-            return jax.vmap(function, out_axes=gives)(*blocks)
-        found = function(*jax.tree.map(lambda leaf: leaf[0], blocks))
-        return jax.tree.map(_with_axis, gives, found, is_leaf=lambda axis: axis is None)
+        if _lanes(blocks) == 1:
+            return jax.tree.map(lambda leaf: leaf[None], function(*_lane(blocks, 0)))
+        if _side_by_side():
+            return jax.vmap(function)(*blocks)
+        return jax.lax.map(lambda lane: function(*lane), blocks)
 
     return mapped
 
 
-def _with_axis(axis: int | None, tree: Any) -> Any:
-    return tree if axis is None else jax.tree.map(lambda leaf: leaf[None], tree)
+def each_lane_in_place(function: Callable[[Any], tuple[Any, Any, Any]]) -> Callable[[Any], tuple[Any, Any, Any]]:
+    """The same of a function that gives a lane in the place of the one that it takes: no second block is made.
+
+    Args:
+        function: of a lane -> (the lane after it, what all lanes have in common, what each has).
+
+    Returns:
+        The function of a block -> (the block after it, what all lanes have in common, what each has).
+    """
+
+    def mapped(block: Any) -> tuple[Any, Any, Any]:
+        if _lanes(block) == 1:
+            lane, common, own = function(_lane(block, 0))
+            return *jax.tree.map(lambda leaf: leaf[None], (lane,)), common, jax.tree.map(lambda leaf: leaf[None], own)
+        if _side_by_side():
+            return jax.vmap(function, out_axes=(0, None, 0))(block)
+
+        def turn(block: Any, index: jax.Array) -> tuple[Any, tuple[Any, Any]]:
+            lane, common, own = function(_lane(block, index))
+            put = partial(jax.lax.dynamic_update_index_in_dim, index=index, axis=0)
+            return jax.tree.map(put, block, lane), (common, own)
+
+        block, (common, own) = jax.lax.scan(turn, block, jnp.arange(_lanes(block)))
+        return block, jax.tree.map(lambda leaf: leaf[0], common), own
+
+    return mapped
+
+
+def _side_by_side() -> bool:
+    return jax.default_backend() != "cpu"
+
+
+def _lanes(blocks: Any) -> int:
+    return jax.tree.leaves(blocks)[0].shape[0]
+
+
+def _lane(blocks: Any, index: Any) -> Any:
+    return jax.tree.map(lambda leaf: jax.lax.dynamic_index_in_dim(leaf, index, keepdims=False), blocks)
 
 
 def place(mesh: Mesh, tree: Any, where: PartitionSpec) -> Any:

@@ -18,6 +18,15 @@ class UserError(Exception):
     """
 
 
+class NotFinite(Exception):
+    """What was trained, or some of it, stopped being finite: its message is one line that says what, and what is kept.
+
+    The command line prints the message and exits with `status`.
+    """
+
+    status = 1
+
+
 def no_space(error: BaseException | None) -> bool:
     """Does an exception, or what it came from, say that the disk is full? TensorStore says so in words alone."""
     if error is None:

@@ -1,12 +1,17 @@
-"""Validation: fixed-length roll-outs of any policy on episodes that nothing was trained or tuned on."""
+"""Validation: fixed-length roll-outs of any policy on episodes that nothing was trained or tuned on.
+
+A roll-out is begun, walked in one stretch or in several, and summed up: the numbers are the same, bit by bit on a CPU.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.sharding import Mesh
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, PRNGKeyArray
@@ -30,16 +35,40 @@ def rollout(
     """Means over `steps` environment steps, shared by `num_envs` environments that reset by themselves.
 
     Outcomes are those of each environment's first episode: the same episodes whatever the policy, and as many long ones
-    as there are. Give steps enough for the longest; "finished" is the share of first episodes that did end.
+    as there are. Give steps enough for the longest: while one has not ended, there is no mean over all of them.
 
     Returns:
-        "reward" a step, every metric of the environment's, and, where it has outcomes, these and "finished".
+        "reward" a step, every metric of the environment's, and, where it has outcomes, these (nan unless all first
+        episodes have ended) and "finished", the share of first episodes that have.
     """
-    k_reset, k_run = jax.random.split(key)
-    state, obs = jax.vmap(env.reset)(jax.random.split(k_reset, num_envs))
+    _, seen = _walked(policy, env, key, _begun(env, key, num_envs), jnp.arange(steps // num_envs))
+    return _summed(seen, num_envs)
 
-    def one_step(carry: tuple, index: jax.Array) -> tuple[tuple, tuple[dict, dict]]:
-        state, obs, first = carry
+
+class _Walk(NamedTuple):
+    """Where a roll-out stands; leading axis: environments."""
+
+    state: Any
+    obs: Array
+    first: Array  # is this still the first episode?
+
+
+Seen = tuple[dict[str, Array], dict[str, Array]]  # of each step: means, and sums over the first episodes that it ended
+
+
+def _begun(env: Environment, key: PRNGKeyArray, num_envs: int) -> _Walk:
+    k_reset, _ = jax.random.split(key)
+    state, obs = jax.vmap(env.reset)(jax.random.split(k_reset, num_envs))
+    return _Walk(state, obs, jnp.ones(num_envs, bool))
+
+
+def _walked(policy: Policy, env: Environment, key: PRNGKeyArray, walk: _Walk, indices: Array) -> tuple[_Walk, Seen]:
+    """The steps of these numbers."""
+    _, k_run = jax.random.split(key)
+    num_envs = walk.first.shape[0]
+
+    def one_step(walk: _Walk, index: jax.Array) -> tuple[_Walk, Seen]:
+        state, obs, first = walk
         k_act, k_env = jax.random.split(jax.random.fold_in(k_run, index))
         action = policy.act(k_act, state, obs)
         state, step = jax.vmap(env.step)(jax.random.split(k_env, num_envs), state, action)
@@ -48,14 +77,19 @@ def rollout(
         ends = {name: jnp.sum(value, where=first & done) for name, value in step.outcome.items()}
         if ends:
             ends["finished"] = jnp.sum(first & done)
-        return (state, step.obs, first & ~done), (means, ends)
+        return _Walk(state, step.obs, first & ~done), (means, ends)
 
-    start = (state, obs, jnp.ones(num_envs, bool))
-    _, (means, ends) = jax.lax.scan(one_step, start, jnp.arange(steps // num_envs))
+    return jax.lax.scan(one_step, walk, indices)
+
+
+def _summed(seen: Seen, num_envs: int) -> dict[str, Float[Array, ""]]:
+    """The metrics of all steps."""
+    means, ends = seen
     metrics = {name: value.mean() for name, value in means.items()}
     if ends:
-        finished = ends.pop("finished").sum()
-        metrics |= {name: value.sum() / jnp.maximum(finished, 1) for name, value in ends.items()}
+        finished = ends["finished"].sum()
+        outcomes = {name: value.sum() / jnp.maximum(finished, 1) for name, value in ends.items() if name != "finished"}
+        metrics |= {name: jnp.where(finished == num_envs, value, jnp.nan) for name, value in outcomes.items()}
         metrics["finished"] = finished / num_envs
     return metrics
 
@@ -138,3 +172,94 @@ def evaluate_policy(
 ) -> dict[str, Float[Array, ""]]:
     """`rollout` of one policy, compiled."""
     return rollout(policy, env, key, num_envs, steps)
+
+
+MOST_STRETCHES = 25  # of a roll-out that is watched
+
+Tell = Callable[[int, int], None]  # (done, of how many): called between stretches; what it raises ends the evaluation
+
+
+def untold(done: int, count: int) -> None:
+    """Nobody watches."""
+
+
+def part_of(tell: Tell, number: int, parts: int) -> Tell:
+    """Who is told of part `number` (from 0) of as many equal ones, one after the other."""
+    return lambda done, count: tell(number * count + done, parts * count)
+
+
+def watched(
+    env: Environment, policy: Policy, key: PRNGKeyArray, num_envs: int, steps: int, tell: Tell = untold
+) -> dict[str, np.ndarray]:
+    """`rollout` of one policy in stretches. Returns metrics ()."""
+    leaves, tree = jax.tree.flatten(policy)
+    return _in_stretches(env, _Structure(tree, (False,) * len(leaves)), [], leaves, key, num_envs, steps, tell)
+
+
+def watched_lanes(
+    env: Environment, policy: Policy, key: PRNGKeyArray, num_envs: int, steps: int, tell: Tell = untold
+) -> dict[str, np.ndarray]:
+    """`evaluate_lanes` on one device, in stretches: as many lanes at once as it takes well. Metrics (lanes,)."""
+    structure = _structure(policy)
+    each, shared = structure.take_apart(policy)
+    lanes = jnp.asarray(each[0]).shape[0]
+    size = min(lanes, portions().agents)
+    firsts, found = range(0, lanes, size), []
+    for number, first in enumerate(firsts):
+        rows = np.minimum(np.arange(first, first + size), lanes - 1)  # the last are repeated, which saves a compile
+        part = [jnp.asarray(leaf)[rows] for leaf in each]
+        told = part_of(tell, number, len(firsts))
+        found.append(_in_stretches(env, structure, part, shared, key, num_envs, steps, told))
+    return {name: np.concatenate([part[name] for part in found])[:lanes] for name in found[0]}
+
+
+def _in_stretches(
+    env: Environment,
+    structure: _Structure,
+    each: list[Array],
+    shared: list[ArrayLike],
+    key: PRNGKeyArray,
+    num_envs: int,
+    steps: int,
+    tell: Tell,
+) -> dict[str, np.ndarray]:
+    """A roll-out of one policy, or of as many lanes as `each` has rows, side by side."""
+    count = _stretches(steps // num_envs)
+    walk, seen = _begin(env, key, num_envs=num_envs, lanes=len(each[0]) if each else 0), []
+    for indices in np.arange(steps // num_envs).reshape(count, -1):
+        tell(len(seen), count)
+        walk, part = _walk(env, each, shared, key, walk, jnp.asarray(indices), structure=structure)
+        seen.append(jax.device_get(part))  # what waits until the stretch is done
+    tell(count, count)
+    whole = jax.tree.map(lambda *parts: np.concatenate(parts, axis=-1), *seen)
+    return jax.device_get(_sum_up(whole, num_envs=num_envs, lanes=bool(each)))
+
+
+def _stretches(steps: int) -> int:
+    """Into how many equal stretches so many steps are cut: one program serves them all, none of a single step.
+
+    XLA unrolls a loop of one step, whose numbers may then differ in their last bit.
+    """
+    return max(count for count in range(1, MOST_STRETCHES + 1) if steps % count == 0 and (count == 1 or steps > count))
+
+
+@partial(jax.jit, static_argnames=("num_envs", "lanes"))
+def _begin(env: Any, key: PRNGKeyArray, *, num_envs: int, lanes: int) -> _Walk:
+    walk = _begun(env, key, num_envs)
+    return jax.tree.map(lambda leaf: jnp.repeat(leaf[None], lanes, axis=0), walk) if lanes else walk
+
+
+@partial(jax.jit, static_argnames=("structure",))
+def _walk(
+    env: Any, each: list[Array], shared: list[Array], key: PRNGKeyArray, walk: _Walk, indices: Array, *, structure
+) -> tuple[_Walk, Seen]:
+    def one(lane: list[Array], walk: _Walk) -> tuple[_Walk, Seen]:
+        return _walked(structure.put_together(lane, shared), env, key, walk, indices)
+
+    return jax.vmap(one)(each, walk) if each else one([], walk)
+
+
+@partial(jax.jit, static_argnames=("num_envs", "lanes"))
+def _sum_up(seen: Seen, *, num_envs: int, lanes: bool) -> dict[str, Array]:
+    summed = partial(_summed, num_envs=num_envs)
+    return jax.vmap(summed)(seen) if lanes else summed(seen)

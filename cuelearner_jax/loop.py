@@ -1,7 +1,8 @@
 """The one training loop, whatever the guidance: policy -> guidance.act -> environment -> replay -> update.
 
-Written for one lane (one seed with one label budget); `vmap` over lanes happens once, in `make_program`. Random numbers
-come from the lane's own key folded with the shared counters, so a lane's result does not depend on its neighbours.
+Written for one lane (one seed with one label budget); lanes are put side by side once, in `make_program`. Random
+numbers come from the lane's own key folded with the shared counters, so a lane's result does not depend on its
+neighbours: not by a bit on a CPU, on an accelerator up to the order in which sums of matrix products are taken.
 """
 
 from __future__ import annotations
@@ -16,15 +17,23 @@ from jax.sharding import Mesh
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from cuelearner_jax import asking
-from cuelearner_jax.agent.learning import Learner, learner, stored_step
+from cuelearner_jax.agent.learning import Learner, all_finite, learner, stored_step
 from cuelearner_jax.asking import label_slots
 from cuelearner_jax.config import RunConfig, Scalars, Schedule, Sizes
-from cuelearner_jax.devices import BY_LANE, SHARED, compiler_options, each_lane, lane_mesh, over_lanes
+from cuelearner_jax.devices import (
+    BY_LANE,
+    SHARED,
+    compiler_options,
+    each_lane,
+    each_lane_in_place,
+    lane_mesh,
+    over_lanes,
+)
 from cuelearner_jax.environment import Environment
 from cuelearner_jax.guidance.bundle import Guidance
 from cuelearner_jax.guidance.refining import Refined, untouched
 from cuelearner_jax.policies import Uniform
-from cuelearner_jax.types import Clock, Label, Stream, Teacher, TrainState
+from cuelearner_jax.types import Clock, GuideState, Label, Stream, Teacher, TrainState
 
 
 class Program(NamedTuple):
@@ -73,11 +82,13 @@ def make_program(
         return each_lane(partial(lane.init, env))(keys, budgets)
 
     def label_round(env, teacher, scalars, clock, state):
-        state = each_lane(partial(lane.label_round, env, teacher, scalars, clock.round))(state)
-        return clock.replace(round=clock.round + 1), state
+        rest, agent = state.replace(agent=None), state.agent  # which is large, and has no part in it
+        asked = each_lane(partial(lane.label_round, env, teacher, scalars, clock.round))(rest)
+        return clock.replace(round=clock.round + 1), asked.replace(agent=agent)
 
     def take_labels(env, scalars, labels, state):
-        return each_lane(partial(lane.take_labels, env, scalars))(labels, state)
+        rest, agent = state.replace(agent=None), state.agent
+        return each_lane(partial(lane.take_labels, env, scalars))(labels, rest).replace(agent=agent)
 
     def train(env, scalars, schedule, clock, state, iterations):
         def run(state):
@@ -86,10 +97,11 @@ def make_program(
                 state, metrics = lane.iterate(env, scalars, schedule, clock, state)
                 return (lane.advance(clock, schedule), state), metrics
 
-            (after, state), metrics = jax.lax.scan(iteration, (clock, state), length=iterations)
-            return after, state, jax.tree.map(lambda leaf: leaf.mean(0), metrics)
+            (after, trained), metrics = jax.lax.scan(iteration, (clock, state), length=iterations)
+            return lane.kept_finite(trained, state), after, jax.tree.map(lambda leaf: leaf.mean(0), metrics)
 
-        return each_lane(run, gives=(None, 0, 0))(state)
+        state, after, metrics = each_lane_in_place(run)(state)
+        return after, state, metrics
 
     def stretch(env, scalars, schedule, clock, state, iterations):
         whole = over_lanes(
@@ -126,6 +138,7 @@ class Lane(NamedTuple):
             agent=self.learner.init(env, k_q, k_env),
             guide=asking.start(self.guidance, env, slots, budget, k_guidance, k_ask),
             key=key,
+            failed=jnp.array(False),
         )
 
     def label_round(
@@ -136,11 +149,29 @@ class Lane(NamedTuple):
         guide = asking.label_round(
             self.guidance, self.sizes, env, teacher, scalars, base, state.guide, state.key, number
         )
-        return state.replace(guide=guide)
+        return self.guided(state, guide)
 
     def take_labels(self, env: Environment, scalars: Scalars, labels: Label, state: TrainState) -> TrainState:
         """Labels that were given elsewhere, in place of questions, and the model fitted to them."""
-        return state.replace(guide=asking.take_labels(self.guidance, env, scalars, labels, state.guide, state.key))
+        return self.guided(state, asking.take_labels(self.guidance, env, scalars, labels, state.guide, state.key))
+
+    def guided(self, state: TrainState, guide: GuideState) -> TrainState:
+        """The lane with a new guide; where that is not finite the lane fails, and keeps the one that it had."""
+        failed = state.failed | ~all_finite((guide.model, guide.labels))
+        kept = jax.tree.map(lambda new, old: jnp.where(failed, old, new), guide, state.guide)
+        return state.replace(guide=kept, failed=failed)
+
+    def kept_finite(self, state: TrainState, before: TrainState) -> TrainState:
+        """A lane after a stretch; one that has failed, in it or before, with what it had learned `before`.
+
+        Asked once a stretch, not at each gradient step: that would read all parameters once more.
+        """
+        learned = lambda lane: (lane.agent.params, lane.agent.target_params, lane.agent.opt_state)  # noqa: E731
+        failed = state.failed | ~all_finite(learned(state))
+        kept = jax.tree.map(lambda new, old: jnp.where(failed, old, new), learned(state), learned(before))
+        params, target_params, opt_state = kept
+        agent = state.agent.replace(params=params, target_params=target_params, opt_state=opt_state)
+        return state.replace(agent=agent, failed=failed)
 
     def advance(self, clock: Clock, schedule: Schedule) -> Clock:
         """The clock after one iteration."""
@@ -167,14 +198,14 @@ class Lane(NamedTuple):
             obs=step.obs,
             guided=jnp.where(done, redrawn, agent.guided),
         )
-        agent, loss = jax.lax.cond(
+        agent, loss, finite = jax.lax.cond(
             clock.step + self.sizes.num_envs >= schedule.learn_after,
             lambda agent: self.learner.learn(env, scalars, schedule, clock, agent, k_learn),
-            lambda agent: (agent, jnp.zeros(())),
+            lambda agent: (agent, jnp.zeros(()), jnp.array(True)),
             agent,
         )
         metrics = {"reward": step.reward.mean(), "loss": loss, "passes": passes.astype(jnp.float32).mean()}
-        return state.replace(agent=agent), metrics
+        return state.replace(agent=agent, failed=state.failed | ~finite), metrics
 
     def act(
         self, env: Environment, scalars: Scalars, schedule: Schedule, clock: Clock, state: TrainState, key: PRNGKeyArray

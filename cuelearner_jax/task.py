@@ -16,8 +16,9 @@ from cuelearner_jax.environment import Environment
 from cuelearner_jax.errors import UserError, closest
 from cuelearner_jax.types import EnvState, Teacher
 
-# (policy, environment, key, environments, steps) -> metrics by name, as `evaluate.rollout`
-Rollout = Callable[[Any, Any, PRNGKeyArray, int, int], dict[str, Any]]
+# (policy, environment, key, environments, steps, tell) -> metrics by name, as `evaluate.rollout`; now and then it calls
+# `tell` with how far it is, and of how much
+Rollout = Callable[[Any, Any, PRNGKeyArray, int, int, Callable[[int, int], None]], dict[str, Any]]
 
 
 @dataclass(frozen=True)
@@ -30,6 +31,7 @@ class Preset:
     labels: tuple[int, ...] = (500, 1000)
     seeds: int = 5
     first_seed: int = 0
+    takes: str = ""  # how long on which machine
 
 
 class Pictures(NamedTuple):
@@ -53,6 +55,9 @@ class Body:
     environment: Callable[[Any, str], Environment]  # (configuration, split); for the splits see `evaluate.SPLITS`
     engines: dict[str, Rollout] = field(default_factory=dict)  # roll-outs in other physics, by name
     pictures: Callable[[], Pictures] | None = None  # loads what draws, when called; None: nothing draws it
+    # a folder of the user's -> the body with what lies there; raises UserError if that is not for it; None: takes none
+    made_of: Callable[[Path], Body] | None = None
+    digest: str = ""  # of what lies in that folder
 
 
 @dataclass(frozen=True)
@@ -77,6 +82,10 @@ class Task:
     config: type  # its configuration: a dataclass, one line of help a field
     bodies: tuple[Body, ...]  # its own first
     teacher: Callable[[Any, Any], Teacher] | None = None  # (configuration, environment); None: nobody answers
+    # configuration -> digests of the user's own files that it names, by field; raises UserError if one is not there
+    files: Callable[[Any], dict[str, str]] = lambda config: {}
+    # configuration -> steps of its longest episode, where episodes count (`Step.outcome`); None: steps count
+    longest: Callable[[Any], int] | None = None
     presets: dict[str, Preset] = field(default_factory=dict)
     scenarios: dict[str, Scenario] = field(default_factory=dict)
     labels_hold: tuple[str, ...] = ()  # fields of the configuration that labels of another world may differ in
@@ -122,17 +131,42 @@ class Task:
             raise UserError(f"{self.name} has no teacher to ask: give --labels-from, or a guidance without labels")
         return self.teacher(config, env)
 
+    def check_whole(self, config: Any, envs: int, steps: int, envs_option: str, steps_option: str) -> None:
+        """Raises UserError if an episode of a world may outlast the steps of each of the environments that share them.
+
+        Means over the episodes that ended in time would be those of the short ones.
+        """
+        if self.longest is not None and steps // envs < self.longest(config):
+            raise UserError(
+                f"{steps_option} is {steps} for {envs} environments, {steps // envs} each, but an episode lasts up to "
+                f"{self.longest(config)}: give {steps_option} {envs * self.longest(config)}, or a lower {envs_option}"
+            )
+
+    def check_evaluations(self, config: RunConfig) -> None:
+        """Raises UserError unless the evaluations of a training see whole episodes."""
+        schedule = config.schedule
+        options = "--schedule.eval-envs", "--schedule.eval-steps"
+        self.check_whole(config.task, schedule.eval_envs, schedule.eval_steps, *options)
+
     def on(self, body: str | None) -> Task:
-        """The task with that body first (None: as it is). Raises UserError if it has no such body."""
+        """The task with that body first (None: as it is); with what lies in a folder, if it is called NAME:FOLDER.
+
+        Raises UserError if it has no such body, or nothing for it lies there.
+        """
         if body is None:
             return self
+        body, _, folder = body.partition(":")
         if len(self.bodies) == 1:
             raise UserError(f"{self.name} has no robots to choose from: leave out --robot")
         known = {one.name: one for one in self.bodies}
         if body not in known:
             raise UserError(f"unknown robot {body!r}{closest(body, known)}")
-        others = tuple(one for one in self.bodies if one.name != body)
-        return dataclasses.replace(self, bodies=(known[body], *others))
+        others, found = tuple(one for one in self.bodies if one.name != body), known[body]
+        if folder:
+            if found.made_of is None:
+                raise UserError(f"{body} takes no folder: leave out {folder!r}")
+            found = found.made_of(Path(folder))
+        return dataclasses.replace(self, bodies=(found, *others))
 
     def engine(self, name: str | None) -> Rollout | None:
         """The first body's roll-out in other physics (None: its own). Raises UserError if it has no such engine."""

@@ -113,6 +113,7 @@ class TrainState(struct.PyTreeNode):
     agent: AgentState
     guide: GuideState
     key: PRNGKeyArray
+    failed: Bool[Array, ""]  # did a loss, a gradient or a parameter stop being finite? It stays as it was before then
 
 
 class Clock(struct.PyTreeNode):

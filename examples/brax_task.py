@@ -18,9 +18,9 @@ import jax.numpy as jnp
 from brax import envs
 from jaxtyping import Array, Float
 
+from cuelearner_envs.bounds import MOST_STEPS, check_number
 from cuelearner_jax.brax_bridge.adapter import BraxTask, from_brax
 from cuelearner_jax.config import RunConfig, Scalars, Schedule, Sizes
-from cuelearner_jax.errors import UserError
 from cuelearner_jax.task import Body, Preset, Task
 
 
@@ -48,8 +48,7 @@ def toward_the_lean(obs: Float[Array, " obs"]) -> Float[Array, "2"]:
 
 def make_environment(config: PendulumConfig, split: str = "training") -> BraxTask:
     """The environment of a configuration."""
-    if config.max_steps < 1:
-        raise UserError(f"task.max_steps is {config.max_steps}: give a positive number")
+    check_number("max_steps", config.max_steps, 1, MOST_STEPS, whole=True)
     return from_brax(_made(config.backend), max_steps=config.max_steps, heuristic=toward_the_lean)
 
 

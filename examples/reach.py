@@ -28,10 +28,10 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from cuelearner_envs import film
+from cuelearner_envs.bounds import MOST_STEPS, check_number
 from cuelearner_jax.actions import from_angle, retract, rotate
 from cuelearner_jax.config import RunConfig, Scalars, Schedule, Sizes
 from cuelearner_jax.environment import Quantity, WholeObservations
-from cuelearner_jax.errors import UserError
 from cuelearner_jax.task import Body, Pictures, Preset, Scenario, Task
 from cuelearner_jax.types import Policy, Step
 
@@ -137,9 +137,10 @@ class Reach(WholeObservations, struct.PyTreeNode):
 
 def make_environment(config: ReachConfig, split: str = "training") -> Reach:
     """The lake of a configuration; its episodes are random, so that splits need differ in nothing."""
-    for name in ("wind", "speed", "max_steps"):
-        if getattr(config, name) < 0:
-            raise UserError(f"task.{name} is {getattr(config, name)}: give a number that is not negative")
+    check_number("wind", config.wind, 0, unit="m/s")
+    check_number("speed", config.speed, 0, unit="m/s")
+    check_number("rudder_deg", config.rudder_deg, unit="degrees")
+    check_number("max_steps", config.max_steps, 1, MOST_STEPS, whole=True)
     return Reach(
         wind=jnp.float32(config.wind),
         speed=jnp.float32(config.speed),
@@ -271,6 +272,7 @@ TASK = Task(
     config=ReachConfig,
     bodies=(Body("boat", "goes where it is sent, and with the wind", make_environment, pictures=_pictures),),
     teacher=lambda config, env: Skipper(env),
+    longest=lambda config: config.max_steps,
     scenarios={
         "storm": Scenario("a wind that the boat barely makes way against", {"wind": 0.75}, bound_deg=60.0),
         "bent_rudder": Scenario("the boat heads 25 degrees too far left", {"rudder_deg": 25.0}, bound_deg=60.0),

@@ -5,7 +5,8 @@
 Sixteen seeds that no setting was chosen on, 150,000 steps each, labels by the road-map teacher; validation in worlds of
 their own. Then 2,000 validation episodes of every agent, 500 in each of two styles of worlds that it never saw, and the
 curves. A part is one kind of guidance with one budget; with several devices, give each process its parts and device
-(CUDA_VISIBLE_DEVICES) and the same FOLDER. Interrupted parts are resumed, finished ones left as they are.
+(CUDA_VISIBLE_DEVICES) and the same FOLDER. Interrupted parts are resumed, finished ones left as they are. Options that
+are not listed here are given to the sweeps (all of them: cuelearner sweep navigation --help).
 """
 
 from __future__ import annotations
@@ -58,7 +59,9 @@ def commands(out: Path, part: str, dtype: str, extra: list[str]) -> list[list[st
 
 def main() -> int:
     """Runs the commands; stops at the first that fails."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
+    )
     parser.add_argument("--out", type=Path, default=Path("runs/navigation"))
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS), help="these alone")
     parser.add_argument("--dtype", choices=("float32", "bfloat16"), default="float32", help="of the targets' argmax")

@@ -1,15 +1,16 @@
 """The quickstart: unguided and guided agents on one-ball billiards, then curves, a table and a film. About two minutes.
 
-    python experiments/quickstart.py [--out FOLDER] [any option of `cuelearner sweep`]
+    python experiments/quickstart.py --out FOLDER
 
 The sweep is the preset `quickstart` of the task `billiards`. It runs the same commands that a user would type, and says
-where guided agents did better than unguided ones by more than chance.
+where guided agents did better than unguided ones by more than chance. Options that are not listed here are given to the
+sweep, for instance --seeds 4 (all of them: cuelearner sweep billiards --help).
 """
 
 from __future__ import annotations
 
+import argparse
 import csv
-import sys
 import time
 from pathlib import Path
 
@@ -18,10 +19,14 @@ from cuelearner_jax.cli import main as cuelearner
 FILM = "relative"
 
 
-def main(arguments: list[str]) -> int:
+def main() -> int:
     """Runs the commands in turn; stops at the first that fails."""
-    started = time.perf_counter()
-    out, rest = _out(arguments)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
+    )
+    parser.add_argument("--out", type=Path, default=Path("runs/quickstart"), help="folder (default: %(default)s)")
+    asked, rest = parser.parse_known_args()
+    out, started = asked.out, time.perf_counter()
     commands = [
         ["sweep", "billiards", "--preset", "quickstart", "--out", str(out), *rest],
         ["report", str(out), "--out", str(out / "report"), "--overwrite"],
@@ -48,12 +53,5 @@ def _span(stretch: str) -> str:
     return first if first == last else f"{first} to {last}"
 
 
-def _out(arguments: list[str]) -> tuple[Path, list[str]]:
-    if "--out" in arguments and arguments.index("--out") + 1 < len(arguments):
-        index = arguments.index("--out")
-        return Path(arguments[index + 1]), arguments[:index] + arguments[index + 2 :]
-    return Path("runs/quickstart"), arguments
-
-
 if __name__ == "__main__":
-    raise SystemExit(main(sys.argv[1:]))
+    raise SystemExit(main())

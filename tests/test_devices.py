@@ -1,6 +1,7 @@
 """Lanes over four devices, forced on a CPU: what they learn is what one device's lanes learn."""
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -12,7 +13,7 @@ import many_devices
 import numpy as np
 import pytest
 
-from cuelearner_jax.devices import BY_LANE, SHARED, each_lane, lane_mesh, over_lanes
+from cuelearner_jax.devices import BY_LANE, SHARED, each_lane, each_lane_in_place, lane_mesh, over_lanes
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.records import results
 from cuelearner_jax.runs.grid import load
@@ -50,18 +51,22 @@ def test_empty_arrays_do_not_enter_the_shared_program():
     chex.assert_trees_all_equal(double(two, lanes), {"labels": jnp.zeros((4, 0)), "values": 2 * jnp.arange(4.0)})
 
 
-@pytest.mark.parametrize("lanes", [1, 3])
-def test_a_lane_alone_is_computed_without_the_axis_and_given_back_with_it(lanes):
-    def product(left, right):
-        return jnp.asarray(left.ndim), {"product": left @ right}
-
+@pytest.mark.parametrize(("lanes", "backend", "rank"), [(1, "cpu", 2), (3, "cpu", 2), (1, "gpu", 2), (3, "gpu", 3)])
+def test_lanes_are_side_by_side_on_an_accelerator_alone(monkeypatch, lanes, backend, rank):
     left, right = jax.random.normal(jax.random.key(0), (2, lanes, 5, 5))
-    mapped = each_lane(product, gives=(None, 0))
-    dimensions, found = mapped(left, right)
-    assert dimensions == 2  # what all lanes have in common
-    np.testing.assert_allclose(found["product"], np.matmul(left, right), rtol=1e-4, atol=1e-5)
-    (made,) = [step for step in jax.make_jaxpr(mapped)(left, right).eqns if step.primitive.name == "dot_general"]
-    assert made.outvars[0].aval.ndim == (2 if lanes == 1 else 3)
+    monkeypatch.setattr(jax, "default_backend", lambda: backend)
+    mapped = each_lane(lambda left, right: {"product": left @ right})
+    in_place = each_lane_in_place(lambda pair: ((pair[0] @ pair[1], pair[1]), jnp.asarray(7), pair[1].sum()))
+    for function, blocks in ((mapped, (left, right)), (in_place, ((left, right),))):
+        (shape,) = re.findall(r"f32\[([^]]*)\] = dot_general", str(jax.make_jaxpr(function)(*blocks)))
+        assert len(shape.split(",")) == rank
+    expected = np.matmul(left, right)
+    np.testing.assert_allclose(mapped(left, right)["product"], expected, rtol=1e-4, atol=1e-5)
+    (found, same), common, own = in_place((left, right))
+    np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
+    np.testing.assert_array_equal(same, right)
+    assert common == 7
+    np.testing.assert_allclose(own, right.sum((1, 2)), rtol=1e-4, atol=1e-5)
 
 
 def measured(folder):

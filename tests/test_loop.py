@@ -370,9 +370,12 @@ def test_lanes_of_one_seed_start_alike_and_differ_by_their_budget(grid):
 
 def test_a_lane_alone_is_the_lane_beside_others(grid):
     state, metrics = grid
-    alone, measured = trained(probes.window_program("relative", LARGEST), SEEDS[3:], BUDGETS[3:])
-    assert_same_lane(state, 3, alone)
-    assert_close(probes.lane(metrics, 3), probes.lane(measured, 0))
+    program = probes.window_program("relative", LARGEST)
+    alone, measured = trained(program, SEEDS[3:], BUDGETS[3:])
+    beside, _ = trained(program, [7, SEEDS[3]], [20, BUDGETS[3]])
+    assert_equal(probes.lane(state, 3), probes.lane(alone, 0))  # to the last bit
+    assert_equal(probes.lane(metrics, 3), probes.lane(measured, 0))
+    assert_equal(probes.lane(beside, 1), probes.lane(alone, 0))
 
 
 def test_the_smaller_budget_is_the_sweep_of_that_budget_alone(grid):
@@ -397,6 +400,52 @@ def assert_same_lane(state, lane, alone):
     assert_close(together.guide.model, single.guide.model, atol=1e-3)
     for part in (lambda one: one.key, lambda one: one.agent.guided, lambda one: one.guide.obs):
         assert_equal(part(together), part(single))
+
+
+# Lanes that are no longer finite.
+
+
+def test_a_lane_that_diverges_stays_at_its_last_finite_state_and_touches_no_other():
+    program = probes.window_program("relative", LARGEST)
+    clock, state = labelled(program, SEEDS, BUDGETS, 1)
+    wrong = jnp.array([1.0, 1e30, 1.0, 1.0])  # squared it is beyond float32: so are the loss and the gradient's norm
+    before = jax.tree.map(jnp.copy, state.agent.params)
+    poisoned = jax.tree.map(lambda leaf: leaf * wrong.reshape(4, *[1] * (leaf.ndim - 1)), before)
+    sick = jax.tree.map(jnp.copy, state.replace(agent=state.agent.replace(params=poisoned)))
+    _, healthy, _ = run(program, probes.SCALARS, probes.SCHEDULE, clock, state, stretches=2)
+    _, after, metrics = run(program, probes.SCALARS, probes.SCHEDULE, clock, sick, stretches=2)
+    assert not healthy.failed.any()
+    np.testing.assert_array_equal(after.failed, wrong > 1)
+    np.testing.assert_array_equal(np.isfinite(metrics["loss"]), wrong == 1)
+    assert_equal(probes.lane(after.agent.params, 1), probes.lane(poisoned, 1))
+    for other in (0, 2, 3):
+        assert_equal(probes.lane(after, other), probes.lane(healthy, other))
+
+
+def test_a_step_beyond_all_numbers_is_taken_back():
+    program = probes.window_program("none")
+    state = probes.start(program, [0], [0])
+    fresh = jax.tree.map(jnp.copy, state.agent)
+    huge = dataclasses.replace(probes.SCALARS, learning_rate=3e38)
+    schedule = replaced(learn_after=48)  # in the last iteration alone: nothing looks at its parameters after that
+    _, state, _ = run(program, huge, schedule, loop.start_clock(), state)
+    assert state.failed.all()
+    assert_equal(state.agent.params, fresh.params)
+    assert_equal(state.agent.opt_state, fresh.opt_state)
+
+
+def test_a_fit_that_diverges_fails_the_lane_and_leaves_its_guide():
+    program = probes.window_program("relative", LARGEST)
+    clock, state = labelled(program, SEEDS, BUDGETS, 1)
+    guide = jax.tree.map(lambda leaf: np.asarray(probes.words(leaf)), state.guide)
+    assert not state.failed.any()
+    wild = dataclasses.replace(probes.SCALARS, feedback_learning_rate=1e30)
+    clock, state = program.label_round(ENV, EXPERT, wild, clock, state)
+    assert state.failed.all()
+    assert_equal(jax.tree.map(lambda leaf: np.asarray(probes.words(leaf)), state.guide), guide)
+    _, state = program.label_round(ENV, EXPERT, probes.SCALARS, clock, state)  # once failed, always
+    assert state.failed.all()
+    assert_equal(jax.tree.map(lambda leaf: np.asarray(probes.words(leaf)), state.guide), guide)
 
 
 def test_one_stretch_of_steps_is_two_of_half_the_length():

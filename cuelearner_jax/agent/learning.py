@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -62,13 +62,17 @@ class Learner(NamedTuple):
         clock: Clock,
         agent: AgentState,
         key: PRNGKeyArray,
-    ) -> tuple[AgentState, Float[Array, ""]]:
-        """As many gradient steps as environment steps were just made (times `updates_per_step`), and the mean loss."""
+    ) -> tuple[AgentState, Float[Array, ""], Bool[Array, ""]]:
+        """As many gradient steps as environment steps were just made (times `updates_per_step`).
+
+        Returns:
+            The agent; the mean loss; were all losses and gradients finite?
+        """
         steps = self.sizes.num_envs * self.sizes.updates_per_step
         filled = clock.step + self.sizes.num_envs
         optimizer = self.optimizer(scalars)
 
-        def update(carry: tuple, index: jax.Array) -> tuple[tuple, jax.Array]:
+        def update(carry: tuple, index: jax.Array) -> tuple[tuple, tuple[jax.Array, jax.Array]]:
             params, target_params, opt_state = carry
             k_sample, k_mirror = jax.random.split(jax.random.fold_in(key, index))
             numbers = self.buffer.draw(k_sample, agent.replay, filled, self.sizes.batch_size)
@@ -87,11 +91,12 @@ class Learner(NamedTuple):
                     lambda: ddqn.polyak(params, target_params, scalars.polyak),
                     lambda: target_params,
                 )
-            return (params, target_params, opt_state), loss
+            return (params, target_params, opt_state), (loss, optax.tree.norm(gradient))
 
         start = (agent.params, agent.target_params, agent.opt_state)
-        (params, target_params, opt_state), losses = jax.lax.scan(update, start, jnp.arange(steps))
-        return agent.replace(params=params, target_params=target_params, opt_state=opt_state), losses.mean()
+        (params, target_params, opt_state), (losses, norms) = jax.lax.scan(update, start, jnp.arange(steps))
+        agent = agent.replace(params=params, target_params=target_params, opt_state=opt_state)
+        return agent, losses.mean(), all_finite((losses, norms))
 
     def one_step(self, env: Environment, stored: StoredStep) -> Transition:
         """Stored steps (batch, ...) as transitions, their observations rebuilt."""
@@ -133,6 +138,12 @@ class Learner(NamedTuple):
         joined = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *batches)
         near, *far = jnp.split(jax.vmap(one)(joined), len(batches))
         return near + scalars.n_step_weight * (far[0] - near) if far else near
+
+
+def all_finite(tree: Any) -> Bool[Array, ""]:
+    """Is every number of a tree of arrays finite?"""
+    numbers = [leaf for leaf in jax.tree.leaves(tree) if jnp.issubdtype(leaf.dtype, jnp.floating)]
+    return jnp.stack([jnp.isfinite(leaf).all() for leaf in numbers] or [jnp.array(True)]).all()
 
 
 def learner(sizes: AgentSizes, bootstraps: bool, env: Environment) -> Learner:

@@ -1,8 +1,8 @@
 """The command `cuelearner`: calls the file of a command, turns errors into one line and an exit status.
 
 Exit status: 0 done; 2 bad input, nothing changed; 130 stopped by Ctrl-C, 143 by SIGTERM, 129 by SIGHUP, everything
-saved; 1 the disk is full or a job failed, everything up to the last checkpoint saved; 141 nobody reads the output any
-more (of progress and messages on standard error nobody has to).
+saved; 1 the disk is full or a job failed, everything up to the last checkpoint saved, or what was trained is not
+finite, all else saved; 141 nobody reads the output any more (of progress and messages on standard error nobody has to).
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
 
 from cuelearner_jax import __version__
 from cuelearner_jax.cli.parsing import HELP, summary
-from cuelearner_jax.errors import UserError, blamed, closest
+from cuelearner_jax.errors import NotFinite, UserError, blamed, closest
 from cuelearner_jax.runs.cluster import JobsFailed
 from cuelearner_jax.tasks import registry
 from cuelearner_jax.terminal import Interrupted, abandon, console
@@ -38,7 +38,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except UserError as error:
         console.print(f"error: {' '.join(str(error).splitlines())}")
         return 2
-    except (Interrupted, JobsFailed) as error:
+    except (Interrupted, JobsFailed, NotFinite) as error:
         console.print(str(error))
         return error.status
     except BrokenPipeError:  # whoever read our output has gone, as `head` does

@@ -18,7 +18,6 @@ from rich.console import Console
 
 from cuelearner_jax.errors import UserError, closest, no_space
 from cuelearner_jax.guidance import registry as guidances
-from cuelearner_jax.runs import grid as runs
 from cuelearner_jax.runs.trained import POLICIES, PolicySource
 from cuelearner_jax.task import Preset, Task
 from cuelearner_jax.tasks import registry
@@ -148,11 +147,15 @@ def preset_of(task: Task, arguments: list[str]) -> tuple[str, Preset, list[str]]
     if not task.presets:
         raise UserError(f"{task.name} has no preset to start from: give its Task one")
     name, rest = taken(arguments, "--preset", ", ".join(task.presets))
-    if name is None:
-        name = "paper" if "paper" in task.presets else next(iter(task.presets))
+    name = _default_preset(task) if name is None else name
     if name not in task.presets:
         raise UserError(f"unknown preset {name!r}{closest(name, task.presets)}")
     return name, task.presets[name], rest
+
+
+def _default_preset(task: Task) -> str:
+    """The same for every command, so that what is evaluated without a run is the world that is trained in."""
+    return "paper" if "paper" in task.presets else next(iter(task.presets))
 
 
 def source_of(arguments: list[str], command: str, kind: type) -> tuple[PolicySource, list[str]]:
@@ -209,10 +212,10 @@ def _task_option(arguments: list[str]) -> tuple[str | None, list[str]]:
 
 def _run(folder: Path, known: Task | None) -> PolicySource:
     """A run folder. Raises UserError if it is none, or of another task than the one named beside it."""
-    task, config, grid = runs.load(folder, registry.find)
-    if known is not None and known.name != task.name:
-        raise UserError(f"{folder} is a run of {task.name}, not of {known.name}: leave out --task")
-    return PolicySource(task, config, grid, folder)
+    source = PolicySource.of_run(folder, registry.find)
+    if known is not None and known.name != source.task.name:
+        raise UserError(f"{folder} is a run of {source.task.name}, not of {known.name}: leave out --task")
+    return source
 
 
 def _tasks() -> str:
@@ -232,8 +235,12 @@ def _choices(task: Task) -> str:
     """A task's presets, changed worlds and other bodies, a line each."""
     scenarios = {name: f"{one.about} ({_as_options(one.changes)})" for name, one in task.scenarios.items()}
     bodies = {body.name: body.about for body in task.bodies} if len(task.bodies) > 1 else {}
+    presets = {
+        name: f"{preset.about}{f' ({preset.takes})' if preset.takes else ''}" for name, preset in task.presets.items()
+    }
+    default = f"; {_default_preset(task)} where none is given" if presets else ""
     groups = {
-        "presets (--preset)": {name: preset.about for name, preset in task.presets.items()},
+        f"presets (--preset{default})": presets,
         "changed worlds (--scenario of evaluate and render)": scenarios,
         "robots (--robot of evaluate and render)": bodies,
     }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Generic
@@ -32,7 +33,8 @@ class Render(Generic[TaskT]):
     episode: int = 0
     """Which random start."""
     robot: str | None = None
-    """Another robot, see above (default: the task's own)."""
+    """Another robot, see above (default: the task's own); with a folder, as anymal:FOLDER, one with your own walking
+    policy."""
     scenario: str | None = None
     """The changed world of this name, see above; options of the task (--task.…) come on top of it."""
     question: Flag[bool] = False
@@ -42,6 +44,9 @@ class Render(Generic[TaskT]):
     overwrite: Flag[bool] = False
     """Replace pictures of the same name."""
 
+
+MOST_STEPS = 100_000  # a frame each
+MOST_EPISODE = 2**32 - 1  # is folded into a key
 
 OPTIONS = {"render": Render}
 
@@ -54,9 +59,11 @@ def run(arguments: list[str]) -> None:
     asked = parse(kind, rest, f"render {source.folder}", default, about(Render, source.task, policies=True))
     source = source.on(asked.robot)
     source.check(asked.policy, asked.task, guidance=asked.guidance, labels=asked.labels, seed=asked.seed)
-    if asked.steps < 1:
-        raise UserError(f"--steps is {asked.steps}: give a positive number")
-    names = [source.folder.name, asked.robot, asked.scenario, asked.policy]
+    for name, least, most in (("steps", 1, MOST_STEPS), ("episode", 0, MOST_EPISODE)):
+        if not least <= getattr(asked, name) <= most:
+            raise UserError(f"--{name} is {getattr(asked, name)}: give a number from {least} to {most:,}")
+    robot = "-".join(part for part in re.split(r"[^\w.-]+", asked.robot or "") if part.strip("."))
+    names = [source.folder.name, robot, asked.scenario, asked.policy]
     files = filming.files(asked.out, "-".join(name for name in names if name), asked.film)
     wanted = (files.question,) if asked.question else (files.film, files.still)
     filming.check_free(*wanted, overwrite=asked.overwrite)

@@ -10,6 +10,8 @@ from typing import Generic
 from cuelearner_jax.cli.parsing import HELP, out, parse, preset_of, summary, task_of
 from cuelearner_jax.cli.shared_options import Flag, TaskT
 from cuelearner_jax.errors import UserError
+from cuelearner_jax.runs.free_memory import free_bytes
+from cuelearner_jax.task import shape_of
 from cuelearner_jax.teachers import training
 from cuelearner_jax.teachers.learned import TeacherConfig
 
@@ -25,7 +27,7 @@ class TeacherTrain(Generic[TaskT]):
     seed: int = 0
     """Seed."""
     eval_steps: int = 10_000
-    """Validation steps at the end."""
+    """Validation steps at the end (a multiple of 100)."""
     resume: Flag[bool] = False
     """Go on with an interrupted training."""
 
@@ -45,6 +47,13 @@ def run(arguments: list[str]) -> None:
     _, preset, rest = preset_of(task, rest)
     default = kind(preset.config.task, Path("runs") / f"{task.name}-teacher")
     asked = parse(kind, rest, f"teacher train {task.name}", default)
+    training.check(asked.teacher, asked.seed, asked.eval_steps)
+    needed, free = training.needed_bytes(asked.teacher, shape_of(task, asked.task)), free_bytes()
+    if free and needed > free:
+        raise UserError(
+            f"the training needs about {needed / 1e9:,.1f} GB, {free / 1e9:.1f} GB are free: lower --teacher.tables, "
+            "--teacher.memory or --teacher.search"
+        )
     command = shlex.join(["cuelearner", "teacher", *arguments])
     reward = training.train(
         task, asked.task, asked.teacher, asked.out, asked.seed, asked.eval_steps, command, asked.resume

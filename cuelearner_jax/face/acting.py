@@ -17,7 +17,6 @@ from cuelearner_jax.errors import UserError
 from cuelearner_jax.face.worlds import World
 from cuelearner_jax.policies import Opaque, Policy
 from cuelearner_jax.runs import trained
-from cuelearner_jax.runs.grid import load
 from cuelearner_jax.task import Task, shape_of
 from cuelearner_jax.tasks import registry
 from cuelearner_jax.types import EnvState
@@ -37,6 +36,7 @@ class CallablePolicy:
 
     policy: Policy
     observation: tuple[Quantity, ...] = ()  # what it expects to see; empty: not known
+    asks: bool = False  # does it ask a teacher, who looks at the true state?
 
     def __call__(self, obs: Any, key: PRNGKeyArray | None = None) -> np.ndarray:
         """Actions for observations.
@@ -49,8 +49,10 @@ class CallablePolicy:
             Unit vectors (2,) or (n, 2).
 
         Raises:
-            UserError: observations of another size, or numbers that are not finite.
+            UserError: observations of another size, numbers that are not finite, or a policy that asks a teacher.
         """
+        if self.asks:
+            raise UserError("this policy asks a teacher, who looks at the true state: call its act(key, states, obs)")
         rows = np.asarray(obs, np.float32)
         batch = rows[None] if rows.ndim == 1 else rows
         wanted = sum(quantity.size for quantity in self.observation) or batch.shape[-1]
@@ -93,7 +95,7 @@ def load_policy(
     """What a lane of a finished run acts with.
 
     Args:
-        folder: of the run.
+        folder: of the run, or of a sweep in pieces.
         policy: "agent", "guided" or another that `cuelearner evaluate --help` lists.
         guidance: kind of guidance of the lane (default: the run's last).
         labels: its label budget (default: the largest).
@@ -107,10 +109,10 @@ def load_policy(
     if isinstance(task, str):
         task = registry.resolve(task)
     path = Path(folder)
-    known, config, grid = load(path, lambda name: task if task and task.name == name else registry.find(name))
-    source = trained.PolicySource(known, config, grid, path)
-    changed = world.config if world else config.task
+    source = trained.PolicySource.of_run(path, lambda name: task if task and task.name == name else registry.find(name))
+    known = source.task
+    changed = world.config if world else source.config.task
     source.check(policy, changed)
     env = known.environment(changed)
     found = trained.one_policy(source, env, changed, policy, guidance, labels, seed)
-    return CallablePolicy(found, shape_of(known, changed).observation)
+    return CallablePolicy(found, shape_of(known, changed).observation, trained.POLICIES[policy].taught)

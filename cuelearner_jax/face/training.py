@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import warnings
 from collections.abc import Sequence
 from typing import Any
 
@@ -20,21 +21,22 @@ from cuelearner_jax.face.acting import CallablePolicy
 from cuelearner_jax.face.worlds import World
 from cuelearner_jax.guidance import registry
 from cuelearner_jax.policies import Agent
+from cuelearner_jax.runs import failures
 from cuelearner_jax.runs.grid import LARGEST_SEED, Grid, check_grid
 from cuelearner_jax.runs.lanes import LaneGroup
 from cuelearner_jax.runs.memory_report import memory_report
-from cuelearner_jax.runs.training import Training
+from cuelearner_jax.runs.training import Training, mean_of_finite
 from cuelearner_jax.terminal import progress_bars
 from cuelearner_jax.types import Teacher
 
 
 @dataclasses.dataclass(frozen=True)
 class Run:
-    """What a training has led to."""
+    """What a training has led to. Rows of `results` with `failed` 1 are of lanes that are no longer finite."""
 
     world: World
     config: RunConfig
-    results: pa.Table  # a row a lane and evaluation: guidance, labels, seed, step, wall_s and metrics
+    results: pa.Table  # a row a lane and evaluation: guidance, labels, seed, step, wall_s, failed and metrics
     trainings: dict[str, Training]  # by kind of guidance, at their end
 
     def policy(self, guidance: str | None = None, labels: int | None = None, seed: int | None = None) -> CallablePolicy:
@@ -77,6 +79,8 @@ def train(
 ) -> Run:
     """Trains seeds x label budgets x kinds of guidance, as `cuelearner sweep` does: the same numbers.
 
+    Warns of lanes that stopped being finite: their agents stay as they last were, their rows have no metrics.
+
     Args:
         world: where.
         teacher: who answers; needed by kinds of guidance that ask.
@@ -92,6 +96,7 @@ def train(
     """
     run_config = dataclasses.replace(_config(world, config), task=world.config)
     configuration.check(run_config)
+    world.task.check_evaluations(run_config)
     asked = guidance or registry.possible(world.env, taught=teacher is not None)
     names = tuple(registry.find(kind).name for kind in asked)
     if isinstance(seeds, int) and not 0 < seeds <= LARGEST_SEED:
@@ -119,9 +124,13 @@ def train(
             bar = bars.add_task(group.guidance.name, total=run_config.schedule.total_steps, note="")
             for row in training.stretches():
                 rows.append(_table(group, row))
-                bars.update(bar, completed=training.step, note=f"reward {np.mean(row['reward']):.3f}")
+                bars.update(bar, completed=training.step, note=f"reward {mean_of_finite(row['reward'])}")
             trainings[group.guidance.name] = training
-    return Run(world, run_config, pa.concat_tables(rows, promote_options="permissive"), trainings)
+    table = pa.concat_tables(rows, promote_options="permissive")
+    failed = failures.summary(table)
+    if failed:
+        warnings.warn(f"{failed}: leave out the rows with failed = 1", stacklevel=2)
+    return Run(world, run_config, table, trainings)
 
 
 def _config(world: World, config: RunConfig | str) -> RunConfig:
@@ -138,4 +147,6 @@ def _table(group: LaneGroup, row: dict[str, Any]) -> pa.Table:
     lanes = len(group.seeds)
     columns = {name: np.broadcast_to(np.asarray(value), (lanes,)) for name, value in row.items()}
     names = pa.array([group.guidance.name] * lanes)
-    return pa.table({"guidance": names, **{name: pa.array(values) for name, values in columns.items()}})
+    return pa.table(
+        {"guidance": names, **{name: pa.array(values, from_pandas=True) for name, values in columns.items()}}
+    )

@@ -55,7 +55,7 @@ def fit_least_squares(
 
     A fixed number of Adam steps, so that vmapped seeds take equally long. Lessons are multiplied by the environment's
     symmetries where it offers them (a target is then a vector like an action). With fewer than five nothing validates:
-    the last parameters are kept.
+    the last parameters are kept. A fit that diverged before anything validated gives parameters that are NaN.
 
     Args:
         env: whose symmetries they are; None: there is none, and nothing multiplies them.
@@ -104,5 +104,7 @@ def fit_least_squares(
     params = init(key_init)
     keys = jax.random.split(key_steps, (sizes.fit_steps // sizes.validate_every, sizes.validate_every))
     start = ((params, optimizer.init(params)), params, jnp.inf)
-    (_, best, _), _ = jax.lax.scan(stretch, start, keys)
+    (_, best, score), _ = jax.lax.scan(stretch, start, keys)
+    diverged = ~jnp.isfinite(score) & validation.any()
+    best = jax.tree.map(lambda leaf: jnp.where(diverged, jnp.nan, leaf), best)
     return GuidanceModel(best, training.any())

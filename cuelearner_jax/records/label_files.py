@@ -37,6 +37,7 @@ SCHEMA = tables.Schema(
 )
 JSONL, PARQUET = SCHEMA.jsonl, SCHEMA.parquet
 ROW = ("obs", "action", "answer")  # columns of lists
+LISTED = 20  # seeds that a message names
 CONVENTIONS = {
     "obs": "the task's observation at the question",
     "action": "unit vector asked about",
@@ -201,6 +202,11 @@ def for_lanes(file: LabelFile, seeds: np.ndarray, budgets: np.ndarray, slots: in
     for seed, budget in zip(seeds, budgets, strict=True):
         own = kept[0] if len(kept) == 1 else seed
         chosen = np.flatnonzero(file.seeds == own)
+        if own not in kept:
+            raise UserError(
+                f"the label file has labels for the seeds {_listed(kept)}, none for seed {seed}: "
+                "give --first-seed and --seeds (train: --seed) of these, or the labels of another run"
+            )
         if len(chosen) < budget:
             raise UserError(
                 f"the label file has {len(chosen)} labels for seed {seed}, the budget is {budget}: "
@@ -209,6 +215,13 @@ def for_lanes(file: LabelFile, seeds: np.ndarray, budgets: np.ndarray, slots: in
         chosen = chosen[:budget]
         sets.append(jax.tree.map(lambda leaf, rows=chosen: _padded(leaf[rows], slots), file.labels))
     return jax.tree.map(lambda *leaves: np.stack(leaves), *sets)
+
+
+def _listed(seeds: np.ndarray) -> str:
+    """Seeds in order, as a range where none between is absent."""
+    if len(seeds) > 2 and seeds[-1] - seeds[0] == len(seeds) - 1:
+        return f"{seeds[0]} to {seeds[-1]}"
+    return ", ".join(map(str, seeds[:LISTED])) + (" and others" if len(seeds) > LISTED else "")
 
 
 def _about(task: dict[str, Any], answers: str, eps_deg: float | None, meaning: str) -> dict[str, Any]:

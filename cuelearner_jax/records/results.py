@@ -14,6 +14,7 @@ One row holds one evaluation of one seed:
 | config_hash  | str   | hash of the configuration of the run                             |
 | wall_s       | float | seconds since the run started                                    |
 | commit, versions, hardware, command | str | where the row comes from (see `provenance`)     |
+| failed       | float | 1 once the lane stopped being finite: its metrics are null then  |
 | all others   | float | metrics, for instance `reward`; a value that is not finite is null |
 
 In the JSONL file, columns that stay the same are written once: a line `{"constants": {...}}` holds for all lines after
@@ -44,6 +45,9 @@ SCHEMA = tables.Schema(
     remedy="is damaged: restore it, or delete its folder and give --resume, which trains these lanes anew",
 )
 JSONL, PARQUET = SCHEMA.jsonl, SCHEMA.parquet
+FAILED = "failed"  # the column that marks rows of lanes that have failed
+LANE = ("guidance", "labels", "seed")  # what tells the lanes of a run apart
+LaneKey = tuple[str, int, int]
 
 
 class ResultsWriter(tables.TableWriter):
@@ -180,4 +184,21 @@ def read(paths: PathLike | Sequence[PathLike], task: str | None = None) -> pa.Ta
 
 def metrics(table: pa.Table) -> list[str]:
     """The names of the metric columns of a table of results."""
-    return [name for name in table.column_names if name not in (*SCHEMA.strings, *SCHEMA.integers, "wall_s", "folder")]
+    others = (*SCHEMA.strings, *SCHEMA.integers, "wall_s", FAILED, "folder")
+    return [name for name in table.column_names if name not in others]
+
+
+def failures(table: pa.Table) -> dict[LaneKey, int]:
+    """The lanes of a table of results that have failed, with the step of the first row that says so, in order."""
+    if FAILED not in table.column_names:
+        return {}
+    marked = table.filter(pc.field(FAILED) == 1.0)
+    first: dict[LaneKey, int] = {}
+    for row in marked.select([*LANE, "step"]).sort_by("step").to_pylist():
+        first.setdefault((row["guidance"], row["labels"], row["seed"]), row["step"])
+    return dict(sorted(first.items()))
+
+
+def lanes(table: pa.Table) -> int:
+    """The number of lanes in a table of results."""
+    return table.group_by(list(LANE)).aggregate([]).num_rows

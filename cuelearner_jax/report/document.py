@@ -9,20 +9,23 @@ from __future__ import annotations
 
 import csv
 import os
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.records import formats, results
+from cuelearner_jax.records import results
 from cuelearner_jax.records.folders import in_use
+from cuelearner_jax.report import escaping, extent
 from cuelearner_jax.report.figures import Variant, draw_curves, draw_label_efficiency, save_figure
 from cuelearner_jax.report.statistics import curve, interval, mean_over_curve, steps_to_reach, stretches_apart
-from cuelearner_jax.runs import shards
+from cuelearner_jax.runs import failures
+
+Row = dict[str, str | int | float]  # of the summary
 
 
 def report(
@@ -53,7 +56,7 @@ def report(
 
     Raises:
         UserError: if `out` is there already, or the results are missing, corrupt, of several tasks, lack the metric or
-            the split, or hold a seed twice.
+            the split, hold a seed twice, or are of failed lanes alone.
     """
     folders = [folders] if isinstance(folders, str | os.PathLike) else list(folders)
     out = Path(out)
@@ -61,12 +64,13 @@ def report(
         raise UserError(
             f"{out} exists already: choose another folder (--out), or allow it to be overwritten (--overwrite)"
         )
-    table, invalid = _select(results.read(folders, task), metric, split)
-    variants = _variants(table, metric)
-    missing = _missing(folders, table, variants)
+    table, failed, invalid = _select(results.read(folders, task), metric, split)
+    variants = _variants(table, metric, results.failures(failed))
+    missing = _failed_lanes(failed, variants) + _missing(folders, pa.concat_tables([table, failed]), variants)
     if invalid:
         missing.append(f"{invalid:,} {split} rows have no finite {metric}; the steps of these rows are left out")
     rows = summary(variants, lower_is_better)
+    rows += _of_failed_alone(rows, failed)
     title = f"{table['task'][0].as_py()}: {split} {metric.replace('_', ' ')}, {_seed_count(variants)}"
     figures = {"curves": draw_curves(variants, title, metric)}
     if len({variant.labels for variant in variants if variant.labels}) > 1:
@@ -80,7 +84,7 @@ def report(
         save_figure(figure, out / name)
     _write_csv(out / "summary.csv", rows)
     _write_csv(out / "curves.csv", _curve_rows(variants))
-    text = _markdown(title, rows, list(figures), missing, _provenance(table, command))
+    text = _markdown(title, rows, list(figures), missing, _provenance(pa.concat_tables([table, failed]), command))
     (out / "report.md").write_text(text, encoding="utf-8")
     return out / "report.md"
 
@@ -88,21 +92,27 @@ def report(
 # --- from rows to variants -------------------------------------------------------------------------------------------
 
 
-def _select(table: pa.Table, metric: str, split: str) -> tuple[pa.Table, int]:
-    """The rows to report, and how many rows of the split were left out because the metric is not finite."""
+def _select(table: pa.Table, metric: str, split: str) -> tuple[pa.Table, pa.Table, int]:
+    """The rows to report, all rows of lanes that failed, and how many rows were left out for a metric not finite."""
     if metric not in results.metrics(table):
         raise UserError(f"no metric {metric!r} in the results: there are {', '.join(results.metrics(table))}")
     splits = sorted(set(table["split"].to_pylist()))
     if split not in splits:
         raise UserError(f"no {split} rows in the results: there are {', '.join(splits)} rows")
     rows = table.filter(pc.field("split") == split)
+    marked = results.failures(rows)
+    lanes = zip(*(rows[name].to_pylist() for name in results.LANE), strict=True) if marked else ()
+    of_failed = np.array([lane in marked for lane in lanes] or [False] * rows.num_rows, bool)
+    rows, failed = rows.filter(pa.array(~of_failed)), rows.filter(pa.array(of_failed))
+    if failed.num_rows and not rows.num_rows:
+        raise UserError(f"nothing to report, {failures.summary(failed)}: train again with other settings")
     table = rows.filter(pc.field(metric).is_valid())
     if table.num_rows == 0:
         raise UserError(f"the metric {metric!r} has no finite value in the {split} rows: choose another metric")
-    return table, rows.num_rows - table.num_rows
+    return table, failed, rows.num_rows - table.num_rows
 
 
-def _variants(table: pa.Table, metric: str) -> list[Variant]:
+def _variants(table: pa.Table, metric: str, failed: Mapping[results.LaneKey, int]) -> list[Variant]:
     """The variants in the order of the legend: unguided, then by guidance and label budget."""
     guidance, labels = np.array(table["guidance"].to_pylist()), table["labels"].to_numpy()
     keys = set(zip(guidance.tolist(), labels.tolist(), strict=True))
@@ -114,7 +124,8 @@ def _variants(table: pa.Table, metric: str) -> list[Variant]:
     for (kind, budget), (seeds, steps, values) in raw.items():
         until = max(1, int(np.searchsorted(steps, shared, side="right")))
         mean = interval(mean_over_curve(steps[:until], values[:, :until]))
-        variants.append(Variant(kind, budget, seeds, values, curve(steps, values), mean))
+        lost = np.array([step for lane, step in failed.items() if lane[:2] == (kind, budget)], int)
+        variants.append(Variant(kind, budget, seeds, values, curve(steps, values), mean, lost))
     return variants
 
 
@@ -149,27 +160,29 @@ def _seed_count(variants: Sequence[Variant]) -> str:
     )
 
 
+def _failed_lanes(failed: pa.Table, variants: Sequence[Variant]) -> list[str]:
+    """One line for each variant of which lanes have failed, given all rows of such lanes."""
+    left = {(variant.guidance, variant.labels): len(variant.seeds) for variant in variants}
+    return [
+        f"{failures.variant_name(*key)}: {seeds} failed, no longer finite: "
+        + (f"curve and means are over the other {left[key]}" if key in left else "no lane is left")
+        for key, seeds in failures.told(failed).items()
+    ]
+
+
+def _of_failed_alone(rows: Sequence[Row], failed: pa.Table) -> list[Row]:
+    """Rows of the summary, beside those that there are, for variants of which every lane has failed."""
+    there = {(row["guidance"], row["labels"]) for row in rows}
+    lanes = Counter(key[:2] for key in results.failures(failed) if key[:2] not in there)
+    blank = dict.fromkeys(rows[0], "")
+    return [{**blank, "guidance": key[0], "labels": key[1], "seeds": 0, "failed": n} for key, n in lanes.items()]
+
+
 def _missing(folders: Sequence[str | os.PathLike[str]], table: pa.Table, variants: Sequence[Variant]) -> list[str]:
     """One line for everything that a reader of the report would otherwise take to be there."""
-    lines = []
-    names, reached = np.array(table["folder"].to_pylist()), table["step"].to_numpy()
+    lines = extent.missing(folders, table)
     guidance, labels = np.array(table["guidance"].to_pylist()), table["labels"].to_numpy()
-    for folder in dict.fromkeys(names.tolist()):
-        # A run's config.json stands above the folders of its kinds of guidance.
-        config = _config(Path(folder)) or _config(Path(folder).parent)
-        last, total = int(reached[names == folder].max()), config.get("total_steps")
-        if total is not None and last < total:
-            lines.append(f"{folder}: at step {last:,} of {total:,} ({last / total:.0%})")
-        elif total is None and not (Path(folder) / results.PARQUET).exists():
-            lines.append(f"{folder}: not finished, at step {last:,}")
-    configurations = sorted({file for folder in folders for file in Path(folder).rglob("config.json")})
-    lines += shards.missing(configurations)
-    for path in (file.parent for file in configurations):
-        found = {str(kind) for name, kind in zip(names, guidance, strict=True) if Path(name).is_relative_to(path)}
-        planned = _config(path).get("grid", {}).get("guidance", [])
-        lines += [f"{path.as_posix()}: no results of {kind} guidance" for kind in planned if kind not in found]
-        if not found and not planned:
-            lines.append(f"{path.as_posix()}: no results")
+    reached = table["step"].to_numpy()
     for variant in variants:
         furthest = int(reached[(guidance == variant.guidance) & (labels == variant.labels)].max())
         if furthest > variant.curve.steps[-1]:
@@ -181,24 +194,20 @@ def _missing(folders: Sequence[str | os.PathLike[str]], table: pa.Table, variant
             lines.append(f"{variant.name}: one seed, so no interval")
     if len({int(variant.curve.steps[-1]) for variant in variants}) > 1:
         shared = min(int(variant.curve.steps[-1]) for variant in variants)
-        lines.append(f"curves end at different steps; means over the curve are taken to step {shared:,}, shared by all")
+        lines.append(
+            "curves end at different steps, so their final values are no comparison; "
+            f"means over the curve are taken to step {shared:,}, shared by all"
+        )
     hashes = sorted(set(table["config_hash"].to_pylist()))
     if len(hashes) > 1:
         lines.append(f"the runs differ in more than guidance, labels and seed: configurations {', '.join(hashes)}")
     return lines
 
 
-def _config(folder: Path) -> dict[str, Any]:
-    try:
-        return formats.read("config", folder / "config.json")
-    except UserError:
-        return {}
-
-
 # --- tables ----------------------------------------------------------------------------------------------------------
 
 
-def summary(variants: Sequence[Variant], lower_is_better: bool = False) -> list[dict[str, str | int | float]]:
+def summary(variants: Sequence[Variant], lower_is_better: bool = False) -> list[Row]:
     """One row for each variant, numbers unrounded; the columns are those of `summary.csv`.
 
     `reaches_unguided_final` is the first step at which the variant's interquartile mean is as good as the unguided
@@ -210,8 +219,8 @@ def summary(variants: Sequence[Variant], lower_is_better: bool = False) -> list[
     for variant in variants:
         goodness = sign * variant.curve.estimate
         steps, best = variant.curve.steps, int(goodness.argmax())
-        row: dict[str, str | int | float] = {"guidance": variant.guidance, "labels": variant.labels}
-        row |= {"seeds": len(variant.seeds), "last_step": int(steps[-1])}
+        row: Row = {"guidance": variant.guidance, "labels": variant.labels}
+        row |= {"seeds": len(variant.seeds), "failed": len(variant.failed), "last_step": int(steps[-1])}
         row |= {"final": variant.curve.estimate[-1], "final_lower": variant.curve.lower[-1]}
         row |= {"final_upper": variant.curve.upper[-1], "mean": float(variant.mean.estimate)}
         row |= {"mean_lower": float(variant.mean.lower), "mean_upper": float(variant.mean.upper)}
@@ -229,7 +238,7 @@ def summary(variants: Sequence[Variant], lower_is_better: bool = False) -> list[
     return rows
 
 
-def _curve_rows(variants: Sequence[Variant]) -> list[dict[str, str | int | float]]:
+def _curve_rows(variants: Sequence[Variant]) -> list[Row]:
     return [
         {"guidance": variant.guidance, "labels": variant.labels, "seeds": len(variant.seeds), "step": int(step)}
         | {"iqm": float(estimate), "lower": float(lower), "upper": float(upper)}
@@ -238,38 +247,44 @@ def _curve_rows(variants: Sequence[Variant]) -> list[dict[str, str | int | float
     ]
 
 
-def _write_csv(path: Path, rows: Sequence[dict[str, str | int | float]]) -> None:
+def _write_csv(path: Path, rows: Sequence[Row]) -> None:
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
         writer.writeheader()
-        writer.writerows(rows)
+        writer.writerows({name: escaping.cell(value) for name, value in row.items()} for row in rows)
 
 
 def _provenance(table: pa.Table, command: str) -> list[str]:
-    lines = [f"report made by: `{command}`"] if command else []
+    """Lines of Markdown."""
+    lines = [f"report made by: {escaping.code(command)}"] if command else []
     names = {"command": "runs made by", "config_hash": "configuration", "commit": "commit"}
     for column, name in (names | {"versions": "versions", "hardware": "hardware"}).items():
         values = set(table[column].to_pylist()) if column in table.column_names else set()
         known = sorted(value for value in values if value)
-        quote = "`" if column in ("command", "config_hash", "commit") else ""
-        lines += [f"{name}: {quote}{value}{quote}" for value in known] or [f"{name}: not recorded"]
+        escape = escaping.code if column in ("command", "config_hash", "commit") else escaping.markdown
+        lines += [f"{name}: {escape(value)}" for value in known] or [f"{name}: not recorded"]
     return lines
 
 
 def _markdown(
     title: str,
-    rows: Sequence[dict[str, str | int | float]],
+    rows: Sequence[Row],
     figures: Sequence[str],
     missing: Sequence[str],
     provenance: Sequence[str],
 ) -> str:
     header = ["guidance", "labels", "seeds", "last step", "final", "mean over the curve", "best (at step)"]
     header += ["reaches the unguided final", "interval above the unguided", "interval below the unguided"]
-    lines = [f"# {title}", "", *(f"![{name.replace('_', ' ')}]({name}.png)\n" for name in figures)]
+    lines = [f"# {escaping.markdown(title)}", "", *(f"![{name.replace('_', ' ')}]({name}.png)\n" for name in figures)]
     lines += [f"| {' | '.join(header)} |", "|" + "---|" * len(header)]
     for row in rows:
-        reached = row["reaches_unguided_final"]
-        cells = [row["guidance"], f"{row['labels']:,}", row["seeds"], f"{row['last_step']:,}"]
+        reached, failed = row["reaches_unguided_final"], int(row["failed"])
+        seeds = f"{row['seeds']} of {int(row['seeds']) + failed}, {failed} failed" if failed else row["seeds"]
+        cells = [escaping.markdown(row["guidance"]), f"{row['labels']:,}", seeds]
+        if not row["seeds"]:
+            lines.append(f"| {' | '.join(map(str, cells))} |" + " |" * (len(header) - len(cells)))
+            continue
+        cells.append(f"{row['last_step']:,}")
         for key in ("final", "mean"):
             bounds = f" [{row[f'{key}_lower']:.3f}, {row[f'{key}_upper']:.3f}]" if int(row["seeds"]) > 1 else ""
             cells.append(f"{row[key]:.3f}{bounds}")
@@ -285,6 +300,11 @@ def _markdown(
         "seeds such intervals are too narrow. Steps are environment steps of one seed. Intervals are compared at each "
         "evaluation by itself, so a short stretch may be chance.",
     ]
-    lines += ["", "## Missing", "", *(f"- {line}" for line in missing or ["nothing: all runs are complete"])]
+    lines += [
+        "",
+        "## Missing",
+        "",
+        *(f"- {escaping.markdown(line)}" for line in missing or ["nothing: all runs are complete"]),
+    ]
     lines += ["", "## Where the numbers come from", "", *(f"- {line}" for line in provenance), ""]
     return "\n".join(lines)

@@ -14,8 +14,10 @@ from matplotlib import ticker
 from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from cuelearner_jax.guidance import registry
+from cuelearner_jax.report.escaping import one_line
 from cuelearner_jax.report.statistics import Curve, Interval
 
 # Okabe and Ito's palette, told apart with any colour vision: what its own kinds of guidance leave of it.
@@ -31,7 +33,10 @@ STYLE: dict[Any, Any] = {
     "axes.axisbelow": True,
     "grid.color": "#e6e6e6",
     "legend.frameon": False,
+    "text.parse_math": False,  # a name with dollar signs is a name
 }
+LONGEST_NAME = 40  # characters of a kind of guidance in a figure
+DWARFED = 5.0  # times the span of all other evaluations that the first may have for it to set the scale
 
 
 class Variant(NamedTuple):
@@ -43,6 +48,7 @@ class Variant(NamedTuple):
     values: Float[np.ndarray, "seeds steps"]
     curve: Curve
     mean: Interval  # of the mean over the curve, up to the last step that all variants share
+    failed: Int[np.ndarray, "lanes"]  # steps by which other lanes had failed, of which nothing else is here
 
     @property
     def name(self) -> str:
@@ -64,11 +70,13 @@ def draw_curves(variants: Sequence[Variant], title: str, metric: str) -> Figure:
             axes.plot(steps, estimate, color=colour, linewidth=1.8, marker=marker, solid_capstyle="round")
         end = max(int(variant.curve.steps[-1]) for variant in variants)
         axes.set_xlim(0, max(end, 1))
+        left_out = _scale(axes, variants)
+        _mark_failed(axes, variants, colours)
         axes.set_xlabel("environment steps of a seed")
         axes.set_ylabel(_axis_name(metric))
         axes.xaxis.set_major_formatter(ticker.EngFormatter(sep=""))
-        axes.set_title(title, fontweight="bold", fontsize=11, pad=20)
-        note = "interquartile mean over seeds, band: its 95% bootstrap interval"
+        axes.set_title(one_line(title), fontweight="bold", fontsize=11, pad=20)
+        note = f"interquartile mean over seeds, band: its 95% bootstrap interval{left_out}"
         axes.text(0, 1.025, note, transform=axes.transAxes, color="#595959", fontsize=9)
         _name_ends(axes, variants, colours)
     return figure
@@ -79,14 +87,21 @@ def draw_label_efficiency(variants: Sequence[Variant], title: str, metric: str) 
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(8, 4.2), layout="constrained")
         left, right = figure.subplots(1, 2, sharey=True)
-        last = [Interval(*(values[-1] for values in variant.curve[1:])) for variant in variants]
-        _draw_budgets(left, variants, last, "last evaluation")
+        shared = min(int(variant.curve.steps[-1]) for variant in variants)
+        last = [_at(variant.curve, shared) for variant in variants]
+        _draw_budgets(left, variants, last, f"at step {shared:,}, reached by all")
         _draw_budgets(right, variants, [variant.mean for variant in variants], "mean over the curve")
         left.set_ylabel(_axis_name(metric))
         handles, names = left.get_legend_handles_labels()
         figure.legend(handles, names, loc="outside lower center", ncols=len(names))
-        figure.suptitle(title, x=0.01, ha="left", fontweight="bold", fontsize=11)
+        figure.suptitle(one_line(title), x=0.01, ha="left", fontweight="bold", fontsize=11)
     return figure
+
+
+def _at(known: Curve, step: int) -> Interval:
+    """The last evaluation up to a step: later ones of some would be compared with earlier ones of others."""
+    place = max(0, int(np.searchsorted(known.steps, step, side="right")) - 1)
+    return Interval(*(values[place] for values in known[1:]))
 
 
 def _draw_budgets(axes: Axes, variants: Sequence[Variant], intervals: Sequence[Interval], panel: str) -> None:
@@ -100,10 +115,9 @@ def _draw_budgets(axes: Axes, variants: Sequence[Variant], intervals: Sequence[I
             axes.axhline(float(estimate), color=colour, label=name, linewidth=1.5, linestyle="--")
         if any(point[0] for point in points):
             labels, estimate, lower, upper = np.array([point for point in points if point[0]], float).T
-            # A little beside one another, so that no interval hides another's.
-            beside = 1.04 ** (place - (len(kinds) - 1) / 2)
             bars = np.nan_to_num([estimate - lower, upper - estimate])
-            axes.errorbar(labels * beside, estimate, bars, color=colour, label=name, marker="o", capsize=3)
+            # All stand on their budget's tick: the caps, of a width each, tell intervals at one budget apart.
+            axes.errorbar(labels, estimate, bars, color=colour, label=name, marker="o", capsize=3 + 2 * place)
     budgets = sorted({variant.labels for variant in variants if variant.labels})
     axes.set_xscale("log")
     axes.set_xticks(budgets, [f"{budget:,}" for budget in budgets])
@@ -121,7 +135,9 @@ def save_figure(figure: Figure, stem: Path) -> None:
 
 def _guidance_name(guidance: str) -> str:
     kind = registry.registered(guidance)
-    return kind.title if kind and kind.title else guidance
+    name = one_line(kind.title if kind and kind.title else guidance)
+    name = name if len(name) <= LONGEST_NAME else f"{name[: LONGEST_NAME - 1]}…"
+    return f" {name}" if name.startswith("_") else name  # Matplotlib leaves names with an underscore out of legends
 
 
 def colour_of(guidance: str) -> str:
@@ -140,30 +156,80 @@ def _colours(variants: Sequence[Variant]) -> list[tuple[float, ...]]:
     return colours
 
 
-def _name_ends(axes: Axes, variants: Sequence[Variant], colours: Sequence[tuple[float, ...]]) -> None:
-    """Writes each curve's name right of the axes, at the height of its end, moved apart where names would overlap."""
+def _scale(axes: Axes, variants: Sequence[Variant]) -> str:
+    """Sets the heights shown; returns words on what lies beyond them.
+
+    The first evaluation, before anything was learned, is left out where it would make the span of all others less than
+    a fifth of the picture: agents that still run into everything say nothing of those that seldom do.
+    """
+    first = [_extremes([row[:1] for row in variant.curve[1:]]) for variant in variants]
+    later = [_extremes([row[1:] for row in variant.curve[1:]]) for variant in variants if len(variant.curve.steps) > 2]
+    if not later:
+        return ""
+    low, high = min(pair[0] for pair in later), max(pair[1] for pair in later)
+    least, most = min(pair[0] for pair in first), max(pair[1] for pair in first)
+    span = high - low
+    if not 0 < DWARFED * span < max(high, most) - min(low, least):
+        return ""
+    axes.set_ylim(low - 0.05 * span, high + 0.05 * span)
+    steps = sorted({int(variant.curve.steps[0]) for variant in variants})
+    where = f"step {steps[0]:,}" if len(steps) == 1 else "the first evaluations"
+    return f"; {where} (from {least:.2g} to {most:.2g}) not on the scale"
+
+
+def _mark_failed(axes: Axes, variants: Sequence[Variant], colours: Sequence[tuple[float, ...]]) -> None:
+    """A cross for each lane that failed, on its variant's curve or at the edge of the scale."""
     low, high = axes.get_ylim()
     axes.set_ylim(low, high)
+    for variant, colour in zip(variants, colours, strict=True):
+        if not len(variant.failed):
+            continue
+        at = np.minimum(variant.failed, variant.curve.steps[-1])
+        heights = np.clip(np.interp(at, variant.curve.steps, variant.curve.estimate), low, high)
+        axes.plot(at, heights, "x", color=colour, markersize=8, clip_on=False)
+    if any(len(variant.failed) for variant in variants):
+        cross = Line2D([], [], linestyle="", marker="x", color="#595959", label="a seed failed, and is left out")
+        axes.legend(handles=[cross], loc="best", fontsize=9)
+
+
+def _extremes(rows: Sequence[np.ndarray]) -> tuple[float, float]:
+    """Least and largest of what is known: a single seed has no interval."""
+    values = np.concatenate(rows)
+    return float(np.nanmin(values)), float(np.nanmax(values))
+
+
+def _name_ends(axes: Axes, variants: Sequence[Variant], colours: Sequence[tuple[float, ...]]) -> None:
+    """Writes each curve's name right of the axes, in the order of their ends, moved apart where names would overlap."""
+    low, high = axes.get_ylim()
+    axes.set_ylim(low, high)
+    right = axes.get_xlim()[1]
     ends = np.array([variant.curve.estimate[-1] for variant in variants])
-    gap = min((high - low) / len(variants), 0.055 * (high - low))
-    order, rank = np.argsort(ends, kind="stable"), gap * np.arange(len(variants))
+    height = 0.055 * (high - low)  # of a line of text, with room
+    gap = min((high - low) / len(variants), height)
     # Heights that keep the order, lie a gap apart and move least are an isotonic regression of the ends less the gaps.
+    order, rank = np.argsort(ends, kind="stable"), gap * np.arange(len(variants))
     heights = scipy.optimize.isotonic_regression(ends[order] - rank).x
     heights = np.clip(heights, low, high - rank[-1]) + rank
-    for place, height in zip(order, heights, strict=True):
+    for place, height_of_name in zip(order, heights, strict=True):
         variant, colour = variants[place], colours[place]
-        axes.annotate(
+        last = float(variant.curve.steps[-1])
+        # Dotted: what leads from the end of a curve is no data. It is level as far as the axes reach, so that leaders
+        # have the order of the names and no two cross.
+        leader = {"color": colour, "linewidth": 1, "linestyle": ":", "clip_on": False}
+        if last < right:
+            axes.plot([last, right], [ends[place]] * 2, **leader)
+            axes.plot([last], [ends[place]], color=colour, marker="o", markersize=4)
+        axes.plot([1, 1.025], [ends[place], height_of_name], transform=axes.get_yaxis_transform(), **leader)
+        axes.text(
+            1.03,
+            height_of_name,
             variant.name,
-            xy=(float(variant.curve.steps[-1]), ends[place]),
-            xytext=(1.03, height),
-            textcoords=axes.get_yaxis_transform(),
+            transform=axes.get_yaxis_transform(),
             color=tuple(0.85 * channel for channel in colour),
+            fontsize=10 * gap / height,
             va="center",
-            annotation_clip=False,
-            # Dotted: what leads from the end of a curve is no data.
-            arrowprops={"arrowstyle": "-", "color": colour, "linewidth": 1, "linestyle": ":", "relpos": (0, 0.5)},
         )
 
 
 def _axis_name(metric: str) -> str:
-    return AXIS_NAMES.get(metric, metric.replace("_", " "))
+    return AXIS_NAMES.get(metric, one_line(metric.replace("_", " ")))

@@ -71,6 +71,7 @@ def describe(
     return {
         "format": formats.FORMATS["config"],
         "task": {"name": task.name, **origin, **configuration.to_json(config.task)},
+        **({"files": files} if (files := task.files(config.task)) else {}),
         "sizes": configuration.to_json(config.sizes),
         "scalars": configuration.to_json(config.scalars),
         "schedule": configuration.to_json(config.schedule),

@@ -23,9 +23,10 @@ def items(blocks: list[TrainState], clock: Clock, wall: float) -> dict[str, Any]
     return {
         "policy": [{"params": block.agent.params, "guidance": block.guide.model} for block in blocks],
         "rest": [
-            block.replace(agent=block.agent.replace(params=None), guide=block.guide.replace(model=None))
+            block.replace(agent=block.agent.replace(params=None), guide=block.guide.replace(model=None), failed=None)
             for block in blocks
         ],
+        "failed": [block.failed for block in blocks],
         "clock": {
             "clock": clock,
             "wall_s": np.float32(wall),
@@ -35,7 +36,9 @@ def items(blocks: list[TrainState], clock: Clock, wall: float) -> dict[str, Any]
 
 
 def restore(group: LaneGroup, saved: Checkpoints, *names: str) -> dict[str, Any]:
-    """Items of the newest checkpoint by name, and "clock". Blocks are cut as they were when it was written.
+    """Items of the newest checkpoint by name, "failed" and "clock". Blocks are cut as they were when it was written.
+
+    A checkpoint that does not say which lanes have failed is of a program that did not look: it counts as of none.
 
     Raises UserError if there is no readable checkpoint or it holds other lanes.
     """
@@ -46,7 +49,9 @@ def restore(group: LaneGroup, saved: Checkpoints, *names: str) -> dict[str, Any]
         raise UserError(f"the checkpoint holds {count * size} lanes, the run has {len(group.seeds)}: start it anew")
     cut = np.minimum(np.arange(count * size), len(group.seeds) - 1).reshape(count, size)
     shapes = items(group.shapes_of(cut), jax.eval_shape(start_clock), 0.0)
-    return {**saved.restore({name: shapes[name] for name in names}), "clock": clock}
+    asked = (*names, "failed") if saved.holds("failed") else names
+    found = saved.restore({name: shapes[name] for name in asked})
+    return {"failed": [jnp.zeros(size, bool)] * count, **found, "clock": clock}
 
 
 def restore_blocks(group: LaneGroup, saved: Checkpoints) -> tuple[list[TrainState], Clock, float]:
@@ -57,9 +62,11 @@ def restore_blocks(group: LaneGroup, saved: Checkpoints) -> tuple[list[TrainStat
     found = restore(group, saved, "policy", "rest")
     blocks = [
         rest.replace(
-            agent=rest.agent.replace(params=policy["params"]), guide=rest.guide.replace(model=policy["guidance"])
+            agent=rest.agent.replace(params=policy["params"]),
+            guide=rest.guide.replace(model=policy["guidance"]),
+            failed=failed,
         )
-        for policy, rest in zip(found["policy"], found["rest"], strict=True)
+        for policy, rest, failed in zip(found["policy"], found["rest"], found["failed"], strict=True)
     ]
     return group.recut(blocks), found["clock"]["clock"], float(found["clock"]["wall_s"])
 
@@ -92,7 +99,10 @@ def check_standing(group: LaneGroup, folder: Path) -> None:
 
 
 def restore_policies(group: LaneGroup, folder: Path) -> tuple[dict[str, Any], int]:
-    """What the lanes of a run's folder act with: ({"params": ..., "guidance": ...}, leading axis: lanes; their step).
+    """What the lanes of a run's folder act with, and which have failed and stand at their last finite state.
+
+    Returns:
+        {"params": ..., "guidance": ..., "failed": ...}, leading axis: lanes; their step.
 
     Raises UserError if there is no readable checkpoint.
     """
@@ -100,5 +110,6 @@ def restore_policies(group: LaneGroup, folder: Path) -> tuple[dict[str, Any], in
         raise UserError(f"no checkpoint in {folder}: train first, or give a run folder that has one")
     with checkpoints(folder / "checkpoints", read_only=True) as saved:
         found = restore(group, saved, "policy")
-    policies = jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[: len(group.seeds)], *found["policy"])
+    blocks = [{**policy, "failed": failed} for policy, failed in zip(found["policy"], found["failed"], strict=True)]
+    policies = jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[: len(group.seeds)], *blocks)
     return policies, int(found["clock"]["clock"].step)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from itertools import pairwise
 from typing import Any, TypeVar
 
 import jax
@@ -17,7 +16,7 @@ from jaxtyping import PRNGKeyArray
 from cuelearner_jax.asking import label_slots
 from cuelearner_jax.config import RunConfig
 from cuelearner_jax.devices import BY_LANE, lane_mesh, place
-from cuelearner_jax.environment import Environment, actions_of
+from cuelearner_jax.environment import Environment
 from cuelearner_jax.evaluate import evaluate_lanes
 from cuelearner_jax.guidance.bundle import Guidance
 from cuelearner_jax.loop import Program, make_program
@@ -25,7 +24,6 @@ from cuelearner_jax.policies import Policy
 from cuelearner_jax.runs.grid import Grid
 from cuelearner_jax.types import Clock, Label, Teacher, TrainState
 
-CACHE_BYTES = 4_000_000  # of the action-value weights of a CPU's block: beyond, they leave the cache between two steps
 CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 T = TypeVar("T")
@@ -69,12 +67,17 @@ class LaneGroup:
         return [place(self.mesh, block, BY_LANE) for block in blocks]
 
     def _fitting_lanes(self) -> int:
-        """Lanes of a block: on accelerators all; on one CPU device what fits its cache, and a block for each core."""
+        """Lanes of a block: on accelerators all; on one CPU device an equal share for each core."""
         if jax.default_backend() != "cpu" or self.mesh.size > 1:
             return len(self.seeds)
-        widths = [self.env.obs_size + actions_of(self.env).size, *self.config.sizes.q_layers, 1]
-        weights = 4 * sum(a * b for a, b in pairwise(widths))
-        return max(1, min(CACHE_BYTES // weights, -(-len(self.seeds) // CORES)))
+        return -(-len(self.seeds) // CORES)
+
+    @property
+    def at_once(self) -> int:
+        """Lanes that each device works on at the same time: of a CPU's block one."""
+        if jax.default_backend() == "cpu":
+            return min(CORES, len(self.cut)) if self.mesh.size == 1 else 1
+        return self.cut.shape[1] // self.mesh.size
 
     def each(self, work: Callable[..., T], *blocks: list[Any]) -> list[T]:
         """`work` of every block. A CPU takes as many at once as it has cores, which then seldom wait for each other."""

@@ -12,7 +12,7 @@ from cuelearner_jax.asking import label_slots
 from cuelearner_jax.devices import portions
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.runs.free_memory import free_bytes
-from cuelearner_jax.runs.lanes import CORES, LaneGroup
+from cuelearner_jax.runs.lanes import LaneGroup
 from cuelearner_jax.types import TrainState
 
 FLOAT = 4  # bytes
@@ -31,10 +31,9 @@ def memory_report(group: LaneGroup) -> str:
     count, width = group.cut.shape
     lanes, devices = len(group.seeds), group.mesh.size
     kept = {option: count * size // devices for option, size in _at_rest(block).items()}
-    blocks = min(CORES, count) if jax.default_backend() == "cpu" else 1  # that are worked on at once
-    together, examined = width // devices, min(width // devices, portions().agents)
-    worked = {option: size * blocks * together for option, size in _training(group, block).items()}
-    worked |= {option: size * blocks * examined for option, size in _evaluating(group, block).items()}
+    examined = group.at_once if jax.default_backend() == "cpu" else min(group.at_once, portions().agents)
+    worked = {option: size * group.at_once for option, size in _training(group, block).items()}
+    worked |= {option: size * examined for option, size in _evaluating(group, block).items()}
     worlds = {"--task": COPIES * state_bytes(jax.eval_shape(lambda env: env, group.env))}
     at_rest, working = sum(kept.values()), max(worked.values()) + worlds["--task"]
     each = f" on each of {devices} devices" if devices > 1 else ""

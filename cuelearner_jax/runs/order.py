@@ -73,6 +73,7 @@ def planned(order: Order) -> Plan:
         grid = dataclasses.replace(order.grid, seeds=order.shard.seeds(order.grid.seeds))
         order = dataclasses.replace(order, grid=grid, out=folder, resume=order.resume or begun)
     env = shape_of(order.task, order.config.task)
+    order.task.check_evaluations(order.config)
     for kind in order.grid.guidance:
         guidances.make(kind, order.config.sizes, env)
     labels = read_labels(order) if order.labels_from else None

@@ -12,11 +12,12 @@ from cuelearner_jax import config as configuration
 from cuelearner_jax.environment import Environment
 from cuelearner_jax.records import label_files, provenance, results
 from cuelearner_jax.records.checkpoint import Checkpoints, checkpoints
+from cuelearner_jax.runs.failures import LISTED, variant_name
 from cuelearner_jax.runs.grid import config_hash
 from cuelearner_jax.runs.kept import items, restore_blocks
 from cuelearner_jax.runs.lanes import LaneGroup
 from cuelearner_jax.runs.order import Order
-from cuelearner_jax.runs.training import Training
+from cuelearner_jax.runs.training import Training, mean_of_finite
 from cuelearner_jax.terminal import Interrupted, console
 from cuelearner_jax.types import Teacher
 
@@ -40,6 +41,7 @@ class Runner:
         self.group, self.order, self.described = group, order, described
         self.stopping, self.bars = stopping, bars
         self.folder = order.out / group.guidance.name
+        self.failed = np.zeros(len(group.seeds), bool)  # lanes that the user has been told of
 
     def run(self, teacher: Teacher | None, labels: label_files.LabelFile | None) -> None:
         """From wherever the group stands to its end.
@@ -73,6 +75,7 @@ class Runner:
             results.truncate_after(self.folder, -1)
             return
         self.training.go_on(*restore_blocks(self.group, saved))
+        self.failed = self.training.failed
         # A checkpoint of the labels alone comes before the rows of step 0.
         results.truncate_after(self.folder, self.training.step or -1)
 
@@ -88,6 +91,19 @@ class Runner:
                 "go on with the same command and --resume"
             )
 
+    def _tell_failed(self, when: str) -> None:
+        """One line for each lane that is no longer finite since the last look, or for the first of very many."""
+        found, group = np.flatnonzero(self.training.failed & ~self.failed), self.group
+        for lane in found[:LISTED]:
+            variant = variant_name(group.guidance.name, int(group.budgets[lane]))
+            console.print(
+                f"{variant}: the lane of seed {group.seeds[lane]} is no longer finite {when}: kept at its last finite "
+                "state and marked as failed"
+            )
+        if len(found) > LISTED:
+            console.print(f"{group.guidance.name}: so are {len(found) - LISTED} more lanes")
+        self.failed = self.training.failed
+
     def _label(self, saved: Checkpoints, teacher: Teacher | None, labels: label_files.LabelFile | None) -> None:
         """Asks the teacher, or takes the labels of a file."""
         now, name, written = self.training, self.group.guidance.name, self.folder / label_files.PARQUET
@@ -96,10 +112,12 @@ class Runner:
         bar = self.bars.add_task(f"{name}: labels", total=self.group.rounds, note="", completed=now.round)
         if labels is not None and not now.labelled:
             now.take(labels)
+            self._tell_failed("after its labels")
         if not now.labelled:
             assert teacher is not None  # asked for where no file was given
             for done in now.label_rounds(teacher):
                 self.bars.update(bar, completed=done)
+                self._tell_failed(f"after {done * self.group.config.sizes.labels_per_round} labels")
                 if done % ROUNDS_A_CHUNK == 0:
                     self._save(saved)
                 self._stop_if_asked(saved)
@@ -119,9 +137,10 @@ class Runner:
         bar = self.bars.add_task(self.group.guidance.name, total=schedule.total_steps, note="", completed=now.step)
         for row in now.stretches():
             writer.append(**row)
+            self._tell_failed(f"at step {now.step:,}")
             if now.step == 0:
                 continue
-            self.bars.update(bar, completed=now.step, note=f"reward {np.mean(row['reward']):.3f}")
+            self.bars.update(bar, completed=now.step, note=f"reward {mean_of_finite(row['reward'])}")
             if now.step % schedule.checkpoint_every == 0 or now.step >= schedule.total_steps:
                 self._save(saved)
             self._stop_if_asked(saved)

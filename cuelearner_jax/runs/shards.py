@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -93,17 +94,33 @@ class Shard(NamedTuple):
 
 
 def missing(configurations: list[Path]) -> list[str]:
-    """One line for each sweep of whose pieces some have not begun, given the config.json files that there are."""
+    """One line for each sweep of whose pieces some have not begun, given the config.json files that there are.
+
+    A file that cannot be read is passed over: it says nothing of a piece. One whose piece makes no sense is named.
+    """
     begun: dict[tuple[Path, int], set[int]] = {}
+    lines = []
     for path in configurations:
         try:
-            shard = Shard.of(formats.read("config", path)["shard"])
-        except (UserError, ValueError, KeyError, TypeError):
+            described = formats.read("config", path)
+            if "shard" not in described:
+                continue
+            shard = Shard.of(described["shard"])
+        except UserError:
+            continue
+        except (ValueError, KeyError, TypeError):
+            lines.append(str(formats.damaged("config", path)))
             continue
         begun.setdefault((path.parent.parent, shard.count), set()).add(shard.index)
-    lines = []
     for (sweep, count), there in sorted(begun.items()):
-        absent = sorted(set(range(1, count + 1)) - there)
+        absent = _between(sorted(there), count)
         if absent:
-            lines.append(f"{sweep.as_posix()}: shards not begun, of {count}: {', '.join(map(str, absent))}")
+            lines.append(f"{sweep.as_posix()}: shards not begun, of {count}: {', '.join(absent)}")
     return lines
+
+
+def _between(there: list[int], count: int) -> list[str]:
+    """The stretches of 1 to `count` that are not there: as many as there are pieces, however many are absent."""
+    edges = [0, *there, count + 1]
+    stretches = [(low + 1, high - 1) for low, high in itertools.pairwise(edges) if high - low > 1]
+    return [str(first) if first == last else f"{first} to {last}" for first, last in stretches]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from cuelearner_jax.devices import SHARED, lane_mesh, place
 from cuelearner_jax.guidance import registry as guidances
 from cuelearner_jax.records.folders import check_folder, claimed, prepare_folder
+from cuelearner_jax.runs import failures
 from cuelearner_jax.runs.kept import check_standing
 from cuelearner_jax.runs.lanes import LaneGroup
 from cuelearner_jax.runs.memory_report import memory_report
@@ -22,6 +23,7 @@ def run(order: Order) -> None:
     Raises:
         UserError: bad configuration, a folder in use, too little memory; nothing has been changed then.
         Interrupted: Ctrl-C or SIGTERM; everything is saved.
+        NotFinite: all is done, but some lanes stopped being finite.
     """
     plan = planned(order)
     order = plan.order
@@ -43,3 +45,4 @@ def run(order: Order) -> None:
         prepare_folder(order.out, plan.described, order.overwrite and not order.resume)
         for group in groups:
             Runner(group, examined, order, plan.described, stopping, bars).run(teacher, plan.labels)
+    failures.check(order.out, [group.guidance.name for group in groups])

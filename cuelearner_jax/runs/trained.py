@@ -3,39 +3,25 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 
 from cuelearner_jax.config import RunConfig, to_json
-from cuelearner_jax.devices import lane_mesh
 from cuelearner_jax.environment import actions_of, offers
 from cuelearner_jax.errors import UserError, closest
-from cuelearner_jax.evaluate import episodes, evaluate_lanes, evaluate_policy, one_lane
+from cuelearner_jax.evaluate import Tell, episodes, one_lane, part_of, untold, watched, watched_lanes
 from cuelearner_jax.guidance import registry as guidances
-from cuelearner_jax.guidance.bundle import Guidance
 from cuelearner_jax.policies import Agent, Corrected, Guided, Heuristic, Policy, Taught, uniform_in
 from cuelearner_jax.records.provenance import provenance
 from cuelearner_jax.runs.grid import Grid
-from cuelearner_jax.runs.kept import restore_policies
-from cuelearner_jax.runs.lanes import LaneGroup
+from cuelearner_jax.runs.opened import Lanes, Piece, lanes_of, open_run
 from cuelearner_jax.task import Rollout, Task, shape_of
 from cuelearner_jax.types import Teacher
-
-
-@dataclass(frozen=True)
-class Lanes:
-    """The lanes of one kind of guidance, as their newest checkpoint has them."""
-
-    guidance: Guidance
-    seeds: np.ndarray  # (lanes,)
-    budgets: np.ndarray  # (lanes,)
-    policies: Any  # {"params", "guidance"}, leading axis: lanes
-    step: int
 
 
 class Parts(NamedTuple):
@@ -102,6 +88,13 @@ class PolicySource:
     config: RunConfig
     grid: Grid | None
     folder: Path
+    pieces: tuple[Piece, ...] = ()  # of a run; none named: all of it lies in its folder
+
+    @classmethod
+    def of_run(cls, folder: Path, find: Callable[[str], Task]) -> PolicySource:
+        """A run's, or those of a sweep in pieces; see `opened.open_run`."""
+        found = open_run(folder, find)
+        return cls(found.task, found.config, found.grid, folder, found.pieces)
 
     def on(self, robot: str | None) -> PolicySource:
         """The same with another robot of the task's (None: its own). Raises UserError if it has no such robot."""
@@ -110,6 +103,7 @@ class PolicySource:
     def check(self, policy: str, changed: Any, **lanes: Any) -> None:
         """Raises UserError unless the policy can be had and acts in the changed world.
 
+        What was trained sees the observations that it was trained on; other policies act in any world.
         `lanes`: options that choose among a run's lanes, by name; one that is given must choose something.
         """
         if policy not in POLICIES:
@@ -121,20 +115,21 @@ class PolicySource:
         if given and not POLICIES[policy].trained:
             what = f"policy {policy!r} belongs to no lane of a run"
             raise UserError(f"--{given[0]} chooses nothing here, {what}: leave it out")
-        before, after = (shape_of(self.task, world) for world in (self.config.task, changed))
+        after = shape_of(self.task, changed)
         for need in POLICIES[policy].needs:
             if not offers(after, need):
                 raise UserError(f"{self.task.name} has no {need}: choose another policy")
-        if before.obs_size != after.obs_size:
+        if POLICIES[policy].trained and (size := shape_of(self.task, self.config.task).obs_size) != after.obs_size:
             raise UserError(
-                f"the run's observations have {before.obs_size} entries, this world's {after.obs_size}: "
-                "keep its structure"
+                f"the run's observations have {size} entries, this world's {after.obs_size}: keep its structure"
             )
 
     def load(self, kinds: tuple[str, ...] = ()) -> list[Lanes]:
-        """The lanes of a run's kinds of guidance (none named: all). Raises UserError for one the run does not have."""
+        """The lanes of a run's kinds of guidance (none named: all), those at different steps apart.
+
+        Raises UserError for a kind that the run does not have, or without a checkpoint.
+        """
         assert self.grid is not None  # `check` has seen to it
-        env = shape_of(self.task, self.config.task)
         loaded = []
         for kind in kinds or self.grid.guidance:
             name = guidances.find(kind).name if ":" in kind else kind
@@ -145,9 +140,8 @@ class PolicySource:
                     f"{self.folder} has lanes of a guidance from outside, {name!r}: name its code by "
                     "--guidance package.module:NAME, if you trust that code"
                 )
-            group = LaneGroup(self.config, env, guidances.make(name, self.config.sizes, env), self.grid)
-            policies, step = restore_policies(group, self.folder / name)
-            loaded.append(Lanes(group.guidance, group.seeds, group.budgets, policies, step))
+            pieces = self.pieces or (Piece(self.folder, self.grid),)
+            loaded += lanes_of(self.task, self.config, pieces, name, sweep=pieces[0].folder != self.folder)
         return loaded
 
 
@@ -169,37 +163,47 @@ def evaluate(
     num_envs: int,
     steps: int,
     engine: Rollout | None = None,
+    watch: Callable[[str], Tell] = lambda kind: untold,
 ) -> list[Measured]:
     """Metrics of a policy on validation episodes of a world (a task configuration), for each guidance and budget.
 
-    `engine` is a roll-out in other physics; without one the environment's own are used.
+    Args:
+        source: where the policy comes from.
+        world: a task configuration.
+        name: of the policy.
+        kinds: of guidance of the run (none named: all).
+        num_envs, steps: as `evaluate.rollout` has them.
+        engine: a roll-out in other physics (default: the environment's own).
+        watch: by kind of guidance, who is told how far its lanes are.
     """
     named, key = POLICIES[name], episodes()
     env = source.task.environment(world, "validation")
     teacher = source.task.make_teacher(world, env) if named.taught else None
     if not named.trained:
         policy = named.make(Parts(source.config, env, teacher, None))
-        found = (engine or _compiled)(policy, env, key, num_envs, steps)
+        tell = watch(name)
+        if engine:
+            found = engine(policy, env, key, num_envs, steps, tell)
+        else:
+            found = watched(env, policy, key, num_envs, steps, tell)
         metrics = {metric: np.asarray(value)[None] for metric, value in found.items()}
         return [Measured("-", 0, 0, np.zeros(1, int), metrics)]
     rows = []
     for lanes in source.load(kinds):
         policy = named.make(Parts(source.config, env, teacher, lanes))
+        tell = watch(lanes.guidance.name)
         if engine:
-            each = [engine(one_lane(policy, lane), env, key, num_envs, steps) for lane in range(len(lanes.seeds))]
+            each, count = [], len(lanes.seeds)
+            for lane in range(count):
+                each.append(engine(one_lane(policy, lane), env, key, num_envs, steps, part_of(tell, lane, count)))
             found = {metric: np.stack([measured[metric] for measured in each]) for metric in each[0]}
         else:
-            mesh = lane_mesh(jax.local_devices()[:1])
-            found = evaluate_lanes(env, policy, key, mesh=mesh, num_envs=num_envs, steps=steps)
+            found = watched_lanes(env, policy, key, num_envs, steps, tell)
         for budget in np.unique(lanes.budgets):
             own = lanes.budgets == budget
             metrics = {metric: np.asarray(values)[own] for metric, values in found.items()}
             rows.append(Measured(lanes.guidance.name, int(budget), lanes.step, lanes.seeds[own], metrics))
     return rows
-
-
-def _compiled(policy: Policy, env: Any, key: Any, num_envs: int, steps: int) -> dict[str, Any]:
-    return evaluate_policy(env, policy, key, num_envs, steps)
 
 
 def one_policy(
@@ -211,16 +215,18 @@ def one_policy(
     if not named.trained:
         return named.make(Parts(source.config, env, teacher, None))
     assert source.grid is not None  # `check` has seen to it
-    lanes = source.load((kind or source.grid.guidance[-1],))[0]
-    budget = int(lanes.budgets.max()) if labels is None else labels
-    seed = int(lanes.seeds[0]) if seed is None else seed
-    index = np.flatnonzero((lanes.seeds == seed) & (lanes.budgets == budget))
-    if not len(index):
-        raise UserError(
-            f"no lane with seed {seed} and {budget} labels: the run has seeds {_listed(lanes.seeds)} "
-            f"and labels {_listed(lanes.budgets)}"
-        )
-    return one_lane(named.make(Parts(source.config, env, teacher, lanes)), int(index[0]))
+    loaded = source.load((kind or source.grid.guidance[-1],))
+    seeds, budgets = (np.concatenate([getattr(lanes, of) for lanes in loaded]) for of in ("seeds", "budgets"))
+    budget = int(budgets.max()) if labels is None else labels
+    seed = int(seeds[0]) if seed is None else seed
+    for lanes in loaded:
+        index = np.flatnonzero((lanes.seeds == seed) & (lanes.budgets == budget))
+        if len(index):
+            return one_lane(named.make(Parts(source.config, env, teacher, lanes)), int(index[0]))
+    raise UserError(
+        f"no lane with seed {seed} and {budget} labels: the run has seeds {_listed(seeds)} "
+        f"and labels {_listed(budgets)}"
+    )
 
 
 def _listed(values: np.ndarray) -> str:
@@ -228,6 +234,10 @@ def _listed(values: np.ndarray) -> str:
     if len(known) > 4 and known[-1] - known[0] == len(known) - 1:
         return f"{known[0]} to {known[-1]}"
     return ", ".join(str(value) for value in known)
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None
 
 
 def write(
@@ -247,13 +257,14 @@ def write(
             "labels": row.labels,
             "trained_steps": row.step,
             "seeds": row.seeds.tolist(),
-            **{metric: values.tolist() for metric, values in row.metrics.items()},
+            **{metric: [_finite(value) for value in values.tolist()] for metric, values in row.metrics.items()},
         }
         for row in measured
     ]
     contents = {
         "subject": source.folder.name,
         "world": {"name": source.task.name, **to_json(world)},
+        **({"files": files} if POLICIES[policy].taught and (files := source.task.files(world)) else {}),
         "policy": policy,
         **body,
         "envs": num_envs,

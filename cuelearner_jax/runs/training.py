@@ -65,6 +65,11 @@ class Training:
         """Has every question been asked?"""
         return not self.group.guidance.asks or self.round >= self.group.rounds
 
+    @property
+    def failed(self) -> np.ndarray:
+        """Which lanes (lanes,) are no longer finite: they stand where they last were, and count in no mean."""
+        return self.group.columns([{"failed": block.failed} for block in self.blocks])["failed"]
+
     def label_rounds(self, teacher: Teacher) -> Iterator[int]:
         """Asks a simulated teacher, a round at a time; gives the number of rounds made."""
         while not self.labelled:
@@ -104,12 +109,13 @@ class Training:
             self.clock, self.blocks, metrics = group.train(self.clock, self.blocks, iterations)
             self.wall += time.perf_counter() - started
             trained = group.columns([{f"train_{name}": v for name, v in block.items()} for block in metrics])
-            yield {**self.evaluation(), **trained}
+            yield {**self.evaluation(), **self._of_finite(trained)}
 
     def evaluation(self) -> dict[str, Any]:
-        """The columns of one evaluation of all agents: scalars, or (lanes,)."""
+        """The columns of one evaluation of all agents: scalars, or (lanes,); NaN where a failed lane has no metric."""
         group = self.group
         own = {"seed": group.seeds, "labels": group.budgets, "step": self.step, "wall_s": self.wall}
+        own["failed"] = self.failed.astype(float)
         actions = actions_of(group.env)
         return {**own, **self._measured(lambda lane: Agent(lane.agent.params, group.config.sizes, actions))}
 
@@ -125,4 +131,15 @@ class Training:
     def _measured(self, policy_of: Any) -> dict[str, np.ndarray]:
         schedule = self.group.config.schedule
         key = episodes(self.split)
-        return self.group.evaluate(policy_of, self.examined, key, schedule.eval_envs, schedule.eval_steps, self.blocks)
+        found = self.group.evaluate(policy_of, self.examined, key, schedule.eval_envs, schedule.eval_steps, self.blocks)
+        return self._of_finite(found)
+
+    def _of_finite(self, columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """Metrics (lanes,) with NaN in place of those of failed lanes, so that nobody averages them unmarked."""
+        return {name: np.where(self.failed, np.nan, values) for name, values in columns.items()}
+
+
+def mean_of_finite(values: np.ndarray) -> str:
+    """The mean of a metric (lanes,) over the lanes that have one, for a progress bar."""
+    there = values[np.isfinite(values)]
+    return f"{there.mean():.3f}" if len(there) else "-"

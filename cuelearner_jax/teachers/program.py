@@ -18,6 +18,7 @@ from flax import struct
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from cuelearner_jax import actions as geometry
+from cuelearner_jax.agent.learning import all_finite
 from cuelearner_jax.environment import random_symmetries
 from cuelearner_jax.teachers.learned import LearnedTeacher, TeacherConfig, ValueNetwork
 from cuelearner_jax.types import Params
@@ -159,7 +160,11 @@ class Trainer(NamedTuple):
         return state.replace(params=params, average=average, opt_state=opt_state), error
 
     def train(self, env: Any, state: TeacherState, rounds: int) -> tuple[TeacherState, dict[str, jax.Array]]:
-        """`rounds` rounds of play with their gradient steps; mean reward of its own best directions, mean loss."""
+        """`rounds` rounds of play with their gradient steps.
+
+        Returns:
+            The state; mean "reward" of its own best directions, mean "loss", and whether all is "finite".
+        """
 
         def one_round(state: TeacherState, _: None) -> tuple[TeacherState, tuple[jax.Array, jax.Array]]:
             state, reward = self.play(env, state)
@@ -172,4 +177,5 @@ class Trainer(NamedTuple):
             return state, (reward, errors.mean())
 
         state, (reward, error) = jax.lax.scan(one_round, state, length=rounds)
-        return state, {"reward": reward.mean(), "loss": error.mean()}
+        finite = all_finite((error, reward, state.params, state.average))
+        return state, {"reward": reward.mean(), "loss": error.mean(), "finite": finite}

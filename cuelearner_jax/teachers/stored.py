@@ -1,45 +1,58 @@
-"""A learned teacher's folder: its network in half precision, and teacher.json: what it is and how it was made."""
+"""A learned teacher's folder: its network in half precision, and teacher.json: what it is and how it was made.
+
+A teacher knows the world that it learned in. Who loads one for another world asks `world_of` first.
+"""
 
 from __future__ import annotations
 
+import hashlib
 import shutil
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
-from cuelearner_jax.config import from_json
-from cuelearner_jax.errors import UserError
+from cuelearner_jax.agent.learning import all_finite
+from cuelearner_jax.config import from_json, to_json
+from cuelearner_jax.errors import NotFinite, UserError
 from cuelearner_jax.records import formats
 from cuelearner_jax.records.checkpoint import checkpoints
 from cuelearner_jax.teachers.learned import LearnedTeacher, TeacherConfig
 from cuelearner_jax.teachers.program import Trainer
+
+ABOUT = "teacher.json"
 
 
 def save(folder: Path, teacher: LearnedTeacher, about: dict[str, Any]) -> None:
     """Writes a teacher: its network in half precision, and teacher.json: what it is and how it was made.
 
     `about` must hold the `config` (a TeacherConfig's fields) under that name.
+
+    Raises NotFinite, and writes nothing, for weights that half precision cannot hold.
     """
+    params = jax.tree.map(lambda leaf: leaf.astype(jnp.float16), teacher.params)
+    if not all_finite(params):
+        raise NotFinite(
+            f"the teacher's weights are not finite, or beyond {jnp.finfo(jnp.float16).max}: it was not written to "
+            f"{folder}; train with a smaller --teacher.learning-rate and another --out"
+        )
     folder.mkdir(parents=True, exist_ok=True)
     if (folder / "network").exists():  # an earlier teacher's, which would be kept
         shutil.rmtree(folder / "network")
-    params = jax.tree.map(lambda leaf: leaf.astype(jnp.float16), teacher.params)
     with checkpoints(folder / "network") as saved:
         saved.save(0, {"params": params})
-    formats.write("teacher", folder / "teacher.json", about)
+    formats.write("teacher", folder / ABOUT, about)
 
 
 def load(folder: Path, env: Any, aim_error: Any, habit: Any) -> LearnedTeacher:
-    """A teacher that `save` wrote. Raises UserError if there is none, or one of another task."""
-    if not (folder / "teacher.json").is_file():
-        raise UserError(f"no teacher in {folder}: train one with `cuelearner teacher train`, or use the search teacher")
-    about = formats.read("teacher", folder / "teacher.json")
+    """A teacher that `save` wrote. Raises UserError if there is none, or one for other observations."""
+    about = _about(folder)
     try:
         config = from_json(TeacherConfig, about["config"])
     except (ValueError, KeyError, TypeError) as error:
-        raise formats.damaged("teacher", folder / "teacher.json") from error
+        raise formats.damaged("teacher", folder / ABOUT) from error
     template = jax.eval_shape(Trainer(config).init, env, jax.random.key(0)).params
     halves = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, jnp.float16), template)
     with checkpoints(folder / "network", read_only=True) as saved:
@@ -47,3 +60,61 @@ def load(folder: Path, env: Any, aim_error: Any, habit: Any) -> LearnedTeacher:
     params = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), params)
     aim = jnp.asarray(aim_error, jnp.float32), jnp.asarray(habit, jnp.float32)
     return LearnedTeacher(env, params, *aim, config.layers, config.directions)
+
+
+def world_of(folder: Path, task: str, config: Any, apart: Collection[str]) -> Any:
+    """The configuration of the world that a teacher learned in.
+
+    Args:
+        folder: of the teacher.
+        task: name of the task in which it is to be asked.
+        config: the configuration in which it is to be asked.
+        apart: fields in which the two may differ, because they change nothing or the task sees to it.
+
+    Raises:
+        UserError: no teacher there, one of another task, or one that knows nothing of a change in this world.
+    """
+    told = _about(folder).get("task")
+    if not isinstance(told, dict) or "name" not in told:
+        raise formats.damaged("teacher", folder / ABOUT)
+    if told["name"] != task:
+        raise UserError(f"the teacher in {folder} is one of {told['name']}, not of {task}: give another folder")
+    try:
+        own = from_json(type(config), {name: value for name, value in told.items() if name != "name"})
+    except (ValueError, TypeError) as error:
+        raise formats.damaged("teacher", folder / ABOUT) from error
+    before, now = ({name: one for name, one in to_json(world).items() if name not in apart} for world in (own, config))
+    for field, value in before.items():
+        if value != now[field]:
+            raise UserError(
+                f"the teacher in {folder} learned with {_typed({field: value})} and knows nothing of this world's "
+                f"{_typed({field: now[field]})}: use the search teacher (--task.teacher search), or train one for this "
+                f"world (cuelearner teacher train {task} {_typed(now)} --out FOLDER) and give --task.teacher FOLDER"
+            )
+    return own
+
+
+def digest(folder: Path) -> str:
+    """Short hash of a teacher's files. Raises UserError if there is none."""
+    _about(folder)
+    found = hashlib.sha256()
+    for file in [folder / ABOUT, *sorted((folder / "network").rglob("*"))]:
+        if file.is_file():
+            found.update(f"{file.relative_to(folder).as_posix()}\n".encode() + file.read_bytes())
+    return found.hexdigest()[:12]
+
+
+def _about(folder: Path) -> dict[str, Any]:
+    """What teacher.json says. Raises UserError if there is none or it is damaged."""
+    if not (folder / ABOUT).is_file():
+        raise UserError(
+            f"no teacher in {folder}: train one with `cuelearner teacher train` and give its folder "
+            "(--task.teacher FOLDER), or use the search teacher (--task.teacher search)"
+        )
+    return formats.read("teacher", folder / ABOUT)
+
+
+def _typed(fields: dict[str, Any]) -> str:
+    """Fields of a task's configuration as they are typed on the command line."""
+    told = {name: value if isinstance(value, list) else [value] for name, value in fields.items()}
+    return " ".join(f"--task.{name.replace('_', '-')} {' '.join(map(str, value))}" for name, value in told.items())

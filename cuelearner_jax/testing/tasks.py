@@ -42,6 +42,7 @@ def check_task(
     for name, preset in task.presets.items():
         with laws.attempted(f"preset {name!r}", "its values must pass cuelearner_jax.config.check"):
             check(preset.config)
+            task.check_evaluations(preset.config)
             check_grid(Grid(preset.guidance or ("none",), (preset.first_seed,), preset.labels))
         env = _shapes(laws, task, preset.config.task, f"preset {name!r}")
         possible = registry.possible(env, taught=task.teacher is not None)
@@ -51,6 +52,7 @@ def check_task(
         _check_scenarios(laws, task, preset.config.task, env.obs_size)
     if small is not None:
         laws.hold(isinstance(small, task.config), f"`small` is a {type(small).__name__}: give a {task.config.__name__}")
+        _check_longest(laws, task, small)
         check_environment(task.environment(small), steps, tolerance=tolerance)
         _check_teacher(laws, task, small)
     if pictures is not None:
@@ -82,6 +84,18 @@ def _check_scenarios(laws: Laws, task: Task, config: Any, obs_size: int) -> None
             world.obs_size == obs_size,
             f"scenario {name!r} has observations of {world.obs_size} entries, not {obs_size}: policies must act in it",
         )
+
+
+def _check_longest(laws: Laws, task: Task, config: Any) -> None:
+    """Where episodes have outcomes, evaluations must know how long to wait for them."""
+    env = task.environment(config)
+    state, _ = jax.eval_shape(env.reset, jax.random.key(0))
+    action = jax.eval_shape(lambda: actions_of(env).uniform(jax.random.key(0), ()))
+    outcomes = sorted(jax.eval_shape(env.step, jax.random.key(0), state, action)[1].outcome)
+    laws.hold(
+        not outcomes or task.longest is not None,
+        f"its episodes have outcomes {outcomes}, but it does not say how long they last: fill `longest`",
+    )
 
 
 def _check_teacher(laws: Laws, task: Task, config: Any) -> None:

@@ -13,7 +13,7 @@ from cuelearner_jax.cli import main
 from cuelearner_jax.errors import UserError
 
 AGENT = Path(__file__).parents[2] / "docs" / "data" / "navigation_agent"
-FEW = ["--envs", "3", "--steps", "12", "--task.worlds", "8", "--task.max-steps", "4"]
+FEW = ["--episodes", "3", "--task.worlds", "8", "--task.max-steps", "4"]
 
 REFUSED = [
     (["evaluate", "billiards", "--robot", "anymal"], "billiards has no robots to choose from: leave out --robot"),
@@ -22,6 +22,8 @@ REFUSED = [
     (["evaluate", "navigation", "--robot", "anymal", "--engine", "bullet"], "unknown engine 'bullet'"),
     (["evaluate", "navigation", "--robot", "anymal", "--policy", "agent"], "needs a trained run"),
     (["render", "billiards", "--robot", "anymal"], "billiards has no robots"),
+    (["evaluate", "navigation", "--robot", "anymal:nowhere"], "no walking policy in nowhere: train one with"),
+    (["render", "navigation", "--robot", "simple:nowhere"], "simple takes no folder: leave out 'nowhere'"),
     (["locomotion", "walk"], "unknown command 'locomotion walk': choose one of train, evaluate"),
     (["locomotion", "train", "--train.robots", "0"], "train.robots is 0: give a positive number"),
     (["locomotion", "train", "--train.robots", "100"], "give a multiple of train.robots (100)"),
@@ -67,6 +69,22 @@ def test_an_agent_of_the_simple_robot_walks_in_c_mujoco(tmp_path, capsys):
     assert row["finished"] == [1.0]
     assert sum(row[name][0] for name in ("success", "collision", "fall", "timeout")) == pytest.approx(1)
     assert "fall" in capsys.readouterr().out
+
+
+def test_it_walks_by_a_policy_of_the_users_own(tmp_path):
+    """The shipped one in another place, then one that lets the robot fall."""
+    own, rows = tmp_path / "own", []
+    shipped = policy.load()
+    limp = shipped.replace(layers=tuple((0 * kernel - 1, 0 * bias - 1) for kernel, bias in shipped.layers))
+    for number, one in enumerate((shipped, limp)):
+        policy.save(own, one, {})
+        out = tmp_path / f"{number}.json"
+        command = ["evaluate", "navigation", "--robot", f"anymal:{own}", "--engine", "mujoco", "--task.worlds", "8"]
+        assert main([*command, "--task.max-steps", "6", "--episodes", "3", "--out", str(out)]) == 0
+        rows.append(json.loads(out.read_text()))
+    assert [row["robot"] for row in rows] == [f"anymal:{own}"] * 2
+    assert len({row["robot_digest"] for row in rows}) == 2
+    assert [row["rows"][0]["fall"] for row in rows] == [[0.0], [1.0]]
 
 
 @pytest.fixture

@@ -2,14 +2,17 @@ import json
 import re
 import subprocess
 import sys
+from io import StringIO
 from pathlib import Path
 from xml.etree import ElementTree
 
 import imageio.v2 as imageio
 import pytest
+from rich.console import Console
 from small_runs import SMALL
 
-from cuelearner_jax.cli import main
+from cuelearner_jax import terminal
+from cuelearner_jax.cli import evaluate, main
 from cuelearner_jax.records import results
 
 ENTRY = [str(Path(sys.executable).with_name("cuelearner"))]
@@ -59,6 +62,17 @@ def test_every_policy_is_evaluated(run_folder, tmp_path, capsys, policy):
     assert {(row["guidance"], row["labels"]) for row in rows} == (lanes if trained else {("-", 0)})
 
 
+def test_an_evaluation_says_how_far_it_is(run_folder, monkeypatch):
+    """On a terminal: a bar for each kind of guidance, that moves between the first step and the last."""
+    shown = StringIO()
+    console = Console(file=shown, force_terminal=True, color_system=None, width=100)
+    for module in (terminal, evaluate):
+        monkeypatch.setattr(module, "console", console)
+    assert main(["evaluate", str(run_folder), "--steps", "100", "--envs", "10"]) == 0
+    for kind, lanes in (("none", 2), ("relative", 4)):
+        assert re.search(rf"{kind} .*{5 * lanes}/{5 * lanes} ", shown.getvalue())
+
+
 def test_a_changed_world_changes_the_measurement(run_folder, tmp_path):
     rewards = []
     for turn in ("0", "90"):
@@ -104,7 +118,8 @@ def test_render_makes_the_picture_of_a_question(run_folder, refused, tmp_path):
 def test_the_overview_has_a_line_for_each_command_and_the_version_can_be_asked_for(capsys):
     assert main(["--help"]) == 0
     told = capsys.readouterr().out
-    for name in ("train", "sweep", "evaluate", "report", "render", "teacher train", "bench", "locomotion evaluate"):
+    locomotion = ("locomotion train", "locomotion evaluate")
+    for name in ("train", "sweep", "evaluate", "report", "render", "teacher train", "bench", *locomotion):
         assert re.search(rf"^  {name} +[A-Z].*\.$", told, re.MULTILINE), name
     assert main(["--version"]) == 0
     assert re.fullmatch(r"cuelearner \d+\.\d+\.\d+\n", capsys.readouterr().out)
@@ -139,16 +154,6 @@ def test_tuning_episodes_are_others_and_stay_out_of_reports(run_folder, tmp_path
     assert main(["report", str(out), "--split", "tuning", "--out", str(tmp_path / "report")]) == 0
 
 
-def test_a_tiny_teacher_is_trained(tmp_path):
-    out = tmp_path / "teacher"
-    command = ["teacher", "train", "billiards", "--preset", "quickstart", "--out", str(out), "--eval-steps", "20"]
-    sizes = ["--teacher.layers", "16", "--teacher.tables", "8", "--teacher.rounds", "20", "--teacher.batch-size", "64"]
-    assert main([*command, *sizes, "--teacher.search", "36", "--teacher.directions", "36"]) == 0
-    told = json.loads((out / "teacher.json").read_text())
-    assert told["command"].startswith("cuelearner teacher train billiards")
-    assert sorted(path.name for path in out.iterdir()) == ["network", "teacher.json"]
-
-
 @pytest.mark.parametrize("command", ["train", "sweep", "evaluate", "report", "render", "teacher", "bench"])
 def test_the_installed_command_explains_itself(command):
     task = {"teacher": ["train", "billiards"], "report": []}.get(command, ["billiards"])
@@ -156,6 +161,9 @@ def test_the_installed_command_explains_itself(command):
     assert done.returncode == 0
     assert "--out" in done.stdout
     assert done.stderr == ""
+    if command in ("train", "sweep", "evaluate", "render"):
+        assert "(--preset; paper where none is given)" in done.stdout
+        assert re.search(r"^  quickstart  .*minutes on 2 cores\)$", done.stdout, re.MULTILINE)
 
 
 def test_the_installed_command_fails_in_one_line(tmp_path):

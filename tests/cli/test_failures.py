@@ -47,7 +47,12 @@ ARGUMENTS = [
     (["render", "billiards", "--labels", "0"], "--labels chooses nothing here"),
     (["render", "billiards", "--guidance", "none"], "--guidance chooses nothing here"),
     (["render", "billiards", "--film", "avi"], "gif or mp4"),
-    (["render", "billiards", "--steps", "0"], "positive"),
+    (["render", "billiards", "--steps", "0"], "--steps is 0: give a number from 1 to 100,000"),
+    (["render", "billiards", "--episode", "-1"], "--episode is -1: give a number from 0 to 4,294,967,295"),
+    (["render", "billiards", "--episode", "5000000000"], "--episode is 5000000000: give a number from 0"),
+    (["evaluate", "billiards", "--envs", "1000000000"], "--envs is 1000000000: give a number from 1 to 100,000"),
+    (["evaluate", "billiards", "--steps", "100000000000"], "at most 1,000,000 for each of the environments"),
+    (["evaluate", "billiards", "--task.table", "one_ball", "--policy", "teacher"], "--task.teacher search"),
     (["teacher", "trian"], "cuelearner teacher train"),
     (["teacher", "train", "billiards", "--teacher.tries", "2"], "at least 4"),
 ]
@@ -162,7 +167,7 @@ def test_labels_that_do_not_fit_are_refused(refused, copy, tmp_path):
     other = [*relative, "--labels", "20", "--seeds", "2", "--task.table", "easy", *new]
     refused(other, "labels of a world with another task.table (one_ball, this run's is easy)", copy)
     refused([*relative, "--labels", "500", "--seeds", "2", *new], "lower --labels or collect more", copy)
-    refused([*relative, "--labels", "20", "--seeds", "3", *new], "for seed 2002", copy)
+    refused([*relative, "--labels", "20", "--seeds", "3", *new], "seeds 2000, 2001, none for seed 2002", copy)
     refused([*QUICK, "--guidance", "none", "--labels-from", file, *new], "add --guidance relative", copy)
     file.write_bytes(b"PAR1 no more")
     refused([*relative, "--labels", "20", "--seeds", "2", *new], "not a label file", copy)

@@ -48,6 +48,29 @@ def test_policies_are_evaluated_in_worlds_of_another_style(walked, tmp_path, pol
         assert min(row["success"]) >= 0.75  # the road map's word, alone or as what refines the agent's actions
 
 
+def test_an_evaluation_is_of_whole_episodes(walked, refused, tmp_path, capsys):
+    """By default, by number, and never of the short ones alone."""
+    evaluate = ["evaluate", str(walked), "--policy", "uniform"]
+    for asked, episodes in ([], 100), (["--episodes", "12"], 12), (["--envs", "12"], 12):
+        out = tmp_path / f"{len(asked)}{asked[:1]}.json"
+        assert main([*evaluate, *asked, "--out", str(out)]) == 0
+        assert f"uniform, {episodes} episodes a lane" in capsys.readouterr().out
+        measured = json.loads(out.read_text())
+        assert (measured["envs"], measured["steps"]) == (episodes, 20 * episodes)
+        (row,) = measured["rows"]
+        assert row["finished"] == [1]
+        assert sum(row[name][0] for name in OUTCOMES) == pytest.approx(1)
+        assert row["timeout"][0] > 0.2  # chance gets nowhere in 4 s
+    short = "--steps is 1200 for 120 environments, 10 each, but an episode lasts up to 20: give --steps 2400"
+    refused([*evaluate, "--steps", "1200", "--envs", "120"], short, tmp_path)
+    refused([*evaluate, "--steps", "10000", "--task.max-steps", "200"], "give --steps 20000", tmp_path)
+    refused([*evaluate, "--episodes", "12", "--envs", "12"], "leave out --steps and --envs", tmp_path)
+    refused([*evaluate, "--episodes", "0"], "from 1 to 100,000", tmp_path)
+    refused(["evaluate", "billiards", "--episodes", "3"], "billiards counts steps, not episodes", tmp_path)
+    cut = ["sweep", "navigation", "--preset", "quickstart", *SMALL, "--task.max-steps", "21"]
+    refused([*cut, "--out", tmp_path / "cut"], "an episode lasts up to 21: give --schedule.eval-steps 210", tmp_path)
+
+
 def test_a_report_of_successes(walked, tmp_path):
     out = tmp_path / "report"
     assert main(["report", str(walked), "--metric", "success", "--out", str(out)]) == 0
@@ -64,4 +87,4 @@ def test_an_episode_is_filmed(walked, tmp_path):
 
 def test_a_task_without_a_world_is_refused(refused, tmp_path):
     command = ["sweep", "navigation", "--preset", "quickstart", *SMALL, "--out", str(tmp_path / "none")]
-    refused([*command, "--task.worlds", "0"], "task.worlds is 0: give a positive number", tmp_path)
+    refused([*command, "--task.worlds", "0"], "task.worlds is 0: give a whole number from 1", tmp_path)

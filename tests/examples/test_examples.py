@@ -220,3 +220,17 @@ def test_any_function_is_corrected(capsys):
     rates = correct(worlds=4, labels=10, episodes_measured=4)
     assert [line.split(":")[0] for line in capsys.readouterr().out.splitlines()] == ["compass", "refined"]
     assert all(rate in (0.0, 0.25, 0.5, 0.75, 1.0) for rate in rates)
+
+
+def test_the_shots_that_the_page_on_billiards_shows_are_won(capsys):
+    (shown,) = re.findall(
+        r"```python\n(.*?)```", (ROOT / "docs" / "billiards.md").read_text(encoding="utf-8"), re.DOTALL
+    )
+    told: dict = {}
+    exec(shown, told)
+    printed = capsys.readouterr().out
+    # The numbers of the page's comments, but for directions on the edge of a window in another build's rounding.
+    assert abs(int(told["won"].sum()) - 51) <= 3
+    assert re.search(r"(\d+) of 3600 directions win", printed)
+    assert told["shot"].pocketed.tolist() == [False, False, False, True]
+    assert float(told["shot"].duration) == pytest.approx(3.1, abs=0.05)

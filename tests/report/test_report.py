@@ -2,7 +2,9 @@
 
 import csv
 import json
+import re
 from collections.abc import Sequence
+from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
@@ -16,11 +18,12 @@ from cuelearner_jax.report.document import report
 STEPS = np.arange(0, 101, 10)
 
 
-def write(folder, guidance, level, labels=0, *, seeds: Sequence[int] = range(8), steps=STEPS, **constants):
+def write(folder, guidance, level, labels=0, *, seeds: Sequence[int] = range(8), steps=STEPS, **constants: Any):
     """Seeds that all stand at 0 until step 30 and at `level`, give or take 0.02, from step 40 on."""
-    constants = {"run": folder.name, "task": "one_ball", "guidance": guidance, "config_hash": "0f"} | constants
+    known = {"run": folder.name, "task": "one_ball", "guidance": guidance, "config_hash": "0f"}
+    known |= {"commit": "abc", "versions": "jax 0", "hardware": "1 x cpu"} | constants
     rng = np.random.default_rng(len(seeds))  # variants of one size differ in nothing but their level
-    with results.ResultsWriter(folder, commit="abc", versions="jax 0", hardware="1 x cpu", **constants) as writer:
+    with results.ResultsWriter(folder, **known) as writer:
         for step in steps:
             reward = (step > 30) * level + rng.uniform(-0.02, 0.02, len(seeds))
             writer.append(step=step, split="validation", seed=np.array(seeds), labels=labels, reward=reward, wall_s=1.0)
@@ -147,6 +150,77 @@ def test_says_what_is_missing(runs, tmp_path):
     assert float(summary(tmp_path / "report")["relative", 500]["mean"]) == pytest.approx(0.6 * 15 / 50, abs=0.01)
 
 
+def test_a_configuration_that_cannot_be_read_is_said_and_nothing_is_called_complete(runs, tmp_path):
+    def missing(report_folder):
+        text = report(runs, tmp_path / report_folder).read_text()
+        return text.split("## Missing")[1].split("## Where")[0]
+
+    whole = {name: (runs / name / "config.json").read_bytes() for name in ("unguided", "relative-100", "relative-500")}
+    (runs / "unguided" / "config.json").write_bytes(whole["unguided"][:7])
+    (runs / "relative-100" / "config.json").write_text('{"total_steps": "all", "grid": []}')
+    (runs / "relative-500" / "config.json").unlink()
+    found = missing("one")
+    assert "complete" not in found
+    for name in ("unguided", "relative-100"):
+        assert f"what was planned in {(runs / name).as_posix()} is not known" in found
+    assert f"{(runs / 'relative-500').as_posix()}: has no config.json" in found
+    for name, contents in whole.items():
+        (runs / name / "config.json").write_bytes(contents)
+    assert "nothing: all runs are complete" in missing("two")
+
+
+def test_seeds_and_budgets_of_the_plan_without_results_are_named(runs, tmp_path):
+    grid = {"guidance": ["none", "relative"], "seeds": list(range(10)), "labels": [100, 700]}
+    (runs / "config.json").write_text(json.dumps({"total_steps": 100, "grid": grid}))
+    missing = report(runs, tmp_path / "report").read_text().split("## Missing")[1].split("## Where")[0]
+    for kind in grid["guidance"]:
+        assert f"no results of {kind} guidance with the seeds 8, 9" in missing
+    assert "no results of relative guidance with the label budgets 700" in missing
+    assert "none guidance with the label" not in missing
+
+
+def test_a_million_pieces_are_named_as_a_range_and_a_billion_make_no_sense(runs, tmp_path):
+    described = json.loads((runs / "unguided" / "config.json").read_text())
+    (runs / "unguided" / "config.json").write_text(json.dumps({**described, "shard": [3, 10**6]}))
+    (runs / "relative-100" / "config.json").write_text(json.dumps({**described, "shard": [5, 10**6]}))
+    (runs / "relative-500" / "config.json").write_text(json.dumps({**described, "shard": [1, 10**9]}))
+    missing = report(runs, tmp_path / "report").read_text().split("## Missing")[1].split("## Where")[0]
+    assert "shards not begun, of 1000000: 1 to 2, 4, 6 to 1000000" in missing
+    assert "relative-500/config.json is damaged" in missing
+
+
+HOSTILE = "=cmd()|![x](http://a.b)<script>alert(1)</script>`\n| relative | 9,000 | 8 |\n\n# all is well $\\frac$"
+
+
+def test_names_are_only_names_in_markdown_csv_and_figures(tmp_path):
+    """A folder, a kind of guidance, a task, a command and a version that try to be tags, rows, links and formulas."""
+    folder = tmp_path / "runs" / "a|b<img src=x>`[c](d)\n- done"
+    constants: dict[str, Any] = {
+        "task": HOSTILE,
+        "command": HOSTILE,
+        "versions": HOSTILE,
+        "hardware": "@SUM(1)",
+        "commit": "`<b>`",
+    }
+    write(folder, HOSTILE, -0.5, 100, steps=STEPS[:-1], **constants)
+    write(tmp_path / "runs" / "plain", "_under", 0.5, 100, seeds=[0, 1], **constants)
+    text = report(tmp_path / "runs", tmp_path / "out", command=f"cuelearner report '{folder}'").read_text()
+    for active in ("<script", "<img", "<b>", "![x]", "[x](", "[c](", "\n- done", "\n# all", "\n| relative"):
+        assert active not in text, active
+    rows = [line for line in text.splitlines() if line.startswith("|")]
+    assert len(rows) == 2 + 2  # the header, the line below it, two variants
+    assert {len(re.findall(r"(?<!\\)\|", row)) for row in rows} == {11}
+    assert "`" not in text.replace("\\`", "").split("configuration: ")[0]
+    for name in ("summary.csv", "curves.csv"):
+        with (tmp_path / "out" / name).open(newline="") as file:
+            found = list(csv.DictReader(file))
+        assert {row["guidance"] for row in found} == {"'" + HOSTILE.replace("\n", "\\n"), "_under"}
+        number = "final" if name == "summary.csv" else "iqm"
+        assert any(row[number].startswith("-0.") for row in found)  # numbers have no apostrophe
+    for path in (tmp_path / "out").glob("*.svg"):
+        ElementTree.parse(path)
+
+
 def test_a_metric_that_is_not_finite_is_left_out_and_said(tmp_path):
     constants = {"run": "a", "task": "one_ball", "guidance": "none", "config_hash": "0f", "labels": 0}
     with results.ResultsWriter(tmp_path / "a", **constants) as writer:
@@ -155,6 +229,55 @@ def test_a_metric_that_is_not_finite_is_left_out_and_said(tmp_path):
     text = report(tmp_path / "a", tmp_path / "report").read_text()
     assert "1 validation rows have no finite reward" in text
     assert float(summary(tmp_path / "report")["none", 0]["final"]) == pytest.approx(0.2)
+
+
+def lose(folder, guidance, labels=0, seeds=(0, 1, 2), by=20):
+    """Appends lanes that had failed by a step: their values before then must not count, those after are null."""
+    constants = {"run": folder.name, "task": "one_ball", "guidance": guidance, "config_hash": "0f", "labels": labels}
+    with results.ResultsWriter(folder, **constants) as writer:
+        for step in STEPS:
+            reward = np.full(len(seeds), 7.0 if step < by else np.nan)
+            writer.append(step=step, split="validation", seed=seeds, reward=reward, failed=float(step >= by))
+
+
+def test_failed_lanes_count_in_no_mean_and_are_marked_everywhere(runs, tmp_path):
+    report(runs, tmp_path / "before")
+    lose(runs / "relative-500", "relative", 500, seeds=[8, 9, 10])
+    lose(runs / "scalar", "scalar", 100, seeds=[0, 1])
+    text = report(runs, tmp_path / "after").read_text()
+    before, after = summary(tmp_path / "before"), summary(tmp_path / "after")
+    assert {name: row for name, row in after["relative", 500].items() if name != "failed"} == {
+        name: row for name, row in before["relative", 500].items() if name != "failed"
+    }
+    assert [after[key]["failed"] for key in before] == ["0", "0", "3"]
+    assert (after["scalar", 100]["seeds"], after["scalar", 100]["failed"], after["scalar", 100]["final"]) == (
+        "0",
+        "2",
+        "",
+    )
+    assert "| relative | 500 | 8 of 11, 3 failed |" in text
+    assert "| scalar | 100 | 0 of 2, 2 failed | | | |" in text
+    assert (
+        "relative, 500 labels: seeds 8 (by step 20), 9 (by step 20), 10 (by step 20) failed, no longer finite: curve "
+        "and means are over the other 8"
+    ) in text
+    assert "scalar, 100 labels: seeds 0 (by step 20), 1 (by step 20) failed, no longer finite: no lane is left" in text
+    assert "all runs are complete" not in text
+    assert "rows have no finite" not in text  # they are counted once
+    for name in ("curves.csv", "label_efficiency.svg"):
+        assert (tmp_path / "after" / name).read_text() == (tmp_path / "before" / name).read_text()
+    marked, plain = ((tmp_path / out / "curves.svg").read_text() for out in ("after", "before"))
+    note = "a seed failed, and is left out"
+    assert note in marked
+    crosses = marked.count("<use ") - plain.count("<use ") - len(note)  # letters are drawn so too
+    assert crosses == 3 + 1  # one for each lane that a curve lacks, and the legend's
+
+
+def test_nothing_but_failed_lanes_is_refused(tmp_path):
+    lose(tmp_path / "a", "none", by=0)
+    with pytest.raises(UserError, match=r"3 of 3 lanes failed, no longer finite \(none: seeds 0 \(by step 0\)"):
+        report(tmp_path / "a", tmp_path / "report")
+    assert not (tmp_path / "report").exists()
 
 
 def test_errors_are_clear_and_leave_no_folder(runs, tmp_path):

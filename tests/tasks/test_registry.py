@@ -1,8 +1,10 @@
 """Tasks by name: loaded when asked for, from packages and from files that the user names."""
 
+import re
 import subprocess
 import sys
 from importlib.metadata import EntryPoint
+from pathlib import Path
 
 import probes
 import pytest
@@ -58,6 +60,7 @@ def test_the_packages_own_tasks_can_be_had(name):
     task = registry.find(name)
     assert task.name == name
     assert task.origin == ""
+    assert all("on 2 cores" in preset.takes for preset in task.presets.values())
     assert registry.resolve(name) is task
     assert {"paper", "quickstart"} <= set(task.presets)
     assert all(isinstance(preset.config, RunConfig) for preset in task.presets.values())
@@ -140,3 +143,11 @@ def test_an_installed_task_that_cannot_be_had_is_refused(tmp_path, monkeypatch):
         registry.find("packed")
     with pytest.raises(UserError, match="no module 'own_gone'"):
         registry.find("gone")
+
+
+def test_the_help_names_the_tables_that_have_a_shipped_teacher():
+    from cuelearner_envs.billiards import config
+    from cuelearner_jax.tasks.billiards import SHIPPED_TEACHERS
+
+    (told,) = re.findall(r"\(shipped for ([^)]*)\)", Path(config.__file__).read_text(encoding="utf-8"))
+    assert told.split(" and ") == sorted(folder.name for folder in SHIPPED_TEACHERS.iterdir())

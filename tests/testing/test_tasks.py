@@ -28,6 +28,14 @@ class Wider(Window):
     observation = (Quantity("context", 2, "1"), Quantity("half the width", 1, "rad"))
 
 
+class Counting(Window):
+    """With an outcome of its episodes."""
+
+    def step(self, key, state, action):
+        after, step = super().step(key, state, action)
+        return after, step.replace(outcome={"success": step.reward})
+
+
 class Mistaken(Expert):
     """Answers no direction."""
 
@@ -101,6 +109,14 @@ BROKEN = {
         "scenario 'narrow' has observations of 3 entries, not 2",
     ),
     "splits of other shapes": (with_environment(by_split), "environments of other shapes for other splits"),
+    "episodes of no length": (
+        with_environment(lambda config, split: Counting()),
+        "its episodes have outcomes ['success'], but it does not say how long they last: fill `longest`",
+    ),
+    "short evaluations": (
+        dataclasses.replace(with_preset(), longest=lambda config: 3),
+        "schedule.eval-steps is 20 for 10 environments, 2 each, but an episode lasts up to 3",
+    ),
     "no direction": (
         dataclasses.replace(PROBE, teacher=lambda config, env: Mistaken(env)),
         "its teacher's best action is no action of the space",

@@ -149,8 +149,13 @@ class LeggedNavigation(Navigation, kw_only=True):
         )
 
 
-def make_environment(config: NavigationConfig, split: str = "training") -> LeggedNavigation:
-    """The environment of a configuration with the quadruped for a robot. Raises UserError if it can't be."""
+def make_environment(
+    config: NavigationConfig, split: str = "training", walking: WalkingPolicy | None = None
+) -> LeggedNavigation:
+    """The environment of a configuration with the quadruped for a robot. Raises UserError if it can't be.
+
+    It walks by a policy (default: the shipped one).
+    """
     plain = make_navigation(config, split)
     noise = jnp.hypot(plain.lidar.noise, SENSOR_NOISE)
     return LeggedNavigation(
@@ -161,5 +166,5 @@ def make_environment(config: NavigationConfig, split: str = "training") -> Legge
         period=plain.period,
         goal_radius=plain.goal_radius,
         mirrors=plain.mirrors,
-        walking=walking_policy.load(),
+        walking=walking_policy.load() if walking is None else walking,
     )

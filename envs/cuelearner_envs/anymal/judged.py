@@ -70,6 +70,12 @@ class Course:
             self.judge.place(number, pose)
 
     @property
+    def outcomes(self) -> list[str]:
+        """Names of what an episode comes to."""
+        first = jax.tree.map(lambda leaf: leaf[0], self.state)
+        return list(jax.eval_shape(self.env.ends, first)[0])
+
+    @property
     def poses(self) -> np.ndarray:
         """x, y, yaw [m, rad] of each robot (robots, 3)."""
         return np.asarray(_poses(self.state.body.qpos))
@@ -94,18 +100,27 @@ class Course:
 
 
 def rollout(
-    policy: Policy, env: LeggedNavigation, key: PRNGKeyArray, num_envs: int, steps: int
+    policy: Policy,
+    env: LeggedNavigation,
+    key: PRNGKeyArray,
+    num_envs: int,
+    steps: int,
+    tell: Callable[[int, int], None] = lambda done, count: None,
 ) -> dict[str, np.ndarray]:
     """`cuelearner_jax.evaluate.rollout` of first episodes alone, the same ones, in C MuJoCo.
 
+    `tell` is told how many steps of how many each robot has made.
+
     Returns:
-        Means over the episodes that ended within `steps` shared by all, and "finished", their share.
+        Means over the episodes (nan unless all have ended within `steps` shared by all), and "finished", the share that
+        has.
     """
     k_reset, k_run = jax.random.split(key)
     course = Course(env, jax.random.split(k_reset, num_envs))
     choose = jax.jit(policy.act)
     running, outcomes = np.ones(num_envs, bool), []
     for index in range(steps // num_envs):
+        tell(index, steps // num_envs)
         k_act, _ = jax.random.split(jax.random.fold_in(k_run, index))
         outcome, terminated, truncated = course.step(choose(k_act, course.state, course.obs))
         ended = running & (terminated | truncated)
@@ -114,5 +129,8 @@ def rollout(
         course.judge.retired |= ended
         if not running.any():
             break
-    means = {name: np.asarray(np.mean([one[name] for one in outcomes])) for name in (outcomes[0] if outcomes else {})}
+    if running.any():
+        means = dict.fromkeys(course.outcomes, np.asarray(np.nan))
+    else:
+        means = {name: np.asarray(np.mean([one[name] for one in outcomes])) for name in course.outcomes}
     return {**means, "finished": np.asarray(1.0 - running.mean())}

@@ -6,6 +6,7 @@ policy/policy.json   how it was trained and what it was measured to do
 
 from __future__ import annotations
 
+import itertools
 import json
 from pathlib import Path
 from typing import Any
@@ -101,18 +102,25 @@ def save(folder: Path, policy: WalkingPolicy, about: dict[str, Any]) -> None:
 
 
 def load(folder: Path = SHIPPED) -> WalkingPolicy:
-    """A policy that `save` wrote, the shipped one by default. Raises UserError if there is none."""
+    """A policy that `save` wrote, the shipped one by default. Raises UserError if there is none, or it is damaged."""
     file = folder / WEIGHTS
     if not file.is_file():
         raise UserError(f"no walking policy in {folder}: train one with `cuelearner locomotion train --out {folder}`")
     try:
         with np.load(file) as stored:
-            arrays = {name: jnp.asarray(stored[name], jnp.float32) for name in stored.files}
+            arrays = {name: np.asarray(stored[name], np.float32) for name in stored.files}
         count = sum(name.startswith("kernel_") for name in arrays)
         layers = tuple((arrays[f"kernel_{number}"], arrays[f"bias_{number}"]) for number in range(count))
-        policy = WalkingPolicy(arrays["mean"], arrays["std"], layers)
-    except (OSError, ValueError, KeyError) as error:
+        mean, std = arrays["mean"], arrays["std"]
+    except PermissionError as error:
+        raise UserError(f"{file} cannot be read ({error.strerror}): check its permissions") from error
+    except Exception as error:  # NumPy's and zipfile's readers raise whatever damaged bytes lead them to
         raise UserError(f"{file} is damaged: restore it, or train the policy anew") from error
-    if not layers or layers[0][0].shape[0] != OBS or layers[-1][0].shape[1] != robot.JOINTS:
+    widths = [OBS, *(bias.size for _, bias in layers)]
+    wanted = [((before, after), (after,)) for before, after in itertools.pairwise(widths)]
+    shapes = [(kernel.shape, bias.shape) for kernel, bias in layers]
+    if shapes != wanted or widths[-1] != robot.JOINTS or {mean.shape, std.shape} != {(OBS,)}:
         raise UserError(f"{file} is no walking policy of this robot ({OBS} observations, {robot.JOINTS} joints)")
-    return policy
+    if not all(np.isfinite(leaf).all() for leaf in arrays.values()) or not (std > 0).all():
+        raise UserError(f"{file} holds numbers that cannot be: train the policy anew")
+    return WalkingPolicy(*jax.tree.map(jnp.asarray, (mean, std, layers)))

@@ -9,7 +9,10 @@ import jax.numpy as jnp
 
 from cuelearner_envs.billiards.environment import Billiards
 from cuelearner_envs.billiards.table import Table
+from cuelearner_envs.bounds import check_number, check_vector
+from cuelearner_jax.errors import UserError, closest
 
+MOST_DIRECTIONS = 100_000  # a shot is simulated for each, in every state that the teacher looks at
 SHOTS = {"one_ball": 1, "easy": 10, "regulation": 10}  # of an episode
 
 
@@ -27,8 +30,9 @@ class BilliardsConfig:
     """Changed world: added to the observed positions of balls on the table, x and y [m] (paper: 0.0071 0.0071)."""
     acceleration: tuple[float, float] = (0.0, 0.0)
     """Changed world: constant acceleration of the balls on a tilted table, x and y [m/s^2] (paper: 0 0.005)."""
-    teacher: Literal["learned", "search"] = "search"
-    """Who labels: a learned teacher (shipped for easy), or exhaustive search over directions."""
+    teacher: str = "search"
+    """Who labels: search (every direction is tried), learned (shipped for easy and regulation), or the folder of a
+    teacher that `cuelearner teacher train` made."""
     aim_error_deg: float = 0.5
     """The teacher values directions for a player whose aim has this standard deviation [deg]."""
     habit: float = 0.2
@@ -37,8 +41,21 @@ class BilliardsConfig:
     """Search teacher: directions that it tries in every state."""
 
 
+def check(config: BilliardsConfig) -> None:
+    """Raises UserError with one line for the first value that cannot work."""
+    if config.table not in SHOTS:
+        raise UserError(f"task.table is {config.table!r}{closest(str(config.table), SHOTS)}")
+    check_number("action_turn_deg", config.action_turn_deg, -360, 360, unit="degrees")
+    check_vector("observation_bias", config.observation_bias, 2, -1, 1, "metres")
+    check_vector("acceleration", config.acceleration, 2, -9.81, 9.81, "m/s^2")
+    check_number("aim_error_deg", config.aim_error_deg, 0, 360, unit="degrees")
+    check_number("habit", config.habit, 0, 1)
+    check_number("search_directions", config.search_directions, 1, MOST_DIRECTIONS, whole=True)
+
+
 def make_environment(config: BilliardsConfig) -> Billiards:
-    """The world that a configuration describes."""
+    """The world that a configuration describes. Raises UserError if it can't be."""
+    check(config)
     table: Table = getattr(Table, config.table)()
     return Billiards(
         table=table.replace(acceleration=jnp.array(config.acceleration, jnp.float32)),

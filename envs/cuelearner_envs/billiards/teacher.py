@@ -1,17 +1,22 @@
-"""The billiards teacher by exhaustive search: tries every direction and prefers those that forgive an error of aim."""
+"""Billiards teachers: by exhaustive search, and one that learned in one world asked in another."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import jax
 from flax import struct
 from jaxtyping import Array, Float
 
 from cuelearner_envs.billiards.environment import Balls, Billiards
-from cuelearner_jax.actions import best_direction, evenly_spaced
+from cuelearner_jax.actions import best_direction, evenly_spaced, rotate
 
 
 class SearchTeacher(struct.PyTreeNode):
-    """Knows the table and its state exactly (`cuelearner_jax.types.Teacher`)."""
+    """Tries every direction and prefers those that forgive an error of aim (`cuelearner_jax.types.Teacher`).
+
+    Knows the table and its state exactly.
+    """
 
     env: Billiards
     aim_error: Float[Array, ""] | float  # standard deviation of the error of a player's aim [rad]
@@ -26,3 +31,20 @@ class SearchTeacher(struct.PyTreeNode):
     def best_action(self, state: Balls, obs: Float[Array, " obs"]) -> Float[Array, "2"]:
         """The direction with the largest expected reward. Looks at the true state, not at the observation."""
         return best_direction(self.rewards(state), self.aim_error, self.habit)
+
+
+class Transferred(struct.PyTreeNode):
+    """A teacher of one world in another with the same table, level or tilted alike (`cuelearner_jax.types.Teacher`).
+
+    Sensor and strike may differ: it is shown the true state as its own sensor would show it, and what it would strike
+    is turned so that the ball leaves the same way. Both are exact.
+    """
+
+    teacher: Any  # looks at the observation
+    own: Billiards  # where it learned
+    env: Billiards  # where it is asked
+
+    def best_action(self, state: Balls, obs: Float[Array, " obs"]) -> Float[Array, "2"]:
+        """What leads to the shot that the teacher holds for best. Looks at the true state, not at the observation."""
+        struck = self.teacher.best_action(state, self.own.observe(state))
+        return rotate(struck, self.own.action_turn - self.env.action_turn)

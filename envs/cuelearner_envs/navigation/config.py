@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Literal
 
 import jax
 import jax.numpy as jnp
 
+from cuelearner_envs.bounds import MOST_SEED, MOST_STEPS, check_number
 from cuelearner_envs.navigation.environment import Navigation
 from cuelearner_envs.navigation.layouts import STYLES
 from cuelearner_envs.navigation.lidar import Lidar
@@ -53,17 +53,14 @@ def check(config: NavigationConfig) -> None:
     """Raises UserError with one line for the first value that cannot work."""
     if config.style not in STYLES:
         raise UserError(f"task.style is {config.style!r}{closest(config.style, STYLES)}")
-    for name in ("worlds", "max_steps", "goal_radius", "max_range"):
-        if not 0 < getattr(config, name) < math.inf:
-            raise UserError(f"task.{name} is {getattr(config, name)}: give a positive number")
-    if config.worlds > MOST_WORLDS:
-        raise UserError(f"task.worlds is {config.worlds}: give at most {MOST_WORLDS}")
-    if not 0 <= config.lidar_dropout <= 1:
-        raise UserError(f"task.lidar_dropout is {config.lidar_dropout}: give a probability from 0 to 1")
-    if not 0 <= config.lidar_noise < math.inf:
-        raise UserError(f"task.lidar_noise is {config.lidar_noise}: give a number of metres that is not negative")
-    if not math.isfinite(config.lidar_rotation_deg):
-        raise UserError(f"task.lidar_rotation_deg is {config.lidar_rotation_deg}: give a finite number")
+    check_number("worlds", config.worlds, 1, MOST_WORLDS, whole=True)
+    check_number("world_seed", config.world_seed, 0, MOST_SEED, whole=True)
+    check_number("max_steps", config.max_steps, 1, MOST_STEPS, whole=True)
+    check_number("goal_radius", config.goal_radius, positive=True, unit="metres")
+    check_number("max_range", config.max_range, positive=True, unit="metres")
+    check_number("lidar_rotation_deg", config.lidar_rotation_deg, unit="degrees")
+    check_number("lidar_noise", config.lidar_noise, 0, unit="metres")
+    check_number("lidar_dropout", config.lidar_dropout, 0, 1, unit="a probability")
 
 
 def make_environment(config: NavigationConfig, split: str = "training") -> Navigation:

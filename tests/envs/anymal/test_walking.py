@@ -50,6 +50,51 @@ def test_a_saved_policy_acts_as_before(tmp_path):
     assert sorted(path.name for path in (tmp_path / "kept").iterdir()) == [policy.ABOUT, policy.WEIGHTS]
 
 
+def test_a_damaged_policy_is_the_same_or_refused_in_one_line(tmp_path):
+    """Bits flipped, bytes cut off or put to zero, anywhere: never a traceback, never other numbers."""
+    made, obs, rng = random_policy((4,)), jnp.ones(policy.OBS), np.random.default_rng(0)
+    policy.save(tmp_path, made, {})
+    file = tmp_path / policy.WEIGHTS
+    whole, wanted, refusals = file.read_bytes(), np.asarray(policy.load(tmp_path)(obs)), 0
+    for number in range(300):
+        place, damaged = int(rng.integers(len(whole))), bytearray(whole)
+        if number % 3 == 0:
+            damaged[place] ^= 1 << int(rng.integers(8))
+        elif number % 3 == 1:
+            del damaged[place:]
+        else:
+            damaged[place : place + 40] = bytes(min(40, len(whole) - place))
+        file.write_bytes(damaged)
+        try:
+            found = policy.load(tmp_path)
+        except UserError as error:
+            assert "\n" not in str(error)
+            refusals += 1
+        else:
+            np.testing.assert_array_equal(found(obs), wanted)
+    assert refusals > 200
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "told"),
+    [
+        ("std", np.zeros(policy.OBS), "numbers that cannot be"),
+        ("bias_1", np.full(robot.JOINTS, np.nan), "numbers that cannot be"),
+        ("mean", np.zeros(3), "no walking policy of this robot"),
+        ("kernel_1", np.zeros((5, robot.JOINTS)), "no walking policy of this robot"),
+        ("bias_0", np.zeros(()), "no walking policy of this robot"),
+        ("kernel_0", np.array(["a"]), "is damaged"),
+    ],
+)
+def test_arrays_that_do_not_fit_are_refused(tmp_path, name, values, told):
+    policy.save(tmp_path, random_policy((4,)), {})
+    with np.load(tmp_path / policy.WEIGHTS) as stored:
+        arrays = dict(stored)
+    np.savez(tmp_path / policy.WEIGHTS, **{**arrays, name: values})
+    with pytest.raises(UserError, match=told):
+        policy.load(tmp_path)
+
+
 def test_what_is_no_policy_is_refused(tmp_path):
     with pytest.raises(UserError, match=r"no walking policy in .*: train one with `cuelearner locomotion train"):
         policy.load(tmp_path)

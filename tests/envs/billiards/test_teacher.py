@@ -1,18 +1,21 @@
 import json
+import re
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from flax import struct
 
 from cuelearner_envs.billiards.config import BilliardsConfig, make_environment
-from cuelearner_envs.billiards.teacher import SearchTeacher
+from cuelearner_envs.billiards.teacher import SearchTeacher, Transferred
 from cuelearner_jax import actions
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import episodes, rollout
 from cuelearner_jax.policies import Taught
 from cuelearner_jax.tasks.billiards import SHIPPED_TEACHERS, make_teacher
 from cuelearner_jax.teachers.learned import LearnedTeacher
+from cuelearner_jax.types import Teacher
 
 RACKS, DIRECTIONS = 50, 1440
 ONE = make_environment(BilliardsConfig("one_ball"))
@@ -102,13 +105,85 @@ def test_a_configuration_names_the_teacher():
     assert float(teacher.habit) == pytest.approx(0.1)
 
 
+def coarsely(teacher):
+    """A shipped teacher that chooses among fewer directions, for speed."""
+    assert isinstance(teacher, Transferred)
+    assert isinstance(teacher.teacher, LearnedTeacher)
+    return teacher.replace(teacher=teacher.teacher.replace(directions=1440))
+
+
+def learned(**changes):
+    """The environment of a changed world, and the shipped teacher in it."""
+    config = BilliardsConfig("easy", teacher="learned", **changes)
+    env = make_environment(config)
+    return env, coarsely(make_teacher(config, env))
+
+
+@pytest.fixture(scope="module")
+def easy():
+    """A few situations on the easy table, and the shipped teacher's answers where nothing is changed."""
+    env, teacher = learned()
+    states, obs = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(1), 8))
+    alone = best(teacher.teacher, states, obs)  # the network of what the unchanged world shows
+    np.testing.assert_array_equal(best(teacher, states, obs), alone)
+    return states, alone
+
+
+def test_a_learned_teacher_knows_of_a_turned_strike(easy):
+    states, clean = easy
+    env, teacher = learned(action_turn_deg=3.0)
+    answers = best(teacher, states, jax.vmap(env.observe)(states))
+    np.testing.assert_allclose(answers, actions.rotate(clean, jnp.deg2rad(-3.0)), atol=1e-6)
+    rewards = [play(learned()[0], states, clean).reward, play(env, states, answers).reward]
+    np.testing.assert_array_equal(*rewards)
+
+
+def test_a_learned_teacher_looks_at_the_table_and_not_at_the_sensor(easy):
+    states, clean = easy
+    env, teacher = learned(observation_bias=(0.0071, 0.0071))
+    seen = jax.vmap(env.observe)(states)
+    assert (seen != jax.vmap(learned()[0].observe)(states)).any()
+    np.testing.assert_array_equal(best(teacher, states, seen), clean)
+
+
+@struct.dataclass
+class Pointer:
+    """Aims at the first target of what it is shown."""
+
+    def best_action(self, state, obs):
+        return actions.retract(obs[3:5] - obs[:2])
+
+
+def test_a_teacher_of_a_changed_world_is_right_in_the_unchanged_one():
+    """What it learned under its own turn and bias, it is asked under those."""
+    own = make_environment(BilliardsConfig("one_ball", action_turn_deg=2.0, observation_bias=(0.1, 0.0)))
+    teacher: Teacher = Transferred(Pointer(), own, ONE)
+    struck = degrees(best(teacher, STATES, OBS)) - degrees(best(Pointer(), STATES, jax.vmap(own.observe)(STATES)))
+    np.testing.assert_allclose(struck, 2.0, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"acceleration": (0.0, 0.005)}, "learned with --task.acceleration 0.0 0.0"),
+        ({"teacher": str(SHIPPED_TEACHERS / "regulation")}, "learned with --task.table regulation"),
+    ],
+)
+def test_a_learned_teacher_refuses_other_physics_than_it_knows(changes, told):
+    config = BilliardsConfig(**{"table": "easy", "teacher": "learned", **changes})
+    with pytest.raises(UserError, match=re.escape(told)) as refused:
+        make_teacher(config, make_environment(config))
+    assert "--task.teacher search" in str(refused.value)
+    x, y = config.acceleration
+    assert f"teacher train billiards --task.table easy --task.acceleration {x} {y} --out" in str(refused.value)
+
+
 @pytest.mark.parametrize(("table", "least"), [("easy", 0.75), ("regulation", 0.45)])
 def test_the_shipped_teachers_play_well(table, least):
     config = BilliardsConfig(table, teacher="learned")
     env = make_environment(config)
     teacher = make_teacher(config, env)
-    assert isinstance(teacher, LearnedTeacher)
-    coarse = teacher.replace(directions=1440)  # for speed
+    coarse = coarsely(teacher)
     measured = jax.jit(lambda teacher: rollout(Taught(teacher), env, episodes("tuning"), 30, 300))(coarse)
     assert float(measured["reward"]) > least  # over 10,000 steps with their 3,600 directions: see teacher.json
 

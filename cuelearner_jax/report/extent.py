@@ -1,0 +1,117 @@
+"""What was planned, as the runs' config.json say, against what their results hold."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pyarrow as pa
+
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.records import formats, results
+from cuelearner_jax.runs import shards
+
+LISTED = 20  # numbers in a line
+
+
+class Planned(NamedTuple):
+    """What a config.json says of its run's extent; what it does not say is None or empty."""
+
+    total_steps: int | None
+    guidance: tuple[str, ...]
+    seeds: tuple[int, ...]
+    labels: tuple[int, ...]
+
+    @classmethod
+    def of(cls, file: Path) -> Planned:
+        """Raises UserError if the file cannot be read or makes no sense."""
+        values = formats.read("config", file)
+        total, grid = values.get("total_steps"), values.get("grid", {})
+        if not isinstance(grid, dict) or not (total is None or _is_number(total)):
+            raise formats.damaged("config", file)
+        axes = [grid.get(name, []) for name in ("guidance", "seeds", "labels")]
+        if not all(isinstance(axis, list) for axis in axes):
+            raise formats.damaged("config", file)
+        kinds, seeds, labels = axes
+        if not all(isinstance(kind, str) for kind in kinds) or not all(map(_is_number, seeds + labels)):
+            raise formats.damaged("config", file)
+        return cls(total, tuple(kinds), tuple(seeds), tuple(labels))
+
+
+def missing(folders: Sequence[str | os.PathLike[str]], table: pa.Table) -> list[str]:
+    """One line for everything that was planned and is not there, or of which that is not known.
+
+    Args:
+        folders: those given to the report.
+        table: the rows that it shows, with their `folder`.
+    """
+    configurations = {folder: _configuration(Path(folder)) for folder in dict.fromkeys(table["folder"].to_pylist())}
+    files = {file for folder in folders for file in Path(folder).rglob("config.json")} | set(configurations.values())
+    planned: dict[Path, Planned] = {}
+    lines = []
+    for file in sorted(file for file in files if file):
+        try:
+            planned[file] = Planned.of(file)
+        except UserError as error:
+            lines.append(f"what was planned in {file.parent.as_posix()} is not known: {error}")
+    lines += _unfinished(configurations, planned, table)
+    lines += shards.missing(sorted(planned))
+    for file, plan in planned.items():
+        lines += _absent(file.parent, plan, table)
+    return lines
+
+
+def _unfinished(configurations: dict[str, Path | None], planned: dict[Path, Planned], table: pa.Table) -> list[str]:
+    """The folders whose results do not go to the end."""
+    folders, steps = np.array(table["folder"].to_pylist()), table["step"].to_numpy()
+    lines = []
+    for folder, file in configurations.items():
+        last, total = int(steps[folders == folder].max()), planned[file].total_steps if file in planned else None
+        if file is None:
+            lines.append(f"{folder}: has no config.json, so what was planned is not known; at step {last:,}")
+        elif total is not None and last < total:
+            lines.append(f"{folder}: at step {last:,} of {total:,} ({last / total:.0%})")
+        elif total is None and not (Path(folder) / results.PARQUET).exists():
+            lines.append(f"{folder}: not finished, at step {last:,}")
+    return lines
+
+
+def _absent(run: Path, plan: Planned, table: pa.Table) -> list[str]:
+    """The kinds of guidance, seeds and label budgets of a run's plan of which there are no results."""
+    folders, row = np.unique(table["folder"].to_pylist(), return_inverse=True)
+    below = np.array([Path(folder).is_relative_to(run) for folder in folders.tolist()])[row]
+    name = run.as_posix()
+    if not plan.guidance:
+        return [] if below.any() else [f"{name}: no results"]
+    guidance, labels = np.array(table["guidance"].to_pylist()), table["labels"].to_numpy()
+    lines = []
+    for kind in plan.guidance:
+        rows = below & (guidance == kind)
+        if not rows.any():
+            lines.append(f"{name}: no results of {kind} guidance")
+            continue
+        seeds, budgets = set(table["seed"].to_numpy()[rows].tolist()), set(labels[rows].tolist())
+        if absent := set(plan.seeds) - seeds:
+            lines.append(f"{name}: no results of {kind} guidance with the seeds {_listed(absent)}")
+        # A kind that asks for no labels has rows of 0 labels, whatever the budgets of the others.
+        if budgets != {0} and (absent := set(plan.labels) - budgets):
+            lines.append(f"{name}: no results of {kind} guidance with the label budgets {_listed(absent)}")
+    return lines
+
+
+def _configuration(folder: Path) -> Path | None:
+    """The config.json of a folder with results: a run's stands above the folders of its kinds of guidance."""
+    files = [folder / "config.json", folder.parent / "config.json"]
+    return next((file for file in files if os.path.exists(file)), None)
+
+
+def _listed(numbers: set[int]) -> str:
+    more = f" and {len(numbers) - LISTED:,} more" if len(numbers) > LISTED else ""
+    return f"{', '.join(map(str, sorted(numbers)[:LISTED]))}{more}"
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and value >= 0

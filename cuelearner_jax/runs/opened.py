@@ -1,0 +1,124 @@
+"""A run as it lies on the disk, whole or in the pieces of a sweep, and the lanes of its newest checkpoints."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from cuelearner_jax.config import RunConfig
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.guidance import registry as guidances
+from cuelearner_jax.guidance.bundle import Guidance
+from cuelearner_jax.records import formats
+from cuelearner_jax.records.folders import CONFIG, differences
+from cuelearner_jax.runs import shards
+from cuelearner_jax.runs.grid import Grid, load
+from cuelearner_jax.runs.kept import restore_policies
+from cuelearner_jax.runs.lanes import LaneGroup
+from cuelearner_jax.task import Task, shape_of
+from cuelearner_jax.terminal import console
+
+
+class Piece(NamedTuple):
+    """A folder with lanes of a run: all of them, or those of some seeds."""
+
+    folder: Path
+    grid: Grid
+
+
+@dataclass(frozen=True)
+class Lanes:
+    """The lanes of one kind of guidance that have come to the same step, as their newest checkpoints have them."""
+
+    guidance: Guidance
+    seeds: np.ndarray  # (lanes,)
+    budgets: np.ndarray  # (lanes,)
+    policies: Any  # {"params", "guidance"}, leading axis: lanes
+    step: int
+
+
+class Opened(NamedTuple):
+    """A run."""
+
+    task: Task
+    config: RunConfig
+    grid: Grid  # of all its pieces
+    pieces: tuple[Piece, ...]
+
+
+def open_run(folder: Path, find: Callable[[str], Task]) -> Opened:
+    """The run in a folder, or the sweep whose pieces lie below it (`--shard`, `--cluster`).
+
+    Args:
+        folder: of the run or sweep.
+        find: as `grid.load` has it.
+
+    Raises:
+        UserError: it is none, of a task that is not known, or its pieces are of different sweeps.
+    """
+    files = [] if (folder / CONFIG).exists() else sorted(folder.glob(f"shard-*-of-*/{CONFIG}"))
+    if not files:
+        task, config, grid = load(folder, find)
+        return Opened(task, config, grid, (Piece(folder, grid),))
+    told = [formats.read("config", file) for file in files]
+    for file, other in zip(files, told, strict=True):
+        found = sorted({*differences(told[0], other)} - {*shards.OWN})
+        if found:
+            raise UserError(
+                f"{files[0].parent} and {file.parent} are pieces of different sweeps (another "
+                f"{', '.join(found[:4])}): give the folder of one of them"
+            )
+    loaded = [load(file.parent, find) for file in files]
+    task, config, first = loaded[0]
+    pieces = tuple(Piece(file.parent, grid) for file, (_, _, grid) in zip(files, loaded, strict=True))
+    seeds = tuple(seed for piece in pieces for seed in piece.grid.seeds)
+    return Opened(task, config, Grid(first.guidance, seeds, first.labels), pieces)
+
+
+def lanes_of(task: Task, config: RunConfig, pieces: tuple[Piece, ...], kind: str, sweep: bool) -> list[Lanes]:
+    """The lanes of one kind of guidance, those at the same step together, the farthest first.
+
+    What is missing or not finished is said on the console, a line for each piece.
+
+    Args:
+        task: whose run it is.
+        config: of the run.
+        pieces: where its lanes lie.
+        kind: of guidance.
+        sweep: are these the pieces of a sweep, some of which may not have begun?
+
+    Raises:
+        UserError: no piece has a checkpoint, or one is damaged.
+    """
+    env = shape_of(task, config.task)
+    found: dict[int, list[Lanes]] = {}
+    told = shards.missing([piece.folder / CONFIG for piece in pieces]) if sweep else []
+    for folder, grid in pieces:
+        if sweep and not (folder / kind / "checkpoints").is_dir():
+            told.append(f"{folder}: no checkpoint of {kind} guidance, left out")
+            continue
+        group = LaneGroup(config, env, guidances.make(kind, config.sizes, env), grid)
+        policies, step = restore_policies(group, folder / kind)
+        found.setdefault(step, []).append(Lanes(group.guidance, group.seeds, group.budgets, policies, step))
+        if step < config.schedule.total_steps:
+            told.append(f"{folder}: {kind} guidance at step {step:,} of {config.schedule.total_steps:,}")
+    for line in told:
+        console.print(line, markup=False)
+    if not found:
+        raise UserError(f"no piece has a checkpoint of {kind} guidance: train first, or choose another --guidance")
+    return [_joined(found[step]) for step in sorted(found, reverse=True)]
+
+
+def _joined(parts: list[Lanes]) -> Lanes:
+    """Lanes of several pieces at one step."""
+    if len(parts) == 1:
+        return parts[0]
+    seeds, budgets = (np.concatenate([getattr(part, name) for part in parts]) for name in ("seeds", "budgets"))
+    policies = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *(part.policies for part in parts))
+    return Lanes(parts[0].guidance, seeds, budgets, policies, parts[0].step)

@@ -1,0 +1,57 @@
+"""Whether a number of a task's configuration can be worked with: refused in one line, before anything is made of it."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from cuelearner_jax.errors import UserError
+
+MOST_STEPS = 1_000_000  # of an episode: counters are of 32 bits
+MOST_SEED = 2**32 - 1  # of a key
+
+
+def check_number(
+    name: str,
+    value: Any,
+    least: float = -math.inf,
+    most: float = math.inf,
+    *,
+    positive: bool = False,
+    whole: bool = False,
+    unit: str = "",
+) -> None:
+    """Raises UserError unless a field holds a number that stays one in single precision, and lies within bounds.
+
+    Args:
+        name: of the field.
+        value: what it holds.
+        least, most: bounds; both are allowed.
+        positive: must it be above 0?
+        whole: must it be a whole number?
+        unit: for the message, in words.
+    """
+    kind = (int, np.integer) if whole else (int, float, np.integer, np.floating)
+    if isinstance(value, kind) and not isinstance(value, bool) and least <= value <= most:
+        with np.errstate(over="ignore"):
+            single = np.float32(min(max(value, -1e300), 1e300))  # of Python's integers no larger ones fit
+        if np.isfinite(single) and not (positive and single <= 0):
+            return
+    told = f"a {'whole' if whole else 'positive' if positive else 'finite'} number"
+    told += f" from {_digits(least)}" if least > -math.inf else ""
+    told += f" up to {_digits(most)}" if most < math.inf else ""
+    raise UserError(f"task.{name} is {value}: give {told}{f' ({unit})' if unit else ''}")
+
+
+def check_vector(name: str, value: Any, size: int, least: float, most: float, unit: str = "") -> None:
+    """The same of a field that holds `size` numbers."""
+    if not isinstance(value, (tuple, list)) or len(value) != size:
+        raise UserError(f"task.{name} is {value}: give {size} numbers")
+    for entry in value:
+        check_number(name, entry, least, most, unit=unit)
+
+
+def _digits(bound: float) -> str:
+    return f"{bound:,}" if isinstance(bound, int) else f"{bound:g}"

@@ -1,0 +1,13 @@
+"""A few damaged run folders; `make fuzz` tries thousands."""
+
+import damaged_folders
+
+CASES, SEED = 16, 0
+
+
+def test_no_damage_gives_a_traceback_or_another_number(tmp_path):
+    damaged_folders.make_runs(tmp_path)
+    tried = damaged_folders.cases(tmp_path, CASES, SEED)
+    expected = damaged_folders.baselines(tmp_path, {(case.run, case.command) for case in tried})
+    found = [(case, damaged_folders.wrong(tmp_path, expected, case)) for case in tried]
+    assert not [(case, outcome) for case, outcome in found if outcome]

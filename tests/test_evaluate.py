@@ -1,0 +1,104 @@
+"""Roll-outs: means over whole first episodes or none at all, and the same numbers in one stretch or in many."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import probes
+import pytest
+
+from cuelearner_jax import evaluate
+from cuelearner_jax.actions import DIRECTIONS
+from cuelearner_jax.config import Schedule
+from cuelearner_jax.devices import lane_mesh
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.policies import Agent, Uniform
+
+LONGEST = 4
+KEY = jax.random.key(7)
+
+
+class Fuse(probes.Window):
+    """The bandit, until a fuse of 1 to `LONGEST` steps has burnt; long ones fail."""
+
+    def reset(self, key):
+        obs, _ = super().reset(key)
+        return (obs, jax.random.randint(key, (), 1, LONGEST + 1), jnp.zeros((), jnp.int32)), obs
+
+    def step(self, key, state, action):
+        obs, fuse, burnt = state
+        _, step = super().step(key, obs, action)
+        ends = burnt + 1 >= fuse
+        fresh, fresh_obs = self.reset(key)
+        after = jax.tree.map(lambda new, old: jnp.where(ends, new, old), fresh, (obs, fuse, burnt + 1))
+        outcome = {"success": jnp.where(fuse < LONGEST, 1.0, 0.0), "duration": burnt + 1.0}
+        return after, step.replace(obs=jnp.where(ends, fresh_obs, obs), terminated=ends, outcome=outcome)
+
+
+ENV = Fuse()
+
+
+def rolled(num_envs, steps, env=ENV):
+    return jax.device_get(jax.jit(lambda env: evaluate.rollout(Uniform(), env, KEY, num_envs, num_envs * steps))(env))
+
+
+def test_means_over_first_episodes_are_of_all_of_them_or_of_none():
+    whole = rolled(400, LONGEST)
+    assert whole["finished"] == 1
+    assert whole["success"] == pytest.approx(1 - 1 / LONGEST, abs=0.07)
+    cut = rolled(400, LONGEST - 1)
+    assert cut["finished"] == pytest.approx(1 - 1 / LONGEST, abs=0.07)
+    assert np.isnan([cut["success"], cut["duration"]]).all()  # 1.0 over the short ones would be wrong
+    assert np.isfinite([cut["reward"], cut["hit"]]).all()
+
+
+@pytest.mark.parametrize("steps", [1, 2, 5, 6, 48])
+def test_a_roll_out_in_stretches_is_bitwise_that_in_one(steps):
+    told = []
+    watched = evaluate.watched(ENV, Uniform(), KEY, 20, 20 * steps, lambda *given: told.append(given))
+    whole = rolled(20, steps)
+    assert watched.keys() == whole.keys()
+    for name, value in whole.items():
+        np.testing.assert_array_equal(watched[name], value, strict=True)
+    assert told == [(done, told[-1][1]) for done in range(told[-1][1] + 1)]
+    assert told[-1][1] == {1: 1, 2: 1, 5: 1, 6: 3, 48: 24}[steps]  # none of a single step
+
+
+@pytest.mark.parametrize("at_once", [1, 2, 16])
+def test_lanes_in_stretches_are_bitwise_those_in_one(monkeypatch, at_once):
+    """Three lanes, one, two or all at a time."""
+    monkeypatch.setattr(evaluate, "portions", lambda: Portions(at_once))
+    program = probes.window_program("none")
+    agents = Agent(probes.start(program, [0, 1, 2], [0, 0, 0]).agent.params, probes.SIZES, DIRECTIONS)
+    told = []
+    watched = evaluate.watched_lanes(ENV, agents, KEY, 10, 120, lambda *given: told.append(given))
+    mesh = lane_mesh(jax.local_devices()[:1])
+    whole = jax.device_get(evaluate.evaluate_lanes(ENV, agents, KEY, mesh=mesh, num_envs=10, steps=120))
+    for name, value in whole.items():
+        np.testing.assert_array_equal(watched[name], value, strict=True)
+    assert len(set(watched["reward"])) > 1
+    batches = -(-3 // at_once)
+    assert told[0] == (0, 6 * batches)
+    assert told[-1] == (6 * batches, 6 * batches)
+    evaluate._evaluate.clear_cache()  # it has seen other portions than the device's
+
+
+@dataclasses.dataclass
+class Portions:
+    """As `devices.Portions`, of another device."""
+
+    agents: int
+    actions: int = 8192
+    states: int = 16
+
+
+def test_an_evaluation_that_cuts_episodes_short_is_refused_before_a_training():
+    task = dataclasses.replace(probes.make_task(), longest=lambda config: LONGEST)
+    config = probes.config(schedule={"eval_envs": 10, "eval_steps": 10 * LONGEST})
+    task.check_evaluations(config)
+    short = dataclasses.replace(config, schedule=dataclasses.replace(config.schedule, eval_steps=30))
+    with pytest.raises(UserError, match="30 for 10 environments, 3 each, but an episode lasts up to 4: give --sched"):
+        task.check_evaluations(short)
+    probes.make_task().check_evaluations(short)  # where steps count
+    assert Schedule().eval_steps >= Schedule().eval_envs
