@@ -23,6 +23,10 @@ from cuelearner_jax.errors import UserError
 
 TaskT = TypeVar("TaskT")
 
+LARGEST = 2**31 - 1  # counters and indices are 32-bit integers
+LARGEST_ROUND = 1 << 30  # so that budgets of as many labels, in whole rounds, are such an integer too
+LARGEST_FLOAT = 3.4028234e38  # scalars are computed in single precision
+
 
 @dataclass(frozen=True)
 class AgentSizes:
@@ -196,6 +200,7 @@ class RunConfig(Generic[TaskT]):
 def check(config: RunConfig) -> None:
     """Raises UserError with one line for the first value that cannot work."""
     sizes, schedule = config.sizes, config.schedule
+    check_whole(schedule, "schedule")
     _check_sizes(sizes)
     check_guide(sizes, config.scalars)
     if config.scalars.discount >= 1:
@@ -203,6 +208,14 @@ def check(config: RunConfig) -> None:
     for name in ("total_steps", "eval_every", "eval_steps", "eval_envs", "checkpoint_every", "target_every"):
         if getattr(schedule, name) < 1:
             raise UserError(f"schedule.{name} is {getattr(schedule, name)}: give a positive number")
+    for name in ("random_steps", "learn_after", "guidance_until"):
+        if getattr(schedule, name) < 0:
+            raise UserError(f"schedule.{name} is {getattr(schedule, name)}: give a number that is not negative")
+    if schedule.total_steps * sizes.updates_per_step > LARGEST:
+        raise UserError(
+            f"schedule.total_steps is {schedule.total_steps}: give at most {LARGEST // sizes.updates_per_step}, or "
+            "gradient steps (sizes.updates_per_step to each) cannot be counted"
+        )
     if sizes.n_step > 1 and not config.bootstraps:
         raise UserError(f"sizes.n_step is {sizes.n_step}: n-step returns need a scalars.discount above 0")
     _check_multiple(schedule.eval_every, sizes.num_envs, "schedule.eval_every", "sizes.num_envs")
@@ -212,7 +225,19 @@ def check(config: RunConfig) -> None:
     _check_multiple(schedule.eval_steps, schedule.eval_envs, "schedule.eval_steps", "schedule.eval_envs")
 
 
+def check_whole(group: Any, prefix: str) -> None:
+    """Raises UserError for a whole number that 32 bits do not hold."""
+    for field in dataclasses.fields(group):
+        value = getattr(group, field.name)
+        for number in value if isinstance(value, tuple) else (value,):
+            if isinstance(number, int) and abs(number) > LARGEST:
+                raise UserError(
+                    f"{prefix}.{field.name} is {number}: give at most {LARGEST}, which is counted in 32 bits"
+                )
+
+
 def _check_sizes(sizes: Sizes) -> None:
+    check_whole(sizes, "sizes")
     positive = ("directions", "peaks", "target_directions", "num_envs", "batch_size", "replay_capacity")
     _check_positive(sizes, (*positive, "updates_per_step", "n_step"))
     if sizes.coarse_directions and (sizes.coarse_directions < 3 or sizes.directions % sizes.coarse_directions):
@@ -227,11 +252,20 @@ def _check_sizes(sizes: Sizes) -> None:
             f"sizes.lanes_per_block is {sizes.lanes_per_block}: give a positive number, or 0 to leave it open"
         )
     _check_layers(sizes.q_layers, "sizes.q_layers")
+    if sizes.n_step * sizes.num_envs > sizes.replay_capacity:
+        raise UserError(
+            f"sizes.n_step is {sizes.n_step}: give at most {sizes.replay_capacity // sizes.num_envs}, the steps of an "
+            "environment that sizes.replay_capacity holds"
+        )
 
 
 def check_guide(sizes: GuideSizes, scalars: GuideScalars) -> None:
     """Raises UserError with one line for the first value of a guide's that cannot work."""
+    check_whole(sizes, "sizes")
+    check_whole(scalars, "scalars")
     _check_positive(sizes, ("labels_per_round", "fit_steps", "fit_batch_size", "validate_every"))
+    if sizes.labels_per_round > LARGEST_ROUND:
+        raise UserError(f"sizes.labels_per_round is {sizes.labels_per_round}: give at most {LARGEST_ROUND}")
     _check_layers(sizes.feedback_layers, "sizes.feedback_layers")
     _check_multiple(sizes.fit_steps, sizes.validate_every, "sizes.fit_steps", "sizes.validate_every")
     _check_numbers(scalars)
@@ -258,8 +292,8 @@ def _check_numbers(scalars: Any) -> None:
     for name, value in dataclasses.asdict(scalars).items():
         if name.endswith(("probability", "fraction", "polyak", "weight")) and not 0 <= value <= 1:
             raise UserError(f"scalars.{name} is {value}: give a number from 0 to 1")
-        if not math.isfinite(value):
-            raise UserError(f"scalars.{name} is {value}: give a finite number")
+        if not math.isfinite(value) or abs(value) > LARGEST_FLOAT:
+            raise UserError(f"scalars.{name} is {value}: give a finite number (in single precision)")
         if name != "teacher_bias_deg" and value < 0:
             raise UserError(f"scalars.{name} is {value}: give a number that is not negative")
 

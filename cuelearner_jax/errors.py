@@ -4,6 +4,12 @@ import difflib
 import errno
 from collections.abc import Iterable
 
+# Refusals of the file system that no check beforehand can rule out.
+FILE_SYSTEM = (
+    *(errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOTDIR, errno.EISDIR, errno.ENAMETOOLONG, errno.ELOOP),
+    *(errno.EIO, errno.ESTALE, errno.EMFILE, errno.ENFILE),
+)
+
 
 class UserError(Exception):
     """Bad input: its message is one clear line that says what is wrong and what to do.
@@ -28,6 +34,15 @@ def no_space(error: BaseException | None) -> bool:
     told = isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
     words = ("No space left on device", "Disk quota exceeded", "File too large")
     return told or any(text in str(error) for text in words) or no_space(error.__cause__ or error.__context__)
+
+
+def blamed(error: BaseException) -> str | None:
+    """What to tell of an exception that the file system is to blame for, in one line; None for any other."""
+    if no_space(error):
+        return "the disk is full: free some, then go on with the same command and --resume"
+    if isinstance(error, OSError) and error.filename is not None and error.errno in FILE_SYSTEM:
+        return f"{error.filename}: {error.strerror}; what was saved before is safe"
+    return None
 
 
 def closest(word: str, known: Iterable[str]) -> str:

@@ -1,54 +1,71 @@
-"""What long work says on the terminal and hears from it: messages and progress on standard error, Ctrl-C."""
+"""What long work says on the terminal: messages and progress on standard error, which nobody needs to read."""
 
 from __future__ import annotations
 
-import signal
-import threading
+import contextlib
+import os
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import IO, Any, cast
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-console = Console(stderr=True, highlight=False, soft_wrap=True)
+from cuelearner_jax.signals import Interrupted, interruptible
+
+__all__ = ["Interrupted", "abandon", "console", "interruptible", "progress_bars"]
 
 
-class Interrupted(Exception):
-    """The user asked to stop; everything is saved."""
+class _StandardError:
+    """`sys.stderr` of the moment. Work goes on where nobody reads it any more: a closed pipe, a terminal that went."""
 
-    status = 130  # that a command ends with
+    def write(self, text: str) -> int:
+        with self._heard() as stream:
+            stream.write(text)
+        return len(text)
+
+    def flush(self) -> None:
+        with self._heard() as stream:
+            stream.flush()
+
+    @contextmanager
+    def _heard(self) -> Iterator[Any]:
+        stream = _stderr()
+        try:
+            yield stream
+        except OSError:  # Python would try again to write what is left, when it ends, and fail
+            abandon(stream)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(_stderr(), name)
+
+
+def _stderr() -> Any:
+    return getattr(sys.stderr, "rich_proxied_file", sys.stderr)  # a progress bar puts itself in front
+
+
+def abandon(stream: Any) -> None:
+    """Sends what is still written to a stream that nobody reads to nowhere."""
+    with contextlib.suppress(OSError, ValueError):
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, stream.fileno())
+        os.close(nowhere)
+
+
+# Text is the user's in parts (paths, names of tasks): nothing in it is markup.
+PLAIN: dict[str, Any] = {"markup": False, "emoji": False, "highlight": False, "soft_wrap": True}
+console = Console(file=cast(IO[str], _StandardError()), **PLAIN)
 
 
 @contextmanager
-def interruptible() -> Iterator[threading.Event]:
-    """An event that the first Ctrl-C sets; a second one stops at once, losing what was not saved."""
-    stopping = threading.Event()
-
-    def stop(number: int, frame: Any) -> None:
-        if stopping.is_set():
-            raise KeyboardInterrupt
-        stopping.set()
-        console.print("stopping after this stretch of steps (Ctrl-C again: at once)")
-
-    if threading.current_thread() is not threading.main_thread():
-        yield stopping
-        return
-    before = signal.signal(signal.SIGINT, stop)
-    try:
-        yield stopping
-    finally:
-        signal.signal(signal.SIGINT, before)
-
-
-@contextmanager
-def progress_bars(shown: bool = True) -> Iterator[Progress]:
-    """Progress bars on standard error, or none to be seen."""
+def progress_bars(shown: bool = True, counted: bool = True) -> Iterator[Progress]:
+    """Progress bars on standard error, or none to be seen; with numbers of what is done if `counted`."""
     columns = (
-        TextColumn("{task.description:<12}"),
+        TextColumn("{task.description:<12}", markup=False),
         BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("{task.fields[note]}"),
+        *([MofNCompleteColumn()] if counted else []),
+        TextColumn("{task.fields[note]}", markup=False),
         TimeRemainingColumn(),
     )
     with Progress(*columns, console=console, disable=not shown) as bars:

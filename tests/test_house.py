@@ -11,7 +11,7 @@ METHOD, TASKS = "cuelearner_jax", "cuelearner_envs"
 
 # Bottom row first: a module imports from rows below its own and, within its row, from its own package.
 ROWS = [
-    ["errors"],
+    ["errors", "signals"],
     ["types", "actions", "plugins"],
     ["environment"],
     ["config", "devices", "terminal"],

@@ -38,7 +38,7 @@ from cuelearner_jax.runs.grid import LARGEST_SEED, Grid
 from cuelearner_jax.runs.lanes import CORES, LaneGroup
 from cuelearner_jax.runs.memory_report import memory_report, state_bytes
 from cuelearner_jax.task import Task, shape_of
-from cuelearner_jax.terminal import Interrupted, console, progress_bars
+from cuelearner_jax.terminal import Interrupted, console, interruptible, progress_bars
 from cuelearner_jax.types import Teacher
 
 FEWEST_STRETCHES = 3
@@ -196,7 +196,7 @@ def run(works: Sequence[Work], asked: Measuring, command: str) -> dict[str, Any]
 
     Raises:
         UserError: bad options or too little memory; nothing has been measured then.
-        Interrupted: Ctrl-C; its message holds what was measured.
+        Interrupted: Ctrl-C or SIGTERM; its message holds what was measured.
     """
     cache = _cache_state()  # before anything is compiled
     mesh = _check(works, asked)
@@ -204,18 +204,15 @@ def run(works: Sequence[Work], asked: Measuring, command: str) -> dict[str, Any]
     rows: list[dict[str, Any]] = []
     entry = _entry(asked, command, cache)
     console.print(f"measuring {len(plan)} times: some seconds to compile, then {asked.seconds:g} s of training each")
-    try:
-        with progress_bars() as bars:
-            bar = bars.add_task("bench", total=len(plan), note="")
-            for work, seeds in plan:
-                name = f"{work.task.name} {work.preset}, {seeds} seeds: "
-                rows.append(
-                    measure(work, seeds, mesh, asked.seconds, lambda note, n=name: bars.update(bar, note=n + note))
-                )
-                bars.advance(bar)
-    except KeyboardInterrupt:
-        done = machines.figures(rows) + "\n" if rows else ""
-        raise Interrupted(f"{done}stopped after {len(rows)} of {len(plan)} measurements; nothing was written") from None
+    with interruptible("this measurement") as stopping, progress_bars() as bars:
+        bar = bars.add_task("bench", total=len(plan), note="")
+        for work, seeds in plan:
+            name = f"{work.task.name} {work.preset}, {seeds} seeds: "
+            rows.append(measure(work, seeds, mesh, asked.seconds, lambda note, n=name: bars.update(bar, note=n + note)))
+            bars.advance(bar)
+            if stopping.is_set() and len(rows) < len(plan):
+                told = f"stopped after {len(rows)} of {len(plan)} measurements; nothing was written"
+                raise Interrupted(f"{machines.figures(rows)}\n{told}")
     entry["rows"] = sorted(rows, key=lambda row: ([work.task.name for work in works].index(row["task"]), row["seeds"]))
     if asked.out:
         with asked.out.open("x") as file:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -75,16 +76,25 @@ class LocomotionConfig:
     """Robots that a measurement watches for 20 s."""
 
 
+LARGEST_ROBOTS = 1 << 20  # each keeps some kilobytes of physics
+
+
 def check(config: LocomotionConfig) -> None:
     """Raises UserError for values that cannot work."""
+    configuration.check_whole(config, "train")
+    for name in ("robots", "measured_robots"):
+        if getattr(config, name) > LARGEST_ROBOTS:
+            raise UserError(f"train.{name} is {getattr(config, name)}: give at most {LARGEST_ROBOTS}")
     for field in dataclasses.fields(config):
         value = getattr(config, field.name)
         if field.name not in ("seconds", "entropy", "layers") and value <= 0:
             raise UserError(f"train.{field.name} is {value}: give a positive number")
     if config.seconds < 0 or config.entropy < 0:
         raise UserError("train.seconds and train.entropy can't be negative")
-    if not config.layers:
-        raise UserError("train.layers: give at least one layer")
+    if not all(math.isfinite(value) for value in dataclasses.asdict(config).values() if isinstance(value, float)):
+        raise UserError("train: give finite numbers")
+    if not config.layers or min(config.layers) < 1:
+        raise UserError("train.layers: give at least one layer of positive width")
     if config.batch_size * config.minibatches % config.robots:
         raise UserError(
             f"train.batch_size times train.minibatches is {config.batch_size * config.minibatches}: "
@@ -92,8 +102,13 @@ def check(config: LocomotionConfig) -> None:
         )
 
 
+def _check_seed(seed: int) -> None:
+    if not 0 <= seed <= configuration.LARGEST:
+        raise UserError(f"--seed is {seed}: give a number from 0 to {configuration.LARGEST}")
+
+
 class _Enough(Exception):
-    """The time is over, or Ctrl-C was pressed."""
+    """The time is over, or somebody asked to stop."""
 
 
 def train(
@@ -111,10 +126,11 @@ def train(
 
     Raises:
         UserError: bad configuration, or a folder in use; nothing has been changed then.
-        Interrupted: Ctrl-C; the newest measured policy is saved.
+        Interrupted: Ctrl-C or SIGTERM; the newest measured policy is saved.
         NotFinite: the training diverged; the newest measured policy that was finite is saved.
     """
     check(config)
+    _check_seed(seed)
     if in_use(out):
         raise UserError(f"{out} is not empty: give another --out")
     with claimed(out):
@@ -150,16 +166,19 @@ def _trained(
         if steps:  # what is still untrained is not worth keeping
             told = {"columns": list(COLUMNS), "rows": history}
             robot.save(out, jax.device_get(policy), {**about, "finished": False, "history": told})
-        if stopping.is_set() or (config.seconds and wall > config.seconds):
+        if stopping.is_set() or (steps and config.seconds and wall > config.seconds):
             raise _Enough
 
     tell(f"{jax.devices()[0].device_kind}: compiling takes a minute or so")
-    with interruptible() as stopping:
+    with interruptible("the next measurement") as stopping:
         try:
             _ppo(robot, config, seed, look)
         except _Enough:
             if stopping.is_set():
-                raise Interrupted(f"stopped; {out} holds the policy of the last measurement") from None
+                learned = (
+                    f"{out} holds the policy of the last measurement" if history[-1][0] else "nothing was learned yet"
+                )
+                raise Interrupted(f"stopped; {learned}") from None
     trained = time.perf_counter() - began
     figures = _examined(robot, robot.load(out), jax.random.fold_in(key, 1), config.measured_robots, tell)
     about |= {
@@ -187,8 +206,9 @@ def evaluate(
     Raises:
         UserError: no policy there, or `out` exists.
     """
-    if robots < 1:
-        raise UserError(f"--robots is {robots}: give a positive number")
+    if not 1 <= robots <= LARGEST_ROBOTS:
+        raise UserError(f"--robots is {robots}: give a number from 1 to {LARGEST_ROBOTS}")
+    _check_seed(seed)
     if out and out.exists():
         raise UserError(f"{out} exists: give another --out")
     policy = robot.load(folder) if folder else robot.load()

@@ -63,7 +63,7 @@ def run(arguments: list[str]) -> None:
         works = [measuring.Work(task, name, task.presets[name].config) for task in tasks if name in task.presets]
     known = known_machines.read()
     entry = measuring.run(works, asked.measuring, shlex.join(["cuelearner", "bench", *_without_out(arguments)]))
-    out.print(known_machines.figures(entry["rows"]), known_machines.beside(entry, known), sep="\n\n", markup=False)
+    out.print(known_machines.figures(entry["rows"]), known_machines.beside(entry, known), sep="\n\n")
     if asked.measuring.out:
         out.print(f"wrote {asked.measuring.out}")
 

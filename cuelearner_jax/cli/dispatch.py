@@ -1,8 +1,8 @@
 """The command `cuelearner`: calls the file of a command, turns errors into one line and an exit status.
 
-Exit status: 0 done; 2 bad input, nothing changed; 130 stopped by Ctrl-C, everything saved;
-1 the disk is full or a job failed, everything up to the last checkpoint saved, or what was trained is not finite, all
-else saved; 141 nobody reads the output any more.
+Exit status: 0 done; 2 bad input, nothing changed; 130 stopped by Ctrl-C, 143 by SIGTERM, 129 by SIGHUP, everything
+saved; 1 the disk is full or a job failed, everything up to the last checkpoint saved, or what was trained is not
+finite, all else saved; 141 nobody reads the output any more (of progress and messages on standard error nobody has to).
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
 
 from cuelearner_jax import __version__
 from cuelearner_jax.cli.parsing import HELP, summary
-from cuelearner_jax.errors import NotFinite, UserError, closest, no_space
+from cuelearner_jax.errors import NotFinite, UserError, blamed, closest
 from cuelearner_jax.runs.cluster import JobsFailed
 from cuelearner_jax.tasks import registry
-from cuelearner_jax.terminal import Interrupted
+from cuelearner_jax.terminal import Interrupted, abandon, console
 
 # Each is a file beside this one with `run(arguments)` and `OPTIONS`, the options of what it does by its full name.
 COMMANDS = ("train", "sweep", "evaluate", "report", "render", "teacher", "bench", "locomotion")
@@ -31,27 +31,34 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Entry point. Returns the exit status."""
     arguments = list(sys.argv[1:] if argv is None else argv)
     try:
-        return _dispatch(arguments)
+        try:
+            return _dispatch(arguments)
+        finally:
+            sys.stdout.flush()  # here, where it is heard if nobody reads
     except UserError as error:
-        print(f"error: {error}", file=sys.stderr)
+        console.print(f"error: {' '.join(str(error).splitlines())}")
         return 2
     except (Interrupted, JobsFailed, NotFinite) as error:
-        print(str(error), file=sys.stderr)
+        console.print(str(error))
         return error.status
     except BrokenPipeError:  # whoever read our output has gone, as `head` does
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        abandon(sys.stdout)
         return 141
     except Exception as error:
-        if not no_space(error):
+        told = blamed(error)
+        if told is None:
             raise
-        print("error: the disk is full: free some, then go on with the same command and --resume", file=sys.stderr)
+        console.print(f"error: {told}")
         return 1
-    except KeyboardInterrupt:
-        print("stopped at once; what the last checkpoint holds is safe, go on with --resume", file=sys.stderr)
+    except KeyboardInterrupt:  # of a process that does more than this command: see `signals`
+        console.print("stopped at once; what was saved before is safe")
         return 130
 
 
 def _dispatch(arguments: list[str]) -> int:
+    for argument in arguments:
+        if not argument.isascii() and argument != argument.encode(errors="replace").decode():
+            raise UserError(f"{argument!r} is not encoded as UTF-8: results could not name it")
     if not arguments or arguments[0] in HELP:
         _overview()
         return 0 if arguments else 2

@@ -59,7 +59,7 @@ def run(arguments: list[str]) -> None:
     asked = parse(kind, rest, f"evaluate {source.folder}", default, about(Evaluate, source.task, policies=True))
     source = source.on(asked.robot)
     engine = source.task.engine(asked.engine)
-    source.check(asked.policy, asked.task)
+    source.check(asked.policy, asked.task, guidance=asked.guidance)
     envs, steps = _work(source.task, asked)
     if asked.out and asked.out.exists():
         raise UserError(f"{asked.out} exists: give another --out")

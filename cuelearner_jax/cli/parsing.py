@@ -3,24 +3,38 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import inspect
 import io
+import os
 import re
+import stat
+import tempfile
 from pathlib import Path
 from typing import Any
 
 import tyro
 from rich.console import Console
 
-from cuelearner_jax.errors import UserError, closest
+from cuelearner_jax.errors import UserError, closest, no_space
 from cuelearner_jax.guidance import registry as guidances
 from cuelearner_jax.runs.trained import POLICIES, PolicySource
 from cuelearner_jax.task import Preset, Task
 from cuelearner_jax.tasks import registry
+from cuelearner_jax.terminal import PLAIN
 
 HELP = ("-h", "--help")
 
-out = Console(highlight=False, soft_wrap=True)
+
+class _Output(Console):
+    """Standard output."""
+
+    def on_broken_pipe(self) -> None:
+        """Raises BrokenPipeError: nobody reads what the command was to tell."""
+        raise BrokenPipeError
+
+
+out = _Output(**PLAIN)
 
 
 def summary(kind: type) -> str:
@@ -29,7 +43,7 @@ def summary(kind: type) -> str:
 
 
 def parse(kind: Any, arguments: list[str], program: str, default: Any = None, about: str | None = None) -> Any:
-    """Arguments as a dataclass. Raises UserError with tyro's message in one line.
+    """Arguments as a dataclass. Raises UserError with tyro's message in one line, or for an `out` that cannot be.
 
     Args:
         kind: the dataclass.
@@ -40,9 +54,10 @@ def parse(kind: Any, arguments: list[str], program: str, default: Any = None, ab
     """
     errors = io.StringIO()
     keywords = {} if default is None else {"default": default}
+    _check_given(arguments)
     try:
         with contextlib.redirect_stderr(errors):
-            return tyro.cli(kind, args=arguments, prog=f"cuelearner {program}", description=about, **keywords)
+            asked = tyro.cli(kind, args=arguments, prog=f"cuelearner {program}", description=about, **keywords)
     except SystemExit as stop:
         if not stop.code:
             raise
@@ -52,6 +67,50 @@ def parse(kind: Any, arguments: list[str], program: str, default: Any = None, ab
         told = told.replace("Perhaps you meant:", "; perhaps you meant")
         told = re.sub(r"\s+", " ", told).replace(" ;", ";")[:400]
         raise UserError(f"{told}; see cuelearner {program} --help") from None
+    for part in (asked, *vars(asked).values()):
+        if isinstance(place := getattr(part, "out", None), Path):
+            default = next(entry.default for entry in dataclasses.fields(part) if entry.name == "out")
+            check_out(place, folder=default is not None)  # what may be left out is a file
+    return asked
+
+
+def _check_given(arguments: list[str]) -> None:
+    """Raises UserError for an option that is given an empty value, as an unset variable of the shell makes it."""
+    for before, argument in zip(["", *arguments], arguments, strict=False):
+        option, equals, value = argument.partition("=")
+        if argument == "" or (equals and option.startswith("--") and not value):
+            name = option or (before if before.startswith("--") else "an argument")
+            raise UserError(f"{name} is empty: give it a value, or leave it out")
+
+
+def check_out(place: Path, folder: bool = True) -> None:
+    """Raises UserError unless a folder (or else a file) is at a place or can be made there; nothing is left there."""
+    place = Path(os.path.normpath(place.absolute()))
+    for there in (place, *place.parents):
+        try:
+            kept = there.stat()
+        except (FileNotFoundError, NotADirectoryError):
+            if not there.is_symlink():
+                continue
+            raise UserError(f"{there} is a link to nothing: give another --out") from None
+        except OSError as error:
+            raise UserError(f"{place}: {error.strerror}: give another --out") from None
+        if (folder or there != place) and not stat.S_ISDIR(kept.st_mode):
+            raise UserError(f"{there} is no folder: give another --out")
+        if there == place and not os.access(there, os.W_OK):
+            raise UserError(f"{there} may not be written to: give another --out, or have its permissions changed")
+        if there != place:
+            _try_folder(there)
+        return
+
+
+def _try_folder(there: Path) -> None:
+    """Raises UserError unless something can be made in a folder, which permissions alone do not tell."""
+    try:
+        os.rmdir(tempfile.mkdtemp(prefix=".cuelearner-", dir=there))
+    except OSError as error:
+        if not no_space(error):
+            raise UserError(f"nothing can be made in {there} ({error.strerror}): give another --out") from None
 
 
 def taken(arguments: list[str], option: str, choices: str) -> tuple[str | None, list[str]]:

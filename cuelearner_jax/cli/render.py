@@ -58,7 +58,7 @@ def run(arguments: list[str]) -> None:
     default = kind(world_of(source, rest), Path("pictures"), policy="agent" if source.grid else "heuristic")
     asked = parse(kind, rest, f"render {source.folder}", default, about(Render, source.task, policies=True))
     source = source.on(asked.robot)
-    source.check(asked.policy, asked.task)
+    source.check(asked.policy, asked.task, guidance=asked.guidance, labels=asked.labels, seed=asked.seed)
     for name, least, most in (("steps", 1, MOST_STEPS), ("episode", 0, MOST_EPISODE)):
         if not least <= getattr(asked, name) <= most:
             raise UserError(f"--{name} is {getattr(asked, name)}: give a number from {least} to {most:,}")

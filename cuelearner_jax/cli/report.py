@@ -10,6 +10,7 @@ import tyro
 
 from cuelearner_jax.cli.parsing import out, parse
 from cuelearner_jax.cli.shared_options import Flag
+from cuelearner_jax.errors import UserError
 
 
 @dataclass(frozen=True)
@@ -38,6 +39,8 @@ def run(arguments: list[str]) -> None:
     from cuelearner_jax.report.document import report  # it loads what draws, which other commands need not wait for
 
     asked = parse(Report, arguments, "report")
+    if not asked.folders:
+        raise UserError("no folder to report on: cuelearner report RUN_FOLDER ... --out FOLDER")
     written = report(
         asked.folders,
         asked.out,

@@ -8,8 +8,9 @@ from typing import Generic
 
 from cuelearner_jax.cli.parsing import about, out, parse, preset_of, task_of
 from cuelearner_jax.cli.shared_options import TaskT, Training, asking_kind, preset_kinds
+from cuelearner_jax.errors import UserError
 from cuelearner_jax.runs import sweep
-from cuelearner_jax.runs.grid import Grid
+from cuelearner_jax.runs.grid import LARGEST_SEED, Grid
 
 
 @dataclass(frozen=True)
@@ -39,5 +40,7 @@ def run(arguments: list[str]) -> None:
         labels=preset.labels[0],
     )
     asked = parse(kind, rest, f"train {task.name}", default, about(Train, task))
+    if not 0 <= asked.seed < LARGEST_SEED:
+        raise UserError(f"--seed is {asked.seed}: give a number from 0 to {LARGEST_SEED - 1}")
     sweep.run(asked.order(task, Grid((asked.guidance,), (asked.seed,), (asked.labels,))))
     out.print(asked.done)

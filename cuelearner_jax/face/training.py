@@ -22,7 +22,7 @@ from cuelearner_jax.face.worlds import World
 from cuelearner_jax.guidance import registry
 from cuelearner_jax.policies import Agent
 from cuelearner_jax.runs import failures
-from cuelearner_jax.runs.grid import Grid, check_grid
+from cuelearner_jax.runs.grid import LARGEST_SEED, Grid, check_grid
 from cuelearner_jax.runs.lanes import LaneGroup
 from cuelearner_jax.runs.memory_report import memory_report
 from cuelearner_jax.runs.training import Training, mean_of_finite
@@ -99,6 +99,8 @@ def train(
     world.task.check_evaluations(run_config)
     asked = guidance or registry.possible(world.env, taught=teacher is not None)
     names = tuple(registry.find(kind).name for kind in asked)
+    if isinstance(seeds, int) and not 0 < seeds <= LARGEST_SEED:
+        raise UserError(f"seeds is {seeds}: give a number from 1 to {LARGEST_SEED}")
     grid = Grid(names, tuple(range(seeds)) if isinstance(seeds, int) else tuple(seeds), tuple(labels))
     check_grid(grid)
     mesh = lane_mesh()

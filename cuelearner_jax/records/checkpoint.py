@@ -27,10 +27,11 @@ import jax.numpy as jnp
 import numpy as np
 import orbax.checkpoint as ocp
 
-from cuelearner_jax.errors import UserError
+from cuelearner_jax.errors import UserError, no_space
+from cuelearner_jax.signals import saving
 
 KEPT = 2  # the newest checkpoints of a run
-SETTLING_S = 0.2  # within which reads that are under way come to their end [s]
+SETTLING_S = 0.2  # within which reads and writes that are under way come to their end [s]
 ROOM_LEFT = 1 << 20  # beyond a checkpoint's arrays, for what describes them [bytes]
 
 
@@ -109,19 +110,25 @@ def _compare(stored: dict[str, Any], wanted: dict[str, jax.ShapeDtypeStruct]) ->
             raise _OfAnother(f"{path} is {there}, expected {here}")
 
 
-def _collect_quietly() -> None:
-    """Ends the other reads of a restore that failed.
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Keeps silent what Orbax leaves to threads and to the garbage collector once a read or a write has failed.
 
-    Orbax leaves them to the garbage collector, where each complains by pages, at any later time and in anybody's code.
+    Each complains by pages, at any later time and in anybody's code.
     """
-    log, hook = logging.getLogger("asyncio"), sys.unraisablehook
+    log, unraisable, uncaught = logging.getLogger("asyncio"), sys.unraisablehook, sys.excepthook
     silenced = log.disabled
-    log.disabled, sys.unraisablehook = True, lambda _: None
+    log.disabled, sys.unraisablehook, sys.excepthook = True, lambda _: None, lambda *_: None
     try:
-        time.sleep(SETTLING_S)
-        gc.collect()
+        yield
     finally:
-        log.disabled, sys.unraisablehook = silenced, hook
+        log.disabled, sys.unraisablehook, sys.excepthook = silenced, unraisable, uncaught
+
+
+def _settle() -> None:
+    """Waits for the other reads or writes of one that failed, and collects them."""
+    time.sleep(SETTLING_S)
+    gc.collect()
 
 
 class Checkpoints:
@@ -148,15 +155,22 @@ class Checkpoints:
 
     def save(self, number: int, items: dict[str, Any]) -> None:
         """Writes a checkpoint; returns once it is complete on disk. Raises OSError where there is no room for it."""
-        # Asked first: a write that fails halfway leaves Orbax's threads complaining for pages.
         needed = sum(leaf.nbytes for leaf in jax.tree.leaves(items) if hasattr(leaf, "nbytes"))
         if shutil.disk_usage(self._folder).free < needed + ROOM_LEFT:
             raise OSError(errno.ENOSPC, f"{needed / 1e6:.0f} MB are needed", str(self._folder))
         flat = {name: _flat(item) for name, item in items.items()}
         args: dict[str, Any] = {name: ocp.args.StandardSave(item) for name, item in flat.items()}
         args[DIGESTS] = ocp.args.JsonSave({name: _digests(item) for name, item in flat.items()})
-        self._manager.save(number, args=ocp.args.Composite(**args))
-        self._manager.wait_until_finished()
+        with saving(), _quiet():
+            try:
+                self._manager.save(number, args=ocp.args.Composite(**args))
+                self._manager.wait_until_finished()
+                return
+            except Exception as error:
+                if not no_space(error):
+                    raise
+            _settle()
+        raise OSError(errno.ENOSPC, f"{needed / 1e6:.0f} MB are needed", str(self._folder))
 
     def restore(self, like: dict[str, Any]) -> dict[str, Any]:
         """The newest checkpoint's items named in `like` (trees of arrays or shapes), onto the default device.
@@ -191,7 +205,8 @@ class Checkpoints:
             told = re.sub(r"\.? See full TensorStore details.*", "", str(error), flags=re.DOTALL).strip()
             reason = told.splitlines()[0][:160] if told else type(error).__name__
             remedy = OTHERS if isinstance(error, _OfAnother) else FORBIDDEN if _forbidden(error) else DAMAGED
-        _collect_quietly()
+        with _quiet():
+            _settle()
         raise UserError(f"checkpoint {number} in {self._folder} cannot be read ({reason}): {remedy}")
 
     @staticmethod

@@ -23,11 +23,10 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
-
+from cuelearner_jax import signals
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.runs.shards import Shard
+from cuelearner_jax.terminal import console, progress_bars
 
 # The command, named in the results as if it had been typed.
 ENTRY = "import sys; sys.argv[0] = 'cuelearner'; from cuelearner_jax.cli import main; sys.exit(main())"
@@ -177,14 +176,17 @@ class Piece:
         signals = (signal.SIGUSR2, signal.SIGTERM)
         for number in signals:  # a scheduler sends them to every process; the command is to hear of them from here
             signal.signal(number, signal.SIG_IGN)
+        # Ignored by a function, not by SIG_IGN, which the command would inherit: it is to hear of this from here too.
+        signal.signal(signal.SIGINT, lambda number, frame: None)
         command = [sys.executable, "-u", "-c", ENTRY, *self.arguments]
         process = subprocess.Popen(command, cwd=self.folder, start_new_session=True)
         print(f"process {process.pid}: {shlex.join(('cuelearner', *self.arguments))}", flush=True)
         asked: list[int] = []
 
         def stop(number: int, frame: Any) -> None:
+            if not (asked and self.scheduled):  # twice would be: at once
+                process.send_signal(signal.SIGINT)
             asked.append(number)
-            process.send_signal(signal.SIGINT)
             signal.alarm(self.grace_s)
 
         for number in signals:
@@ -286,13 +288,13 @@ class LocalJobs:
         self._running: dict[Shard, tuple[Any, list[int]]] = {}
         self.succeeded: list[Shard] = []
         self.failed: dict[Shard, str] = {}  # with the last line of its log
-        self.stopping = False
+        self.stopping: int | None = None  # the signal that they were stopped by
         self._executor = _submitit().LocalExecutor(folder)
 
     @property
     def ended(self) -> bool:
         """Is there nothing more to wait for?"""
-        return not self._running and (self.stopping or not self._waiting)
+        return not self._running and (self.stopping is not None or not self._waiting)
 
     @property
     def note(self) -> str:
@@ -310,7 +312,7 @@ class LocalJobs:
                     self.succeeded.append(shard)
                 else:
                     self.failed[shard] = _last_line(job.paths.stderr)
-        while self._free and self._waiting and not self.stopping:
+        while self._free and self._waiting and self.stopping is None:
             (shard, arguments), gpus = self._waiting.pop(0), self._free.pop(0)
             self._executor.update_parameters(timeout_min=FOREVER_MIN, gpus_per_node=len(gpus), visible_gpus=gpus)
             piece = Piece(arguments, os.getcwd(), grace_s=FOREVER_MIN, scheduled=False)
@@ -321,10 +323,12 @@ class LocalJobs:
                 signal.signal(signal.SIGINT, before)
 
     def stop(self, number: int, frame: Any) -> None:
-        """Tells all that run to save and stop; told a second time, they stop at once. A handler of signals."""
-        if not self.stopping:
-            print("stopping: each piece saves after its stretch of steps (Ctrl-C again: at once)", file=sys.stderr)
-        self.stopping = True
+        """Tells all that run to save and stop; at a second Ctrl-C they stop at once. A handler of signals."""
+        if self.stopping is None:
+            self.stopping = number
+            console.print("stopping: each piece saves after its stretch of steps (Ctrl-C again: at once)")
+        elif number != signal.SIGINT:
+            return
         for job, _ in self._running.values():
             job._process.send_signal(signal.SIGTERM)  # submitit's controller passes it on to the job
 
@@ -341,12 +345,11 @@ def run_locally(pieces: dict[Shard, tuple[str, ...]], out: Path, job: Job, progr
     Raises:
         JobsFailed: with the last line of each piece that failed, or was stopped.
     """
-    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[note]}"), TimeRemainingColumn())
     folder = _new_folder(out)
     jobs = LocalJobs(pieces, folder, job)
-    before = {number: signal.signal(number, jobs.stop) for number in (signal.SIGINT, signal.SIGTERM)}
+    before = {number: signal.signal(number, jobs.stop) for number in signals.NUMBERS}
     try:
-        with Progress(*columns, console=Console(stderr=True)) as bars:
+        with progress_bars(counted=False) as bars:
             bar = bars.add_task(f"{len(pieces)} pieces", total=1.0, note="")
             while True:
                 jobs.poll()
@@ -357,11 +360,11 @@ def run_locally(pieces: dict[Shard, tuple[str, ...]], out: Path, job: Job, progr
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-    if jobs.failed or jobs.stopping:
+    if jobs.failed or jobs.stopping is not None:
         lines = [f"piece {shard.index}/{shard.count}: {line}" for shard, line in sorted(jobs.failed.items())]
-        ended = "stopped" if jobs.stopping else f"error: {len(jobs.failed)} of {len(pieces)} pieces failed"
+        ended = "stopped" if jobs.stopping is not None else f"error: {len(jobs.failed)} of {len(pieces)} pieces failed"
         told = "\n".join([*lines, f"{ended}; logs in {folder}; go on with the same command"])
-        raise JobsFailed(told, 130 if jobs.stopping else 1)
+        raise JobsFailed(told, 1 if jobs.stopping is None else 128 + jobs.stopping)
 
 
 def _last_line(log: Path) -> str:

@@ -21,7 +21,7 @@ from cuelearner_jax.runs.shards import Shard
 from cuelearner_jax.task import Task
 
 LARGEST_SEED = min(SPLITS.values())  # seeds and splits are folded into one key
-LARGEST_BUDGET = 1 << 31  # budgets are 32-bit integers
+LARGEST_BUDGET = configuration.LARGEST_ROUND
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ def check_grid(grid: Grid) -> None:
     if not grid.guidance or len(set(grid.guidance)) < len(grid.guidance):
         raise UserError("--guidance: give each kind once, and at least one")
     if not grid.seeds or len(set(grid.seeds)) < len(grid.seeds) or not all(0 <= s < LARGEST_SEED for s in grid.seeds):
-        raise UserError(f"seeds must be different numbers from 0 to {LARGEST_SEED - 1}: give --seeds and --first-seed")
+        raise UserError(f"seeds must be different numbers from 0 to {LARGEST_SEED - 1}, at least one")
     if any(kind.asks for kind in kinds):
         if not grid.labels or len(set(grid.labels)) < len(grid.labels):
             raise UserError("--labels: give each budget once, and at least one")
@@ -54,6 +54,8 @@ def check_grid(grid: Grid) -> None:
                 f"a label budget of {min(grid.labels)} teaches nothing: give --labels of at least 1, "
                 "and --guidance none for the unguided agent"
             )
+        if max(grid.labels) >= LARGEST_BUDGET:
+            raise UserError(f"a label budget of {max(grid.labels)} cannot be counted: give less than {LARGEST_BUDGET}")
 
 
 def describe(

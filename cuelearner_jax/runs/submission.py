@@ -9,6 +9,7 @@ from statistics import fmean
 import jax
 
 from cuelearner_jax.errors import UserError
+from cuelearner_jax.records.folders import holder
 from cuelearner_jax.runs import cluster, failures
 from cuelearner_jax.runs.cluster import Job
 from cuelearner_jax.runs.order import Plan
@@ -75,7 +76,19 @@ def submit(
         )
         return
     if pieces:
+        _check_free({shard: plans[shard].order.out for shard in pieces})
         cluster.run_locally(pieces, out, job, lambda: fmean(planned.done for planned in plans.values()))
     orders = [planned.order for planned in plans.values()]
     failures.check(out, [order.out / kind for order in orders for kind in order.grid.guidance])
     tell(f"done: {out} (see it with: {told})")
+
+
+def _check_free(folders: dict[Shard, Path]) -> None:
+    """Raises UserError if other processes write some pieces, as they do whose parent was killed."""
+    held = {shard: by for shard, folder in folders.items() if (by := holder(folder))}
+    if held:
+        told = ", ".join(f"{shard.index}/{shard.count} by {by}" for shard, by in held.items())
+        raise UserError(
+            f"pieces are being written by others: {told}; wait for them, or end them there (kill -INT NUMBER: they "
+            "save), then give the same command again"
+        )

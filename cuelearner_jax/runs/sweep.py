@@ -11,6 +11,7 @@ from cuelearner_jax.runs.lanes import LaneGroup
 from cuelearner_jax.runs.memory_report import memory_report
 from cuelearner_jax.runs.order import Order, planned
 from cuelearner_jax.runs.runner import Runner
+from cuelearner_jax.task import shape_of
 from cuelearner_jax.terminal import console, interruptible, progress_bars
 
 
@@ -21,18 +22,19 @@ def run(order: Order) -> None:
 
     Raises:
         UserError: bad configuration, a folder in use, too little memory; nothing has been changed then.
-        Interrupted: Ctrl-C; everything is saved.
+        Interrupted: Ctrl-C or SIGTERM; everything is saved.
         NotFinite: all is done, but some lanes stopped being finite.
     """
     plan = planned(order)
     order = plan.order
     task, config = order.task, order.config
-    mesh = lane_mesh()
+    mesh, shape = lane_mesh(), shape_of(task, config.task)
+    for kind in order.grid.guidance:  # before anything is made that has a size
+        made = guidances.make(kind, config.sizes, shape)
+        console.print(memory_report(LaneGroup(config, shape, made, order.grid)))
     env = place(mesh, task.environment(config.task), SHARED)
     kinds = [guidances.make(kind, config.sizes, env) for kind in order.grid.guidance]
     groups = [LaneGroup(config, env, kind, order.grid) for kind in kinds]
-    for group in groups:
-        console.print(memory_report(group))
     asked = any(kind.asks for kind in kinds) and plan.labels is None
     teacher = place(mesh, task.make_teacher(config.task, env), SHARED) if asked else None
     examined = task.environment(config.task, order.split)

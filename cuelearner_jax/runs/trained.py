@@ -102,16 +102,21 @@ class PolicySource:
         """The same with another robot of the task's (None: its own). Raises UserError if it has no such robot."""
         return replace(self, task=self.task.on(robot))
 
-    def check(self, policy: str, changed: Any) -> None:
+    def check(self, policy: str, changed: Any, **lanes: Any) -> None:
         """Raises UserError unless the policy can be had and acts in the changed world.
 
         What was trained sees the observations that it was trained on; other policies act in any world.
+        `lanes`: options that choose among a run's lanes, by name; one that is given must choose something.
         """
         if policy not in POLICIES:
             raise UserError(f"unknown policy {policy!r}{closest(policy, POLICIES)}")
         if POLICIES[policy].trained and not self.grid:
             untrained = ", ".join(name for name, named in POLICIES.items() if not named.trained)
             raise UserError(f"policy {policy!r} needs a trained run: give a run folder, or one of {untrained}")
+        given = [name for name, value in lanes.items() if value not in (None, ())]
+        if given and not POLICIES[policy].trained:
+            what = f"policy {policy!r} belongs to no lane of a run"
+            raise UserError(f"--{given[0]} chooses nothing here, {what}: leave it out")
         after = shape_of(self.task, changed)
         for need in POLICIES[policy].needs:
             if not offers(after, need):

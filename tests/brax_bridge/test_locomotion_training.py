@@ -156,6 +156,10 @@ def test_training_that_dies_leaves_the_newest_policy(tmp_path):
         ({"batch_size": 10}, "train.batch_size times train.minibatches is 20: give a multiple of train.robots"),
         ({"layers": ()}, "give at least one layer"),
         ({"seconds": -1.0}, "can't be negative"),
+        ({"layers": (0,)}, "positive width"),
+        ({"learning_rate": float("nan")}, "give finite numbers"),
+        ({"steps": 10**10}, "train.steps is 10000000000: give at most"),
+        ({"robots": 10**9}, "train.robots is 1000000000: give at most"),
     ],
 )
 def test_what_cannot_work_is_refused(tmp_path, changed, says):

@@ -10,7 +10,7 @@ import time
 from pathlib import Path
 
 import pytest
-from small_runs import SMALL
+from small_runs import SMALL, listing
 
 from cuelearner_jax.cli import main
 from cuelearner_jax.errors import UserError
@@ -96,10 +96,13 @@ def test_submitted_twice_then_one_killed_then_submitted_again_gives_what_one_pro
     processes = [command_of(out, shard) for shard in (1, 2)]
     for process in processes:
         os.kill(process, signal.SIGSTOP)  # both live, and hold their folders
-    assert main(command) == 1
+    before = listing(out)
+    assert main(command) == 2
     told = capsys.readouterr().err.splitlines()
-    assert sum("is being written by another process" in line for line in told) == 2
-    assert "2 of 2 pieces failed" in told[-1]
+    assert len(told) == 1
+    for shard, process in enumerate(processes, 1):
+        assert f"{shard}/2 by process {process} on " in told[0]
+    assert listing(out) == before
     os.kill(processes[0], signal.SIGKILL)
     os.kill(processes[1], signal.SIGCONT)
     told = first.communicate(timeout=120)[1].splitlines()

@@ -21,7 +21,14 @@ ARGUMENTS = [
     ([*QUICK, "--labels", "0"], "teaches nothing"),
     ([*QUICK, "--labels", "10", "10"], "give each budget once"),
     ([*QUICK, "--seeds", "0"], "give --seeds"),
-    ([*QUICK, "--sizes.replay-capacity", "1000000000000"], "train at most"),
+    ([*QUICK, "--sizes.replay-capacity", "2000000000"], "lower --sizes.replay-capacity"),
+    ([*QUICK, "--sizes.replay-capacity", "1000000000000"], "give at most 2147483647"),
+    ([*QUICK, "--seeds", "100000000000000000000"], "seeds are numbers from 0 to 1000000"),
+    ([*QUICK, "--first-seed", "1000001"], "seeds are numbers from 0 to 1000000"),
+    ([*QUICK, "--labels", "3000000000", "--guidance", "relative"], "cannot be counted"),
+    ([*QUICK, "--labels", "1000000000", "--guidance", "relative"], "lower --labels"),
+    ([*QUICK, "--schedule.total-steps", "3000000000"], "give at most 2147483647"),
+    (["train", "billiards", "--preset", "quickstart", "--seed", "-1"], "--seed is -1: give a number from 0"),
     ([*QUICK, "--sizes.replay-capacity", "1001"], "give a multiple of sizes.num_envs"),
     ([*QUICK, "--schedule.total-steps", "150"], "give a multiple of schedule.eval_every"),
     ([*QUICK, "--resume"], "nothing to resume"),
@@ -35,6 +42,10 @@ ARGUMENTS = [
     (["evaluate", "billiards", "--steps", "150"], "multiple of --envs"),
     (["evaluate", "billiards", "--scenario", "tilted_tabel"], "did you mean 'tilted_table'"),
     (["evaluate", "billiards", "--scenario"], "choose one of turned_strike, shifted_balls, tilted_table"),
+    (["evaluate", "billiards", "--guidance", "none"], "--guidance chooses nothing here"),
+    (["render", "billiards", "--seed", "3"], "--seed chooses nothing here"),
+    (["render", "billiards", "--labels", "0"], "--labels chooses nothing here"),
+    (["render", "billiards", "--guidance", "none"], "--guidance chooses nothing here"),
     (["render", "billiards", "--film", "avi"], "gif or mp4"),
     (["render", "billiards", "--steps", "0"], "--steps is 0: give a number from 1 to 100,000"),
     (["render", "billiards", "--episode", "-1"], "--episode is -1: give a number from 0 to 4,294,967,295"),
@@ -55,6 +66,35 @@ def test_bad_arguments_are_refused(refused, tmp_path, command, says):
     takes_out = command[0] in ("sweep", "train", "teacher", "render") and len(command) > 2 and command[-1] != "--preset"
     refused([*command, *(["--out", tmp_path / "new"] if takes_out else [])], says, tmp_path)
     assert not (tmp_path / "new").exists()
+
+
+WITH_OUT = [
+    QUICK,
+    [*QUICK, "--cluster", "local", "--shards", "2"],
+    ["train", "billiards"],
+    ["teacher", "train", "billiards"],
+    ["locomotion", "train"],
+    ["locomotion", "evaluate"],
+    ["evaluate", "billiards"],
+    ["render", "billiards"],
+    ["report", "docs/data/navigation"],
+    ["bench"],
+]
+
+
+@pytest.mark.parametrize("command", WITH_OUT, ids=[" ".join(c[:2] + c[-2:-1]) for c in WITH_OUT])
+def test_an_out_that_cannot_be_is_refused_before_any_work(refused, tmp_path, command):
+    (tmp_path / "file").write_text("mine")
+    (tmp_path / "link").symlink_to("nowhere")
+    for out in (tmp_path / "file" / "run", tmp_path / "new" / ".." / "file" / "run"):
+        refused([*command, "--out", out], "file is no folder: give another --out", tmp_path)
+    refused([*command, "--out", tmp_path / "link"], "is a link to nothing", tmp_path)
+    refused([*command, "--out", tmp_path / ("x" * 300)], "File name too long", tmp_path)
+    refused([*command, "--out", "/proc/run"], "nothing can be made in /proc", tmp_path)
+    refused([*command, "--out", ""], "--out is empty", tmp_path)
+    refused([*command, "--out="], "--out is empty", tmp_path)
+    refused([*command, "--out", tmp_path / "\udcff"], "not encoded as UTF-8", tmp_path)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "link"]
 
 
 def test_a_folder_in_use_is_left_alone(refused, run_folder, tmp_path):
@@ -164,6 +204,7 @@ def test_reports_that_cannot_be_made_are_refused(refused, copy, tmp_path):
     out = ["--out", tmp_path / "report"]
     refused(["report", tmp_path / "nowhere", *out], "does not exist", tmp_path)
     refused(["report", empty, *out], "no results", tmp_path)
+    refused(["report", *out], "no folder to report on", tmp_path)
     refused(["report", copy, "--metric", "success", *out], "success", tmp_path)
     assert main(["report", str(copy), "--out", str(tmp_path / "report")]) == 0
     refused(["report", copy, *out], "overwrite", tmp_path)

@@ -20,8 +20,8 @@ def rows(folder):
     return [{name: row[name] for name in ("seed", "step", "labels", "reward", "scored", "train_loss")} for row in table]
 
 
-def start_and_wait_for(folder, step):
-    process = subprocess.Popen([*COMMAND, "--out", str(folder)], stderr=subprocess.PIPE, text=True)
+def start_and_wait_for(folder, step, *options):
+    process = subprocess.Popen([*COMMAND, "--out", str(folder), *options], stderr=subprocess.PIPE, text=True)
     for _ in range(1200):
         file = folder / "none" / "results.jsonl"
         if file.exists() and f'"step": {step}' in file.read_text():
@@ -39,15 +39,17 @@ def uninterrupted(tmp_path_factory):
     return rows(folder)
 
 
-def test_ctrl_c_saves_and_resume_goes_on_as_if_never_stopped(tmp_path, uninterrupted):
+def test_ctrl_c_and_sigterm_save_and_resume_goes_on_as_if_never_stopped(tmp_path, uninterrupted):
     folder = tmp_path / "run"
-    process = start_and_wait_for(folder, 200)
-    process.send_signal(signal.SIGINT)
-    told = process.communicate(timeout=120)[1]
-    assert process.returncode == 130
-    assert "--resume" in told.splitlines()[-1]
-    reached = max(row["step"] for row in rows(folder))
-    assert reached < STEPS
+    for step, number, *options in ((200, signal.SIGINT), (600, signal.SIGTERM, "--resume")):
+        process = start_and_wait_for(folder, step, *options)
+        process.send_signal(number)
+        told = process.communicate(timeout=120)[1]
+        assert process.returncode == 128 + number
+        assert "--resume" in told.splitlines()[-1]
+        reached = max(row["step"] for row in rows(folder))
+        assert str(reached) in {path.name for path in (folder / "none" / "checkpoints").iterdir()}
+        assert reached < STEPS
     subprocess.run([*COMMAND, "--out", str(folder), "--resume"], check=True, capture_output=True, timeout=300)
     assert rows(folder) == uninterrupted
 
@@ -64,3 +66,34 @@ def test_kill_loses_one_stretch_at_most_and_resume_goes_on(tmp_path, uninterrupt
     assert rows(folder) == uninterrupted
     saved = sorted(int(path.name) for path in (folder / "none" / "checkpoints").iterdir() if path.name.isdigit())
     assert saved[-1] == STEPS
+
+
+@pytest.mark.parametrize(("seconds", "number"), [(0.3, signal.SIGINT), (7.0, signal.SIGINT), (7.0, signal.SIGTERM)])
+def test_an_evaluation_ends_at_once_in_one_line(seconds, number):
+    """While modules are loaded, and while something is compiled or computed."""
+    begun = "import sys; from cuelearner_jax.cli import main; print('begun', flush=True); sys.exit(main())"
+    command = [sys.executable, "-c", begun, "evaluate", "billiards", "--policy", "teacher", "--steps", "2000000"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    process.stdout.readline()
+    time.sleep(seconds)
+    process.send_signal(number)
+    told = process.communicate(timeout=30)[1]
+    assert process.returncode == 128 + number
+    assert told == "stopped at once; what was saved before is safe\n"
+
+
+def test_a_closed_standard_error_and_a_path_like_markup_disturb_no_sweep(tmp_path):
+    folder = tmp_path / "br[" / "x]" / ":smile:"
+    options = ["sweep", "billiards", "--preset", "quickstart", *SMALL, "--guidance", "none", "--seeds", "1"]
+    script = ["sh", "-c", 'exec "$@" 2>&-', "sh", *ENTRY, *options, "--out", str(folder)]
+    done = subprocess.run(script, stdout=subprocess.PIPE, text=True, check=False, timeout=300)
+    assert done.returncode == 0
+    assert f"cuelearner report {folder} " in done.stdout
+    assert (folder / "none" / "results.parquet").exists()
+
+
+def test_a_reader_that_has_gone_is_told_by_the_status():
+    script = ["bash", "-c", '"$@" | head -0; exit ${PIPESTATUS[0]}', "bash", *ENTRY, "sweep", "billiards", "--help"]
+    done = subprocess.run(script, capture_output=True, text=True, check=False, timeout=120)
+    assert (done.returncode, done.stderr) == (141, "")
