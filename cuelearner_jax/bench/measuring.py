@@ -17,6 +17,7 @@ import statistics
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -147,7 +148,7 @@ def iterations_of(config: RunConfig, spaces: Spaces, seeds: int) -> int:
 def measure(
     work: Work, seeds: int, mesh: Mesh, seconds: float, told: Callable[[str], None] = lambda note: None
 ) -> dict[str, Any]:
-    """One row of figures; `machines.ROW` says what each is."""
+    """One row of figures; `machines.ROW` says what each is. `told` hears of each stretch before it begins."""
     config = learning(work.config)
     sizes = config.sizes
     told("compiling")
@@ -162,6 +163,7 @@ def measure(
     told("training")
     rates, stretches = _rates(), []
     while len(stretches) < FEWEST_STRETCHES or sum(stretches) < seconds:
+        told("training")
         stretches.append(timed.train(iterations))
     rates = {name: max(rate, rates[name]) for name, rate in _rates().items()}
     iteration = statistics.median(stretches) / iterations
@@ -204,15 +206,19 @@ def run(works: Sequence[Work], asked: Measuring, command: str) -> dict[str, Any]
     rows: list[dict[str, Any]] = []
     entry = _entry(asked, command, cache)
     console.print(f"measuring {len(plan)} times: some seconds to compile, then {asked.seconds:g} s of training each")
-    with interruptible("this measurement") as stopping, progress_bars() as bars:
+    with interruptible() as stopping, progress_bars() as bars:
         bar = bars.add_task("bench", total=len(plan), note="")
+
+        def told(name: str, note: str) -> None:
+            bars.update(bar, note=f"{name}: {note}")
+            if stopping.is_set():
+                done = machines.figures(rows) + "\n" if rows else ""
+                raise Interrupted(f"{done}stopped after {len(rows)} of {len(plan)} measurements; nothing was written")
+
         for work, seeds in plan:
-            name = f"{work.task.name} {work.preset}, {seeds} seeds: "
-            rows.append(measure(work, seeds, mesh, asked.seconds, lambda note, n=name: bars.update(bar, note=n + note)))
+            name = f"{work.task.name} {work.preset}, {seeds} seeds"
+            rows.append(measure(work, seeds, mesh, asked.seconds, partial(told, name)))
             bars.advance(bar)
-            if stopping.is_set() and len(rows) < len(plan):
-                told = f"stopped after {len(rows)} of {len(plan)} measurements; nothing was written"
-                raise Interrupted(f"{machines.figures(rows)}\n{told}")
     entry["rows"] = sorted(rows, key=lambda row: ([work.task.name for work in works].index(row["task"]), row["seeds"]))
     if asked.out:
         with asked.out.open("x") as file:

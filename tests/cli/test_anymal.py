@@ -28,7 +28,7 @@ REFUSED = [
     (["locomotion", "train", "--train.robots", "0"], "train.robots is 0: give a positive number"),
     (["locomotion", "train", "--train.robots", "100"], "give a multiple of train.robots (100)"),
     (["locomotion", "evaluate", "nowhere"], "no walking policy in nowhere: train one with"),
-    (["locomotion", "evaluate", "--robots", "0"], "--robots is 0: give a positive number"),
+    (["locomotion", "evaluate", "--robots", "0"], "--robots is 0: give a number from 1"),
     (["locomotion", "evaluate", "--robts", "3"], "perhaps you meant --robots"),
 ]
 

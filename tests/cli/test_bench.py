@@ -67,7 +67,7 @@ BAD = [
     ([*SMALL, "--seconds", "0"], "--seconds is 0.0"),
     ([*SMALL, "--devices", "9"], "--devices is 9: there are"),
     ([*SMALL, "--out", "nowhere/entry.json"], "make it first"),
-    ([*SMALL, "--sizes.replay-capacity", "1000000000000"], "train at most"),
+    ([*SMALL, "--sizes.replay-capacity", "1000000000000"], "counted in 32 bits"),
     (["bench", "billards"], "did you mean 'billiards'"),
     (["bench", "billiards", "--preset", "papr"], "did you mean 'paper'"),
     (["bench", "--seedz", "1"], "--seeds"),

@@ -157,7 +157,7 @@ NONSENSE = [
     (lambda: cl.load_policy("nowhere"), "nowhere is no run folder"),
     (lambda: cl.train(WORLD, None, probes.CONFIG, guidance=["relative"], seeds=1), "asks a teacher: give one"),
     (lambda: cl.train(WORLD, TEACHER, "quickstat", seeds=1), "unknown preset 'quickstat'"),
-    (lambda: cl.train(WORLD, TEACHER, probes.CONFIG, seeds=0), "seeds must be different numbers"),
+    (lambda: cl.train(WORLD, TEACHER, probes.CONFIG, seeds=0), "seeds is 0: give a number from 1"),
     (lambda: cl.train(WORLD, TEACHER, probes.CONFIG, guidance=["telepathy"]), "unknown guidance 'telepathy'"),
 ]
 

@@ -58,7 +58,7 @@ def test_lanes_are_seeds_for_each_budget_where_labels_are_asked_for():
 
 def test_memory_is_told_before_and_too_much_is_refused():
     assert "3 lanes" in memory_report(group_of(3))
-    with pytest.raises(UserError, match=r"are free: lower --sizes\.replay-capacity"):
+    with pytest.raises(UserError, match="are free: "):
         memory_report(group_of(3, replay_capacity=2 * 10**9))
 
 

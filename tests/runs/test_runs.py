@@ -229,7 +229,7 @@ def test_lanes_are_seeds_times_budgets_and_one_a_seed_without_labels():
         (probes.config(scalars={"k_max": 3}), GRID, {"resume": True}, r"another scalars\.k_max"),
         (probes.config(sizes={"batch_size": 0}), GRID, {"overwrite": True}, r"sizes\.batch_size is 0"),
         (probes.CONFIG, Grid(("none",), (), ()), {"overwrite": True}, "seeds must be"),
-        (probes.config(sizes={"replay_capacity": 10**12}), GRID, {"overwrite": True}, "are free"),
+        (probes.config(sizes={"replay_capacity": 2 * 10**9}), GRID, {"overwrite": True}, "are free"),
     ],
 )
 def test_a_refused_run_changes_nothing(out, config, grid, options, message):

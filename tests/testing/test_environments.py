@@ -212,9 +212,9 @@ class Labelled:
     def __init__(self, window):
         self.window = window
         self.label = str(getattr(window, "half_width", ""))
-
-    def __getattr__(self, name):
-        return getattr(self.window, name)
+        for name in dir(window):  # so that it is an environment to whoever looks at it without asking it
+            if not name.startswith("_"):
+                setattr(self, name, getattr(window, name))
 
     def tree_flatten(self):
         return (self.window,), self.label
