@@ -31,15 +31,13 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 from probes import files_of
-from small_runs import SMALL
+from small_runs import SWEEP
 
 from cuelearner_jax.cli import main
 from cuelearner_jax.records import results
 from cuelearner_jax.runs import sweep
 
-SWEEP = ["sweep", "billiards", "--preset", "quickstart", *SMALL, "--seeds", "2", "--labels", "10"]
-SWEEP += ["--guidance", "none", "relative"]
-RUNS = {"finished": None, "stopped": 4}  # at which look at Ctrl-C the run is stopped
+RUNS = {"finished": None, "stopped": 5}  # at which look at Ctrl-C the run is stopped
 VOLATILE = ("wall_s", "commit", "command", "folder", "run")
 
 
@@ -127,6 +125,7 @@ def _render(folder: Path, work: Path) -> Outcome:
 
 
 COMMANDS = {"resume": _resume, "report": _report, "evaluate": _evaluate, "render": _render}
+SHARES = (0.3, 0.3, 0.3, 0.1)  # of the cases; drawing takes ten times as long as the others
 
 
 @contextlib.contextmanager
@@ -143,9 +142,12 @@ def _stopping_at(looks: int | None) -> Iterator[threading.Event]:
     yield Event()
 
 
-def make_runs(folder: Path) -> None:
-    """The whole runs, each in a folder of its name."""
+def make_runs(folder: Path, finished: Path | None = None) -> None:
+    """The whole runs, each in a folder of its name; one that is finished may be given."""
     for name, looks in RUNS.items():
+        if finished and looks is None:
+            shutil.copytree(finished, folder / name / "run")
+            continue
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(sweep, "interruptible", partial(_stopping_at, looks))
             status, _, told = _called([*SWEEP, "--out", str(folder / name / "run")])
@@ -167,7 +169,7 @@ def cases(folder: Path, count: int, seed: int) -> list[Case]:
     for index in range(count):
         run, item = names[index % len(names)]
         file = str(rng.choice(kinds[run, item]))
-        damage, command = str(rng.choice(list(DAMAGES))), str(rng.choice(list(COMMANDS)))
+        damage, command = str(rng.choice(list(DAMAGES))), str(rng.choice(list(COMMANDS), p=SHARES))
         found.append(Case(run, file, damage, command, int(rng.integers(1 << 32))))
     return found
 

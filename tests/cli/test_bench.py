@@ -97,7 +97,10 @@ def test_ctrl_c_stops_it_with_what_was_measured_and_no_file(tmp_path):
             break
     time.sleep(2)
     process.send_signal(signal.SIGINT)
-    told = process.communicate(timeout=120)[1]
+    try:
+        told = process.communicate(timeout=60)[1]
+    finally:
+        process.kill()
     assert process.returncode == 130, told
     assert told.splitlines()[-1] == "stopped after 0 of 1 measurements; nothing was written"
     assert not out.exists()

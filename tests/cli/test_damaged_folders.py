@@ -2,11 +2,11 @@
 
 import damaged_folders
 
-CASES, SEED = 16, 0
+CASES, SEED = 24, 0
 
 
-def test_no_damage_gives_a_traceback_or_another_number(tmp_path):
-    damaged_folders.make_runs(tmp_path)
+def test_no_damage_gives_a_traceback_or_another_number(run_folder, tmp_path):
+    damaged_folders.make_runs(tmp_path, run_folder)
     tried = damaged_folders.cases(tmp_path, CASES, SEED)
     expected = damaged_folders.baselines(tmp_path, {(case.run, case.command) for case in tried})
     found = [(case, damaged_folders.wrong(tmp_path, expected, case)) for case in tried]
