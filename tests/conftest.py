@@ -1,6 +1,7 @@
 """Settings of every test: the CPU, compiled programs kept between runs, shapes in signatures checked."""
 
 import os
+import signal
 from pathlib import Path
 
 import jaxlib.version
@@ -19,6 +20,11 @@ flags = ["--xla_backend_optimization_level=1"]
 if jaxlib.version.__version_info__ < (0, 11):  # JAX does not start with a flag that it no longer knows
     flags.append("--xla_cpu_use_fusion_emitters=false")
 os.environ["XLA_FLAGS"] = " ".join([*flags, os.environ.get("XLA_FLAGS", "")]).strip()
+
+# What starts the tests may ignore signals, as a shell does for work in the background, and processes pass that on.
+signal.signal(signal.SIGINT, signal.default_int_handler)
+signal.signal(signal.SIGHUP, signal.SIG_DFL)
+signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 install_import_hook(PACKAGES, "checked.checked")  # before anything of them is imported
 

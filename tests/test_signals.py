@@ -15,17 +15,27 @@ BUSY = "import hashlib; print('ready', flush=True); hashlib.pbkdf2_hmac('sha256'
 LISTEN = "from cuelearner_jax import signals; signals.listen();"
 
 
-def started(script):
-    process = subprocess.Popen(
-        [sys.executable, "-c", script], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
-    assert process.stdout is not None
-    assert process.stdout.readline() == "ready\n"
-    return process
+@pytest.fixture
+def started():
+    """Starts a script and waits until it says that it is ready; none is left behind."""
+    processes = []
+
+    def start(script):
+        process = subprocess.Popen(
+            [sys.executable, "-c", script], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        )
+        processes.append(process)
+        assert process.stdout is not None
+        assert process.stdout.readline() == "ready\n"
+        return process
+
+    yield start
+    for process in processes:
+        process.kill()
 
 
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
-def test_a_command_with_nothing_to_save_ends_at_once_in_one_line(number, status):
+def test_a_command_with_nothing_to_save_ends_at_once_in_one_line(started, number, status):
     process = started(f"{LISTEN} {BUSY}")
     process.send_signal(number)
     told = process.communicate(timeout=20)[1]
@@ -33,7 +43,7 @@ def test_a_command_with_nothing_to_save_ends_at_once_in_one_line(number, status)
     assert told == "stopped at once; what was saved before is safe\n"
 
 
-def test_what_a_process_was_started_to_ignore_stays_ignored():
+def test_what_a_process_was_started_to_ignore_stays_ignored(started):
     process = started(f"import signal; signal.signal(1, signal.SIG_IGN); {LISTEN} {BUSY}")
     process.send_signal(signal.SIGHUP)
     time.sleep(0.3)
@@ -43,7 +53,7 @@ def test_what_a_process_was_started_to_ignore_stays_ignored():
     assert process.returncode == 143
 
 
-def test_the_first_signal_is_told_at_once_and_a_second_ctrl_c_ends_compiled_code():
+def test_the_first_signal_is_told_at_once_and_a_second_ctrl_c_ends_compiled_code(started):
     process = started(f"{LISTEN} guard = signals.interruptible(); guard.__enter__(); {BUSY}")
     process.send_signal(signal.SIGTERM)
     assert process.stderr is not None
@@ -56,7 +66,7 @@ def test_the_first_signal_is_told_at_once_and_a_second_ctrl_c_ends_compiled_code
     assert process.returncode == 130
 
 
-def test_a_second_ctrl_c_waits_for_a_save():
+def test_a_second_ctrl_c_waits_for_a_save(started):
     script = """
 import time
 with signals.interruptible(), signals.saving():
