@@ -74,11 +74,12 @@ def run(arguments: list[str]) -> None:
     told = {name: value for name, value in told.items() if value}
     robot = {"robot_digest": digest} if (digest := source.task.bodies[0].digest) else {}
     amount = f"{steps:,} steps a lane" if source.task.longest is None else f"{envs:,} episodes a lane"
+    if asked.out:  # first: whoever reads the table may leave before its end
+        trained.write(asked.out, source, asked.task, asked.policy, envs, steps, measured, {**told, **robot})
     out.print(_measurements(measured, ", ".join([asked.policy, *told.values(), amount])))
     if any((row.metrics.get("finished", np.ones(1)) < 1).any() for row in measured):
         console.print("not every first episode has ended, so outcomes have no mean: give more --steps")
     if asked.out:
-        trained.write(asked.out, source, asked.task, asked.policy, envs, steps, measured, {**told, **robot})
         out.print(f"wrote {asked.out}")
 
 

@@ -18,6 +18,7 @@ from cuelearner_jax.evaluate import Tell, episodes, one_lane, part_of, untold, w
 from cuelearner_jax.guidance import registry as guidances
 from cuelearner_jax.policies import Agent, Corrected, Guided, Heuristic, Policy, Taught, uniform_in
 from cuelearner_jax.records.provenance import provenance
+from cuelearner_jax.records.whole import replacing
 from cuelearner_jax.runs.failures import without_failed
 from cuelearner_jax.runs.grid import Grid
 from cuelearner_jax.runs.opened import Lanes, Piece, lanes_of, open_run
@@ -277,4 +278,5 @@ def write(
         "rows": rows,
     }
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(contents, indent=1) + "\n")
+    with replacing(path) as file:
+        file.write(json.dumps(contents, indent=1) + "\n")
