@@ -93,7 +93,7 @@ BILLIARDS = Task(
     teacher=make_teacher,
     files=_files,
     scenarios=SCENARIOS,
-    labels_hold=("mirrors", "teacher", "aim_error_deg", "habit", "search_directions"),
+    labels_hold=("mirrors", *TEACHERS),
     presets={
         "paper": Preset(
             "the paper's figure: regulation table, its networks, 10 million steps a seed",
