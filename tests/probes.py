@@ -215,7 +215,7 @@ def files_of(folder):
     The mark of the process that wrote last is left out.
     """
     return {
-        path.relative_to(folder): (path.stat().st_mtime_ns, path.read_bytes() if path.is_file() else None)
+        path.relative_to(folder): (path.lstat().st_mtime_ns, path.read_bytes() if path.is_file() else None)
         for path in sorted(folder.rglob("*"))
         if path.name != ".lock"
     }

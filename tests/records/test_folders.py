@@ -39,11 +39,12 @@ def out(tmp_path):
 
 def refused(folder, message, now=DESCRIBED, resume=False, overwrite=False):
     """`check_folder` refuses with `message` and changes nothing."""
-    before = probes.files_of(folder.parent)
+    looked_at = folder if folder.is_dir() else folder.parent
+    before = probes.files_of(looked_at)
     with pytest.raises(UserError, match=message) as refusal:
         folders.check_folder(folder, now, resume, overwrite)
     assert "\n" not in str(refusal.value)
-    assert probes.files_of(folder.parent) == before
+    assert probes.files_of(looked_at) == before
 
 
 def test_a_missing_or_empty_folder_may_be_used(tmp_path):
