@@ -12,6 +12,7 @@ import pyarrow as pa
 
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.records import formats, results
+from cuelearner_jax.records.folders import CONFIG
 from cuelearner_jax.runs import shards
 
 LISTED = 20  # numbers in a line
@@ -49,7 +50,7 @@ def missing(folders: Sequence[str | os.PathLike[str]], table: pa.Table) -> list[
         table: the rows that it shows, with their `folder`.
     """
     configurations = {folder: _configuration(Path(folder)) for folder in dict.fromkeys(table["folder"].to_pylist())}
-    files = {file for folder in folders for file in Path(folder).rglob("config.json")} | set(configurations.values())
+    files = {file for folder in folders for file in Path(folder).rglob(CONFIG)} | set(configurations.values())
     planned: dict[Path, Planned] = {}
     lines = []
     for file in sorted(file for file in files if file):
@@ -104,7 +105,7 @@ def _absent(run: Path, plan: Planned, table: pa.Table) -> list[str]:
 
 def _configuration(folder: Path) -> Path | None:
     """The config.json of a folder with results: a run's stands above the folders of its kinds of guidance."""
-    files = [folder / "config.json", folder.parent / "config.json"]
+    files = [folder / CONFIG, folder.parent / CONFIG]
     return next((file for file in files if os.path.exists(file)), None)
 
 

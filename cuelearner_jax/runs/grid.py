@@ -17,6 +17,7 @@ from cuelearner_jax.guidance import registry as guidances
 from cuelearner_jax.guidance.bundle import Guidance
 from cuelearner_jax.plugins import REFERENCE
 from cuelearner_jax.records import formats, label_files
+from cuelearner_jax.records.folders import CONFIG
 from cuelearner_jax.runs.shards import Shard
 from cuelearner_jax.task import Task
 
@@ -101,7 +102,7 @@ def load(folder: Path, find: Callable[[str], Task]) -> tuple[Task, RunConfig, Gr
     Raises:
         UserError: it is no run folder, or of a task that is not known.
     """
-    path = folder / "config.json"
+    path = folder / CONFIG
     if not path.is_file():
         raise UserError(f"{folder} is no run folder (it has no config.json): give the --out of a train or sweep")
     values = formats.read("config", path)

@@ -109,7 +109,7 @@ def lanes_of(task: Task, config: RunConfig, pieces: tuple[Piece, ...], kind: str
         if step < config.schedule.total_steps:
             told.append(f"{folder}: {kind} guidance at step {step:,} of {config.schedule.total_steps:,}")
     for line in told:
-        console.print(line, markup=False)
+        console.print(line)
     if not found:
         raise UserError(f"no piece has a checkpoint of {kind} guidance: train first, or choose another --guidance")
     return [_joined(found[step]) for step in sorted(found, reverse=True)]

@@ -16,7 +16,7 @@ from cuelearner_jax.errors import UserError
 from cuelearner_jax.guidance import given
 from cuelearner_jax.guidance import registry as guidances
 from cuelearner_jax.records import formats, label_files, results
-from cuelearner_jax.records.folders import check_folder
+from cuelearner_jax.records.folders import CONFIG, check_folder
 from cuelearner_jax.runs.grid import Grid, check_grid, describe
 from cuelearner_jax.runs.shards import Shard
 from cuelearner_jax.task import Task, shape_of
@@ -69,7 +69,7 @@ def planned(order: Order) -> Plan:
     if order.shard:
         piece = order.shard.described(order.grid.seeds)
         folder = order.shard.folder(order.out)
-        begun = not order.overwrite and (folder / "config.json").is_file()
+        begun = not order.overwrite and (folder / CONFIG).is_file()
         grid = dataclasses.replace(order.grid, seeds=order.shard.seeds(order.grid.seeds))
         order = dataclasses.replace(order, grid=grid, out=folder, resume=order.resume or begun)
     env = shape_of(order.task, order.config.task)

@@ -226,7 +226,7 @@ def one_policy(
         index = np.flatnonzero((lanes.seeds == seed) & (lanes.budgets == budget))
         if len(index):
             if lanes.policies["failed"][index[0]]:
-                console.print(f"seed {seed} failed, no longer finite: this is its last finite state", markup=False)
+                console.print(f"seed {seed} failed, no longer finite: this is its last finite state")
             return one_lane(named.make(Parts(source.config, env, teacher, lanes)), int(index[0]))
     raise UserError(
         f"no lane with seed {seed} and {budget} labels: the run has seeds {_listed(seeds)} "

@@ -13,6 +13,7 @@ import jax
 import numpy as np
 
 from cuelearner_jax import config as configuration
+from cuelearner_jax.config import LARGEST
 from cuelearner_jax.errors import NotFinite, UserError
 from cuelearner_jax.evaluate import episodes, evaluate_policy
 from cuelearner_jax.policies import Taught
@@ -31,7 +32,6 @@ from cuelearner_jax.terminal import Interrupted, console, interruptible, progres
 ROUNDS_A_STRETCH = 50  # in one jitted call
 SECONDS_BETWEEN_CHECKPOINTS = 60.0
 EVAL_ENVS = 100  # environments that share the validation steps
-LARGEST = 2**31 - 1  # of a count, as JAX has them
 TRAINING, HISTORY = "training", "history.json"  # kept in the folder until the teacher is finished
 
 
