@@ -1,8 +1,9 @@
-"""Fitting a model to labels by least squares (paper, Eq. 3), whatever the form of their answers."""
+"""Fitting a model to labels, by least squares (paper, Eq. 3) or another loss, whatever the form of their answers."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -51,17 +52,49 @@ def fit_least_squares(
     apply: Callable[[Params, jax.Array, jax.Array], jax.Array],
     sizes: GuideSizes,
 ) -> GuidanceModel:
-    """Fits a model from scratch by least squares (paper, Eq. 3) and keeps the parameters that validated best.
+    """`fit_model` by least squares (paper, Eq. 3).
 
-    A fixed number of Adam steps, so that vmapped seeds take equally long. Lessons are multiplied by the environment's
-    symmetries where it offers them (a target is then a vector like an action). With fewer than five nothing validates:
-    the last parameters are kept. A fit that diverged before anything validated gives parameters that are NaN.
+    Lessons are multiplied by the environment's symmetries where it offers them (a target is then a vector like an
+    action).
 
     Args:
         env: whose symmetries they are; None: there is none, and nothing multiplies them.
-        rows: lessons (slots, ...), of which the valid ones count.
-        init: parameters from a key.
         apply: (params, obs (n, obs), actions (n, action)) -> predictions (n, outputs).
+        key, rows, scalars, init, sizes: as `fit_model` has them.
+    """
+
+    def errors(params: Params, rows: Lesson) -> Float[Array, " n"]:
+        return jnp.sum(jnp.square(apply(params, rows.obs, rows.action) - rows.target), -1)
+
+    def mirrored(key: PRNGKeyArray, batch: Lesson) -> Lesson:
+        image = random_symmetries(key, env, sizes.fit_batch_size)
+        (obs, action), (_, target) = image(batch.obs, batch.action), image(batch.obs, batch.target)
+        return batch.replace(obs=obs, action=action, target=target)
+
+    return fit_model(key, rows, scalars, init=init, losses=errors, sizes=sizes, varied=mirrored)
+
+
+def fit_model(
+    key: PRNGKeyArray,
+    rows: Any,
+    scalars: GuideScalars,
+    *,
+    init: Callable[[PRNGKeyArray], Params],
+    losses: Callable[[Params, Any], Float[Array, " n"]],
+    sizes: GuideSizes,
+    varied: Callable[[PRNGKeyArray, Any], Any] = lambda key, batch: batch,
+) -> GuidanceModel:
+    """Fits a model from scratch and keeps the parameters that validated best.
+
+    A fixed number of Adam steps, so that vmapped seeds take equally long. With fewer than five labels nothing
+    validates: the last parameters are kept. A fit that diverged before anything validated gives parameters that are
+    NaN.
+
+    Args:
+        rows: what is learned from (slots, ...), such as lessons; their `valid` says which count.
+        init: parameters from a key.
+        losses: (params, rows (n, ...)) -> the loss of each.
+        varied: (key, batch) -> another batch that is as good.
 
     Returns:
         The model; its `fitted` is False if there was no valid label to train on.
@@ -75,23 +108,19 @@ def fit_least_squares(
         optax.clip_by_global_norm(scalars.max_grad_norm), optax.adam(scalars.feedback_learning_rate)
     )
 
-    def loss(params: Params, batch: Lesson) -> jax.Array:
-        error = apply(params, batch.obs, batch.action) - batch.target
-        return jnp.mean(jnp.sum(jnp.square(error), -1))
+    def loss(params: Params, batch: Any) -> jax.Array:
+        return jnp.mean(losses(params, batch))
 
     def step(carry: tuple[Params, optax.OptState], key: PRNGKeyArray) -> tuple[tuple[Params, optax.OptState], None]:
         params, opt_state = carry
         key_draw, key_mirror = jax.random.split(key)
         batch = jax.tree.map(lambda leaf: leaf[draw(key_draw, sizes.fit_batch_size)], rows)
-        image = random_symmetries(key_mirror, env, sizes.fit_batch_size)
-        (obs, action), (_, target) = image(batch.obs, batch.action), image(batch.obs, batch.target)
-        batch = batch.replace(obs=obs, action=action, target=target)
+        batch = varied(key_mirror, batch)
         updates, opt_state = optimizer.update(jax.grad(loss)(params, batch), opt_state, params)
         return (optax.apply_updates(params, updates), opt_state), None
 
     def validate(params: Params) -> jax.Array:
-        error = apply(params, rows.obs, rows.action) - rows.target
-        return jnp.sum(jnp.sum(jnp.square(error), -1), where=validation)
+        return jnp.sum(losses(params, rows), where=validation)
 
     def stretch(carry: tuple, keys: Key[Array, " steps"]) -> tuple[tuple, None]:
         running, best, best_loss = carry
