@@ -27,6 +27,13 @@ class Quantity(NamedTuple):
     about: str = ""  # what it is, where from and in which order, in a few words
 
 
+class Features(NamedTuple):
+    """An observation as it looks from actions. Networks take the two parts where they take observation and action."""
+
+    own: Float[Array, " own"]  # what looks alike from every action: computed once, however many there are
+    turned: Float[Array, "*n turned"]  # what hangs on the action
+
+
 @runtime_checkable
 class Environment(Protocol):
     """One task. Inherit `WholeObservations` (or `Described`) for what can be derived."""
@@ -96,7 +103,7 @@ class OffersMirror(Protocol):
 class OffersFeatures(Protocol):
     """An environment that can show an observation as it looks from an action."""
 
-    def features(self, obs: Float[Array, " obs"], actions: Float[Array, "*n action"]) -> Float[Array, "*n features"]:
+    def features(self, obs: Float[Array, " obs"], actions: Float[Array, "*n action"]) -> Features:
         """What a network is to see of one observation and each of the actions."""
         ...
 
@@ -168,15 +175,19 @@ class Spaces(NamedTuple):
 
     obs_size: int
     actions: Actions
-    aim_features: int | None = None  # entries of one row of `Aims.features`, if it offers any
+    features: tuple[int, int] | None = None  # entries of `Features.own` and `Features.turned`, if it offers any
+    aims: int | None = None  # entries of one row of `Aims.features`, if it offers any
 
 
 def spaces_of(env: Any) -> Spaces:
     """An environment's; shapes in place of its arrays will do."""
     spaces = Spaces(env.obs_size, actions_of(env))
+    obs, action = jnp.zeros(spaces.obs_size), jnp.zeros(spaces.actions.size)
+    if offers(env, "features"):
+        seen = jax.eval_shape(lambda env: env.features(obs, action), env)
+        spaces = spaces._replace(features=(seen.own.shape[-1], seen.turned.shape[-1]))
     if offers(env, "aims"):
-        aims = jax.eval_shape(lambda env: env.aims(jnp.zeros(spaces.obs_size)), env)
-        spaces = spaces._replace(aim_features=aims.features.shape[-1])
+        spaces = spaces._replace(aims=jax.eval_shape(lambda env: env.aims(obs), env).features.shape[-1])
     return spaces
 
 

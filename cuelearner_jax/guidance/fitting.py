@@ -12,7 +12,6 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Key, PRNGKeyArray
 
 from cuelearner_jax.config import GuideScalars, GuideSizes
-from cuelearner_jax.environment import Environment, random_symmetries
 from cuelearner_jax.guidance.bundle import TargetFunction
 from cuelearner_jax.types import GuidanceModel, Label, Params
 
@@ -44,7 +43,6 @@ def _subset(valid: Bool[Array, " labels"]) -> Callable[[PRNGKeyArray, int], jax.
 
 def fit_least_squares(
     key: PRNGKeyArray,
-    env: Environment | None,
     rows: Lesson,
     scalars: GuideScalars,
     *,
@@ -54,24 +52,18 @@ def fit_least_squares(
 ) -> GuidanceModel:
     """`fit_model` by least squares (paper, Eq. 3).
 
-    Lessons are multiplied by the environment's symmetries where it offers them (a target is then a vector like an
-    action).
+    Lessons are never multiplied by an environment's symmetries: what a teacher would answer in the mirror image is its
+    own choice where several actions are as good, and mostly another than the mirror image of its answer.
 
     Args:
-        env: whose symmetries they are; None: there is none, and nothing multiplies them.
-        apply: (params, obs (n, obs), actions (n, action)) -> predictions (n, outputs).
         key, rows, scalars, init, sizes: as `fit_model` has them.
+        apply: (params, obs (n, obs), actions (n, action)) -> predictions (n, outputs).
     """
 
     def errors(params: Params, rows: Lesson) -> Float[Array, " n"]:
         return jnp.sum(jnp.square(apply(params, rows.obs, rows.action) - rows.target), -1)
 
-    def mirrored(key: PRNGKeyArray, batch: Lesson) -> Lesson:
-        image = random_symmetries(key, env, sizes.fit_batch_size)
-        (obs, action), (_, target) = image(batch.obs, batch.action), image(batch.obs, batch.target)
-        return batch.replace(obs=obs, action=action, target=target)
-
-    return fit_model(key, rows, scalars, init=init, losses=errors, sizes=sizes, varied=mirrored)
+    return fit_model(key, rows, scalars, init=init, losses=errors, sizes=sizes)
 
 
 def fit_model(
@@ -82,19 +74,16 @@ def fit_model(
     init: Callable[[PRNGKeyArray], Params],
     losses: Callable[[Params, Any], Float[Array, " n"]],
     sizes: GuideSizes,
-    varied: Callable[[PRNGKeyArray, Any], Any] = lambda key, batch: batch,
 ) -> GuidanceModel:
     """Fits a model from scratch and keeps the parameters that validated best.
 
-    A fixed number of Adam steps, so that vmapped seeds take equally long. With fewer than five labels nothing
-    validates: the last parameters are kept. A fit that diverged before anything validated gives parameters that are
-    NaN.
+    A fixed number of Adam steps, so that vmapped seeds take equally long. With fewer than five nothing validates: the
+    last parameters are kept. A fit that diverged before anything validated gives parameters that are NaN.
 
     Args:
-        rows: what is learned from (slots, ...), such as lessons; their `valid` says which count.
+        rows: a record of what is learned from (slots, ...), such as lessons, of which the `valid` ones count.
         init: parameters from a key.
         losses: (params, rows (n, ...)) -> the loss of each.
-        varied: (key, batch) -> another batch that is as good.
 
     Returns:
         The model; its `fitted` is False if there was no valid label to train on.
@@ -113,9 +102,8 @@ def fit_model(
 
     def step(carry: tuple[Params, optax.OptState], key: PRNGKeyArray) -> tuple[tuple[Params, optax.OptState], None]:
         params, opt_state = carry
-        key_draw, key_mirror = jax.random.split(key)
+        key_draw, _ = jax.random.split(key)  # so that numbers are those of results that are recorded
         batch = jax.tree.map(lambda leaf: leaf[draw(key_draw, sizes.fit_batch_size)], rows)
-        batch = varied(key_mirror, batch)
         updates, opt_state = optimizer.update(jax.grad(loss)(params, batch), opt_state, params)
         return (optax.apply_updates(params, updates), opt_state), None
 

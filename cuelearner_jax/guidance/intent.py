@@ -1,10 +1,10 @@
 """Relative feedback read as intent: of the aims that a situation offers, which one does the teacher have in mind?
 
 "More to the left" says that what the teacher means lies to the left: of the aims there (`Environment.aims`) some remain
-likely, the others do not. One network weighs every aim by its features, with the same weights for all; labels fit it by
-the likelihood of the teacher's words, summed over what it may have meant (a mixture of logits, as in goal inference:
-Baker, Saxe, Tenenbaum, "Action understanding as inverse planning", Cognition 2009). A pass of refinement goes by at most
-eps toward the likeliest aim and ends there, so precision is the aim's and not the label's.
+likely, the others do not. One network weighs every aim by its features, with the same weights for all; it is fitted by
+the likelihood of the teacher's words, summed over what may have been meant. (Inferring goals from what somebody does or
+says: Baker, Saxe, Tenenbaum, "Action understanding as inverse planning", Cognition 2009.) A pass of refinement goes by
+at most eps toward the likeliest aim and ends there, so precision is the aim's and not the label's.
 """
 
 from __future__ import annotations
@@ -30,7 +30,8 @@ from cuelearner_jax.types import GuidanceModel, Label, Params
 
 SPREAD_DEG = 1.0  # how far what a teacher means may lie from the aim that describes it
 ELSEWHERE = 360  # evenly spaced actions that stand for "it means none of these"
-SLIPS = 0.02  # share of answers that say nothing
+SLIPS = 0.02  # share of answers that say nothing: any of the words
+WORDS = 3
 
 
 class Weights(nn.Module):
@@ -82,7 +83,7 @@ def make(sizes: GuideSizes, spaces: Spaces) -> Guidance:
     """The bundle for an environment's spaces."""
     space = spaces.actions
     network = Weights(sizes.aim_layers)
-    width = spaces.aim_features or 0
+    width = spaces.aims or 0
 
     def init_params(key: PRNGKeyArray) -> Params:
         return network.init(key, jnp.zeros((1, width)), jnp.ones(1, bool))
@@ -104,7 +105,7 @@ def make(sizes: GuideSizes, spaces: Spaces) -> Guidance:
     def surprise(params: Params, rows: Evidence) -> Float[Array, " rows"]:
         """-log of the probability of each answer."""
         weights = jax.nn.softmax(jax.vmap(network.apply, (None, 0, 0))(params, rows.features, rows.possible))
-        return -jnp.log((1.0 - SLIPS) * (weights * rows.likelihood).sum(-1) + SLIPS / len(RELATIVE.values or ()))
+        return -jnp.log((1.0 - SLIPS) * (weights * rows.likelihood).sum(-1) + SLIPS / WORDS)
 
     def fit(key: PRNGKeyArray, env: Any, labels: Label, former: GuidanceModel, scalars: GuideScalars) -> GuidanceModel:
         rows = jax.vmap(lambda label: evidence(env, label, scalars))(labels)
@@ -141,6 +142,4 @@ def make(sizes: GuideSizes, spaces: Spaces) -> Guidance:
     return Guidance("intent", RELATIVE, init, about_refined(act), target, fit, act)
 
 
-KIND = Kind(
-    "intent", "relative feedback about the task's aims", make, form=RELATIVE, needs=("aims",), colour="#CC79A7"
-)
+KIND = Kind("intent", "relative feedback about the task's aims", make, form=RELATIVE, needs=("aims",), colour="#CC79A7")
