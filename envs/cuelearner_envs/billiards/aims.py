@@ -98,10 +98,9 @@ def _features(
     cos = jnp.maximum(jnp.cos(contact.cut), THINNEST)
     gain = jnp.log((far / diameter) * (near / diameter + 0.1) / cos + 0.1)  # of an error of the aim, at the mouth
     margin = (table.hole_width * (opening * retract(way)).sum() - radius - table.cushion_radius) / radius
-    apart = jnp.stack(
-        [_clearance(targets, others, cue, contact.place), _clearance(targets, others, targets[ball], mouth)]
-    )
-    apart = jnp.minimum(apart / diameter, FARTHEST)
+    ways = ((cue, contact.place), (targets[ball], mouth))
+    apart = jnp.stack([_clearance(targets, others, *ends) for ends in ways]) / diameter
+    apart = jnp.minimum(apart, FARTHEST)
     inside = jnp.stack([jnp.asarray(table.width), jnp.asarray(table.height)]) / 2.0 - radius - table.cushion_radius
     room = jnp.clip((inside - jnp.abs(contact.place)).min() / radius, -1.0, 1.0)
     miss, travel = _afterwards(table, contact)
@@ -119,8 +118,8 @@ def _clearance(
 ) -> Float[Array, ""]:
     """Distance of the closest of the other balls' centres from a ball's way [m]."""
     way = end - start
-    share = jnp.clip(((balls - start) @ way) / jnp.maximum((way * way).sum(), 1e-12), 0.0, 1.0)
-    distance = jnp.linalg.norm(balls - start - share[:, None] * way, axis=-1)
+    share = jnp.clip(((targets - start) @ way) / jnp.maximum((way * way).sum(), 1e-12), 0.0, 1.0)
+    distance = jnp.linalg.norm(targets - start - share[:, None] * way, axis=-1)
     return jnp.where(others, distance, jnp.inf).min()
 
 
