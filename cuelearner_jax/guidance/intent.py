@@ -85,6 +85,11 @@ def make(sizes: GuideSizes, spaces: Spaces) -> Guidance:
     network = Weights(sizes.aim_layers)
     width = spaces.aims or 0
 
+    def weigh(
+        params: Params, features: Float[Array, "aims features"], possible: Bool[Array, " aims"]
+    ) -> Float[Array, " aims_and_none"]:
+        return jnp.asarray(network.apply(params, features, possible))
+
     def init_params(key: PRNGKeyArray) -> Params:
         return network.init(key, jnp.zeros((1, width)), jnp.ones(1, bool))
 
@@ -104,7 +109,7 @@ def make(sizes: GuideSizes, spaces: Spaces) -> Guidance:
 
     def surprise(params: Params, rows: Evidence) -> Float[Array, " rows"]:
         """-log of the probability of each answer."""
-        weights = jax.nn.softmax(jax.vmap(network.apply, (None, 0, 0))(params, rows.features, rows.possible))
+        weights = jax.nn.softmax(jax.vmap(weigh, (None, 0, 0))(params, rows.features, rows.possible))
         return -jnp.log((1.0 - SLIPS) * (weights * rows.likelihood).sum(-1) + SLIPS / WORDS)
 
     def fit(key: PRNGKeyArray, env: Any, labels: Label, former: GuidanceModel, scalars: GuideScalars) -> GuidanceModel:
@@ -121,7 +126,7 @@ def make(sizes: GuideSizes, spaces: Spaces) -> Guidance:
     ) -> Refined:
         def meant(obs: Float[Array, " obs"]) -> tuple[Float[Array, " action"], Bool[Array, ""]]:
             aims: Aims = env.aims(obs)
-            likeliest = jnp.argmax(network.apply(model.params, aims.features, aims.possible)[:-1])
+            likeliest = jnp.argmax(weigh(model.params, aims.features, aims.possible)[:-1])
             return aims.actions[likeliest], aims.possible.any()
 
         def residual(current: Float[Array, "n action"]) -> Float[Array, "n action"]:

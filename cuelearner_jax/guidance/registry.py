@@ -73,7 +73,7 @@ def make(name: str, sizes: GuideSizes, env: Any) -> Guidance:
     kind = find(name)
     for need in kind.needs:
         if not offers(env, need):
-            raise UserError(f"guidance {kind.name!r} needs an environment with a {need}, which this task's is not")
+            raise UserError(f"guidance {kind.name!r} needs an environment with `{need}`, which this task's has not")
     return made_for(kind, sizes, spaces_of(env))
 
 

@@ -17,7 +17,7 @@ from cuelearner_envs.billiards.table import Table, corner_gap, pockets
 from cuelearner_jax.actions import difference, retract, rotate
 from cuelearner_jax.environment import Aims
 
-THROWS = 4  # fixed-point steps for the line of centres: the throw hangs on the cut, and the cut on the line
+THROWS = 8  # fixed-point steps for the line of centres: the throw hangs on the cut, and the cut on the line
 THINNEST = 0.15  # cosine of the thinnest cut that is tried
 FARTHEST = 2.0  # clearances and misses beyond this count as this
 INWARD = 0.25  # a corner pocket is aimed at this share of its gap before the corner: its jaws stand out
@@ -118,8 +118,8 @@ def _clearance(
 ) -> Float[Array, ""]:
     """Distance of the closest of the other balls' centres from a ball's way [m]."""
     way = end - start
-    share = jnp.clip(((targets - start) @ way) / jnp.maximum((way * way).sum(), 1e-12), 0.0, 1.0)
-    distance = jnp.linalg.norm(targets - start - share[:, None] * way, axis=-1)
+    share = jnp.clip(((targets - start[None]) @ way) / jnp.maximum((way * way).sum(), 1e-12), 0.0, 1.0)
+    distance = jnp.linalg.norm(targets - start[None] - share[:, None] * way[None], axis=-1)
     return jnp.where(others, distance, jnp.inf).min()
 
 
@@ -132,7 +132,7 @@ def _afterwards(table: Table, contact: Contact) -> tuple[Float[Array, ""], Float
     along, across = jnp.cos(contact.cut), jnp.abs(jnp.sin(contact.cut))
     kept = across - jnp.minimum(table.friction * along, across / (2.0 * TANGENT_PER_DISC))
     tangent = retract(contact.strike - along * contact.normal)
-    to = pockets(table) - contact.place
+    to = pockets(table) - contact.place[None]
     beside = jnp.abs(to[:, 0] * tangent[1] - to[:, 1] * tangent[0])
     miss = jnp.where(to @ tangent > 0.0, beside, jnp.inf).min() / table.hole_width
     travel = kept * table.strike_speed / -jnp.log(table.speed_kept) / table.height
