@@ -62,10 +62,11 @@ def follow(
     gain = pace.gain + (scalars.discount**pace.steps * reward if bootstraps else reward)
     steps, whole = pace.steps + 1, pace.whole & counts
     finished = done & whole
-    arms = (jnp.stack([~guided, guided]) & finished).astype(jnp.float32)  # (2, num_envs)
+    arms = jnp.stack([finished & ~guided, finished & guided]).astype(jnp.float32)  # (2, num_envs)
     size = jnp.ones_like(steps) if bootstraps else steps
     # Sums and not a matrix product, whose factors accelerators round.
-    new = ArmSums(*[(arms * each).sum(-1) for each in (1.0, gain, size, gain**2, gain * size, size**2)])
+    earned = (jnp.ones_like(gain), gain, size, gain**2, gain * size, size**2)
+    new = ArmSums(*[(arms * each[None]).sum(-1) for each in earned])
     fade = (1 - 1 / scalars.pace_window) ** finished.sum()
     return Pace(
         gain=jnp.where(done, 0, gain),
