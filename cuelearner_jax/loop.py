@@ -228,7 +228,7 @@ class Lane(NamedTuple):
         base = jax.lax.cond(
             clock.step < schedule.random_steps,
             lambda: self.learner.actions.uniform(key, (self.sizes.num_envs,)),
-            lambda: self.learner.greedy(agent),
+            lambda: self.learner.greedy(env, agent),
         )
         return jax.lax.cond(
             guides(clock, schedule),
