@@ -14,7 +14,9 @@ from cuelearner_jax import loop
 from cuelearner_jax.config import Scalars
 from cuelearner_jax.guidance import pace
 from cuelearner_jax.guidance import registry as guidances
+from cuelearner_jax.tasks import registry
 from cuelearner_jax.types import ArmSums
+from examples import reach
 
 LASTING = Scalars(pace_window=1e12)  # nothing fades
 
@@ -159,6 +161,12 @@ def test_a_guide_that_becomes_worse_half_way_is_followed_within_a_window():
     back = np.asarray(jax.vmap(lambda key: played(key, scalars, 0.5, jnp.where(half, 0.9, 0.1), 4000))(keys))
     assert back[:, 400:500].mean() < 0.08
     assert back[:, 650:].mean() > 0.4  # a guide that becomes better is tried, though seldom seen before
+
+
+def test_every_preset_is_paced_but_those_that_are_the_papers():
+    offered = [*map(registry.find, registry.names()), reach.TASK]
+    found = {(task.name, name): preset.config.sizes.pace for task in offered for name, preset in task.presets.items()}
+    assert found == {named: named[1] != "paper" for named in found}
 
 
 # In the loop, on the bandit: the heuristic turns by -1 rad, and is right in a world of that offset alone.
