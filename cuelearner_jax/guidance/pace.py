@@ -79,7 +79,7 @@ def follow(
 def scores(sums: ArmSums) -> tuple[Float[Array, "2"], Float[Array, "2"]]:
     """Each arm's ratio of sums, and the variance that one episode gives it.
 
-    The standard error of a ratio of m episodes is sqrt(variance / m) (Cochran, Sampling Techniques, 1977, eq. 6.13
+    The standard error of a ratio of m episodes is sqrt(variance / m) (Cochran, Sampling Techniques, 1977, chapter 6,
     without the correction for a finite population: residuals gain - ratio * size, over the mean size).
     """
     ratio = sums.gain / jnp.maximum(sums.size, TINY)
