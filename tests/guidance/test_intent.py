@@ -11,6 +11,7 @@ import pytest
 
 from cuelearner_jax import actions
 from cuelearner_jax.guidance import intent, registry
+from cuelearner_jax.guidance.answers import RELATIVE
 from cuelearner_jax.types import Label
 
 
@@ -36,7 +37,7 @@ def fitted():
     keys = jax.random.split(jax.random.key(3), 40)
     obs = jax.vmap(lambda key: ENV.reset(key)[1])(keys)
     asked = actions.uniform(jax.random.key(4), (40,))
-    tell = jax.vmap(lambda key, obs, a: bundle.form.answer(key, probes.Expert(ENV), obs, obs, a, probes.SCALARS))
+    tell = jax.vmap(lambda key, obs, a: RELATIVE.answer(key, probes.Expert(ENV), obs, obs, a, probes.SCALARS))
     answers, _ = tell(keys, obs, asked)
     labels = Label(obs, asked, answers, jnp.ones(40, bool))
     former = bundle.init(jax.random.key(0))
