@@ -28,7 +28,7 @@ from cuelearner_jax.types import EnvState, GuidanceModel, Label, Params, Teacher
 
 
 def shown(
-    key: PRNGKeyArray, teacher: Teacher, state: EnvState, obs: Array, action: Array, scalars: Scalars
+    key: PRNGKeyArray, env: Any, teacher: Teacher, state: EnvState, obs: Array, action: Array, scalars: Scalars
 ) -> tuple[Float[Array, "2"], Bool[Array, ""]]:
     """The best action of a teacher with the faults of `scalars` that mean something here, and whether it answered."""
     best = rotate(teacher.best_action(state, obs), scalars.radians("teacher_bias"))
