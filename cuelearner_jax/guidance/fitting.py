@@ -34,6 +34,11 @@ def lessons(labels: Label, target: TargetFunction, scalars: GuideScalars) -> Les
     return Lesson(labels.obs, labels.action, jax.lax.optimization_barrier(targets), labels.valid)
 
 
+def optimizer(scalars: GuideScalars) -> optax.GradientTransformation:
+    """Gradients clipped to a global norm, then Adam (paper, appendix): that of every guidance model."""
+    return optax.chain(optax.clip_by_global_norm(scalars.max_grad_norm), optax.adam(scalars.feedback_learning_rate))
+
+
 def _subset(valid: Bool[Array, " labels"]) -> Callable[[PRNGKeyArray, int], jax.Array]:
     """Sampler of indices, with replacement, among the true rows of `valid`."""
     order = jnp.argsort(~valid, stable=True)
@@ -71,9 +76,7 @@ def fit_least_squares(
     training = rows.valid & ~held_out
     draw = _subset(training)
     key_init, key_steps = jax.random.split(key)
-    optimizer = optax.chain(
-        optax.clip_by_global_norm(scalars.max_grad_norm), optax.adam(scalars.feedback_learning_rate)
-    )
+    adam = optimizer(scalars)
 
     def loss(params: Params, batch: Lesson) -> jax.Array:
         error = apply(params, batch.obs, batch.action) - batch.target
@@ -86,7 +89,7 @@ def fit_least_squares(
         image = random_symmetries(key_mirror, env, sizes.fit_batch_size)
         (obs, action), (_, target) = image(batch.obs, batch.action), image(batch.obs, batch.target)
         batch = batch.replace(obs=obs, action=action, target=target)
-        updates, opt_state = optimizer.update(jax.grad(loss)(params, batch), opt_state, params)
+        updates, opt_state = adam.update(jax.grad(loss)(params, batch), opt_state, params)
         return (optax.apply_updates(params, updates), opt_state), None
 
     def validate(params: Params) -> jax.Array:
@@ -103,7 +106,7 @@ def fit_least_squares(
 
     params = init(key_init)
     keys = jax.random.split(key_steps, (sizes.fit_steps // sizes.validate_every, sizes.validate_every))
-    start = ((params, optimizer.init(params)), params, jnp.inf)
+    start = ((params, adam.init(params)), params, jnp.inf)
     (_, best, score), _ = jax.lax.scan(stretch, start, keys)
     diverged = ~jnp.isfinite(score) & validation.any()
     best = jax.tree.map(lambda leaf: jnp.where(diverged, jnp.nan, leaf), best)
