@@ -15,6 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
+ROUNDING = 1e-5  # of the largest of values that a Fourier transform averaged
+
 Direction = Float[Array, "... 2"]
 DirectionLike = Direction | Float[np.ndarray, "... 2"]  # what functions take; they give JAX's arrays
 Angle = Float[Array, "..."] | Float[np.ndarray, "..."] | float
@@ -148,7 +150,8 @@ def nearest_direction(
     """
     expected = expected_values(values, spread)
     best = jnp.argmax(expected)
-    good = jnp.where(expected[best] > 0, expected >= share * expected[best], jnp.arange(values.shape[0]) == best)
+    worth_it = expected >= (share - ROUNDING) * expected[best]
+    good = jnp.where(expected[best] > 0, worth_it, jnp.arange(values.shape[0]) == best)
     options = evenly_spaced(values.shape[0])
     return options[jnp.argmin(jnp.where(good, distance(options, action), jnp.inf))]
 
