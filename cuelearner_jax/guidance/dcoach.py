@@ -64,8 +64,8 @@ def make(sizes: GuideSizes, spaces: Spaces) -> Guidance:
             error = policy.vectors(env, params, batch.obs, batch.action) - batch.target
             return jnp.mean(jnp.sum(jnp.square(error), -1))
 
-        def step(coached: Coached, numbers: Int[Array, " batch"]) -> Coached:
-            batch = jax.tree.map(lambda leaf: leaf[order[numbers]], rows)
+        def step(coached: Coached, numbers: Int[Array, " batch"], key: PRNGKeyArray) -> Coached:
+            batch = policy.seen_again(key, jax.tree.map(lambda leaf: leaf[order[numbers]], rows))
             gradient = jax.grad(loss)(coached.policy, batch)
             updates, state = optimizer(scalars).update(gradient, coached.optimizer, coached.policy)
             return coached.replace(policy=optax.apply_updates(coached.policy, updates), optimizer=state)
@@ -73,10 +73,15 @@ def make(sizes: GuideSizes, spaces: Spaces) -> Guidance:
         def corrected(number: Int[Array, ""], coached: Coached) -> Coached:
             """By label `number` of those that count, and by a replay of the newest up to it."""
             oldest = jnp.maximum(number + 1 - scalars.correction_replay, 0)
-            shape = (sizes.replay_steps, sizes.fit_batch_size)
-            replayed = jax.random.randint(jax.random.fold_in(key, number), shape, oldest, number + 1)
-            coached = step(coached, number[None])
-            coached, _ = jax.lax.scan(lambda one, numbers: (step(one, numbers), None), coached, replayed)
+
+            def replay(coached: Coached, key: PRNGKeyArray) -> tuple[Coached, None]:
+                k_draw, k_see = jax.random.split(key)
+                numbers = jax.random.randint(k_draw, (sizes.fit_batch_size,), oldest, number + 1)
+                return step(coached, numbers, k_see), None
+
+            k_new, k_replay = jax.random.split(jax.random.fold_in(key, number))
+            coached = step(coached, number[None], k_new)
+            coached, _ = jax.lax.scan(replay, coached, jax.random.split(k_replay, sizes.replay_steps))
             return coached.replace(learned=number + 1)
 
         coached = jax.lax.fori_loop(former.params.learned, count, corrected, former.params)

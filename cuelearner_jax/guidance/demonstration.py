@@ -6,6 +6,7 @@ are about what the policy itself would do, once there is one (DAgger: Ross, Gord
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import jax.numpy as jnp
@@ -20,7 +21,7 @@ from cuelearner_jax.guidance.fitting import fit_least_squares, lessons
 from cuelearner_jax.guidance.kind import Kind
 from cuelearner_jax.guidance.questions import about_refined
 from cuelearner_jax.guidance.refining import Refined
-from cuelearner_jax.types import GuidanceModel, Label, Params
+from cuelearner_jax.types import GuidanceModel, Label
 
 
 def make(sizes: GuideSizes, spaces: Spaces) -> Guidance:
@@ -35,11 +36,10 @@ def make(sizes: GuideSizes, spaces: Spaces) -> Guidance:
         return label.answer
 
     def fit(key: PRNGKeyArray, env: Any, labels: Label, former: GuidanceModel, scalars: GuideScalars) -> GuidanceModel:
-        def predict(params: Params, obs: Array, actions: Array) -> Array:
-            return policy.vectors(env, params, obs, actions)
-
-        rows = lessons(labels, target, scalars)
-        return fit_least_squares(key, env, rows, scalars, init=policy.init, apply=predict, sizes=sizes)
+        rows, predict = lessons(labels, target, scalars), partial(policy.vectors, env)
+        return fit_least_squares(
+            key, rows, scalars, init=policy.init, apply=predict, sizes=sizes, redrawn=policy.seen_again
+        )
 
     def act(
         model: GuidanceModel,

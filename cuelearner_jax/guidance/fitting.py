@@ -11,7 +11,6 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Key, PRNGKeyArray
 
 from cuelearner_jax.config import GuideScalars, GuideSizes
-from cuelearner_jax.environment import Environment, random_symmetries
 from cuelearner_jax.guidance.bundle import TargetFunction
 from cuelearner_jax.types import GuidanceModel, Label, Params
 
@@ -48,25 +47,27 @@ def _subset(valid: Bool[Array, " labels"]) -> Callable[[PRNGKeyArray, int], jax.
 
 def fit_least_squares(
     key: PRNGKeyArray,
-    env: Environment | None,
     rows: Lesson,
     scalars: GuideScalars,
     *,
     init: Callable[[PRNGKeyArray], Params],
     apply: Callable[[Params, jax.Array, jax.Array], jax.Array],
     sizes: GuideSizes,
+    redrawn: Callable[[PRNGKeyArray, Lesson], Lesson] = lambda key, batch: batch,
 ) -> GuidanceModel:
     """Fits a model from scratch by least squares (paper, Eq. 3) and keeps the parameters that validated best.
 
-    A fixed number of Adam steps, so that vmapped seeds take equally long. Lessons are multiplied by the environment's
-    symmetries where it offers them (a target is then a vector like an action). With fewer than five nothing validates:
-    the last parameters are kept. A fit that diverged before anything validated gives parameters that are NaN.
+    A fixed number of Adam steps, so that vmapped seeds take equally long. With fewer than five nothing validates: the
+    last parameters are kept. A fit that diverged before anything validated gives parameters that are NaN.
+
+    Lessons are never multiplied by an environment's symmetries: what a teacher would answer in the mirror image is its
+    own choice where several actions are as good, and mostly another than the mirror image of its answer.
 
     Args:
-        env: whose symmetries they are; None: there is none, and nothing multiplies them.
         rows: lessons (slots, ...), of which the valid ones count.
         init: parameters from a key.
         apply: (params, obs (n, obs), actions (n, action)) -> predictions (n, outputs).
+        redrawn: (key, batch (n, ...) of lessons) -> what to train on in its place; validation lessons stay.
 
     Returns:
         The model; its `fitted` is False if there was no valid label to train on.
@@ -84,11 +85,8 @@ def fit_least_squares(
 
     def step(carry: tuple[Params, optax.OptState], key: PRNGKeyArray) -> tuple[tuple[Params, optax.OptState], None]:
         params, opt_state = carry
-        key_draw, key_mirror = jax.random.split(key)
-        batch = jax.tree.map(lambda leaf: leaf[draw(key_draw, sizes.fit_batch_size)], rows)
-        image = random_symmetries(key_mirror, env, sizes.fit_batch_size)
-        (obs, action), (_, target) = image(batch.obs, batch.action), image(batch.obs, batch.target)
-        batch = batch.replace(obs=obs, action=action, target=target)
+        key_draw, key_redraw = jax.random.split(key)
+        batch = redrawn(key_redraw, jax.tree.map(lambda leaf: leaf[draw(key_draw, sizes.fit_batch_size)], rows))
         updates, opt_state = adam.update(jax.grad(loss)(params, batch), opt_state, params)
         return (optax.apply_updates(params, updates), opt_state), None
 

@@ -7,6 +7,7 @@ alone may never see one: a share `explored_fraction` of the questions stays abou
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import jax
@@ -14,29 +15,27 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from cuelearner_jax.agent.choice import greedy_actions
-from cuelearner_jax.agent.networks import applied, q_network
 from cuelearner_jax.config import AgentSizes, GuideScalars, GuideSizes
 from cuelearner_jax.environment import Spaces
 from cuelearner_jax.guidance.answers import SCALAR
 from cuelearner_jax.guidance.bundle import Guidance
 from cuelearner_jax.guidance.fitting import fit_least_squares, lessons
 from cuelearner_jax.guidance.kind import Kind
+from cuelearner_jax.guidance.model import guide_model
 from cuelearner_jax.guidance.questions import about_refined
 from cuelearner_jax.guidance.refining import Refined
-from cuelearner_jax.types import GuidanceModel, Label, Params
+from cuelearner_jax.types import GuidanceModel, Label
 
 
 def make(sizes: GuideSizes, spaces: Spaces) -> Guidance:
     """The bundle for an environment's spaces."""
     space = spaces.actions
-    searched = AgentSizes(q_layers=sizes.feedback_layers, directions=sizes.guide_directions)
-    network = q_network(sizes.feedback_layers)
-
-    def init_params(key: PRNGKeyArray) -> Params:
-        return network.init(key, jnp.zeros(spaces.obs_size), jnp.zeros(space.size))
+    network = guide_model(sizes, spaces, 1)
+    # The argmax is the agent's own, of a network of these layers in this frame.
+    searched = AgentSizes(sizes.frame, sizes.feedback_layers, sizes.guide_directions)
 
     def init(key: PRNGKeyArray) -> GuidanceModel:
-        return GuidanceModel(init_params(key), jnp.array(False))
+        return GuidanceModel(network.init(key), jnp.array(False))
 
     def target(label: Label, scalars: GuideScalars) -> Float[Array, "1"]:
         """Whether it was called good."""
@@ -44,8 +43,8 @@ def make(sizes: GuideSizes, spaces: Spaces) -> Guidance:
 
     def fit(key: PRNGKeyArray, env: Any, labels: Label, former: GuidanceModel, scalars: GuideScalars) -> GuidanceModel:
         rows = lessons(labels, target, scalars)
-        # No symmetries: what is predicted is no vector of the world.
-        return fit_least_squares(key, None, rows, scalars, init=init_params, apply=applied(network), sizes=sizes)
+        predict = partial(network.predict, env)
+        return fit_least_squares(key, rows, scalars, init=network.init, apply=predict, sizes=sizes)
 
     def act(
         model: GuidanceModel,
@@ -56,7 +55,7 @@ def make(sizes: GuideSizes, spaces: Spaces) -> Guidance:
         scalars: GuideScalars,
     ) -> Refined:
         guided = active & model.fitted
-        chosen = greedy_actions(searched, space, model.params, obs)
+        chosen = greedy_actions(searched, space, env, model.params, obs)
         return Refined(jnp.where(guided[:, None], chosen, actions), guided.astype(jnp.int32))
 
     about_chosen = about_refined(act)

@@ -24,15 +24,15 @@ KEY = jax.random.key(3)
 
 
 @cache
-def compiled(kind):
+def compiled(kind, frame="raw"):
     """A kind's bundle, its `fit` and its `act`."""
-    bundle = registry.make(kind, SIZES, ENV)
+    bundle = registry.make(kind, dataclasses.replace(SIZES, frame=frame), ENV)
     return bundle, jax.jit(bundle.fit), jax.jit(bundle.act)
 
 
-def taught(kind, rounds, scalars=SCALARS):
+def taught(kind, rounds, scalars=SCALARS, frame="raw"):
     """A guide after rounds of ten questions about its own choices, uniform actions before there is a model."""
-    bundle = registry.make(kind, SIZES, ENV)
+    bundle = compiled(kind, frame)[0]
     label_round = jax.jit(partial(asking.label_round, bundle, SIZES))
     guide = asking.start(bundle, ENV, 10 * rounds, 10 * rounds, jax.random.key(1), jax.random.key(2))
     for number in range(rounds):
@@ -40,9 +40,9 @@ def taught(kind, rounds, scalars=SCALARS):
     return guide
 
 
-def errors(kind, model, base=BEST, scalars=SCALARS):
+def errors(kind, model, base=BEST, scalars=SCALARS, frame="raw"):
     """Degrees from the best direction in each context, under guidance of base actions."""
-    acted = compiled(kind)[2](model, ENV, OBS, base, jnp.ones(4, bool), scalars).actions
+    acted = compiled(kind, frame)[2](model, ENV, OBS, base, jnp.ones(4, bool), scalars).actions
     return np.degrees(actions.distance(BEST, acted))
 
 
@@ -57,10 +57,11 @@ def drawn(count):
     return OBS[jax.random.randint(k_context, (count,), 0, 4)], actions.uniform(k_action, (count,))
 
 
-def test_demonstrations_are_cloned_and_replace_whatever_the_agent_would_do():
-    guide = taught("demonstration", 3)
-    assert errors("demonstration", guide.model).max() < 2
-    np.testing.assert_allclose(errors("demonstration", guide.model, base=-BEST), errors("demonstration", guide.model))
+@pytest.mark.parametrize(("frame", "rounds", "within"), [("raw", 3, 2), ("action", 6, 10)])
+def test_demonstrations_are_cloned_and_replace_whatever_the_agent_would_do(frame, rounds, within):
+    guide = taught("demonstration", rounds, frame=frame)
+    for base in (BEST, -BEST, actions.rotate(BEST, 1.0)):
+        assert errors("demonstration", guide.model, base, frame=frame).max() < within
     asked = np.degrees(actions.distance(jax.vmap(ENV.best)(guide.labels.obs), guide.labels.action))
     assert asked[:10].max() > 60  # uniform
     assert np.median(asked[20:]) < 20  # about the policy itself, once there is one
