@@ -52,7 +52,7 @@ def asked_one_by_one(guide, number, base, scalars, env=ENV, teacher=EXPERT):
 def test_asking_one_by_one_is_bitwise_a_round(base):
     rounds = typed = begun(budget=17)
     for number in range(2):
-        rounds = label_round(ENV, EXPERT, FAULTY, base, rounds, LANE_KEY, jnp.asarray(number))
+        rounds = label_round(ENV, EXPERT, FAULTY, base, rounds, LANE_KEY)
         typed = asked_one_by_one(typed, number, base, FAULTY)
         chex.assert_trees_all_equal(typed, rounds)
     valid = np.asarray(rounds.labels.valid)
@@ -66,20 +66,20 @@ def test_a_lanes_round_in_the_training_program_is_this_round_of_uniform_actions(
     state = probes.start(program, [3], [2 * ROUND])
     guide, key = jax.tree.map(lambda leaf: jnp.copy(leaf[0]), (state.guide, state.key))
     clock = start_clock()
-    for number in range(2):
+    for _ in range(2):
         clock, state = program.label_round(ENV, EXPERT, FAULTY, clock, state)
-        guide = label_round(ENV, EXPERT, FAULTY, Uniform(), guide, key, jnp.asarray(number))
+        guide = label_round(ENV, EXPERT, FAULTY, Uniform(), guide, key)
     chex.assert_trees_all_equal(probes.lane(state.guide, 0), jax.tree.map(np.asarray, guide))
 
 
 def test_questions_are_about_what_the_base_policy_does():
     for base, turn in ((Heuristic(ENV), -1.0), (Taught(EXPERT), 0.6)):
-        labels = label_round(ENV, EXPERT, probes.SCALARS, base, begun(), LANE_KEY, jnp.asarray(0)).labels
+        labels = label_round(ENV, EXPERT, probes.SCALARS, base, begun(), LANE_KEY).labels
         np.testing.assert_allclose(actions.difference(labels.obs, labels.action)[:ROUND], turn, atol=1e-5)
         assert len(np.unique(np.asarray(labels.obs)[:ROUND], axis=0)) > 1
         # 1.6 rad short of the best direction, or right there.
         assert set(np.asarray(labels.answer)[:ROUND, 0]) == {1.0 if turn < 0 else 0.0}
-    uniform = label_round(ENV, EXPERT, probes.SCALARS, Uniform(), begun(), LANE_KEY, jnp.asarray(0)).labels
+    uniform = label_round(ENV, EXPERT, probes.SCALARS, Uniform(), begun(), LANE_KEY).labels
     keys = [asking.question_keys(LANE_KEY, position).base for position in range(ROUND)]
     drawn = np.concatenate([actions.uniform(key, (1,)) for key in keys])
     np.testing.assert_allclose(uniform.action[:ROUND], drawn, atol=1e-6)
@@ -121,7 +121,8 @@ def test_an_answer_stands_in_its_row_and_changes_nothing_else():
     others = np.arange(2 * ROUND) != 3
     rest = [jax.tree.map(lambda leaf: np.asarray(leaf)[others], one.labels) for one in (told, guide)]
     chex.assert_trees_all_equal(*rest)
-    chex.assert_trees_all_equal(told.replace(labels=None), guide.replace(labels=None))
+    assert int(told.asked) == 4  # questions with the numbers 0 to 3
+    chex.assert_trees_all_equal(told.replace(labels=None, asked=0), guide.replace(labels=None, asked=0))
 
 
 def test_answers_past_the_budget_do_not_count():
@@ -130,8 +131,8 @@ def test_answers_past_the_budget_do_not_count():
         guide = record(guide, position, jnp.array([1.0, 0.0]), jnp.array([1.0]), True)
     assert np.asarray(guide.labels.valid).tolist() == [True] * 4 + [False] * (ROUND - 4)
     # The round beyond a spent budget leaves everything as it is, the model too.
-    spent = label_round(ENV, EXPERT, probes.SCALARS, Uniform(), begun(budget=ROUND), LANE_KEY, jnp.asarray(0))
-    after = label_round(ENV, EXPERT, probes.SCALARS, Uniform(), spent, LANE_KEY, jnp.asarray(1))
+    spent = label_round(ENV, EXPERT, probes.SCALARS, Uniform(), begun(budget=ROUND), LANE_KEY)
+    after = label_round(ENV, EXPERT, probes.SCALARS, Uniform(), spent, LANE_KEY)
     chex.assert_trees_all_equal(after, spent)
 
 
@@ -146,7 +147,7 @@ def test_questions_without_an_answer_do_not_count():
 
 
 def test_answers_that_do_not_count_teach_nothing():
-    guide = label_round(ENV, EXPERT, probes.SCALARS, Uniform(), begun(budget=ROUND + 2), LANE_KEY, jnp.asarray(0))
+    guide = label_round(ENV, EXPERT, probes.SCALARS, Uniform(), begun(budget=ROUND + 2), LANE_KEY)
     position = ROUND + 1
     one, other = (record(guide, position, jnp.array([1.0, 0.0]), jnp.array([h]), False) for h in (1.0, -1.0))
     fits = [fit(ENV, probes.SCALARS, told, LANE_KEY, jnp.asarray(1)).model for told in (one, other)]
@@ -161,14 +162,15 @@ def test_each_question_and_each_fit_has_random_numbers_of_its_own():
     drawn = [asking.question_keys(LANE_KEY, position) for position in range(3)]
     words = {tuple(np.asarray(jax.random.key_data(key)).tolist()) for keys in drawn for key in keys}
     assert len(words) == 3 * 4
-    guide = label_round(ENV, EXPERT, probes.SCALARS, Uniform(), begun(), LANE_KEY, jnp.asarray(0))
+    guide = label_round(ENV, EXPERT, probes.SCALARS, Uniform(), begun(), LANE_KEY)
     models = [fit(ENV, probes.SCALARS, guide, LANE_KEY, jnp.asarray(number)).model for number in (0, 0, 1)]
     chex.assert_trees_all_equal(models[0], models[1], guide.model)
     assert not np.array_equal(jax.tree.leaves(models[0].params)[1], jax.tree.leaves(models[2].params)[1])
 
 
 def test_labels_given_elsewhere_are_fitted_once():
-    labels = label_round(ENV, EXPERT, probes.SCALARS, Uniform(), begun(), LANE_KEY, jnp.asarray(0)).labels
+    labels = label_round(ENV, EXPERT, probes.SCALARS, Uniform(), begun(), LANE_KEY).labels
     taken = jax.jit(partial(asking.take_labels, RELATIVE))(ENV, probes.SCALARS, labels, begun(), LANE_KEY)
-    chex.assert_trees_all_equal(taken, fit(ENV, probes.SCALARS, begun().replace(labels=labels), LANE_KEY))
+    given = begun().replace(labels=labels, asked=begun().budget)
+    chex.assert_trees_all_equal(taken, fit(ENV, probes.SCALARS, given, LANE_KEY))
     assert bool(taken.model.fitted)
