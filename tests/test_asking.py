@@ -13,7 +13,7 @@ import pytest
 from cuelearner_jax import actions, asking
 from cuelearner_jax.guidance import registry as guidances
 from cuelearner_jax.loop import start_clock
-from cuelearner_jax.policies import Heuristic, Taught, Uniform
+from cuelearner_jax.policies import Agent, Heuristic, Taught, Uniform
 
 ENV, EXPERT = probes.Window(), probes.Expert(probes.Window())
 RELATIVE = guidances.make("relative", probes.SIZES, ENV)
@@ -174,3 +174,59 @@ def test_labels_given_elsewhere_are_fitted_once():
     given = begun().replace(labels=labels, asked=begun().budget)
     chex.assert_trees_all_equal(taken, fit(ENV, probes.SCALARS, given, LANE_KEY))
     assert bool(taken.model.fitted)
+
+
+# Instalments.
+
+
+def test_instalments_are_equal_up_to_whole_rounds_and_end_with_the_budget():
+    shares = lambda budget, count: [asking.share(budget, i, count, probes.SIZES) for i in range(count)]  # noqa: E731
+    assert shares(100, 1) == [100]
+    assert shares(35, 1) == [35]
+    assert shares(100, 2) == [50, 100]
+    assert shares(100, 4) == [30, 50, 80, 100]
+    assert shares(25, 2) == [20, 25]
+    for budget in range(21, 200):
+        found = np.diff([0, *shares(budget, 3)])
+        assert found.sum() == budget
+        assert found.min() > 0
+        rounds = -(-found // ROUND)
+        assert rounds.max() - rounds.min() <= 1
+
+
+def test_a_guide_asks_until_its_instalment_is_done_and_then_waits():
+    guide = begun(budget=2 * ROUND)
+    one = label_round(ENV, EXPERT, probes.SCALARS, Uniform(), guide, LANE_KEY, jnp.asarray(ROUND))
+    waited = label_round(ENV, EXPERT, probes.SCALARS, Uniform(), one, LANE_KEY, jnp.asarray(ROUND))
+    chex.assert_trees_all_equal(waited, one)
+    assert int(one.asked) == int(one.labels.valid.sum()) == ROUND
+    # What it has waited for changes nothing: it goes on as if it had asked all at once.
+    done = label_round(ENV, EXPERT, probes.SCALARS, Uniform(), waited, LANE_KEY, jnp.asarray(2 * ROUND))
+    at_once = guide
+    for _ in range(2):
+        at_once = label_round(ENV, EXPERT, probes.SCALARS, Uniform(), at_once, LANE_KEY, jnp.asarray(2 * ROUND))
+    chex.assert_trees_all_equal(done, at_once)
+    assert int(done.asked) == 2 * ROUND
+
+
+def test_later_questions_are_about_the_agents_greedy_actions_refined_within_the_bound():
+    program = probes.window_program("relative", 2 * ROUND)
+    clock, state = start_clock(), probes.start(program, [3, 4], [2 * ROUND, 15])
+    clock, state = program.label_round(ENV, EXPERT, probes.SCALARS, clock, state, jnp.array([ROUND, ROUND]))
+    assert np.asarray(state.guide.labels.valid).sum(1).tolist() == [ROUND, ROUND]
+    first = jax.tree.map(np.asarray, state.guide.labels)
+    bounded = dataclasses.replace(probes.SCALARS, ask_bound_deg=7.0)
+    plain = dataclasses.replace(bounded, refined_fraction=0.0)
+    params = jax.tree.map(jnp.copy, state.agent.params)
+    for scalars, turned in ((plain, False), (bounded, True)):
+        kept = jax.tree.map(jnp.copy, state)
+        _, later = program.label_round(ENV, EXPERT, scalars, clock, kept, state.guide.budget, own=True)
+        for lane, budget in enumerate((2 * ROUND, 15)):
+            labels, before = probes.lane(later.guide.labels, lane), probes.lane(first, lane)
+            assert labels.valid.tolist() == [True] * budget + [False] * (2 * ROUND - budget)  # never past the budget
+            chex.assert_trees_all_equal(*(jax.tree.map(lambda leaf: leaf[:ROUND], one) for one in (labels, before)))
+            greedy = Agent(probes.lane(params, lane), probes.SIZES).act(LANE_KEY, None, labels.obs[ROUND:])
+            away = np.degrees(np.abs(actions.difference(greedy, labels.action[ROUND:])))
+            assert away.max() <= 7.0 + 1e-3
+            assert (away.max() > 1.0) == turned
+        assert later.guide.asked.tolist() == [2 * ROUND, 15]
