@@ -225,7 +225,7 @@ def test_later_questions_are_about_the_agents_greedy_actions_refined_within_the_
             labels, before = probes.lane(later.guide.labels, lane), probes.lane(first, lane)
             assert labels.valid.tolist() == [True] * budget + [False] * (2 * ROUND - budget)  # never past the budget
             chex.assert_trees_all_equal(*(jax.tree.map(lambda leaf: leaf[:ROUND], one) for one in (labels, before)))
-            greedy = Agent(probes.lane(params, lane), probes.SIZES).act(LANE_KEY, None, labels.obs[ROUND:])
+            greedy = Agent(probes.lane(params, lane), probes.SIZES).act(LANE_KEY, None, jnp.asarray(labels.obs[ROUND:]))
             away = np.degrees(np.abs(actions.difference(greedy, labels.action[ROUND:])))
             assert away.max() <= 7.0 + 1e-3
             assert (away.max() > 1.0) == turned
