@@ -167,7 +167,7 @@ class Lane(NamedTuple):
         """
         base, bound = Uniform(self.learner.actions), None
         if params is not None:
-            base, bound = Agent(params, self.sizes, self.learner.actions), scalars.radians("ask_bound")
+            base, bound = Agent(params, self.sizes, self.learner.actions, env), scalars.radians("ask_bound")
         guide = asking.label_round(
             self.guidance, self.sizes, env, teacher, scalars, base, state.guide, state.key, until, bound
         )
