@@ -10,7 +10,7 @@ import numpy as np
 import probes
 import pytest
 
-from cuelearner_jax import actions, asking
+from cuelearner_jax import actions, asking, loop
 from cuelearner_jax.guidance import registry as guidances
 from cuelearner_jax.loop import start_clock
 from cuelearner_jax.policies import Agent, Heuristic, Taught, Uniform
@@ -230,3 +230,17 @@ def test_later_questions_are_about_the_agents_greedy_actions_refined_within_the_
             assert away.max() <= 7.0 + 1e-3
             assert (away.max() > 1.0) == turned
         assert later.guide.asked.tolist() == [2 * ROUND, 15]
+
+
+def test_guided_episodes_keep_to_the_bound_once_there_are_labels_about_the_agents_own_actions():
+    config = probes.config(scalars={"ask_bound_deg": 9.0}, schedule={"ask_at": (0, 16)})
+    lane = loop.make_lane(config, guidances.make("heuristic", config.sizes, ENV), ENV, 0)
+    state = jax.tree.map(lambda leaf: leaf[0], probes.start(probes.window_program("heuristic"), [3], [0]))
+    state = state.replace(agent=state.agent.replace(guided=jnp.array([True, True, False, True])))
+    base = actions.rotate(state.agent.obs, 0.5)  # 1.5 rad from the heuristic's
+    one = dataclasses.replace(config.schedule, ask_at=(0,))
+    for schedule, step, away in ((config.schedule, 15, 1.5), (config.schedule, 16, np.deg2rad(9.0)), (one, 16, 1.5)):
+        clock = start_clock().replace(step=jnp.asarray(step))
+        found = lane.guide(ENV, config.scalars, schedule, clock, state, base)
+        turned = np.abs(actions.difference(base, found.actions))
+        np.testing.assert_allclose(turned, [away, away, 0, away], atol=1e-5)

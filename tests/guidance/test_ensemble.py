@@ -57,18 +57,6 @@ def test_members_that_are_the_same_predict_what_one_does_and_do_not_disagree():
     assert single.disagreement is None
 
 
-def test_each_member_is_fitted_by_itself_from_numbers_of_its_own():
-    several = registry.make("relative", FOUR, ENV)
-    guide = begun(several, FOUR)
-    guide = asking.label_round(
-        several, FOUR, ENV, probes.Expert(ENV), probes.SCALARS, Uniform(), guide, jax.random.key(3)
-    )
-    assert bool(guide.model.fitted)
-    chex.assert_tree_shape_prefix(guide.model.params, (4,))
-    for kernel in (leaf for leaf in jax.tree.leaves(guide.model.params) if leaf.ndim == 3):
-        assert all(not np.array_equal(kernel[i], kernel[j]) for i in range(4) for j in range(i))
-
-
 # Which question.
 
 
@@ -103,18 +91,20 @@ def test_the_candidate_is_asked_about_on_which_members_disagree_most_and_all_wal
         chex.assert_trees_all_equal((after.env, after.obs), (states, steps.obs))
 
 
-def test_rounds_of_chosen_questions_fill_the_budget():
+def test_rounds_of_chosen_questions_fill_the_budget_and_fit_each_member_from_numbers_of_its_own():
     several = registry.make("relative", CHOOSING, ENV)
-    guide, expert = begun(several, CHOOSING, budget=15), probes.Expert(ENV)
+    guide, expert, key = begun(several, CHOOSING, budget=15), probes.Expert(ENV), jax.random.key(3)
     one = jax.jit(
-        lambda guide: asking.label_round(
-            several, CHOOSING, ENV, expert, probes.SCALARS, Uniform(), guide, jax.random.key(3)
-        )
+        lambda guide: asking.label_round(several, CHOOSING, ENV, expert, probes.SCALARS, Uniform(), guide, key)
     )
     for _ in range(2):
         guide = one(guide)
     assert np.asarray(guide.labels.valid).tolist() == [True] * 15 + [False] * 5
     assert int(guide.asked) == 15
+    assert bool(guide.model.fitted)
+    chex.assert_tree_shape_prefix(guide.model.params, (4,))
+    for kernel in (leaf for leaf in jax.tree.leaves(guide.model.params) if leaf.ndim == 3):
+        assert all(not np.array_equal(kernel[i], kernel[j]) for i in range(4) for j in range(i))
 
 
 def test_kinds_of_one_model_are_refused_where_members_are_wanted(monkeypatch):
