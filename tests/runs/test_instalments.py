@@ -163,37 +163,37 @@ def test_budgets_are_exact_and_labels_of_earlier_instalments_stay(whole):
     assert len(file.seeds) == 40  # every answer counts, and none is past the budget
 
 
-@pytest.mark.parametrize("when", ["before the second instalment", "within it", "at its end"])
-def test_a_run_goes_on_from_the_middle_of_its_instalments(whole, tmp_path, when):
-    out = tmp_path / "run"
-    if when == "before the second instalment":
-        with stopping_at(4), pytest.raises(Interrupted, match="stopped at step 32"):
-            run(out)
-    elif when == "within it":
-        with stopping_at(5), pytest.raises(Interrupted, match="stopped at step 32"):
-            run(out)
-        assert not (out / "relative" / label_files.PARQUET).exists()
-    else:  # its last round was asked and its row written, but no checkpoint tells
-        with killed_instead_of_save(6):
-            run(out)
-        rounds = tables.read(out / "relative" / guides.JSONL, guides.SCHEMA)["round"].to_pylist()
-        assert max(rounds) == 4
-    run(out, resume=True)
+def assert_same_run(out, whole):
     assert rows(results.read(out)) == rows(results.read(whole))
     assert rows(guides.read_guides(out)) == rows(guides.read_guides(whole))
     mine, theirs = (label_files.read(folder / "relative" / label_files.PARQUET).labels for folder in (out, whole))
     np.testing.assert_array_equal(mine.action, theirs.action)
 
 
-def test_a_lost_row_of_the_guides_is_missed(whole, tmp_path):
+def test_a_run_goes_on_from_the_end_of_an_instalment_that_no_checkpoint_tells_of(whole, tmp_path):
     out = tmp_path / "run"
-    with stopping_at(5), pytest.raises(Interrupted):
+    with stopping_at(4), pytest.raises(Interrupted, match="stopped at step 32"):  # before the second one
+        run(out)
+    with killed_instead_of_save(2):  # its last round was asked and its row written
+        run(out, resume=True)
+    assert max(tables.read(out / "relative" / guides.JSONL, guides.SCHEMA)["round"].to_pylist()) == 4
+    assert not (out / "relative" / label_files.PARQUET).exists()
+    run(out, resume=True)
+    assert_same_run(out, whole)
+
+
+def test_a_run_goes_on_from_the_middle_of_an_instalment_and_misses_rows_that_were_lost(whole, tmp_path):
+    out = tmp_path / "run"
+    with stopping_at(5), pytest.raises(Interrupted, match="stopped at step 32"):
         run(out)
     file = out / "relative" / guides.JSONL
-    lines = file.read_text().splitlines(keepends=True)
-    file.write_text("".join(lines[:-1]))
+    told = file.read_text()
+    file.write_text("".join(told.splitlines(keepends=True)[:-1]))
     with pytest.raises(UserError, match="lacks rows: 1, the first of seed 3 with 40 labels after 30 of them"):
         run(out, resume=True)
+    file.write_text(told)
+    run(out, resume=True)
+    assert_same_run(out, whole)
 
 
 def test_runs_that_ask_nothing_have_no_table_of_guides(tmp_path):
