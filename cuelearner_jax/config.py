@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import itertools
 import json
 import math
 from dataclasses import dataclass
@@ -91,6 +92,10 @@ class GuideSizes(_Seeing):
     """Directions over which a guide that values actions takes its argmax."""
     replay_steps: int = 5
     """Gradient steps on earlier corrections after each new one, of a guide that goes on learning (deep COACH)."""
+    ensemble: int = 1
+    """Members of the guidance model, each fitted to all labels; it predicts their mean."""
+    candidates: int = 1
+    """Situations among which each question is chosen: where the members disagree most (1: as they come)."""
 
 
 @dataclass(frozen=True)
@@ -153,6 +158,8 @@ class GuideScalars(_Degrees, _Clipping):
     """Share of the questions that a guide which values actions asks about base actions even so, to find good ones."""
     correction_replay: int = 50
     """Newest corrections that a guide which goes on learning (deep COACH) keeps learning from."""
+    ask_bound_deg: float = 180.0
+    """From the second instalment on: questions and guided episodes stay within this of the agent's own action [deg]."""
     guided_probability: float = 0.5
     """Probability that an episode is guided."""
 
@@ -216,6 +223,11 @@ class Schedule:
     """Environments that share an evaluation's steps."""
     checkpoint_every: int = 1_000_000
     """Steps between two checkpoints, which is what a killed run may lose."""
+    ask_at: tuple[int, ...] = (0,)
+    """Steps before which an equal instalment of the labels is asked for, the first 0: about uniform actions; later
+    ones about the agent's own."""
+    guide_eval_every: int = 0
+    """Labels between two evaluations of the guide alone (0: after each instalment alone)."""
 
 
 for _traced in (AgentScalars, GuideScalars, TeacherFaults, Scalars, Schedule):
@@ -269,6 +281,34 @@ def check(config: RunConfig) -> None:
     _check_multiple(schedule.total_steps, schedule.eval_every, "schedule.total_steps", "schedule.eval_every")
     _check_multiple(schedule.checkpoint_every, schedule.eval_every, "schedule.checkpoint_every", "schedule.eval_every")
     _check_multiple(schedule.eval_steps, schedule.eval_envs, "schedule.eval_steps", "schedule.eval_envs")
+    _check_asking(config)
+
+
+def _check_asking(config: RunConfig) -> None:
+    """When labels are asked for, and when the guide is looked at."""
+    schedule, scalars = config.schedule, config.scalars
+    given = f"schedule.ask_at is {' '.join(map(str, schedule.ask_at)) or 'empty'}"
+    if schedule.ask_at[:1] != (0,) or any(b <= a for a, b in itertools.pairwise(schedule.ask_at)):
+        raise UserError(f"{given}: give steps in ascending order, the first of them 0")
+    for step in schedule.ask_at:
+        _check_multiple(step, schedule.eval_every, "schedule.ask_at", "schedule.eval_every")
+    later = schedule.ask_at[1:]
+    if later and later[-1] >= min(schedule.guidance_until, schedule.total_steps):
+        end = "guidance_until" if schedule.guidance_until <= schedule.total_steps else "total_steps"
+        raise UserError(
+            f"{given}: give steps below schedule.{end} ({getattr(schedule, end)}), after which no guide acts"
+        )
+    if not 0 < scalars.ask_bound_deg <= 180:
+        raise UserError(f"scalars.ask_bound_deg is {scalars.ask_bound_deg}: give an angle above 0 and up to 180")
+    if not later and scalars.ask_bound_deg < 180:
+        raise UserError(
+            f"scalars.ask_bound_deg is {scalars.ask_bound_deg}, which bounds later instalments, and there is but one: "
+            "add steps to schedule.ask_at, or leave it out"
+        )
+    if schedule.guide_eval_every < 0:
+        raise UserError(f"schedule.guide_eval_every is {schedule.guide_eval_every}: give a number that is not negative")
+    unit = config.sizes.labels_per_round
+    _check_multiple(schedule.guide_eval_every, unit, "schedule.guide_eval_every", "sizes.labels_per_round")
 
 
 def check_whole(group: Any, prefix: str) -> None:
@@ -309,8 +349,13 @@ def check_guide(sizes: GuideSizes, scalars: GuideScalars) -> None:
     """Raises UserError with one line for the first value of a guide's that cannot work."""
     check_whole(sizes, "sizes")
     check_whole(scalars, "scalars")
-    positive = ("labels_per_round", "fit_steps", "fit_batch_size", "validate_every", "guide_directions", "replay_steps")
-    _check_positive(sizes, positive)
+    positive = ("labels_per_round", "fit_steps", "fit_batch_size", "validate_every", "ensemble", "candidates")
+    _check_positive(sizes, (*positive, "guide_directions", "replay_steps"))
+    if sizes.candidates > 1 and sizes.ensemble == 1:
+        raise UserError(
+            f"sizes.candidates is {sizes.candidates}: questions are chosen by the disagreement of members, so give a "
+            "sizes.ensemble above 1 too"
+        )
     if sizes.labels_per_round > LARGEST_ROUND:
         raise UserError(f"sizes.labels_per_round is {sizes.labels_per_round}: give at most {LARGEST_ROUND}")
     _check_layers(sizes.feedback_layers, "sizes.feedback_layers")

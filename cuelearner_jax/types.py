@@ -110,8 +110,9 @@ class GuideState(struct.PyTreeNode):
     model: GuidanceModel
     labels: Label  # leading axis: slots, the largest budget of the sweep in whole rounds
     budget: Int[Array, ""]  # labels that this lane may use
-    env: EnvState
-    obs: Float[Array, " obs"]
+    asked: Int[Array, ""]  # questions so far that count within it, answered or not
+    env: EnvState  # leading axis: candidates, where each question is chosen among several situations
+    obs: Float[Array, "*candidates obs"]
 
 
 class AgentState(struct.PyTreeNode):

@@ -69,6 +69,23 @@ from cuelearner_jax.errors import UserError
         ("schedule", {"total_steps": 50}, "schedule.total_steps is 50: give a multiple of schedule.eval_every"),
         ("schedule", {"checkpoint_every": 24}, "schedule.checkpoint_every is 24: give a multiple"),
         ("schedule", {"eval_steps": 25}, "schedule.eval_steps is 25: give a multiple of schedule.eval_envs"),
+        ("sizes", {"ensemble": 0}, "sizes.ensemble is 0"),
+        ("sizes", {"candidates": 0}, "sizes.candidates is 0"),
+        ("sizes", {"candidates": 8}, "sizes.candidates is 8: questions are chosen by the disagreement of members"),
+        ("scalars", {"ask_bound_deg": 20.0}, "ask_bound_deg is 20.0, which bounds later instalments, and there is but"),
+        ("scalars", {"ask_bound_deg": 0.0}, "scalars.ask_bound_deg is 0.0: give an angle"),
+        ("schedule", {"ask_at": ()}, "schedule.ask_at is empty: give steps in ascending order, the first of them 0"),
+        ("schedule", {"ask_at": (16,)}, "schedule.ask_at is 16: give steps in ascending order, the first of them 0"),
+        ("schedule", {"ask_at": (0, 16, 16)}, "schedule.ask_at is 0 16 16: give steps in ascending order"),
+        ("schedule", {"ask_at": (0, 10)}, "schedule.ask_at is 10: give a multiple of schedule.eval_every (16)"),
+        ("schedule", {"ask_at": (0, 32)}, "schedule.ask_at is 0 32: give steps below schedule.guidance_until (24)"),
+        (
+            "schedule",
+            {"ask_at": (0, 48), "guidance_until": 100},
+            "schedule.ask_at is 0 48: give steps below schedule.total_steps (48)",
+        ),
+        ("schedule", {"guide_eval_every": -10}, "schedule.guide_eval_every is -10"),
+        ("schedule", {"guide_eval_every": 15}, "schedule.guide_eval_every is 15: give a multiple of sizes.labels"),
     ],
 )
 def test_values_that_cannot_work_are_refused(group, values, message):
@@ -113,11 +130,16 @@ def test_other_scalars_and_schedules_compile_nothing_again(group):
         traced.append(group)
         return sum(jax.tree.leaves(group))
 
-    values = {name: value for name, value in dataclasses.asdict(group).items() if not isinstance(value, str)}
-    assert float(total(group)) == pytest.approx(sum(values.values()))
-    for name, value in values.items():
-        other = dataclasses.replace(group, **{name: 2 * value + type(value)(1000)})
-        assert float(total(other)) == pytest.approx(sum(values.values()) + value + 1000)
+    before = sum(jax.tree.leaves(group))
+    assert float(total(group)) == pytest.approx(before)
+    for name, value in dataclasses.asdict(group).items():
+        if isinstance(value, str):  # a choice, which is compiled in
+            continue
+        several = isinstance(value, tuple)  # of which the number is fixed
+        (first, *rest) = value if several else (value,)
+        other = 2 * first + type(first)(1000)
+        changed = dataclasses.replace(group, **{name: (other, *rest) if several else other})
+        assert float(total(changed)) == pytest.approx(before + first + 1000)
     assert len(traced) == 1
     assert type(traced[0]) is type(group)
 

@@ -134,14 +134,14 @@ def ask(
     guidance = _relative(sizes, spaces_of(env))
     k_model, k_env, k_lane = jax.random.split(jax.random.key(seed), 3)
     slots = asking.label_slots(labels, sizes)
-    guide = asking.start(guidance, env, slots, labels, k_model, k_env)
+    guide = asking.start(guidance, env, slots, labels, k_model, k_env, sizes.candidates)
 
     @jax.jit
-    def one_round(env: Any, teacher: Teacher, base: Any, scalars: Scalars, guide: Any, number: jax.Array) -> Any:
-        return asking.label_round(guidance, sizes, env, teacher, scalars, base, guide, k_lane, number)
+    def one_round(env: Any, teacher: Teacher, base: Any, scalars: Scalars, guide: Any) -> Any:
+        return asking.label_round(guidance, sizes, env, teacher, scalars, base, guide, k_lane)
 
-    for number in range(slots // sizes.labels_per_round):
-        guide = one_round(env, teacher, base, scalars, guide, jnp.asarray(number))
+    for _ in range(slots // sizes.labels_per_round):
+        guide = one_round(env, teacher, base, scalars, guide)
     given = jax.device_get(guide.labels)
     asked = Labels(*(np.asarray(part)[given.valid] for part in (given.obs, given.action, given.answer[:, 0])))
     return FeedbackModel(guidance, _finite(guide.model), scalars, asked)

@@ -107,6 +107,17 @@ class ActFunction(Protocol):
         ...
 
 
+@runtime_checkable
+class DisagreementFunction(Protocol):
+    """How far the members of a model are apart."""
+
+    def __call__(
+        self, model: GuidanceModel, env: Any, obs: Float[Array, "n obs"], actions: Float[Array, "n action"]
+    ) -> Float[Array, " n"]:
+        """Of each row, not negative; 0 where they agree."""
+        ...
+
+
 class Guidance(NamedTuple):
     """One form of guidance for one lane: pure functions over an explicit model."""
 
@@ -117,6 +128,7 @@ class Guidance(NamedTuple):
     target: TargetFunction
     fit: FitFunction
     act: ActFunction
+    disagreement: DisagreementFunction | None = None  # None: its model has no members
 
     @property
     def asks(self) -> bool:

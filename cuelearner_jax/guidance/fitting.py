@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +13,7 @@ from jaxtyping import Array, Bool, Float, Key, PRNGKeyArray
 
 from cuelearner_jax.config import GuideScalars, GuideSizes
 from cuelearner_jax.guidance.bundle import TargetFunction
+from cuelearner_jax.guidance.ensemble import fitted_members
 from cuelearner_jax.types import GuidanceModel, Label, Params
 
 VALIDATION_STRIDE = 5  # every fifth label is a validation label: the 80/20 split of the paper's public code
@@ -65,13 +67,27 @@ def fit_least_squares(
 
     Args:
         rows: lessons (slots, ...), of which the valid ones count.
-        init: parameters from a key.
+        init: parameters from a key; with `sizes.ensemble` those of `ensemble`, whose members are fitted each by itself.
         apply: (params, obs (n, obs), actions (n, action)) -> predictions (n, outputs).
         redrawn: (key, batch (n, ...) of lessons) -> what to train on in its place; validation lessons stay.
 
     Returns:
         The model; its `fitted` is False if there was no valid label to train on.
     """
+    fit = partial(_fit_network, rows=rows, scalars=scalars, apply=apply, redrawn=redrawn, sizes=sizes)
+    return fitted_members(sizes.ensemble, fit, key, init)
+
+
+def _fit_network(
+    key: PRNGKeyArray,
+    init: Callable[[PRNGKeyArray], Params],
+    *,
+    rows: Lesson,
+    scalars: GuideScalars,
+    apply: Callable[[Params, jax.Array, jax.Array], jax.Array],
+    redrawn: Callable[[PRNGKeyArray, Lesson], Lesson],
+    sizes: GuideSizes,
+) -> GuidanceModel:
     held_out = (jnp.arange(rows.valid.shape[0]) % VALIDATION_STRIDE) == VALIDATION_STRIDE - 1
     validation = rows.valid & held_out
     training = rows.valid & ~held_out

@@ -44,7 +44,7 @@ def run(order: Order) -> None:
     with claimed(order.out), interruptible() as stopping, progress_bars() as bars:
         check_folder(order.out, plan.described, order.resume, order.overwrite)  # nobody else can change it any more
         for group in groups if order.resume else ():
-            check_standing(group, order.out / group.guidance.name)
+            check_standing(group, order.out / group.guidance.name, given=plan.labels is not None)
         prepare_folder(order.out, plan.described, order.overwrite and not order.resume)
         for group in groups:
             Runner(group, examined, order, plan.described, stopping, bars).run(teacher, plan.labels)

@@ -118,6 +118,7 @@ NAVIGATION = Task(
                     eval_steps=50_000,
                     eval_envs=250,
                     checkpoint_every=100_000,
+                    guide_eval_every=50,
                 ),
             ),
             labels=(100, 350, 500),
