@@ -80,6 +80,8 @@ class GuideSizes(_Seeing):
 
     feedback_layers: tuple[int, ...] = (400, 400, 300, 300)
     """Hidden layers of the guidance model."""
+    aim_layers: tuple[int, ...] = (32, 32)
+    """Hidden layers of a guidance model that weighs the task's aims: the same ones for every aim."""
     labels_per_round: int = 10
     """New labels after which the guidance model is fitted again from scratch."""
     fit_steps: int = 2000
@@ -359,6 +361,7 @@ def check_guide(sizes: GuideSizes, scalars: GuideScalars) -> None:
     if sizes.labels_per_round > LARGEST_ROUND:
         raise UserError(f"sizes.labels_per_round is {sizes.labels_per_round}: give at most {LARGEST_ROUND}")
     _check_layers(sizes.feedback_layers, "sizes.feedback_layers")
+    _check_layers(sizes.aim_layers, "sizes.aim_layers")
     _check_multiple(sizes.fit_steps, sizes.validate_every, "sizes.fit_steps", "sizes.validate_every")
     _check_numbers(scalars)
     if not 0 < scalars.eps_deg <= 180:

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from cuelearner_jax.actions import DIRECTIONS, Actions
 from cuelearner_jax.types import EnvState, Step
@@ -108,6 +108,26 @@ class OffersFeatures(Protocol):
         ...
 
 
+class Aims(NamedTuple):
+    """Actions that somebody may have in mind in a situation, as many in each; see `OffersAims`."""
+
+    actions: Float[Array, "aims action"]
+    features: Float[Array, "aims features"]  # what tells good ones from bad ones, of the order of one
+    possible: Bool[Array, " aims"]  # False: none of these, here
+
+
+@runtime_checkable
+class OffersAims(Protocol):
+    """An environment in which an action is about something: a ball and a pocket, say."""
+
+    def aims(self, obs: Float[Array, " obs"]) -> Aims:
+        """One aim for each thing that an action may be about.
+
+        In one order of things, which means nothing: one network with the same weights looks at each of them.
+        """
+        ...
+
+
 class Described:
     """Mixed into an environment: what follows from its `observation`."""
 
@@ -141,7 +161,7 @@ class WholeObservations(Described):
 
 
 def offers(env: Any, name: str) -> bool:
-    """Has an environment the optional member `name` (`heuristic`, `mirror`, `features`)?"""
+    """Has an environment the optional member `name` (`heuristic`, `mirror`, `features`, `aims`)?"""
     return getattr(env, name, None) is not None
 
 
@@ -156,15 +176,19 @@ class Spaces(NamedTuple):
     obs_size: int
     actions: Actions
     features: tuple[int, int] | None = None  # entries of `Features.own` and `Features.turned`, if it offers any
+    aims: int | None = None  # entries of one row of `Aims.features`, if it offers any
 
 
 def spaces_of(env: Any) -> Spaces:
     """An environment's; shapes in place of its arrays will do."""
-    obs_size, actions = env.obs_size, actions_of(env)
-    if not offers(env, "features"):
-        return Spaces(obs_size, actions)
-    seen = jax.eval_shape(lambda env: env.features(jnp.zeros(obs_size), jnp.zeros(actions.size)), env)
-    return Spaces(obs_size, actions, (seen.own.shape[-1], seen.turned.shape[-1]))
+    spaces = Spaces(env.obs_size, actions_of(env))
+    obs, action = jnp.zeros(spaces.obs_size), jnp.zeros(spaces.actions.size)
+    if offers(env, "features"):
+        seen = jax.eval_shape(lambda env: env.features(obs, action), env)
+        spaces = spaces._replace(features=(seen.own.shape[-1], seen.turned.shape[-1]))
+    if offers(env, "aims"):
+        spaces = spaces._replace(aims=jax.eval_shape(lambda env: env.aims(obs), env).features.shape[-1])
+    return spaces
 
 
 def symmetries_of(env: Any) -> int:

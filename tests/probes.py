@@ -16,7 +16,7 @@ from flax import struct
 
 from cuelearner_jax.actions import difference, evenly_spaced, from_angle, inward, rotate
 from cuelearner_jax.config import RunConfig, Scalars, Schedule, Sizes, digest
-from cuelearner_jax.environment import Features, Quantity, WholeObservations
+from cuelearner_jax.environment import Aims, Features, Quantity, WholeObservations
 from cuelearner_jax.guidance import registry as guidances
 from cuelearner_jax.loop import make_program
 from cuelearner_jax.task import Body, Task
@@ -62,6 +62,22 @@ class Window(WholeObservations, struct.PyTreeNode):
 
     def features(self, obs, action):
         return Features(obs, jnp.concatenate([inward(jnp.broadcast_to(obs, action.shape), action), action], axis=-1))
+
+
+class Aimed(Window):
+    """The bandit with four aims, told apart by where they lie from the context; its expert means the second.
+
+    The last is impossible.
+    """
+
+    order = (0, 1, 2, 3)
+    possible = (True, True, True, False)
+
+    def aims(self, obs):
+        turns = jnp.array((-1.0, 0.6, 2.5, -2.2))[jnp.array(self.order)]
+        found = from_angle(jnp.arctan2(obs[1], obs[0])[None] + turns)
+        features = jnp.stack([jnp.cos(turns), jnp.sin(turns), turns], -1)
+        return Aims(found, features, jnp.array(self.possible)[jnp.array(self.order)])
 
 
 class Chain(WholeObservations, struct.PyTreeNode):

@@ -36,7 +36,13 @@ ROWS = [
 ]
 ROW = {room: number for number, row in enumerate(ROWS) for room in row}
 FOR_TASKS = {"errors", "types", "actions", "environment"}  # what a task may know of the method
-KINDS = {"relative", "demonstration", "scalar", "dcoach"}  # of guidance ("heuristic" names a member and a policy too)
+KINDS = {
+    "relative",
+    "intent",
+    "demonstration",
+    "scalar",
+    "dcoach",
+}  # of guidance ("heuristic" names a member and a policy too)
 
 
 @cache

@@ -1,9 +1,10 @@
-"""Fitting a model to labels by least squares (paper, Eq. 3), whatever the form of their answers."""
+"""Fitting a model to labels, by least squares (paper, Eq. 3) or another loss, whatever the form of their answers."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -40,6 +41,14 @@ def optimizer(scalars: GuideScalars) -> optax.GradientTransformation:
     return optax.chain(optax.clip_by_global_norm(scalars.max_grad_norm), optax.adam(scalars.feedback_learning_rate))
 
 
+Redrawn = Callable[[PRNGKeyArray, Any], Any]  # (key, batch of rows) -> what to train on in its place
+
+
+def as_drawn(key: PRNGKeyArray, batch: Any) -> Any:
+    """The batch itself."""
+    return batch
+
+
 def _subset(valid: Bool[Array, " labels"]) -> Callable[[PRNGKeyArray, int], jax.Array]:
     """Sampler of indices, with replacement, among the true rows of `valid`."""
     order = jnp.argsort(~valid, stable=True)
@@ -55,26 +64,49 @@ def fit_least_squares(
     init: Callable[[PRNGKeyArray], Params],
     apply: Callable[[Params, jax.Array, jax.Array], jax.Array],
     sizes: GuideSizes,
-    redrawn: Callable[[PRNGKeyArray, Lesson], Lesson] = lambda key, batch: batch,
+    redrawn: Redrawn = as_drawn,
 ) -> GuidanceModel:
-    """Fits a model from scratch by least squares (paper, Eq. 3) and keeps the parameters that validated best.
-
-    A fixed number of Adam steps, so that vmapped seeds take equally long. With fewer than five nothing validates: the
-    last parameters are kept. A fit that diverged before anything validated gives parameters that are NaN.
+    """`fit_model` by least squares (paper, Eq. 3).
 
     Lessons are never multiplied by an environment's symmetries: what a teacher would answer in the mirror image is its
     own choice where several actions are as good, and mostly another than the mirror image of its answer.
 
     Args:
-        rows: lessons (slots, ...), of which the valid ones count.
-        init: parameters from a key; with `sizes.ensemble` those of `ensemble`, whose members are fitted each by itself.
+        key, rows, scalars, init, sizes, redrawn: as `fit_model` has them.
         apply: (params, obs (n, obs), actions (n, action)) -> predictions (n, outputs).
-        redrawn: (key, batch (n, ...) of lessons) -> what to train on in its place; validation lessons stay.
+    """
+
+    def errors(params: Params, rows: Lesson) -> Float[Array, " n"]:
+        return jnp.sum(jnp.square(apply(params, rows.obs, rows.action) - rows.target), -1)
+
+    return fit_model(key, rows, scalars, init=init, losses=errors, sizes=sizes, redrawn=redrawn)
+
+
+def fit_model(
+    key: PRNGKeyArray,
+    rows: Any,
+    scalars: GuideScalars,
+    *,
+    init: Callable[[PRNGKeyArray], Params],
+    losses: Callable[[Params, Any], Float[Array, " n"]],
+    sizes: GuideSizes,
+    redrawn: Redrawn = as_drawn,
+) -> GuidanceModel:
+    """Fits a model from scratch and keeps the parameters that validated best.
+
+    A fixed number of Adam steps, so that vmapped seeds take equally long. With fewer than five nothing validates: the
+    last parameters are kept. A fit that diverged before anything validated gives parameters that are NaN.
+
+    Args:
+        rows: a record of what is learned from (slots, ...), such as lessons, of which the `valid` ones count.
+        init: parameters from a key; with `sizes.ensemble` those of `ensemble`, whose members are fitted each by itself.
+        losses: (params, rows (n, ...)) -> the loss of each.
+        redrawn: (key, batch (n, ...) of rows) -> what to train on in its place; validation rows stay.
 
     Returns:
         The model; its `fitted` is False if there was no valid label to train on.
     """
-    fit = partial(_fit_network, rows=rows, scalars=scalars, apply=apply, redrawn=redrawn, sizes=sizes)
+    fit = partial(_fit_network, rows=rows, scalars=scalars, losses=losses, redrawn=redrawn, sizes=sizes)
     return fitted_members(sizes.ensemble, fit, key, init)
 
 
@@ -82,10 +114,10 @@ def _fit_network(
     key: PRNGKeyArray,
     init: Callable[[PRNGKeyArray], Params],
     *,
-    rows: Lesson,
+    rows: Any,
     scalars: GuideScalars,
-    apply: Callable[[Params, jax.Array, jax.Array], jax.Array],
-    redrawn: Callable[[PRNGKeyArray, Lesson], Lesson],
+    losses: Callable[[Params, Any], Float[Array, " n"]],
+    redrawn: Redrawn,
     sizes: GuideSizes,
 ) -> GuidanceModel:
     held_out = (jnp.arange(rows.valid.shape[0]) % VALIDATION_STRIDE) == VALIDATION_STRIDE - 1
@@ -95,9 +127,8 @@ def _fit_network(
     key_init, key_steps = jax.random.split(key)
     adam = optimizer(scalars)
 
-    def loss(params: Params, batch: Lesson) -> jax.Array:
-        error = apply(params, batch.obs, batch.action) - batch.target
-        return jnp.mean(jnp.sum(jnp.square(error), -1))
+    def loss(params: Params, batch: Any) -> jax.Array:
+        return jnp.mean(losses(params, batch))
 
     def step(carry: tuple[Params, optax.OptState], key: PRNGKeyArray) -> tuple[tuple[Params, optax.OptState], None]:
         params, opt_state = carry
@@ -107,8 +138,7 @@ def _fit_network(
         return (optax.apply_updates(params, updates), opt_state), None
 
     def validate(params: Params) -> jax.Array:
-        error = apply(params, rows.obs, rows.action) - rows.target
-        return jnp.sum(jnp.sum(jnp.square(error), -1), where=validation)
+        return jnp.sum(losses(params, rows), where=validation)
 
     def stretch(carry: tuple, keys: Key[Array, " steps"]) -> tuple[tuple, None]:
         running, best, best_loss = carry

@@ -13,16 +13,15 @@ from typing import Any
 from cuelearner_jax.config import GuideSizes
 from cuelearner_jax.environment import Spaces, offers, spaces_of
 from cuelearner_jax.errors import UserError, closest
-from cuelearner_jax.guidance import dcoach, demonstration, heuristic, none, relative, scalar
+from cuelearner_jax.guidance import dcoach, demonstration, heuristic, intent, none, relative, scalar
 from cuelearner_jax.guidance.bundle import Guidance
 from cuelearner_jax.guidance.kind import Kind
 from cuelearner_jax.plugins import load
 
 ENTRY_POINTS = "cuelearner.guidances"
 
-_KINDS: dict[str, Kind] = {
-    kind.name: kind for kind in (none.KIND, relative.KIND, heuristic.KIND, demonstration.KIND, scalar.KIND, dcoach.KIND)
-}
+_BUILT_IN = (none, relative, intent, heuristic, demonstration, scalar, dcoach)
+_KINDS: dict[str, Kind] = {module.KIND.name: module.KIND for module in _BUILT_IN}
 
 
 def register(kind: Kind) -> Kind:
@@ -75,7 +74,7 @@ def make(name: str, sizes: GuideSizes, env: Any) -> Guidance:
     kind = find(name)
     for need in kind.needs:
         if not offers(env, need):
-            raise UserError(f"guidance {kind.name!r} needs an environment with a {need}, which this task's is not")
+            raise UserError(f"guidance {kind.name!r} needs an environment with `{need}`, which this task's has not")
     return made_for(kind, sizes, spaces_of(env))
 
 

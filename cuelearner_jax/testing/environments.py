@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PRNGKeyArray
 
-from cuelearner_jax.environment import Environment, Quantity, actions_of, offers, symmetries_of
+from cuelearner_jax.environment import Aims, Environment, Quantity, actions_of, offers, symmetries_of
 from cuelearner_jax.testing.laws import Laws, Traced, changed, pytree
 from cuelearner_jax.types import Step
 
@@ -190,6 +190,8 @@ def _asked(env: Any, obs: Array, actions: Array) -> dict[str, Any]:
         each = [env.features(obs[0], action) for action in few]
         singly = jax.tree.map(lambda *rows: jnp.stack(rows), *map(tuple, each))
         found["features"] = tuple(env.features(obs[0], few)), singly
+    if offers(env, "aims"):
+        found["aims"] = jax.vmap(env.aims)(obs)
     if offers(env, "mirror"):
         which = jnp.arange(symmetries_of(env))
         rows = jax.vmap(env.mirror, (None, 0, 0))
@@ -252,6 +254,8 @@ def _check_optional(laws: Laws, env: Environment, walk: Walk) -> None:
         laws.actions(actions_of(env), walk.optional["heuristic"], "what `heuristic` gives")
     if "features" in walk.optional:
         _check_features(laws, *walk.optional["features"])
+    if "aims" in walk.optional:
+        _check_aims(laws, env, walk.optional["aims"])
     if "mirror" in walk.optional:
         _check_mirrors(laws, walk, **walk.optional["mirror"])
 
@@ -275,6 +279,21 @@ def _check_features(laws: Laws, together: Any, each: Any) -> None:
     )
     finite = np.isfinite(own).all() and np.isfinite(turned).all()
     laws.hold(finite, "`features` are not finite everywhere")
+
+
+def _check_aims(laws: Laws, env: Environment, aims: Any) -> None:
+    """They are actions with features, possible or not, as many in every situation (leading axis: steps)."""
+    laws.hold(isinstance(aims, Aims), f"`aims` returns a {type(aims).__name__}: give `environment.Aims`")
+    rows = np.shape(aims.possible)
+    fits = len(rows) == 2 and np.shape(aims.actions)[:-1] == rows and np.shape(aims.features)[:-1] == rows
+    laws.hold(
+        fits and np.asarray(aims.possible).dtype == bool,
+        f"`aims` are actions {np.shape(aims.actions)[1:]}, features {np.shape(aims.features)[1:]} and `possible` "
+        f"{rows[1:]}: give a row of each, and a bool, for every aim",
+    )
+    laws.actions(actions_of(env), aims.actions, "an aim's action")
+    laws.hold(np.isfinite(aims.features).all(), "an aim's features are not finite, where it is impossible included")
+    laws.hold(np.any(aims.possible), "no aim was possible in any step: mark those that are")
 
 
 def _check_mirrors(laws: Laws, walk: Walk, images: Any, other: Any, combined: Any, twice: Any) -> None:

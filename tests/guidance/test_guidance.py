@@ -254,10 +254,10 @@ def test_a_kind_is_refused_where_the_environment_lacks_what_it_needs(registered)
     class Plain(probes.Chain):
         heuristic = None
 
-    with pytest.raises(UserError, match="'heuristic' needs an environment with a heuristic") as refusal:
+    with pytest.raises(UserError, match="'heuristic' needs an environment with `heuristic`") as refusal:
         guidance.make("heuristic", probes.SIZES, Plain())
     assert "\n" not in str(refusal.value)
     guidance.register(kind_of("symmetric", needs=("mirror",)))
     assert guidance.make("symmetric", probes.SIZES, ENV).name == "symmetric"
-    with pytest.raises(UserError, match="'symmetric' needs an environment with a mirror"):
+    with pytest.raises(UserError, match="'symmetric' needs an environment with `mirror`"):
         guidance.make("symmetric", probes.SIZES, probes.Chain())

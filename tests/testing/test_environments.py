@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from flax import struct
-from probes import Chain, Window
+from probes import Aimed, Chain, Window
 
 from cuelearner_jax.actions import DIRECTIONS, rotate
 from cuelearner_jax.environment import Features, Quantity, WholeObservations
@@ -128,6 +128,15 @@ class Confused(Window):
         return Features(action.ravel()[:1], action)
 
 
+class Unequal(Aimed):
+    def aims(self, obs):
+        return super().aims(obs)._replace(possible=jnp.ones(3, bool))
+
+
+class Pointless(Aimed):
+    possible = (False, False, False, False)
+
+
 class Loose(Window):
     actions = DIRECTIONS._replace(uniform=lambda key, shape: 2.0 * DIRECTIONS.uniform(key, shape))
 
@@ -171,6 +180,8 @@ BROKEN = {
     "no action": (Astray(), "what `heuristic` gives is no action of the space"),
     "features": (Narrow(), "`features` of 8 actions"),
     "features of an action": (Confused(), "`features` hold in `own` what hangs on the action"),
+    "aims": (Unequal(), "give a row of each, and a bool, for every aim"),
+    "possible aims": (Pointless(), "no aim was possible in any step"),
     "uniform": (Loose(), "what its actions' `uniform` draws is no action of the space"),
     "uniform's shape": (Short(), "`uniform` gives shape (3,) for 3 actions of 2"),
     "both ends": (altered(truncated=lambda step, _: step.terminated), "is terminated and truncated"),
@@ -200,7 +211,7 @@ def test_a_broken_law_is_told_in_one_line(law):
 
 
 @pytest.mark.parametrize(
-    "env", [Window(), Window(jnp.float32(0.3), mirrors=True), Chain(), Chain(jnp.array(True))], ids=str
+    "env", [Window(), Aimed(), Window(jnp.float32(0.3), mirrors=True), Chain(), Chain(jnp.array(True))], ids=str
 )
 def test_the_probes_keep_the_laws(env):
     check_environment(env)

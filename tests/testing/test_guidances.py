@@ -4,7 +4,7 @@ import dataclasses
 
 import jax.numpy as jnp
 import pytest
-from probes import Chain, Window
+from probes import Aimed, Chain, Window
 
 from cuelearner_jax.guidance import registry
 from cuelearner_jax.guidance.refining import Refined
@@ -100,7 +100,7 @@ def test_a_broken_law_is_told_in_one_line(law):
 
 @pytest.mark.parametrize("name", [kind.name for kind in registry.known()])
 def test_our_own_kinds_keep_the_laws(name):
-    check_guidance(registry.find(name), Window(mirrors=True), SIZES)
+    check_guidance(registry.find(name), Aimed(mirrors=True), SIZES)
 
 
 def test_what_a_kind_needs_must_be_there():

@@ -11,10 +11,11 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
+from cuelearner_envs.billiards.aims import aims_of
 from cuelearner_envs.billiards.physics import simulate
 from cuelearner_envs.billiards.table import Table, parking, rack
 from cuelearner_jax.actions import retract, rotate, to_angle
-from cuelearner_jax.environment import Features, Quantity, WholeObservations
+from cuelearner_jax.environment import Aims, Features, Quantity, WholeObservations
 from cuelearner_jax.types import Step
 
 PLACEMENTS = 16  # places tried for a ball that must not touch another
@@ -134,6 +135,13 @@ class Billiards(WholeObservations, struct.PyTreeNode):
         balls = obs.reshape(-1, 3)
         image = balls.at[:, :2].multiply(jnp.where(balls[:, 2:] > 0, 1.0, signs))
         return jnp.concatenate([image[0], self._sorted(image[1:]).ravel()]), vector * signs
+
+    def aims(self, obs: Float[Array, " obs"]) -> Aims:
+        """Each target straight into each pocket: where to strike, and what makes the shot hard (`aims_of`).
+
+        As the player sees the table: of a sensor's bias, a turned strike or a tilt they know nothing.
+        """
+        return aims_of(self.table, obs)
 
     def features(self, obs: Float[Array, " obs"], actions: Float[Array, "*n 2"]) -> Features:
         """A shot as the player sees it: balls relative to the cue ball, along and across the direction of the strike.

@@ -1,0 +1,150 @@
+"""Relative feedback read as intent: of the aims that a situation offers, which one does the teacher have in mind?
+
+"More to the left" says that what the teacher means lies to the left: of the aims there (`Environment.aims`) some remain
+likely, the others do not. One network weighs every aim by its features, with the same weights for all; it is fitted by
+the likelihood of the teacher's words, summed over what may have been meant. (Inferring goals from what somebody does or
+says: Baker, Saxe, Tenenbaum, "Action understanding as inverse planning", Cognition 2009.) A pass of refinement goes by
+at most eps toward the likeliest aim and ends there, so precision is the aim's and not the label's.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
+
+from cuelearner_jax.actions import Actions
+from cuelearner_jax.config import GuideScalars, GuideSizes
+from cuelearner_jax.environment import Aims, Spaces
+from cuelearner_jax.guidance.answers import RELATIVE
+from cuelearner_jax.guidance.bundle import Guidance
+from cuelearner_jax.guidance.fitting import fit_model
+from cuelearner_jax.guidance.kind import Kind
+from cuelearner_jax.guidance.questions import about_refined
+from cuelearner_jax.guidance.refining import Refined, refine
+from cuelearner_jax.types import GuidanceModel, Label, Params
+
+SPREAD_DEG = 1.0  # how far what a teacher means may lie from the aim that describes it
+ELSEWHERE = 360  # evenly spaced actions that stand for "it means none of these"
+SLIPS = 0.02  # share of answers that say nothing: any of the words
+WORDS = 3
+
+
+class Weights(nn.Module):
+    """log-weights of a situation's aims, and of none of them: every aim goes through the same layers."""
+
+    layers: tuple[int, ...]
+
+    @nn.compact
+    def __call__(
+        self, features: Float[Array, "aims features"], possible: Bool[Array, " aims"]
+    ) -> Float[Array, " aims_and_none"]:
+        """Starts out without a preference."""
+        x = features
+        for width in self.layers:
+            x = nn.relu(nn.Dense(width, kernel_init=nn.initializers.xavier_uniform())(x))
+        weights = nn.Dense(1, kernel_init=nn.initializers.zeros)(x)[:, 0]
+        none = self.param("none", nn.initializers.zeros, (1,))
+        return jnp.concatenate([jnp.where(possible, weights, -jnp.inf), none])
+
+
+class Evidence(struct.PyTreeNode):
+    """What one answer says of what may have been meant."""
+
+    features: Float[Array, "aims features"]
+    possible: Bool[Array, " aims"]
+    likelihood: Float[Array, " aims_and_none"]  # of the answer, if this was meant
+    valid: Bool[Array, ""]
+
+
+def likelihood(
+    space: Actions,
+    action: Float[Array, " action"],
+    goals: Float[Array, "goals action"],
+    h: Float[Array, ""],
+    eps: Float[Array, ""],
+) -> Float[Array, " goals"]:
+    """Probability of the answer h about `action` from somebody who means each of the goals.
+
+    What is meant lies round the goal with a logistic error of `SPREAD_DEG`; within eps / 2 of the action it is right.
+    """
+    offset = space.sense(action[None], goals) * space.distance(action[None], goals)
+    width = jnp.deg2rad(SPREAD_DEG)
+    above = jax.nn.sigmoid((offset - eps / 2) / width)
+    below = jax.nn.sigmoid((-offset - eps / 2) / width)
+    return jnp.where(h > 0, above, jnp.where(h < 0, below, 1.0 - above - below))
+
+
+def make(sizes: GuideSizes, spaces: Spaces) -> Guidance:
+    """The bundle for an environment's spaces."""
+    space = spaces.actions
+    network = Weights(sizes.aim_layers)
+    width = spaces.aims or 0
+
+    def weigh(
+        params: Params, features: Float[Array, "aims features"], possible: Bool[Array, " aims"]
+    ) -> Float[Array, " aims_and_none"]:
+        return jnp.asarray(network.apply(params, features, possible))
+
+    def init_params(key: PRNGKeyArray) -> Params:
+        return network.init(key, jnp.zeros((1, width)), jnp.ones(1, bool))
+
+    def init(key: PRNGKeyArray) -> GuidanceModel:
+        return GuidanceModel(init_params(key), jnp.array(False))
+
+    def target(label: Label, scalars: GuideScalars) -> Float[Array, "1"]:
+        """h itself: what is fitted is its probability."""
+        return label.answer
+
+    def evidence(env: Any, label: Label, scalars: GuideScalars) -> Evidence:
+        aims: Aims = env.aims(label.obs)
+        h, eps = target(label, scalars)[0], scalars.radians("eps")
+        of_aims = likelihood(space, label.action, aims.actions, h, eps)
+        of_none = likelihood(space, label.action, space.spread(ELSEWHERE), h, eps).mean(keepdims=True)
+        return Evidence(aims.features, aims.possible, jnp.concatenate([of_aims, of_none]), label.valid)
+
+    def surprise(params: Params, rows: Evidence) -> Float[Array, " rows"]:
+        """-log of the probability of each answer."""
+        weights = jax.nn.softmax(jax.vmap(weigh, (None, 0, 0))(params, rows.features, rows.possible))
+        return -jnp.log((1.0 - SLIPS) * (weights * rows.likelihood).sum(-1) + SLIPS / WORDS)
+
+    def fit(key: PRNGKeyArray, env: Any, labels: Label, former: GuidanceModel, scalars: GuideScalars) -> GuidanceModel:
+        rows = jax.vmap(lambda label: evidence(env, label, scalars))(labels)
+        return fit_model(key, rows, scalars, init=init_params, losses=surprise, sizes=sizes)
+
+    def act(
+        model: GuidanceModel,
+        env: Any,
+        obs: Float[Array, "n obs"],
+        actions: Float[Array, "n action"],
+        active: Bool[Array, " n"],
+        scalars: GuideScalars,
+    ) -> Refined:
+        def meant(obs: Float[Array, " obs"]) -> tuple[Float[Array, " action"], Bool[Array, ""]]:
+            aims: Aims = env.aims(obs)
+            likeliest = jnp.argmax(weigh(model.params, aims.features, aims.possible)[:-1])
+            return aims.actions[likeliest], aims.possible.any()
+
+        def residual(current: Float[Array, "n action"]) -> Float[Array, "n action"]:
+            step = jnp.minimum(scalars.radians("eps"), space.distance(current, goals))
+            return space.toward(current, space.sense(current, goals), step) - current
+
+        goals, offered = jax.vmap(meant)(obs)
+        return refine(
+            residual,
+            actions,
+            active & offered & model.fitted,
+            space=space,
+            tau=scalars.radians("tau"),
+            tau_max=scalars.radians("tau_max"),
+            k_max=scalars.k_max,
+        )
+
+    return Guidance("intent", RELATIVE, init, about_refined(act), target, fit, act)
+
+
+KIND = Kind("intent", "relative feedback about the task's aims", make, form=RELATIVE, needs=("aims",), colour="#CC79A7")

@@ -1,0 +1,102 @@
+"""Where to strike a target so that it goes into a pocket: by hand, by the impulses, by symmetry, by playing it."""
+
+import billiards_scenes as scenes
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from cuelearner_envs.billiards.aims import aims_of, contact_for
+from cuelearner_envs.billiards.impacts import normal_impulse, tangential_impulse
+from cuelearner_envs.billiards.table import Table
+from cuelearner_jax import actions
+from cuelearner_jax.testing import check_environment
+
+REGULATION = Table.regulation()
+CUE = (-0.2, 0.05)
+# x, y and flag of the cue ball and three targets; pockets: corners (+,+) (+,-) (-,+) (-,-), then the sides up and down.
+SEEN = jnp.array([*CUE, -0.5, 0.0, 0.1, -0.5, 0.3, -0.1, -0.5, -0.1, -0.15, -0.5])
+aims_seen = jax.jit(aims_of)
+UP, MIRRORED = 4, {1: [2, 3, 0, 1, 4, 5], 2: [1, 0, 3, 2, 5, 4], 3: [3, 2, 1, 0, 5, 4]}
+
+
+def by_ball(aims):
+    """The leaves with axes (targets, pockets, ...)."""
+    return [np.asarray(leaf).reshape(3, 6, *leaf.shape[1:]) for leaf in aims]
+
+
+def test_the_laws_of_an_environment_hold_with_aims():
+    check_environment(scenes.EASY.replace(max_shots=8), steps=16)
+
+
+def test_a_ball_straight_in_front_of_a_pocket_is_struck_straight():
+    seen = SEEN.at[0:5].set(jnp.array([0.0, -0.1, -0.5, 0.0, 0.1]))
+    strikes, features, possible = (leaf[0, UP] for leaf in by_ball(aims_seen(REGULATION, seen)))
+    np.testing.assert_allclose(strikes, [0.0, 1.0], atol=1e-6)
+    assert possible
+    # No cut; 0.2 m less a ball's diameter to the contact, 0.12 m to the pocket, in heights of the table.
+    np.testing.assert_allclose(features[:4], [0.0, 1.0, (0.2 - 0.0225) / 0.44, 0.12 / 0.44], atol=1e-5)
+    assert np.isclose(features[5], (0.025 - 0.01125 - 0.004) / 0.01125)  # room between the jaws, in radii
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.3, -0.7, 1.1])
+def test_a_target_leaves_along_its_way_by_the_impulses_of_an_impact(turn):
+    way = actions.from_angle(jnp.array(0.4 + turn))
+    contact = contact_for(REGULATION, jnp.array([-0.3, -0.1]), jnp.array([0.1, 0.05]), way)
+    tangent = actions.rotate(contact.normal, jnp.pi / 2)
+    along, across = contact.strike @ contact.normal, contact.strike @ tangent
+    push = normal_impulse(along, 0.0, 1.0, 2.0)
+    drag = -tangential_impulse(across, push, REGULATION.friction, 2.0)
+    leaves = actions.retract(push * contact.normal + drag * tangent)
+    np.testing.assert_allclose(actions.difference(way, leaves), 0.0, atol=2e-4)
+
+
+def test_a_turned_situation_turns_the_strike():
+    cue, target, way = jnp.array([-0.3, -0.1]), jnp.array([0.1, 0.05]), actions.from_angle(jnp.array(0.9))
+    turned = [actions.rotate(vector, 1.3) for vector in (cue, target, way)]
+    one, other = contact_for(REGULATION, cue, target, way), contact_for(REGULATION, *turned)
+    np.testing.assert_allclose(other.strike, actions.rotate(one.strike, 1.3), atol=1e-5)
+    np.testing.assert_allclose(other.cut, one.cut, atol=1e-5)
+
+
+@pytest.mark.parametrize("which", [1, 2, 3])
+def test_a_mirrored_table_mirrors_strikes_and_keeps_features(which):
+    signs = jnp.array([1.0 - 2.0 * (which % 2), 1.0 - 2.0 * (which // 2)])
+    image = SEEN.reshape(4, 3).at[:, :2].multiply(signs).ravel()
+    strikes, features, possible = by_ball(aims_seen(REGULATION, SEEN))
+    mirrored = [leaf[:, MIRRORED[which]] for leaf in by_ball(aims_seen(REGULATION, image))]
+    np.testing.assert_allclose(mirrored[0], strikes * np.asarray(signs), atol=1e-5)
+    np.testing.assert_allclose(mirrored[1], features, atol=1e-3)
+    np.testing.assert_array_equal(mirrored[2], possible)
+
+
+def test_targets_in_another_order_give_the_same_aims_in_another_order():
+    order = np.array([2, 0, 1])
+    balls = SEEN.reshape(4, 3)
+    shuffled = jnp.concatenate([balls[:1], balls[1:][order]]).ravel()
+    for one, other in zip(by_ball(aims_seen(REGULATION, SEEN)), by_ball(aims_seen(REGULATION, shuffled)), strict=True):
+        np.testing.assert_allclose(one[order], other, atol=1e-6)
+
+
+def test_a_pocketed_ball_is_no_aim_and_in_nobodys_way():
+    between = SEEN.at[6:9].set(jnp.array([-0.1, 0.075, -0.5]))  # on the way from the cue ball to the first target
+    gone = between.at[8].set(0.5)
+    blocked, free = (by_ball(aims_seen(REGULATION, seen)) for seen in (between, gone))
+    assert not free[2][1].any()
+    assert (
+        blocked[1][0, UP, 7] < -0.5 < 0.9 < free[1][0, UP, 7]
+    )  # clearance of the cue ball's way, in diameters, less 1
+
+
+def test_thick_free_shots_at_wide_open_pockets_score():
+    states, _ = scenes.random_states()
+    aims = jax.jit(jax.vmap(scenes.EASY.aims))(scenes.observe_many(scenes.EASY, states))
+    strikes, features, possible = (np.asarray(leaf) for leaf in aims)
+    easy = possible & (features[..., 1] > 0.7) & (features[..., 5] > 0.5) & (features[..., 6] > 0.0)
+    easy &= (features[..., 7:9] > 0.2).all(-1) & (features[..., -1] < 0.1)
+    chosen, some = easy.argmax(-1), easy.any(-1)
+    strikes = strikes[np.arange(len(chosen)), chosen]
+    keys = jax.random.split(scenes.KEY, scenes.BATCH)
+    _, step = scenes.step_many(scenes.EASY, keys, states, jnp.asarray(strikes))
+    assert some.sum() > 50
+    assert np.asarray(step.reward)[some].mean() > 0.9

@@ -1,0 +1,92 @@
+"""Relative feedback read as intent: what an answer says of each aim, and what the fitted weights make of actions."""
+
+import dataclasses
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import probes
+import pytest
+
+from cuelearner_jax import actions
+from cuelearner_jax.guidance import intent, registry
+from cuelearner_jax.guidance.answers import RELATIVE
+from cuelearner_jax.types import Label
+
+
+class Shuffled(probes.Aimed):
+    order = (3, 1, 0, 2)
+
+
+class Aimless(probes.Aimed):
+    possible = (False, False, False, False)
+
+
+ENV, SHUFFLED, AIMLESS = probes.Aimed(), Shuffled(), Aimless()
+SIZES = dataclasses.replace(probes.SIZES, aim_layers=(8,))
+OBS = actions.evenly_spaced(16)
+BASE = actions.rotate(OBS, jnp.linspace(-3.0, 3.0, 16))
+EVERYWHERE = jnp.ones(16, bool)
+
+
+@pytest.fixture(scope="module")
+def fitted():
+    """A bundle and its model of 40 of the expert's answers about random actions."""
+    bundle = registry.make("intent", SIZES, ENV)
+    keys = jax.random.split(jax.random.key(3), 40)
+    obs = jax.vmap(lambda key: ENV.reset(key)[1])(keys)
+    asked = actions.uniform(jax.random.key(4), (40,))
+    tell = jax.vmap(lambda key, obs, a: RELATIVE.answer(key, ENV, probes.Expert(ENV), obs, obs, a, probes.SCALARS))
+    answers, _ = tell(keys, obs, asked)
+    labels = Label(obs, asked, answers, jnp.ones(40, bool))
+    former = bundle.init(jax.random.key(0))
+    return bundle, jax.jit(bundle.fit)(jax.random.key(1), ENV, labels, former, probes.SCALARS)
+
+
+def acted(fitted, env, base=BASE, **scalars):
+    bundle, model = fitted
+    return bundle.act(model, env, OBS, base, EVERYWHERE, dataclasses.replace(probes.SCALARS, **scalars))
+
+
+def test_an_answer_makes_aims_on_its_side_likely():
+    goals = actions.from_angle(jnp.deg2rad(jnp.array([-90.0, 0.0, 9.0, 10.0, 90.0])))
+    action, eps = actions.from_angle(jnp.array(0.0)), jnp.deg2rad(20.0)
+    words = jnp.stack(
+        [intent.likelihood(actions.DIRECTIONS, action, goals, jnp.array(h), eps) for h in (-1.0, 0.0, 1.0)]
+    )
+    np.testing.assert_allclose(words.sum(0), 1.0, atol=1e-6)
+    # Logistic: 1 / (1 + e) beyond an edge that lies one degree away; half on the edge, at eps / 2 = 10 degrees.
+    np.testing.assert_allclose(words[2], [0.0, 0.0, 1.0 / (1.0 + math.e), 0.5, 1.0], atol=1e-4)
+    np.testing.assert_allclose(words[0], [1.0, 0.0, 0.0, 0.0, 0.0], atol=1e-4)
+
+
+def test_coarse_answers_lead_exactly_to_the_aim_that_is_meant(fitted):
+    assert probes.SCALARS.eps_deg == 20.0
+    refined = acted(fitted, ENV)
+    np.testing.assert_allclose(actions.difference(ENV.best(OBS), refined.actions), 0.0, atol=1e-5)
+    # ceil(turn / eps) passes, and one that finds nothing left to do.
+    turns = np.degrees(np.abs(np.asarray(actions.difference(BASE, ENV.best(OBS)))))
+    assert (np.abs(np.asarray(refined.passes) - (np.ceil(turns / 20.0) + 1)) <= 1).all()
+
+
+def test_a_pass_goes_by_at_most_eps(fitted):
+    away = np.degrees(np.abs(np.asarray(actions.difference(BASE, acted(fitted, ENV, k_max=1).actions))))
+    assert away.max() == pytest.approx(20.0, abs=1e-3)
+
+
+def test_in_which_order_aims_are_told_changes_nothing(fitted):
+    one, other = acted(fitted, ENV), acted(fitted, SHUFFLED)
+    np.testing.assert_allclose(one.actions, other.actions, atol=1e-6)
+
+
+def test_without_a_possible_aim_actions_stay_as_they_are(fitted):
+    np.testing.assert_array_equal(acted(fitted, AIMLESS).actions, BASE)
+
+
+def test_an_impossible_aim_has_no_weight(fitted):
+    _, model = fitted
+    network, aims = intent.Weights(SIZES.aim_layers), ENV.aims(OBS[0])
+    weights = jax.nn.softmax(jnp.asarray(network.apply(model.params, aims.features, aims.possible)))
+    assert weights[3] == 0.0
+    assert weights[1] > 0.9
