@@ -4,7 +4,8 @@
 likely, the others do not. One network weighs every aim by its features, with the same weights for all; it is fitted by
 the likelihood of the teacher's words, summed over what may have been meant. (Inferring goals from what somebody does or
 says: Baker, Saxe, Tenenbaum, "Action understanding as inverse planning", Cognition 2009.) A pass of refinement goes by
-at most eps toward the likeliest aim and ends there, so precision is the aim's and not the label's.
+at most eps toward the likeliest aim and ends there, so precision is the aim's and not the label's. Among aims that are
+about as likely it goes to the nearest: a guide that knows nothing of a situation must not do the same there each time.
 """
 
 from __future__ import annotations
@@ -32,6 +33,7 @@ SPREAD_DEG = 1.0  # how far what a teacher means may lie from the aim that descr
 ELSEWHERE = 360  # evenly spaced actions that stand for "it means none of these"
 SLIPS = 0.02  # share of answers that say nothing: any of the words
 WORDS = 3
+LEAN = 0.5  # nats a radian by which an aim that is nearer to the action is preferred
 
 
 class Weights(nn.Module):
@@ -79,6 +81,36 @@ def likelihood(
     return jnp.where(h > 0, above, jnp.where(h < 0, below, 1.0 - above - below))
 
 
+def evidence_of(env: Any, space: Actions, label: Label, eps: Float[Array, ""]) -> Evidence:
+    """What a label says of the aims of its situation."""
+    aims: Aims = env.aims(label.obs)
+    of_aims = likelihood(space, label.action, aims.actions, label.answer[0], eps)
+    of_none = likelihood(space, label.action, space.spread(ELSEWHERE), label.answer[0], eps).mean(keepdims=True)
+    return Evidence(aims.features, aims.possible, jnp.concatenate([of_aims, of_none]), label.valid)
+
+
+def preferences(weights: Float[Array, " aims_and_none"], possible: Bool[Array, " aims"]) -> Float[Array, " aims"]:
+    """log-probability of each aim, from log-weights; where none of them is meant, one is as good as another."""
+    share = jax.nn.softmax(weights)
+    evenly = share[-1] / jnp.maximum(possible.sum(), 1)
+    return jnp.where(possible, jnp.log(share[:-1] + evenly), -jnp.inf)
+
+
+def toward_likeliest(
+    space: Actions,
+    preferred: Float[Array, "n aims"],
+    aims: Float[Array, "n aims action"],
+    current: Float[Array, "n action"],
+    eps: Float[Array, ""],
+) -> Float[Array, "n action"]:
+    """The residual: a step of at most eps toward the likeliest aim, which stays that one on the way."""
+    away = space.distance(current[:, None], aims)
+    chosen = jnp.argmax(preferred - LEAN * away, axis=-1)
+    goals = jnp.take_along_axis(aims, chosen[:, None, None], axis=1)[:, 0]
+    step = jnp.minimum(eps, space.distance(current, goals))
+    return space.toward(current, space.sense(current, goals), step) - current
+
+
 def make(sizes: GuideSizes, spaces: Spaces) -> Guidance:
     """The bundle for an environment's spaces."""
     space = spaces.actions
@@ -86,9 +118,9 @@ def make(sizes: GuideSizes, spaces: Spaces) -> Guidance:
     width = spaces.aims or 0
 
     def weigh(
-        params: Params, features: Float[Array, "aims features"], possible: Bool[Array, " aims"]
-    ) -> Float[Array, " aims_and_none"]:
-        return jnp.asarray(network.apply(params, features, possible))
+        params: Params, features: Float[Array, "n aims features"], possible: Bool[Array, "n aims"]
+    ) -> Float[Array, "n aims_and_none"]:
+        return jnp.asarray(jax.vmap(network.apply, (None, 0, 0))(params, features, possible))
 
     def init_params(key: PRNGKeyArray) -> Params:
         return network.init(key, jnp.zeros((1, width)), jnp.ones(1, bool))
@@ -100,20 +132,13 @@ def make(sizes: GuideSizes, spaces: Spaces) -> Guidance:
         """h itself: what is fitted is its probability."""
         return label.answer
 
-    def evidence(env: Any, label: Label, scalars: GuideScalars) -> Evidence:
-        aims: Aims = env.aims(label.obs)
-        h, eps = target(label, scalars)[0], scalars.radians("eps")
-        of_aims = likelihood(space, label.action, aims.actions, h, eps)
-        of_none = likelihood(space, label.action, space.spread(ELSEWHERE), h, eps).mean(keepdims=True)
-        return Evidence(aims.features, aims.possible, jnp.concatenate([of_aims, of_none]), label.valid)
-
     def surprise(params: Params, rows: Evidence) -> Float[Array, " rows"]:
         """-log of the probability of each answer."""
-        weights = jax.nn.softmax(jax.vmap(weigh, (None, 0, 0))(params, rows.features, rows.possible))
-        return -jnp.log((1.0 - SLIPS) * (weights * rows.likelihood).sum(-1) + SLIPS / WORDS)
+        share = jax.nn.softmax(weigh(params, rows.features, rows.possible))
+        return -jnp.log((1.0 - SLIPS) * (share * rows.likelihood).sum(-1) + SLIPS / WORDS)
 
     def fit(key: PRNGKeyArray, env: Any, labels: Label, former: GuidanceModel, scalars: GuideScalars) -> GuidanceModel:
-        rows = jax.vmap(lambda label: evidence(env, label, scalars))(labels)
+        rows = jax.vmap(lambda label: evidence_of(env, space, label, scalars.radians("eps")))(labels)
         return fit_model(key, rows, scalars, init=init_params, losses=surprise, sizes=sizes)
 
     def act(
@@ -124,20 +149,12 @@ def make(sizes: GuideSizes, spaces: Spaces) -> Guidance:
         active: Bool[Array, " n"],
         scalars: GuideScalars,
     ) -> Refined:
-        def meant(obs: Float[Array, " obs"]) -> tuple[Float[Array, " action"], Bool[Array, ""]]:
-            aims: Aims = env.aims(obs)
-            likeliest = jnp.argmax(weigh(model.params, aims.features, aims.possible)[:-1])
-            return aims.actions[likeliest], aims.possible.any()
-
-        def residual(current: Float[Array, "n action"]) -> Float[Array, "n action"]:
-            step = jnp.minimum(scalars.radians("eps"), space.distance(current, goals))
-            return space.toward(current, space.sense(current, goals), step) - current
-
-        goals, offered = jax.vmap(meant)(obs)
+        aims: Aims = jax.vmap(env.aims)(obs)
+        preferred = jax.vmap(preferences)(weigh(model.params, aims.features, aims.possible), aims.possible)
         return refine(
-            residual,
+            lambda current: toward_likeliest(space, preferred, aims.actions, current, scalars.radians("eps")),
             actions,
-            active & offered & model.fitted,
+            active & aims.possible.any(-1) & model.fitted,
             space=space,
             tau=scalars.radians("tau"),
             tau_max=scalars.radians("tau_max"),

@@ -84,6 +84,16 @@ def test_without_a_possible_aim_actions_stay_as_they_are(fitted):
     np.testing.assert_array_equal(acted(fitted, AIMLESS).actions, BASE)
 
 
+def test_without_a_preference_the_nearest_possible_aim_is_meant():
+    bundle = registry.make("intent", SIZES, ENV)
+    unfitted = bundle.init(jax.random.key(0)).replace(fitted=jnp.array(True))  # its weights are all the same
+    refined = acted((bundle, unfitted), ENV).actions
+    turns = np.array([-1.0, 0.6, 2.5])
+    base = np.asarray(actions.difference(OBS, BASE))
+    nearest = turns[np.abs((base[:, None] - turns + np.pi) % (2 * np.pi) - np.pi).argmin(1)]
+    np.testing.assert_allclose(actions.difference(actions.rotate(OBS, jnp.asarray(nearest)), refined), 0.0, atol=1e-5)
+
+
 def test_an_impossible_aim_has_no_weight(fitted):
     _, model = fitted
     network, aims = intent.Weights(SIZES.aim_layers), ENV.aims(OBS[0])
