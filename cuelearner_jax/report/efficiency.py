@@ -51,10 +51,14 @@ class Known(NamedTuple):
     def columns(self, name: str) -> Row:
         """As columns of a table: `name` is empty where only `name_above` or `name_below` is known."""
         low, high = float(self.bounds.lower), float(self.bounds.upper)
-        row: Row = {name: low if low == high else "", f"{name}_lower": self.lower, f"{name}_upper": self.upper}
-        row[f"{name}_above"] = low if low != high else ""
-        row[f"{name}_below"] = high if low != high else ""
-        return row
+        row = interval_columns(name, Interval(*map(np.array, (low if low == high else np.nan, self.lower, self.upper))))
+        exact = low == high or np.isnan(low)
+        return row | {f"{name}_above": "" if exact else low, f"{name}_below": "" if exact else high}
+
+
+def interval_columns(name: str, found: Interval) -> Row:
+    """As columns of a table, empty where there is no number."""
+    return {name + end: _number(value) for end, value in zip(("", "_lower", "_upper"), found, strict=True)}
 
 
 class Drawn:
@@ -115,26 +119,23 @@ class Carried(NamedTuple):
     steps: Known  # to the level
     reached: float  # share of draws whose interquartile mean reaches the level
     ratio: Known | None  # of those steps to the unguided agents'
-    area: Known  # mean over the curve
-    area_difference: Known | None  # to the unguided agents', in units of the metric
-    area_ratio: Known | None
+    area_difference: Interval | None  # of the mean over the curve to the unguided agents', in units of the metric
+    area_ratio: Interval | None
 
     def row(self) -> Row:
         """As a row of `efficiency.csv`."""
-        blank = dict.fromkeys(Known(exactly(0), 0, 0).columns(""), "")
         row: Row = {**named(self.variant), "seeds": len(self.variant.seeds)}
         row |= {"against": self.against.name if self.against else ""}
-        guide = self.guide or Interval(*(np.array(np.nan),) * 3)
-        row |= {f"guide{end}": _number(value) for end, value in zip(("", "_lower", "_upper"), guide, strict=True)}
+        row |= interval_columns("guide", self.guide or NOTHING)
         row |= self.steps.columns("steps_to_level") | {"reached": self.reached}
-        for name, value in (
-            ("steps_ratio", self.ratio),
-            ("mean", self.area),
-            ("mean_difference", self.area_difference),
-            ("mean_ratio", self.area_ratio),
-        ):
-            row |= value.columns(name) if value else {name + end: "" for end in blank}
-        return {name: _number(value) for name, value in row.items()}
+        row |= self.ratio.columns("steps_ratio") if self.ratio else UNKNOWN.columns("steps_ratio")
+        row |= interval_columns("mean", self.variant.mean)
+        row |= interval_columns("mean_difference", self.area_difference or NOTHING)
+        return _numbers(row | interval_columns("mean_ratio", self.area_ratio or NOTHING))
+
+
+NOTHING = Interval(*(np.array(np.nan),) * 3)
+UNKNOWN = Known(exactly(np.nan), np.nan, np.nan)
 
 
 class LabelsToLevel(NamedTuple):
@@ -252,23 +253,20 @@ def _level(variants: Sequence[Variant], question: Question, shared: int) -> tupl
 
 def _carried(own: Drawn, unguided: Drawn | None, level: float) -> Carried:
     one, many = own.steps_to(level)
-    area, areas = own.areas
     guide = None if own.variant.guide is None else statistics.interval(own.variant.guide)
-    steps, mean = known(one, many, own), known(exactly(area), exactly(areas), own)
-    reached = float(np.isfinite(many.upper).mean())
+    steps, reached = known(one, many, own), float(np.isfinite(many.upper).mean())
     if unguided is None:
-        return Carried(own.variant, None, guide, steps, reached, None, mean, None, None)
+        return Carried(own.variant, None, guide, steps, reached, None, None, None)
     below, belows = unguided.steps_to(level)
-    other, others = unguided.areas
     ratio = known(statistics.ratio_bounds(one, below), statistics.ratio_bounds(many, belows), own, unguided)
+    (area, areas), (other, others) = own.areas, unguided.areas
     difference = known(exactly(area - other), exactly(areas - others), own, unguided)
-    relative = known(
-        statistics.ratio_bounds(exactly(area), exactly(other)),
-        statistics.ratio_bounds(exactly(areas), exactly(others)),
-        own,
-        unguided,
-    )
-    return Carried(own.variant, unguided.variant, guide, steps, reached, ratio, mean, difference, relative)
+    more = Interval(difference.bounds.lower, np.array(difference.lower), np.array(difference.upper))
+    pairs = ((area, other), (areas, others))
+    one, many = (statistics.ratio_bounds(exactly(above), exactly(under)) for above, under in pairs)
+    times = known(one, many, own, unguided)
+    share = Interval(np.where(other == 0, np.nan, one.lower), np.array(times.lower), np.array(times.upper))
+    return Carried(own.variant, unguided.variant, guide, steps, reached, ratio, more, share)
 
 
 def _labels_to_level(own: Sequence[Drawn], unguided: Drawn, level: float, within: float) -> LabelsToLevel:

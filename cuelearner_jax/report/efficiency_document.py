@@ -17,7 +17,7 @@ from cuelearner_jax.report.statistics import Interval
 from cuelearner_jax.report.tables import markdown_table
 from cuelearner_jax.report.variants import Variant, shortened
 
-LARGEST_RATIO = 3.0  # shown of the steps to the level: what lies above is drawn at the edge
+LARGEST_RATIO = 3.0  # shown of steps to the level over the unguided agents': what lies above is drawn at the edge
 Shown = Sequence[tuple[Variant, Interval]]
 
 
@@ -66,10 +66,11 @@ NOTE = (
     "The level is held fixed. Steps to it are those of the interquartile mean, on straight lines between evaluations. "
     "Intervals are 95% percentile bootstraps: the seeds of each variant are drawn with replacement, 2,000 times, "
     "independently of those of others. A curve that ends below the level has needed more than its last step, and "
-    "nothing else is said of it: such draws count as infinite at the upper end of an interval and as their last step at "
-    "the lower one. Areas of a kind are made nondecreasing in its labels (isotonic regression) and lie on straight "
-    "lines over the logarithm of the labels; beyond its budgets nothing is assumed. The smallest of several budgets is "
-    "chosen by its luck as well, so it errs to the low side."
+    "nothing else is said of it: such draws count as infinite at the upper end of an interval and as their last step "
+    "at the lower one (of a ratio, the other way round where they are unguided ones). Areas of a kind are made "
+    "nondecreasing in its labels (isotonic regression) and lie on straight lines over the logarithm of the labels; "
+    "beyond its budgets nothing is assumed. The smallest of several budgets is chosen by its luck as well, so it errs "
+    "to the low side."
 )
 
 
@@ -93,19 +94,19 @@ def _cells(each: Carried, by_run: bool) -> list[str]:
     cells = [escaping.markdown(variant.run)] if by_run else []
     cells += [escaping.markdown(variant.guidance), f"{variant.labels:,}", _interval(each.guide)]
     cells += [told(each.steps, "{:,.0f}"), f"{each.reached:.0%}", _known(each.ratio, "{:.2f}")]
-    cells += [told(each.area, "{:.3f}"), _known(each.area_difference, "{:+.3f}")]
-    return [*cells, _known(each.area_ratio, "{:.2f}")]
+    cells += [_interval(variant.mean), _interval(each.area_difference, "{:+.3f}")]
+    return [*cells, _interval(each.area_ratio, "{:.2f}")]
 
 
 def _known(known: Known | None, form: str) -> str:
     return told(known, form) if known else ""
 
 
-def _interval(found: Interval | None) -> str:
-    if found is None:
+def _interval(found: Interval | None, form: str = "{:.3f}") -> str:
+    if found is None or np.isnan(found.estimate):
         return ""
-    text = f"{float(found.estimate):.3f}"
-    return text if np.isnan(found.lower) else f"{text} [{float(found.lower):.3f}, {float(found.upper):.3f}]"
+    estimate, lower, upper = (form.format(float(value)) for value in found)
+    return estimate if np.isnan(found.lower) else f"{estimate} [{lower}, {upper}]"
 
 
 # --- the figures -----------------------------------------------------------------------------------------------------
@@ -137,17 +138,19 @@ def efficiency_figures(found: Efficiency, title: str, metric: str) -> dict[str, 
         figures["labels_to_quality"] = _panels(guides, f"{title}: the guide alone", axis_name(metric))
     if ratios := of_ratios(found):
         level = f"steps to {found.level:.3g} over unguided"
-        figures["steps_saved"] = _panels(_at_most(ratios, LARGEST_RATIO), title, level, even=1.0)
+        figures["steps_saved"] = _panels(ratios, title, level, even=1.0)
     return figures
 
 
-def _at_most(shown: Shown, largest: float) -> Shown:
-    """With what lies above, infinity too, at `largest`."""
-    return [(variant, Interval(*(np.minimum(value, largest) for value in found))) for variant, found in shown]
-
-
 def _panels(shown: Shown, title: str, name: str, even: float | None = None) -> Figure:
-    """A panel for each run against labels; `even`: a height at which guidance makes no difference."""
+    """A panel for each run against labels; `even`: a height at which guidance makes no difference, of ratios."""
+    edge = np.inf
+    if even is not None:
+        heights = np.array([[found.estimate, found.upper] for _, found in shown])
+        edge = min(LARGEST_RATIO, max(2 * even, *(1.2 * heights[np.isfinite(heights)])))
+        if heights.max() <= edge:
+            edge = np.inf
+        shown = [(variant, Interval(*(np.minimum(value, edge) for value in found))) for variant, found in shown]
     runs = list(dict.fromkeys(variant.run for variant, _ in shown))
     columns = min(3, len(runs))
     lines = -(-len(runs) // columns)
@@ -158,7 +161,7 @@ def _panels(shown: Shown, title: str, name: str, even: float | None = None) -> F
             own = [(variant, found) for variant, found in shown if variant.run == run]
             draw_budgets(axes, [variant for variant, _ in own], [found for _, found in own], shortened(run))
             if even is not None:
-                _limit(axes, even)
+                _limit(axes, even, edge)
         for axes in panels.flat[len(runs) :]:
             axes.set_axis_off()
         for axes in panels[:, 0]:
@@ -172,10 +175,12 @@ def _panels(shown: Shown, title: str, name: str, even: float | None = None) -> F
     return figure
 
 
-def _limit(axes: Axes, even: float) -> None:
+def _limit(axes: Axes, even: float, edge: float) -> None:
     """Of ratios: a line where nothing is saved, and words at the edge where what never reaches the level is drawn."""
     axes.axhline(even, color=colour_of("none"), linewidth=1)
-    axes.axhline(LARGEST_RATIO, color="#595959", linewidth=0.8, linestyle=":")
-    across = axes.get_yaxis_transform()
-    axes.text(0.99, LARGEST_RATIO, "or more, or never", transform=across, ha="right", va="bottom", fontsize=8)
-    axes.set_ylim(0, 1.08 * LARGEST_RATIO)
+    axes.set_ylim(bottom=0)
+    if np.isfinite(edge):
+        axes.axhline(edge, color="#595959", linewidth=0.8, linestyle=":")
+        across = axes.get_yaxis_transform()
+        axes.text(0.99, edge, "or more, or never", transform=across, ha="right", va="bottom", fontsize=8)
+        axes.set_ylim(0, 1.08 * edge)
