@@ -124,10 +124,10 @@ def of_ratios(found: Efficiency) -> Shown:
     for each in found.carried:
         if each.ratio is None or (np.isinf(each.ratio.bounds.upper) and each.ratio.bounds.lower <= 0):
             continue
-        low, high = (float(bound) for bound in each.ratio.bounds)
+        high = float(each.ratio.bounds.upper)
         estimate = np.inf if np.isinf(high) else high  # below `high`, where the unguided agents never get there
-        ends = (each.ratio.lower if not np.isinf(high) else low, each.ratio.upper)
-        shown.append((each.variant, Interval(np.array(estimate), np.array(ends[0]), np.array(ends[1]))))
+        ends = np.array(each.ratio.lower), np.array(each.ratio.upper)
+        shown.append((each.variant, Interval(np.array(estimate), *ends)))
     return shown if any(variant.labels for variant, _ in shown) else []
 
 
@@ -147,7 +147,7 @@ def _panels(shown: Shown, title: str, name: str, even: float | None = None) -> F
     edge = np.inf
     if even is not None:
         heights = np.array([[found.estimate, found.upper] for _, found in shown])
-        edge = min(LARGEST_RATIO, max(2 * even, *(1.2 * heights[np.isfinite(heights)])))
+        edge = min(LARGEST_RATIO, float(1.2 * heights.max(where=np.isfinite(heights), initial=1.6 * even)))
         if heights.max() <= edge:
             edge = np.inf
         shown = [(variant, Interval(*(np.minimum(value, edge) for value in found))) for variant, found in shown]
