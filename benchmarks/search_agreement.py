@@ -22,8 +22,7 @@ import jax.numpy as jnp
 
 from cuelearner_jax import actions as geometry
 from cuelearner_jax.actions import DIRECTIONS
-from cuelearner_jax.agent.choice import greedy_actions
-from cuelearner_jax.agent.networks import applied, q_network
+from cuelearner_jax.agent.choice import greedy_actions, values
 from cuelearner_jax.config import Sizes
 from cuelearner_jax.evaluate import episodes, rollout
 from cuelearner_jax.guidance import registry as guidance
@@ -46,7 +45,7 @@ def met(env: Any, sizes: Sizes, params: Any) -> jax.Array:
     def step(carry: tuple, key: jax.Array) -> tuple[tuple, None]:
         state, obs = carry
         after, made = jax.vmap(env.step)(
-            jax.random.split(key, STATES), state, greedy_actions(sizes, DIRECTIONS, params, obs)
+            jax.random.split(key, STATES), state, greedy_actions(sizes, DIRECTIONS, env, params, obs)
         )
         return (after, made.obs), None
 
@@ -56,20 +55,20 @@ def met(env: Any, sizes: Sizes, params: Any) -> jax.Array:
 def compare(env: Any, agents: Any, own: Sizes, way: Sizes, steps: int, precise: bool) -> dict[str, float]:
     """Means over agents (leading axis of `agents`) of one way to search against the full one."""
     options = geometry.evenly_spaced(way.directions)
-    q = applied(q_network(way.q_layers))
+    q = values(way, env)
 
     def one(params: Any) -> dict[str, jax.Array]:
         obs = met(env, own, params)
         with jax.default_matmul_precision("highest"):
-            values = jax.lax.map(lambda seen: q(params, seen, options)[:, 0], obs, batch_size=16)
+            found = jax.lax.map(lambda seen: q(params, seen, options)[:, 0], obs, batch_size=16)
         with jax.default_matmul_precision("highest" if precise else "default"):
-            chosen = greedy_actions(way, DIRECTIONS, params, obs)
+            chosen = greedy_actions(way, DIRECTIONS, env, params, obs)
             reward = rollout(Agent(params, way), env, episodes(), 100, steps)["reward"]
-        best, number = values.max(-1), values.argmax(-1)
+        best, number = found.max(-1), found.argmax(-1)
         off = jnp.abs(geometry.difference(options[number], chosen))
         tenth = jnp.deg2rad(360.0 / way.directions)
         taken = jnp.round(geometry.to_angle(chosen) / tenth).astype(int) % way.directions
-        lost = (best - values[jnp.arange(STATES), taken]) / (best - values.mean(-1))
+        lost = (best - found[jnp.arange(STATES), taken]) / (best - found.mean(-1))
         return {
             "same": jnp.mean(off < 0.5 * tenth),
             "neighbouring": jnp.mean(off < 1.5 * tenth),

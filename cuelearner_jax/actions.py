@@ -31,6 +31,7 @@ class Actions(NamedTuple):
     distance: Callable[[Array, Array], Array]  # (action, other) -> how far apart they are
     sense: Callable[[Array, Array], Array]  # (action, goal) -> h: -1, 0 or +1, the way from one to the other
     toward: Callable[[Array, Array, Angle], Array]  # (action, h, step) -> the action moved by a step the way of h
+    outward: Callable[[Array, Array], Array]  # (vector as it looks from an action, action) -> the vector
 
 
 def from_angle(angle: Angle) -> Direction:
@@ -90,6 +91,18 @@ def toward(action: DirectionLike, h: Float[Array, "..."], step: Angle) -> Direct
     return rotate(action, h * step)
 
 
+def outward(vector: Float[Array, "... 2"], action: DirectionLike) -> Float[Array, "... 2"]:
+    """A vector given along and across (counterclockwise) a direction, in the frame in which the direction is given."""
+    along, across = vector[..., 0], vector[..., 1]
+    x, y = action[..., 0], action[..., 1]
+    return jnp.stack([x * along - y * across, y * along + x * across], axis=-1)
+
+
+def inward(vector: Float[Array, "... 2"], action: DirectionLike) -> Float[Array, "... 2"]:
+    """The inverse of `outward`: how much of a vector lies along a direction, and how much across it."""
+    return outward(vector, jnp.stack([action[..., 0], -action[..., 1]], axis=-1))
+
+
 def evenly_spaced(count: int) -> Float[Array, "count 2"]:
     """`count` directions, the first along x, the others counterclockwise."""
     return from_angle(jnp.arange(count) * (2 * math.pi / count))
@@ -109,6 +122,7 @@ DIRECTIONS = Actions(
     distance=distance,
     sense=sense,
     toward=toward,
+    outward=outward,
 )
 
 

@@ -28,8 +28,20 @@ LARGEST_ROUND = 1 << 30  # so that budgets of as many labels, in whole rounds, a
 LARGEST_FLOAT = 3.4028234e38  # scalars are computed in single precision
 
 
+Frame = Literal["raw", "action"]
+
+
 @dataclass(frozen=True)
-class AgentSizes:
+class _Seeing:
+    """What the networks of the agent and of the guide share."""
+
+    frame: Frame = "raw"
+    """What networks see: observation and action as they are, or the observation as it looks from the action (and
+    a guide then says by how much to turn from there)."""
+
+
+@dataclass(frozen=True)
+class AgentSizes(_Seeing):
     """Static sizes of the agent."""
 
     q_layers: tuple[int, ...] = (400, 400, 400, 300, 300, 300)
@@ -62,7 +74,7 @@ class AgentSizes:
 
 
 @dataclass(frozen=True)
-class GuideSizes:
+class GuideSizes(_Seeing):
     """Static sizes of the guidance model and of its fitting."""
 
     feedback_layers: tuple[int, ...] = (400, 400, 300, 300)

@@ -27,6 +27,13 @@ class Quantity(NamedTuple):
     about: str = ""  # what it is, where from and in which order, in a few words
 
 
+class Features(NamedTuple):
+    """An observation as it looks from actions. Networks take the two parts where they take observation and action."""
+
+    own: Float[Array, " own"]  # what looks alike from every action: computed once, however many there are
+    turned: Float[Array, "*n turned"]  # what hangs on the action
+
+
 @runtime_checkable
 class Environment(Protocol):
     """One task. Inherit `WholeObservations` (or `Described`) for what can be derived."""
@@ -96,7 +103,7 @@ class OffersMirror(Protocol):
 class OffersFeatures(Protocol):
     """An environment that can show an observation as it looks from an action."""
 
-    def features(self, obs: Float[Array, " obs"], actions: Float[Array, "*n action"]) -> Float[Array, "*n features"]:
+    def features(self, obs: Float[Array, " obs"], actions: Float[Array, "*n action"]) -> Features:
         """What a network is to see of one observation and each of the actions."""
         ...
 
@@ -148,11 +155,16 @@ class Spaces(NamedTuple):
 
     obs_size: int
     actions: Actions
+    features: tuple[int, int] | None = None  # entries of `Features.own` and `Features.turned`, if it offers any
 
 
 def spaces_of(env: Any) -> Spaces:
     """An environment's; shapes in place of its arrays will do."""
-    return Spaces(env.obs_size, actions_of(env))
+    obs_size, actions = env.obs_size, actions_of(env)
+    if not offers(env, "features"):
+        return Spaces(obs_size, actions)
+    seen = jax.eval_shape(lambda env: env.features(jnp.zeros(obs_size), jnp.zeros(actions.size)), env)
+    return Spaces(obs_size, actions, (seen.own.shape[-1], seen.turned.shape[-1]))
 
 
 def symmetries_of(env: Any) -> int:

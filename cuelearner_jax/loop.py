@@ -219,7 +219,7 @@ class Lane(NamedTuple):
         base = jax.lax.cond(
             clock.step < schedule.random_steps,
             lambda: self.learner.actions.uniform(key, (self.sizes.num_envs,)),
-            lambda: self.learner.greedy(agent),
+            lambda: self.learner.greedy(env, agent),
         )
         guides = (clock.step >= schedule.random_steps) & (clock.step < schedule.guidance_until)
         return jax.lax.cond(

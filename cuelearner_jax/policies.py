@@ -46,15 +46,16 @@ class Agent(struct.PyTreeNode):
     params: Params
     sizes: AgentSizes = struct.field(pytree_node=False)
     actions: Actions = struct.field(pytree_node=False, default=DIRECTIONS)
+    env: Any = None  # says how an observation looks from an action; nobody asks it in the raw frame
 
     def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
         """The action with the largest value."""
-        return greedy_actions(self.sizes, self.actions, self.params, obs)
+        return greedy_actions(self.sizes, self.actions, self.env, self.params, obs)
 
     @property
     def axes(self) -> Agent:
         """Each lane has its own network."""
-        return self.replace(params=BY_LANE)
+        return self.replace(params=BY_LANE, env=SHARED)
 
 
 class Uniform(struct.PyTreeNode):

@@ -59,7 +59,7 @@ def make(sizes: GuideSizes, spaces: Spaces) -> Guidance:
 
     def fit(key: PRNGKeyArray, env: Any, labels: Label, former: GuidanceModel, scalars: GuideScalars) -> GuidanceModel:
         rows = lessons(labels, target, scalars)
-        return fit_least_squares(key, env, rows, scalars, init=init_params, apply=predict, sizes=sizes)
+        return fit_least_squares(key, rows, scalars, init=init_params, apply=predict, sizes=sizes)
 
     def act(
         model: GuidanceModel, env: Any, obs: Array, actions: Array, active: Array, scalars: GuideScalars

@@ -14,9 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from cuelearner_jax.actions import difference, evenly_spaced, from_angle, rotate
+from cuelearner_jax.actions import difference, evenly_spaced, from_angle, inward, rotate
 from cuelearner_jax.config import RunConfig, Scalars, Schedule, Sizes, digest
-from cuelearner_jax.environment import Quantity, WholeObservations
+from cuelearner_jax.environment import Features, Quantity, WholeObservations
 from cuelearner_jax.guidance import registry as guidances
 from cuelearner_jax.loop import make_program
 from cuelearner_jax.task import Body, Task
@@ -61,7 +61,7 @@ class Window(WholeObservations, struct.PyTreeNode):
         return rotate(obs, which * (math.pi / 2)), rotate(vector, which * (math.pi / 2))
 
     def features(self, obs, action):
-        return jnp.concatenate([jnp.broadcast_to(obs, action.shape), action], axis=-1)
+        return Features(obs, jnp.concatenate([inward(jnp.broadcast_to(obs, action.shape), action), action], axis=-1))
 
 
 class Chain(WholeObservations, struct.PyTreeNode):

@@ -11,12 +11,12 @@ import optax
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from cuelearner_jax.actions import Actions
-from cuelearner_jax.agent import ddqn
-from cuelearner_jax.agent.choice import greedy_actions
-from cuelearner_jax.agent.networks import applied, q_network
+from cuelearner_jax.agent import ddqn, view
+from cuelearner_jax.agent.choice import greedy_actions, values
+from cuelearner_jax.agent.networks import q_network
 from cuelearner_jax.agent.replay import RingBuffer, ring_buffer
 from cuelearner_jax.config import AgentScalars, AgentSizes, Schedule
-from cuelearner_jax.environment import Environment, actions_of, random_symmetries
+from cuelearner_jax.environment import Environment, actions_of, random_symmetries, spaces_of
 from cuelearner_jax.types import AgentState, Clock, Params, Step, StoredStep, Transition
 
 
@@ -28,17 +28,14 @@ class Learner(NamedTuple):
     actions: Actions
     buffer: RingBuffer
 
-    def q(self, params: Params, obs: jax.Array, actions: jax.Array) -> jax.Array:
-        """Action values (..., 1)."""
-        return applied(q_network(self.sizes.q_layers))(params, obs, actions)
-
     def optimizer(self, scalars: AgentScalars) -> optax.GradientTransformation:
         """The optimiser of the action values."""
         return ddqn.optimizer(self.sizes.optimizer, scalars.learning_rate, scalars.max_grad_norm)
 
     def init(self, env: Environment, k_params: PRNGKeyArray, k_env: PRNGKeyArray) -> AgentState:
         """A fresh agent at the start of its environments' first episodes."""
-        params = q_network(self.sizes.q_layers).init(k_params, jnp.zeros(env.obs_size), jnp.zeros(self.actions.size))
+        own, turned = view.widths(self.sizes.frame, spaces_of(env))
+        params = q_network(self.sizes.q_layers).init(k_params, jnp.zeros(own), jnp.zeros(turned))
         env_state, obs = jax.vmap(env.reset)(jax.random.split(k_env, self.sizes.num_envs))
         return AgentState(
             params=params,
@@ -50,9 +47,9 @@ class Learner(NamedTuple):
             guided=jnp.zeros(self.sizes.num_envs, bool),
         )
 
-    def greedy(self, agent: AgentState) -> Float[Array, "num_envs action"]:
+    def greedy(self, env: Environment, agent: AgentState) -> Float[Array, "num_envs action"]:
         """The greedy choice in each of its environments."""
-        return greedy_actions(self.sizes, self.actions, agent.params, agent.obs)
+        return greedy_actions(self.sizes, self.actions, env, agent.params, agent.obs)
 
     def learn(
         self,
@@ -70,7 +67,7 @@ class Learner(NamedTuple):
         """
         steps = self.sizes.num_envs * self.sizes.updates_per_step
         filled = clock.step + self.sizes.num_envs
-        optimizer = self.optimizer(scalars)
+        optimizer, q = self.optimizer(scalars), values(self.sizes, env)
 
         def update(carry: tuple, index: jax.Array) -> tuple[tuple, tuple[jax.Array, jax.Array]]:
             params, target_params, opt_state = carry
@@ -80,9 +77,9 @@ class Learner(NamedTuple):
             if self.sizes.n_step > 1:
                 batches.append(self.n_step(env, agent.replay, filled, numbers, scalars))
             batches = [mirrored(k_mirror, env, batch) for batch in batches]
-            targets = self.targets(params, target_params, batches, scalars)
+            targets = self.targets(env, params, target_params, batches, scalars)
             batch = batches[0]
-            loss, gradient = jax.value_and_grad(lambda p: ddqn.loss(self.q, p, batch, targets))(params)
+            loss, gradient = jax.value_and_grad(lambda p: ddqn.loss(q, p, batch, targets))(params)
             change, opt_state = optimizer.update(gradient, opt_state, params)
             params = optax.apply_updates(params, change)
             if self.bootstraps:
@@ -125,14 +122,19 @@ class Learner(NamedTuple):
         return Transition(jax.vmap(env.recall)(first.obs), first.action, reward, discount, next_obs)
 
     def targets(
-        self, params: Params, target_params: Params, batches: list[Transition], scalars: AgentScalars
+        self,
+        env: Environment,
+        params: Params,
+        target_params: Params,
+        batches: list[Transition],
+        scalars: AgentScalars,
     ) -> Float[Array, " batch"]:
         """What the values of a batch are fitted to: of one-step and, if there are, n-step transitions."""
         options = self.actions.spread(self.sizes.target_directions)
-        chooser = applied(q_network(self.sizes.q_layers, self.sizes.target_dtype))
+        q, chooser = values(self.sizes, env), values(self.sizes, env, jnp.dtype(self.sizes.target_dtype))
 
         def one(item: Transition) -> jax.Array:
-            return ddqn.target(self.q, params, target_params, item, options, scalars.discount, chooser)
+            return ddqn.target(q, params, target_params, item, options, scalars.discount, chooser)
 
         # One pass through the networks for both: their weights are what has to be read.
         joined = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *batches)
@@ -147,8 +149,12 @@ def all_finite(tree: Any) -> Bool[Array, ""]:
 
 
 def learner(sizes: AgentSizes, bootstraps: bool, env: Environment) -> Learner:
-    """The agent for an environment, whose shapes alone are looked at."""
+    """The agent for an environment, whose shapes alone are looked at.
+
+    Raises UserError for a frame in which the environment cannot be seen.
+    """
     actions = actions_of(env)
+    view.widths(sizes.frame, spaces_of(env))
 
     def one_step(env: Environment, key: PRNGKeyArray) -> StoredStep:
         state, obs = env.reset(key)

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
+from cuelearner_jax.agent import view
 from cuelearner_jax.agent.choice import looked_at
 from cuelearner_jax.config import Sizes
 from cuelearner_jax.environment import Spaces
@@ -37,30 +38,31 @@ def step_operations(sizes: Sizes, spaces: Spaces, bootstraps: bool) -> Operation
         spaces: of the environment.
         bootstraps: whether targets look at the next observation.
     """
+    widths = view.widths(sizes.frame, spaces)
     rows = sizes.batch_size * (2 if sizes.n_step > 1 else 1) if bootstraps else 0
-    target = forward(sizes.q_layers, spaces, sizes.target_directions) + forward(sizes.q_layers, spaces, 1)
+    target = forward(sizes.q_layers, widths, sizes.target_directions) + forward(sizes.q_layers, widths, 1)
     return Operations(
-        acting=forward(sizes.q_layers, spaces, looked_at(sizes)),
-        gradient=sizes.updates_per_step * sizes.batch_size * forward_and_backward(sizes.q_layers, spaces),
+        acting=forward(sizes.q_layers, widths, looked_at(sizes)),
+        gradient=sizes.updates_per_step * sizes.batch_size * forward_and_backward(sizes.q_layers, widths),
         targets=sizes.updates_per_step * rows * target,
     )
 
 
-def forward(layers: Sequence[int], spaces: Spaces, actions: int) -> int:
-    """Values of so many actions in one state. The observation's share of the first layer is computed once a state."""
-    first, later = _weights(layers, spaces)
-    return 2 * (spaces.obs_size * layers[0] + actions * (first + later))
+def forward(layers: Sequence[int], widths: tuple[int, int], actions: int) -> int:
+    """Values of so many actions in one state. What hangs on no action enters the first layer once a state."""
+    first, later = _weights(layers, widths[1])
+    return 2 * (widths[0] * layers[0] + actions * (first + later))
 
 
-def forward_and_backward(layers: Sequence[int], spaces: Spaces) -> int:
+def forward_and_backward(layers: Sequence[int], widths: tuple[int, int]) -> int:
     """The value of one action and its gradient: 2 a weight forward, 4 backward (gradients of weights and of inputs).
 
     Nobody asks for the gradient of the first layer's inputs.
     """
-    first, later = _weights(layers, spaces)
-    return 4 * (spaces.obs_size * layers[0] + first) + 6 * later
+    first, later = _weights(layers, widths[1])
+    return 4 * (widths[0] * layers[0] + first) + 6 * later
 
 
-def _weights(layers: Sequence[int], spaces: Spaces) -> tuple[int, int]:
+def _weights(layers: Sequence[int], turned: int) -> tuple[int, int]:
     """Weights from the entries of an action to the first layer, and of all later layers with the output."""
-    return spaces.actions.size * layers[0], sum(a * b for a, b in pairwise([*layers, 1]))
+    return turned * layers[0], sum(a * b for a, b in pairwise([*layers, 1]))

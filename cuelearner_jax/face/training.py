@@ -62,7 +62,7 @@ class Run:
             raise UserError(f"no lane with seed {wanted} and {budget} labels was trained")
         params = [block.agent.params for block in training.blocks]
         joined = jax.tree.map(lambda *leaves: np.concatenate([np.asarray(leaf) for leaf in leaves]), *params)
-        agents = Agent(joined, self.config.sizes, actions_of(group.env))
+        agents = Agent(joined, self.config.sizes, actions_of(group.env), group.env)
         return CallablePolicy(one_lane(agents, int(found[0])), self.world.observation)
 
 

@@ -11,7 +11,6 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Key, PRNGKeyArray
 
 from cuelearner_jax.config import GuideScalars, GuideSizes
-from cuelearner_jax.environment import Environment, random_symmetries
 from cuelearner_jax.guidance.bundle import TargetFunction
 from cuelearner_jax.types import GuidanceModel, Label, Params
 
@@ -43,7 +42,6 @@ def _subset(valid: Bool[Array, " labels"]) -> Callable[[PRNGKeyArray, int], jax.
 
 def fit_least_squares(
     key: PRNGKeyArray,
-    env: Environment | None,
     rows: Lesson,
     scalars: GuideScalars,
     *,
@@ -53,12 +51,13 @@ def fit_least_squares(
 ) -> GuidanceModel:
     """Fits a model from scratch by least squares (paper, Eq. 3) and keeps the parameters that validated best.
 
-    A fixed number of Adam steps, so that vmapped seeds take equally long. Lessons are multiplied by the environment's
-    symmetries where it offers them (a target is then a vector like an action). With fewer than five nothing validates:
-    the last parameters are kept. A fit that diverged before anything validated gives parameters that are NaN.
+    A fixed number of Adam steps, so that vmapped seeds take equally long. With fewer than five nothing validates: the
+    last parameters are kept. A fit that diverged before anything validated gives parameters that are NaN.
+
+    Lessons are never multiplied by an environment's symmetries: what a teacher would answer in the mirror image is its
+    own choice where several actions are as good, and mostly another than the mirror image of its answer.
 
     Args:
-        env: whose symmetries they are; None: there is none, and nothing multiplies them.
         rows: lessons (slots, ...), of which the valid ones count.
         init: parameters from a key.
         apply: (params, obs (n, obs), actions (n, action)) -> predictions (n, outputs).
@@ -81,11 +80,8 @@ def fit_least_squares(
 
     def step(carry: tuple[Params, optax.OptState], key: PRNGKeyArray) -> tuple[tuple[Params, optax.OptState], None]:
         params, opt_state = carry
-        key_draw, key_mirror = jax.random.split(key)
+        key_draw, _ = jax.random.split(key)  # so that numbers are those of results that are recorded
         batch = jax.tree.map(lambda leaf: leaf[draw(key_draw, sizes.fit_batch_size)], rows)
-        image = random_symmetries(key_mirror, env, sizes.fit_batch_size)
-        (obs, action), (_, target) = image(batch.obs, batch.action), image(batch.obs, batch.target)
-        batch = batch.replace(obs=obs, action=action, target=target)
         updates, opt_state = optimizer.update(jax.grad(loss)(params, batch), opt_state, params)
         return (optax.apply_updates(params, updates), opt_state), None
 

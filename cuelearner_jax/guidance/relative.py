@@ -5,34 +5,31 @@ The network predicts in units of eps, so that a small eps fits as easily as a la
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from cuelearner_jax.agent.networks import applied, residual_network
 from cuelearner_jax.config import GuideScalars, GuideSizes
 from cuelearner_jax.environment import Spaces
 from cuelearner_jax.guidance.answers import RELATIVE
 from cuelearner_jax.guidance.bundle import Guidance
 from cuelearner_jax.guidance.fitting import fit_least_squares, lessons
 from cuelearner_jax.guidance.kind import Kind
+from cuelearner_jax.guidance.model import residual_model
 from cuelearner_jax.guidance.questions import about_refined
 from cuelearner_jax.guidance.refining import Refined, refine
-from cuelearner_jax.types import GuidanceModel, Label, Params
+from cuelearner_jax.types import GuidanceModel, Label
 
 
 def make(sizes: GuideSizes, spaces: Spaces) -> Guidance:
     """The bundle for an environment's spaces."""
     space = spaces.actions
-    network = residual_network(sizes.feedback_layers, space.size)
-    predict = applied(network)
-
-    def init_params(key: PRNGKeyArray) -> Params:
-        return network.init(key, jnp.zeros(spaces.obs_size), jnp.zeros(space.size))
+    network = residual_model(sizes, spaces)
 
     def init(key: PRNGKeyArray) -> GuidanceModel:
-        return GuidanceModel(init_params(key), jnp.array(False))
+        return GuidanceModel(network.init(key), jnp.array(False))
 
     def target(label: Label, scalars: GuideScalars) -> Float[Array, " action"]:
         """Eq. 3's eps * h as a vector: the action turned by h * eps, less the action."""
@@ -41,7 +38,8 @@ def make(sizes: GuideSizes, spaces: Spaces) -> Guidance:
     def fit(key: PRNGKeyArray, env: Any, labels: Label, former: GuidanceModel, scalars: GuideScalars) -> GuidanceModel:
         rows = lessons(labels, target, scalars)
         rows = rows.replace(target=rows.target / scalars.radians("eps"))
-        return fit_least_squares(key, env, rows, scalars, init=init_params, apply=predict, sizes=sizes)
+        predict = partial(network.predict, env)
+        return fit_least_squares(key, rows, scalars, init=network.init, apply=predict, sizes=sizes)
 
     def act(
         model: GuidanceModel,
@@ -52,7 +50,7 @@ def make(sizes: GuideSizes, spaces: Spaces) -> Guidance:
         scalars: GuideScalars,
     ) -> Refined:
         return refine(
-            lambda current: scalars.radians("eps") * predict(model.params, obs, current),
+            lambda current: scalars.radians("eps") * network.predict(env, model.params, obs, current),
             actions,
             active & model.fitted,
             space=space,

@@ -26,7 +26,7 @@ from cuelearner_jax.errors import UserError
 from cuelearner_jax.records.whole import replacing, unreadable
 
 DIGEST = "digest"  # the name under which a JSON file holds the digest of its other values
-FORMATS = {"config": 2, "labels": 1, "teacher": 2}
+FORMATS = {"config": 2, "labels": 1, "teacher": 3}
 SEALED_SINCE = 2  # the format from which on a JSON file must carry a digest
 REMEDIES = {  # what a message says of a damaged file, after its path
     "config": "is damaged or of another program: restore it, or start anew with --overwrite",
@@ -109,6 +109,14 @@ def _pieces_with_seeds(values: Values) -> Values:
     return {**values, "shard": {"index": index, "count": count, "seeds": None}}
 
 
+def _seen_in_another_order(values: Values) -> Values:
+    """What a teacher's network takes stood ball by ball; now what hangs on the direction stands apart."""
+    raise UserError(
+        "the teacher was trained by an earlier cuelearner, whose networks saw the table in another order: train it "
+        "anew with `cuelearner teacher train`"
+    )
+
+
 def _answers_of_targets(values: Values) -> Values:
     """Labels held what the model of relative feedback was to predict, rotate(action, h * eps) - action; now h."""
     kept = {name: value for name, value in values.items() if name not in ("guidance", "columns")}
@@ -133,4 +141,5 @@ STEPS: dict[tuple[str, int], Callable[[Values], Values]] = {
     ("labels", 0): _answers_of_targets,
     ("teacher", 0): _only_numbered,
     ("teacher", 1): _only_numbered,
+    ("teacher", 2): _seen_in_another_order,
 }

@@ -39,7 +39,7 @@ class Parts(NamedTuple):
     def agent(self) -> Agent:
         """The lanes' agents."""
         assert self.lanes is not None
-        return Agent(self.lanes.policies["params"], self.config.sizes, actions_of(self.env))
+        return Agent(self.lanes.policies["params"], self.config.sizes, actions_of(self.env), self.env)
 
     def guided(self, base: Policy) -> Guided:
         """A policy under the lanes' guidance."""

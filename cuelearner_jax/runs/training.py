@@ -116,8 +116,11 @@ class Training:
         group = self.group
         own = {"seed": group.seeds, "labels": group.budgets, "step": self.step, "wall_s": self.wall}
         own["failed"] = self.failed.astype(float)
-        actions = actions_of(group.env)
-        return {**own, **self._measured(lambda lane: Agent(lane.agent.params, group.config.sizes, actions))}
+        return {**own, **self._measured(self._agent)}
+
+    def _agent(self, lane: TrainState) -> Policy:
+        """A block's agents, who look at the examined world."""
+        return Agent(lane.agent.params, self.group.config.sizes, actions_of(self.group.env), self.examined)
 
     def guide_alone(self) -> dict[str, np.ndarray]:
         """Metrics (lanes,) of uniform actions under guidance; for unguided lanes that is chance."""

@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import flax.linen as nn
-import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float
 
 from cuelearner_jax import actions as geometry
+from cuelearner_jax.agent.networks import applied, q_network
+from cuelearner_jax.agent.view import seen
 from cuelearner_jax.types import Params
 
 
@@ -44,17 +44,11 @@ class TeacherConfig:
     """Largest standard deviation of the directions tried round a promising one [deg]."""
 
 
-class ValueNetwork(nn.Module):
-    """Expected reward from the features of (observation, action)."""
-
-    layers: tuple[int, ...]
-
-    @nn.compact
-    def __call__(self, features: Float[Array, "... features"]) -> Float[Array, "..."]:
-        x = features
-        for width in self.layers:
-            x = nn.relu(nn.Dense(width)(x))
-        return nn.Dense(1)(x)[..., 0]
+def expected_reward(
+    layers: tuple[int, ...], env: Any, params: Params, obs: Float[Array, " obs"], actions: Float[Array, "*n 2"]
+) -> Float[Array, "*n"]:
+    """A teacher's network: the reward that it expects of actions in one situation, as it looks from them."""
+    return applied(q_network(layers))(params, *seen("action", env, obs, actions))[..., 0]
 
 
 class LearnedTeacher(struct.PyTreeNode):
@@ -69,7 +63,7 @@ class LearnedTeacher(struct.PyTreeNode):
 
     def values(self, obs: Float[Array, " obs"], options: Float[Array, "n 2"]) -> Float[Array, " n"]:
         """Expected reward of each direction."""
-        return jnp.asarray(ValueNetwork(self.layers).apply(self.params, self.env.features(obs, options)))
+        return expected_reward(self.layers, self.env, self.params, obs, options)
 
     def best_action(self, state: Any, obs: Float[Array, " obs"]) -> Float[Array, "2"]:
         """The direction with the largest value."""

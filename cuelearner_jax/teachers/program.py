@@ -19,8 +19,10 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from cuelearner_jax import actions as geometry
 from cuelearner_jax.agent.learning import all_finite
+from cuelearner_jax.agent.networks import q_network
+from cuelearner_jax.agent.view import seen
 from cuelearner_jax.environment import random_symmetries
-from cuelearner_jax.teachers.learned import LearnedTeacher, TeacherConfig, ValueNetwork
+from cuelearner_jax.teachers.learned import LearnedTeacher, TeacherConfig, expected_reward
 from cuelearner_jax.types import Params
 
 SHARPNESS = 0.05  # values that differ by this are told apart when promising directions are drawn
@@ -79,14 +81,14 @@ class Trainer(NamedTuple):
 
     def value(self, env: Any, params: Params, obs: jax.Array, actions: jax.Array) -> jax.Array:
         """Expected reward of actions in one state."""
-        return jnp.asarray(ValueNetwork(self.config.layers).apply(params, env.features(obs, actions)))
+        return expected_reward(self.config.layers, env, params, obs, actions)
 
     def init(self, env: Any, key: PRNGKeyArray) -> TeacherState:
         """A fresh network, every table at the start of an episode."""
         c = self.config
         k_params, k_env, key = jax.random.split(key, 3)
         env_state, obs = jax.vmap(env.reset)(jax.random.split(k_env, c.tables))
-        params = ValueNetwork(c.layers).init(k_params, env.features(obs[0], jnp.array([1.0, 0.0])))
+        params = q_network(c.layers).init(k_params, *seen("action", env, obs[0], jnp.array([1.0, 0.0])))
         return TeacherState(
             params=params,
             average=jax.tree.map(jnp.copy, params),

@@ -187,7 +187,9 @@ def _asked(env: Any, obs: Array, actions: Array) -> dict[str, Any]:
         found["heuristic"] = jax.vmap(env.heuristic)(obs)
     if offers(env, "features"):
         few = actions[:COMPARED]
-        found["features"] = env.features(obs[0], few), jnp.stack([env.features(obs[0], action) for action in few])
+        each = [env.features(obs[0], action) for action in few]
+        singly = jax.tree.map(lambda *rows: jnp.stack(rows), *map(tuple, each))
+        found["features"] = tuple(env.features(obs[0], few)), singly
     if offers(env, "mirror"):
         which = jnp.arange(symmetries_of(env))
         rows = jax.vmap(env.mirror, (None, 0, 0))
@@ -249,16 +251,30 @@ def _check_optional(laws: Laws, env: Environment, walk: Walk) -> None:
     if "heuristic" in walk.optional:
         laws.actions(actions_of(env), walk.optional["heuristic"], "what `heuristic` gives")
     if "features" in walk.optional:
-        batch, single = walk.optional["features"]
-        fits = np.shape(batch) == np.shape(single) and np.ndim(batch) == 2
-        laws.hold(
-            fits and laws.same(batch, single),
-            f"`features` of {len(single)} actions (shape {np.shape(batch)}) are not those of each (together "
-            f"{np.shape(single)}): let any leading axes of the actions through",
-        )
-        laws.hold(np.isfinite(batch).all(), "`features` are not finite everywhere")
+        _check_features(laws, *walk.optional["features"])
     if "mirror" in walk.optional:
         _check_mirrors(laws, walk, **walk.optional["mirror"])
+
+
+def _check_features(laws: Laws, together: Any, each: Any) -> None:
+    """Those of many actions are those of each, and what they say of the observation alone hangs on no action."""
+    laws.hold(
+        len(together) == len(each) == 2,
+        "`features` are no `environment.Features`: give what hangs on no action, and the rest",
+    )
+    (own, turned), (owns, singly) = together, each
+    laws.hold(
+        np.ndim(own) == 1 and laws.same(np.broadcast_to(own, np.shape(owns)), owns),
+        "`features` hold in `own` what hangs on the action: move it to `turned`",
+    )
+    fits = np.shape(turned) == np.shape(singly) and np.ndim(turned) == 2
+    laws.hold(
+        fits and laws.same(turned, singly),
+        f"`features` of {len(singly)} actions (`turned` of shape {np.shape(turned)}) are not those of each (together "
+        f"{np.shape(singly)}): let any leading axes of the actions through",
+    )
+    finite = np.isfinite(own).all() and np.isfinite(turned).all()
+    laws.hold(finite, "`features` are not finite everywhere")
 
 
 def _check_mirrors(laws: Laws, walk: Walk, images: Any, other: Any, combined: Any, twice: Any) -> None:

@@ -61,7 +61,7 @@ def test_the_higher_of_two_peaks_is_found_though_the_first_look_sees_it_lower():
 def test_the_quick_choice_of_a_network_is_the_full_one(coarse):
     obs = jax.random.normal(jax.random.key(1), (64, 5))
     quick = dataclasses.replace(FULL, coarse_directions=coarse, peaks=4)
-    fast, full = (search.greedy_actions(sizes, DIRECTIONS, agent(), obs) for sizes in (quick, FULL))
+    fast, full = (search.greedy_actions(sizes, DIRECTIONS, None, agent(), obs) for sizes in (quick, FULL))
     assert len(np.unique(np.asarray(full), axis=0)) > 5  # choices differ from state to state
     np.testing.assert_array_equal(fast, full)
 
@@ -69,7 +69,7 @@ def test_the_quick_choice_of_a_network_is_the_full_one(coarse):
 def test_a_first_look_in_bfloat16_gives_up_hardly_any_value():
     obs, params = jax.random.normal(jax.random.key(1), (64, 5)), agent()
     rough = dataclasses.replace(FULL, coarse_directions=60, coarse_dtype="bfloat16", peaks=4)
-    chosen = search.greedy_actions(rough, DIRECTIONS, params, obs)
+    chosen = search.greedy_actions(rough, DIRECTIONS, None, params, obs)
     q = applied(q_network(LAYERS))
     values = jax.vmap(lambda seen: q(params, seen, evenly_spaced(360))[:, 0])(obs)
     taken = jax.vmap(lambda seen, action: q(params, seen, action)[0])(obs, chosen)
@@ -80,9 +80,9 @@ def test_a_first_look_in_bfloat16_gives_up_hardly_any_value():
 
 def test_actions_do_not_depend_on_how_many_states_are_searched_at_once(monkeypatch):
     obs = jax.random.normal(jax.random.key(2), (7, 5))
-    together = search.greedy_actions(FULL, DIRECTIONS, agent(), obs)
+    together = search.greedy_actions(FULL, DIRECTIONS, None, agent(), obs)
     monkeypatch.setattr(search, "portions", lambda: Portions(actions=360, agents=1, states=1))
-    np.testing.assert_allclose(search.greedy_actions(FULL, DIRECTIONS, agent(), obs), together, atol=1e-6)
+    np.testing.assert_allclose(search.greedy_actions(FULL, DIRECTIONS, None, agent(), obs), together, atol=1e-6)
 
 
 def test_units_that_fill_up_a_layer_add_exactly_nothing():

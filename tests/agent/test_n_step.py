@@ -163,8 +163,12 @@ def test_the_target_lies_between_that_of_one_step_and_that_of_many_by_the_weight
     # termination with 2; three steps: 3 + 0.5 * 0.25 * 8 and 3 with a termination.
     near, far = batch([1.0, 2.0], [1.0, 0.0]), batch([3.0, 3.0], [0.25, 0.0])
     scalars = Scalars(discount=HALF, n_step_weight=weight)
-    np.testing.assert_allclose(AGENT.targets(constant(-3.0), constant(8.0), [near, far], scalars), expected, rtol=1e-6)
-    np.testing.assert_allclose(AGENT.targets(constant(-3.0), constant(8.0), [near], scalars), [5.0, 2.0], rtol=1e-6)
+    np.testing.assert_allclose(
+        AGENT.targets(probes.Window(), constant(-3.0), constant(8.0), [near, far], scalars), expected, rtol=1e-6
+    )
+    np.testing.assert_allclose(
+        AGENT.targets(probes.Window(), constant(-3.0), constant(8.0), [near], scalars), [5.0, 2.0], rtol=1e-6
+    )
 
 
 # The whole loop.

@@ -25,15 +25,16 @@ from cuelearner_jax.types import Transition
 
 LAYERS, OBS = (64, 48), 10
 SPACES = Spaces(OBS, DIRECTIONS)
+WIDTHS = (OBS, DIRECTIONS.size)
 Q = applied(q_network(LAYERS))
 
 
 def test_operations_are_those_counted_by_hand():
     # Two numbers of an action and ten of an observation to 64, 64 to 48, 48 to 1: weights 128, 640, 3072, 48.
-    assert forward(LAYERS, SPACES, 1) == 2 * (640 + 128 + 3072 + 48)
-    assert forward(LAYERS, SPACES, 5) == 2 * 640 + 5 * 2 * (128 + 3072 + 48)
+    assert forward(LAYERS, WIDTHS, 1) == 2 * (640 + 128 + 3072 + 48)
+    assert forward(LAYERS, WIDTHS, 5) == 2 * 640 + 5 * 2 * (128 + 3072 + 48)
     # Weights' gradients of all layers; inputs' of all but the first.
-    assert forward_and_backward(LAYERS, SPACES) == 2 * 3888 + 2 * 3888 + 2 * 3120
+    assert forward_and_backward(LAYERS, WIDTHS) == 2 * 3888 + 2 * 3888 + 2 * 3120
     sizes = Sizes(q_layers=LAYERS, directions=36, target_directions=12, batch_size=7, updates_per_step=2)
     one_step = step_operations(sizes, SPACES, bootstraps=False)
     assert one_step == (2 * 640 + 36 * 2 * 3248, 2 * 7 * (4 * 3888 + 2 * 3120), 0)
@@ -63,14 +64,14 @@ def test_operations_are_those_that_xla_counts():
     directions, batch = jnp.ones((72, 2)), 32
     items = Transition(*(jnp.ones((batch, *shape)) for shape in ((OBS,), (2,), (), (), (OBS,))))
     acting = traced_operations(lambda p, obs: ddqn.greedy(Q, p, obs, directions), params, jnp.ones(OBS))
-    assert acting == pytest.approx(forward(LAYERS, SPACES, 72), rel=0.05)
+    assert acting == pytest.approx(forward(LAYERS, WIDTHS, 72), rel=0.05)
     loss = jax.value_and_grad(lambda p: ddqn.loss(Q, p, items, items.reward))
     gradient = traced_operations(loss, params)
-    assert gradient == pytest.approx(batch * forward_and_backward(LAYERS, SPACES), rel=0.05)
+    assert gradient == pytest.approx(batch * forward_and_backward(LAYERS, WIDTHS), rel=0.05)
     other = jax.tree.map(lambda leaf: leaf + 1, params)
     target = partial(ddqn.target, Q, params, other, options=directions, discount=0.9)
     targets = traced_operations(jax.vmap(target), items)
-    assert targets == pytest.approx(batch * (forward(LAYERS, SPACES, 72) + forward(LAYERS, SPACES, 1)), rel=0.05)
+    assert targets == pytest.approx(batch * (forward(LAYERS, WIDTHS, 72) + forward(LAYERS, WIDTHS, 1)), rel=0.05)
 
 
 @pytest.fixture(scope="module")

@@ -227,7 +227,7 @@ def test_what_is_made_must_be_what_was_announced(registered):
 def test_bundles_are_made_once_for_the_same_sizes_and_spaces(kind):
     bundle = guidance.make(kind, probes.SIZES, ENV)
     assert guidance.make(kind, probes.SIZES, probes.Window(half_width=0.1, mirrors=True)) is bundle
-    assert guidance.make(kind, dataclasses.replace(probes.SIZES), probes.Chain()) is bundle
+    assert guidance.make(kind, dataclasses.replace(probes.SIZES), probes.Window(offset=1.0)) is bundle
     assert guidance.make(kind, dataclasses.replace(probes.SIZES, feedback_layers=(3,)), ENV) is not bundle
     assert guidance.make(kind, probes.SIZES, jax.eval_shape(probes.Window)) is bundle
 

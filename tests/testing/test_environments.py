@@ -8,7 +8,7 @@ from flax import struct
 from probes import Chain, Window
 
 from cuelearner_jax.actions import DIRECTIONS, rotate
-from cuelearner_jax.environment import Quantity, WholeObservations
+from cuelearner_jax.environment import Features, Quantity, WholeObservations
 from cuelearner_jax.testing import check_environment
 
 
@@ -120,7 +120,12 @@ class Astray(Window):
 
 class Narrow(Window):
     def features(self, obs, action):
-        return (jnp.broadcast_to(obs, action.shape) * action).sum()
+        return Features(obs, (jnp.broadcast_to(obs, action.shape) * action).sum())
+
+
+class Confused(Window):
+    def features(self, obs, action):
+        return Features(action.ravel()[:1], action)
 
 
 class Loose(Window):
@@ -165,6 +170,7 @@ BROKEN = {
     "neighbours": (Looking(), "steps under vmap differ"),
     "no action": (Astray(), "what `heuristic` gives is no action of the space"),
     "features": (Narrow(), "`features` of 8 actions"),
+    "features of an action": (Confused(), "`features` hold in `own` what hangs on the action"),
     "uniform": (Loose(), "what its actions' `uniform` draws is no action of the space"),
     "uniform's shape": (Short(), "`uniform` gives shape (3,) for 3 actions of 2"),
     "both ends": (altered(truncated=lambda step, _: step.terminated), "is terminated and truncated"),

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from cuelearner_envs.billiards.physics import simulate
 from cuelearner_envs.billiards.table import Table, parking, rack
 from cuelearner_jax.actions import retract, rotate, to_angle
-from cuelearner_jax.environment import Quantity, WholeObservations
+from cuelearner_jax.environment import Features, Quantity, WholeObservations
 from cuelearner_jax.types import Step
 
 PLACEMENTS = 16  # places tried for a ball that must not touch another
@@ -135,28 +135,29 @@ class Billiards(WholeObservations, struct.PyTreeNode):
         image = balls.at[:, :2].multiply(jnp.where(balls[:, 2:] > 0, 1.0, signs))
         return jnp.concatenate([image[0], self._sorted(image[1:]).ravel()]), vector * signs
 
-    def features(self, obs: Float[Array, " obs"], action: Float[Array, "... 2"]) -> Float[Array, "... features"]:
+    def features(self, obs: Float[Array, " obs"], actions: Float[Array, "*n 2"]) -> Features:
         """A shot as the player sees it: balls relative to the cue ball, along and across the direction of the strike.
 
         Scaled to the order of one; the offset across is also given in ball diameters, squashed, for it decides the cut.
-        Shape (..., 8 + 6 * targets): cue ball and direction first, then each target.
+
+        - own, 2 + 3 * targets: the cue ball's place; of each target its place and whether it is on the table
+        - turned, 6 + 3 * targets: the direction, alone and times the cue ball's place; of each target its offset along
+          and across, and the latter in diameters through the arc tangent
         """
         balls = obs.reshape(-1, 3)
         scale = jnp.asarray(self.table.height)
-        cue, targets = balls[0, :2] / scale, balls[1:]
-        leading = action.shape[:-1]
-        frame = jnp.stack([action, rotate(action, jnp.asarray(jnp.pi / 2))], axis=-2)  # (..., 2, 2): along, across
+        cue, places, on_table = balls[0, :2] / scale, balls[1:, :2] / scale, (balls[1:, 2:] < 0).astype(jnp.float32)
+        own = jnp.concatenate([cue, jnp.concatenate([places * on_table, on_table], axis=-1).ravel()])
+        frame = jnp.stack([actions, rotate(actions, jnp.asarray(jnp.pi / 2))], axis=-2)  # (*n, 2, 2): along, across
         # Precise on accelerators too: they round the factors of a matrix product.
-        apart = targets[:, :2] - balls[:1, :2]
+        apart = balls[1:, :2] - balls[:1, :2]
         offsets = jnp.einsum("...ij,tj->...ti", frame, apart, precision=jax.lax.Precision.HIGHEST)
         cut = jnp.arctan(offsets[..., 1:] / (2.0 * self.table.ball_radius))
-        on_table = jnp.broadcast_to(targets[:, 2:] < 0, (*leading, targets.shape[0], 1)).astype(jnp.float32)
-        place = jnp.broadcast_to(targets[:, :2] / scale, (*leading, targets.shape[0], 2))
-        seen = jnp.concatenate([offsets / scale, cut, place], axis=-1) * on_table
-        each = jnp.concatenate([seen, on_table], axis=-1).reshape(*leading, -1)
-        cue = jnp.broadcast_to(cue, (*leading, 2))
-        own = jnp.concatenate([cue, action, cue * action, cue[..., ::-1] * action], axis=-1)
-        return jnp.concatenate([own, each], axis=-1)
+        each = jnp.concatenate([offsets / scale, cut], axis=-1)
+        each = jnp.where(jnp.broadcast_to(on_table, each.shape) > 0, each, 0.0).reshape(*actions.shape[:-1], -1)
+        cue = jnp.broadcast_to(cue, actions.shape)
+        turned = [actions, cue * actions, cue[..., ::-1] * actions, each]
+        return Features(own, jnp.concatenate(turned, axis=-1))
 
 
 def _jittered_rack(key: PRNGKeyArray, table: Table) -> Float[Array, "balls 2"]:

@@ -16,11 +16,13 @@ from cuelearner_envs.navigation.lidar import BEAMS, Lidar
 from cuelearner_envs.navigation.robot import Motion, Robot, collides, walk
 from cuelearner_envs.navigation.world import World
 from cuelearner_envs.navigation.worlds import FARTHEST
-from cuelearner_jax.actions import retract, rotate
-from cuelearner_jax.environment import Described, Quantity
+from cuelearner_jax.actions import inward, retract, rotate, to_angle
+from cuelearner_jax.environment import Described, Features, Quantity
 from cuelearner_jax.types import Step
 
 REMEMBERED = 3  # actions in the observation
+RING = 360  # directions all round in which `features` gives how near things are: as far apart as beams are
+UNSEEN = -1.0  # what it gives where the lidar does not look; nearness is from 0 to 1
 Scalar = float | Float[Array, ""]
 
 
@@ -165,6 +167,30 @@ class Navigation(Described, struct.PyTreeNode):
     def heuristic(self, obs: Float[Array, " obs"]) -> Float[Array, "2"]:
         """Straight toward the goal."""
         return obs[BEAMS : BEAMS + 2]
+
+    def features(self, obs: Float[Array, " obs"], actions: Float[Array, "*n 2"]) -> Features:
+        """What lies ahead, to the left and to the right of a robot that walks in the direction.
+
+        - own, 1: the distance to the goal
+        - turned, 370: nearness all round in steps of one degree, from behind by way of the right, the direction itself
+          in the middle (of the two nearest beams, by how near they are); `UNSEEN` where the lidar does not look; goal
+          and previous actions along and across the direction; the direction in the body's frame
+        """
+        count = actions.shape[:-1]
+        ring = jnp.concatenate([obs[:BEAMS], jnp.full(RING - BEAMS, UNSEEN)])  # from -135 degrees on, counterclockwise
+        behind = to_angle(actions) * (RING / (2 * jnp.pi)) - RING / 2 + (BEAMS - 1) / 2  # number of the first beam
+        first = jnp.floor(behind)
+        near = (behind - first)[..., None]
+        numbers = jnp.mod(first.astype(jnp.int32), RING)
+        twice = jnp.concatenate([ring, ring, ring[:1]])
+        slices = jax.vmap(lambda number: jax.lax.dynamic_slice(twice, (number,), (RING + 1,)))(numbers.ravel())
+        slices = slices.reshape(*count, RING + 1)
+        around = slices[..., :-1] + near * (slices[..., 1:] - slices[..., :-1])
+        vectors = jnp.concatenate([obs[BEAMS : BEAMS + 2], obs[BEAMS + 3 :]]).reshape(-1, 2)  # goal, previous actions
+        shape = (*count, *vectors.shape)
+        seen = inward(jnp.broadcast_to(vectors, shape), jnp.broadcast_to(actions[..., None, :], shape))
+        turned = jnp.concatenate([around, seen.reshape(*count, -1), actions], axis=-1)
+        return Features(obs[BEAMS + 2 : BEAMS + 3], turned)
 
     def mirror(
         self, which: Int[Array, ""] | int, obs: Float[Array, " obs"], vector: Float[Array, "2"]

@@ -64,29 +64,35 @@ def test_the_heuristic_points_at_the_closest_ball_that_is_left():
 PLAYED = balls([(0.1, 0.05), (0.1, 0.15), (0.3, 0.05), (0.0, 0.0)], (False, False, False, True))
 
 
+def parts(obs, strike):
+    """Cue ball (2,), targets as they are (3, 3), what hangs on the direction alone (6,), targets from there (3, 3)."""
+    own, turned = features(obs, strike)
+    return np.asarray(own[:2]), np.asarray(own[2:]).reshape(3, 3), turned[:6], np.asarray(turned[6:]).reshape(3, 3)
+
+
 def test_features_give_the_balls_along_and_across_the_strike():
-    seen = np.asarray(features(observe(EASY, PLAYED), jnp.array([0.0, 1.0])))
-    assert seen.shape == (8 + 6 * 3,)
-    np.testing.assert_allclose(seen[:8], [0.25, 0.125, 0.0, 1.0, 0.0, 0.125, 0.0, 0.25], atol=1e-6)
-    pocketed, ahead, aside = seen[8:].reshape(3, 6)  # in the observation's order
-    np.testing.assert_array_equal(pocketed, np.zeros(6))
-    np.testing.assert_allclose(ahead, [0.25, 0.0, 0.0, 0.25, 0.375, 1.0], atol=1e-6)
-    np.testing.assert_allclose(aside, [0.0, -0.5, np.arctan(-0.2 / 0.04), 0.75, 0.125, 1.0], atol=1e-6)
+    cue, places, strike, offsets = parts(observe(EASY, PLAYED), jnp.array([0.0, 1.0]))
+    np.testing.assert_allclose(cue, [0.25, 0.125], atol=1e-6)
+    np.testing.assert_allclose(strike, [0.0, 1.0, 0.0, 0.125, 0.0, 0.25], atol=1e-6)
+    np.testing.assert_allclose(places, [[0, 0, 0], [0.25, 0.375, 1.0], [0.75, 0.125, 1.0]], atol=1e-6)
+    aside = [0.0, -0.5, np.arctan(-0.2 / 0.04)]  # the first is pocketed, the second straight ahead
+    np.testing.assert_allclose(offsets, [[0, 0, 0], [0.25, 0.0, 0.0], aside], atol=1e-6)
 
 
 def test_features_of_many_directions_are_those_of_each():
     directions = actions.evenly_spaced(6).reshape(3, 2, 2)
     obs = observe(EASY, PLAYED)
     many = features(obs, directions)
-    assert many.shape == (3, 2, 26)
+    assert many.own.shape == (2 + 3 * 3,)
+    assert many.turned.shape == (3, 2, 6 + 3 * 3)
     for place in np.ndindex(3, 2):
-        np.testing.assert_allclose(many[place], features(obs, directions[place]), atol=1e-6)
+        np.testing.assert_allclose(many.turned[place], features(obs, directions[place]).turned, atol=1e-6)
 
 
 def test_a_mirror_reverses_what_lies_across_and_keeps_what_lies_along():
     obs, strike = observe(EASY, PLAYED), toward(25.0)
-    targets = np.asarray(features(obs, strike)[8:].reshape(3, 6))
+    _, places, _, offsets = parts(obs, strike)
     for which, flipped, order in ((1, [-1, 1], [0, 1, 2]), (2, [1, -1], [0, 2, 1])):  # upside down: from the top again
-        image = features(*mirror(jnp.array(which), obs, strike))[8:].reshape(3, 6)
-        signs = np.array([1, -1, -1, *flipped, 1])  # along, across, cut, place, on the table
-        np.testing.assert_allclose(image, targets[np.array(order)] * signs, atol=1e-6)
+        _, image_places, _, image_offsets = parts(*mirror(jnp.array(which), obs, strike))
+        np.testing.assert_allclose(image_offsets, offsets[order] * np.array([1, -1, -1]), atol=1e-6)
+        np.testing.assert_allclose(image_places, places[order] * np.array([*flipped, 1]), atol=1e-6)

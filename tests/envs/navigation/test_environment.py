@@ -120,6 +120,59 @@ def test_previous_actions_move_up_by_one_each_step():
         np.testing.assert_array_equal(result.final_obs, result.obs)
 
 
+# --- features --------------------------------------------------------------------------------------------------------
+
+AROUND, AHEAD_OF_IT, SEEN_GOAL, SEEN_PREVIOUS = slice(0, 360), 180, slice(360, 362), slice(362, 368)
+TURNED = walker((0.3, -0.2, 0.4), previous=((1.0, 0.0), (0.0, 1.0), (0.6, 0.8)))
+
+
+def degrees(angle):
+    return jnp.array([math.cos(math.radians(angle)), math.sin(math.radians(angle))])
+
+
+@jax.jit
+def features(env, obs, actions):
+    return env.features(obs, actions)
+
+
+def test_features_of_the_direction_ahead_are_the_scan_itself():
+    obs = observe(HALL, TURNED)
+    own, turned = features(HALL, obs, AHEAD)
+    np.testing.assert_allclose(turned[45:316], obs[:271], atol=1e-5)  # from 135 degrees right to 135 left
+    np.testing.assert_array_equal(turned[np.r_[0:45, 316:360]], -1.0)  # behind
+    np.testing.assert_allclose(turned[360:], np.concatenate([obs[GOAL], obs[PREVIOUS], AHEAD]), atol=1e-6)
+    np.testing.assert_allclose(own, obs[DISTANCE : DISTANCE + 1])
+
+
+def test_features_turn_what_is_seen_to_the_direction():
+    obs = observe(HALL, TURNED)
+    left = features(HALL, obs, LEFT).turned
+    np.testing.assert_allclose(left[AHEAD_OF_IT], obs[135 + 90], atol=1e-5)
+    np.testing.assert_allclose(left[AHEAD_OF_IT - 90], obs[135], atol=1e-5)  # what lies ahead is on the right of it
+    np.testing.assert_allclose(left[SEEN_PREVIOUS], [0, -1, 1, 0, 0.8, -0.6], atol=1e-5)
+    half = features(HALL, obs, degrees(20.5)).turned
+    np.testing.assert_allclose(half[AHEAD_OF_IT], (obs[155] + obs[156]) / 2, atol=1e-4)
+    along = float(jnp.dot(obs[GOAL], degrees(20.5)))
+    np.testing.assert_allclose(half[SEEN_GOAL.start], along, atol=1e-5)
+
+
+def test_a_robot_that_is_turned_sees_the_same_from_the_same_direction():
+    turned = TURNED.replace(pose=TURNED.pose.at[2].add(math.radians(30)))
+    one = features(HALL, observe(HALL, TURNED), degrees(30)).turned[AROUND]
+    other = features(HALL, observe(HALL, turned), AHEAD).turned[AROUND]
+    both = np.asarray((one > -0.5) & (other > -0.5))
+    assert both.sum() == 271 - 30
+    np.testing.assert_allclose(np.asarray(one)[both], np.asarray(other)[both], atol=1e-4)
+
+
+def test_features_of_many_directions_are_those_of_each():
+    obs, directions = observe(HALL, TURNED), jnp.stack([AHEAD, LEFT, BACK, degrees(77.7)]).reshape(2, 2, 2)
+    many = features(HALL, obs, directions)
+    assert (many.own.shape, many.turned.shape) == ((1,), (2, 2, 370))
+    for place in np.ndindex(2, 2):
+        np.testing.assert_allclose(many.turned[place], features(HALL, obs, directions[place]).turned, atol=1e-5)
+
+
 # --- reward and ends -------------------------------------------------------------------------------------------------
 
 

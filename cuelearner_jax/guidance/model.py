@@ -1,0 +1,53 @@
+"""The network of a guide: what it sees, and what its outputs mean."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from cuelearner_jax.agent import view
+from cuelearner_jax.agent.networks import applied, residual_network
+from cuelearner_jax.config import GuideSizes
+from cuelearner_jax.environment import Spaces
+from cuelearner_jax.types import Params
+
+
+class GuideModel(NamedTuple):
+    """A network of observation and action, as pure functions."""
+
+    init: Callable[[PRNGKeyArray], Params]
+    # (env, params, obs (n, obs), actions (n, action)) -> outputs (n, outputs)
+    predict: Callable[[Any, Params, Array, Array], Array]
+
+
+def guide_model(sizes: GuideSizes, spaces: Spaces, outputs: int) -> GuideModel:
+    """A network whose outputs are numbers, such as the value of an action.
+
+    Raises UserError for a frame in which the environment cannot be seen.
+    """
+    network = residual_network(sizes.feedback_layers, outputs)
+    own, turned = view.widths(sizes.frame, spaces)
+
+    def init(key: PRNGKeyArray) -> Params:
+        return network.init(key, jnp.zeros(own), jnp.zeros(turned))
+
+    def predict(
+        env: Any, params: Params, obs: Float[Array, "n obs"], actions: Float[Array, "n action"]
+    ) -> Float[Array, "n outputs"]:
+        return applied(network)(params, *view.seen(sizes.frame, env, obs, actions))
+
+    return GuideModel(init, predict)
+
+
+def residual_model(sizes: GuideSizes, spaces: Spaces) -> GuideModel:
+    """A network whose outputs are something to add to the action, whichever frame it sees them in."""
+    inner = guide_model(sizes, spaces, spaces.actions.size)
+
+    def predict(env: Any, params: Params, obs: jax.Array, actions: jax.Array) -> jax.Array:
+        return view.outward(sizes.frame, spaces, inner.predict(env, params, obs, actions), actions)
+
+    return GuideModel(inner.init, predict)
