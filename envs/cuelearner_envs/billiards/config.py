@@ -23,7 +23,7 @@ class BilliardsConfig:
     table: Literal["one_ball", "easy", "regulation"] = "regulation"
     """one_ball: one large target, one shot. easy: three large targets. regulation: the paper's table."""
     mirrors: bool = False
-    """Multiply labels and transitions by the mirror images of an unchanged table, whatever the guidance."""
+    """Multiply transitions by the mirror images of an unchanged table; labels stay as they were given."""
     action_turn_deg: float = 0.0
     """Changed world: every strike is turned by this, counterclockwise [deg] (paper: 0.8)."""
     observation_bias: tuple[float, float] = (0.0, 0.0)

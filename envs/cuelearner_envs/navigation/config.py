@@ -46,7 +46,7 @@ class NavigationConfig:
     lidar_dropout: float = 0.0
     """Changed world: probability that a beam reads the full range."""
     mirrors: bool = False
-    """Multiply labels and transitions by their mirror images, whatever the guidance."""
+    """Multiply transitions by their mirror images, whatever the guidance; labels stay as they were given."""
 
 
 def check(config: NavigationConfig) -> None:
