@@ -6,8 +6,8 @@
 
 The sweeps are data below: every piece fits half an hour of one accelerator, has a folder of its own and is resumed.
 After the pieces, or alone with --report, there is a report of each table (FOLDER/TABLE/report). Several processes may
-share FOLDER, each with pieces of its own. At the scale `quick` a piece takes minutes, at `smoke` seconds on a CPU; both have
-folders of their own in FOLDER.
+share FOLDER, each with pieces of its own. At the scale `quick` a piece takes minutes, at `smoke` seconds on a CPU; both
+have folders of their own in FOLDER.
 """
 
 from __future__ import annotations
