@@ -46,7 +46,8 @@ def main() -> None:
     for name in arguments.presets:
         config = BILLIARDS.presets[name].config
         labels = 2 * config.sizes.labels_per_round  # enough for a fitted model; the time of a round is scaled up below
-        sizes = dataclasses.replace(config.sizes, replay_capacity=min(config.sizes.replay_capacity, 100_000))
+        capacity = min(config.sizes.replay_capacity, 100_000)
+        sizes = dataclasses.replace(config.sizes, replay_capacity=capacity, pace=False)  # half of all episodes guided
         measured = learning(dataclasses.replace(config, sizes=sizes), guided=True)
         runs = {kind: Run(kind, measured, arguments.seeds, labels) for kind in ("none", "relative")}
         steps = arguments.steps or (1000 if name == "quickstart" else 20)

@@ -93,6 +93,8 @@ class GuideSizes(_Seeing):
 class Sizes(GuideSizes, AgentSizes):
     """Static sizes: changing one compiles the program again."""
 
+    pace: bool = False
+    """Does the share of guided episodes follow whether they earn more than the agent's own?"""
     lanes_per_block: int = 0
     """Seeds trained in one block, side by side (0: all) on an accelerator, one by one (0: a block a core) on a CPU."""
 
@@ -165,6 +167,11 @@ class TeacherFaults(_Degrees):
 class Scalars(TeacherFaults, GuideScalars, AgentScalars):
     """Traced scalars: changing one needs no new compile."""
 
+    pace_window: float = 200.0
+    """With sizes.pace: episodes, own and guided together, within which what they earned fades to 1/e."""
+    pace_floor: float = 0.02
+    """With sizes.pace: least share of guided episodes, and of own ones, so that both go on being seen."""
+
 
 @dataclass(frozen=True)
 class Schedule:
@@ -215,6 +222,10 @@ def check(config: RunConfig) -> None:
     check_whole(schedule, "schedule")
     _check_sizes(sizes)
     check_guide(sizes, config.scalars)
+    if config.scalars.pace_window < 1:
+        raise UserError(f"scalars.pace_window is {config.scalars.pace_window}: give at least 1 episode")
+    if config.scalars.pace_floor > 0.5:
+        raise UserError(f"scalars.pace_floor is {config.scalars.pace_floor}: give at most 0.5, for both have it")
     if config.scalars.discount >= 1:
         raise UserError(f"scalars.discount is {config.scalars.discount}: give a number below 1")
     for name in ("total_steps", "eval_every", "eval_steps", "eval_envs", "checkpoint_every", "target_every"):

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from jax.sharding import Mesh
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from cuelearner_jax import asking
 from cuelearner_jax.agent.learning import Learner, all_finite, learner, stored_step
@@ -30,6 +30,7 @@ from cuelearner_jax.devices import (
     over_lanes,
 )
 from cuelearner_jax.environment import Environment
+from cuelearner_jax.guidance import pace
 from cuelearner_jax.guidance.bundle import Guidance
 from cuelearner_jax.guidance.refining import Refined, untouched
 from cuelearner_jax.policies import Uniform
@@ -139,6 +140,7 @@ class Lane(NamedTuple):
             guide=asking.start(self.guidance, env, slots, budget, k_guidance, k_ask),
             key=key,
             failed=jnp.array(False),
+            pace=pace.start(self.sizes.num_envs) if self.sizes.pace else None,
         )
 
     def label_round(
@@ -190,7 +192,12 @@ class Lane(NamedTuple):
         remembered = jax.vmap(env.remember)(agent.env, agent.obs)
         env_state, step = jax.vmap(env.step)(jax.random.split(k_env, self.sizes.num_envs), agent.env, action)
         done = step.terminated | step.truncated
-        redrawn = jax.random.bernoulli(k_guided, scalars.guided_probability, done.shape)
+        paced = state.pace
+        if paced is not None:
+            counts = guides(clock, schedule)
+            paced = pace.follow(paced, scalars, bootstraps, step.reward, done, agent.guided, counts)
+        share = scalars.guided_probability if paced is None else pace.probability(paced, scalars)
+        redrawn = jax.random.bernoulli(k_guided, share, done.shape)
         stored = jax.vmap(partial(stored_step, bootstraps=bootstraps))(remembered, action, step)
         agent = agent.replace(
             replay=self.learner.buffer.add(agent.replay, clock.step, stored),
@@ -205,7 +212,9 @@ class Lane(NamedTuple):
             agent,
         )
         metrics = {"reward": step.reward.mean(), "loss": loss, "passes": passes.astype(jnp.float32).mean()}
-        return state.replace(agent=agent, failed=state.failed | ~finite), metrics
+        if paced is not None:
+            metrics["guided_share"] = (passes > 0).astype(jnp.float32).mean()
+        return state.replace(agent=agent, failed=state.failed | ~finite, pace=paced), metrics
 
     def act(
         self, env: Environment, scalars: Scalars, schedule: Schedule, clock: Clock, state: TrainState, key: PRNGKeyArray
@@ -221,12 +230,16 @@ class Lane(NamedTuple):
             lambda: self.learner.actions.uniform(key, (self.sizes.num_envs,)),
             lambda: self.learner.greedy(env, agent),
         )
-        guides = (clock.step >= schedule.random_steps) & (clock.step < schedule.guidance_until)
         return jax.lax.cond(
-            guides,
+            guides(clock, schedule),
             lambda: self.guidance.act(state.guide.model, env, agent.obs, base, agent.guided, scalars),
             lambda: untouched(base),
         )
+
+
+def guides(clock: Clock, schedule: Schedule) -> Bool[Array, ""]:
+    """Is this the time of guidance: after the random steps and before the cut-off?"""
+    return (clock.step >= schedule.random_steps) & (clock.step < schedule.guidance_until)
 
 
 def make_lane(config: RunConfig, guidance: Guidance, env: Environment, largest_budget: int) -> Lane:

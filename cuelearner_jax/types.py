@@ -107,6 +107,26 @@ class AgentState(struct.PyTreeNode):
     guided: Bool[Array, " num_envs"]  # is the running episode a guided one?
 
 
+class ArmSums(struct.PyTreeNode):
+    """Fading sums over the episodes of two arms, own and guided; an episode earned `gain` in `size`, see `pace`."""
+
+    episodes: Float[Array, "2"]
+    gain: Float[Array, "2"]
+    size: Float[Array, "2"]
+    gain_gain: Float[Array, "2"]
+    gain_size: Float[Array, "2"]
+    size_size: Float[Array, "2"]
+
+
+class Pace(struct.PyTreeNode):
+    """What guided and own episodes have earned, and how far the running ones are; see `guidance.pace`."""
+
+    gain: Float[Array, " num_envs"]  # of the running episode so far
+    steps: Float[Array, " num_envs"]  # of the running episode so far
+    whole: Bool[Array, " num_envs"]  # has it been its arm's from its first step on?
+    sums: ArmSums
+
+
 class TrainState(struct.PyTreeNode):
     """One lane's everything: a lane is one seed with one label budget."""
 
@@ -114,6 +134,7 @@ class TrainState(struct.PyTreeNode):
     guide: GuideState
     key: PRNGKeyArray
     failed: Bool[Array, ""]  # did a loss, a gradient or a parameter stop being finite? It stays as it was before then
+    pace: Pace | None = None  # None where the share of guided episodes is fixed
 
 
 class Clock(struct.PyTreeNode):

@@ -70,6 +70,7 @@ TASK = Task(
                     batch_size=64,
                     replay_capacity=20_000,
                     optimizer="adam",
+                    pace=True,
                 ),
                 Scalars(learning_rate=0.003, discount=0.95, max_grad_norm=10.0, polyak=0.05),
                 Schedule(

@@ -293,6 +293,7 @@ TASK = Task(
                     optimizer="adam",
                     fit_steps=600,
                     fit_batch_size=64,
+                    pace=True,
                 ),
                 Scalars(
                     learning_rate=0.003,

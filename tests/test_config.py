@@ -41,6 +41,8 @@ from cuelearner_jax.errors import UserError
         ("scalars", {"discount": 1.0}, "scalars.discount is 1.0"),
         ("scalars", {"discount": -0.5}, "scalars.discount is -0.5"),
         ("scalars", {"guided_probability": 1.5}, "scalars.guided_probability is 1.5: give a number from 0 to 1"),
+        ("scalars", {"pace_window": 0.5}, "scalars.pace_window is 0.5: give at least 1 episode"),
+        ("scalars", {"pace_floor": 0.6}, "scalars.pace_floor is 0.6: give at most 0.5"),
         ("scalars", {"mistake_probability": -0.1}, "scalars.mistake_probability is -0.1"),
         ("scalars", {"silence_probability": 2.0}, "scalars.silence_probability is 2.0"),
         ("scalars", {"refined_fraction": 1.1}, "scalars.refined_fraction is 1.1"),

@@ -109,7 +109,7 @@ BILLIARDS = Task(
             "larger balls and pockets, the paper's networks, 1 million steps a seed",
             RunConfig(
                 BilliardsConfig("easy", teacher="learned"),
-                Sizes(directions=720, num_envs=100, replay_capacity=1_000_000),
+                Sizes(directions=720, num_envs=100, replay_capacity=1_000_000, pace=True),
                 Scalars(),
                 Schedule(total_steps=1_000_000, guidance_until=500_000, checkpoint_every=100_000),
             ),
@@ -127,6 +127,7 @@ BILLIARDS = Task(
                     replay_capacity=20_000,
                     fit_steps=400,
                     fit_batch_size=64,
+                    pace=True,
                 ),
                 Scalars(learning_rate=0.01, eps_deg=2.0, k_max=100),
                 Schedule(

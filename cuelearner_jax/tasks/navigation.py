@@ -135,6 +135,7 @@ NAVIGATION = Task(
                     replay_capacity=50_000,
                     fit_steps=400,
                     fit_batch_size=64,
+                    pace=True,
                 ),
                 dataclasses.replace(NAVIGATION_SCALARS, learning_rate=0.003),
                 Schedule(

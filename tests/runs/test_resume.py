@@ -25,10 +25,12 @@ from cuelearner_jax.runs.kept import items
 from cuelearner_jax.runs.order import Order
 from cuelearner_jax.terminal import Interrupted
 
-# Bootstraps, so that target network, next observations and Adam's moments are in the checkpoint as well.
+# Bootstraps and is paced, so that target network, next observations, Adam's moments and what each arm has earned are in
+# the checkpoint as well.
+SMALL = {"q_layers": (16,), "feedback_layers": (16,), "lanes_per_block": 2, "fit_steps": 100, "replay_capacity": 40}
 CONFIG = probes.config(
-    sizes={"q_layers": (16,), "feedback_layers": (16,), "lanes_per_block": 2, "fit_steps": 100, "replay_capacity": 40},
-    scalars={"discount": 0.5, "silence_probability": 0.05},
+    sizes={**SMALL, "pace": True},
+    scalars={"discount": 0.5, "silence_probability": 0.05, "pace_window": 10.0},
     schedule={"total_steps": 96, "guidance_until": 64, "eval_every": 16, "checkpoint_every": 32},
 )
 GRID = Grid(("relative", "none"), seeds=(3, 5), labels=(35, 60))  # 6 rounds; 4 lanes in 2 blocks of 2
@@ -161,6 +163,9 @@ def test_a_run_leaves_a_row_for_each_lane_and_evaluation(whole):
     state, number = newest(whole, "relative")
     assert number == 6 + 96
     assert state["rest"][0].agent.target_params is not None
+    assert (state["rest"][0].pace.sums.episodes > 0).all()
+    assert len({row["train_guided_share"] for row in table if row["guidance"] == "relative" and row["step"] == 48}) > 1
+    assert all(row["train_guided_share"] == 0 for row in table if row["guidance"] == "none" and row["step"])
     assert int(state["clock"]["clock"].update) == 96
 
 
