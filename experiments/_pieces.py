@@ -10,7 +10,7 @@ from typing import NamedTuple
 from cuelearner_jax.cli import main as cuelearner
 
 FIRST_SEED = 4000  # of reported runs; settings are chosen on seeds from 0 on, with --tuning
-Options = Mapping[str, object]  # of `cuelearner sweep`: a value, several in a tuple, or None where it takes none
+Options = Mapping[str, object]  # of `cuelearner sweep`: a value, several in a tuple, or whether a flag is on
 
 
 class Piece(NamedTuple):
@@ -69,14 +69,21 @@ def scaled(piece: Piece, scale: Scale) -> Piece | None:
     return piece._replace(seeds=seeds, labels=labels, options={**piece.options, **scale.options, **instead})
 
 
+def option(name: str, value: object) -> list[str]:
+    """An option as it is typed: `--sizes.no-pace` for a flag that is off."""
+    if isinstance(value, bool):
+        group, _, flag = name.rpartition(".")
+        return [f"--{group}.{flag if value else f'no-{flag}'}"]
+    return [f"--{name}", *(str(each) for each in (value if isinstance(value, tuple) else (value,)))]
+
+
 def sweep_command(task: str, piece: Piece, out: Path, resume: bool) -> list[str]:
     """The command line of a piece."""
     given: dict[str, object] = {**piece.options, "guidance": piece.kinds, "seeds": piece.seeds}
     given |= {"first-seed": FIRST_SEED, **({"labels": piece.labels} if piece.labels else {})}
     words = ["sweep", task]
     for name, value in given.items():
-        words.append(f"--{name}")
-        words += [str(each) for each in (value if isinstance(value, tuple) else () if value is None else (value,))]
+        words += option(name, value)
     folder = out / piece.path
     return [*words, "--out", str(folder), *(["--resume"] if resume and (folder / "config.json").exists() else [])]
 

@@ -41,7 +41,8 @@ FULL: Options = {
     "schedule.eval-every": 100_000,
     "schedule.checkpoint-every": 10_000_000,
 }
-FRAME: Options = {"sizes.frame": "action"}
+RAW: Options = {"sizes.frame": "raw", "sizes.pace": False}  # said whatever the presets say
+FRAME: Options = {"sizes.frame": "action", "sizes.pace": False}
 # Fits are as long for a label as those of small budgets are, and rounds as few as keep them within minutes.
 LARGE_ROUNDS: Options = {"sizes.labels-per-round": 2_500, "sizes.fit-steps": 20_000, "sizes.fit-batch-size": 500}
 FAULTS: dict[str, Options] = {
@@ -93,7 +94,7 @@ def variations(world: str, options: Options, minutes: int) -> list[Piece]:
         Piece(world, name, "relative", ("relative",), (500, 1_000), 8, {**options, **way}, minutes, "what is asked")
         for name, way in WAYS.items()
     ]
-    paced = {**options, "sizes.pace": None}
+    paced = {**options, "sizes.pace": True}
     random = {**paced, **FAULTS["random"]}
     serves = "guidance never costs"
     pieces += [
@@ -106,10 +107,19 @@ def variations(world: str, options: Options, minutes: int) -> list[Piece]:
 
 def raw(world: str, options: Options, minutes: int) -> list[Piece]:
     """What networks on raw coordinates make of it."""
-    serves = "the frame against raw coordinates"
+    options, serves = {**options, **RAW}, "the frame against raw coordinates"
     return [
         Piece(world, "raw", "none", ("none",), (), 8, options, minutes // 2, serves),
         Piece(world, "raw", "relative", ("relative",), (500, 1_000), 8, options, minutes, serves),
+    ]
+
+
+def full_length(minutes: int) -> list[Piece]:
+    """The paper's own figure over all its steps, once."""
+    options, serves = {**FULL, **RAW}, "the paper's own figure at full length"
+    return [
+        Piece("full", "raw", "none", ("none",), (), 4, options, minutes, serves),
+        Piece("full", "raw", "relative", ("relative",), (1_000,), 4, options, minutes + 2, serves),
     ]
 
 
@@ -122,8 +132,7 @@ PIECES = (
     *curves("easy", EASY, 8),
     *variations("easy", EASY, 8),
     *raw("easy", EASY, 8),
-    Piece("full", "raw", "none", ("none",), (), 4, FULL, 26, "the paper's own figure at full length"),
-    Piece("full", "raw", "relative", ("relative",), (1_000,), 4, FULL, 28, "the paper's own figure at full length"),
+    *full_length(26),
 )
 
 SCALES = {

@@ -30,7 +30,8 @@ HALLS: Options = {
     "schedule.eval-steps": 40_000,
     "schedule.checkpoint-every": 50_000,
 }
-FRAME: Options = {"sizes.frame": "action"}
+RAW: Options = {"sizes.frame": "raw", "sizes.pace": False}  # said whatever the presets say
+FRAME: Options = {"sizes.frame": "action", "sizes.pace": False}
 FAULTS: dict[str, Options] = {
     "flipped-05": {"scalars.mistake-probability": 0.05},
     "flipped-10": {"scalars.mistake-probability": 0.1},
@@ -77,7 +78,7 @@ def variations(minutes: int) -> list[Piece]:
         Piece("clutter", name, "relative", relative, (100, 500), SEEDS, {**options, **way}, minutes, "what is asked")
         for name, way in WAYS.items()
     ]
-    paced = {**options, "sizes.pace": None}
+    paced = {**options, "sizes.pace": True}
     random = {**paced, **FAULTS["random"]}
     serves = "guidance never costs"
     pieces += [
@@ -88,7 +89,7 @@ def variations(minutes: int) -> list[Piece]:
     return pieces
 
 
-PIECES = (*budgets("frame", FRAME, 16), *budgets("raw", {}, 16), *variations(16))
+PIECES = (*budgets("frame", FRAME, 16), *budgets("raw", RAW, 16), *variations(16))
 
 SCALES = {
     "smoke": Scale(

@@ -95,9 +95,9 @@ def test_every_piece_is_a_sweep_that_would_begin(experiment, scale, modules, mon
         assert order.out == tmp_path / piece.path
     assert len(orders) >= 4
     if scale == "paper":
-        frames = {piece.run: order.config.sizes.frame for piece, order in zip(different.values(), orders, strict=True)}
-        assert frames["frame"] == "action"
-        assert frames["raw"] == "raw"
+        sizes = {piece.run: order.config.sizes for piece, order in zip(different.values(), orders, strict=True)}
+        assert [sizes[run].frame for run in ("frame", "raw", "paced")] == ["action", "raw", "action"]
+        assert [sizes[run].pace for run in ("frame", "raw", "paced")] == [False, False, True]
 
 
 def test_scales_keep_what_they_say(modules):
