@@ -5,6 +5,7 @@ from __future__ import annotations
 import shlex
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import tyro
 
@@ -46,6 +47,12 @@ class Report:
     overwrite: Flag[bool] = False
     """Replace an earlier report."""
 
+    @property
+    def question(self) -> dict[str, Any]:
+        """What was said of what --efficiency is to look for."""
+        given = {"level": self.level, "level_at": self.level_at, "within": self.within, "reference": self.reference}
+        return {name: value for name, value in given.items() if value is not None}
+
 
 OPTIONS = {"report": Report}
 
@@ -59,10 +66,9 @@ def run(arguments: list[str]) -> None:
     asked = parse(Report, arguments, "report")
     if not asked.folders:
         raise UserError("no folder to report on: cuelearner report RUN_FOLDER ... --out FOLDER")
-    given = {"level": asked.level, "level_at": asked.level_at, "within": asked.within, "reference": asked.reference}
-    given = {name: value for name, value in given.items() if value is not None}
-    if given and not asked.efficiency:
-        raise UserError(f"--{next(iter(given)).replace('_', '-')} says what --efficiency is to look for: give both")
+    if asked.question and not asked.efficiency:
+        first = next(iter(asked.question)).replace("_", "-")
+        raise UserError(f"--{first} says what --efficiency is to look for: give both")
     written = report(
         asked.folders,
         asked.out,
@@ -70,7 +76,7 @@ def run(arguments: list[str]) -> None:
         split=asked.split,
         lower_is_better=asked.lower_is_better,
         by_run=asked.by_run,
-        efficiency=Question(**given) if asked.efficiency else None,
+        efficiency=Question(**asked.question) if asked.efficiency else None,
         overwrite=asked.overwrite,
         command=shlex.join(["cuelearner", "report", *arguments]),
     )

@@ -10,8 +10,13 @@ from pathlib import Path
 import pytest
 
 from cuelearner_jax.cli import main
+from cuelearner_jax.cli.parsing import parse
+from cuelearner_jax.cli.report import Report
 from cuelearner_jax.config import Scalars, Schedule, Sizes
 from cuelearner_jax.guidance import registry
+from cuelearner_jax.report.efficiency import Question, efficiency_of
+from cuelearner_jax.report.efficiency_document import efficiency_lines
+from cuelearner_jax.report.variants import read_groups, variants_of
 from cuelearner_jax.runs import sweep
 from cuelearner_jax.runs.order import planned
 
@@ -157,3 +162,25 @@ def test_a_smoke_of_the_easy_table_runs_resumes_and_reports(modules, tmp_path, c
     assert data.main([*asked, "--resume"]) == 0
     assert (out / "frame" / "none" / "none" / "results.parquet").stat().st_mtime_ns == before
     assert data.main(asked) == 2  # begun already, and --resume was not given
+
+
+def said_of(world, modules):
+    """What the page says of a world, and what the recorded runs of it give, as far as it is computed from them."""
+    pieces, page = modules["_pieces"], modules["bootstrapping_page"]
+    text = (FOLDER.parent / "docs" / "results" / "bootstrapping.md").read_text(encoding="utf-8")
+    shown = text.split(f"<!-- {world} -->\n")[1].split(f"<!-- end of {world} -->")[0].strip()
+    (experiment,) = (e for e in page.EXPERIMENTS if any(piece.world == world for piece in e.pieces))
+    data = FOLDER.parent / "docs" / "data" / "bootstrapping"
+    if (command := pieces.report_command(experiment, world, data, "paper")) is None:
+        return shown, ""
+    asked = parse(Report, command[1:], "report")
+    groups = read_groups(asked.folders, None, asked.metric, asked.split, by_run=True)
+    question = Question(**asked.question)
+    lines = efficiency_lines(efficiency_of(variants_of(groups, asked.metric), question, asked.lower_is_better))
+    return shown, page.section("\n".join([*lines, page.LAST]), f"../data/bootstrapping/{world}/report")
+
+
+@pytest.mark.parametrize("world", ["regulation", "easy", "full", "clutter"])
+def test_the_page_says_what_the_recorded_runs_give_and_nothing_where_there_are_none(world, modules):
+    shown, given = said_of(world, modules)
+    assert shown.split("\n\nMissing:")[0] == given
