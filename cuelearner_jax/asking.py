@@ -125,7 +125,7 @@ def ask(
         raise ValueError(f"guidance {guidance.name!r} asks nothing")
     keys = question_keys(lane_key, position)
     action = question(guidance, env, scalars, base, guide, keys)
-    answer, answered = guidance.form.answer(keys.answer, teacher, guide.env, guide.obs, action, scalars)
+    answer, answered = guidance.form.answer(keys.answer, env, teacher, guide.env, guide.obs, action, scalars)
     return proceed(env, record(guide, position, action, answer, answered), action, keys)
 
 

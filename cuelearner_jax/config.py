@@ -87,6 +87,10 @@ class GuideSizes(_Seeing):
     """Labels in one step of a fit."""
     validate_every: int = 20
     """Adam steps between two looks at the validation labels (every fifth label); the best parameters are kept."""
+    guide_directions: int = 360
+    """Directions over which a guide that values actions takes its argmax."""
+    replay_steps: int = 5
+    """Gradient steps on earlier corrections after each new one, of a guide that goes on learning (deep COACH)."""
 
 
 @dataclass(frozen=True)
@@ -145,22 +149,39 @@ class GuideScalars(_Degrees, _Clipping):
     """Largest number of refinement passes."""
     refined_fraction: float = 1.0
     """Share of the labels after the first fit asked about refined actions (DAgger); the rest about base actions."""
+    explored_fraction: float = 0.25
+    """Share of the questions that a guide which values actions asks about base actions even so, to find good ones."""
+    correction_replay: int = 50
+    """Newest corrections that a guide which goes on learning (deep COACH) keeps learning from."""
     guided_probability: float = 0.5
     """Probability that an episode is guided."""
 
 
 @dataclass(frozen=True)
 class TeacherFaults(_Degrees):
-    """Traced scalars of a simulated teacher: how it errs."""
+    """Scalars of a simulated teacher: what it answers about, and how it errs; traced, but for words."""
 
+    answer: Literal["best", "nearest"] = "best"
+    """What it has in mind: its best action, or of those that it holds for good the nearest to the one asked about."""
+    nearest_share: float = 0.6
+    """Good is an action worth at least this share of the best one."""
+    nearest_aim_deg: float = 1.0
+    """Standard deviation of the error of aim over which that worth is averaged [deg]."""
+    scalar_good: Literal["near", "scored"] = "near"
+    """Scalar feedback calls good what lies near the action in mind, or what is rewarded at once as well."""
+    scalar_within_deg: float = 5.0
+    """Scalar feedback: how near that is [deg]."""
     mistake_probability: float = 0.0
-    """Teacher's fault: a turn is told the wrong way round with this probability."""
+    """Teacher's fault: with this probability a turn is told the wrong way round, a demonstration errs on the other side
+    of the action asked about, good is called bad and bad good."""
     silence_probability: float = 0.0
-    """Teacher's fault: no answer with this probability (the question still counts as a label)."""
+    """Teacher's fault: no answer, of any form, with this probability (the question still counts as a label)."""
     indifference_deg: float = 0.0
-    """Teacher's fault: errors up to this pass for right (relative feedback alone implies eps / 2) [deg]."""
+    """Teacher's fault: errors up to this pass for right (relative feedback alone implies eps / 2): the action asked
+    about is then the one demonstrated, and called good [deg]."""
     teacher_bias_deg: float = 0.0
-    """Teacher's fault: constant error of what it takes for the best action, counterclockwise [deg]."""
+    """Teacher's fault: constant error, counterclockwise, of what it takes for the best action or for a good one,
+    whatever the form of its answers [deg]."""
 
 
 @dataclass(frozen=True)
@@ -198,7 +219,9 @@ class Schedule:
 
 
 for _traced in (AgentScalars, GuideScalars, TeacherFaults, Scalars, Schedule):
-    jax.tree_util.register_dataclass(_traced, [field.name for field in dataclasses.fields(_traced)], [])
+    _names = [field.name for field in dataclasses.fields(_traced)]
+    _words = [name for name in _names if isinstance(getattr(_traced, name), str)]  # no numbers: part of the program
+    jax.tree_util.register_dataclass(_traced, [name for name in _names if name not in _words], _words)
 
 
 @dataclass(frozen=True)
@@ -286,7 +309,8 @@ def check_guide(sizes: GuideSizes, scalars: GuideScalars) -> None:
     """Raises UserError with one line for the first value of a guide's that cannot work."""
     check_whole(sizes, "sizes")
     check_whole(scalars, "scalars")
-    _check_positive(sizes, ("labels_per_round", "fit_steps", "fit_batch_size", "validate_every"))
+    positive = ("labels_per_round", "fit_steps", "fit_batch_size", "validate_every", "guide_directions", "replay_steps")
+    _check_positive(sizes, positive)
     if sizes.labels_per_round > LARGEST_ROUND:
         raise UserError(f"sizes.labels_per_round is {sizes.labels_per_round}: give at most {LARGEST_ROUND}")
     _check_layers(sizes.feedback_layers, "sizes.feedback_layers")
@@ -296,6 +320,8 @@ def check_guide(sizes: GuideSizes, scalars: GuideScalars) -> None:
         raise UserError(
             f"scalars.eps_deg is {scalars.eps_deg}: a relative label is a turn of more than 0 and up to 180"
         )
+    if scalars.correction_replay < 1:
+        raise UserError(f"scalars.correction_replay is {scalars.correction_replay}: give a positive number")
     if scalars.max_grad_norm <= 0:  # a zero gradient would be scaled by 0 / 0
         raise UserError(f"scalars.max_grad_norm is {scalars.max_grad_norm}: give a positive number")
 
@@ -312,8 +338,13 @@ def _check_layers(layers: tuple[int, ...], name: str) -> None:
 
 
 def _check_numbers(scalars: Any) -> None:
+    types = get_type_hints(type(scalars))
     for name, value in dataclasses.asdict(scalars).items():
-        if name.endswith(("probability", "fraction", "polyak", "weight")) and not 0 <= value <= 1:
+        if get_origin(types[name]) is Literal:
+            if not _fits(value, types[name]):
+                raise UserError(f"scalars.{name} is {value!r}: give {' or '.join(get_args(types[name]))}")
+            continue
+        if name.endswith(("probability", "fraction", "share", "polyak", "weight")) and not 0 <= value <= 1:
             raise UserError(f"scalars.{name} is {value}: give a number from 0 to 1")
         if not math.isfinite(value) or abs(value) > LARGEST_FLOAT:
             raise UserError(f"scalars.{name} is {value}: give a finite number (in single precision)")
