@@ -89,13 +89,19 @@ def sweep_command(task: str, piece: Piece, out: Path, resume: bool) -> list[str]
 
 
 def report_command(experiment: Experiment, world: str, out: Path, scale: str) -> list[str] | None:
-    """The command line of the report of all runs of a world that have been begun, or None where none has."""
-    runs = dict.fromkeys(piece.run for piece in experiment.pieces if piece.world == world)
+    """The command line of the report of all runs of a world that have been begun, or None where none has.
+
+    How far labels carry is said as soon as there are unguided agents to compare with.
+    """
+    own = [piece for piece in experiment.pieces if piece.world == world]
+    runs = dict.fromkeys(piece.run for piece in own)
     begun = [str(out / world / run) for run in runs if list((out / world / run).glob("*/config.json"))]
     if not begun:
         return None
     asked = experiment.report.get(world, ()) if scale == "paper" else ()
-    words = ["report", *begun, "--by-run", "--efficiency", *experiment.metric, *asked]
+    unguided = any((out / p.path / "config.json").exists() for p in own if p.kinds == ("none",))
+    efficiency = ["--efficiency", *asked] if unguided else []
+    words = ["report", *begun, "--by-run", *experiment.metric, *efficiency]
     return [*words, "--out", str(out / world / "report"), "--overwrite"]
 
 

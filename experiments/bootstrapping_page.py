@@ -62,8 +62,8 @@ def main() -> int:
     for experiment in EXPERIMENTS:
         for world in dict.fromkeys(piece.world for piece in experiment.pieces):
             command = report_command(experiment, world, asked.data, "paper")
-            if command is None:
-                print(f"{world}: no runs in {asked.data}")
+            if command is None or "--efficiency" not in command:
+                print(f"{world}: no runs in {asked.data}, or no unguided ones")
                 continue
             if status := cuelearner(command):
                 return status

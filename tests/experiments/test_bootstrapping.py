@@ -171,7 +171,8 @@ def said_of(world, modules):
     shown = text.split(f"<!-- {world} -->\n")[1].split(f"<!-- end of {world} -->")[0].strip()
     (experiment,) = (e for e in page.EXPERIMENTS if any(piece.world == world for piece in e.pieces))
     data = FOLDER.parent / "docs" / "data" / "bootstrapping"
-    if (command := pieces.report_command(experiment, world, data, "paper")) is None:
+    command = pieces.report_command(experiment, world, data, "paper") or []
+    if "--efficiency" not in command:
         return shown, ""
     asked = parse(Report, command[1:], "report")
     groups = read_groups(asked.folders, None, asked.metric, asked.split, by_run=True)
