@@ -18,7 +18,7 @@ from _pieces import Experiment, Options, Piece, Scale, run
 
 FEW, MANY = (25, 50, 100, 350), (500, 1_000, 2_000, 5_000)
 CURVE = (10_000, 20_000, 50_000, 100_000)  # simulated: from which number on do labels pay?
-ASKING = ("relative", "demonstration", "scalar", "dcoach")
+ASKING = ("relative", "intent", "demonstration", "scalar", "dcoach")
 
 REGULATION: Options = {
     "preset": "paper",
