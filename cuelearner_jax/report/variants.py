@@ -15,6 +15,7 @@ from jaxtyping import Float, Int
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guidance import registry
 from cuelearner_jax.records import results
+from cuelearner_jax.records.guides import read_guides
 from cuelearner_jax.report.escaping import one_line
 from cuelearner_jax.report.statistics import Curve, Interval, curve, interval, mean_over_curve
 from cuelearner_jax.runs import failures
@@ -64,6 +65,7 @@ class Group(NamedTuple):
     table: pa.Table  # the rows to report
     failed: pa.Table  # all rows of lanes that failed
     invalid: int  # rows left out for a metric that is not finite
+    guides: pa.Table | None  # rows of the guides' own quality, see `records.guides`; None: there are none
 
     @property
     def all_rows(self) -> pa.Table:
@@ -79,18 +81,24 @@ def read_groups(folders: Sequence[PathLike], task: str | None, metric: str, spli
             alone; or two folders that are to be told apart have one name.
     """
     if not by_run:
-        return [Group("", *_select(results.read(folders, task), metric, split))]
+        return [_group("", folders, task, metric, split)]
     names = [Path(os.path.abspath(folder)).name for folder in folders]
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise UserError(f"--by-run: several folders are called {twice[0]}: give them different names")
-    groups = [
-        Group(name, *_select(results.read(folder, task), metric, split))
-        for name, folder in zip(names, folders, strict=True)
-    ]
+    groups = [_group(name, [folder], task, metric, split) for name, folder in zip(names, folders, strict=True)]
     tasks = sorted({group.table["task"][0].as_py() for group in groups})
     if len(tasks) > 1:
         raise UserError(f"results of several tasks ({', '.join(tasks)}) cannot be mixed: choose one of them")
     return groups
+
+
+def _group(name: str, folders: Sequence[PathLike], task: str | None, metric: str, split: str) -> Group:
+    selected = _select(results.read(folders, task), metric, split)
+    guides = read_guides(folders, task)
+    column = f"guide_{metric}"
+    if guides is None or column not in guides.column_names:
+        return Group(name, *selected, None)
+    return Group(name, *selected, guides.filter((pc.field("split") == split) & pc.field(column).is_valid()))
 
 
 def _select(table: pa.Table, metric: str, split: str) -> tuple[pa.Table, pa.Table, int]:
@@ -119,7 +127,7 @@ def variants_of(groups: Sequence[Group], metric: str) -> list[Variant]:
     Raises:
         UserError: a seed is there twice, or the seeds of a variant have no step in common.
     """
-    raw = {(group.name, *key): matrix for group in groups for key, matrix in _matrices(group.table, metric).items()}
+    raw = {(group.name, *key): matrix for group in groups for key, matrix in _matrices(group, metric).items()}
     failed: Mapping[str, Mapping[results.LaneKey, int]]
     failed = {group.name: results.failures(group.failed) for group in groups}
     shared = min(steps[-1] for _, steps, _, _ in raw.values())
@@ -136,24 +144,37 @@ def variants_of(groups: Sequence[Group], metric: str) -> list[Variant]:
 Matrix = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
 
-def _matrices(table: pa.Table, metric: str) -> dict[tuple[str, int], Matrix]:
+def _matrices(group: Group, metric: str) -> dict[tuple[str, int], Matrix]:
     """By kind of guidance and label budget: seeds, steps, values (see `_matrix`) and the guides' metric."""
+    table = group.table
     guidance, labels = np.array(table["guidance"].to_pylist()), table["labels"].to_numpy()
     keys = set(zip(guidance.tolist(), labels.tolist(), strict=True))
     found = {}
     for key in sorted(keys, key=lambda key: (key[0] != "none", key[0], key[1])):
         rows = table.filter(pa.array((guidance == key[0]) & (labels == key[1])))
-        found[key] = (*_matrix(rows, metric, key), _guides(rows, metric))
+        found[key] = (*_matrix(rows, metric, key), _guides(rows, metric, group.guides, key))
     return found
 
 
-def _guides(rows: pa.Table, metric: str) -> np.ndarray:
-    """The metric of each seed's guide alone when it was last measured, (seeds,) in their order; empty if it was not."""
+def _guides(rows: pa.Table, metric: str, guides: pa.Table | None, key: tuple[str, int]) -> np.ndarray:
+    """The metric of each seed's guide after all the labels it has asked for so far, (seeds,); empty if none is known.
+
+    Args:
+        rows: of the results, which have it for what never asks and for guides before the first step.
+        metric: of results.
+        guides: rows of guides after their rounds, if there are any.
+        key: kind of guidance and budget.
+    """
     column = f"guide_{metric}"
-    if column not in rows.column_names:
-        return np.zeros(0)
-    measured = rows.filter(pc.field(column).is_valid()).sort_by("step")
-    latest = dict(zip(measured["seed"].to_pylist(), measured[column].to_pylist(), strict=True))
+    latest: dict[int, float] = {}
+    if column in rows.column_names:
+        measured = rows.filter(pc.field(column).is_valid()).sort_by("step")
+        latest = dict(zip(measured["seed"].to_pylist(), measured[column].to_pylist(), strict=True))
+    if guides is not None:
+        own = guides.filter((pc.field("guidance") == key[0]) & (pc.field("labels") == key[1])).sort_by("asked")
+        seeds = set(rows["seed"].to_pylist())  # those of failed lanes are not among them
+        pairs = zip(own["seed"].to_pylist(), own[column].to_pylist(), strict=True)
+        latest |= {seed: value for seed, value in pairs if seed in seeds}
     return np.array([latest[seed] for seed in sorted(latest)])
 
 

@@ -11,6 +11,7 @@ import pytest
 from cuelearner_jax.cli import main
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.records import results
+from cuelearner_jax.records.guides import GuideWriter
 from cuelearner_jax.report.document import report
 from cuelearner_jax.report.efficiency import Question, efficiency_of
 from cuelearner_jax.report.statistics import Interval, curve, interval, mean_over_curve
@@ -213,6 +214,21 @@ def test_the_same_results_give_the_same_numbers(runs):
     # What is said of a variant does not hang on the others that are there.
     alone = efficiency_of(variants[:2], Question(level=0.4))
     assert alone.carried[1].row() == first.carried[1].row()
+
+
+def test_a_guide_is_as_good_as_after_its_last_label(runs):
+    """Instalments go on after step 0: what the results say of guides then is not the last word."""
+    folder = runs / "raw" / "relative-100"
+    known = {"run": "raw", "task": "one_ball", "guidance": "relative", "config_hash": "raw", "split": "validation"}
+    with GuideWriter(folder, **known) as writer:
+        for asked, step, good in ((50, 0, 0.2), (100, 40, 0.7)):
+            row = {"asked": asked, "step": step, "round": asked // 10, "labels": 100, "failed": 0.0, "wall_s": 1.0}
+            writer.append(seed=np.arange(4), guide_reward=np.full(4, good), **row)
+    variants = variants_of(read_groups([runs / "raw"], None, "reward", "validation", by_run=False), "reward")
+    found = {(v.guidance, v.labels): v.guide for v in variants}
+    assert found["relative", 100].tolist() == [0.7] * 4
+    assert found["relative", 500] == pytest.approx(0.16 + 0.001 * np.arange(4))
+    assert found["none", 0] == pytest.approx(0.1 + 0.001 * np.arange(4))
 
 
 def rows(file):
