@@ -5,11 +5,12 @@ BIN := $(VENV)/bin
 UV := $(BIN)/python -m uv
 UV_VERSION := $(shell sed -n 's/^uv==\([0-9.]*\).*/\1/p' constraints.txt)
 
-.PHONY: help setup quickstart test test-quick fuzz lint format bench constraints clean
+.PHONY: help setup quickstart smoke test test-quick fuzz lint format bench constraints clean
 help:
 	@echo "make quickstart   train, report and film the small billiards example (two to three minutes)"
 	@echo "make test         run the tests (about 14 minutes on 2 idle cores)"
 	@echo "make test-quick   those of them that compile next to nothing (under 3 minutes)"
+	@echo "make smoke        one tiny sweep of every form of feedback on both tasks, and their reports (minutes on 2 cores)"
 	@echo "make fuzz         damaged run folders by chance, CASES=2000 SEED=0 (hours on 2 cores)"
 	@echo "make lint         ruff and pyright"
 	@echo "make format       what ruff can put right by itself"
@@ -37,6 +38,10 @@ setup: $(VENV)/.tested
 
 quickstart: $(VENV)/.installed
 	$(BIN)/python experiments/quickstart.py
+
+smoke: $(VENV)/.installed
+	$(BIN)/python experiments/billiards_bootstrapping.py --scale smoke --pieces easy/frame --resume
+	$(BIN)/python experiments/navigation_bootstrapping.py --scale smoke --pieces clutter/frame --resume
 
 test: $(VENV)/.tested
 	$(BIN)/python -m pytest -n 2 --dist loadfile

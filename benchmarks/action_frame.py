@@ -43,9 +43,8 @@ def measure(task: str, preset: str, lanes: int, iterations: int, rounds: int) ->
             times[frame].append(run.train(iterations))
     steps = iterations * config.sizes.num_envs
     raw, action = (1e3 * float(np.median(times[frame][1:])) / steps for frame in FRAMES)
-    counted = [
-        step_operations(run.group.config.sizes, spaces_of(env), config.bootstraps).total for run in runs.values()
-    ]
+    spaces = spaces_of(env)
+    counted = [step_operations(run.group.config.sizes, spaces, config.bootstraps).total for run in runs.values()]
     own, turned = view.widths("action", spaces)
     return {
         "task": task,

@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from cuelearner_jax.config import GuideScalars, GuideSizes, Scalars
 from cuelearner_jax.environment import Environment, actions_of
+from cuelearner_jax.guidance.bounding import within
 from cuelearner_jax.guidance.bundle import Guidance
 from cuelearner_jax.policies import Policy
 from cuelearner_jax.types import GuideState, Label, Stream, Teacher
@@ -39,6 +40,15 @@ def label_slots(budget: int, sizes: GuideSizes) -> int:
     return -(-budget // sizes.labels_per_round) * sizes.labels_per_round
 
 
+def share(budget: int, instalment: int, instalments: int, sizes: GuideSizes) -> int:
+    """Labels that a lane of this budget has asked for once an instalment (from 0) is done.
+
+    Instalments are equal up to whole rounds, of which the earlier ones get the more; the last ends with the budget.
+    """
+    rounds = label_slots(budget, sizes) // sizes.labels_per_round
+    return min(-(-rounds * (instalment + 1) // instalments) * sizes.labels_per_round, budget)
+
+
 def empty_labels(slots: int, obs_size: int, action_size: int, answer_width: int) -> Label:
     """`slots` rows of padding."""
     return Label(
@@ -56,25 +66,66 @@ def start(
     budget: Int[Array, ""] | int,
     k_model: PRNGKeyArray,
     k_env: PRNGKeyArray,
+    candidates: int = 1,
 ) -> GuideState:
-    """A guide that has asked nothing yet, at the start of an episode."""
-    state, obs = env.reset(k_env)
+    """A guide that has asked nothing yet, at the start of an episode; of as many as there are candidates, if several.
+
+    Raises ValueError if its questions are to be chosen and there is nothing to choose them by.
+    """
+    if candidates > 1 and guidance.disagreement is None:
+        raise ValueError(f"guidance {guidance.name!r} has no members whose disagreement could choose its questions")
+    state, obs = env.reset(k_env) if candidates == 1 else jax.vmap(env.reset)(jax.random.split(k_env, candidates))
     return GuideState(
         model=guidance.init(k_model),
         labels=empty_labels(slots, env.obs_size, actions_of(env).size, guidance.answer_width),
         budget=jnp.asarray(budget, jnp.int32),
+        asked=jnp.zeros((), jnp.int32),
         env=state,
         obs=obs,
     )
 
 
 def question(
-    guidance: Guidance, env: Environment, scalars: GuideScalars, base: Policy, guide: GuideState, keys: QuestionKeys
-) -> Float[Array, " action"]:
-    """The action to ask about in the guide's situation."""
+    guidance: Guidance,
+    env: Environment,
+    scalars: GuideScalars,
+    base: Policy,
+    guide: GuideState,
+    keys: QuestionKeys,
+    bound: Float[Array, ""] | None = None,
+) -> Float[Array, "*candidates action"]:
+    """The action to ask about in the guide's situation, or in each of its candidates.
+
+    `bound`: questions stay within it of what the base policy does [rad]; None: wherever the guidance leads.
+    """
+    if bound is not None:
+        scalars = within(scalars, bound)
+
+    def one(key: PRNGKeyArray, obs: Array, proposed: Array) -> Array:
+        asked = guidance.question(key, guide.model, env, obs, proposed, scalars)
+        return asked if bound is None else actions_of(env).clip(asked, proposed, bound)
+
+    if guide.obs.ndim > 1:
+        proposed = base.act(keys.base, guide.env, guide.obs)
+        return jax.vmap(one)(jax.random.split(keys.question, len(guide.obs)), guide.obs, proposed)
     states = jax.tree.map(lambda leaf: leaf[None], guide.env)
-    proposed = base.act(keys.base, states, guide.obs[None])[0]
-    return guidance.question(keys.question, guide.model, env, guide.obs, proposed, scalars)
+    return one(keys.question, guide.obs, base.act(keys.base, states, guide.obs[None])[0])
+
+
+def chosen(
+    guidance: Guidance, env: Environment, guide: GuideState, actions: Float[Array, "*candidates action"]
+) -> tuple[GuideState, Float[Array, " action"]]:
+    """The guide in the one situation to ask in, and the action to ask about there.
+
+    Of several candidates it is the one on which the members of the guide's model disagree most (query by committee:
+    Seung, Opper, Sompolinsky, 1992); before the first fit, when they know nothing, the first.
+    """
+    if guidance.disagreement is None or guide.obs.ndim == 1:
+        return guide, actions
+    apart = guidance.disagreement(guide.model, env, guide.obs, actions)
+    index = jnp.where(guide.model.fitted, jnp.argmax(apart), 0)
+    there = jax.tree.map(lambda leaf: leaf[index], (guide.env, guide.obs, actions))
+    return guide.replace(env=there[0], obs=there[1]), there[2]
 
 
 def record(
@@ -87,12 +138,18 @@ def record(
     """The guide with an answer in the row `position` of its labels; it counts within the budget alone."""
     label = Label(guide.obs, action, answer, jnp.asarray(answered) & (position < guide.budget))
     put = lambda rows, row: jax.lax.dynamic_update_index_in_dim(rows, row, position, 0)  # noqa: E731
-    return guide.replace(labels=jax.tree.map(put, guide.labels, label))
+    asked = jnp.minimum(position + 1, guide.budget)
+    return guide.replace(labels=jax.tree.map(put, guide.labels, label), asked=asked)
 
 
-def proceed(env: Environment, guide: GuideState, action: Float[Array, " action"], keys: QuestionKeys) -> GuideState:
-    """The guide in the situation that the action leads to."""
-    state, step = env.step(keys.env, guide.env, action)
+def proceed(
+    env: Environment, guide: GuideState, action: Float[Array, "*candidates action"], keys: QuestionKeys
+) -> GuideState:
+    """The guide in the situation that the action leads to; of candidates, each by its own."""
+    if guide.obs.ndim > 1:
+        state, step = jax.vmap(env.step)(jax.random.split(keys.env, len(guide.obs)), guide.env, action)
+    else:
+        state, step = env.step(keys.env, guide.env, action)
     return guide.replace(env=state, obs=step.obs)
 
 
@@ -119,14 +176,17 @@ def ask(
     guide: GuideState,
     lane_key: PRNGKeyArray,
     position: Int[Array, ""],
+    bound: Float[Array, ""] | None = None,
 ) -> GuideState:
-    """Question number `position`, answered by a simulated teacher, recorded and acted on."""
+    """Question number `position`, answered by a simulated teacher, recorded and acted on; `bound`: see `question`."""
     if guidance.form is None:
         raise ValueError(f"guidance {guidance.name!r} asks nothing")
     keys = question_keys(lane_key, position)
-    action = question(guidance, env, scalars, base, guide, keys)
-    answer, answered = guidance.form.answer(keys.answer, teacher, guide.env, guide.obs, action, scalars)
-    return proceed(env, record(guide, position, action, answer, answered), action, keys)
+    actions = question(guidance, env, scalars, base, guide, keys, bound)
+    there, action = chosen(guidance, env, guide, actions)
+    answer, answered = guidance.form.answer(keys.answer, env, teacher, there.env, there.obs, action, scalars)
+    told = record(there, position, action, answer, answered)
+    return proceed(env, told.replace(env=guide.env, obs=guide.obs), actions, keys)
 
 
 def label_round(
@@ -138,22 +198,28 @@ def label_round(
     base: Policy,
     guide: GuideState,
     lane_key: PRNGKeyArray,
-    number: Int[Array, ""],
+    until: Int[Array, ""] | None = None,
+    bound: Float[Array, ""] | None = None,
 ) -> GuideState:
-    """Round `number`: as many questions as a round has, then a fit. A guide whose budget is spent stays as it is."""
-    first = number * sizes.labels_per_round
+    """As many questions as a round has, then a fit to all labels so far.
+
+    Args:
+        until: labels at which this instalment ends (default: the budget); a guide that has asked for as many stays as
+            it is.
+        bound: see `question`.
+    """
+    first, until = guide.asked, guide.budget if until is None else until
 
     def one(guide: GuideState, offset: Int[Array, ""]) -> tuple[GuideState, None]:
-        return ask(guidance, env, teacher, scalars, base, guide, lane_key, first + offset), None
+        return ask(guidance, env, teacher, scalars, base, guide, lane_key, first + offset, bound), None
 
     asked, _ = jax.lax.scan(one, guide, jnp.arange(sizes.labels_per_round))
-    fitted = fit(guidance, env, scalars, asked, lane_key, number)
-    going = first < guide.budget
-    return jax.tree.map(lambda new, old: jnp.where(going, new, old), fitted, guide)
+    fitted = fit(guidance, env, scalars, asked, lane_key, first // sizes.labels_per_round)
+    return jax.tree.map(lambda new, old: jnp.where(first < until, new, old), fitted, guide)
 
 
 def take_labels(
     guidance: Guidance, env: Environment, scalars: GuideScalars, labels: Label, guide: GuideState, lane_key: Any
 ) -> GuideState:
     """The guide with labels (slots, ...) that were given elsewhere, and a model fitted to them once."""
-    return fit(guidance, env, scalars, guide.replace(labels=labels), lane_key)
+    return fit(guidance, env, scalars, guide.replace(labels=labels, asked=guide.budget), lane_key)

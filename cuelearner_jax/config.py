@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import itertools
 import json
 import math
 from dataclasses import dataclass
@@ -89,6 +90,14 @@ class GuideSizes(_Seeing):
     """Labels in one step of a fit."""
     validate_every: int = 20
     """Adam steps between two looks at the validation labels (every fifth label); the best parameters are kept."""
+    guide_directions: int = 360
+    """Directions over which a guide that values actions takes its argmax."""
+    replay_steps: int = 5
+    """Gradient steps on earlier corrections after each new one, of a guide that goes on learning (deep COACH)."""
+    ensemble: int = 1
+    """Members of the guidance model, each fitted to all labels; it predicts their mean."""
+    candidates: int = 1
+    """Situations among which each question is chosen: where the members disagree most (1: as they come)."""
 
 
 @dataclass(frozen=True)
@@ -147,22 +156,41 @@ class GuideScalars(_Degrees, _Clipping):
     """Largest number of refinement passes."""
     refined_fraction: float = 1.0
     """Share of the labels after the first fit asked about refined actions (DAgger); the rest about base actions."""
+    explored_fraction: float = 0.25
+    """Share of the questions that a guide which values actions asks about base actions even so, to find good ones."""
+    correction_replay: int = 50
+    """Newest corrections that a guide which goes on learning (deep COACH) keeps learning from."""
+    ask_bound_deg: float = 180.0
+    """From the second instalment on: questions and guided episodes stay within this of the agent's own action [deg]."""
     guided_probability: float = 0.5
     """Probability that an episode is guided."""
 
 
 @dataclass(frozen=True)
 class TeacherFaults(_Degrees):
-    """Traced scalars of a simulated teacher: how it errs."""
+    """Scalars of a simulated teacher: what it answers about, and how it errs; traced, but for words."""
 
+    answer: Literal["best", "nearest"] = "best"
+    """What it has in mind: its best action, or of those that it holds for good the nearest to the one asked about."""
+    nearest_share: float = 0.6
+    """Good is an action worth at least this share of the best one."""
+    nearest_aim_deg: float = 1.0
+    """Standard deviation of the error of aim over which that worth is averaged [deg]."""
+    scalar_good: Literal["near", "scored"] = "near"
+    """Scalar feedback calls good what lies near the action in mind, or what is rewarded at once as well."""
+    scalar_within_deg: float = 5.0
+    """Scalar feedback: how near that is [deg]."""
     mistake_probability: float = 0.0
-    """Teacher's fault: a turn is told the wrong way round with this probability."""
+    """Teacher's fault: with this probability a turn is told the wrong way round, a demonstration errs on the other side
+    of the action asked about, good is called bad and bad good."""
     silence_probability: float = 0.0
-    """Teacher's fault: no answer with this probability (the question still counts as a label)."""
+    """Teacher's fault: no answer, of any form, with this probability (the question still counts as a label)."""
     indifference_deg: float = 0.0
-    """Teacher's fault: errors up to this pass for right (relative feedback alone implies eps / 2) [deg]."""
+    """Teacher's fault: errors up to this pass for right (relative feedback alone implies eps / 2): the action asked
+    about is then the one demonstrated, and called good [deg]."""
     teacher_bias_deg: float = 0.0
-    """Teacher's fault: constant error of what it takes for the best action, counterclockwise [deg]."""
+    """Teacher's fault: constant error, counterclockwise, of what it takes for the best action or for a good one,
+    whatever the form of its answers [deg]."""
 
 
 @dataclass(frozen=True)
@@ -197,10 +225,17 @@ class Schedule:
     """Environments that share an evaluation's steps."""
     checkpoint_every: int = 1_000_000
     """Steps between two checkpoints, which is what a killed run may lose."""
+    ask_at: tuple[int, ...] = (0,)
+    """Steps before which an equal instalment of the labels is asked for, the first 0: about uniform actions; later
+    ones about the agent's own."""
+    guide_eval_every: int = 0
+    """Labels between two evaluations of the guide alone (0: after each instalment alone)."""
 
 
 for _traced in (AgentScalars, GuideScalars, TeacherFaults, Scalars, Schedule):
-    jax.tree_util.register_dataclass(_traced, [field.name for field in dataclasses.fields(_traced)], [])
+    _names = [field.name for field in dataclasses.fields(_traced)]
+    _words = [name for name in _names if isinstance(getattr(_traced, name), str)]  # no numbers: part of the program
+    jax.tree_util.register_dataclass(_traced, [name for name in _names if name not in _words], _words)
 
 
 @dataclass(frozen=True)
@@ -248,6 +283,34 @@ def check(config: RunConfig) -> None:
     _check_multiple(schedule.total_steps, schedule.eval_every, "schedule.total_steps", "schedule.eval_every")
     _check_multiple(schedule.checkpoint_every, schedule.eval_every, "schedule.checkpoint_every", "schedule.eval_every")
     _check_multiple(schedule.eval_steps, schedule.eval_envs, "schedule.eval_steps", "schedule.eval_envs")
+    _check_asking(config)
+
+
+def _check_asking(config: RunConfig) -> None:
+    """When labels are asked for, and when the guide is looked at."""
+    schedule, scalars = config.schedule, config.scalars
+    given = f"schedule.ask_at is {' '.join(map(str, schedule.ask_at)) or 'empty'}"
+    if schedule.ask_at[:1] != (0,) or any(b <= a for a, b in itertools.pairwise(schedule.ask_at)):
+        raise UserError(f"{given}: give steps in ascending order, the first of them 0")
+    for step in schedule.ask_at:
+        _check_multiple(step, schedule.eval_every, "schedule.ask_at", "schedule.eval_every")
+    later = schedule.ask_at[1:]
+    if later and later[-1] >= min(schedule.guidance_until, schedule.total_steps):
+        end = "guidance_until" if schedule.guidance_until <= schedule.total_steps else "total_steps"
+        raise UserError(
+            f"{given}: give steps below schedule.{end} ({getattr(schedule, end)}), after which no guide acts"
+        )
+    if not 0 < scalars.ask_bound_deg <= 180:
+        raise UserError(f"scalars.ask_bound_deg is {scalars.ask_bound_deg}: give an angle above 0 and up to 180")
+    if not later and scalars.ask_bound_deg < 180:
+        raise UserError(
+            f"scalars.ask_bound_deg is {scalars.ask_bound_deg}, which bounds later instalments, and there is but one: "
+            "add steps to schedule.ask_at, or leave it out"
+        )
+    if schedule.guide_eval_every < 0:
+        raise UserError(f"schedule.guide_eval_every is {schedule.guide_eval_every}: give a number that is not negative")
+    unit = config.sizes.labels_per_round
+    _check_multiple(schedule.guide_eval_every, unit, "schedule.guide_eval_every", "sizes.labels_per_round")
 
 
 def check_whole(group: Any, prefix: str) -> None:
@@ -288,7 +351,13 @@ def check_guide(sizes: GuideSizes, scalars: GuideScalars) -> None:
     """Raises UserError with one line for the first value of a guide's that cannot work."""
     check_whole(sizes, "sizes")
     check_whole(scalars, "scalars")
-    _check_positive(sizes, ("labels_per_round", "fit_steps", "fit_batch_size", "validate_every"))
+    positive = ("labels_per_round", "fit_steps", "fit_batch_size", "validate_every", "ensemble", "candidates")
+    _check_positive(sizes, (*positive, "guide_directions", "replay_steps"))
+    if sizes.candidates > 1 and sizes.ensemble == 1:
+        raise UserError(
+            f"sizes.candidates is {sizes.candidates}: questions are chosen by the disagreement of members, so give a "
+            "sizes.ensemble above 1 too"
+        )
     if sizes.labels_per_round > LARGEST_ROUND:
         raise UserError(f"sizes.labels_per_round is {sizes.labels_per_round}: give at most {LARGEST_ROUND}")
     _check_layers(sizes.feedback_layers, "sizes.feedback_layers")
@@ -299,6 +368,8 @@ def check_guide(sizes: GuideSizes, scalars: GuideScalars) -> None:
         raise UserError(
             f"scalars.eps_deg is {scalars.eps_deg}: a relative label is a turn of more than 0 and up to 180"
         )
+    if scalars.correction_replay < 1:
+        raise UserError(f"scalars.correction_replay is {scalars.correction_replay}: give a positive number")
     if scalars.max_grad_norm <= 0:  # a zero gradient would be scaled by 0 / 0
         raise UserError(f"scalars.max_grad_norm is {scalars.max_grad_norm}: give a positive number")
 
@@ -315,8 +386,13 @@ def _check_layers(layers: tuple[int, ...], name: str) -> None:
 
 
 def _check_numbers(scalars: Any) -> None:
+    types = get_type_hints(type(scalars))
     for name, value in dataclasses.asdict(scalars).items():
-        if name.endswith(("probability", "fraction", "polyak", "weight")) and not 0 <= value <= 1:
+        if get_origin(types[name]) is Literal:
+            if not _fits(value, types[name]):
+                raise UserError(f"scalars.{name} is {value!r}: give {' or '.join(get_args(types[name]))}")
+            continue
+        if name.endswith(("probability", "fraction", "share", "polyak", "weight")) and not 0 <= value <= 1:
             raise UserError(f"scalars.{name} is {value}: give a number from 0 to 1")
         if not math.isfinite(value) or abs(value) > LARGEST_FLOAT:
             raise UserError(f"scalars.{name} is {value}: give a finite number (in single precision)")

@@ -31,10 +31,11 @@ from cuelearner_jax.devices import (
 )
 from cuelearner_jax.environment import Environment
 from cuelearner_jax.guidance import pace
+from cuelearner_jax.guidance.bounding import act_within
 from cuelearner_jax.guidance.bundle import Guidance
 from cuelearner_jax.guidance.refining import Refined, untouched
-from cuelearner_jax.policies import Uniform
-from cuelearner_jax.types import Clock, GuideState, Label, Stream, Teacher, TrainState
+from cuelearner_jax.policies import Agent, Uniform
+from cuelearner_jax.types import Clock, GuideState, Label, Params, Stream, Teacher, TrainState
 
 
 class Program(NamedTuple):
@@ -45,8 +46,9 @@ class Program(NamedTuple):
 
     # (env, seeds (lanes,), budgets (lanes,), root key) -> state
     init: Callable[[Any, Array, Array, PRNGKeyArray], TrainState]
-    # (env, teacher, scalars, clock, state) -> clock, state
-    label_round: Callable[[Any, Teacher, Scalars, Clock, TrainState], tuple[Clock, TrainState]]
+    # (env, teacher, scalars, clock, state, labels (lanes,) at which this instalment ends (default: the budgets),
+    # own=True: about the agent's actions, not uniform ones) -> clock, state
+    label_round: Callable[..., tuple[Clock, TrainState]]
     # (env, scalars, labels (lanes, slots, ...) that were given elsewhere, state) -> state
     take_labels: Callable[[Any, Scalars, Label, TrainState], TrainState]
     # (env, scalars, schedule, clock, state, iterations) -> clock, state, metrics (lanes,)
@@ -82,10 +84,16 @@ def make_program(
         keys = jax.vmap(lambda seed: jax.random.fold_in(root, seed))(seeds)
         return each_lane(partial(lane.init, env))(keys, budgets)
 
-    def label_round(env, teacher, scalars, clock, state):
-        rest, agent = state.replace(agent=None), state.agent  # which is large, and has no part in it
-        asked = each_lane(partial(lane.label_round, env, teacher, scalars, clock.round))(rest)
+    def label_round(env, teacher, scalars, clock, state, until, own):
+        rest, agent = state.replace(agent=None), state.agent  # which is large; of it questions need the network alone
+        networks = (agent.params,) if own else ()
+        asked = each_lane(partial(lane.label_round, env, teacher, scalars))(until, rest, *networks)
         return clock.replace(round=clock.round + 1), asked.replace(agent=agent)
+
+    def one_round(env, teacher, scalars, clock, state, until=None, own=False):
+        until = state.guide.budget if until is None else until
+        whole = over_lanes(mesh, partial(label_round, own=own), (*(SHARED,) * 4, BY_LANE, BY_LANE), (SHARED, BY_LANE))
+        return whole(env, teacher, scalars, clock, state, until)
 
     def take_labels(env, scalars, labels, state):
         rest, agent = state.replace(agent=None), state.agent
@@ -111,11 +119,10 @@ def make_program(
         return whole(env, scalars, schedule, clock, state)
 
     init = over_lanes(mesh, init, (SHARED, BY_LANE, BY_LANE, SHARED), BY_LANE)
-    label_round = over_lanes(mesh, label_round, (*(SHARED,) * 4, BY_LANE), (SHARED, BY_LANE))
     take_labels = over_lanes(mesh, take_labels, (SHARED, SHARED, BY_LANE, BY_LANE), BY_LANE)
     return Program(
         init=jax.jit(init),
-        label_round=jax.jit(label_round, donate_argnums=4),
+        label_round=jax.jit(one_round, donate_argnames="state", static_argnames="own"),
         take_labels=jax.jit(take_labels, donate_argnums=3),
         train=jax.jit(
             stretch, donate_argnames="state", static_argnames="iterations", compiler_options=compiler_options(lanes)
@@ -137,19 +144,34 @@ class Lane(NamedTuple):
         slots = label_slots(self.largest_budget, self.sizes)
         return TrainState(
             agent=self.learner.init(env, k_q, k_env),
-            guide=asking.start(self.guidance, env, slots, budget, k_guidance, k_ask),
+            guide=asking.start(self.guidance, env, slots, budget, k_guidance, k_ask, self.sizes.candidates),
             key=key,
             failed=jnp.array(False),
             pace=pace.start(self.sizes.num_envs) if self.sizes.pace else None,
         )
 
     def label_round(
-        self, env: Environment, teacher: Teacher, scalars: Scalars, number: Int[Array, ""], state: TrainState
+        self,
+        env: Environment,
+        teacher: Teacher,
+        scalars: Scalars,
+        until: Int[Array, ""],
+        state: TrainState,
+        params: Params | None = None,
     ) -> TrainState:
-        """One round of questions to a simulated teacher, uniform actions their base (see `asking.label_round`)."""
-        base = Uniform(self.learner.actions)
+        """One round of questions to a simulated teacher (see `asking.label_round`).
+
+        Args:
+            until: labels at which the instalment ends.
+            state: the lane, its agent left out.
+            params: the agent's, whose greedy actions are then asked about, refined within `ask_bound_deg`: local
+                corrections. None: uniform actions are the base, refined as far as they lead.
+        """
+        base, bound = Uniform(self.learner.actions), None
+        if params is not None:
+            base, bound = Agent(params, self.sizes, self.learner.actions, env), scalars.radians("ask_bound")
         guide = asking.label_round(
-            self.guidance, self.sizes, env, teacher, scalars, base, state.guide, state.key, number
+            self.guidance, self.sizes, env, teacher, scalars, base, state.guide, state.key, until, bound
         )
         return self.guided(state, guide)
 
@@ -232,9 +254,29 @@ class Lane(NamedTuple):
         )
         return jax.lax.cond(
             guides(clock, schedule),
-            lambda: self.guidance.act(state.guide.model, env, agent.obs, base, agent.guided, scalars),
+            lambda: self.guide(env, scalars, schedule, clock, state, base),
             lambda: untouched(base),
         )
+
+    def guide(
+        self,
+        env: Environment,
+        scalars: Scalars,
+        schedule: Schedule,
+        clock: Clock,
+        state: TrainState,
+        base: Float[Array, "num_envs action"],
+    ) -> Refined:
+        """The agent's actions as guidance has them, in guided episodes.
+
+        Once there are labels about its own actions, within `ask_bound_deg` of them: these are local corrections.
+        """
+        agent, guidance = state.agent, self.guidance
+        where = (state.guide.model, env, agent.obs, base, agent.guided, scalars)
+        if len(schedule.ask_at) == 1:
+            return guidance.act(*where)
+        bound = jnp.where(clock.step >= schedule.ask_at[1], scalars.radians("ask_bound"), jnp.pi)
+        return act_within(bound, guidance, *where)
 
 
 def guides(clock: Clock, schedule: Schedule) -> Bool[Array, ""]:

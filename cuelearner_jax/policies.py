@@ -23,6 +23,7 @@ from cuelearner_jax.devices import portions
 from cuelearner_jax.environment import actions_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guidance.answers import relative_feedback
+from cuelearner_jax.guidance.bounding import act_within
 from cuelearner_jax.guidance.bundle import Guidance
 from cuelearner_jax.guidance.refining import refine
 from cuelearner_jax.types import EnvState, GuidanceModel, Params, Teacher
@@ -111,17 +112,20 @@ class Guided(struct.PyTreeNode):
     env: Any
     scalars: GuideScalars
     guidance: Guidance = struct.field(pytree_node=False)
+    bound: Float[Array, ""] | None = None  # to the way from the base's actions [rad]; None: wherever guidance leads
 
     def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
         """The base's actions as the guidance has them."""
-        everywhere = jnp.ones(obs.shape[0], bool)
         base = self.base.act(key, states, obs)
-        return self.guidance.act(self.model, self.env, obs, base, everywhere, self.scalars).actions
+        where = (self.model, self.env, obs, base, jnp.ones(obs.shape[0], bool), self.scalars)
+        if self.bound is None:
+            return self.guidance.act(*where).actions
+        return act_within(self.bound, self.guidance, *where).actions
 
     @property
     def axes(self) -> Guided:
         """Each lane has its own base and model."""
-        return self.replace(base=self.base.axes, model=BY_LANE, env=SHARED, scalars=SHARED)
+        return self.replace(base=self.base.axes, model=BY_LANE, env=SHARED, scalars=SHARED, bound=SHARED)
 
 
 class Corrected(struct.PyTreeNode):

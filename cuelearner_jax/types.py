@@ -40,6 +40,25 @@ class Teacher(Protocol):
 
 
 @runtime_checkable
+class ValuesDirections(Protocol):
+    """A teacher that holds more than one action for good, and so knows the way to the nearest."""
+
+    def nearest_good(
+        self,
+        state: EnvState,
+        obs: Float[Array, " obs"],
+        action: Float[Array, " action"],
+        spread: Float[Array, ""] | float,
+        share: Float[Array, ""] | float,
+    ) -> Float[Array, " action"]:
+        """Of the actions worth at least a share of the best, averaged over an error of aim, the nearest to `action`.
+
+        `spread` is the standard deviation of the aim [rad]; see `actions.nearest_direction`.
+        """
+        ...
+
+
+@runtime_checkable
 class Policy(Protocol):
     """Anything that acts. A pytree, like an environment; see `policies`."""
 
@@ -91,8 +110,9 @@ class GuideState(struct.PyTreeNode):
     model: GuidanceModel
     labels: Label  # leading axis: slots, the largest budget of the sweep in whole rounds
     budget: Int[Array, ""]  # labels that this lane may use
-    env: EnvState
-    obs: Float[Array, " obs"]
+    asked: Int[Array, ""]  # questions so far that count within it, answered or not
+    env: EnvState  # leading axis: candidates, where each question is chosen among several situations
+    obs: Float[Array, "*candidates obs"]
 
 
 class AgentState(struct.PyTreeNode):

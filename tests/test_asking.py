@@ -10,10 +10,10 @@ import numpy as np
 import probes
 import pytest
 
-from cuelearner_jax import actions, asking
+from cuelearner_jax import actions, asking, loop
 from cuelearner_jax.guidance import registry as guidances
 from cuelearner_jax.loop import start_clock
-from cuelearner_jax.policies import Heuristic, Taught, Uniform
+from cuelearner_jax.policies import Agent, Heuristic, Taught, Uniform
 
 ENV, EXPERT = probes.Window(), probes.Expert(probes.Window())
 RELATIVE = guidances.make("relative", probes.SIZES, ENV)
@@ -42,7 +42,7 @@ def asked_one_by_one(guide, number, base, scalars, env=ENV, teacher=EXPERT):
     for position in range(number * ROUND, (number + 1) * ROUND):
         keys = asking.question_keys(LANE_KEY, position)
         action = question(env, scalars, base, guide, keys)
-        answer, answered = said(keys.answer, teacher, guide.env, guide.obs, action, scalars)
+        answer, answered = said(keys.answer, env, teacher, guide.env, guide.obs, action, scalars)
         typed = np.asarray(answer), bool(answered)
         guide = proceed(env, record(guide, position, action, *typed), action, keys)
     return fit(env, scalars, guide, LANE_KEY, jnp.asarray(number))
@@ -52,7 +52,7 @@ def asked_one_by_one(guide, number, base, scalars, env=ENV, teacher=EXPERT):
 def test_asking_one_by_one_is_bitwise_a_round(base):
     rounds = typed = begun(budget=17)
     for number in range(2):
-        rounds = label_round(ENV, EXPERT, FAULTY, base, rounds, LANE_KEY, jnp.asarray(number))
+        rounds = label_round(ENV, EXPERT, FAULTY, base, rounds, LANE_KEY)
         typed = asked_one_by_one(typed, number, base, FAULTY)
         chex.assert_trees_all_equal(typed, rounds)
     valid = np.asarray(rounds.labels.valid)
@@ -66,20 +66,20 @@ def test_a_lanes_round_in_the_training_program_is_this_round_of_uniform_actions(
     state = probes.start(program, [3], [2 * ROUND])
     guide, key = jax.tree.map(lambda leaf: jnp.copy(leaf[0]), (state.guide, state.key))
     clock = start_clock()
-    for number in range(2):
+    for _ in range(2):
         clock, state = program.label_round(ENV, EXPERT, FAULTY, clock, state)
-        guide = label_round(ENV, EXPERT, FAULTY, Uniform(), guide, key, jnp.asarray(number))
+        guide = label_round(ENV, EXPERT, FAULTY, Uniform(), guide, key)
     chex.assert_trees_all_equal(probes.lane(state.guide, 0), jax.tree.map(np.asarray, guide))
 
 
 def test_questions_are_about_what_the_base_policy_does():
     for base, turn in ((Heuristic(ENV), -1.0), (Taught(EXPERT), 0.6)):
-        labels = label_round(ENV, EXPERT, probes.SCALARS, base, begun(), LANE_KEY, jnp.asarray(0)).labels
+        labels = label_round(ENV, EXPERT, probes.SCALARS, base, begun(), LANE_KEY).labels
         np.testing.assert_allclose(actions.difference(labels.obs, labels.action)[:ROUND], turn, atol=1e-5)
         assert len(np.unique(np.asarray(labels.obs)[:ROUND], axis=0)) > 1
         # 1.6 rad short of the best direction, or right there.
         assert set(np.asarray(labels.answer)[:ROUND, 0]) == {1.0 if turn < 0 else 0.0}
-    uniform = label_round(ENV, EXPERT, probes.SCALARS, Uniform(), begun(), LANE_KEY, jnp.asarray(0)).labels
+    uniform = label_round(ENV, EXPERT, probes.SCALARS, Uniform(), begun(), LANE_KEY).labels
     keys = [asking.question_keys(LANE_KEY, position).base for position in range(ROUND)]
     drawn = np.concatenate([actions.uniform(key, (1,)) for key in keys])
     np.testing.assert_allclose(uniform.action[:ROUND], drawn, atol=1e-6)
@@ -121,7 +121,8 @@ def test_an_answer_stands_in_its_row_and_changes_nothing_else():
     others = np.arange(2 * ROUND) != 3
     rest = [jax.tree.map(lambda leaf: np.asarray(leaf)[others], one.labels) for one in (told, guide)]
     chex.assert_trees_all_equal(*rest)
-    chex.assert_trees_all_equal(told.replace(labels=None), guide.replace(labels=None))
+    assert int(told.asked) == 4  # questions with the numbers 0 to 3
+    chex.assert_trees_all_equal(told.replace(labels=None, asked=0), guide.replace(labels=None, asked=0))
 
 
 def test_answers_past_the_budget_do_not_count():
@@ -130,8 +131,8 @@ def test_answers_past_the_budget_do_not_count():
         guide = record(guide, position, jnp.array([1.0, 0.0]), jnp.array([1.0]), True)
     assert np.asarray(guide.labels.valid).tolist() == [True] * 4 + [False] * (ROUND - 4)
     # The round beyond a spent budget leaves everything as it is, the model too.
-    spent = label_round(ENV, EXPERT, probes.SCALARS, Uniform(), begun(budget=ROUND), LANE_KEY, jnp.asarray(0))
-    after = label_round(ENV, EXPERT, probes.SCALARS, Uniform(), spent, LANE_KEY, jnp.asarray(1))
+    spent = label_round(ENV, EXPERT, probes.SCALARS, Uniform(), begun(budget=ROUND), LANE_KEY)
+    after = label_round(ENV, EXPERT, probes.SCALARS, Uniform(), spent, LANE_KEY)
     chex.assert_trees_all_equal(after, spent)
 
 
@@ -146,7 +147,7 @@ def test_questions_without_an_answer_do_not_count():
 
 
 def test_answers_that_do_not_count_teach_nothing():
-    guide = label_round(ENV, EXPERT, probes.SCALARS, Uniform(), begun(budget=ROUND + 2), LANE_KEY, jnp.asarray(0))
+    guide = label_round(ENV, EXPERT, probes.SCALARS, Uniform(), begun(budget=ROUND + 2), LANE_KEY)
     position = ROUND + 1
     one, other = (record(guide, position, jnp.array([1.0, 0.0]), jnp.array([h]), False) for h in (1.0, -1.0))
     fits = [fit(ENV, probes.SCALARS, told, LANE_KEY, jnp.asarray(1)).model for told in (one, other)]
@@ -161,14 +162,85 @@ def test_each_question_and_each_fit_has_random_numbers_of_its_own():
     drawn = [asking.question_keys(LANE_KEY, position) for position in range(3)]
     words = {tuple(np.asarray(jax.random.key_data(key)).tolist()) for keys in drawn for key in keys}
     assert len(words) == 3 * 4
-    guide = label_round(ENV, EXPERT, probes.SCALARS, Uniform(), begun(), LANE_KEY, jnp.asarray(0))
+    guide = label_round(ENV, EXPERT, probes.SCALARS, Uniform(), begun(), LANE_KEY)
     models = [fit(ENV, probes.SCALARS, guide, LANE_KEY, jnp.asarray(number)).model for number in (0, 0, 1)]
     chex.assert_trees_all_equal(models[0], models[1], guide.model)
     assert not np.array_equal(jax.tree.leaves(models[0].params)[1], jax.tree.leaves(models[2].params)[1])
 
 
 def test_labels_given_elsewhere_are_fitted_once():
-    labels = label_round(ENV, EXPERT, probes.SCALARS, Uniform(), begun(), LANE_KEY, jnp.asarray(0)).labels
+    labels = label_round(ENV, EXPERT, probes.SCALARS, Uniform(), begun(), LANE_KEY).labels
     taken = jax.jit(partial(asking.take_labels, RELATIVE))(ENV, probes.SCALARS, labels, begun(), LANE_KEY)
-    chex.assert_trees_all_equal(taken, fit(ENV, probes.SCALARS, begun().replace(labels=labels), LANE_KEY))
+    given = begun().replace(labels=labels, asked=begun().budget)
+    chex.assert_trees_all_equal(taken, fit(ENV, probes.SCALARS, given, LANE_KEY))
     assert bool(taken.model.fitted)
+
+
+# Instalments.
+
+
+def test_instalments_are_equal_up_to_whole_rounds_and_end_with_the_budget():
+    shares = lambda budget, count: [asking.share(budget, i, count, probes.SIZES) for i in range(count)]  # noqa: E731
+    assert shares(100, 1) == [100]
+    assert shares(35, 1) == [35]
+    assert shares(100, 2) == [50, 100]
+    assert shares(100, 4) == [30, 50, 80, 100]
+    assert shares(25, 2) == [20, 25]
+    for budget in range(21, 200):
+        found = np.diff([0, *shares(budget, 3)])
+        assert found.sum() == budget
+        assert found.min() > 0
+        rounds = -(-found // ROUND)
+        assert rounds.max() - rounds.min() <= 1
+
+
+def test_a_guide_asks_until_its_instalment_is_done_and_then_waits():
+    guide = begun(budget=2 * ROUND)
+    one = label_round(ENV, EXPERT, probes.SCALARS, Uniform(), guide, LANE_KEY, jnp.asarray(ROUND))
+    waited = label_round(ENV, EXPERT, probes.SCALARS, Uniform(), one, LANE_KEY, jnp.asarray(ROUND))
+    chex.assert_trees_all_equal(waited, one)
+    assert int(one.asked) == int(one.labels.valid.sum()) == ROUND
+    # What it has waited for changes nothing: it goes on as if it had asked all at once.
+    done = label_round(ENV, EXPERT, probes.SCALARS, Uniform(), waited, LANE_KEY, jnp.asarray(2 * ROUND))
+    at_once = guide
+    for _ in range(2):
+        at_once = label_round(ENV, EXPERT, probes.SCALARS, Uniform(), at_once, LANE_KEY, jnp.asarray(2 * ROUND))
+    chex.assert_trees_all_equal(done, at_once)
+    assert int(done.asked) == 2 * ROUND
+
+
+def test_later_questions_are_about_the_agents_greedy_actions_refined_within_the_bound():
+    program = probes.window_program("relative", 2 * ROUND)
+    clock, state = start_clock(), probes.start(program, [3, 4], [2 * ROUND, 15])
+    clock, state = program.label_round(ENV, EXPERT, probes.SCALARS, clock, state, jnp.array([ROUND, ROUND]))
+    assert np.asarray(state.guide.labels.valid).sum(1).tolist() == [ROUND, ROUND]
+    first = jax.tree.map(np.asarray, state.guide.labels)
+    bounded = dataclasses.replace(probes.SCALARS, ask_bound_deg=7.0)
+    plain = dataclasses.replace(bounded, refined_fraction=0.0)
+    params = jax.tree.map(jnp.copy, state.agent.params)
+    for scalars, turned in ((plain, False), (bounded, True)):
+        kept = jax.tree.map(jnp.copy, state)
+        _, later = program.label_round(ENV, EXPERT, scalars, clock, kept, state.guide.budget, own=True)
+        for lane, budget in enumerate((2 * ROUND, 15)):
+            labels, before = probes.lane(later.guide.labels, lane), probes.lane(first, lane)
+            assert labels.valid.tolist() == [True] * budget + [False] * (2 * ROUND - budget)  # never past the budget
+            chex.assert_trees_all_equal(*(jax.tree.map(lambda leaf: leaf[:ROUND], one) for one in (labels, before)))
+            greedy = Agent(probes.lane(params, lane), probes.SIZES).act(LANE_KEY, None, jnp.asarray(labels.obs[ROUND:]))
+            away = np.degrees(np.abs(actions.difference(greedy, labels.action[ROUND:])))
+            assert away.max() <= 7.0 + 1e-3
+            assert (away.max() > 1.0) == turned
+        assert later.guide.asked.tolist() == [2 * ROUND, 15]
+
+
+def test_guided_episodes_keep_to_the_bound_once_there_are_labels_about_the_agents_own_actions():
+    config = probes.config(scalars={"ask_bound_deg": 9.0}, schedule={"ask_at": (0, 16)})
+    lane = loop.make_lane(config, guidances.make("heuristic", config.sizes, ENV), ENV, 0)
+    state = jax.tree.map(lambda leaf: leaf[0], probes.start(probes.window_program("heuristic"), [3], [0]))
+    state = state.replace(agent=state.agent.replace(guided=jnp.array([True, True, False, True])))
+    base = actions.rotate(state.agent.obs, 0.5)  # 1.5 rad from the heuristic's
+    one = dataclasses.replace(config.schedule, ask_at=(0,))
+    for schedule, step, away in ((config.schedule, 15, 1.5), (config.schedule, 16, np.deg2rad(9.0)), (one, 16, 1.5)):
+        clock = start_clock().replace(step=jnp.asarray(step))
+        found = lane.guide(ENV, config.scalars, schedule, clock, state, base)
+        turned = np.abs(actions.difference(base, found.actions))
+        np.testing.assert_allclose(turned, [away, away, 0, away], atol=1e-5)

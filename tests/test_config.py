@@ -26,6 +26,8 @@ from cuelearner_jax.errors import UserError
         ("sizes", {"fit_steps": 0}, "sizes.fit_steps is 0"),
         ("sizes", {"fit_batch_size": 0}, "sizes.fit_batch_size is 0"),
         ("sizes", {"validate_every": 0}, "sizes.validate_every is 0"),
+        ("sizes", {"guide_directions": 0}, "sizes.guide_directions is 0"),
+        ("sizes", {"replay_steps": 0}, "sizes.replay_steps is 0"),
         ("sizes", {"lanes_per_block": -1}, "sizes.lanes_per_block is -1"),
         ("sizes", {"q_layers": ()}, "at least one layer"),
         ("sizes", {"feedback_layers": ()}, "at least one layer"),
@@ -46,6 +48,13 @@ from cuelearner_jax.errors import UserError
         ("scalars", {"mistake_probability": -0.1}, "scalars.mistake_probability is -0.1"),
         ("scalars", {"silence_probability": 2.0}, "scalars.silence_probability is 2.0"),
         ("scalars", {"refined_fraction": 1.1}, "scalars.refined_fraction is 1.1"),
+        ("scalars", {"answer": "worst"}, "scalars.answer is 'worst': give best or nearest"),
+        ("scalars", {"scalar_good": ""}, "scalars.scalar_good is '': give near or scored"),
+        ("scalars", {"nearest_share": 1.1}, "scalars.nearest_share is 1.1: give a number from 0 to 1"),
+        ("scalars", {"nearest_aim_deg": -1.0}, "scalars.nearest_aim_deg is -1.0: give a number that is not negative"),
+        ("scalars", {"scalar_within_deg": math.nan}, "scalars.scalar_within_deg is nan"),
+        ("scalars", {"explored_fraction": 1.5}, "scalars.explored_fraction is 1.5: give a number from 0 to 1"),
+        ("scalars", {"correction_replay": 0}, "scalars.correction_replay is 0: give a positive number"),
         ("scalars", {"polyak": 1.5}, "scalars.polyak is 1.5: give a number from 0 to 1"),
         ("scalars", {"learning_rate": math.nan}, "scalars.learning_rate is nan: give a finite number"),
         ("scalars", {"teacher_bias_deg": -math.inf}, "scalars.teacher_bias_deg is -inf: give a finite number"),
@@ -60,6 +69,23 @@ from cuelearner_jax.errors import UserError
         ("schedule", {"total_steps": 50}, "schedule.total_steps is 50: give a multiple of schedule.eval_every"),
         ("schedule", {"checkpoint_every": 24}, "schedule.checkpoint_every is 24: give a multiple"),
         ("schedule", {"eval_steps": 25}, "schedule.eval_steps is 25: give a multiple of schedule.eval_envs"),
+        ("sizes", {"ensemble": 0}, "sizes.ensemble is 0"),
+        ("sizes", {"candidates": 0}, "sizes.candidates is 0"),
+        ("sizes", {"candidates": 8}, "sizes.candidates is 8: questions are chosen by the disagreement of members"),
+        ("scalars", {"ask_bound_deg": 20.0}, "ask_bound_deg is 20.0, which bounds later instalments, and there is but"),
+        ("scalars", {"ask_bound_deg": 0.0}, "scalars.ask_bound_deg is 0.0: give an angle"),
+        ("schedule", {"ask_at": ()}, "schedule.ask_at is empty: give steps in ascending order, the first of them 0"),
+        ("schedule", {"ask_at": (16,)}, "schedule.ask_at is 16: give steps in ascending order, the first of them 0"),
+        ("schedule", {"ask_at": (0, 16, 16)}, "schedule.ask_at is 0 16 16: give steps in ascending order"),
+        ("schedule", {"ask_at": (0, 10)}, "schedule.ask_at is 10: give a multiple of schedule.eval_every (16)"),
+        ("schedule", {"ask_at": (0, 32)}, "schedule.ask_at is 0 32: give steps below schedule.guidance_until (24)"),
+        (
+            "schedule",
+            {"ask_at": (0, 48), "guidance_until": 100},
+            "schedule.ask_at is 0 48: give steps below schedule.total_steps (48)",
+        ),
+        ("schedule", {"guide_eval_every": -10}, "schedule.guide_eval_every is -10"),
+        ("schedule", {"guide_eval_every": 15}, "schedule.guide_eval_every is 15: give a multiple of sizes.labels"),
     ],
 )
 def test_values_that_cannot_work_are_refused(group, values, message):
@@ -86,7 +112,11 @@ def test_radians():
 
 
 def test_scalars_and_schedule_are_trees_of_their_numbers_and_sizes_are_not():
-    assert len(jax.tree.leaves(Scalars())) == len(dataclasses.fields(Scalars))
+    words = {"answer": "nearest", "scalar_good": "scored"}
+    assert len(jax.tree.leaves(Scalars())) == len(dataclasses.fields(Scalars)) - len(words)
+    for name, word in words.items():  # part of the program
+        other = dataclasses.replace(Scalars(), **{name: word})
+        assert jax.tree.structure(other) != jax.tree.structure(Scalars())
     assert len(jax.tree.leaves(Schedule())) == len(dataclasses.fields(Schedule))
     assert hash(Sizes()) == hash(Sizes())
 
@@ -100,11 +130,16 @@ def test_other_scalars_and_schedules_compile_nothing_again(group):
         traced.append(group)
         return sum(jax.tree.leaves(group))
 
-    values = dataclasses.asdict(group)
-    assert float(total(group)) == pytest.approx(sum(values.values()))
-    for name, value in values.items():
-        other = dataclasses.replace(group, **{name: 2 * value + type(value)(1000)})
-        assert float(total(other)) == pytest.approx(sum(values.values()) + value + 1000)
+    before = sum(jax.tree.leaves(group))
+    assert float(total(group)) == pytest.approx(before)
+    for name, value in dataclasses.asdict(group).items():
+        if isinstance(value, str):  # a choice, which is compiled in
+            continue
+        several = isinstance(value, tuple)  # of which the number is fixed
+        (first, *rest) = value if several else (value,)
+        other = 2 * first + type(first)(1000)
+        changed = dataclasses.replace(group, **{name: (other, *rest) if several else other})
+        assert float(total(changed)) == pytest.approx(before + first + 1000)
     assert len(traced) == 1
     assert type(traced[0]) is type(group)
 

@@ -231,7 +231,7 @@ def agents():
 
 BLOCKS = {
     "agent": agents,
-    "guided agent": lambda: guided(agents()),
+    "guided agent": lambda: guided(agents()).replace(bound=jnp.array(0.2)),
     "guided uniform": lambda: guided(Uniform()),
     "guided heuristic": lambda: guided(Heuristic(ENV)),
     "corrected agent": lambda: Corrected(agents(), EXPERT, dataclasses.replace(probes.SCALARS, tau_max_deg=60.0)),

@@ -28,7 +28,7 @@ from cuelearner_jax.errors import UserError
 from cuelearner_jax.face.acting import CallablePolicy, as_policy
 from cuelearner_jax.face.worlds import World
 from cuelearner_jax.guidance import given, registry
-from cuelearner_jax.guidance.answers import RELATIVE
+from cuelearner_jax.guidance.answers import RELATIVE, check_teacher
 from cuelearner_jax.guidance.bundle import Guidance
 from cuelearner_jax.guidance.relative import KIND
 from cuelearner_jax.policies import Guided
@@ -128,19 +128,20 @@ def ask(
     if labels < 1:
         raise UserError(f"labels is {labels}: give at least 1")
     sizes, scalars = _settings(sizes, scalars, eps_deg)
+    check_teacher(teacher, scalars)
     scalars = _bounded(scalars, bound_deg)
     base, env = as_policy(policy), world.env
     guidance = _relative(sizes, spaces_of(env))
     k_model, k_env, k_lane = jax.random.split(jax.random.key(seed), 3)
     slots = asking.label_slots(labels, sizes)
-    guide = asking.start(guidance, env, slots, labels, k_model, k_env)
+    guide = asking.start(guidance, env, slots, labels, k_model, k_env, sizes.candidates)
 
     @jax.jit
-    def one_round(env: Any, teacher: Teacher, base: Any, scalars: Scalars, guide: Any, number: jax.Array) -> Any:
-        return asking.label_round(guidance, sizes, env, teacher, scalars, base, guide, k_lane, number)
+    def one_round(env: Any, teacher: Teacher, base: Any, scalars: Scalars, guide: Any) -> Any:
+        return asking.label_round(guidance, sizes, env, teacher, scalars, base, guide, k_lane)
 
-    for number in range(slots // sizes.labels_per_round):
-        guide = one_round(env, teacher, base, scalars, guide, jnp.asarray(number))
+    for _ in range(slots // sizes.labels_per_round):
+        guide = one_round(env, teacher, base, scalars, guide)
     given = jax.device_get(guide.labels)
     asked = Labels(*(np.asarray(part)[given.valid] for part in (given.obs, given.action, given.answer[:, 0])))
     return FeedbackModel(guidance, _finite(guide.model), scalars, asked)

@@ -21,7 +21,7 @@ from cuelearner_jax.face.acting import CallablePolicy
 from cuelearner_jax.face.worlds import World
 from cuelearner_jax.guidance import registry
 from cuelearner_jax.policies import Agent
-from cuelearner_jax.runs import failures
+from cuelearner_jax.runs import failures, instalments
 from cuelearner_jax.runs.grid import LARGEST_SEED, Grid, check_grid
 from cuelearner_jax.runs.lanes import LaneGroup
 from cuelearner_jax.runs.memory_report import memory_report
@@ -103,6 +103,7 @@ def train(
         raise UserError(f"seeds is {seeds}: give a number from 1 to {LARGEST_SEED}")
     grid = Grid(names, tuple(range(seeds)) if isinstance(seeds, int) else tuple(seeds), tuple(labels))
     check_grid(grid)
+    instalments.check(run_config, grid)
     mesh = lane_mesh()
     env = place(mesh, world.env, SHARED)
     kinds = [registry.make(kind, run_config.sizes, env) for kind in names]
@@ -117,14 +118,15 @@ def train(
         for group in groups:
             training = Training(group, examined, split)
             training.begin()
-            if not training.labelled:
-                bar = bars.add_task(f"{group.guidance.name}: labels", total=group.rounds, note="")
-                for done in training.label_rounds(place(mesh, teacher, SHARED)):
-                    bars.update(bar, completed=done)
             bar = bars.add_task(group.guidance.name, total=run_config.schedule.total_steps, note="")
-            for row in training.stretches():
-                rows.append(_table(group, row))
-                bars.update(bar, completed=training.step, note=f"reward {mean_of_finite(row['reward'])}")
+            while not training.done:
+                if not training.labelled:
+                    asked = bars.add_task(f"{group.guidance.name}: labels", total=group.rounds, note="")
+                    for done in training.label_rounds(place(mesh, teacher, SHARED)):
+                        bars.update(asked, completed=done)
+                for row in training.stretches():
+                    rows.append(_table(group, row))
+                    bars.update(bar, completed=training.step, note=f"reward {mean_of_finite(row['reward'])}")
             trainings[group.guidance.name] = training
     table = pa.concat_tables(rows, promote_options="permissive")
     failed = failures.summary(table)

@@ -21,6 +21,7 @@ class AnswerFunction(Protocol):
     def __call__(
         self,
         key: PRNGKeyArray,
+        env: Any,
         teacher: Teacher,
         state: EnvState,
         obs: Float[Array, " obs"],
@@ -39,6 +40,8 @@ class AnswerForm(NamedTuple):
     meaning: str  # of an entry, in a few words
     answer: AnswerFunction
     values: tuple[float, ...] | None = None  # that an entry may have; None: any finite number
+    is_action: bool = False  # is an answer an action itself?
+    by_eps: bool = False  # does it mean a turn by eps? Label files then say how much that was
 
 
 @runtime_checkable
@@ -104,6 +107,17 @@ class ActFunction(Protocol):
         ...
 
 
+@runtime_checkable
+class DisagreementFunction(Protocol):
+    """How far the members of a model are apart."""
+
+    def __call__(
+        self, model: GuidanceModel, env: Any, obs: Float[Array, "n obs"], actions: Float[Array, "n action"]
+    ) -> Float[Array, " n"]:
+        """Of each row, not negative; 0 where they agree."""
+        ...
+
+
 class Guidance(NamedTuple):
     """One form of guidance for one lane: pure functions over an explicit model."""
 
@@ -114,6 +128,7 @@ class Guidance(NamedTuple):
     target: TargetFunction
     fit: FitFunction
     act: ActFunction
+    disagreement: DisagreementFunction | None = None  # None: its model has no members
 
     @property
     def asks(self) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
@@ -13,6 +14,7 @@ from jaxtyping import Array, Bool, Float, Key, PRNGKeyArray
 
 from cuelearner_jax.config import GuideScalars, GuideSizes
 from cuelearner_jax.guidance.bundle import TargetFunction
+from cuelearner_jax.guidance.ensemble import fitted_members
 from cuelearner_jax.types import GuidanceModel, Label, Params
 
 VALIDATION_STRIDE = 5  # every fifth label is a validation label: the 80/20 split of the paper's public code
@@ -34,6 +36,19 @@ def lessons(labels: Label, target: TargetFunction, scalars: GuideScalars) -> Les
     return Lesson(labels.obs, labels.action, jax.lax.optimization_barrier(targets), labels.valid)
 
 
+def optimizer(scalars: GuideScalars) -> optax.GradientTransformation:
+    """Gradients clipped to a global norm, then Adam (paper, appendix): that of every guidance model."""
+    return optax.chain(optax.clip_by_global_norm(scalars.max_grad_norm), optax.adam(scalars.feedback_learning_rate))
+
+
+Redrawn = Callable[[PRNGKeyArray, Any], Any]  # (key, batch of rows) -> what to train on in its place
+
+
+def as_drawn(key: PRNGKeyArray, batch: Any) -> Any:
+    """The batch itself."""
+    return batch
+
+
 def _subset(valid: Bool[Array, " labels"]) -> Callable[[PRNGKeyArray, int], jax.Array]:
     """Sampler of indices, with replacement, among the true rows of `valid`."""
     order = jnp.argsort(~valid, stable=True)
@@ -49,6 +64,7 @@ def fit_least_squares(
     init: Callable[[PRNGKeyArray], Params],
     apply: Callable[[Params, jax.Array, jax.Array], jax.Array],
     sizes: GuideSizes,
+    redrawn: Redrawn = as_drawn,
 ) -> GuidanceModel:
     """`fit_model` by least squares (paper, Eq. 3).
 
@@ -56,14 +72,14 @@ def fit_least_squares(
     own choice where several actions are as good, and mostly another than the mirror image of its answer.
 
     Args:
-        key, rows, scalars, init, sizes: as `fit_model` has them.
+        key, rows, scalars, init, sizes, redrawn: as `fit_model` has them.
         apply: (params, obs (n, obs), actions (n, action)) -> predictions (n, outputs).
     """
 
     def errors(params: Params, rows: Lesson) -> Float[Array, " n"]:
         return jnp.sum(jnp.square(apply(params, rows.obs, rows.action) - rows.target), -1)
 
-    return fit_model(key, rows, scalars, init=init, losses=errors, sizes=sizes)
+    return fit_model(key, rows, scalars, init=init, losses=errors, sizes=sizes, redrawn=redrawn)
 
 
 def fit_model(
@@ -74,6 +90,7 @@ def fit_model(
     init: Callable[[PRNGKeyArray], Params],
     losses: Callable[[Params, Any], Float[Array, " n"]],
     sizes: GuideSizes,
+    redrawn: Redrawn = as_drawn,
 ) -> GuidanceModel:
     """Fits a model from scratch and keeps the parameters that validated best.
 
@@ -82,29 +99,42 @@ def fit_model(
 
     Args:
         rows: a record of what is learned from (slots, ...), such as lessons, of which the `valid` ones count.
-        init: parameters from a key.
+        init: parameters from a key; with `sizes.ensemble` those of `ensemble`, whose members are fitted each by itself.
         losses: (params, rows (n, ...)) -> the loss of each.
+        redrawn: (key, batch (n, ...) of rows) -> what to train on in its place; validation rows stay.
 
     Returns:
         The model; its `fitted` is False if there was no valid label to train on.
     """
+    fit = partial(_fit_network, rows=rows, scalars=scalars, losses=losses, redrawn=redrawn, sizes=sizes)
+    return fitted_members(sizes.ensemble, fit, key, init)
+
+
+def _fit_network(
+    key: PRNGKeyArray,
+    init: Callable[[PRNGKeyArray], Params],
+    *,
+    rows: Any,
+    scalars: GuideScalars,
+    losses: Callable[[Params, Any], Float[Array, " n"]],
+    redrawn: Redrawn,
+    sizes: GuideSizes,
+) -> GuidanceModel:
     held_out = (jnp.arange(rows.valid.shape[0]) % VALIDATION_STRIDE) == VALIDATION_STRIDE - 1
     validation = rows.valid & held_out
     training = rows.valid & ~held_out
     draw = _subset(training)
     key_init, key_steps = jax.random.split(key)
-    optimizer = optax.chain(
-        optax.clip_by_global_norm(scalars.max_grad_norm), optax.adam(scalars.feedback_learning_rate)
-    )
+    adam = optimizer(scalars)
 
     def loss(params: Params, batch: Any) -> jax.Array:
         return jnp.mean(losses(params, batch))
 
     def step(carry: tuple[Params, optax.OptState], key: PRNGKeyArray) -> tuple[tuple[Params, optax.OptState], None]:
         params, opt_state = carry
-        key_draw, _ = jax.random.split(key)  # so that numbers are those of results that are recorded
-        batch = jax.tree.map(lambda leaf: leaf[draw(key_draw, sizes.fit_batch_size)], rows)
-        updates, opt_state = optimizer.update(jax.grad(loss)(params, batch), opt_state, params)
+        key_draw, key_redraw = jax.random.split(key)
+        batch = redrawn(key_redraw, jax.tree.map(lambda leaf: leaf[draw(key_draw, sizes.fit_batch_size)], rows))
+        updates, opt_state = adam.update(jax.grad(loss)(params, batch), opt_state, params)
         return (optax.apply_updates(params, updates), opt_state), None
 
     def validate(params: Params) -> jax.Array:
@@ -120,7 +150,7 @@ def fit_model(
 
     params = init(key_init)
     keys = jax.random.split(key_steps, (sizes.fit_steps // sizes.validate_every, sizes.validate_every))
-    start = ((params, optimizer.init(params)), params, jnp.inf)
+    start = ((params, adam.init(params)), params, jnp.inf)
     (_, best, score), _ = jax.lax.scan(stretch, start, keys)
     diverged = ~jnp.isfinite(score) & validation.any()
     best = jax.tree.map(lambda leaf: jnp.where(diverged, jnp.nan, leaf), best)

@@ -13,19 +13,22 @@ from cuelearner_jax.agent import view
 from cuelearner_jax.agent.networks import applied, residual_network
 from cuelearner_jax.config import GuideSizes
 from cuelearner_jax.environment import Spaces
+from cuelearner_jax.guidance.bundle import DisagreementFunction
+from cuelearner_jax.guidance.ensemble import ensemble
 from cuelearner_jax.types import Params
 
 
 class GuideModel(NamedTuple):
-    """A network of observation and action, as pure functions."""
+    """A network of observation and action, or the mean of an ensemble of such, as pure functions."""
 
     init: Callable[[PRNGKeyArray], Params]
     # (env, params, obs (n, obs), actions (n, action)) -> outputs (n, outputs)
     predict: Callable[[Any, Params, Array, Array], Array]
+    disagreement: DisagreementFunction | None = None  # for the bundle; None: there is but one network
 
 
 def guide_model(sizes: GuideSizes, spaces: Spaces, outputs: int) -> GuideModel:
-    """A network whose outputs are numbers, such as the value of an action.
+    """A network whose outputs are numbers, such as the value of an action; with `ensemble` several, and their mean.
 
     Raises UserError for a frame in which the environment cannot be seen.
     """
@@ -40,7 +43,7 @@ def guide_model(sizes: GuideSizes, spaces: Spaces, outputs: int) -> GuideModel:
     ) -> Float[Array, "n outputs"]:
         return applied(network)(params, *view.seen(sizes.frame, env, obs, actions))
 
-    return GuideModel(init, predict)
+    return GuideModel(*ensemble(sizes.ensemble, init, predict))
 
 
 def residual_model(sizes: GuideSizes, spaces: Spaces) -> GuideModel:
@@ -50,4 +53,4 @@ def residual_model(sizes: GuideSizes, spaces: Spaces) -> GuideModel:
     def predict(env: Any, params: Params, obs: jax.Array, actions: jax.Array) -> jax.Array:
         return view.outward(sizes.frame, spaces, inner.predict(env, params, obs, actions), actions)
 
-    return GuideModel(inner.init, predict)
+    return GuideModel(inner.init, predict, inner.disagreement)

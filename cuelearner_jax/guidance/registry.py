@@ -13,14 +13,15 @@ from typing import Any
 from cuelearner_jax.config import GuideSizes
 from cuelearner_jax.environment import Spaces, offers, spaces_of
 from cuelearner_jax.errors import UserError, closest
-from cuelearner_jax.guidance import heuristic, intent, none, relative
+from cuelearner_jax.guidance import dcoach, demonstration, heuristic, intent, none, relative, scalar
 from cuelearner_jax.guidance.bundle import Guidance
 from cuelearner_jax.guidance.kind import Kind
 from cuelearner_jax.plugins import load
 
 ENTRY_POINTS = "cuelearner.guidances"
 
-_KINDS: dict[str, Kind] = {kind.name: kind for kind in (none.KIND, relative.KIND, intent.KIND, heuristic.KIND)}
+_BUILT_IN = (none, relative, intent, heuristic, demonstration, scalar, dcoach)
+_KINDS: dict[str, Kind] = {module.KIND.name: module.KIND for module in _BUILT_IN}
 
 
 def register(kind: Kind) -> Kind:
@@ -83,6 +84,11 @@ def made_for(kind: Kind, sizes: GuideSizes, spaces: Spaces) -> Guidance:
     made = kind.make(sizes, spaces)
     if made.form != kind.form or made.name != kind.name:
         raise ValueError(f"guidance {kind.name!r} was made with another name or form of answers than its kind has")
+    if made.asks and made.disagreement is None and sizes.ensemble > 1:
+        raise UserError(
+            f"guidance {kind.name!r} has one model, no ensemble of them: leave out --sizes.ensemble and "
+            "--sizes.candidates, or run it by itself"
+        )
     return made
 
 

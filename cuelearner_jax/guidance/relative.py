@@ -59,7 +59,7 @@ def make(sizes: GuideSizes, spaces: Spaces) -> Guidance:
             k_max=scalars.k_max,
         )
 
-    return Guidance("relative", RELATIVE, init, about_refined(act), target, fit, act)
+    return Guidance("relative", RELATIVE, init, about_refined(act), target, fit, act, network.disagreement)
 
 
 KIND = Kind("relative", "a model of the teacher's relative feedback", make, form=RELATIVE, colour="#0072B2")

@@ -7,6 +7,7 @@ Folder of a run:
     <guidance>/checkpoints/      the newest states
     <guidance>/labels.parquet    what the teacher answered
     <guidance>/results.jsonl     one row a seed and evaluation; results.parquet once done
+    <guidance>/guide.jsonl       how good the guides are by themselves while they ask; guide.parquet once done
 """
 
 from __future__ import annotations

@@ -127,34 +127,37 @@ def check_complete(folder: Path, seeds: np.ndarray, budgets: np.ndarray, steps: 
     )
 
 
-def find(paths: PathLike | Sequence[PathLike]) -> list[Path]:
+def find(paths: PathLike | Sequence[PathLike], schema: tables.Schema = SCHEMA) -> list[Path]:
     """The results files at or below the given files or folders: one a run, whether it is done or still going.
 
-    Raises:
-        UserError: if a path does not exist, or has no results below it.
+    `schema`: of the tables that are meant. Raises UserError if a path does not exist, or has none below it.
     """
     paths = [paths] if isinstance(paths, str | os.PathLike) else list(paths)
     found: dict[Path, Path] = {}
     for path in map(Path, paths):
         if not path.exists():
             raise UserError(f"{path} does not exist: give the folder of a run, or a folder that holds runs")
-        files = [path] if path.is_file() else sorted([*path.rglob(JSONL), *path.rglob(PARQUET)])
+        files = [path] if path.is_file() else sorted([*path.rglob(schema.jsonl), *path.rglob(schema.parquet)])
         if not files:
-            raise UserError(f"no results below {path}: expected a {JSONL} or {PARQUET} in it or in a folder below it")
+            raise UserError(
+                f"no {schema.stem} below {path}: expected a {schema.jsonl} or {schema.parquet} in it or in a folder "
+                "below it"
+            )
         for file in files:
             # Both exist only after a crash between writing one and removing the other, and then hold the same rows.
-            whole = file.with_name(PARQUET)
-            file = whole if file.name == JSONL and whole.exists() else file  # noqa: PLW2901
+            whole = file.with_name(schema.parquet)
+            file = whole if file.name == schema.jsonl and whole.exists() else file  # noqa: PLW2901
             found[file.resolve()] = file
     return list(found.values())
 
 
-def read(paths: PathLike | Sequence[PathLike], task: str | None = None) -> pa.Table:
+def read(paths: PathLike | Sequence[PathLike], task: str | None = None, schema: tables.Schema = SCHEMA) -> pa.Table:
     """Reads the results of any number of runs, done or still going, into one table.
 
     Args:
         paths: results files, folders of runs, or folders at any height above them.
         task: keeps the rows of this task only; needed where the runs are of several tasks.
+        schema: of the tables that are meant.
 
     Returns:
         A table with the columns listed at the top of this module, and `folder`, the folder of the row's run; a column
@@ -163,10 +166,10 @@ def read(paths: PathLike | Sequence[PathLike], task: str | None = None) -> pa.Ta
     Raises:
         UserError: if a path is missing, holds no rows, is corrupt, or the runs are of several tasks.
     """
-    files = find(paths)
+    files = find(paths, schema)
     parts = []
     for file in files:
-        part = tables.read(file, SCHEMA)
+        part = tables.read(file, schema)
         folder = pa.repeat(pa.scalar(file.parent.as_posix()), part.num_rows)
         parts.append(part.append_column("folder", folder))
     table = pa.concat_tables(parts, promote_options="permissive")

@@ -1,4 +1,4 @@
-"""What was planned, as the runs' config.json say, against what their results hold."""
+"""What was planned, as the runs' config.json say, against what their results hold; and what a report cannot show."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ import pyarrow as pa
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.records import formats, results
 from cuelearner_jax.records.folders import CONFIG
-from cuelearner_jax.runs import shards
+from cuelearner_jax.report.variants import Variant
+from cuelearner_jax.runs import failures, shards
 
 LISTED = 20  # numbers in a line
 
@@ -63,6 +64,55 @@ def missing(folders: Sequence[str | os.PathLike[str]], table: pa.Table) -> list[
     for file, plan in planned.items():
         lines += _absent(file.parent, plan, table)
     return lines
+
+
+def failed_lanes(failed: pa.Table, variants: Sequence[Variant]) -> list[str]:
+    """One line for each variant of which lanes have failed, given all rows of such lanes."""
+    left = {(variant.guidance, variant.labels): len(variant.seeds) for variant in variants}
+    return [
+        f"{failures.variant_name(*key)}: {seeds} failed, no longer finite: "
+        + (f"curve and means are over the other {left[key]}" if key in left else "no lane is left")
+        for key, seeds in failures.told(failed).items()
+    ]
+
+
+def short(table: pa.Table, variants: Sequence[Variant]) -> list[str]:
+    """One line for each variant that is shown less far than it is known, or without an interval, and for mixed runs.
+
+    Args:
+        table: all rows of results that are taken together.
+        variants: made of them.
+    """
+    lines = []
+    guidance, labels = np.array(table["guidance"].to_pylist()), table["labels"].to_numpy()
+    reached = table["step"].to_numpy()
+    for variant in variants:
+        furthest = int(reached[(guidance == variant.guidance) & (labels == variant.labels)].max())
+        if furthest > variant.curve.steps[-1]:
+            lines.append(
+                f"{variant.name}: some seeds have reached step {furthest:,}; shown to {variant.curve.steps[-1]:,}, "
+                "where all of them are"
+            )
+        if len(variant.seeds) == 1:
+            lines.append(f"{variant.name}: one seed, so no interval")
+    hashes = sorted(set(table["config_hash"].to_pylist()))
+    if len(hashes) > 1:
+        where = f" of {variants[0].run}" if variants and variants[0].run else ""
+        lines.append(
+            f"the runs{where} differ in more than guidance, labels and seed: configurations {', '.join(hashes)}"
+        )
+    return lines
+
+
+def uneven(variants: Sequence[Variant]) -> list[str]:
+    """A line where curves do not end together."""
+    ends = {int(variant.curve.steps[-1]) for variant in variants}
+    if len(ends) == 1:
+        return []
+    return [
+        "curves end at different steps, so their final values are no comparison; "
+        f"means over the curve are taken to step {min(ends):,}, shared by all"
+    ]
 
 
 def _unfinished(configurations: dict[str, Path | None], planned: dict[Path, Planned], table: pa.Table) -> list[str]:

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import matplotlib
 import numpy as np
 import scipy.optimize
-from jaxtyping import Float, Int
 from matplotlib import ticker
 from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
@@ -19,6 +18,7 @@ from matplotlib.lines import Line2D
 from cuelearner_jax.guidance import registry
 from cuelearner_jax.report.escaping import one_line
 from cuelearner_jax.report.statistics import Curve, Interval
+from cuelearner_jax.report.variants import Variant, guidance_name
 
 # Okabe and Ito's palette, told apart with any colour vision: what its own kinds of guidance leave of it.
 OTHER_COLOURS = ("#E69F00", "#56B4E9", "#B8A600", "#000000")
@@ -35,26 +35,7 @@ STYLE: dict[Any, Any] = {
     "legend.frameon": False,
     "text.parse_math": False,  # a name with dollar signs is a name
 }
-LONGEST_NAME = 40  # characters of a kind of guidance in a figure
 DWARFED = 5.0  # times the span of all other evaluations that the first may have for it to set the scale
-
-
-class Variant(NamedTuple):
-    """All seeds under one kind of guidance with one label budget, at the steps that all of them have reached."""
-
-    guidance: str
-    labels: int
-    seeds: Int[np.ndarray, "seeds"]
-    values: Float[np.ndarray, "seeds steps"]
-    curve: Curve
-    mean: Interval  # of the mean over the curve, up to the last step that all variants share
-    failed: Int[np.ndarray, "lanes"]  # steps by which other lanes had failed, of which nothing else is here
-
-    @property
-    def name(self) -> str:
-        """What the legend says."""
-        name = _guidance_name(self.guidance)
-        return f"{name}, {self.labels:,} labels" if self.labels else name
 
 
 def draw_curves(variants: Sequence[Variant], title: str, metric: str) -> Figure:
@@ -73,7 +54,7 @@ def draw_curves(variants: Sequence[Variant], title: str, metric: str) -> Figure:
         left_out = _scale(axes, variants)
         _mark_failed(axes, variants, colours)
         axes.set_xlabel("environment steps of a seed")
-        axes.set_ylabel(_axis_name(metric))
+        axes.set_ylabel(axis_name(metric))
         axes.xaxis.set_major_formatter(ticker.EngFormatter(sep=""))
         axes.set_title(one_line(title), fontweight="bold", fontsize=11, pad=20)
         note = f"interquartile mean over seeds, band: its 95% bootstrap interval{left_out}"
@@ -89,9 +70,9 @@ def draw_label_efficiency(variants: Sequence[Variant], title: str, metric: str) 
         left, right = figure.subplots(1, 2, sharey=True)
         shared = min(int(variant.curve.steps[-1]) for variant in variants)
         last = [_at(variant.curve, shared) for variant in variants]
-        _draw_budgets(left, variants, last, f"at step {shared:,}, reached by all")
-        _draw_budgets(right, variants, [variant.mean for variant in variants], "mean over the curve")
-        left.set_ylabel(_axis_name(metric))
+        draw_budgets(left, variants, last, f"at step {shared:,}, reached by all")
+        draw_budgets(right, variants, [variant.mean for variant in variants], "mean over the curve")
+        left.set_ylabel(axis_name(metric))
         handles, names = left.get_legend_handles_labels()
         figure.legend(handles, names, loc="outside lower center", ncols=len(names))
         figure.suptitle(one_line(title), x=0.01, ha="left", fontweight="bold", fontsize=11)
@@ -104,10 +85,11 @@ def _at(known: Curve, step: int) -> Interval:
     return Interval(*(values[place] for values in known[1:]))
 
 
-def _draw_budgets(axes: Axes, variants: Sequence[Variant], intervals: Sequence[Interval], panel: str) -> None:
+def draw_budgets(axes: Axes, variants: Sequence[Variant], intervals: Sequence[Interval], panel: str) -> None:
+    """Intervals against the label budget, a line for each kind of guidance; what takes no labels is a level."""
     kinds = list(dict.fromkeys(variant.guidance for variant in variants))
     for place, kind in enumerate(kinds):
-        colour, name = colour_of(kind), _guidance_name(kind)
+        colour, name = colour_of(kind), guidance_name(kind)
         pairs = zip(variants, intervals, strict=True)
         points = [(variant.labels, *at) for variant, at in pairs if variant.guidance == kind]
         for _, estimate, lower, upper in (point for point in points if not point[0]):
@@ -131,13 +113,6 @@ def save_figure(figure: Figure, stem: Path) -> None:
     with matplotlib.rc_context(STYLE):
         figure.savefig(stem.with_name(stem.name + ".png"), dpi=200, metadata={"Software": None})
         figure.savefig(stem.with_name(stem.name + ".svg"), metadata={"Date": None, "Creator": None})
-
-
-def _guidance_name(guidance: str) -> str:
-    kind = registry.registered(guidance)
-    name = one_line(kind.title if kind and kind.title else guidance)
-    name = name if len(name) <= LONGEST_NAME else f"{name[: LONGEST_NAME - 1]}…"
-    return f" {name}" if name.startswith("_") else name  # Matplotlib leaves names with an underscore out of legends
 
 
 def colour_of(guidance: str) -> str:
@@ -231,5 +206,6 @@ def _name_ends(axes: Axes, variants: Sequence[Variant], colours: Sequence[tuple[
         )
 
 
-def _axis_name(metric: str) -> str:
+def axis_name(metric: str) -> str:
+    """What an axis says of a metric."""
     return AXIS_NAMES.get(metric, one_line(metric.replace("_", " ")))

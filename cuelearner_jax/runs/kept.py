@@ -11,7 +11,7 @@ import numpy as np
 
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.loop import start_clock
-from cuelearner_jax.records import label_files, results
+from cuelearner_jax.records import guides, label_files, results
 from cuelearner_jax.records import table as tables
 from cuelearner_jax.records.checkpoint import Checkpoints, checkpoints
 from cuelearner_jax.runs.lanes import LaneGroup
@@ -71,7 +71,7 @@ def restore_blocks(group: LaneGroup, saved: Checkpoints) -> tuple[list[TrainStat
     return group.recut(blocks), found["clock"]["clock"], float(found["clock"]["wall_s"])
 
 
-def check_standing(group: LaneGroup, folder: Path) -> None:
+def check_standing(group: LaneGroup, folder: Path, given: bool = False) -> None:
     """Whether a group can go on from what its folder holds: nothing lost, nothing changed.
 
     Its rows must be there up to the newest checkpoint, or to the end if it is finished; what comes after the checkpoint
@@ -80,22 +80,30 @@ def check_standing(group: LaneGroup, folder: Path) -> None:
     Args:
         group: the lanes.
         folder: of the run and this kind of guidance.
+        given: are its labels from a file?
 
     Raises:
         UserError: rows are missing, or a file cannot be read; nothing has been changed.
     """
     schedule, finished = group.config.schedule, (folder / results.PARQUET).exists()
-    step = schedule.total_steps if finished else 0
+    step, rounds = (schedule.total_steps, group.rounds) if finished else (0, 0)
     if not finished and (folder / "checkpoints").is_dir():
         with checkpoints(folder / "checkpoints", read_only=True) as saved:
             if saved.latest() is not None:
-                step = int(restore(group, saved)["clock"]["clock"].step)
+                clock = restore(group, saved)["clock"]["clock"]
+                step, rounds = int(clock.step), int(clock.round)
     if step:
         results.check_complete(folder, group.seeds, group.budgets, range(0, step + 1, schedule.eval_every))
     elif (folder / results.JSONL).exists():
         tables.read(folder / results.JSONL, results.SCHEMA)
+    if _has_guides(folder) or (rounds and not finished):  # finished runs of before have no such table
+        guides.check_complete(folder, rounds, group.looks(rounds, given))
     if finished and group.guidance.asks:
         label_files.read(folder / label_files.PARQUET)
+
+
+def _has_guides(folder: Path) -> bool:
+    return any((folder / name).exists() for name in (guides.JSONL, guides.PARQUET))
 
 
 def restore_policies(group: LaneGroup, folder: Path) -> tuple[dict[str, Any], int]:

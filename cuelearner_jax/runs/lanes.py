@@ -13,7 +13,6 @@ import numpy as np
 from jax.sharding import Mesh
 from jaxtyping import PRNGKeyArray
 
-from cuelearner_jax.asking import label_slots
 from cuelearner_jax.config import RunConfig
 from cuelearner_jax.devices import BY_LANE, lane_mesh, place
 from cuelearner_jax.environment import Environment
@@ -22,6 +21,7 @@ from cuelearner_jax.guidance.bundle import Guidance
 from cuelearner_jax.loop import Program, make_program
 from cuelearner_jax.policies import Policy
 from cuelearner_jax.runs.grid import Grid
+from cuelearner_jax.runs.instalments import Instalments
 from cuelearner_jax.types import Clock, Label, Teacher, TrainState
 
 CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
@@ -43,9 +43,27 @@ class LaneGroup:
         )
 
     @property
+    def instalments(self) -> Instalments:
+        """When its lanes are asked for labels."""
+        return Instalments(self.budgets, self.config.sizes, self.config.schedule)
+
+    @property
     def rounds(self) -> int:
-        """Label rounds of the largest lane."""
-        return label_slots(self.largest_budget, self.config.sizes) // self.config.sizes.labels_per_round
+        """Label rounds of all instalments."""
+        return self.instalments.rounds
+
+    def looks(self, rounds: int, given: bool) -> list[tuple[int, int, int]]:
+        """(seed, budget, labels asked for) of each evaluation of a guide alone up to so many rounds.
+
+        `given`: were labels taken from a file at once, instead of asked for?
+        """
+        made = [(0, rounds)] if given else [(number - 1, number) for number in range(1, rounds + 1)]
+        found = []
+        for before, after in made:
+            due = self.instalments.examined(after, before)
+            columns = (self.seeds, self.budgets, self.instalments.asked(after))
+            found += zip(*(column[due].tolist() for column in columns), strict=True)
+        return found
 
     def blocks(self) -> list[tuple[np.ndarray, np.ndarray]]:
         """(seeds, budgets) of each block; the last is filled up with repeats, whose results are dropped."""
@@ -117,10 +135,21 @@ class LaneGroup:
         after = jax.block_until_ready(done[0][0])
         return after, [block for _, block, _ in done], [measured for _, _, measured in done]
 
-    def label_round(self, teacher: Teacher, clock: Clock, blocks: list[TrainState]) -> tuple[Clock, list[TrainState]]:
-        """One round of questions to a simulated teacher, and the fit that follows it."""
+    def label_round(
+        self, teacher: Teacher, clock: Clock, blocks: list[TrainState], instalment: int = 0
+    ) -> tuple[Clock, list[TrainState]]:
+        """One round of questions to a simulated teacher, and the fit that follows it.
+
+        Questions of an instalment after the first (0) are about the agents' own actions.
+        """
+        ends = self.instalments.shares(instalment)
+        shares = [place(self.mesh, jnp.asarray(ends[rows]), BY_LANE) for rows in self.cut]
         done = self.each(
-            lambda block: self.program.label_round(self.env, teacher, self.config.scalars, clock, block), blocks
+            lambda block, until: self.program.label_round(
+                self.env, teacher, self.config.scalars, clock, block, until, own=instalment > 0
+            ),
+            blocks,
+            shares,
         )
         return jax.block_until_ready(done[0][0]), [block for _, block in done]
 

@@ -59,6 +59,7 @@ def _at_rest(block: TrainState) -> dict[str, int]:
         "--sizes.replay-capacity": agent.replay,
         "--labels": guide.labels,
         "--sizes.num-envs": (agent.env, agent.obs, agent.guided),
+        "--sizes.candidates": (guide.env, guide.obs),
         "--sizes.feedback-layers": guide.model,
     }
     found = {option: state_bytes(part) for option, part in parts.items()}
@@ -81,19 +82,26 @@ def _training(group: LaneGroup, block: TrainState) -> dict[str, int]:
     needed["--sizes.n-step"] = 8 * FLOAT * sizes.batch_size * sizes.n_step
     needed["--schedule.eval-every"] = 3 * FLOAT * (schedule.eval_every // sizes.num_envs)
     if group.largest_budget:
-        obs = state_bytes(block.guide.obs) // block.key.shape[0]
+        obs = state_bytes(block.guide.obs) // (block.key.shape[0] * sizes.candidates)
         layers = FLOAT * sum(sizes.feedback_layers)
-        needed["--sizes.fit-batch-size"] = sizes.fit_batch_size * (3 * layers + COPIES * obs)
+        needed["--sizes.fit-batch-size"] = sizes.ensemble * sizes.fit_batch_size * (3 * layers + COPIES * obs)
         needed["--sizes.fit-steps"] = 2 * FLOAT * sizes.fit_steps
         slots = label_slots(group.largest_budget, sizes)
-        needed["--labels and --sizes.labels-per-round"] = slots * 2 * FLOAT * max(sizes.feedback_layers)
+        valued = min(sizes.num_envs * sizes.guide_directions, max(portions().actions, sizes.guide_directions))
+        needed["--sizes.guide-directions"] = 4 * FLOAT * _widest(group) * valued
+        needed["--sizes.replay-steps"] = FLOAT * sizes.replay_steps * sizes.fit_batch_size
+        widest = FLOAT * sizes.ensemble * max(sizes.feedback_layers)
+        needed["--labels and --sizes.labels-per-round"] = slots * 2 * widest
+        situation = state_bytes((block.guide.env, block.guide.obs)) // block.key.shape[0]
+        needed["--sizes.candidates"] = COPIES * situation + 2 * sizes.candidates * widest
     return needed
 
 
 def _evaluating(group: LaneGroup, block: TrainState) -> dict[str, int]:
     """The same of evaluations."""
     schedule = group.config.schedule
-    situation = state_bytes((block.guide.env, block.guide.obs)) // block.key.shape[0]
+    lanes = block.key.shape[0] * group.config.sizes.candidates
+    situation = state_bytes((block.guide.env, block.guide.obs)) // lanes
     return {
         "--schedule.eval-envs": schedule.eval_envs * (COPIES * situation + 2 * FLOAT * _widest(group)),
         "--schedule.eval-steps": METRICS * FLOAT * (schedule.eval_steps // schedule.eval_envs),

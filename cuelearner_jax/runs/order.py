@@ -17,6 +17,7 @@ from cuelearner_jax.guidance import given
 from cuelearner_jax.guidance import registry as guidances
 from cuelearner_jax.records import formats, label_files, results
 from cuelearner_jax.records.folders import CONFIG, check_folder
+from cuelearner_jax.runs import instalments
 from cuelearner_jax.runs.grid import Grid, check_grid, describe
 from cuelearner_jax.runs.shards import Shard
 from cuelearner_jax.task import Task, shape_of
@@ -72,6 +73,7 @@ def planned(order: Order) -> Plan:
         begun = not order.overwrite and (folder / CONFIG).is_file()
         grid = dataclasses.replace(order.grid, seeds=order.shard.seeds(order.grid.seeds))
         order = dataclasses.replace(order, grid=grid, out=folder, resume=order.resume or begun)
+    instalments.check(order.config, order.grid, given=order.labels_from is not None)
     env = shape_of(order.task, order.config.task)
     order.task.check_evaluations(order.config)
     for kind in order.grid.guidance:

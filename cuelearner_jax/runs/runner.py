@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import threading
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 import numpy as np
-from rich.progress import Progress
+from rich.progress import Progress, TaskID
 
 from cuelearner_jax import config as configuration
 from cuelearner_jax.environment import Environment
+from cuelearner_jax.records import guides as guide_records
 from cuelearner_jax.records import label_files, provenance, results
 from cuelearner_jax.records.checkpoint import Checkpoints, checkpoints
+from cuelearner_jax.records.guides import GuideWriter
 from cuelearner_jax.runs.failures import LISTED, variant_name
 from cuelearner_jax.runs.grid import config_hash
 from cuelearner_jax.runs.kept import items, restore_blocks
@@ -42,6 +45,7 @@ class Runner:
         self.stopping, self.bars = stopping, bars
         self.folder = order.out / group.guidance.name
         self.failed = np.zeros(len(group.seeds), bool)  # lanes that the user has been told of
+        self._bar: TaskID | None = None  # of training, once it has begun
 
     def run(self, teacher: Teacher | None, labels: label_files.LabelFile | None) -> None:
         """From wherever the group stands to its end.
@@ -53,10 +57,20 @@ class Runner:
             return
         with checkpoints(self.folder / "checkpoints") as saved:
             self._restore(saved)
-            with results.ResultsWriter(self.folder, **self._constants()) as writer:
-                self._label(saved, teacher, labels)
-                self._train(saved, writer)
-        results.finish(self.folder)
+            constants = self._constants()
+            with results.ResultsWriter(self.folder, **constants) as writer, self._guide_table(constants) as guides:
+                while True:
+                    self._label(saved, guides, teacher, labels)
+                    self._train(saved, writer)
+                    if self.training.done:
+                        break
+        if self.group.guidance.asks:
+            guide_records.finish(self.folder)
+        results.finish(self.folder)  # last: a kind with finished results is finished
+
+    def _guide_table(self, constants: dict[str, Any]) -> AbstractContextManager[GuideWriter | None]:
+        """Where the guides' own quality is kept; kinds that never ask have no such table."""
+        return GuideWriter(self.folder, **constants) if self.group.guidance.asks else nullcontext()
 
     def _constants(self) -> dict[str, Any]:
         return {
@@ -73,11 +87,13 @@ class Runner:
         if saved.latest() is None:
             self.training.begin()
             results.truncate_after(self.folder, -1)
+            guide_records.truncate_after(self.folder, -1)
             return
         self.training.go_on(*restore_blocks(self.group, saved))
         self.failed = self.training.failed
         # A checkpoint of the labels alone comes before the rows of step 0.
         results.truncate_after(self.folder, self.training.step or -1)
+        guide_records.truncate_after(self.folder, self.training.round)
 
     def _save(self, saved: Checkpoints) -> None:
         now = self.training
@@ -104,43 +120,76 @@ class Runner:
             console.print(f"{group.guidance.name}: so are {len(found) - LISTED} more lanes")
         self.failed = self.training.failed
 
-    def _label(self, saved: Checkpoints, teacher: Teacher | None, labels: label_files.LabelFile | None) -> None:
-        """Asks the teacher, or takes the labels of a file."""
-        now, name, written = self.training, self.group.guidance.name, self.folder / label_files.PARQUET
-        if not self.group.guidance.asks or (now.labelled and label_files.readable(written)):
+    def _label(
+        self,
+        saved: Checkpoints,
+        guides: GuideWriter | None,
+        teacher: Teacher | None,
+        labels: label_files.LabelFile | None,
+    ) -> None:
+        """Asks the teacher for the instalment that is due, or takes the labels of a file."""
+        now, rounds = self.training, self.group.rounds
+        if guides is None:
             return
-        bar = self.bars.add_task(f"{name}: labels", total=self.group.rounds, note="", completed=now.round)
-        if labels is not None and not now.labelled:
+        if not now.labelled:
+            self._ask(saved, guides, teacher, labels)
+        elif now.round < rounds or label_files.readable(self.folder / label_files.PARQUET):
+            return
+        if now.round >= rounds:
+            self._write_labels()
+        self._save(saved)
+
+    def _ask(
+        self,
+        saved: Checkpoints,
+        guides: GuideWriter,
+        teacher: Teacher | None,
+        labels: label_files.LabelFile | None,
+    ) -> None:
+        now, unit = self.training, self.group.config.sizes.labels_per_round
+        bar = self.bars.add_task(
+            f"{self.group.guidance.name}: labels", total=self.group.rounds, note="", completed=now.round
+        )
+        if labels is not None:
             now.take(labels)
             self._tell_failed("after its labels")
-        if not now.labelled:
-            assert teacher is not None  # asked for where no file was given
-            for done in now.label_rounds(teacher):
-                self.bars.update(bar, completed=done)
-                self._tell_failed(f"after {done * self.group.config.sizes.labels_per_round} labels")
-                if done % ROUNDS_A_CHUNK == 0:
-                    self._save(saved)
-                self._stop_if_asked(saved)
-        self._write_labels()
-        self._save(saved)
+            self._examine(guides, before=0)
+            return
+        assert teacher is not None  # asked for where no file was given
+        for done in now.label_rounds(teacher):
+            self.bars.update(bar, completed=done)
+            self._tell_failed(f"after {done * unit} labels")
+            self._examine(guides, before=done - 1)
+            if done % ROUNDS_A_CHUNK == 0:
+                self._save(saved)
+            self._stop_if_asked(saved)
+
+    def _examine(self, guides: GuideWriter, before: int) -> None:
+        """Writes how good the guides are by themselves that are due after the rounds since `before`."""
+        row = self.training.guides(before)
+        if row is not None:
+            guides.append(**row)
 
     def _write_labels(self) -> None:
         form, config = self.group.guidance.form, self.group.config
         assert form is not None
         task = {"name": self.order.task.name, **configuration.to_json(config.task)}
         seeds, labels = self.training.labels()
-        eps = config.scalars.eps_deg
+        eps = config.scalars.eps_deg if form.by_eps else None
         label_files.write(self.folder / label_files.PARQUET, task, form.name, eps, seeds, labels, form.meaning)
 
     def _train(self, saved: Checkpoints, writer: results.ResultsWriter) -> None:
         now, schedule = self.training, self.group.config.schedule
-        bar = self.bars.add_task(self.group.guidance.name, total=schedule.total_steps, note="", completed=now.step)
+        if self._bar is None:
+            self._bar = self.bars.add_task(
+                self.group.guidance.name, total=schedule.total_steps, note="", completed=now.step
+            )
         for row in now.stretches():
             writer.append(**row)
             self._tell_failed(f"at step {now.step:,}")
             if now.step == 0:
                 continue
-            self.bars.update(bar, completed=now.step, note=f"reward {mean_of_finite(row['reward'])}")
+            self.bars.update(self._bar, completed=now.step, note=f"reward {mean_of_finite(row['reward'])}")
             if now.step % schedule.checkpoint_every == 0 or now.step >= schedule.total_steps:
                 self._save(saved)
             self._stop_if_asked(saved)

@@ -41,10 +41,12 @@ class Parts(NamedTuple):
         assert self.lanes is not None
         return Agent(self.lanes.policies["params"], self.config.sizes, actions_of(self.env), self.env)
 
-    def guided(self, base: Policy) -> Guided:
-        """A policy under the lanes' guidance."""
+    def guided(self, base: Policy, own: bool = False) -> Guided:
+        """A policy under the lanes' guidance; of the agents' `own` actions it is bounded as in the guided episodes."""
         assert self.lanes is not None
-        return Guided(base, self.lanes.policies["guidance"], self.env, self.config.scalars, self.lanes.guidance)
+        bounded = own and len(self.config.schedule.ask_at) > 1
+        bound = self.config.scalars.radians("ask_bound") if bounded else None
+        return Guided(base, self.lanes.policies["guidance"], self.env, self.config.scalars, self.lanes.guidance, bound)
 
     def corrected(self, base: Policy) -> Corrected:
         """A policy under the teacher's own corrections."""
@@ -70,7 +72,7 @@ class Named(NamedTuple):
 POLICIES: dict[str, Named] = {
     "agent": Named("the trained agent", lambda parts: parts.agent, trained=True),
     "guide": Named("guidance of uniform actions", lambda parts: parts.guided(uniform_in(parts.env)), trained=True),
-    "guided": Named("guidance of the agent's actions", lambda parts: parts.guided(parts.agent), trained=True),
+    "guided": Named("guidance of the agent's actions", lambda parts: parts.guided(parts.agent, own=True), trained=True),
     "corrected": Named(
         "the teacher's own feedback on the agent's actions",
         lambda parts: parts.corrected(parts.agent),

@@ -40,13 +40,16 @@ class Training:
         self.clock: Clock = place(group.mesh, start_clock(), SHARED)
         self.blocks: list[TrainState] = []
         self.wall = 0.0  # seconds of labelling and training
+        self._guides: tuple[int, dict[str, np.ndarray]] | None = None  # the round of the newest measurement, and that
 
     def begin(self) -> None:
         """Fresh lanes."""
+        self._guides = None
         self.blocks = self.group.start()
 
     def go_on(self, blocks: list[TrainState], clock: Clock, wall: float) -> None:
         """From where others stood."""
+        self._guides = None
         self.blocks, self.wall = blocks, wall
         self.clock = place(self.group.mesh, clock, SHARED)
 
@@ -62,8 +65,14 @@ class Training:
 
     @property
     def labelled(self) -> bool:
-        """Has every question been asked?"""
-        return not self.group.guidance.asks or self.round >= self.group.rounds
+        """Have the questions been asked that come before the next training step?"""
+        instalments = self.group.instalments
+        return not self.group.guidance.asks or self.round >= instalments.end(instalments.begun(self.step))
+
+    @property
+    def done(self) -> bool:
+        """Is nothing left to do?"""
+        return self.step >= self.group.config.schedule.total_steps
 
     @property
     def failed(self) -> np.ndarray:
@@ -71,10 +80,11 @@ class Training:
         return self.group.columns([{"failed": block.failed} for block in self.blocks])["failed"]
 
     def label_rounds(self, teacher: Teacher) -> Iterator[int]:
-        """Asks a simulated teacher, a round at a time; gives the number of rounds made."""
+        """Asks a simulated teacher for an instalment, a round at a time; gives the number of all rounds so far."""
+        instalment = self.group.instalments.begun(self.step)
         while not self.labelled:
             started = time.perf_counter()
-            self.clock, self.blocks = self.group.label_round(teacher, self.clock, self.blocks)
+            self.clock, self.blocks = self.group.label_round(teacher, self.clock, self.blocks, instalment)
             self.wall += time.perf_counter() - started
             yield self.round
 
@@ -87,8 +97,23 @@ class Training:
             for seeds, budgets in group.blocks()
         ]
         self.blocks = group.take_labels(rows, self.blocks)
+        self._guides = None
         taken = self.clock.replace(round=jnp.asarray(group.rounds, jnp.int32))
         self.clock = place(group.mesh, taken, SHARED)
+
+    def guides(self, before: int) -> dict[str, Any] | None:
+        """The columns of an evaluation of the guides alone after the rounds since `before`, or None: none is due.
+
+        Scalars, or one entry for each lane whose guide is due, see `Instalments.examined`.
+        """
+        group, rounds = self.group, self.round
+        due = group.instalments.examined(rounds, before)
+        if not due.any():
+            return None
+        own = {"round": rounds, "step": self.step, "wall_s": self.wall}
+        each = {"seed": group.seeds, "labels": group.budgets, "asked": group.instalments.asked(rounds)}
+        each |= {"failed": self.failed.astype(float), **self.guide_alone()}
+        return {**own, **{name: values[due] for name, values in each.items()}}
 
     def labels(self) -> tuple[np.ndarray, Label]:
         """Seeds (lanes,) and labels (lanes, slots, ...) of the largest budget: other lanes hold the first of these."""
@@ -99,12 +124,16 @@ class Training:
         return group.seeds[largest], jax.tree.map(lambda leaf: leaf[largest], rows)
 
     def stretches(self) -> Iterator[dict[str, Any]]:
-        """Trains to the end; gives the columns of each evaluation: before the first step, then after every stretch."""
+        """Trains until labels are asked for again, or to the end.
+
+        Gives the columns of each evaluation: before the first step, then after every stretch.
+        """
         group, schedule = self.group, self.group.config.schedule
+        until = group.instalments.next_step(self.step)
         if self.step == 0:
             yield {**self.evaluation(), **self.guide_alone()}
         iterations = schedule.eval_every // group.config.sizes.num_envs
-        while self.step < schedule.total_steps:
+        while self.step < until:
             started = time.perf_counter()
             self.clock, self.blocks, metrics = group.train(self.clock, self.blocks, iterations)
             self.wall += time.perf_counter() - started
@@ -123,7 +152,15 @@ class Training:
         return Agent(lane.agent.params, self.group.config.sizes, actions_of(self.group.env), self.examined)
 
     def guide_alone(self) -> dict[str, np.ndarray]:
-        """Metrics (lanes,) of uniform actions under guidance; for unguided lanes that is chance."""
+        """Metrics (lanes,) of uniform actions under guidance; for unguided lanes that is chance.
+
+        Guides change by rounds alone, so what was measured after the last one is measured once.
+        """
+        if self._guides is None or self._guides[0] != self.round:
+            self._guides = self.round, self._of_guides()
+        return self._guides[1]
+
+    def _of_guides(self) -> dict[str, np.ndarray]:
         group, base = self.group, uniform_in(self.group.env)
 
         def guide(lane: TrainState) -> Policy:

@@ -101,6 +101,7 @@ BILLIARDS = Task(
                 BilliardsConfig("regulation", teacher="learned", aim_error_deg=0.25),
                 # The reference alternates 1,000 steps with 1,000 gradient steps, this a hundred with a hundred.
                 Sizes(num_envs=100, coarse_directions=360, coarse_dtype="bfloat16", peaks=4),
+                schedule=Schedule(guide_eval_every=50),
             ),
             labels=(500, 1000),
             takes="one seed: 20 minutes on one H200; most of a day on 2 cores, by arithmetic",
@@ -111,7 +112,7 @@ BILLIARDS = Task(
                 BilliardsConfig("easy", teacher="learned"),
                 Sizes(directions=720, num_envs=100, replay_capacity=1_000_000, pace=True),
                 Scalars(),
-                Schedule(total_steps=1_000_000, guidance_until=500_000, checkpoint_every=100_000),
+                Schedule(total_steps=1_000_000, guidance_until=500_000, checkpoint_every=100_000, guide_eval_every=50),
             ),
             takes="8 seeds under one guidance: 5 to 6 minutes on one H200; one: hours on 2 cores, by arithmetic",
         ),

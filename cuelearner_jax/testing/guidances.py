@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 from typing import Any
 
@@ -62,6 +63,7 @@ def check_guidance(kind: Kind, env: Environment, sizes: GuideSizes = SMALL, tole
         fitted = model
     _check_act(laws, guidance, env, model, fitted, obs, actions)
     _check_question(laws, guidance, env, fitted, obs, actions)
+    _check_disagreement(laws, kind, env, sizes, obs, actions)
 
 
 def _unfitted(laws: Laws, guidance: Guidance, key: Array) -> GuidanceModel:
@@ -86,7 +88,7 @@ def _answered(
     teacher = Steady(actions_of(env).spread(8)[3])
 
     def each(key: Array, state: Any, obs: Array, action: Array) -> tuple[Array, Array]:
-        return form.answer(key, teacher, state, obs, action, Scalars())
+        return form.answer(key, env, teacher, state, obs, action, Scalars())
 
     with laws.attempted("its form's `answer`", "it returns (answer, answered), in jax.numpy"):
         answers, answered = jax.jit(jax.vmap(each))(jax.random.split(jax.random.key(1), ROWS), states, obs, actions)
@@ -168,3 +170,16 @@ def _check_question(laws: Laws, guidance: Guidance, env: Any, model: GuidanceMod
         asked = jax.jit(guidance.question)(jax.random.key(3), model, env, obs[0], actions[0], GuideScalars())
     laws.hold(asked.shape == actions[0].shape, f"`question` returns shape {asked.shape}: ask about one action")
     laws.actions(actions_of(env), asked, "what `question` asks about")
+
+
+def _check_disagreement(laws: Laws, kind: Kind, env: Any, sizes: GuideSizes, obs: Array, actions: Array) -> None:
+    """What the members of an ensemble say of each other, if the kind can be had with several."""
+    guidance = kind.make(dataclasses.replace(sizes, ensemble=2), spaces_of(env))
+    if guidance.disagreement is None:
+        return
+    model = guidance.init(jax.random.key(4))
+    with laws.attempted("`disagreement` under jit", "it gets a model and a batch of situations and actions"):
+        apart = jax.jit(guidance.disagreement)(model, env, obs, actions)
+    laws.hold(apart.shape == (ROWS,), f"`disagreement` of {ROWS} rows has shape {apart.shape}: give one number a row")
+    laws.hold(np.isfinite(apart).all() and (apart >= 0).all(), "`disagreement` is negative or not finite")
+    laws.hold(jnp.ptp(apart) > 0, "`disagreement` is the same of all situations: it can choose none of them")

@@ -13,7 +13,7 @@ from small_runs import SMALL
 
 from cuelearner_jax import terminal
 from cuelearner_jax.cli import evaluate, main
-from cuelearner_jax.records import results
+from cuelearner_jax.records import guides, results
 
 ENTRY = [str(Path(sys.executable).with_name("cuelearner"))]
 
@@ -60,6 +60,18 @@ def test_every_policy_is_evaluated(run_folder, tmp_path, capsys, policy):
     lanes = {("none", 0), ("relative", 10), ("relative", 20)}
     trained = policy in ("agent", "guide", "guided")
     assert {(row["guidance"], row["labels"]) for row in rows} == (lanes if trained else {("-", 0)})
+
+
+def test_labels_in_instalments_each_about_the_situation_that_members_disagree_on(tmp_path):
+    out, task = tmp_path / "run", "examples.reach:TASK"
+    command = ["train", task, "--preset", "quickstart", "--guidance", "relative", "--labels", "25"]
+    command += ["--schedule.total-steps", "1000", "--sizes.q-layers", "8", "--sizes.feedback-layers", "8"]
+    command += ["--sizes.fit-steps", "20"]
+    command += ["--schedule.ask-at", "0", "500", "--schedule.guide-eval-every", "10", "--scalars.ask-bound-deg", "15"]
+    assert main([*command, "--sizes.ensemble", "2", "--sizes.candidates", "3", "--out", str(out)]) == 0
+    found = guides.read_guides(out)
+    assert found is not None
+    assert [(row["asked"], row["step"]) for row in found.to_pylist()] == [(10, 0), (20, 0), (25, 500)]
 
 
 def test_a_task_alone_is_evaluated_and_drawn_on_any_of_its_tables(tmp_path, capsys):

@@ -15,6 +15,7 @@ from cuelearner_jax.errors import UserError
 from cuelearner_jax.guidance import none
 from cuelearner_jax.guidance import registry as guidance
 from cuelearner_jax.guidance.answers import RELATIVE
+from cuelearner_jax.guidance.bounding import act_within
 from cuelearner_jax.guidance.kind import Kind
 from cuelearner_jax.guidance.questions import about_base
 from cuelearner_jax.types import Label
@@ -74,7 +75,9 @@ def told(base, best, scalars=probes.SCALARS):
     bundle, _ = made("relative")
     window = probes.Window(offset=best)
     asked = jax.jit(bundle.form.answer)
-    return asked(jax.random.key(0), probes.Expert(window), jnp.array([1.0, 0.0]), jnp.array([1.0, 0.0]), base, scalars)
+    return asked(
+        jax.random.key(0), window, probes.Expert(window), jnp.array([1.0, 0.0]), jnp.array([1.0, 0.0]), base, scalars
+    )
 
 
 def target_of(base, answer, scalars=probes.SCALARS):
@@ -130,6 +133,21 @@ def test_guidance_that_never_asks_has_no_form_of_answers_and_never_fits(kind):
     assert bundle.target(Label(OBS[0], BASE[0], jnp.zeros(0), jnp.array(False)), probes.SCALARS).shape == (0,)
     labels = Label(OBS, BASE, jnp.zeros((6, 0)), jnp.ones(6, bool))
     assert not bool(bundle.fit(jax.random.key(0), ENV, labels, model, probes.SCALARS).fitted)
+
+
+def test_within_a_bound_no_kind_leads_farther_and_rows_that_are_not_active_stay():
+    for kind in ("heuristic", "relative"):
+        bundle, model = made(kind)
+        model = model.replace(fitted=jnp.array(True))
+        result = act_within(jnp.array(0.01), bundle, model, ENV, OBS, BASE, ACTIVE, probes.SCALARS)
+        away = np.abs(actions.difference(BASE, result.actions))
+        assert away.max() <= 0.01 + 1e-6
+        assert away[ACTIVE].max() == pytest.approx(0.01, abs=1e-5)  # of the heuristic's 1.3 rad
+        np.testing.assert_array_equal(result.actions[~ACTIVE], BASE[~ACTIVE])
+    bundle, model = made("heuristic")
+    free = act_within(jnp.array(math.pi), bundle, model, ENV, OBS, BASE, ACTIVE, probes.SCALARS)
+    alone = bundle.act(model, ENV, OBS, BASE, ACTIVE, probes.SCALARS)
+    np.testing.assert_array_equal(free.actions, alone.actions)
 
 
 # Questions.

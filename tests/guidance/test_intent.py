@@ -37,7 +37,7 @@ def fitted():
     keys = jax.random.split(jax.random.key(3), 40)
     obs = jax.vmap(lambda key: ENV.reset(key)[1])(keys)
     asked = actions.uniform(jax.random.key(4), (40,))
-    tell = jax.vmap(lambda key, obs, a: RELATIVE.answer(key, probes.Expert(ENV), obs, obs, a, probes.SCALARS))
+    tell = jax.vmap(lambda key, obs, a: RELATIVE.answer(key, ENV, probes.Expert(ENV), obs, obs, a, probes.SCALARS))
     answers, _ = tell(keys, obs, asked)
     labels = Label(obs, asked, answers, jnp.ones(40, bool))
     former = bundle.init(jax.random.key(0))

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-from cuelearner_jax.report.figures import Variant, draw_curves, draw_label_efficiency
+from cuelearner_jax.report.figures import draw_curves, draw_label_efficiency
 from cuelearner_jax.report.statistics import Interval, curve
+from cuelearner_jax.report.variants import Variant
 
 
 def variant(guidance, labels, level, *, first=0.8, steps=11, spread=0.002):

@@ -1,0 +1,128 @@
+"""The tables of a report: what they hold, as CSV and as Markdown."""
+
+from __future__ import annotations
+
+import csv
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from cuelearner_jax.records import results
+from cuelearner_jax.report import escaping
+from cuelearner_jax.report.statistics import steps_to_reach, stretches_apart
+from cuelearner_jax.report.variants import Group, Variant
+
+Row = dict[str, str | int | float]  # of a table
+
+
+def summary(variants: Sequence[Variant], lower_is_better: bool = False) -> list[Row]:
+    """One row for each variant, numbers unrounded; the columns are those of `summary.csv`.
+
+    `reaches_unguided_final` is the first step at which the variant's interquartile mean is as good as the unguided
+    one's at its last step. The stretches `above_unguided` and `below_unguided` are those of `stretches_apart`. Where
+    runs are told apart, a variant is compared with the unguided one of `unguided_of`.
+    """
+    sign = -1.0 if lower_is_better else 1.0
+    rows = []
+    for variant in variants:
+        unguided = unguided_of(variant, variants)
+        goodness = sign * variant.curve.estimate
+        steps, best = variant.curve.steps, int(goodness.argmax())
+        row: Row = {**named(variant), "seeds": len(variant.seeds), "failed": len(variant.failed)}
+        row |= {"last_step": int(steps[-1])}
+        row |= {"final": variant.curve.estimate[-1], "final_lower": variant.curve.lower[-1]}
+        row |= {"final_upper": variant.curve.upper[-1], "mean": float(variant.mean.estimate)}
+        row |= {"mean_lower": float(variant.mean.lower), "mean_upper": float(variant.mean.upper)}
+        row |= {"best_step": int(steps[best]), "best": variant.curve.estimate[best]}
+        row |= {"reaches_unguided_final": "", "above_unguided": "", "below_unguided": ""}
+        if unguided is not None:
+            reached = steps_to_reach(steps, goodness[None], sign * unguided.curve.estimate[-1])[0]
+            row["reaches_unguided_final"] = int(reached) if np.isfinite(reached) else "never"
+            for column, apart in (
+                ("above_unguided", stretches_apart(variant.curve, unguided.curve)),
+                ("below_unguided", stretches_apart(unguided.curve, variant.curve)),
+            ):
+                row[column] = "; ".join(f"{start}-{end}" for start, end in apart) if variant is not unguided else ""
+        rows.append({name: value.item() if isinstance(value, np.generic) else value for name, value in row.items()})
+    return rows
+
+
+def unguided_of(variant: Variant, variants: Sequence[Variant]) -> Variant | None:
+    """The unguided agents that a variant is compared with: those of its own run, or else the first there are."""
+    unguided = [other for other in variants if other.guidance == "none"]
+    return next((other for other in unguided if other.run == variant.run), unguided[0] if unguided else None)
+
+
+def named(variant: Variant) -> Row:
+    """The columns that tell a variant from others; `run` is one of them where runs are told apart."""
+    row: Row = {"run": variant.run} if variant.run else {}
+    return row | {"guidance": variant.guidance, "labels": variant.labels}
+
+
+def of_failed_alone(rows: Sequence[Row], groups: Sequence[Group]) -> list[Row]:
+    """Rows of the summary, beside those that there are, for variants of which every lane has failed."""
+    blank = dict.fromkeys(rows[0], "")
+    more: list[Row] = []
+    for group in groups:
+        there = {(row["guidance"], row["labels"]) for row in rows if row.get("run", "") == group.name}
+        lanes = Counter(key[:2] for key in results.failures(group.failed) if key[:2] not in there)
+        run = {"run": group.name} if group.name else {}
+        more += [
+            {**blank, **run, "guidance": key[0], "labels": key[1], "seeds": 0, "failed": n} for key, n in lanes.items()
+        ]
+    return more
+
+
+def curve_rows(variants: Sequence[Variant]) -> list[Row]:
+    """One row for each variant and evaluation: what the curves show."""
+    return [
+        {**named(variant), "seeds": len(variant.seeds), "step": int(step)}
+        | {"iqm": float(estimate), "lower": float(lower), "upper": float(upper)}
+        for variant in variants
+        for step, estimate, lower, upper in zip(*variant.curve, strict=True)
+    ]
+
+
+def write_csv(path: Path, rows: Sequence[Row]) -> None:
+    """Writes a table whose rows have the columns of the first."""
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows({name: escaping.cell(value) for name, value in row.items()} for row in rows)
+
+
+def markdown_table(header: Sequence[str], rows: Iterable[Sequence[object]]) -> list[str]:
+    """Lines of a table in Markdown; cells are Markdown already, and a short row is filled with blank ones."""
+    lines = [f"| {' | '.join(header)} |", "|" + "---|" * len(header)]
+    for cells in rows:
+        lines.append(f"| {' | '.join(map(str, cells))} |" + " |" * (len(header) - len(cells)))
+    return lines
+
+
+def summary_lines(rows: Sequence[Row]) -> list[str]:
+    """The summary as a table in Markdown."""
+    header = ["guidance", "labels", "seeds", "last step", "final", "mean over the curve", "best (at step)"]
+    header += ["reaches the unguided final", "interval above the unguided", "interval below the unguided"]
+    by_run = "run" in rows[0]
+    return markdown_table(["run"] * by_run + header, [_summary_cells(row, by_run) for row in rows])
+
+
+def _summary_cells(row: Row, by_run: bool) -> list[object]:
+    reached, failed = row["reaches_unguided_final"], int(row["failed"])
+    seeds = f"{row['seeds']} of {int(row['seeds']) + failed}, {failed} failed" if failed else row["seeds"]
+    cells: list[object] = [escaping.markdown(row["run"])] if by_run else []
+    cells += [escaping.markdown(row["guidance"]), f"{row['labels']:,}", seeds]
+    if not row["seeds"]:
+        return cells
+    cells.append(f"{row['last_step']:,}")
+    for key in ("final", "mean"):
+        bounds = f" [{row[f'{key}_lower']:.3f}, {row[f'{key}_upper']:.3f}]" if int(row["seeds"]) > 1 else ""
+        cells.append(f"{row[key]:.3f}{bounds}")
+    cells += [f"{row['best']:.3f} ({row['best_step']:,})", f"{reached:,}" if isinstance(reached, int) else reached]
+    for column in ("above_unguided", "below_unguided"):
+        apart = [stretch.split("-") for stretch in str(row[column]).split("; ") if stretch]
+        spans = [f"{int(start):,} to {int(end):,}" if start != end else f"{int(start):,}" for start, end in apart]
+        cells.append("; ".join(spans))
+    return cells

@@ -1,0 +1,202 @@
+"""From rows of results to variants: all seeds under one kind of guidance with one label budget, of a group of runs."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from jaxtyping import Float, Int
+
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.guidance import registry
+from cuelearner_jax.records import results
+from cuelearner_jax.records.guides import read_guides
+from cuelearner_jax.report.escaping import one_line
+from cuelearner_jax.report.statistics import Curve, Interval, curve, interval, mean_over_curve
+from cuelearner_jax.runs import failures
+
+PathLike = str | os.PathLike[str]
+LONGEST_NAME = 40  # characters of a kind of guidance, or of a run, in a figure
+
+
+class Variant(NamedTuple):
+    """All seeds under one kind of guidance with one label budget, at the steps that all of them have reached."""
+
+    guidance: str
+    labels: int
+    seeds: Int[np.ndarray, "seeds"]
+    values: Float[np.ndarray, "seeds steps"]
+    curve: Curve
+    mean: Interval  # of the mean over the curve, up to the last step that all variants share
+    failed: Int[np.ndarray, "lanes"]  # steps by which other lanes had failed, of which nothing else is here
+    run: str = ""  # of the group of runs, where groups are told apart
+    guide: Float[np.ndarray, "guides"] | None = None  # metric of each seed's guide alone, where it was measured
+
+    @property
+    def name(self) -> str:
+        """What the legend says."""
+        name = guidance_name(self.guidance)
+        name = f"{name}, {self.labels:,} labels" if self.labels else name
+        return f"{shortened(self.run)}: {name}" if self.run else name
+
+
+def guidance_name(guidance: str) -> str:
+    """What figures call a kind of guidance, one that is not known here too."""
+    kind = registry.registered(guidance)
+    return shortened(kind.title if kind and kind.title else guidance)
+
+
+def shortened(name: str) -> str:
+    """A name in a figure: one line of bounded length."""
+    name = one_line(name)
+    name = name if len(name) <= LONGEST_NAME else f"{name[: LONGEST_NAME - 1]}…"
+    return f" {name}" if name.startswith("_") else name  # Matplotlib leaves names with an underscore out of legends
+
+
+class Group(NamedTuple):
+    """Results that are taken together."""
+
+    name: str  # empty where there is one group alone
+    table: pa.Table  # the rows to report
+    failed: pa.Table  # all rows of lanes that failed
+    invalid: int  # rows left out for a metric that is not finite
+    guides: pa.Table | None  # rows of the guides' own quality, see `records.guides`; None: there are none
+
+    @property
+    def all_rows(self) -> pa.Table:
+        """Those of failed lanes too."""
+        return pa.concat_tables([self.table, self.failed])
+
+
+def read_groups(folders: Sequence[PathLike], task: str | None, metric: str, split: str, by_run: bool) -> list[Group]:
+    """The results of folders, together or (`by_run`) each folder by itself under its name.
+
+    Raises:
+        UserError: results are missing, corrupt, of several tasks, lack the metric or the split, or are of failed lanes
+            alone; or two folders that are to be told apart have one name.
+    """
+    if not by_run:
+        return [_group("", folders, task, metric, split)]
+    names = [Path(os.path.abspath(folder)).name for folder in folders]
+    if twice := sorted({name for name in names if names.count(name) > 1}):
+        raise UserError(f"--by-run: several folders are called {twice[0]}: give them different names")
+    groups = [_group(name, [folder], task, metric, split) for name, folder in zip(names, folders, strict=True)]
+    tasks = sorted({group.table["task"][0].as_py() for group in groups})
+    if len(tasks) > 1:
+        raise UserError(f"results of several tasks ({', '.join(tasks)}) cannot be mixed: choose one of them")
+    return groups
+
+
+def _group(name: str, folders: Sequence[PathLike], task: str | None, metric: str, split: str) -> Group:
+    selected = _select(results.read(folders, task), metric, split)
+    guides = read_guides(folders, task)
+    column = f"guide_{metric}"
+    if guides is None or column not in guides.column_names:
+        return Group(name, *selected, None)
+    return Group(name, *selected, guides.filter((pc.field("split") == split) & pc.field(column).is_valid()))
+
+
+def _select(table: pa.Table, metric: str, split: str) -> tuple[pa.Table, pa.Table, int]:
+    """The rows to report, all rows of lanes that failed, and how many rows were left out for a metric not finite."""
+    if metric not in results.metrics(table):
+        raise UserError(f"no metric {metric!r} in the results: there are {', '.join(results.metrics(table))}")
+    splits = sorted(set(table["split"].to_pylist()))
+    if split not in splits:
+        raise UserError(f"no {split} rows in the results: there are {', '.join(splits)} rows")
+    rows = table.filter(pc.field("split") == split)
+    marked = results.failures(rows)
+    lanes = zip(*(rows[name].to_pylist() for name in results.LANE), strict=True) if marked else ()
+    of_failed = np.array([lane in marked for lane in lanes] or [False] * rows.num_rows, bool)
+    rows, failed = rows.filter(pa.array(~of_failed)), rows.filter(pa.array(of_failed))
+    if failed.num_rows and not rows.num_rows:
+        raise UserError(f"nothing to report, {failures.summary(failed)}: train again with other settings")
+    table = rows.filter(pc.field(metric).is_valid())
+    if table.num_rows == 0:
+        raise UserError(f"the metric {metric!r} has no finite value in the {split} rows: choose another metric")
+    return table, failed, rows.num_rows - table.num_rows
+
+
+def variants_of(groups: Sequence[Group], metric: str) -> list[Variant]:
+    """The variants in the order of the legend: group by group unguided, then by guidance and label budget.
+
+    Raises:
+        UserError: a seed is there twice, or the seeds of a variant have no step in common.
+    """
+    raw = {(group.name, *key): matrix for group in groups for key, matrix in _matrices(group, metric).items()}
+    failed: Mapping[str, Mapping[results.LaneKey, int]]
+    failed = {group.name: results.failures(group.failed) for group in groups}
+    shared = min(steps[-1] for _, steps, _, _ in raw.values())
+    variants = []
+    for (run, kind, budget), (seeds, steps, values, guide) in raw.items():
+        until = max(1, int(np.searchsorted(steps, shared, side="right")))
+        mean = interval(mean_over_curve(steps[:until], values[:, :until]))
+        lost = np.array([step for lane, step in failed[run].items() if lane[:2] == (kind, budget)], int)
+        known = guide if len(guide) else None
+        variants.append(Variant(kind, budget, seeds, values, curve(steps, values), mean, lost, run, known))
+    return variants
+
+
+Matrix = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+
+
+def _matrices(group: Group, metric: str) -> dict[tuple[str, int], Matrix]:
+    """By kind of guidance and label budget: seeds, steps, values (see `_matrix`) and the guides' metric."""
+    table = group.table
+    guidance, labels = np.array(table["guidance"].to_pylist()), table["labels"].to_numpy()
+    keys = set(zip(guidance.tolist(), labels.tolist(), strict=True))
+    found = {}
+    for key in sorted(keys, key=lambda key: (key[0] != "none", key[0], key[1])):
+        rows = table.filter(pa.array((guidance == key[0]) & (labels == key[1])))
+        found[key] = (*_matrix(rows, metric, key), _guides(rows, metric, group.guides, key))
+    return found
+
+
+def _guides(rows: pa.Table, metric: str, guides: pa.Table | None, key: tuple[str, int]) -> np.ndarray:
+    """The metric of each seed's guide after all the labels it has asked for so far, (seeds,); empty if none is known.
+
+    Args:
+        rows: of the results, which have it for what never asks and for guides before the first step.
+        metric: of results.
+        guides: rows of guides after their rounds, if there are any.
+        key: kind of guidance and budget.
+    """
+    column = f"guide_{metric}"
+    latest: dict[int, float] = {}
+    if column in rows.column_names:
+        measured = rows.filter(pc.field(column).is_valid()).sort_by("step")
+        latest = dict(zip(measured["seed"].to_pylist(), measured[column].to_pylist(), strict=True))
+    if guides is not None:
+        own = guides.filter((pc.field("guidance") == key[0]) & (pc.field("labels") == key[1])).sort_by("asked")
+        seeds = set(rows["seed"].to_pylist())  # those of failed lanes are not among them
+        pairs = zip(own["seed"].to_pylist(), own[column].to_pylist(), strict=True)
+        latest |= {seed: value for seed, value in pairs if seed in seeds}
+    return np.array([latest[seed] for seed in sorted(latest)])
+
+
+def _matrix(table: pa.Table, metric: str, key: tuple[str, int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Seeds (seeds,), steps (steps,) and values (seeds, steps) of one variant, at the steps that all seeds have."""
+    seeds, row = np.unique(table["seed"].to_numpy(), return_inverse=True)
+    steps, column = np.unique(table["step"].to_numpy(), return_inverse=True)
+    count = np.zeros((len(seeds), len(steps)), int)
+    np.add.at(count, (row, column), 1)
+    if count.max() > 1:
+        twice = seeds[(count > 1).any(axis=1)][0]
+        where = sorted(set(table.filter(pc.field("seed") == int(twice))["folder"].to_pylist()))
+        raise UserError(
+            f"seed {twice} of {key[0]} guidance with {key[1]} labels occurs twice, in {' and '.join(where)}: "
+            "leave one of them out, or give --by-run and each folder by itself"
+        )
+    values = np.full(count.shape, np.nan)
+    values[row, column] = table[metric].to_numpy()
+    whole = (count == 1).all(axis=0)
+    if not whole.any():
+        raise UserError(
+            f"the seeds of {key[0]} guidance with {key[1]} labels have no step in common: wait for all of them, or "
+            "leave out the run that was evaluated at other steps"
+        )
+    return seeds, steps[whole], values[:, whole]

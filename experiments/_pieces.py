@@ -1,0 +1,160 @@
+"""What sweeps have in common that are cut into pieces: which pieces, at which scale, resumed, and reported together."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from cuelearner_jax.cli import main as cuelearner
+
+FIRST_SEED = 4000  # of reported runs; settings are chosen on seeds from 0 on, with --tuning
+Options = Mapping[str, object]  # of `cuelearner sweep`: a value, several in a tuple, or whether a flag is on
+
+
+class Piece(NamedTuple):
+    """One sweep that fits half an hour of one accelerator. Its folder is world/run/name."""
+
+    world: str  # that it is played in: what one report is of
+    run: str  # what is compared as one: kinds and budgets under one configuration
+    name: str
+    kinds: tuple[str, ...]
+    labels: tuple[int, ...]  # budgets; none for kinds that never ask
+    seeds: int
+    options: Options
+    minutes: int  # of an H100 or H200; estimated from 0.45 ms a step of 32 lanes, not measured
+    serves: str  # which figure
+
+    @property
+    def path(self) -> str:
+        """Of its folder, and what it is called on the command line."""
+        return f"{self.world}/{self.run}/{self.name}"
+
+    @property
+    def lanes(self) -> int:
+        """Seeds times budgets times kinds."""
+        return self.seeds * max(1, len(self.labels)) * len(self.kinds)
+
+
+class Scale(NamedTuple):
+    """How much of every piece is run."""
+
+    about: str
+    seeds: int | None = None  # at most so many
+    labels: Mapping[int, int] | None = None  # budgets that are kept, and what they become
+    options: Mapping[str, object] = {}
+    instead: Mapping[str, object] = {}  # of options that a piece has
+
+
+class Experiment(NamedTuple):
+    """The sweeps of one task."""
+
+    task: str
+    pieces: tuple[Piece, ...]
+    scales: Mapping[str, Scale]
+    report: Mapping[str, Sequence[str]]  # options of `cuelearner report` at the scale `paper`, by world
+    metric: Sequence[str] = ()  # options of it at every scale
+
+
+def scaled(piece: Piece, scale: Scale) -> Piece | None:
+    """A piece at a scale, or None where nothing of it is left."""
+    seeds = min(piece.seeds, scale.seeds or piece.seeds)
+    labels = piece.labels
+    if scale.labels is not None and labels:
+        labels = tuple(scale.labels[budget] for budget in labels if budget in scale.labels)
+        if not labels:
+            return None
+    instead = {name: value for name, value in scale.instead.items() if name in piece.options}
+    return piece._replace(seeds=seeds, labels=labels, options={**piece.options, **scale.options, **instead})
+
+
+def option(name: str, value: object) -> list[str]:
+    """An option as it is typed: `--sizes.no-pace` for a flag that is off."""
+    if isinstance(value, bool):
+        group, _, flag = name.rpartition(".")
+        return [f"--{group}.{flag if value else f'no-{flag}'}"]
+    return [f"--{name}", *(str(each) for each in (value if isinstance(value, tuple) else (value,)))]
+
+
+def sweep_command(task: str, piece: Piece, out: Path, resume: bool) -> list[str]:
+    """The command line of a piece."""
+    given: dict[str, object] = {**piece.options, "guidance": piece.kinds, "seeds": piece.seeds}
+    given |= {"first-seed": FIRST_SEED, **({"labels": piece.labels} if piece.labels else {})}
+    words = ["sweep", task]
+    for name, value in given.items():
+        words += option(name, value)
+    folder = out / piece.path
+    return [*words, "--out", str(folder), *(["--resume"] if resume and (folder / "config.json").exists() else [])]
+
+
+def report_command(experiment: Experiment, world: str, out: Path, scale: str) -> list[str] | None:
+    """The command line of the report of all runs of a world that have been begun, or None where none has.
+
+    How far labels carry is said as soon as there are unguided agents to compare with.
+    """
+    own = [piece for piece in experiment.pieces if piece.world == world]
+    runs = dict.fromkeys(piece.run for piece in own)
+    begun = [str(out / world / run) for run in runs if list((out / world / run).glob("*/config.json"))]
+    if not begun:
+        return None
+    asked = experiment.report.get(world, ()) if scale == "paper" else ()
+    unguided = any((out / p.path / "config.json").exists() for p in own if p.kinds == ("none",))
+    efficiency = ["--efficiency", *asked] if unguided else []
+    words = ["report", *begun, "--by-run", *experiment.metric, *efficiency]
+    return [*words, "--out", str(out / world / "report"), "--overwrite"]
+
+
+def chosen(experiment: Experiment, names: Sequence[str]) -> list[Piece]:
+    """The pieces of these names, or below these folders, in the order of the data; all of them for no name.
+
+    Raises ValueError for a name that none has.
+    """
+    for name in names:
+        if not any(_below(piece, name) for piece in experiment.pieces):
+            raise ValueError(f"no piece {name!r}: see --list")
+    return [piece for piece in experiment.pieces if not names or any(_below(piece, name) for name in names)]
+
+
+def _below(piece: Piece, name: str) -> bool:
+    return f"{piece.path}/".startswith(f"{name.rstrip('/')}/")
+
+
+def _listed(pieces: Sequence[Piece]) -> str:
+    width = max(len(piece.path) for piece in pieces)
+    rows = [f"{piece.path:<{width}} {piece.lanes:4} lanes  {piece.minutes:3} min  {piece.serves}" for piece in pieces]
+    hours = sum(piece.minutes for piece in pieces) / 60
+    return "\n".join([*rows, f"{len(pieces)} pieces, {hours:.1f} hours of one accelerator (estimates, not measured)"])
+
+
+def run(experiment: Experiment, about: str, arguments: Sequence[str] | None = None) -> int:
+    """Runs pieces and reports on their worlds; stops at the first command that fails and returns its status."""
+    parser = argparse.ArgumentParser(
+        description=about, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
+    )
+    scales = "; ".join(f"{name}: {scale.about}" for name, scale in experiment.scales.items())
+    parser.add_argument("--scale", choices=list(experiment.scales), default="paper", help=scales)
+    parser.add_argument("--pieces", nargs="+", default=[], metavar="NAME", help="these alone, or all below a folder")
+    parser.add_argument("--out", type=Path, default=Path(f"runs/{experiment.task}_bootstrapping"), help="folder")
+    parser.add_argument("--resume", action="store_true", help="go on with pieces that were begun, leave finished ones")
+    parser.add_argument("--list", action="store_true", help="list the pieces and stop")
+    parser.add_argument("--report", action="store_true", help="report on what there is, and run nothing")
+    asked = parser.parse_args(arguments)
+    try:
+        pieces = chosen(experiment, asked.pieces)
+    except ValueError as error:
+        parser.error(str(error))
+    if asked.list:
+        print(_listed(pieces))
+        return 0
+    out = asked.out if asked.scale == "paper" else asked.out / asked.scale
+    commands = []
+    if not asked.report:
+        at_scale = [scaled(piece, experiment.scales[asked.scale]) for piece in pieces]
+        commands = [sweep_command(experiment.task, piece, out, asked.resume) for piece in at_scale if piece]
+    for command in commands:
+        if status := cuelearner(command):
+            return status
+    worlds = dict.fromkeys(piece.world for piece in pieces)
+    reports = [report_command(experiment, world, out, asked.scale) for world in worlds]
+    return next((status for command in reports if command and (status := cuelearner(command))), 0)

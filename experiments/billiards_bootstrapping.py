@@ -1,0 +1,202 @@
+"""How far labels carry on the billiards tables: every form of feedback, its budgets, faults and ways to ask.
+
+    python experiments/billiards_bootstrapping.py --list
+    python experiments/billiards_bootstrapping.py --out FOLDER --pieces regulation/frame [--resume]
+    python experiments/billiards_bootstrapping.py --out FOLDER --report
+
+The sweeps are data below: every piece fits half an hour of one accelerator, has a folder of its own and is resumed.
+After the pieces, or alone with --report, there is a report of each table (FOLDER/TABLE/report). Several processes may
+share FOLDER, each with pieces of its own. At the scale `quick` a piece takes minutes, at `smoke` seconds on a CPU; both
+have folders of their own in FOLDER.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from _pieces import Experiment, Options, Piece, Scale, run
+
+FEW, MANY = (25, 50, 100, 350), (500, 1_000, 2_000, 5_000)
+CURVE = (10_000, 20_000, 50_000, 100_000)  # simulated: from which number on do labels pay?
+ASKING = ("relative", "intent", "demonstration", "scalar", "dcoach")
+
+REGULATION: Options = {
+    "preset": "paper",
+    "sizes.replay-capacity": 2_000_000,  # all steps: as many as the preset's
+    "schedule.total-steps": 2_000_000,
+    "schedule.guidance-until": 500_000,
+    "schedule.eval-every": 100_000,
+    "schedule.checkpoint-every": 500_000,
+}
+EASY: Options = {
+    "preset": "easy",
+    "schedule.total-steps": 1_000_000,
+    "schedule.guidance-until": 500_000,
+    "schedule.eval-every": 50_000,
+    "schedule.checkpoint-every": 250_000,
+}
+FULL: Options = {
+    "preset": "paper",
+    "schedule.total-steps": 10_000_000,
+    "schedule.eval-every": 100_000,
+    "schedule.checkpoint-every": 10_000_000,
+}
+RAW: Options = {"sizes.frame": "raw", "sizes.pace": False}  # said whatever the presets say
+FRAME: Options = {"sizes.frame": "action", "sizes.pace": False}
+# Fits are as long for a label as those of small budgets are, and rounds as few as keep them within minutes.
+LARGE_ROUNDS: Options = {"sizes.labels-per-round": 2_500, "sizes.fit-steps": 20_000, "sizes.fit-batch-size": 500}
+FAULTS: dict[str, Options] = {
+    "flipped-05": {"scalars.mistake-probability": 0.05},
+    "flipped-10": {"scalars.mistake-probability": 0.1},
+    "flipped-20": {"scalars.mistake-probability": 0.2},
+    "random": {"scalars.mistake-probability": 0.5},
+    "silent-20": {"scalars.silence-probability": 0.2},
+    "indifferent": {"scalars.indifference-deg": 5.0},
+    "biased": {"scalars.teacher-bias-deg": 2.5},
+}
+WAYS: dict[str, Options] = {
+    "nearest": {"scalars.answer": "nearest"},
+    "instalments": {"schedule.ask-at": (0, 100_000, 200_000), "scalars.ask-bound-deg": 20.0},
+    "ensemble": {"sizes.ensemble": 5},
+    "active": {"sizes.ensemble": 5, "sizes.candidates": 16},
+}
+
+
+def budgets(world: str, options: Options, minutes: int) -> list[Piece]:
+    """Every form of feedback with every budget seen from the action, beside agents that nobody guides."""
+    options = {**options, **FRAME}
+    pieces = [
+        Piece(world, "frame", "none", ("none",), (), 16, options, minutes // 2, "unguided agents, of every figure"),
+        Piece(world, "frame", "heuristic", ("heuristic",), (), 8, options, minutes // 2, "against the obvious shot"),
+    ]
+    for kind in ASKING:
+        serves = f"labels of {kind}"
+        pieces.append(Piece(world, "frame", f"{kind}-few", (kind,), FEW, 8, options, minutes, serves))
+        pieces.append(Piece(world, "frame", f"{kind}-many", (kind,), MANY, 8, options, minutes + 6, serves))
+    return pieces
+
+
+def curves(world: str, options: Options, minutes: int) -> list[Piece]:
+    """The same with more labels than anybody gives."""
+    options = {**options, **FRAME, **LARGE_ROUNDS}
+    serves = "the number from which labels pay"
+    return [Piece(world, "frame", f"{kind}-curve", (kind,), CURVE, 8, options, minutes + 8, serves) for kind in ASKING]
+
+
+def variations(world: str, options: Options, minutes: int) -> list[Piece]:
+    """Five hundred labels of a faulty teacher, and other ways to ask and to answer; then paced."""
+    options = {**options, **FRAME}
+    pieces = [
+        Piece(world, name, "relative", ("relative",), (500,), 8, {**options, **fault}, minutes // 2, "faulty teachers")
+        for name, fault in FAULTS.items()
+    ]
+    pieces += [
+        Piece(world, name, "relative", ("relative",), (500, 1_000), 8, {**options, **way}, minutes, "what is asked")
+        for name, way in WAYS.items()
+    ]
+    scored = {**options, "scalars.scalar-good": "scored"}
+    pieces.append(
+        Piece(world, "scored", "scalar", ("scalar",), (500, 1_000), 8, scored, minutes, "what is called good")
+    )
+    paced = {**options, "sizes.pace": True}
+    random = {**paced, **FAULTS["random"]}
+    serves = "guidance never costs"
+    pieces += [
+        Piece(world, "paced", "heuristic", ("heuristic",), (), 8, paced, minutes // 2, serves),
+        Piece(world, "paced", "relative", ("relative",), (500,), 8, paced, minutes // 2, serves),
+        Piece(world, "paced-random", "relative", ("relative",), (500,), 8, random, minutes // 2, serves),
+    ]
+    return pieces
+
+
+def raw(world: str, options: Options, minutes: int) -> list[Piece]:
+    """What networks on raw coordinates make of it."""
+    options, serves = {**options, **RAW}, "the frame against raw coordinates"
+    return [
+        Piece(world, "raw", "none", ("none",), (), 8, options, minutes // 2, serves),
+        Piece(world, "raw", "relative", ("relative",), (500, 1_000), 8, options, minutes, serves),
+    ]
+
+
+def full_length(minutes: int) -> list[Piece]:
+    """The paper's own figure over all its steps, once."""
+    options, serves = {**FULL, **RAW}, "the paper's own figure at full length"
+    return [
+        Piece("full", "raw", "none", ("none",), (), 4, options, minutes, serves),
+        Piece("full", "raw", "relative", ("relative",), (1_000,), 4, options, minutes + 2, serves),
+    ]
+
+
+PIECES = (
+    *budgets("regulation", REGULATION, 16),
+    *curves("regulation", REGULATION, 16),
+    *variations("regulation", REGULATION, 16),
+    *raw("regulation", REGULATION, 16),
+    *budgets("easy", EASY, 8),
+    *curves("easy", EASY, 8),
+    *variations("easy", EASY, 8),
+    *raw("easy", EASY, 8),
+    *full_length(26),
+)
+
+SCALES = {
+    "smoke": Scale(
+        "seconds a piece on a CPU, to see that everything runs",
+        seeds=2,
+        labels={25: 5, 500: 10, 10_000: 15},
+        options={
+            "sizes.q-layers": 16,
+            "sizes.feedback-layers": 16,
+            "sizes.directions": 36,
+            "sizes.coarse-directions": 0,
+            "sizes.num-envs": 10,
+            "sizes.replay-capacity": 200,
+            "sizes.labels-per-round": 5,
+            "sizes.fit-steps": 20,
+            "sizes.fit-batch-size": 10,
+            "sizes.lanes-per-block": 1,
+            "schedule.total-steps": 200,
+            "schedule.random-steps": 50,
+            "schedule.learn-after": 50,
+            "schedule.guidance-until": 200,
+            "schedule.eval-every": 100,
+            "schedule.eval-steps": 100,
+            "schedule.eval-envs": 10,
+            "schedule.checkpoint-every": 200,
+        },
+        instead={"schedule.ask-at": (0, 100)},
+    ),
+    "quick": Scale(
+        "minutes a piece on an accelerator, to see where it goes",
+        seeds=4,
+        labels={100: 100, 500: 500, 1_000: 1_000, 10_000: 10_000},
+        options={
+            "sizes.replay-capacity": 200_000,
+            "schedule.total-steps": 200_000,
+            "schedule.guidance-until": 100_000,
+            "schedule.eval-every": 20_000,
+            "schedule.checkpoint-every": 100_000,
+        },
+        instead={"schedule.ask-at": (0, 20_000, 40_000)},
+    ),
+    "paper": Scale("what is reported"),
+}
+
+EXPERIMENT = Experiment(
+    "billiards",
+    PIECES,
+    SCALES,
+    report={
+        "regulation": ("--level-at", "1000000", "--reference", "relative"),
+        "easy": ("--level-at", "1000000", "--reference", "relative"),
+    },
+)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs what is asked for; returns the exit status."""
+    return run(EXPERIMENT, __doc__ or "", arguments)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

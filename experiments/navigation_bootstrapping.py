@@ -1,0 +1,154 @@
+"""How far labels carry in navigation: every form of feedback, its budgets, faults and ways to ask, in both frames.
+
+    python experiments/navigation_bootstrapping.py --list
+    python experiments/navigation_bootstrapping.py --out FOLDER --pieces clutter/frame [--resume]
+    python experiments/navigation_bootstrapping.py --out FOLDER --report
+
+The sweeps are data below: every piece fits half an hour of one accelerator, has a folder of its own and is resumed.
+After the pieces, or alone with --report, there is a report (FOLDER/clutter/report). Several processes may share FOLDER,
+each with pieces of its own. At the scale `quick` a piece takes minutes, at `smoke` seconds on a CPU; both have folders
+of their own in FOLDER.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from _pieces import Experiment, Options, Piece, Scale, run
+
+FEW, MANY = (25, 50, 100), (350, 500, 1_000)
+ASKING = ("relative", "demonstration", "scalar", "dcoach")
+SEEDS = 16
+
+HALLS: Options = {
+    "preset": "paper",
+    "sizes.target-dtype": "bfloat16",
+    "schedule.total-steps": 200_000,
+    "schedule.guidance-until": 100_000,
+    "schedule.eval-every": 10_000,
+    "schedule.eval-envs": 200,
+    "schedule.eval-steps": 40_000,
+    "schedule.checkpoint-every": 50_000,
+}
+RAW: Options = {"sizes.frame": "raw", "sizes.pace": False}  # said whatever the presets say
+FRAME: Options = {"sizes.frame": "action", "sizes.pace": False}
+FAULTS: dict[str, Options] = {
+    "flipped-05": {"scalars.mistake-probability": 0.05},
+    "flipped-10": {"scalars.mistake-probability": 0.1},
+    "flipped-20": {"scalars.mistake-probability": 0.2},
+    "random": {"scalars.mistake-probability": 0.5},
+    "silent-20": {"scalars.silence-probability": 0.2},
+    "indifferent": {"scalars.indifference-deg": 20.0},
+    "biased": {"scalars.teacher-bias-deg": 10.0},
+}
+WAYS: dict[str, Options] = {
+    "instalments": {"schedule.ask-at": (0, 20_000, 40_000), "scalars.ask-bound-deg": 60.0},
+    "ensemble": {"sizes.ensemble": 5},
+    "active": {"sizes.ensemble": 5, "sizes.candidates": 16},
+}
+
+
+def budgets(name: str, options: Options, minutes: int) -> list[Piece]:
+    """Every form of feedback with every budget, beside agents that nobody guides."""
+    options = {**HALLS, **options}
+    pieces = [
+        Piece("clutter", name, "none", ("none",), (), SEEDS, options, minutes // 2, "unguided agents, of every figure"),
+        Piece(
+            "clutter", name, "heuristic", ("heuristic",), (), SEEDS, options, minutes // 2, "against walking straight"
+        ),
+    ]
+    for kind in ASKING:
+        serves = f"labels of {kind}"
+        pieces.append(Piece("clutter", name, f"{kind}-few", (kind,), FEW, SEEDS, options, minutes, serves))
+        pieces.append(Piece("clutter", name, f"{kind}-many", (kind,), MANY, SEEDS, options, minutes + 3, serves))
+    return pieces
+
+
+def variations(minutes: int) -> list[Piece]:
+    """Five hundred labels of a faulty teacher, and other ways to ask; then paced."""
+    options = {**HALLS, **FRAME}
+    relative = ("relative",)
+    pieces = [
+        Piece(
+            "clutter", name, "relative", relative, (500,), SEEDS, {**options, **fault}, minutes // 2, "faulty teachers"
+        )
+        for name, fault in FAULTS.items()
+    ]
+    pieces += [
+        Piece("clutter", name, "relative", relative, (100, 500), SEEDS, {**options, **way}, minutes, "what is asked")
+        for name, way in WAYS.items()
+    ]
+    paced = {**options, "sizes.pace": True}
+    random = {**paced, **FAULTS["random"]}
+    serves = "guidance never costs"
+    pieces += [
+        Piece("clutter", "paced", "heuristic", ("heuristic",), (), SEEDS, paced, minutes // 2, serves),
+        Piece("clutter", "paced", "relative", relative, (500,), SEEDS, paced, minutes // 2, serves),
+        Piece("clutter", "paced-random", "relative", relative, (500,), SEEDS, random, minutes // 2, serves),
+    ]
+    return pieces
+
+
+PIECES = (*budgets("frame", FRAME, 16), *budgets("raw", RAW, 16), *variations(16))
+
+SCALES = {
+    "smoke": Scale(
+        "seconds a piece on a CPU, to see that everything runs",
+        seeds=2,
+        labels={25: 5, 350: 10, 500: 15},
+        options={
+            "task.worlds": 2,
+            "task.max-steps": 20,
+            "sizes.q-layers": 16,
+            "sizes.feedback-layers": 16,
+            "sizes.directions": 12,
+            "sizes.target-directions": 6,
+            "sizes.target-dtype": "float32",
+            "sizes.n-step": 3,
+            "sizes.replay-capacity": 200,
+            "sizes.labels-per-round": 5,
+            "sizes.fit-steps": 20,
+            "sizes.fit-batch-size": 10,
+            "sizes.lanes-per-block": 1,
+            "schedule.total-steps": 200,
+            "schedule.random-steps": 50,
+            "schedule.learn-after": 50,
+            "schedule.guidance-until": 200,
+            "schedule.eval-every": 100,
+            "schedule.eval-envs": 5,
+            "schedule.eval-steps": 100,
+            "schedule.checkpoint-every": 200,
+        },
+        instead={"schedule.ask-at": (0, 100)},
+    ),
+    "quick": Scale(
+        "minutes a piece on an accelerator, to see where it goes",
+        seeds=4,
+        labels={100: 100, 500: 500},
+        options={
+            "schedule.total-steps": 50_000,
+            "schedule.guidance-until": 30_000,
+            "schedule.eval-every": 5_000,
+            "schedule.checkpoint-every": 50_000,
+        },
+        instead={"schedule.ask-at": (0, 5_000, 10_000)},
+    ),
+    "paper": Scale("what is reported"),
+}
+
+EXPERIMENT = Experiment(
+    "navigation",
+    PIECES,
+    SCALES,
+    report={"clutter": ("--level", "0.9", "--within", "1", "--reference", "relative")},
+    metric=("--metric", "success"),
+)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs what is asked for; returns the exit status."""
+    return run(EXPERIMENT, __doc__ or "", arguments)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

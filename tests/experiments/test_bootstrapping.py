@@ -1,0 +1,187 @@
+"""The sweeps of label efficiency: every piece is a legal command, fits its half hour, runs, and ends in a report."""
+
+import csv
+import dataclasses
+import importlib
+import sys
+from itertools import chain
+from pathlib import Path
+
+import pytest
+
+from cuelearner_jax.cli import main
+from cuelearner_jax.cli.parsing import parse
+from cuelearner_jax.cli.report import Report
+from cuelearner_jax.config import Scalars, Schedule, Sizes
+from cuelearner_jax.guidance import registry
+from cuelearner_jax.report.efficiency import Question, efficiency_of
+from cuelearner_jax.report.efficiency_document import efficiency_lines
+from cuelearner_jax.report.variants import read_groups, variants_of
+from cuelearner_jax.runs import sweep
+from cuelearner_jax.runs.order import planned
+
+FOLDER = Path(__file__).parents[2] / "experiments"
+BUDGETS = [25, 50, 100, 350, 500, 1_000, 2_000, 5_000]
+
+
+@pytest.fixture(scope="module")
+def modules():
+    """Those of the experiments, as Python finds them when it runs one of the files."""
+    sys.path.insert(0, str(FOLDER))
+    names = ("_pieces", "billiards_bootstrapping", "navigation_bootstrapping", "bootstrapping_page")
+    yield {name: importlib.import_module(name) for name in names}
+    sys.path.remove(str(FOLDER))
+
+
+@pytest.fixture(params=["billiards", "navigation"])
+def experiment(request, modules):
+    return modules[f"{request.param}_bootstrapping"].EXPERIMENT
+
+
+def test_pieces_are_bounded_and_no_lane_is_trained_twice(experiment):
+    assert len({piece.path for piece in experiment.pieces}) == len(experiment.pieces)
+    for piece in experiment.pieces:
+        assert piece.lanes <= 64, piece.path
+        assert 0 < piece.minutes <= 30, piece.path
+        if all(map(known_kind, piece.kinds)):
+            assert bool(piece.labels) == any(registry.find(kind).asks for kind in piece.kinds), piece.path
+    variants = [
+        (piece.world, piece.run, kind, budget)
+        for piece in experiment.pieces
+        for kind in piece.kinds
+        for budget in piece.labels or (0,)
+    ]
+    assert len(set(variants)) == len(variants)
+    first = {piece.world: piece for piece in reversed(experiment.pieces)}
+    assert {piece.kinds for piece in first.values()} == {("none",)}  # whom all runs of a world are compared with
+
+
+def test_every_form_of_feedback_has_every_budget(modules):
+    pieces = modules["billiards_bootstrapping"].PIECES
+    for world in ("regulation", "easy"):
+        for kind in ("relative", "demonstration", "scalar", "dcoach"):
+            own = [p for p in pieces if (p.world, p.run, p.kinds) == (world, "frame", (kind,))]
+            assert sorted(chain(*(p.labels for p in own)))[:8] == BUDGETS
+            assert {p.seeds for p in own} == {8}
+    for run in ("raw", "frame"):
+        own = [p for p in modules["navigation_bootstrapping"].PIECES if p.run == run]
+        assert {p.seeds for p in own} == {16}
+        assert sorted({budget for p in own for budget in p.labels}) == BUDGETS[:6]
+
+
+def known_kind(name):
+    return registry.registered(name) is not None
+
+
+def options_known(piece):
+    """Are a piece's options and kinds part of this version?"""
+    fields = {"sizes": Sizes, "scalars": Scalars, "schedule": Schedule}
+    known = {f"{group}.{field.name}" for group, kind in fields.items() for field in dataclasses.fields(kind)}
+    own = {name.replace("-", "_") for name in piece.options if name.partition(".")[0] in fields}
+    return own <= known and all(map(known_kind, piece.kinds))
+
+
+@pytest.mark.parametrize("scale", ["smoke", "quick", "paper"])
+def test_every_piece_is_a_sweep_that_would_begin(experiment, scale, modules, monkeypatch, tmp_path):
+    """The command line itself plans each: options exist, values are legal, counts divide each other."""
+    orders = []
+    monkeypatch.setattr(sweep, "run", lambda order: orders.append(planned(order).order))
+    pieces = modules["_pieces"]
+    different = {}
+    for piece in experiment.pieces:
+        if (left := pieces.scaled(piece, experiment.scales[scale])) and options_known(piece):
+            different.setdefault((str(left.options), left.kinds), left)
+    for piece in different.values():
+        assert main(pieces.sweep_command(experiment.task, piece, tmp_path, resume=False)) == 0, piece.path
+        order = orders[-1]
+        assert order.grid.guidance == piece.kinds
+        assert order.grid.labels == piece.labels or not piece.labels
+        assert order.grid.seeds == tuple(range(4000, 4000 + piece.seeds))
+        assert order.out == tmp_path / piece.path
+    assert len(orders) >= 4
+    if scale == "paper":
+        sizes = {piece.run: order.config.sizes for piece, order in zip(different.values(), orders, strict=True)}
+        assert [sizes[run].frame for run in ("frame", "raw", "paced")] == ["action", "raw", "action"]
+        assert [sizes[run].pace for run in ("frame", "raw", "paced")] == [False, False, True]
+
+
+def test_scales_keep_what_they_say(modules):
+    pieces, data = modules["_pieces"], modules["billiards_bootstrapping"]
+    many = next(piece for piece in data.PIECES if piece.name == "relative-many")
+    assert pieces.scaled(many, data.SCALES["paper"]) == many
+    quick = pieces.scaled(many, data.SCALES["quick"])
+    assert (quick.labels, quick.seeds) == ((500, 1_000), 4)
+    assert quick.options["sizes.frame"] == "action"
+    assert pieces.scaled(many._replace(labels=(50,)), data.SCALES["quick"]) is None
+    later = next(piece for piece in data.PIECES if piece.run == "instalments")
+    assert pieces.scaled(later, data.SCALES["smoke"]).options["schedule.ask-at"] == (0, 100)
+    assert "schedule.ask-at" not in pieces.scaled(many, data.SCALES["smoke"]).options
+
+
+def test_names_choose_pieces_and_folders_of_them(modules, capsys):
+    pieces, data = modules["_pieces"], modules["billiards_bootstrapping"]
+    found = pieces.chosen(data.EXPERIMENT, ["regulation/frame/none", "full/"])
+    assert [piece.path for piece in found] == ["regulation/frame/none", "full/raw/none", "full/raw/relative"]
+    with pytest.raises(SystemExit):
+        data.main(["--pieces", "regulation/fra"])
+    assert "no piece 'regulation/fra': see --list" in capsys.readouterr().err
+    assert data.main(["--list", "--pieces", "full"]) == 0
+    assert "full/raw/relative" in capsys.readouterr().out
+
+
+def test_a_page_shows_sections_between_their_marks_and_nothing_else_changes(modules):
+    page = modules["bootstrapping_page"]
+    text = "# A\n\n<!-- easy -->\nold\n<!-- end of easy -->\n\nrest\n"
+    report = "# t\n\n## Label efficiency\n\n![steps saved](steps_saved.png)\n\n| a |\n\n## Missing\n\n- b\n\n"
+    report += "## Where the numbers come from\n\n- c\n"
+    shown = page.section(report, "../data/easy/report")
+    assert shown == "![steps saved](../data/easy/report/steps_saved.png)\n\n| a |\n\nMissing:\n\n- b"
+    once = page.rendered(text, {"easy": shown})
+    assert once == f"# A\n\n<!-- easy -->\n\n{shown}\n\n<!-- end of easy -->\n\nrest\n"
+    assert page.rendered(once, {"easy": shown}) == once
+    with pytest.raises(ValueError, match="no place for full"):
+        page.rendered(text, {"full": shown})
+    real = (FOLDER.parent / "docs" / "results" / "bootstrapping.md").read_text()
+    worlds = [p.world for name in ("billiards", "navigation") for p in modules[f"{name}_bootstrapping"].PIECES]
+    page.rendered(real, dict.fromkeys(worlds, "x"))  # every world has its place
+
+
+def test_a_smoke_of_the_easy_table_runs_resumes_and_reports(modules, tmp_path, capsys):
+    data = modules["billiards_bootstrapping"]
+    asked = ["--scale", "smoke", "--out", str(tmp_path), "--pieces", "easy/frame/none", "easy/frame/relative-few"]
+    assert data.main(asked) == 0
+    out = tmp_path / "smoke" / "easy"
+    with (out / "report" / "efficiency.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [(row["run"], row["guidance"], row["labels"], row["seeds"]) for row in rows] == [
+        ("frame", "none", "0", "2"),
+        ("frame", "relative", "5", "2"),
+    ]
+    before = (out / "frame" / "none" / "none" / "results.parquet").stat().st_mtime_ns
+    capsys.readouterr()
+    assert data.main([*asked, "--resume"]) == 0
+    assert (out / "frame" / "none" / "none" / "results.parquet").stat().st_mtime_ns == before
+    assert data.main(asked) == 2  # begun already, and --resume was not given
+
+
+def said_of(world, modules):
+    """What the page says of a world, and what the recorded runs of it give, as far as it is computed from them."""
+    pieces, page = modules["_pieces"], modules["bootstrapping_page"]
+    text = (FOLDER.parent / "docs" / "results" / "bootstrapping.md").read_text(encoding="utf-8")
+    shown = text.split(f"<!-- {world} -->\n")[1].split(f"<!-- end of {world} -->")[0].strip()
+    (experiment,) = (e for e in page.EXPERIMENTS if any(piece.world == world for piece in e.pieces))
+    data = FOLDER.parent / "docs" / "data" / "bootstrapping"
+    command = pieces.report_command(experiment, world, data, "paper") or []
+    if "--efficiency" not in command:
+        return shown, ""
+    asked = parse(Report, command[1:], "report")
+    groups = read_groups(asked.folders, None, asked.metric, asked.split, by_run=True)
+    question = Question(**asked.question)
+    lines = efficiency_lines(efficiency_of(variants_of(groups, asked.metric), question, asked.lower_is_better))
+    return shown, page.section("\n".join([*lines, page.LAST]), f"../data/bootstrapping/{world}/report")
+
+
+@pytest.mark.parametrize("world", ["regulation", "easy", "full", "clutter"])
+def test_the_page_says_what_the_recorded_runs_give_and_nothing_where_there_are_none(world, modules):
+    shown, given = said_of(world, modules)
+    assert shown.split("\n\nMissing:")[0] == given

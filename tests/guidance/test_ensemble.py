@@ -1,0 +1,121 @@
+"""Ensembles: their mean, how far members are apart, which question that chooses."""
+
+import dataclasses
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import probes
+import pytest
+
+from cuelearner_jax import actions, asking
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.guidance import registry
+from cuelearner_jax.guidance.ensemble import ensemble
+from cuelearner_jax.guidance.questions import about_base
+from cuelearner_jax.policies import Uniform
+from cuelearner_jax.types import GuidanceModel
+
+ENV = probes.Window()
+OBS = actions.evenly_spaced(5)
+BASE = actions.rotate(OBS, 0.3)
+ONE = dataclasses.replace(probes.SIZES, feedback_layers=(8,), fit_steps=20)
+FOUR = dataclasses.replace(ONE, ensemble=4)
+CHOOSING = dataclasses.replace(FOUR, candidates=6)
+
+
+def linear(env, params, obs, actions):
+    """Two outputs: the observation's first entry times a member's number, and the action's."""
+    return jnp.stack([params * obs[:, 0], params * actions[:, 0]], -1)
+
+
+def test_an_ensemble_predicts_its_members_mean_and_tells_their_variance():
+    made = ensemble(3, jax.random.normal, linear)
+    params = jnp.array([1.0, 2.0, 6.0])
+    np.testing.assert_allclose(made.predict(None, params, OBS, BASE), linear(None, 3.0, OBS, BASE), rtol=1e-6)
+    apart = made.disagreement(GuidanceModel(params, jnp.array(True)), None, OBS, BASE)
+    np.testing.assert_allclose(apart, 14 / 3 * (OBS[:, 0] ** 2 + BASE[:, 0] ** 2), rtol=1e-5)
+    assert len(set(np.asarray(made.init(jax.random.key(0))).tolist())) == 3
+
+
+def test_one_member_is_the_network_itself():
+    made = ensemble(1, jax.random.normal, linear)
+    assert (made.init, made.predict, made.disagreement) == (jax.random.normal, linear, None)
+
+
+def test_members_that_are_the_same_predict_what_one_does_and_do_not_disagree():
+    single, several = (registry.make("relative", sizes, ENV) for sizes in (ONE, FOUR))
+    alone = single.init(jax.random.key(0)).replace(fitted=jnp.array(True))
+    same = alone.replace(params=jax.tree.map(lambda leaf: jnp.stack([leaf] * 4), alone.params))
+    everywhere = jnp.ones(5, bool)
+    one, mean = (b.act(m, ENV, OBS, BASE, everywhere, probes.SCALARS) for b, m in ((single, alone), (several, same)))
+    np.testing.assert_allclose(one.actions, mean.actions, atol=1e-5)
+    np.testing.assert_allclose(several.disagreement(same, ENV, OBS, BASE), 0, atol=1e-10)
+    apart = several.disagreement(several.init(jax.random.key(0)), ENV, OBS, BASE)
+    assert apart.min() > 1e-6
+    assert single.disagreement is None
+
+
+# Which question.
+
+
+def begun(guidance, sizes, budget=20):
+    slots = asking.label_slots(budget, sizes)
+    return asking.start(guidance, ENV, slots, budget, jax.random.key(1), jax.random.key(2), sizes.candidates)
+
+
+def test_the_candidate_is_asked_about_on_which_members_disagree_most_and_all_walk_on():
+    several = registry.make("relative", CHOOSING, ENV)
+    told = several._replace(
+        question=about_base, disagreement=lambda model, env, obs, actions: 2 * obs[:, 0] + actions[:, 1]
+    )
+    guide = begun(told, CHOOSING)
+    assert guide.obs.shape == (6, 2)
+    assert len(np.unique(np.asarray(guide.obs), axis=0)) > 1
+    fitted = guide.replace(model=guide.model.replace(fitted=jnp.array(True)))
+    key, expert = jax.random.key(7), probes.Expert(ENV)
+    keys = asking.question_keys(key, 0)
+    proposed = Uniform().act(keys.base, fitted.env, fitted.obs)
+    best = int(np.argmax(2 * fitted.obs[:, 0] + proposed[:, 1]))
+    assert best != 0
+    for asked, index in ((guide, 0), (fitted, best)):  # members that were never fitted have no say
+        after = asking.ask(told, ENV, expert, probes.SCALARS, Uniform(), asked, key, jnp.asarray(0))
+        np.testing.assert_array_equal(after.labels.obs[0], asked.obs[index])
+        np.testing.assert_array_equal(after.labels.action[0], proposed[index])
+        error = actions.difference(proposed[index], ENV.best(asked.obs[index]))
+        h = 0.0 if abs(float(error)) <= np.deg2rad(10) else float(np.sign(error))
+        assert after.labels.answer[0].tolist() == [h]
+        assert after.labels.valid.sum() == 1
+        states, steps = jax.vmap(ENV.step)(jax.random.split(keys.env, 6), asked.env, proposed)
+        chex.assert_trees_all_equal((after.env, after.obs), (states, steps.obs))
+
+
+def test_rounds_of_chosen_questions_fill_the_budget_and_fit_each_member_from_numbers_of_its_own():
+    several = registry.make("relative", CHOOSING, ENV)
+    guide, expert, key = begun(several, CHOOSING, budget=15), probes.Expert(ENV), jax.random.key(3)
+    one = jax.jit(
+        lambda guide: asking.label_round(several, CHOOSING, ENV, expert, probes.SCALARS, Uniform(), guide, key)
+    )
+    for _ in range(2):
+        guide = one(guide)
+    assert np.asarray(guide.labels.valid).tolist() == [True] * 15 + [False] * 5
+    assert int(guide.asked) == 15
+    assert bool(guide.model.fitted)
+    chex.assert_tree_shape_prefix(guide.model.params, (4,))
+    for kernel in (leaf for leaf in jax.tree.leaves(guide.model.params) if leaf.ndim == 3):
+        assert all(not np.array_equal(kernel[i], kernel[j]) for i in range(4) for j in range(i))
+
+
+def test_kinds_of_one_model_are_refused_where_members_are_wanted(monkeypatch):
+    monkeypatch.setattr(registry, "_KINDS", dict(registry._KINDS))
+    kind = registry.find("relative")
+
+    def make(sizes, spaces):
+        return kind.make(ONE, spaces)._replace(name="single")
+
+    registry.register(dataclasses.replace(kind, name="single", make=make))
+    with pytest.raises(UserError, match="'single' has one model, no ensemble of them: leave out") as refusal:
+        registry.make("single", CHOOSING, ENV)
+    assert "\n" not in str(refusal.value)
+    assert registry.make("none", CHOOSING, ENV).name == "none"  # which asks nothing

@@ -1,0 +1,293 @@
+"""How far labels carry, on curves whose answers are known by hand; and the command that tells it."""
+
+import csv
+import json
+from collections.abc import Sequence
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+
+from cuelearner_jax.cli import main
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.records import results
+from cuelearner_jax.records.guides import GuideWriter
+from cuelearner_jax.report.document import report
+from cuelearner_jax.report.efficiency import Question, efficiency_of
+from cuelearner_jax.report.statistics import Interval, curve, interval, mean_over_curve
+from cuelearner_jax.report.variants import Variant, read_groups, variants_of
+
+STEPS = np.arange(0, 101, 10)
+
+
+def ramp(slope, most=1.0):
+    """A curve of that many units over all steps."""
+    return np.minimum(slope * STEPS / 100, most)
+
+
+def variant(guidance, labels, curves, *, run="", guide: Sequence[float] | None = None):
+    values = np.atleast_2d(np.asarray(curves, float))
+    mean = interval(mean_over_curve(STEPS, values))
+    known = None if guide is None else np.asarray(guide, float)
+    seeds = np.arange(len(values))
+    return Variant(guidance, labels, seeds, values, curve(STEPS, values), mean, np.array([], int), run, known)
+
+
+def same(guidance, labels, slope, **more):
+    """Five seeds that are all alike, so that every interval is its estimate."""
+    return variant(guidance, labels, [ramp(slope)] * 5, **more)
+
+
+def numbers(known):
+    return [float(value) for value in (*known.bounds, known.lower, known.upper)]
+
+
+def test_known_curves_give_known_steps_ratios_and_areas():
+    unguided, guided = same("none", 0, 1.0), same("relative", 100, 2.0, guide=[0.1] * 5)
+    found = efficiency_of([unguided, guided], Question(level=0.6))
+    (plain, steered) = found.carried
+    assert numbers(plain.steps) == pytest.approx([60.0] * 4)
+    assert numbers(steered.steps) == pytest.approx([30.0] * 4)
+    assert numbers(steered.ratio) == pytest.approx([0.5] * 4)
+    assert (plain.reached, steered.reached) == (1.0, 1.0)
+    assert plain.ratio is None
+    # Areas: a half of a triangle; a triangle to the middle and a rectangle after it.
+    assert list(map(float, plain.variant.mean)) == pytest.approx([0.5] * 3)
+    assert list(map(float, steered.variant.mean)) == pytest.approx([0.75] * 3)
+    assert steered.area_difference is not None
+    assert steered.area_ratio is not None
+    assert list(map(float, steered.area_difference)) == pytest.approx([0.25] * 3)
+    assert list(map(float, steered.area_ratio)) == pytest.approx([1.5] * 3)
+    assert isinstance(steered.guide, Interval)
+    assert list(map(float, steered.guide)) == pytest.approx([0.1] * 3)
+    assert found.level == 0.6
+
+
+def test_the_level_is_the_unguided_agents_at_a_step():
+    variants = [same("none", 0, 0.8), same("relative", 100, 1.6)]
+    assert efficiency_of(variants, Question(level_at=50)).level == pytest.approx(0.4)
+    found = efficiency_of(variants, Question())
+    assert found.level == pytest.approx(0.8)
+    assert found.origin == "that of no guidance at step 100"
+    with pytest.raises(UserError, match="--level-at 55: no guidance has no such step, but 0, 10, 20"):
+        efficiency_of(variants, Question(level_at=55))
+    with pytest.raises(UserError, match="no results of unguided agents"):
+        efficiency_of(variants[1:], Question())
+    with pytest.raises(UserError, match="no better than what no guidance begins with"):
+        efficiency_of(variants, Question(level=0.0))
+    with pytest.raises(UserError, match="give one of them"):
+        Question(level=0.1, level_at=10)
+    assert efficiency_of(variants[1:], Question(level=0.8)).carried[0].ratio is None
+
+
+def test_intervals_hold_what_seeds_differ_in():
+    """Slopes of 1 to 2: the interquartile mean of the guided reaches 0.5 between the steps 25 and 50."""
+    slopes = np.linspace(1.0, 2.0, 12)
+    found = efficiency_of(
+        [same("none", 0, 0.5), variant("relative", 100, [ramp(slope) for slope in slopes])], Question(level=0.5)
+    )
+    steps = found.carried[1].steps
+    assert 25 < steps.lower < float(steps.bounds.lower) < steps.upper < 50
+    ratio = found.carried[1].ratio
+    assert ratio is not None
+    # The unguided seeds are all alike and take 100 steps, so the ratio's interval is that of the steps.
+    assert numbers(ratio) == pytest.approx([value / 100 for value in numbers(steps)])
+
+
+def test_a_curve_that_never_gets_there_is_a_bound_and_no_number():
+    never = same("relative", 100, 0.3)
+    found = efficiency_of([same("none", 0, 1.0), never], Question(level=0.5)).carried[1]
+    assert numbers(found.steps) == [100.0, np.inf, 100.0, np.inf]
+    assert numbers(found.ratio) == [2.0, np.inf, 2.0, np.inf]  # more than 100 steps over 50
+    assert found.reached == 0.0
+    row = found.row()
+    assert (row["steps_to_level"], row["steps_to_level_above"], row["steps_to_level_upper"]) == ("", 100.0, np.inf)
+    assert (row["steps_ratio"], row["steps_ratio_above"], row["steps_ratio_lower"]) == ("", 2.0, 2.0)
+    # Unguided agents that never get there: the others need less than their share of all steps.
+    found = efficiency_of([same("none", 0, 0.3), same("relative", 100, 1.0)], Question(level=0.5)).carried[1]
+    assert numbers(found.ratio) == [0.0, 0.5, 0.0, 0.5]
+    assert found.row()["steps_ratio_below"] == 0.5
+
+
+def test_a_level_that_some_draws_reach_leaves_the_interval_open():
+    """Half of the seeds reach 0.5 at step 50, half stay at 0.4: draws of either kind are many."""
+    mixed = variant("relative", 100, [ramp(1.0)] * 4 + [ramp(1.0, most=0.4)] * 4)
+    found = efficiency_of([same("none", 0, 1.0), mixed], Question(level=0.5)).carried[1]
+    assert 0.3 < found.reached < 1.0
+    assert found.steps.lower < 100
+    assert found.steps.upper == np.inf
+
+
+def test_a_single_seed_has_no_interval():
+    found = efficiency_of([same("none", 0, 1.0), variant("relative", 100, [ramp(2.0)])], Question(level=0.5)).carried[1]
+    assert np.isnan([found.steps.lower, found.steps.upper]).all()
+    assert float(found.steps.bounds.lower) == 25.0
+    assert found.row()["steps_to_level_lower"] == ""
+
+
+def test_the_smallest_budget_in_time():
+    variants = [same("none", 0, 0.5)]  # 0.4 at step 80: in time is by step 40, of slope 1
+    variants += [same("relative", budget, slope) for budget, slope in ((50, 0.7), (100, 1.1), (500, 2.0))]
+    variants += [same("scalar", budget, 0.6) for budget in (50, 500)]
+    found = efficiency_of(variants, Question(level=0.4, within=0.5)).labels_to_level
+    assert [(each.guidance, each.budgets) for each in found] == [("relative", (50, 100, 500)), ("scalar", (50, 500))]
+    assert numbers(found[0].labels) == [100.0] * 4
+    assert numbers(found[1].labels) == [500.0, np.inf, 500.0, np.inf]
+    assert [each.reached for each in found] == [1.0, 0.0]
+    with pytest.raises(UserError, match="--within is 0"):
+        Question(within=0.0)
+
+
+def test_labels_for_equal_areas():
+    """Ten times as many scalar labels do what relative ones do; outside their budgets there is a bound alone."""
+    slopes = {10: 0.2, 100: 0.4, 1000: 0.6}
+    variants = [same("relative", budget, slope) for budget, slope in slopes.items()]
+    variants += [same("scalar", 10 * budget, slope) for budget, slope in slopes.items()]
+    found = efficiency_of(variants, Question(level=0.1)).equal_area
+    ratios = {(each.reference, each.reference_labels, each.guidance): numbers(each.ratio) for each in found}
+    assert ratios["relative", 100, "scalar"] == pytest.approx([10.0] * 4)
+    assert ratios["relative", 1000, "scalar"] == pytest.approx([10.0] * 4)
+    assert ratios["relative", 10, "scalar"] == pytest.approx([0.0, 10.0, 0.0, 10.0])  # its smallest budget does as well
+    assert ratios["scalar", 1000, "relative"] == pytest.approx([0.1] * 4)
+    assert found[1].area == pytest.approx(0.2)
+    better = [same("relative", budget, 2 * slope) for budget, slope in slopes.items()]
+    found = efficiency_of([*better, *variants[3:]], Question(level=0.1, reference="relative")).equal_area
+    assert [(each.reference, each.reference_labels) for each in found] == [("relative", b) for b in slopes]
+    assert numbers(found[2].labels) == [10000.0, np.inf, 10000.0, np.inf]
+    with pytest.raises(UserError, match="--reference dcoach: no results with its labels; there are relative, scalar"):
+        efficiency_of(variants, Question(level=0.1, reference="dcoach"))
+
+
+def test_of_collisions_fewer_are_better():
+    def falling(guidance, labels, slope):
+        return variant(guidance, labels, [1 - ramp(slope)] * 3)
+
+    variants = [falling("none", 0, 0.5), falling("relative", 10, 1.0), falling("scalar", 10, 0.5)]
+    variants += [falling("relative", 100, 1.0), falling("scalar", 100, 1.0)]
+    found = efficiency_of(variants, Question(level=0.6), lower_is_better=True)
+    assert numbers(found.carried[0].steps) == pytest.approx([80.0] * 4)
+    assert numbers(found.carried[1].ratio) == pytest.approx([0.5] * 4)
+    difference = found.carried[1].area_difference
+    assert difference is not None
+    assert float(difference.estimate) == pytest.approx(-0.25)
+    equal = {(each.reference, each.reference_labels): each for each in found.equal_area}
+    assert equal["relative", 100].area == pytest.approx(0.5)
+    assert numbers(equal["relative", 100].labels) == pytest.approx([100.0] * 4)
+
+
+def test_runs_are_compared_with_their_own_unguided_agents_or_the_first():
+    variants = [same("none", 0, 0.5, run="raw"), same("relative", 100, 1.0, run="raw")]
+    variants += [same("none", 0, 1.0, run="frame"), same("relative", 100, 1.0, run="frame")]
+    variants += [same("relative", 100, 2.0, run="nearest")]
+    found = efficiency_of(variants, Question(level=0.5)).carried
+    assert [each.against and each.against.run for each in found] == [None, "raw", None, "frame", "raw"]
+    assert [numbers(each.ratio)[0] for each in found if each.ratio] == pytest.approx([0.5, 1.0, 0.25])
+
+
+# --- the command -----------------------------------------------------------------------------------------------------
+
+
+def write(folder, guidance, labels, slope, *, seeds: Sequence[int] = range(4), guide=0.1):
+    known = {"run": folder.name, "task": "one_ball", "guidance": guidance, "config_hash": folder.parent.name}
+    with results.ResultsWriter(folder, **known) as writer:
+        for step, value in zip(STEPS, ramp(slope), strict=True):
+            row = {"reward": value + 0.001 * np.array(seeds)}
+            row |= {"guide_reward": guide + 0.001 * np.array(seeds)} if step == 0 else {}
+            writer.append(step=step, split="validation", seed=np.array(seeds), labels=labels, wall_s=1.0, **row)
+    (folder / "config.json").write_text(json.dumps({"total_steps": int(STEPS[-1])}))
+
+
+@pytest.fixture
+def runs(tmp_path):
+    for run, factor in (("raw", 0.5), ("frame", 1.0)):
+        write(tmp_path / run / "none", "none", 0, factor)
+        for kind, better in (("relative", 1.6), ("scalar", 1.2)):
+            for labels, more in ((100, 0.0), (500, 0.5)):
+                write(tmp_path / run / f"{kind}-{labels}", kind, labels, factor * (better + more), guide=0.1 * better)
+    return tmp_path
+
+
+def test_the_same_results_give_the_same_numbers(runs):
+    variants = variants_of(read_groups([runs / "raw"], None, "reward", "validation", by_run=False), "reward")
+    first = efficiency_of(variants, Question(level=0.4))
+    assert first.tables() == efficiency_of(variants, Question(level=0.4)).tables()
+    # What is said of a variant does not hang on the others that are there.
+    alone = efficiency_of(variants[:2], Question(level=0.4))
+    assert alone.carried[1].row() == first.carried[1].row()
+
+
+def test_a_guide_is_as_good_as_after_its_last_label(runs):
+    """Instalments go on after step 0: what the results say of guides then is not the last word."""
+    folder = runs / "raw" / "relative-100"
+    known = {"run": "raw", "task": "one_ball", "guidance": "relative", "config_hash": "raw", "split": "validation"}
+    with GuideWriter(folder, **known) as writer:
+        for asked, step, good in ((50, 0, 0.2), (100, 40, 0.7)):
+            row = {"asked": asked, "step": step, "round": asked // 10, "labels": 100, "failed": 0.0, "wall_s": 1.0}
+            writer.append(seed=np.arange(4), guide_reward=np.full(4, good), **row)
+    variants = variants_of(read_groups([runs / "raw"], None, "reward", "validation", by_run=False), "reward")
+    found = {(v.guidance, v.labels): v.guide for v in variants}
+    assert found["relative", 100].tolist() == [0.7] * 4
+    assert found["relative", 500] == pytest.approx(0.16 + 0.001 * np.arange(4))
+    assert found["none", 0] == pytest.approx(0.1 + 0.001 * np.arange(4))
+
+
+def rows(file):
+    with file.open() as opened:
+        return list(csv.DictReader(opened))
+
+
+def test_the_command_writes_tables_figures_and_a_section(runs, tmp_path):
+    out = tmp_path / "report"
+    command = ["report", str(runs / "raw"), str(runs / "frame"), "--by-run", "--efficiency", "--level", "0.4"]
+    assert main([*command, "--reference", "relative", "--out", str(out)]) == 0
+    text = (out / "report.md").read_text()
+    section = text.split("## Label efficiency")[1].split("## Missing")[0]
+    assert "The level is 0.400: given." in section
+    table = {(row["run"], row["guidance"], int(row["labels"])): row for row in rows(out / "efficiency.csv")}
+    assert len(table) == 2 * 5
+    own = table["frame", "relative", 500]
+    assert float(own["steps_ratio"]) == pytest.approx(1 / 2.1, abs=0.01)
+    assert float(own["guide"]) == pytest.approx(0.1615)
+    assert own["against"] == "frame: no guidance"
+    shown, _ = (row for row in section.splitlines() if row.startswith("| frame | relative | 500 | "))
+    assert f"| {float(own['steps_ratio']):.2f} [" in shown
+    needed = rows(out / "labels_to_level.csv")
+    # In time, in two thirds of the unguided agents' steps, are slopes of one and a half times theirs.
+    assert {(row["run"], row["guidance"]): float(row["labels"]) for row in needed} == {
+        (run, kind): labels for run in ("raw", "frame") for kind, labels in (("relative", 100), ("scalar", 500))
+    }
+    assert {row["reference"] for row in rows(out / "equal_area.csv")} == {"relative"}
+    summary = rows(out / "summary.csv")
+    assert [float(row["mean"]) for row in summary] == [float(row["mean"]) for row in table.values()]
+    for name in ("labels_to_quality", "steps_saved"):
+        assert f"({name}.png)" in section
+        assert ElementTree.parse(out / f"{name}.svg").getroot().tag.endswith("svg")
+    assert "differ in more than" not in text  # each run has one configuration
+    assert main(["report", str(runs / "raw"), "--out", str(out), "--overwrite"]) == 0
+    left = {path.name for path in out.iterdir()}
+    assert not left & {"efficiency.csv", "labels_to_level.csv", "equal_area.csv", "steps_saved.svg"}
+    assert "Label efficiency" not in (out / "report.md").read_text()
+    assert "run" not in rows(out / "summary.csv")[0]
+
+
+def test_what_cannot_be_asked_is_refused_in_one_line(runs, tmp_path, capsys):
+    def refused(*options, says):
+        capsys.readouterr()
+        assert main(["report", str(runs / "raw"), "--out", str(tmp_path / "report"), *options]) == 2
+        told = capsys.readouterr().err.splitlines()
+        assert len(told) == 1
+        assert told[0].startswith("error: ")
+        assert says in told[0]
+        assert not (tmp_path / "report").exists()
+
+    refused("--level", "0.3", says="--level says what --efficiency is to look for: give both")
+    refused("--efficiency", "--level", "0.3", "--level-at", "50", says="give one of them")
+    refused("--efficiency", "--level-at", "51", says="has no such step")
+    refused("--efficiency", "--within", "1.5", says="--within is 1.5")
+    (tmp_path / "more").mkdir()
+    (runs / "frame").rename(tmp_path / "more" / "raw")
+    both = [tmp_path / "raw", tmp_path / "more" / "raw"]
+    with pytest.raises(UserError, match="leave one of them out, or give --by-run"):
+        report(both, tmp_path / "report")
+    with pytest.raises(UserError, match="several folders are called raw"):
+        report(both, tmp_path / "report", by_run=True)
