@@ -33,7 +33,7 @@ SPREAD_DEG = 1.0  # how far what a teacher means may lie from the aim that descr
 ELSEWHERE = 360  # evenly spaced actions that stand for "it means none of these"
 SLIPS = 0.02  # share of answers that say nothing: any of the words
 WORDS = 3
-DOUBT = 4.0  # where it is so many times likelier that no aim is meant, actions are left as they are
+DOUBT = 2.0  # where it is so many times likelier that no aim is meant, actions are left as they are
 
 
 class Weights(nn.Module):

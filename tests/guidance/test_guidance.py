@@ -197,7 +197,7 @@ def kind_of(name, **fields):
 
 @pytest.mark.parametrize("kind", guidance.known(), ids=lambda kind: kind.name)
 def test_every_kind_is_called_by_its_name_and_made_as_it_is_announced(kind):
-    bundle = guidance.make(kind.name, probes.SIZES, ENV)
+    bundle = guidance.make(kind.name, probes.SIZES, probes.Aimed())
     assert (bundle.name, bundle.form, bundle.asks) == (kind.name, kind.form, kind.asks)
     assert guidance.find(kind.name) is kind
     assert kind in guidance.known()
