@@ -15,6 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
+ROUNDING = 1e-5  # of the largest of values that a Fourier transform averaged
+
 Direction = Float[Array, "... 2"]
 DirectionLike = Direction | Float[np.ndarray, "... 2"]  # what functions take; they give JAX's arrays
 Angle = Float[Array, "..."] | Float[np.ndarray, "..."] | float
@@ -139,9 +141,43 @@ def best_direction(
             table has many) always the same way; without it the choice jumps between far-apart directions from state to
             state and can't be learned from. 0: no habit.
     """
-    count = values.shape[0]
-    turn = jnp.arange(count) * (2 * math.pi / count)
-    distance = jnp.minimum(turn, 2 * math.pi - turn)
-    kernel = jax.nn.softmax(-0.5 * jnp.square(distance / jnp.maximum(spread, 1e-6)))
-    expected = jnp.fft.irfft(jnp.fft.rfft(values) * jnp.fft.rfft(kernel), n=count)
-    return evenly_spaced(count)[jnp.argmax(expected * (1.0 - habit * turn / (2 * math.pi)))]
+    count, expected = values.shape[0], expected_values(values, spread)
+    return evenly_spaced(count)[jnp.argmax(expected * (1.0 - habit * _turns(count) / (2 * math.pi)))]
+
+
+def nearest_direction(
+    values: Float[Array, " count"],
+    spread: Float[Array, ""] | float,
+    share: Float[Array, ""] | float,
+    action: Float[Array, "2"],
+) -> Float[Array, "2"]:
+    """The direction nearest to an action among those of `evenly_spaced(count)` that a player holds for good.
+
+    Good is what is expected to be worth at least a share of the best. Where nothing is worth anything (the best is not
+    above 0), the best alone is.
+
+    Args:
+        values: value of each direction.
+        spread: standard deviation of the aim [rad], over which values are averaged; 0: perfect aim.
+        share: of the best expected value.
+        action: from which it is looked for.
+    """
+    expected = expected_values(values, spread)
+    best = jnp.argmax(expected)
+    worth_it = expected >= (share - ROUNDING) * expected[best]
+    good = jnp.where(expected[best] > 0, worth_it, jnp.arange(values.shape[0]) == best)
+    options = evenly_spaced(values.shape[0])
+    return options[jnp.argmin(jnp.where(good, distance(options, action), jnp.inf))]
+
+
+def expected_values(values: Float[Array, " count"], spread: Float[Array, ""] | float) -> Float[Array, " count"]:
+    """Values of evenly spaced directions, averaged over a normal error of aim of standard deviation `spread` [rad]."""
+    turn = _turns(values.shape[0])
+    around = jnp.minimum(turn, 2 * math.pi - turn)
+    kernel = jax.nn.softmax(-0.5 * jnp.square(around / jnp.maximum(spread, 1e-6)))
+    return jnp.fft.irfft(jnp.fft.rfft(values) * jnp.fft.rfft(kernel), n=values.shape[0])
+
+
+def _turns(count: int) -> Float[Array, " count"]:
+    """How far each of `evenly_spaced(count)` is turned from x, counterclockwise [rad]."""
+    return jnp.arange(count) * (2 * math.pi / count)

@@ -184,7 +184,7 @@ def ask(
     keys = question_keys(lane_key, position)
     actions = question(guidance, env, scalars, base, guide, keys, bound)
     there, action = chosen(guidance, env, guide, actions)
-    answer, answered = guidance.form.answer(keys.answer, teacher, there.env, there.obs, action, scalars)
+    answer, answered = guidance.form.answer(keys.answer, env, teacher, there.env, there.obs, action, scalars)
     told = record(there, position, action, answer, answered)
     return proceed(env, told.replace(env=guide.env, obs=guide.obs), actions, keys)
 

@@ -92,6 +92,10 @@ class GuideSizes(_Seeing):
     """Members of the guidance model, each fitted to all labels; it predicts their mean."""
     candidates: int = 1
     """Situations among which each question is chosen: where the members disagree most (1: as they come)."""
+    guide_directions: int = 360
+    """Directions over which a guide that values actions takes its argmax."""
+    replay_steps: int = 5
+    """Gradient steps on earlier corrections after each new one, of a guide that goes on learning (deep COACH)."""
 
 
 @dataclass(frozen=True)
@@ -152,22 +156,39 @@ class GuideScalars(_Degrees, _Clipping):
     """Share of the labels after the first fit asked about refined actions (DAgger); the rest about base actions."""
     ask_bound_deg: float = 180.0
     """From the second instalment on: questions and guided episodes stay within this of the agent's own action [deg]."""
+    explored_fraction: float = 0.25
+    """Share of the questions that a guide which values actions asks about base actions even so, to find good ones."""
+    correction_replay: int = 50
+    """Newest corrections that a guide which goes on learning (deep COACH) keeps learning from."""
     guided_probability: float = 0.5
     """Probability that an episode is guided."""
 
 
 @dataclass(frozen=True)
 class TeacherFaults(_Degrees):
-    """Traced scalars of a simulated teacher: how it errs."""
+    """Scalars of a simulated teacher: what it answers about, and how it errs; traced, but for words."""
 
+    answer: Literal["best", "nearest"] = "best"
+    """What it has in mind: its best action, or of those that it holds for good the nearest to the one asked about."""
+    nearest_share: float = 0.6
+    """Good is an action worth at least this share of the best one."""
+    nearest_aim_deg: float = 1.0
+    """Standard deviation of the error of aim over which that worth is averaged [deg]."""
+    scalar_good: Literal["near", "scored"] = "near"
+    """Scalar feedback calls good what lies near the action in mind, or what is rewarded at once as well."""
+    scalar_within_deg: float = 5.0
+    """Scalar feedback: how near that is [deg]."""
     mistake_probability: float = 0.0
-    """Teacher's fault: a turn is told the wrong way round with this probability."""
+    """Teacher's fault: with this probability a turn is told the wrong way round, a demonstration errs on the other side
+    of the action asked about, good is called bad and bad good."""
     silence_probability: float = 0.0
-    """Teacher's fault: no answer with this probability (the question still counts as a label)."""
+    """Teacher's fault: no answer, of any form, with this probability (the question still counts as a label)."""
     indifference_deg: float = 0.0
-    """Teacher's fault: errors up to this pass for right (relative feedback alone implies eps / 2) [deg]."""
+    """Teacher's fault: errors up to this pass for right (relative feedback alone implies eps / 2): the action asked
+    about is then the one demonstrated, and called good [deg]."""
     teacher_bias_deg: float = 0.0
-    """Teacher's fault: constant error of what it takes for the best action, counterclockwise [deg]."""
+    """Teacher's fault: constant error, counterclockwise, of what it takes for the best action or for a good one,
+    whatever the form of its answers [deg]."""
 
 
 @dataclass(frozen=True)
@@ -210,7 +231,9 @@ class Schedule:
 
 
 for _traced in (AgentScalars, GuideScalars, TeacherFaults, Scalars, Schedule):
-    jax.tree_util.register_dataclass(_traced, [field.name for field in dataclasses.fields(_traced)], [])
+    _names = [field.name for field in dataclasses.fields(_traced)]
+    _words = [name for name in _names if isinstance(getattr(_traced, name), str)]  # no numbers: part of the program
+    jax.tree_util.register_dataclass(_traced, [name for name in _names if name not in _words], _words)
 
 
 @dataclass(frozen=True)
@@ -326,8 +349,8 @@ def check_guide(sizes: GuideSizes, scalars: GuideScalars) -> None:
     """Raises UserError with one line for the first value of a guide's that cannot work."""
     check_whole(sizes, "sizes")
     check_whole(scalars, "scalars")
-    positive = ("labels_per_round", "fit_steps", "fit_batch_size", "validate_every", "ensemble", "candidates")
-    _check_positive(sizes, positive)
+    positive = ("labels_per_round", "fit_steps", "fit_batch_size", "validate_every", "guide_directions", "replay_steps")
+    _check_positive(sizes, (*positive, "ensemble", "candidates"))
     if sizes.candidates > 1 and sizes.ensemble == 1:
         raise UserError(
             f"sizes.candidates is {sizes.candidates}: questions are chosen by the disagreement of members, so give a "
@@ -342,6 +365,8 @@ def check_guide(sizes: GuideSizes, scalars: GuideScalars) -> None:
         raise UserError(
             f"scalars.eps_deg is {scalars.eps_deg}: a relative label is a turn of more than 0 and up to 180"
         )
+    if scalars.correction_replay < 1:
+        raise UserError(f"scalars.correction_replay is {scalars.correction_replay}: give a positive number")
     if scalars.max_grad_norm <= 0:  # a zero gradient would be scaled by 0 / 0
         raise UserError(f"scalars.max_grad_norm is {scalars.max_grad_norm}: give a positive number")
 
@@ -358,8 +383,13 @@ def _check_layers(layers: tuple[int, ...], name: str) -> None:
 
 
 def _check_numbers(scalars: Any) -> None:
+    types = get_type_hints(type(scalars))
     for name, value in dataclasses.asdict(scalars).items():
-        if name.endswith(("probability", "fraction", "polyak", "weight")) and not 0 <= value <= 1:
+        if get_origin(types[name]) is Literal:
+            if not _fits(value, types[name]):
+                raise UserError(f"scalars.{name} is {value!r}: give {' or '.join(get_args(types[name]))}")
+            continue
+        if name.endswith(("probability", "fraction", "share", "polyak", "weight")) and not 0 <= value <= 1:
             raise UserError(f"scalars.{name} is {value}: give a number from 0 to 1")
         if not math.isfinite(value) or abs(value) > LARGEST_FLOAT:
             raise UserError(f"scalars.{name} is {value}: give a finite number (in single precision)")

@@ -40,6 +40,25 @@ class Teacher(Protocol):
 
 
 @runtime_checkable
+class ValuesDirections(Protocol):
+    """A teacher that holds more than one action for good, and so knows the way to the nearest."""
+
+    def nearest_good(
+        self,
+        state: EnvState,
+        obs: Float[Array, " obs"],
+        action: Float[Array, " action"],
+        spread: Float[Array, ""] | float,
+        share: Float[Array, ""] | float,
+    ) -> Float[Array, " action"]:
+        """Of the actions worth at least a share of the best, averaged over an error of aim, the nearest to `action`.
+
+        `spread` is the standard deviation of the aim [rad]; see `actions.nearest_direction`.
+        """
+        ...
+
+
+@runtime_checkable
 class Policy(Protocol):
     """Anything that acts. A pytree, like an environment; see `policies`."""
 

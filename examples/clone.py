@@ -1,4 +1,4 @@
-"""A guidance of one's own in one file: the teacher shows its best action, a network of the answers acts in its place.
+"""A guidance of one's own in one file: the teacher names a point of the compass, a network of these acts in its place.
 
 Run in the folder above this one, with any task that has a teacher:
 
@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from cuelearner_jax.actions import rotate
+from cuelearner_jax.actions import evenly_spaced, rotate
 from cuelearner_jax.agent.networks import applied, residual_network
 from cuelearner_jax.config import GuideScalars, GuideSizes, Scalars
 from cuelearner_jax.environment import Spaces
@@ -26,16 +26,33 @@ from cuelearner_jax.guidance.questions import about_refined
 from cuelearner_jax.guidance.refining import Refined
 from cuelearner_jax.types import EnvState, GuidanceModel, Label, Params, Teacher
 
+POINTS = 8  # of the compass, counterclockwise from the x axis
 
-def shown(
-    key: PRNGKeyArray, teacher: Teacher, state: EnvState, obs: Array, action: Array, scalars: Scalars
-) -> tuple[Float[Array, "2"], Bool[Array, ""]]:
-    """The best action of a teacher with the faults of `scalars` that mean something here, and whether it answered."""
+
+def named(
+    key: PRNGKeyArray,
+    env: Any,
+    teacher: Teacher,
+    state: EnvState,
+    obs: Float[Array, " obs"],
+    action: Float[Array, " action"],
+    scalars: Scalars,
+) -> tuple[Float[Array, "1"], Bool[Array, ""]]:
+    """The number of the point nearest to the best action of a teacher, and whether it answered.
+
+    Of the faults in `scalars` it has those that mean something here: its bias and its silence.
+    """
     best = rotate(teacher.best_action(state, obs), scalars.radians("teacher_bias"))
-    return best, ~jax.random.bernoulli(key, scalars.silence_probability)
+    return jnp.argmax(evenly_spaced(POINTS) @ best)[None] * 1.0, ~jax.random.bernoulli(key, scalars.silence_probability)
 
 
-FORM = AnswerForm("demonstration", width=2, meaning="x, y of the teacher's best action, a unit vector", answer=shown)
+FORM = AnswerForm(
+    name="compass",
+    width=1,
+    meaning="number of the point of the compass, of eight, counterclockwise from the x axis",
+    answer=named,
+    values=tuple(float(point) for point in range(POINTS)),
+)
 
 
 def make(sizes: GuideSizes, spaces: Spaces) -> Guidance:
@@ -54,8 +71,8 @@ def make(sizes: GuideSizes, spaces: Spaces) -> Guidance:
         return GuidanceModel(init_params(key), jnp.array(False))
 
     def target(label: Label, scalars: GuideScalars) -> Float[Array, "2"]:
-        """What was shown."""
-        return label.answer
+        """The direction of the point that was named."""
+        return evenly_spaced(POINTS)[label.answer[0].astype(int)]
 
     def fit(key: PRNGKeyArray, env: Any, labels: Label, former: GuidanceModel, scalars: GuideScalars) -> GuidanceModel:
         rows = lessons(labels, target, scalars)
@@ -73,4 +90,4 @@ def make(sizes: GuideSizes, spaces: Spaces) -> Guidance:
     return Guidance("clone", FORM, init, about_refined(act), target, fit, act)
 
 
-KIND = Kind("clone", "a network of the actions that the teacher shows", make, form=FORM, colour="#CC79A7")
+KIND = Kind("clone", "a network of the points that the teacher names", make, form=FORM, colour="#CC79A7")

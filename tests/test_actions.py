@@ -161,3 +161,35 @@ def test_expected_value_is_that_of_a_gaussian_aim():
     kernel = np.exp(-0.5 * (np.minimum(apart, 2 * np.pi - apart) / spread) ** 2)
     expected = (kernel / kernel.sum(1, keepdims=True)) @ values * (1 - habit * turn / (2 * np.pi))
     assert index_of(actions.best_direction(jnp.array(values), spread, habit), count) == np.argmax(expected)
+
+
+@pytest.mark.parametrize(
+    ("share", "action", "nearest"),
+    [
+        (0.6, 90, 100),  # a narrower window, worth 0.7 of the best one
+        (0.8, 90, 20),  # for which that is too little
+        (0.6, 101.3, 101),  # already good
+        (0.6, 62, 100),  # 38 degrees away, the other 42
+        (0.6, 58, 20),
+        (0.6, 300, 10),  # over the wrap: 70 degrees, not 158
+        (1.0, 300, 10),
+        (0.0, 222.2, 222),  # anything is good
+    ],
+)
+def test_the_nearest_good_direction_by_hand(share, action, nearest):
+    values = windows(360, (10, 20)) + 0.7 * windows(360, (100, 102))
+    found = actions.nearest_direction(values, 0.0, share, actions.from_angle(action * DEG))
+    assert index_of(found, 360) == nearest
+
+
+def test_worth_is_averaged_over_the_aim_before_it_is_called_good():
+    values = windows(360, (10, 30)) + windows(360, (100, 100))  # one direction alone: nobody hits it
+    assert index_of(actions.nearest_direction(values, 0.0, 0.6, actions.from_angle(90 * DEG)), 360) == 100
+    assert index_of(actions.nearest_direction(values, 3 * DEG, 0.6, actions.from_angle(90 * DEG)), 360) == 29
+
+
+@pytest.mark.parametrize("worth", [0.0, -1.0])
+def test_where_nothing_is_worth_anything_the_best_alone_is_good(worth):
+    values = jnp.full(360, worth) - windows(360, (0, 49), (51, 359))
+    found = actions.nearest_direction(values, 0.0, 0.6, actions.from_angle(200 * DEG))
+    assert index_of(found, 360) == index_of(actions.best_direction(values, 0.0, 0.0), 360) == 50

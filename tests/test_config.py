@@ -26,6 +26,8 @@ from cuelearner_jax.errors import UserError
         ("sizes", {"fit_steps": 0}, "sizes.fit_steps is 0"),
         ("sizes", {"fit_batch_size": 0}, "sizes.fit_batch_size is 0"),
         ("sizes", {"validate_every": 0}, "sizes.validate_every is 0"),
+        ("sizes", {"guide_directions": 0}, "sizes.guide_directions is 0"),
+        ("sizes", {"replay_steps": 0}, "sizes.replay_steps is 0"),
         ("sizes", {"lanes_per_block": -1}, "sizes.lanes_per_block is -1"),
         ("sizes", {"q_layers": ()}, "at least one layer"),
         ("sizes", {"feedback_layers": ()}, "at least one layer"),
@@ -46,6 +48,13 @@ from cuelearner_jax.errors import UserError
         ("scalars", {"mistake_probability": -0.1}, "scalars.mistake_probability is -0.1"),
         ("scalars", {"silence_probability": 2.0}, "scalars.silence_probability is 2.0"),
         ("scalars", {"refined_fraction": 1.1}, "scalars.refined_fraction is 1.1"),
+        ("scalars", {"answer": "worst"}, "scalars.answer is 'worst': give best or nearest"),
+        ("scalars", {"scalar_good": ""}, "scalars.scalar_good is '': give near or scored"),
+        ("scalars", {"nearest_share": 1.1}, "scalars.nearest_share is 1.1: give a number from 0 to 1"),
+        ("scalars", {"nearest_aim_deg": -1.0}, "scalars.nearest_aim_deg is -1.0: give a number that is not negative"),
+        ("scalars", {"scalar_within_deg": math.nan}, "scalars.scalar_within_deg is nan"),
+        ("scalars", {"explored_fraction": 1.5}, "scalars.explored_fraction is 1.5: give a number from 0 to 1"),
+        ("scalars", {"correction_replay": 0}, "scalars.correction_replay is 0: give a positive number"),
         ("scalars", {"polyak": 1.5}, "scalars.polyak is 1.5: give a number from 0 to 1"),
         ("scalars", {"learning_rate": math.nan}, "scalars.learning_rate is nan: give a finite number"),
         ("scalars", {"teacher_bias_deg": -math.inf}, "scalars.teacher_bias_deg is -inf: give a finite number"),
@@ -103,7 +112,11 @@ def test_radians():
 
 
 def test_scalars_and_schedule_are_trees_of_their_numbers_and_sizes_are_not():
-    assert len(jax.tree.leaves(Scalars())) == len(dataclasses.fields(Scalars))
+    words = {"answer": "nearest", "scalar_good": "scored"}
+    assert len(jax.tree.leaves(Scalars())) == len(dataclasses.fields(Scalars)) - len(words)
+    for name, word in words.items():  # part of the program
+        other = dataclasses.replace(Scalars(), **{name: word})
+        assert jax.tree.structure(other) != jax.tree.structure(Scalars())
     assert len(jax.tree.leaves(Schedule())) == len(dataclasses.fields(Schedule))
     assert hash(Sizes()) == hash(Sizes())
 
@@ -119,7 +132,8 @@ def test_other_scalars_and_schedules_compile_nothing_again(group):
 
     before = sum(jax.tree.leaves(group))
     assert float(total(group)) == pytest.approx(before)
-    for name, value in dataclasses.asdict(group).items():
+    numbers = {name: value for name, value in dataclasses.asdict(group).items() if not isinstance(value, str)}
+    for name, value in numbers.items():
         several = isinstance(value, tuple)  # of which the number is fixed
         (first, *rest) = value if several else (value,)
         other = 2 * first + type(first)(1000)

@@ -28,7 +28,7 @@ from cuelearner_jax.errors import UserError
 from cuelearner_jax.face.acting import CallablePolicy, as_policy
 from cuelearner_jax.face.worlds import World
 from cuelearner_jax.guidance import given, registry
-from cuelearner_jax.guidance.answers import RELATIVE
+from cuelearner_jax.guidance.answers import RELATIVE, check_teacher
 from cuelearner_jax.guidance.bundle import Guidance
 from cuelearner_jax.guidance.relative import KIND
 from cuelearner_jax.policies import Guided
@@ -128,6 +128,7 @@ def ask(
     if labels < 1:
         raise UserError(f"labels is {labels}: give at least 1")
     sizes, scalars = _settings(sizes, scalars, eps_deg)
+    check_teacher(teacher, scalars)
     scalars = _bounded(scalars, bound_deg)
     base, env = as_policy(policy), world.env
     guidance = _relative(sizes, spaces_of(env))

@@ -21,6 +21,7 @@ class AnswerFunction(Protocol):
     def __call__(
         self,
         key: PRNGKeyArray,
+        env: Any,
         teacher: Teacher,
         state: EnvState,
         obs: Float[Array, " obs"],
@@ -39,6 +40,8 @@ class AnswerForm(NamedTuple):
     meaning: str  # of an entry, in a few words
     answer: AnswerFunction
     values: tuple[float, ...] | None = None  # that an entry may have; None: any finite number
+    is_action: bool = False  # is an answer an action itself?
+    by_eps: bool = False  # does it mean a turn by eps? Label files then say how much that was
 
 
 @runtime_checkable

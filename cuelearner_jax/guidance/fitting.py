@@ -35,6 +35,11 @@ def lessons(labels: Label, target: TargetFunction, scalars: GuideScalars) -> Les
     return Lesson(labels.obs, labels.action, jax.lax.optimization_barrier(targets), labels.valid)
 
 
+def optimizer(scalars: GuideScalars) -> optax.GradientTransformation:
+    """Gradients clipped to a global norm, then Adam (paper, appendix): that of every guidance model."""
+    return optax.chain(optax.clip_by_global_norm(scalars.max_grad_norm), optax.adam(scalars.feedback_learning_rate))
+
+
 def _subset(valid: Bool[Array, " labels"]) -> Callable[[PRNGKeyArray, int], jax.Array]:
     """Sampler of indices, with replacement, among the true rows of `valid`."""
     order = jnp.argsort(~valid, stable=True)
@@ -50,6 +55,7 @@ def fit_least_squares(
     init: Callable[[PRNGKeyArray], Params],
     apply: Callable[[Params, jax.Array, jax.Array], jax.Array],
     sizes: GuideSizes,
+    redrawn: Callable[[PRNGKeyArray, Lesson], Lesson] = lambda key, batch: batch,
 ) -> GuidanceModel:
     """Fits a model from scratch by least squares (paper, Eq. 3) and keeps the parameters that validated best.
 
@@ -63,11 +69,12 @@ def fit_least_squares(
         rows: lessons (slots, ...), of which the valid ones count.
         init: parameters from a key; with `sizes.ensemble` those of `ensemble`, whose members are fitted each by itself.
         apply: (params, obs (n, obs), actions (n, action)) -> predictions (n, outputs).
+        redrawn: (key, batch (n, ...) of lessons) -> what to train on in its place; validation lessons stay.
 
     Returns:
         The model; its `fitted` is False if there was no valid label to train on.
     """
-    fit = partial(_fit_network, rows=rows, scalars=scalars, apply=apply, sizes=sizes)
+    fit = partial(_fit_network, rows=rows, scalars=scalars, apply=apply, sizes=sizes, redrawn=redrawn)
     return fitted_members(sizes.ensemble, fit, key, init)
 
 
@@ -79,15 +86,14 @@ def _fit_network(
     scalars: GuideScalars,
     apply: Callable[[Params, jax.Array, jax.Array], jax.Array],
     sizes: GuideSizes,
+    redrawn: Callable[[PRNGKeyArray, Lesson], Lesson],
 ) -> GuidanceModel:
     held_out = (jnp.arange(rows.valid.shape[0]) % VALIDATION_STRIDE) == VALIDATION_STRIDE - 1
     validation = rows.valid & held_out
     training = rows.valid & ~held_out
     draw = _subset(training)
     key_init, key_steps = jax.random.split(key)
-    optimizer = optax.chain(
-        optax.clip_by_global_norm(scalars.max_grad_norm), optax.adam(scalars.feedback_learning_rate)
-    )
+    adam = optimizer(scalars)
 
     def loss(params: Params, batch: Lesson) -> jax.Array:
         error = apply(params, batch.obs, batch.action) - batch.target
@@ -95,9 +101,9 @@ def _fit_network(
 
     def step(carry: tuple[Params, optax.OptState], key: PRNGKeyArray) -> tuple[tuple[Params, optax.OptState], None]:
         params, opt_state = carry
-        key_draw, _ = jax.random.split(key)  # so that numbers are those of results that are recorded
-        batch = jax.tree.map(lambda leaf: leaf[draw(key_draw, sizes.fit_batch_size)], rows)
-        updates, opt_state = optimizer.update(jax.grad(loss)(params, batch), opt_state, params)
+        key_draw, key_redraw = jax.random.split(key)
+        batch = redrawn(key_redraw, jax.tree.map(lambda leaf: leaf[draw(key_draw, sizes.fit_batch_size)], rows))
+        updates, opt_state = adam.update(jax.grad(loss)(params, batch), opt_state, params)
         return (optax.apply_updates(params, updates), opt_state), None
 
     def validate(params: Params) -> jax.Array:
@@ -114,7 +120,7 @@ def _fit_network(
 
     params = init(key_init)
     keys = jax.random.split(key_steps, (sizes.fit_steps // sizes.validate_every, sizes.validate_every))
-    start = ((params, optimizer.init(params)), params, jnp.inf)
+    start = ((params, adam.init(params)), params, jnp.inf)
     (_, best, score), _ = jax.lax.scan(stretch, start, keys)
     diverged = ~jnp.isfinite(score) & validation.any()
     best = jax.tree.map(lambda leaf: jnp.where(diverged, jnp.nan, leaf), best)

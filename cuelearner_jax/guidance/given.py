@@ -32,10 +32,11 @@ def check(labels: Label, spaces: Spaces, form: AnswerForm, named: str = "the lab
             raise UserError(f"{named}: {name} have the shape {values.shape}, (labels, {widths[name]}) is needed")
         if not np.isfinite(values).all():
             raise UserError(f"{named}: {name} hold numbers that are not finite: leave these labels out")
-    action = np.asarray(labels.action)
-    # The one action space there is has unit vectors; retract leaves an action of any as it is.
-    if np.abs(np.asarray(spaces.actions.retract(jnp.asarray(action))) - action).max(initial=0.0) > ACTION_ERROR:
-        raise UserError(f"{named}: actions are no unit vectors: divide each by its length")
+    for name in ("actions", "answers") if form.is_action else ("actions",):
+        action = np.asarray(rows[name])
+        # The one action space there is has unit vectors; retract leaves an action of any as it is.
+        if np.abs(np.asarray(spaces.actions.retract(jnp.asarray(action))) - action).max(initial=0.0) > ACTION_ERROR:
+            raise UserError(f"{named}: {name} are no unit vectors: divide each by its length")
     if form.values is not None and not np.isin(labels.answer, form.values).all():
         values = ", ".join(f"{value:g}" for value in form.values)
         raise UserError(f"{named}: an answer is none of {values} ({form.meaning})")

@@ -13,14 +13,16 @@ from typing import Any
 from cuelearner_jax.config import GuideSizes
 from cuelearner_jax.environment import Spaces, offers, spaces_of
 from cuelearner_jax.errors import UserError, closest
-from cuelearner_jax.guidance import heuristic, none, relative
+from cuelearner_jax.guidance import dcoach, demonstration, heuristic, none, relative, scalar
 from cuelearner_jax.guidance.bundle import Guidance
 from cuelearner_jax.guidance.kind import Kind
 from cuelearner_jax.plugins import load
 
 ENTRY_POINTS = "cuelearner.guidances"
 
-_KINDS: dict[str, Kind] = {kind.name: kind for kind in (none.KIND, relative.KIND, heuristic.KIND)}
+_KINDS: dict[str, Kind] = {
+    kind.name: kind for kind in (none.KIND, relative.KIND, heuristic.KIND, demonstration.KIND, scalar.KIND, dcoach.KIND)
+}
 
 
 def register(kind: Kind) -> Kind:

@@ -87,6 +87,9 @@ def _training(group: LaneGroup, block: TrainState) -> dict[str, int]:
         needed["--sizes.fit-batch-size"] = sizes.ensemble * sizes.fit_batch_size * (3 * layers + COPIES * obs)
         needed["--sizes.fit-steps"] = 2 * FLOAT * sizes.fit_steps
         slots = label_slots(group.largest_budget, sizes)
+        valued = min(sizes.num_envs * sizes.guide_directions, max(portions().actions, sizes.guide_directions))
+        needed["--sizes.guide-directions"] = 4 * FLOAT * _widest(group) * valued * sizes.ensemble
+        needed["--sizes.replay-steps"] = FLOAT * sizes.replay_steps * sizes.fit_batch_size
         widest = FLOAT * sizes.ensemble * max(sizes.feedback_layers)
         needed["--labels and --sizes.labels-per-round"] = slots * 2 * widest
         situation = state_bytes((block.guide.env, block.guide.obs)) // block.key.shape[0]

@@ -175,7 +175,7 @@ class Runner:
         assert form is not None
         task = {"name": self.order.task.name, **configuration.to_json(config.task)}
         seeds, labels = self.training.labels()
-        eps = config.scalars.eps_deg
+        eps = config.scalars.eps_deg if form.by_eps else None
         label_files.write(self.folder / label_files.PARQUET, task, form.name, eps, seeds, labels, form.meaning)
 
     def _train(self, saved: Checkpoints, writer: results.ResultsWriter) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from cuelearner_jax.devices import SHARED, lane_mesh, place
 from cuelearner_jax.guidance import registry as guidances
+from cuelearner_jax.guidance.answers import check_teacher
 from cuelearner_jax.records.folders import check_folder, claimed, prepare_folder
 from cuelearner_jax.runs import failures
 from cuelearner_jax.runs.kept import check_standing
@@ -37,6 +38,8 @@ def run(order: Order) -> None:
     groups = [LaneGroup(config, env, kind, order.grid) for kind in kinds]
     asked = any(kind.asks for kind in kinds) and plan.labels is None
     teacher = place(mesh, task.make_teacher(config.task, env), SHARED) if asked else None
+    if asked:
+        check_teacher(teacher, config.scalars)
     examined = task.environment(config.task, order.split)
     with claimed(order.out), interruptible() as stopping, progress_bars() as bars:
         check_folder(order.out, plan.described, order.resume, order.overwrite)  # nobody else can change it any more

@@ -20,11 +20,14 @@ NAVIGATION_SIZES = Sizes(
     n_step=30,
     num_envs=10,
     replay_capacity=100_000,
+    guide_directions=72,
 )
 
-# The paper's step size, discount and eps. The bound on the gradient's norm (0.5) and the target network's rate (0.005)
-# of its billiards code learn more slowly here, see docs/results.md.
-NAVIGATION_SCALARS = Scalars(learning_rate=0.001, discount=0.995, eps_deg=20.0, max_grad_norm=10.0, polyak=0.05)
+# The paper's step size, discount, eps, and what scalar feedback calls good. The bound on the gradient's norm (0.5) and
+# the target network's rate (0.005) of its billiards code learn more slowly here, see docs/results.md.
+NAVIGATION_SCALARS = Scalars(
+    learning_rate=0.001, discount=0.995, eps_deg=20.0, scalar_within_deg=20.0, max_grad_norm=10.0, polyak=0.05
+)
 
 
 def _pictures() -> Pictures:

@@ -69,3 +69,15 @@ class LearnedTeacher(struct.PyTreeNode):
         """The direction with the largest value."""
         values = self.values(obs, geometry.evenly_spaced(self.directions))
         return geometry.best_direction(values, self.aim_error, self.habit)
+
+    def nearest_good(
+        self,
+        state: Any,
+        obs: Float[Array, " obs"],
+        action: Float[Array, "2"],
+        spread: Float[Array, ""] | float,
+        share: Float[Array, ""] | float,
+    ) -> Float[Array, "2"]:
+        """The nearest direction that it holds for good (`cuelearner_jax.types.ValuesDirections`)."""
+        values = self.values(obs, geometry.evenly_spaced(self.directions))
+        return geometry.nearest_direction(values, spread, share, action)

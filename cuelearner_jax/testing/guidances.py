@@ -88,7 +88,7 @@ def _answered(
     teacher = Steady(actions_of(env).spread(8)[3])
 
     def each(key: Array, state: Any, obs: Array, action: Array) -> tuple[Array, Array]:
-        return form.answer(key, teacher, state, obs, action, Scalars())
+        return form.answer(key, env, teacher, state, obs, action, Scalars())
 
     with laws.attempted("its form's `answer`", "it returns (answer, answered), in jax.numpy"):
         answers, answered = jax.jit(jax.vmap(each))(jax.random.split(jax.random.key(1), ROWS), states, obs, actions)

@@ -18,6 +18,7 @@ from cuelearner_jax.runs.grid import Grid, check_grid
 from cuelearner_jax.task import Task, shape_of
 from cuelearner_jax.testing.environments import check_environment
 from cuelearner_jax.testing.laws import Laws
+from cuelearner_jax.types import ValuesDirections
 
 FILMED = 3  # steps
 
@@ -104,13 +105,18 @@ def _check_teacher(laws: Laws, task: Task, config: Any) -> None:
     env = task.environment(config)
 
     @jax.jit
-    def asked(env: Any, key: jax.Array) -> jax.Array:
-        return task.make_teacher(config, env).best_action(*env.reset(key))
+    def asked(env: Any, key: jax.Array) -> dict[str, jax.Array]:
+        teacher, (state, obs) = task.make_teacher(config, env), env.reset(key)
+        best = teacher.best_action(state, obs)
+        if not isinstance(teacher, ValuesDirections):
+            return {"best action": best}
+        return {"best action": best, "nearest good action": teacher.nearest_good(state, obs, best, 0.0, 1.0)}
 
     with laws.attempted("its teacher's best_action", "it gets one state and its observation, in jax.numpy"):
-        action = asked(env, jax.random.key(0))
-    laws.hold(action.ndim == 1, f"its teacher answers an action of shape {action.shape}: give one action")
-    laws.actions(actions_of(env), action, "its teacher's best action")
+        answers = asked(env, jax.random.key(0))
+    for name, action in answers.items():
+        laws.hold(action.ndim == 1, f"its teacher's {name} has shape {action.shape}: give one action")
+        laws.actions(actions_of(env), action, f"its teacher's {name}")
 
 
 def _check_pictures(laws: Laws, task: Task, config: Any, folder: Path) -> None:

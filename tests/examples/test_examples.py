@@ -147,6 +147,13 @@ def test_a_kind_that_asks_needs_a_teacher(home, capsys):
     assert not (home / "new").exists()
 
 
+def test_a_teacher_that_knows_the_best_action_alone_answers_about_no_other(home, capsys):
+    command = ["train", "examples.reach:TASK", *TINY, "--labels", "5", "--guidance", "relative"]
+    command += ["--scalars.answer", "nearest", "--out", home / "new"]
+    refused(capsys, command, "give --scalars.answer best")
+    assert not (home / "new").exists()
+
+
 def test_a_run_goes_on_with_the_same_command(runs, home):
     described = (runs / "clone" / "config.json").read_text()
     rows = results.read(runs / "clone").num_rows

@@ -75,7 +75,9 @@ def told(base, best, scalars=probes.SCALARS):
     bundle, _ = made("relative")
     window = probes.Window(offset=best)
     asked = jax.jit(bundle.form.answer)
-    return asked(jax.random.key(0), probes.Expert(window), jnp.array([1.0, 0.0]), jnp.array([1.0, 0.0]), base, scalars)
+    return asked(
+        jax.random.key(0), window, probes.Expert(window), jnp.array([1.0, 0.0]), jnp.array([1.0, 0.0]), base, scalars
+    )
 
 
 def target_of(base, answer, scalars=probes.SCALARS):

@@ -8,6 +8,7 @@ import pytest
 
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.records import label_files
+from cuelearner_jax.runs import sweep
 from cuelearner_jax.runs.grid import Grid
 from cuelearner_jax.runs.order import Order, read_labels
 
@@ -108,3 +109,39 @@ def test_labels_of_another_world_are_refused_but_for_what_they_do_not_depend_on(
     written(path, task={"name": "window", "half_width_deg": "wide"})
     with pytest.raises(UserError, match="damaged"):
         read_for(path)
+
+
+SMALL = {"q_layers": (4,), "feedback_layers": (4,), "fit_steps": 20, "lanes_per_block": 1, "guide_directions": 6}
+RUN = probes.config(sizes=SMALL, schedule={"total_steps": 16, "guidance_until": 16})
+
+
+def test_demonstrations_are_written_and_taken_again_by_their_own_kind_alone(tmp_path):
+    grid, task = Grid(("demonstration",), (4,), (10,)), probes.make_task()
+    sweep.run(Order(task, RUN, grid, tmp_path / "asked"))
+    path = tmp_path / "asked" / "demonstration" / "labels.parquet"
+    file = label_files.read(path)
+    assert (file.answers, file.eps_deg, file.labels.answer.shape) == ("demonstration", None, (10, 2))
+    sweep.run(Order(task, RUN, grid, tmp_path / "given", labels_from=path))
+    again = label_files.read(tmp_path / "given" / "demonstration" / "labels.parquet")
+    np.testing.assert_array_equal(again.labels.answer, file.labels.answer)
+    for other in ("relative", "scalar", "dcoach"):
+        with pytest.raises(UserError, match=f"holds demonstration answers, guidance {other} needs"):
+            read_for(path, Grid((other,), (4,), (10,)))
+
+
+def test_demonstrations_that_are_no_actions_are_refused(path):
+    rng = np.random.default_rng(0)
+    rows = rng.normal(size=(3, 1, 20, 2)).astype(np.float32)
+    action = rows[1] / np.linalg.norm(rows[1], axis=-1, keepdims=True)
+    labels = probes.label_set(rows[0], action, rows[2], np.ones((1, 20), bool))
+    label_files.write(path, TASK, "demonstration", None, np.array([4]), labels)
+    with pytest.raises(UserError, match="answers are no unit vectors"):
+        read_for(path, Grid(("demonstration",), (4,), (10,)))
+
+
+def test_the_nearest_good_action_is_refused_where_the_teacher_knows_the_best_one_alone(tmp_path):
+    config = dataclasses.replace(RUN, scalars=dataclasses.replace(RUN.scalars, answer="nearest"))
+    order = Order(probes.make_task(), config, Grid(("relative",), (4,), (10,)), tmp_path / "run")
+    with pytest.raises(UserError, match=r"give --scalars\.answer best"):
+        sweep.run(order)
+    assert not (tmp_path / "run").exists()

@@ -43,6 +43,13 @@ class Mistaken(Expert):
         return 2.0 * super().best_action(state, obs)
 
 
+class Halfhearted(Expert):
+    """Holds something for good that is no direction."""
+
+    def nearest_good(self, state, obs, action, spread, share):
+        return 0.5 * action
+
+
 class Field(envs.Env):
     """A walk in the plane: half the action is added to the place; ends past a length of 1."""
 
@@ -120,6 +127,10 @@ BROKEN = {
     "no direction": (
         dataclasses.replace(PROBE, teacher=lambda config, env: Mistaken(env)),
         "its teacher's best action is no action of the space",
+    ),
+    "no good direction": (
+        dataclasses.replace(PROBE, teacher=lambda config, env: Halfhearted(env)),
+        "its teacher's nearest good action is no action of the space",
     ),
     "nothing draws it": (PROBE, "window has no pictures of point"),
     "nothing is written": (with_pictures(DRAWN._replace(still=lambda *_: None)), "window.png was not written"),

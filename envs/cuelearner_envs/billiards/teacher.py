@@ -9,7 +9,7 @@ from flax import struct
 from jaxtyping import Array, Float
 
 from cuelearner_envs.billiards.environment import Balls, Billiards
-from cuelearner_jax.actions import best_direction, evenly_spaced, rotate
+from cuelearner_jax.actions import best_direction, evenly_spaced, nearest_direction, rotate
 
 
 class SearchTeacher(struct.PyTreeNode):
@@ -32,6 +32,17 @@ class SearchTeacher(struct.PyTreeNode):
         """The direction with the largest expected reward. Looks at the true state, not at the observation."""
         return best_direction(self.rewards(state), self.aim_error, self.habit)
 
+    def nearest_good(
+        self,
+        state: Balls,
+        obs: Float[Array, " obs"],
+        action: Float[Array, "2"],
+        spread: Float[Array, ""] | float,
+        share: Float[Array, ""] | float,
+    ) -> Float[Array, "2"]:
+        """The nearest direction that it holds for good (`cuelearner_jax.types.ValuesDirections`)."""
+        return nearest_direction(self.rewards(state), spread, share, action)
+
 
 class Transferred(struct.PyTreeNode):
     """A teacher of one world in another with the same table, level or tilted alike (`cuelearner_jax.types.Teacher`).
@@ -46,5 +57,20 @@ class Transferred(struct.PyTreeNode):
 
     def best_action(self, state: Balls, obs: Float[Array, " obs"]) -> Float[Array, "2"]:
         """What leads to the shot that the teacher holds for best. Looks at the true state, not at the observation."""
-        struck = self.teacher.best_action(state, self.own.observe(state))
+        return self._here(self.teacher.best_action(state, self.own.observe(state)))
+
+    def nearest_good(
+        self,
+        state: Balls,
+        obs: Float[Array, " obs"],
+        action: Float[Array, "2"],
+        spread: Float[Array, ""] | float,
+        share: Float[Array, ""] | float,
+    ) -> Float[Array, "2"]:
+        """The nearest direction of a shot that the teacher holds for good."""
+        struck = rotate(action, self.env.action_turn - self.own.action_turn)
+        return self._here(self.teacher.nearest_good(state, self.own.observe(state), struck, spread, share))
+
+    def _here(self, struck: Float[Array, "2"]) -> Float[Array, "2"]:
+        """What leads here to the shot that a strike leads to where the teacher learned."""
         return rotate(struck, self.own.action_turn - self.env.action_turn)

@@ -203,3 +203,23 @@ def test_a_table_without_a_shipped_teacher_says_what_to_do():
     config = BilliardsConfig("one_ball", teacher="learned")
     with pytest.raises(UserError, match=r"cuelearner teacher train.*search teacher"):
         make_teacher(config, make_environment(config))
+
+
+def test_the_nearest_good_shot_is_that_of_the_averaged_values(wins):
+    """Against sums instead of Fourier transforms, from 40 degrees to the left of straight on."""
+    spread, share = np.deg2rad(2.0), 0.6
+    turn = 2 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS
+    apart = np.minimum(turn, 2 * np.pi - turn)
+    kernel = np.exp(-0.5 * (apart / spread) ** 2)
+    expected = np.stack([np.roll(kernel / kernel.sum(), n) for n in range(DIRECTIONS)], 1) @ wins[:4].T
+    good = expected >= share * expected.max(0)
+    asked = actions.from_angle(jnp.deg2rad(40.0))
+    way = np.abs(np.angle(np.exp(1j * (turn - np.deg2rad(40.0)))))
+    wanted = degrees(actions.from_angle(turn[np.argmin(np.where(good, way[:, None], np.inf), 0)]))
+    few = jax.tree.map(lambda leaf: leaf[:4], (STATES, OBS))
+    for world, turned in ((ONE, 0.0), (make_environment(BilliardsConfig("one_ball", action_turn_deg=3.0)), 3.0)):
+        teacher = SearchTeacher(ONE, AIM, HABIT)
+        teacher = Transferred(teacher, ONE, world) if turned else teacher
+        there = actions.rotate(asked, -np.deg2rad(turned))  # the strike that there is what `asked` is here
+        near = jax.jit(jax.vmap(lambda state, obs, t=teacher, a=there: t.nearest_good(state, obs, a, spread, share)))
+        np.testing.assert_allclose(degrees(near(*few)), wanted - turned, atol=0.01)

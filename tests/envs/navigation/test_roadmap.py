@@ -306,7 +306,7 @@ def answer(teacher, index, pose, goal, action_deg, scalars=SCALARS):
     h, _ = told(key, action, wanted, scalars)
     relative = guidances.make("relative", Sizes(feedback_layers=(8,)), teacher.env)
     where = jax.tree.map(lambda leaf: leaf[0], state)
-    said, answered = asked(key, teacher, where, obs, action, scalars)
+    said, answered = asked(key, teacher.env, teacher, where, obs, action, scalars)
     assert bool(answered)
     assert said.tolist() == [float(h)]
     target = relative.target(Label(obs, action, said, answered), scalars)
