@@ -4,8 +4,8 @@
 likely, the others do not. One network weighs every aim by its features, with the same weights for all; it is fitted by
 the likelihood of the teacher's words, summed over what may have been meant. (Inferring goals from what somebody does or
 says: Baker, Saxe, Tenenbaum, "Action understanding as inverse planning", Cognition 2009.) A pass of refinement goes by
-at most eps toward the likeliest aim and ends there, so precision is the aim's and not the label's. Among aims that are
-about as likely it goes to the nearest: a guide that knows nothing of a situation must not do the same there each time.
+at most eps toward the likeliest aim and ends there, so precision is the aim's and not the label's. Where the teacher
+seems to mean none of them, actions stay as they are: the same bad shot again and again is worse than the agent's own.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ SPREAD_DEG = 1.0  # how far what a teacher means may lie from the aim that descr
 ELSEWHERE = 360  # evenly spaced actions that stand for "it means none of these"
 SLIPS = 0.02  # share of answers that say nothing: any of the words
 WORDS = 3
-LEAN = 0.5  # nats a radian by which an aim that is nearer to the action is preferred
+DOUBT = 4.0  # where it is so many times likelier that no aim is meant, actions are left as they are
 
 
 class Weights(nn.Module):
@@ -89,26 +89,12 @@ def evidence_of(env: Any, space: Actions, label: Label, eps: Float[Array, ""]) -
     return Evidence(aims.features, aims.possible, jnp.concatenate([of_aims, of_none]), label.valid)
 
 
-def preferences(weights: Float[Array, " aims_and_none"], possible: Bool[Array, " aims"]) -> Float[Array, " aims"]:
-    """log-probability of each aim, from log-weights; where none of them is meant, one is as good as another."""
-    share = jax.nn.softmax(weights)
-    evenly = share[-1] / jnp.maximum(possible.sum(), 1)
-    return jnp.where(possible, jnp.log(share[:-1] + evenly), -jnp.inf)
-
-
-def toward_likeliest(
-    space: Actions,
-    preferred: Float[Array, "n aims"],
-    aims: Float[Array, "n aims action"],
-    current: Float[Array, "n action"],
-    eps: Float[Array, ""],
-) -> Float[Array, "n action"]:
-    """The residual: a step of at most eps toward the likeliest aim, which stays that one on the way."""
-    away = space.distance(current[:, None], aims)
-    chosen = jnp.argmax(preferred - LEAN * away, axis=-1)
-    goals = jnp.take_along_axis(aims, chosen[:, None, None], axis=1)[:, 0]
-    step = jnp.minimum(eps, space.distance(current, goals))
-    return space.toward(current, space.sense(current, goals), step) - current
+def likeliest(
+    weights: Float[Array, " aims_and_none"], aims: Float[Array, "aims action"]
+) -> tuple[Float[Array, " action"], Bool[Array, ""]]:
+    """The aim of the largest log-weight, and whether it is likely enough to be followed."""
+    best = jnp.argmax(weights[:-1])
+    return aims[best], weights[best] > weights[-1] - jnp.log(DOUBT)
 
 
 def make(sizes: GuideSizes, spaces: Spaces) -> Guidance:
@@ -150,11 +136,16 @@ def make(sizes: GuideSizes, spaces: Spaces) -> Guidance:
         scalars: GuideScalars,
     ) -> Refined:
         aims: Aims = jax.vmap(env.aims)(obs)
-        preferred = jax.vmap(preferences)(weigh(model.params, aims.features, aims.possible), aims.possible)
+        goals, sure = jax.vmap(likeliest)(weigh(model.params, aims.features, aims.possible), aims.actions)
+
+        def residual(current: Float[Array, "n action"]) -> Float[Array, "n action"]:
+            step = jnp.minimum(scalars.radians("eps"), space.distance(current, goals))
+            return space.toward(current, space.sense(current, goals), step) - current
+
         return refine(
-            lambda current: toward_likeliest(space, preferred, aims.actions, current, scalars.radians("eps")),
+            residual,
             actions,
-            active & aims.possible.any(-1) & model.fitted,
+            active & sure & model.fitted,
             space=space,
             tau=scalars.radians("tau"),
             tau_max=scalars.radians("tau_max"),

@@ -84,14 +84,13 @@ def test_without_a_possible_aim_actions_stay_as_they_are(fitted):
     np.testing.assert_array_equal(acted(fitted, AIMLESS).actions, BASE)
 
 
-def test_without_a_preference_the_nearest_possible_aim_is_meant():
-    bundle = registry.make("intent", SIZES, ENV)
-    unfitted = bundle.init(jax.random.key(0)).replace(fitted=jnp.array(True))  # its weights are all the same
-    refined = acted((bundle, unfitted), ENV).actions
-    turns = np.array([-1.0, 0.6, 2.5])
-    base = np.asarray(actions.difference(OBS, BASE))
-    nearest = turns[np.abs((base[:, None] - turns + np.pi) % (2 * np.pi) - np.pi).argmin(1)]
-    np.testing.assert_allclose(actions.difference(actions.rotate(OBS, jnp.asarray(nearest)), refined), 0.0, atol=1e-5)
+def test_actions_stay_where_it_is_likelier_by_far_that_none_is_meant():
+    aims = actions.evenly_spaced(3)
+    for none, sure in ((math.log(7.9), True), (math.log(8.1), False)):
+        goal, followed = intent.likeliest(jnp.array([0.0, math.log(2.0), -jnp.inf, none]), aims)
+        np.testing.assert_array_equal(goal, aims[1])
+        assert bool(followed) == sure
+    assert not intent.likeliest(jnp.array([-jnp.inf, -jnp.inf, -jnp.inf, 0.0]), aims)[1]
 
 
 def test_an_impossible_aim_has_no_weight(fitted):
