@@ -16,18 +16,20 @@ from collections.abc import Sequence
 
 from _pieces import Experiment, Options, Piece, Scale, run
 
-FEW, MANY = (25, 50, 100, 350), (500, 1_000, 2_000, 5_000)
+BUDGETS = (25, 50, 100, 350, 500, 1_000, 2_000, 5_000)
 CURVE = (10_000, 20_000, 50_000, 100_000)  # simulated: from which number on do labels pay?
 ASKING = ("relative", "intent", "demonstration", "scalar", "dcoach")
 
 REGULATION: Options = {
     "preset": "paper",
-    "sizes.replay-capacity": 2_000_000,  # all steps: as many as the preset's
-    "schedule.total-steps": 2_000_000,
+    "sizes.replay-capacity": 1_000_000,  # all steps: as many as the preset's
+    "schedule.total-steps": 1_000_000,
     "schedule.guidance-until": 500_000,
-    "schedule.eval-every": 100_000,
-    "schedule.checkpoint-every": 500_000,
+    "schedule.eval-every": 50_000,
+    "schedule.checkpoint-every": 250_000,
 }
+# How far agents get alone, whom the others are measured against.
+ALONE: Options = {"sizes.replay-capacity": 2_000_000, "schedule.total-steps": 2_000_000}
 EASY: Options = {
     "preset": "easy",
     "schedule.total-steps": 1_000_000,
@@ -44,7 +46,12 @@ FULL: Options = {
 RAW: Options = {"sizes.frame": "raw", "sizes.pace": False}  # said whatever the presets say
 FRAME: Options = {"sizes.frame": "action", "sizes.pace": False}
 # Fits are as long for a label as those of small budgets are, and rounds as few as keep them within minutes.
-LARGE_ROUNDS: Options = {"sizes.labels-per-round": 2_500, "sizes.fit-steps": 20_000, "sizes.fit-batch-size": 500}
+LARGE_ROUNDS: Options = {
+    "sizes.labels-per-round": 2_500,
+    "sizes.fit-steps": 20_000,
+    "sizes.fit-batch-size": 500,
+    "schedule.guide-eval-every": 2_500,
+}
 FAULTS: dict[str, Options] = {
     "flipped-05": {"scalars.mistake-probability": 0.05},
     "flipped-10": {"scalars.mistake-probability": 0.1},
@@ -65,15 +72,12 @@ WAYS: dict[str, Options] = {
 def budgets(world: str, options: Options, minutes: int) -> list[Piece]:
     """Every form of feedback with every budget seen from the action, beside agents that nobody guides."""
     options = {**options, **FRAME}
-    pieces = [
-        Piece(world, "frame", "none", ("none",), (), 16, options, minutes // 2, "unguided agents, of every figure"),
-        Piece(world, "frame", "heuristic", ("heuristic",), (), 8, options, minutes // 2, "against the obvious shot"),
+    alone = {**options, **(ALONE if world == "regulation" else {})}
+    return [
+        Piece(world, "frame", "none", ("none",), (), 16, alone, minutes // 2, "unguided agents, of every figure"),
+        Piece(world, "frame", "heuristic", ("heuristic",), (), 8, options, minutes // 3, "against the obvious shot"),
+        *(Piece(world, "frame", kind, (kind,), BUDGETS, 8, options, minutes, f"labels of {kind}") for kind in ASKING),
     ]
-    for kind in ASKING:
-        serves = f"labels of {kind}"
-        pieces.append(Piece(world, "frame", f"{kind}-few", (kind,), FEW, 8, options, minutes, serves))
-        pieces.append(Piece(world, "frame", f"{kind}-many", (kind,), MANY, 8, options, minutes + 6, serves))
-    return pieces
 
 
 def curves(world: str, options: Options, minutes: int) -> list[Piece]:

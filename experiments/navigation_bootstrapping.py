@@ -23,7 +23,7 @@ SEEDS = 16
 HALLS: Options = {
     "preset": "paper",
     "sizes.target-dtype": "bfloat16",
-    "schedule.total-steps": 200_000,
+    "schedule.total-steps": 100_000,
     "schedule.guidance-until": 100_000,
     "schedule.eval-every": 10_000,
     "schedule.eval-envs": 200,

@@ -34,12 +34,16 @@ def looked_at(sizes: AgentSizes) -> int:
 
 
 def greedy_actions(
-    sizes: AgentSizes, actions: Actions, env: Any, params: Params, obs: Float[Array, "n obs"]
+    sizes: AgentSizes, actions: Actions, env: Any, params: Params, obs: Float[Array, "n obs"], members: int = 1
 ) -> Float[Array, "n action"]:
     """The greedy actions of one agent, as its sizes have them searched: all of the set, or near the peaks.
 
-    `env` says how an observation looks from an action; in the raw frame nobody asks it.
+    `env` says how an observation looks from an action; in the raw frame nobody asks it. Of several `members` (leading
+    axis of `params`) it is the argmax of their mean value, over all of the set.
     """
+    if members > 1:
+        choose = partial(_of_mean, sizes, actions.spread(sizes.directions), env, params)
+        return jax.lax.map(choose, obs, batch_size=max(1, min(len(obs), portions().actions // sizes.directions)))
     choose = partial(
         _near_peaks if sizes.coarse_directions else _of_all, sizes, actions.spread(sizes.directions), env, params
     )
@@ -50,6 +54,15 @@ def _of_all(
     sizes: AgentSizes, options: Float[Array, "m action"], env: Any, params: Params, obs: Float[Array, " obs"]
 ) -> Float[Array, " action"]:
     return ddqn.greedy(values(sizes, env), params, obs, options)
+
+
+def _of_mean(
+    sizes: AgentSizes, options: Float[Array, "m action"], env: Any, params: Params, obs: Float[Array, " obs"]
+) -> Float[Array, " action"]:
+    def mean(params: Params, obs: Array, options: Array) -> Array:
+        return jax.vmap(values(sizes, env), in_axes=(0, None, None))(params, obs, options).mean(0)
+
+    return ddqn.greedy(mean, params, obs, options)
 
 
 def _near_peaks(

@@ -19,10 +19,11 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 from cuelearner_jax.actions import Actions
 from cuelearner_jax.config import GuideScalars, GuideSizes
 from cuelearner_jax.environment import Spaces
+from cuelearner_jax.guidance.bundle import DisagreementFunction
 from cuelearner_jax.guidance.fitting import Lesson
 from cuelearner_jax.guidance.model import guide_model, residual_model
 from cuelearner_jax.guidance.refining import Refined, refine
-from cuelearner_jax.types import Params
+from cuelearner_jax.types import GuidanceModel, Params
 
 
 class AuxiliaryPolicy(NamedTuple):
@@ -35,6 +36,7 @@ class AuxiliaryPolicy(NamedTuple):
     seen_again: Callable[[PRNGKeyArray, Lesson], Lesson]
     space: Actions
     looks_again: bool  # does what it does hang on from where it sees?
+    disagreement: DisagreementFunction | None  # of the members of an ensemble, for the bundle
 
     def act(
         self,
@@ -65,13 +67,20 @@ def auxiliary_policy(sizes: GuideSizes, spaces: Spaces) -> AuxiliaryPolicy:
         def alone(env: Any, params: Params, obs: Array, views: Array) -> Array:
             return network.predict(env, params, obs, jnp.zeros_like(views))
 
-        return AuxiliaryPolicy(network.init, alone, lambda key, batch: batch, spaces.actions, False)
+        def apart(model: GuidanceModel, env: Any, obs: Array, views: Array) -> Array:
+            assert network.disagreement is not None
+            return network.disagreement(model, env, obs, jnp.zeros_like(views))
+
+        members = apart if network.disagreement else None
+        return AuxiliaryPolicy(network.init, alone, lambda key, batch: batch, spaces.actions, False, members)
     turning = residual_model(sizes, spaces)
 
     def from_there(env: Any, params: Params, obs: Array, views: Array) -> Array:
         return views + turning.predict(env, params, obs, views)
 
-    return AuxiliaryPolicy(turning.init, from_there, partial(_elsewhere, spaces.actions), spaces.actions, True)
+    return AuxiliaryPolicy(
+        turning.init, from_there, partial(_elsewhere, spaces.actions), spaces.actions, True, turning.disagreement
+    )
 
 
 def _elsewhere(space: Actions, key: PRNGKeyArray, batch: Lesson) -> Lesson:

@@ -51,7 +51,7 @@ def make(sizes: GuideSizes, spaces: Spaces) -> Guidance:
     ) -> Refined:
         return policy.act(env, model.params, obs, actions, active & model.fitted, scalars)
 
-    return Guidance("demonstration", DEMONSTRATION, init, about_refined(act), target, fit, act)
+    return Guidance("demonstration", DEMONSTRATION, init, about_refined(act), target, fit, act, policy.disagreement)
 
 
 KIND = Kind("demonstration", "a policy cloned from what the teacher shows", make, form=DEMONSTRATION, colour="#009E73")

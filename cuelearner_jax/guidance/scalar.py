@@ -55,7 +55,7 @@ def make(sizes: GuideSizes, spaces: Spaces) -> Guidance:
         scalars: GuideScalars,
     ) -> Refined:
         guided = active & model.fitted
-        chosen = greedy_actions(searched, space, env, model.params, obs)
+        chosen = greedy_actions(searched, space, env, model.params, obs, sizes.ensemble)
         return Refined(jnp.where(guided[:, None], chosen, actions), guided.astype(jnp.int32))
 
     about_chosen = about_refined(act)
@@ -72,7 +72,7 @@ def make(sizes: GuideSizes, spaces: Spaces) -> Guidance:
         explores = jax.random.bernoulli(k_explore, scalars.explored_fraction)
         return jnp.where(explores, base, about_chosen(k_refined, model, env, obs, base, scalars))
 
-    return Guidance("scalar", SCALAR, init, question, target, fit, act)
+    return Guidance("scalar", SCALAR, init, question, target, fit, act, network.disagreement)
 
 
 KIND = Kind("scalar", "a model of which actions the teacher calls good", make, form=SCALAR, colour="#E69F00")

@@ -88,7 +88,7 @@ def _training(group: LaneGroup, block: TrainState) -> dict[str, int]:
         needed["--sizes.fit-steps"] = 2 * FLOAT * sizes.fit_steps
         slots = label_slots(group.largest_budget, sizes)
         valued = min(sizes.num_envs * sizes.guide_directions, max(portions().actions, sizes.guide_directions))
-        needed["--sizes.guide-directions"] = 4 * FLOAT * _widest(group) * valued
+        needed["--sizes.guide-directions"] = 4 * FLOAT * _widest(group) * valued * sizes.ensemble
         needed["--sizes.replay-steps"] = FLOAT * sizes.replay_steps * sizes.fit_batch_size
         widest = FLOAT * sizes.ensemble * max(sizes.feedback_layers)
         needed["--labels and --sizes.labels-per-round"] = slots * 2 * widest

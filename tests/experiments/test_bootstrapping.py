@@ -107,10 +107,10 @@ def test_every_piece_is_a_sweep_that_would_begin(experiment, scale, modules, mon
 
 def test_scales_keep_what_they_say(modules):
     pieces, data = modules["_pieces"], modules["billiards_bootstrapping"]
-    many = next(piece for piece in data.PIECES if piece.name == "relative-many")
+    many = next(piece for piece in data.PIECES if piece.name == "relative")
     assert pieces.scaled(many, data.SCALES["paper"]) == many
     quick = pieces.scaled(many, data.SCALES["quick"])
-    assert (quick.labels, quick.seeds) == ((500, 1_000), 4)
+    assert (quick.labels, quick.seeds) == ((100, 500, 1_000), 4)
     assert quick.options["sizes.frame"] == "action"
     assert pieces.scaled(many._replace(labels=(50,)), data.SCALES["quick"]) is None
     later = next(piece for piece in data.PIECES if piece.run == "instalments")
@@ -148,7 +148,7 @@ def test_a_page_shows_sections_between_their_marks_and_nothing_else_changes(modu
 
 def test_a_smoke_of_the_easy_table_runs_resumes_and_reports(modules, tmp_path, capsys):
     data = modules["billiards_bootstrapping"]
-    asked = ["--scale", "smoke", "--out", str(tmp_path), "--pieces", "easy/frame/none", "easy/frame/relative-few"]
+    asked = ["--scale", "smoke", "--out", str(tmp_path), "--pieces", "easy/frame/none", "easy/frame/relative"]
     assert data.main(asked) == 0
     out = tmp_path / "smoke" / "easy"
     with (out / "report" / "efficiency.csv").open() as file:

@@ -44,8 +44,9 @@ def test_one_member_is_the_network_itself():
     assert (made.init, made.predict, made.disagreement) == (jax.random.normal, linear, None)
 
 
-def test_members_that_are_the_same_predict_what_one_does_and_do_not_disagree():
-    single, several = (registry.make("relative", sizes, ENV) for sizes in (ONE, FOUR))
+@pytest.mark.parametrize("kind", ["relative", "demonstration", "scalar"])
+def test_members_that_are_the_same_do_what_one_does_and_do_not_disagree(kind):
+    single, several = (registry.make(kind, sizes, ENV) for sizes in (ONE, FOUR))
     alone = single.init(jax.random.key(0)).replace(fitted=jnp.array(True))
     same = alone.replace(params=jax.tree.map(lambda leaf: jnp.stack([leaf] * 4), alone.params))
     everywhere = jnp.ones(5, bool)
