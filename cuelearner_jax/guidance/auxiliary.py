@@ -67,9 +67,9 @@ def auxiliary_policy(sizes: GuideSizes, spaces: Spaces) -> AuxiliaryPolicy:
         def alone(env: Any, params: Params, obs: Array, views: Array) -> Array:
             return network.predict(env, params, obs, jnp.zeros_like(views))
 
-        def apart(model: GuidanceModel, env: Any, obs: Array, views: Array) -> Array:
+        def apart(model: GuidanceModel, env: Any, obs: Array, actions: Array) -> Array:
             assert network.disagreement is not None
-            return network.disagreement(model, env, obs, jnp.zeros_like(views))
+            return network.disagreement(model, env, obs, jnp.zeros_like(actions))
 
         members = apart if network.disagreement else None
         return AuxiliaryPolicy(network.init, alone, lambda key, batch: batch, spaces.actions, False, members)
