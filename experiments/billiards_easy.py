@@ -20,10 +20,10 @@ SCHEDULE = {
     "eval-steps": 5_000,
     "checkpoint-every": 100_000,
 }
-VARIANTS = {
-    "plain": ["--labels", "500", "1000"],
-    "mirrors": ["--task.mirrors", "--labels", "500", "1000"],
-}
+# As recorded, whatever the preset has become: raw coordinates, all directions searched.
+RAW = ["--sizes.frame", "raw", "--sizes.directions", "720", "--sizes.coarse-directions", "0", "--sizes.coarse-dtype", "float32"]
+LABELS = ["--guidance", "none", "relative", "heuristic", "--labels", "500", "1000"]
+VARIANTS = {"plain": [*RAW, *LABELS], "mirrors": [*RAW, *LABELS, "--task.mirrors"]}
 
 
 def main() -> int:

@@ -121,6 +121,7 @@ NAVIGATION = Task(
                     guide_eval_every=50,
                 ),
             ),
+            guidance=("none", "relative", "heuristic"),
             labels=(100, 350, 500),
             seeds=16,
             takes="16 seeds under one guidance: half an hour on one H200; one: half a day on 2 cores, by arithmetic",

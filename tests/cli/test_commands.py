@@ -84,7 +84,9 @@ def test_a_task_alone_is_evaluated_and_drawn_on_any_of_its_tables(tmp_path, caps
         with pytest.raises(SystemExit) as stopped:
             main([command, "billiards", "--help"])
         assert not stopped.value.code
-        assert re.search(r"presets \(--preset.*\):\n  paper +.*\n  easy +.*\n  quickstart", capsys.readouterr().out)
+        assert re.search(
+            r"presets \(--preset.*\):\n  paper +.*\n  regulation +.*\n  easy +.*\n  quickstart", capsys.readouterr().out
+        )
 
 
 def test_an_evaluation_says_how_far_it_is(run_folder, monkeypatch):
