@@ -21,7 +21,7 @@ SCHEDULE = {
     "checkpoint-every": 100_000,
 }
 # As recorded, whatever the preset has become: raw coordinates, all directions searched.
-RAW = ["--sizes.frame", "raw", "--sizes.directions", "720", "--sizes.coarse-directions", "0", "--sizes.coarse-dtype", "float32"]
+RAW = ["--sizes.frame", "raw", "--sizes.directions", "720", "--sizes.coarse-directions", "0"]
 LABELS = ["--guidance", "none", "relative", "heuristic", "--labels", "500", "1000"]
 VARIANTS = {"plain": [*RAW, *LABELS], "mirrors": [*RAW, *LABELS, "--task.mirrors"]}
 
