@@ -13,7 +13,7 @@ from cuelearner_jax.config.groups import (
     Sizes,
     TeacherFaults,
 )
-from cuelearner_jax.config.plain import digest, from_json, to_json
+from cuelearner_jax.config.plain import defaults, digest, from_json, to_json
 
 __all__ = [
     "LARGEST",
@@ -32,6 +32,7 @@ __all__ = [
     "check",
     "check_guide",
     "check_whole",
+    "defaults",
     "digest",
     "from_json",
     "to_json",

@@ -52,6 +52,14 @@ def fits(value: Any, kind: Any) -> bool:
     return isinstance(value, kind) if isinstance(kind, type) else True
 
 
+def defaults(kind: type) -> dict[str, Any]:
+    """The JSON values of a configuration dataclass's fields, of those that have a default."""
+    fields = [field for field in dataclasses.fields(kind) if field.init]
+    plain = {field.name: field.default for field in fields if field.default is not dataclasses.MISSING}
+    made = {field.name: field.default_factory for field in fields if field.default_factory is not dataclasses.MISSING}
+    return json.loads(json.dumps({**plain, **{name: factory() for name, factory in made.items()}}))
+
+
 def digest(values: dict[str, Any]) -> str:
     """Short hash of JSON values: equal configurations have equal hashes."""
     return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:12]
