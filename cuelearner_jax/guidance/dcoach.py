@@ -8,11 +8,14 @@ What differs, and why: corrections come in rounds, so a round's are learned one 
 (`--sizes.labels-per-round 1` learns each at once). "Already right" is an answer here where silence is meant there, and
 holds the policy where it is. There the replay is learned from at every tenth step too, of which a person corrects few;
 here every step is asked about, and `replay_steps` minibatches follow a correction. Adam in place of their SGD: the
-paper's appendix gives all auxiliary policies the same optimiser.
+paper's appendix gives all auxiliary policies the same optimiser. Members of an ensemble are corrected each by itself,
+and differ by where they began and by what they drew from the replay.
 """
 
 from __future__ import annotations
 
+import dataclasses
+from functools import partial
 from typing import Any
 
 import jax
@@ -26,6 +29,7 @@ from cuelearner_jax.environment import Spaces
 from cuelearner_jax.guidance.answers import RELATIVE
 from cuelearner_jax.guidance.auxiliary import auxiliary_policy
 from cuelearner_jax.guidance.bundle import Guidance
+from cuelearner_jax.guidance.ensemble import for_each
 from cuelearner_jax.guidance.fitting import Lesson, lessons, optimizer
 from cuelearner_jax.guidance.kind import Kind
 from cuelearner_jax.guidance.questions import about_refined
@@ -34,7 +38,7 @@ from cuelearner_jax.types import GuidanceModel, Label, Params
 
 
 class Coached(struct.PyTreeNode):
-    """A policy on its way, as the parameters of a model."""
+    """A policy on its way, as the parameters of a model; of several members with a leading axis."""
 
     policy: Params
     optimizer: Any  # state
@@ -43,12 +47,15 @@ class Coached(struct.PyTreeNode):
 
 def make(sizes: GuideSizes, spaces: Spaces) -> Guidance:
     """The bundle for an environment's spaces."""
-    space, policy = spaces.actions, auxiliary_policy(sizes, spaces)
+    space, policies = spaces.actions, auxiliary_policy(sizes, spaces)
+    member = auxiliary_policy(dataclasses.replace(sizes, ensemble=1), spaces)
+
+    def begin(key: PRNGKeyArray) -> Coached:
+        params = member.init(key)
+        return Coached(params, optimizer(GuideScalars()).init(params), jnp.zeros((), jnp.int32))
 
     def init(key: PRNGKeyArray) -> GuidanceModel:
-        params = policy.init(key)
-        start = Coached(params, optimizer(GuideScalars()).init(params), jnp.zeros((), jnp.int32))
-        return GuidanceModel(start, jnp.array(False))
+        return GuidanceModel(for_each(sizes.ensemble, begin, key), jnp.array(False))
 
     def target(label: Label, scalars: GuideScalars) -> Float[Array, " action"]:
         """The action turned by h * eps."""
@@ -61,16 +68,16 @@ def make(sizes: GuideSizes, spaces: Spaces) -> Guidance:
         count = rows.valid.sum()
 
         def loss(params: Params, batch: Lesson) -> Array:
-            error = policy.vectors(env, params, batch.obs, batch.action) - batch.target
+            error = member.vectors(env, params, batch.obs, batch.action) - batch.target
             return jnp.mean(jnp.sum(jnp.square(error), -1))
 
         def step(coached: Coached, numbers: Int[Array, " batch"], key: PRNGKeyArray) -> Coached:
-            batch = policy.seen_again(key, jax.tree.map(lambda leaf: leaf[order[numbers]], rows))
+            batch = member.seen_again(key, jax.tree.map(lambda leaf: leaf[order[numbers]], rows))
             gradient = jax.grad(loss)(coached.policy, batch)
             updates, state = optimizer(scalars).update(gradient, coached.optimizer, coached.policy)
             return coached.replace(policy=optax.apply_updates(coached.policy, updates), optimizer=state)
 
-        def corrected(number: Int[Array, ""], coached: Coached) -> Coached:
+        def corrected(key: PRNGKeyArray, number: Int[Array, ""], coached: Coached) -> Coached:
             """By label `number` of those that count, and by a replay of the newest up to it."""
             oldest = jnp.maximum(number + 1 - scalars.correction_replay, 0)
 
@@ -84,8 +91,10 @@ def make(sizes: GuideSizes, spaces: Spaces) -> Guidance:
             coached, _ = jax.lax.scan(replay, coached, jax.random.split(k_replay, sizes.replay_steps))
             return coached.replace(learned=number + 1)
 
-        coached = jax.lax.fori_loop(former.params.learned, count, corrected, former.params)
-        return GuidanceModel(coached, former.fitted | (count > 0))
+        def taught(key: PRNGKeyArray, coached: Coached) -> Coached:
+            return jax.lax.fori_loop(coached.learned, count, partial(corrected, key), coached)
+
+        return GuidanceModel(for_each(sizes.ensemble, taught, key, former.params), former.fitted | (count > 0))
 
     def act(
         model: GuidanceModel,
@@ -95,9 +104,17 @@ def make(sizes: GuideSizes, spaces: Spaces) -> Guidance:
         active: Bool[Array, " n"],
         scalars: GuideScalars,
     ) -> Refined:
-        return policy.act(env, model.params.policy, obs, actions, active & model.fitted, scalars)
+        return policies.act(env, model.params.policy, obs, actions, active & model.fitted, scalars)
 
-    return Guidance("dcoach", RELATIVE, init, about_refined(act), target, fit, act)
+    def disagreement(
+        model: GuidanceModel, env: Any, obs: Float[Array, "n obs"], actions: Float[Array, "n action"]
+    ) -> Float[Array, " n"]:
+        """The variance of the members' vectors, summed over their entries."""
+        assert policies.disagreement is not None
+        return policies.disagreement(model.replace(params=model.params.policy), env, obs, actions)
+
+    members = disagreement if policies.disagreement else None
+    return Guidance("dcoach", RELATIVE, init, about_refined(act), target, fit, act, members)
 
 
 KIND = Kind("dcoach", "a policy moved by each correction", make, form=RELATIVE, title="deep COACH", colour="#56B4E9")

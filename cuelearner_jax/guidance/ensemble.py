@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray, Shaped
 
 from cuelearner_jax.guidance.bundle import DisagreementFunction
 from cuelearner_jax.types import GuidanceModel, Params
@@ -41,18 +41,32 @@ def ensemble(members: int, init: Callable[[PRNGKeyArray], Params], predict: Pred
     each = jax.vmap(predict, in_axes=(None, 0, None, None))
 
     def init_all(key: PRNGKeyArray) -> Params:
-        return jax.vmap(init)(jax.random.split(key, members))
+        return for_each(members, init, key)
 
     def mean(env: Any, params: Params, obs: Array, actions: Array) -> Array:
         return each(env, params, obs, actions).mean(0)
 
     def disagreement(
-        model: GuidanceModel, env: Any, obs: Float[Array, "n obs"], actions: Float[Array, "n action"]
+        model: GuidanceModel, env: Any, obs: Shaped[Array, "n ..."], actions: Shaped[Array, "n ..."]
     ) -> Float[Array, " n"]:
-        """The members' variance, summed over outputs."""
+        """The members' variance, summed over outputs; of whatever they predict from."""
         return jnp.sum(each(env, model.params, obs, actions).var(0), -1)
 
     return Ensemble(init_all, mean, disagreement)
+
+
+def for_each(members: int, function: Callable[..., Any], key: PRNGKeyArray, *parameters: Any) -> Any:
+    """What a function of a key and of one member's parameters makes of every member, each from its own random numbers.
+
+    Args:
+        members: their number.
+        function: (key, *parameters of one member) -> a tree.
+        key: of all of them; of one member, its own.
+        parameters: the members', with the leading axis that several have.
+    """
+    if members == 1:
+        return function(key, *parameters)
+    return jax.vmap(function)(jax.random.split(key, members), *parameters)
 
 
 def fitted_members(

@@ -23,6 +23,7 @@ from cuelearner_jax.config import GuideScalars, GuideSizes
 from cuelearner_jax.environment import Aims, Spaces
 from cuelearner_jax.guidance.answers import RELATIVE
 from cuelearner_jax.guidance.bundle import Guidance
+from cuelearner_jax.guidance.ensemble import ensemble
 from cuelearner_jax.guidance.fitting import fit_model
 from cuelearner_jax.guidance.kind import Kind
 from cuelearner_jax.guidance.questions import about_refined
@@ -90,11 +91,11 @@ def evidence_of(env: Any, space: Actions, label: Label, eps: Float[Array, ""]) -
 
 
 def likeliest(
-    weights: Float[Array, " aims_and_none"], aims: Float[Array, "aims action"]
+    share: Float[Array, " aims_and_none"], aims: Float[Array, "aims action"]
 ) -> tuple[Float[Array, " action"], Bool[Array, ""]]:
-    """The aim of the largest log-weight, and whether it is likely enough to be followed."""
-    best = jnp.argmax(weights[:-1])
-    return aims[best], weights[best] > weights[-1] - jnp.log(DOUBT)
+    """The aim of the largest probability, and whether that is enough to be followed."""
+    best = jnp.argmax(share[:-1])
+    return aims[best], DOUBT * share[best] > share[-1]
 
 
 def make(sizes: GuideSizes, spaces: Spaces) -> Guidance:
@@ -103,16 +104,19 @@ def make(sizes: GuideSizes, spaces: Spaces) -> Guidance:
     network = Weights(sizes.aim_layers)
     width = spaces.aims or 0
 
-    def weigh(
-        params: Params, features: Float[Array, "n aims features"], possible: Bool[Array, "n aims"]
+    def shares(
+        env: Any, params: Params, features: Float[Array, "n aims features"], possible: Bool[Array, "n aims"]
     ) -> Float[Array, "n aims_and_none"]:
-        return jnp.asarray(jax.vmap(network.apply, (None, 0, 0))(params, features, possible))
+        """The probability that each aim, or none, is meant; the mean of several members is one too."""
+        return jax.nn.softmax(jnp.asarray(jax.vmap(network.apply, (None, 0, 0))(params, features, possible)))
 
     def init_params(key: PRNGKeyArray) -> Params:
         return network.init(key, jnp.zeros((1, width)), jnp.ones(1, bool))
 
+    weighing = ensemble(sizes.ensemble, init_params, shares)
+
     def init(key: PRNGKeyArray) -> GuidanceModel:
-        return GuidanceModel(init_params(key), jnp.array(False))
+        return GuidanceModel(weighing.init(key), jnp.array(False))
 
     def target(label: Label, scalars: GuideScalars) -> Float[Array, "1"]:
         """h itself: what is fitted is its probability."""
@@ -120,12 +124,12 @@ def make(sizes: GuideSizes, spaces: Spaces) -> Guidance:
 
     def surprise(params: Params, rows: Evidence) -> Float[Array, " rows"]:
         """-log of the probability of each answer."""
-        share = jax.nn.softmax(weigh(params, rows.features, rows.possible))
+        share = weighing.predict(None, params, rows.features, rows.possible)
         return -jnp.log((1.0 - SLIPS) * (share * rows.likelihood).sum(-1) + SLIPS / WORDS)
 
     def fit(key: PRNGKeyArray, env: Any, labels: Label, former: GuidanceModel, scalars: GuideScalars) -> GuidanceModel:
         rows = jax.vmap(lambda label: evidence_of(env, space, label, scalars.radians("eps")))(labels)
-        return fit_model(key, rows, scalars, init=init_params, losses=surprise, sizes=sizes)
+        return fit_model(key, rows, scalars, init=weighing.init, losses=surprise, sizes=sizes)
 
     def act(
         model: GuidanceModel,
@@ -136,7 +140,8 @@ def make(sizes: GuideSizes, spaces: Spaces) -> Guidance:
         scalars: GuideScalars,
     ) -> Refined:
         aims: Aims = jax.vmap(env.aims)(obs)
-        goals, sure = jax.vmap(likeliest)(weigh(model.params, aims.features, aims.possible), aims.actions)
+        share = weighing.predict(env, model.params, aims.features, aims.possible)
+        goals, sure = jax.vmap(likeliest)(share, aims.actions)
 
         def residual(current: Float[Array, "n action"]) -> Float[Array, "n action"]:
             step = jnp.minimum(scalars.radians("eps"), space.distance(current, goals))
@@ -152,7 +157,16 @@ def make(sizes: GuideSizes, spaces: Spaces) -> Guidance:
             k_max=scalars.k_max,
         )
 
-    return Guidance("intent", RELATIVE, init, about_refined(act), target, fit, act)
+    def disagreement(
+        model: GuidanceModel, env: Any, obs: Float[Array, "n obs"], actions: Float[Array, "n action"]
+    ) -> Float[Array, " n"]:
+        """The variance of the members' probabilities, summed over aims; of situations, whatever the action."""
+        assert weighing.disagreement is not None
+        aims: Aims = jax.vmap(env.aims)(obs)
+        return weighing.disagreement(model, env, aims.features, aims.possible)
+
+    members = disagreement if weighing.disagreement else None
+    return Guidance("intent", RELATIVE, init, about_refined(act), target, fit, act, members)
 
 
 KIND = Kind("intent", "relative feedback about the task's aims", make, form=RELATIVE, needs=("aims",), colour="#CC79A7")

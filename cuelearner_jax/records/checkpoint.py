@@ -110,6 +110,13 @@ def _compare(stored: dict[str, Any], wanted: dict[str, jax.ShapeDtypeStruct]) ->
             raise _OfAnother(f"{path} is {there}, expected {here}")
 
 
+def _compare_items(folder: Any, wanted: dict[str, dict[str, Any]]) -> None:
+    """The same of the items in a checkpoint's folder."""
+    reader = ocp.StandardCheckpointHandler()
+    for name, item in wanted.items():
+        _compare(reader.metadata(folder / name).tree, item)
+
+
 @contextmanager
 def _quiet() -> Iterator[None]:
     """Keeps silent what Orbax leaves to threads and to the garbage collector once a read or a write has failed.
@@ -172,15 +179,21 @@ class Checkpoints:
             _settle()
         raise OSError(errno.ENOSPC, f"{needed / 1e6:.0f} MB are needed", str(self._folder))
 
+    def compare(self, like: dict[str, Any]) -> None:
+        """Whether the newest checkpoint's items have the leaves of those in `like`; their arrays are not read.
+
+        Raises:
+            UserError: no checkpoint, one that cannot be read, or one of other shapes.
+        """
+        with self._reading() as folder:
+            _compare_items(folder, {name: _flat(item) for name, item in like.items()})
+
     def restore(self, like: dict[str, Any]) -> dict[str, Any]:
         """The newest checkpoint's items named in `like` (trees of arrays or shapes), onto the default device.
 
         Raises:
             UserError: no checkpoint, one that cannot be read, or one of other shapes.
         """
-        number = self.latest()
-        if number is None:
-            raise UserError(f"no checkpoint in {self._folder}: the run was stopped before its first one")
         device = jax.sharding.SingleDeviceSharding(jax.devices()[0])
         wanted = {
             name: {
@@ -189,17 +202,25 @@ class Checkpoints:
             }
             for name, item in like.items()
         }
-        try:
-            folder, reader = self._manager.directory / str(number), ocp.StandardCheckpointHandler()
-            for name, item in wanted.items():
-                _compare(reader.metadata(folder / name).tree, item)
+        with self._reading() as folder:
+            _compare_items(folder, wanted)
             args: dict[str, Any] = {name: ocp.args.StandardRestore(item) for name, item in wanted.items()}
             if (folder / DIGESTS).exists():
                 args[DIGESTS] = ocp.args.JsonRestore()
-            restored = self._manager.restore(number, args=ocp.args.Composite(**args))
+            restored = self._manager.restore(int(folder.name), args=ocp.args.Composite(**args))
             if DIGESTS in args:
                 self._verify({name: restored[name] for name in like}, restored[DIGESTS])
             return {name: _unflat(restored[name], like[name]) for name in like}
+
+    @contextmanager
+    def _reading(self) -> Iterator[Any]:
+        """The folder of the newest checkpoint; whatever fails while it is read is a UserError."""
+        number = self.latest()
+        if number is None:
+            raise UserError(f"no checkpoint in {self._folder}: the run was stopped before its first one")
+        try:
+            yield self._manager.directory / str(number)
+            return
         except Exception as error:  # Orbax and TensorStore raise many kinds for one cause: the files do not fit
             # Orbax means to print TensorStore's details and prints the method that has them.
             told = re.sub(r"\.? See full TensorStore details.*", "", str(error), flags=re.DOTALL).strip()

@@ -35,8 +35,17 @@ def in_use(out: Path) -> bool:
     return out.exists() and (not out.is_dir() or any(entry.name not in LEFT for entry in out.iterdir()))
 
 
-def check_folder(out: Path, described: dict[str, Any], resume: bool, overwrite: bool) -> None:
-    """Raises UserError unless `out` may be used as asked. `described` is what config.json is to say."""
+def check_folder(
+    out: Path, described: dict[str, Any], resume: bool, overwrite: bool, defaults: dict[str, Any] | None = None
+) -> None:
+    """Raises UserError unless `out` may be used as asked.
+
+    Args:
+        out: the folder.
+        described: what config.json is to say.
+        resume, overwrite: what is asked for.
+        defaults: as `differences` has them.
+    """
     if resume and overwrite:
         raise UserError("--resume continues a run and --overwrite deletes it: give one of them")
     used = in_use(out)
@@ -44,7 +53,7 @@ def check_folder(out: Path, described: dict[str, Any], resume: bool, overwrite: 
     if resume:
         if not ours:
             raise UserError(f"nothing to resume in {out}: give the --out of an interrupted run, or leave out --resume")
-        differing = sorted(differences(formats.read("config", out / CONFIG), described))
+        differing = sorted(differences(formats.read("config", out / CONFIG), described, defaults))
         if differing:
             raise UserError(
                 f"{out} was run with another {', '.join(differing[:4])}: give the same options, or another --out"
@@ -55,14 +64,26 @@ def check_folder(out: Path, described: dict[str, Any], resume: bool, overwrite: 
         raise UserError(f"{out} is not a run folder, so --overwrite will not delete it: give another --out")
 
 
-def differences(before: dict[str, Any], now: dict[str, Any], prefix: str = "") -> Iterator[str]:
-    """The names, as `part.field`, in which two descriptions of runs differ."""
+def differences(
+    before: dict[str, Any], now: dict[str, Any], defaults: dict[str, Any] | None = None, prefix: str = ""
+) -> Iterator[str]:
+    """The names, as `part.field`, in which two descriptions of runs differ.
+
+    Args:
+        before, now: the descriptions.
+        defaults: values by part and field that one counts as having where it does not say: a program that had not the
+            field yet did what the default does.
+        prefix: the part, of names.
+    """
+    defaults = defaults or {}
     for name in {**before, **now}:
         if f"{prefix}{name}" == "task.from":  # where a task's code lies changes nothing in it
             continue
-        old, new = before.get(name), now.get(name)
+        default = defaults.get(name)
+        within, value = (default, None) if isinstance(default, dict) else (None, default)
+        old, new = before.get(name, value), now.get(name, value)
         if isinstance(old, dict) and isinstance(new, dict):
-            yield from differences(old, new, f"{prefix}{name}.")
+            yield from differences(old, new, within, f"{prefix}{name}.")
         elif old != new:
             yield prefix + name
 

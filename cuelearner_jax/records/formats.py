@@ -91,6 +91,8 @@ def upgrade(kind: str, values: Any, path: Path) -> Values:
     for before in range(number, FORMATS[kind]):
         try:
             values = {**STEPS[kind, before](values), "format": before + 1}
+        except UserError as error:
+            raise UserError(f"{path}: {error}") from error
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise damaged(kind, path) from error
     return values

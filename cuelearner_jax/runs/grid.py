@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from cuelearner_jax import config as configuration
-from cuelearner_jax.config import RunConfig
+from cuelearner_jax.config import RunConfig, Scalars, Schedule, Sizes
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import SPLITS
 from cuelearner_jax.guidance import registry as guidances
@@ -84,6 +84,12 @@ def describe(
     }
 
 
+def defaults(task: Task) -> dict[str, Any]:
+    """What a config.json means where it lacks a field that a task or the method got later: the field's default."""
+    groups = {"task": task.config, "sizes": Sizes, "scalars": Scalars, "schedule": Schedule}
+    return {name: configuration.defaults(kind) for name, kind in groups.items()}
+
+
 def config_hash(described: dict[str, Any]) -> str:
     """Short hash of what a lane learns from: of a description less the file's format and the other lanes."""
     apart = ("format", "grid", "shard")
@@ -113,9 +119,9 @@ def load(folder: Path, find: Callable[[str], Task]) -> tuple[Task, RunConfig, Gr
         task = _known(find, name, origin, path)
         config = RunConfig(
             configuration.from_json(task.config, values["task"]),
-            configuration.from_json(configuration.Sizes, values["sizes"]),
-            configuration.from_json(configuration.Scalars, values["scalars"]),
-            configuration.from_json(configuration.Schedule, values["schedule"]),
+            configuration.from_json(Sizes, values["sizes"]),
+            configuration.from_json(Scalars, values["scalars"]),
+            configuration.from_json(Schedule, values["schedule"]),
         )
         grid = _grid(values["grid"])
         if "shard" in values:

@@ -35,12 +35,18 @@ def items(blocks: list[TrainState], clock: Clock, wall: float) -> dict[str, Any]
     }
 
 
-def restore(group: LaneGroup, saved: Checkpoints, *names: str) -> dict[str, Any]:
+def restore(group: LaneGroup, saved: Checkpoints, *names: str, whole: bool = False) -> dict[str, Any]:
     """Items of the newest checkpoint by name, "failed" and "clock". Blocks are cut as they were when it was written.
 
     A checkpoint that does not say which lanes have failed is of a program that did not look: it counts as of none.
 
-    Raises UserError if there is no readable checkpoint or it holds other lanes.
+    Args:
+        group: the lanes.
+        saved: their checkpoints.
+        names: of the items.
+        whole: must training be able to go on from it? The items that are not named are then compared too, unread.
+
+    Raises UserError if there is no readable checkpoint or it holds other lanes, or another state of them.
     """
     shapes = items(group.shapes(), jax.eval_shape(start_clock), 0.0)
     clock = saved.restore({"clock": shapes["clock"]})["clock"]
@@ -49,6 +55,8 @@ def restore(group: LaneGroup, saved: Checkpoints, *names: str) -> dict[str, Any]
         raise UserError(f"the checkpoint holds {count * size} lanes, the run has {len(group.seeds)}: start it anew")
     cut = np.minimum(np.arange(count * size), len(group.seeds) - 1).reshape(count, size)
     shapes = items(group.shapes_of(cut), jax.eval_shape(start_clock), 0.0)
+    if whole:
+        saved.compare({name: shapes[name] for name in ("policy", "rest")})
     asked = (*names, "failed") if saved.holds("failed") else names
     found = saved.restore({name: shapes[name] for name in asked})
     return {"failed": [jnp.zeros(size, bool)] * count, **found, "clock": clock}
@@ -83,14 +91,15 @@ def check_standing(group: LaneGroup, folder: Path, given: bool = False) -> None:
         given: are its labels from a file?
 
     Raises:
-        UserError: rows are missing, or a file cannot be read; nothing has been changed.
+        UserError: rows are missing, a file cannot be read, or the checkpoint is of another version of the program;
+            nothing has been changed.
     """
     schedule, finished = group.config.schedule, (folder / results.PARQUET).exists()
     step, rounds = (schedule.total_steps, group.rounds) if finished else (0, 0)
     if not finished and (folder / "checkpoints").is_dir():
         with checkpoints(folder / "checkpoints", read_only=True) as saved:
             if saved.latest() is not None:
-                clock = restore(group, saved)["clock"]["clock"]
+                clock = restore(group, saved, whole=True)["clock"]["clock"]
                 step, rounds = int(clock.step), int(clock.round)
     if step:
         results.check_complete(folder, group.seeds, group.budgets, range(0, step + 1, schedule.eval_every))

@@ -18,7 +18,7 @@ from cuelearner_jax.guidance.bundle import Guidance
 from cuelearner_jax.records import formats
 from cuelearner_jax.records.folders import CONFIG, differences
 from cuelearner_jax.runs import shards
-from cuelearner_jax.runs.grid import Grid, load
+from cuelearner_jax.runs.grid import Grid, defaults, load
 from cuelearner_jax.runs.kept import restore_policies
 from cuelearner_jax.runs.lanes import LaneGroup
 from cuelearner_jax.task import Task, shape_of
@@ -67,15 +67,15 @@ def open_run(folder: Path, find: Callable[[str], Task]) -> Opened:
         task, config, grid = load(folder, find)
         return Opened(task, config, grid, (Piece(folder, grid),))
     told = [formats.read("config", file) for file in files]
+    loaded = [load(file.parent, find) for file in files]
+    task, config, first = loaded[0]
     for file, other in zip(files, told, strict=True):
-        found = sorted({*differences(told[0], other)} - {*shards.OWN})
+        found = sorted({*differences(told[0], other, defaults(task))} - {*shards.OWN})
         if found:
             raise UserError(
                 f"{files[0].parent} and {file.parent} are pieces of different sweeps (another "
                 f"{', '.join(found[:4])}): give the folder of one of them"
             )
-    loaded = [load(file.parent, find) for file in files]
-    task, config, first = loaded[0]
     pieces = tuple(Piece(file.parent, grid) for file, (_, _, grid) in zip(files, loaded, strict=True))
     seeds = tuple(seed for piece in pieces for seed in piece.grid.seeds)
     return Opened(task, config, Grid(first.guidance, seeds, first.labels), pieces)

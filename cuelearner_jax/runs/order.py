@@ -18,7 +18,7 @@ from cuelearner_jax.guidance import registry as guidances
 from cuelearner_jax.records import formats, label_files, results
 from cuelearner_jax.records.folders import CONFIG, check_folder
 from cuelearner_jax.runs import instalments
-from cuelearner_jax.runs.grid import Grid, check_grid, describe
+from cuelearner_jax.runs.grid import Grid, check_grid, defaults, describe
 from cuelearner_jax.runs.shards import Shard
 from cuelearner_jax.task import Task, shape_of
 
@@ -81,8 +81,8 @@ def planned(order: Order) -> Plan:
     labels = read_labels(order) if order.labels_from else None
     described = describe(order.task, order.config, order.grid, order.split, order.labels_from, piece)
     if order.shard:
-        order.shard.check_sweep(sweep, described)
-    check_folder(order.out, described, order.resume, order.overwrite)
+        order.shard.check_sweep(sweep, described, defaults(order.task))
+    check_folder(order.out, described, order.resume, order.overwrite, defaults(order.task))
     return Plan(order, described, labels)
 
 

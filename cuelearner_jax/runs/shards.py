@@ -37,12 +37,13 @@ class Shard(NamedTuple):
         """Where the piece writes below the sweep's folder."""
         return out / f"shard-{self.index:0{len(str(self.count))}d}-of-{self.count}"
 
-    def check_sweep(self, out: Path, described: dict[str, Any]) -> None:
+    def check_sweep(self, out: Path, described: dict[str, Any], defaults: dict[str, Any]) -> None:
         """Whether its piece belongs to the sweep that lies in a folder.
 
         Args:
             out: the sweep's folder.
             described: what the piece's config.json is to say.
+            defaults: as `differences` has them.
 
         Raises:
             UserError: the folder holds a whole run, pieces of another count, or of a sweep with other settings.
@@ -59,7 +60,8 @@ class Shard(NamedTuple):
                 )
             if folder == self.folder(out) or not (folder / CONFIG).is_file():
                 continue
-            found = sorted({*differences(formats.read("config", folder / CONFIG), described)} - set(OWN))
+            told = formats.read("config", folder / CONFIG)
+            found = sorted({*differences(told, described, defaults)} - set(OWN))
             if found:
                 raise UserError(
                     f"{folder} is a piece of a sweep with another {', '.join(found[:4])}: give the same options for "

@@ -5,8 +5,10 @@ from __future__ import annotations
 from cuelearner_jax.devices import SHARED, lane_mesh, place
 from cuelearner_jax.guidance import registry as guidances
 from cuelearner_jax.guidance.answers import check_teacher
-from cuelearner_jax.records.folders import check_folder, claimed, prepare_folder
+from cuelearner_jax.records import formats
+from cuelearner_jax.records.folders import CONFIG, check_folder, claimed, prepare_folder
 from cuelearner_jax.runs import failures
+from cuelearner_jax.runs.grid import defaults
 from cuelearner_jax.runs.kept import check_standing
 from cuelearner_jax.runs.lanes import LaneGroup
 from cuelearner_jax.runs.memory_report import memory_report
@@ -42,10 +44,13 @@ def run(order: Order) -> None:
         check_teacher(teacher, config.scalars)
     examined = task.environment(config.task, order.split)
     with claimed(order.out), interruptible() as stopping, progress_bars() as bars:
-        check_folder(order.out, plan.described, order.resume, order.overwrite)  # nobody else can change it any more
+        # Nobody else can change it any more.
+        check_folder(order.out, plan.described, order.resume, order.overwrite, defaults(task))
         for group in groups if order.resume else ():
             check_standing(group, order.out / group.guidance.name, given=plan.labels is not None)
         prepare_folder(order.out, plan.described, order.overwrite and not order.resume)
+        # Rows of what was begun earlier and of what comes now are of one configuration, as config.json tells it.
+        described = formats.read("config", order.out / CONFIG)
         for group in groups:
-            Runner(group, examined, order, plan.described, stopping, bars).run(teacher, plan.labels)
+            Runner(group, examined, order, described, stopping, bars).run(teacher, plan.labels)
     failures.check(order.out, [order.out / group.guidance.name for group in groups])

@@ -86,6 +86,17 @@ def test_a_lane_of_any_piece_is_drawn_and_called(sweeps, tmp_path):
     np.testing.assert_array_equal(whole, pieces)
 
 
+def test_pieces_are_of_one_sweep_though_one_was_begun_before_a_field_existed(pieces, refused):
+    """By the command line: evaluated together, and a piece that is finished is found so."""
+    for group, name in (("sizes", "frame"), ("schedule", "ask_at"), ("scalars", "answer"), ("task", "mirrors")):
+        edit_json(pieces / "shard-2-of-2" / "config.json", lambda told, group=group, name=name: told[group].pop(name))
+    assert main(["evaluate", str(pieces), "--steps", "20", "--envs", "20"]) == 0
+    for piece in ("1/2", "2/2"):
+        assert main([*SWEEP, "--shard", piece, "--out", str(pieces)]) == 0
+    edit_json(pieces / "shard-2-of-2" / "config.json", lambda told: told["sizes"].update(frame="action"))
+    refused([*SWEEP, "--shard", "1/2", "--out", pieces], "is a piece of a sweep with another sizes.frame", pieces)
+
+
 def test_pieces_of_different_sweeps_are_refused(pieces, refused):
     edit_json(pieces / "shard-2-of-2" / "config.json", lambda told: told["scalars"].update(eps_deg=3.0))
     refused(["evaluate", pieces], "are pieces of different sweeps (another scalars.eps_deg): give the folder", pieces)

@@ -156,6 +156,7 @@ def test_a_smoke_of_the_easy_table_runs_resumes_and_reports(modules, tmp_path, c
     assert [(row["run"], row["guidance"], row["labels"], row["seeds"]) for row in rows] == [
         ("frame", "none", "0", "2"),
         ("frame", "relative", "5", "2"),
+        ("frame", "relative", "10", "2"),
     ]
     before = (out / "frame" / "none" / "none" / "results.parquet").stat().st_mtime_ns
     capsys.readouterr()

@@ -15,9 +15,9 @@ from cuelearner_jax.guidance import registry
 from cuelearner_jax.guidance.ensemble import ensemble
 from cuelearner_jax.guidance.questions import about_base
 from cuelearner_jax.policies import Uniform
-from cuelearner_jax.types import GuidanceModel
+from cuelearner_jax.types import GuidanceModel, Label
 
-ENV = probes.Window()
+ENV = probes.Aimed()
 OBS = actions.evenly_spaced(5)
 BASE = actions.rotate(OBS, 0.3)
 ONE = dataclasses.replace(probes.SIZES, feedback_layers=(8,), fit_steps=20)
@@ -44,7 +44,7 @@ def test_one_member_is_the_network_itself():
     assert (made.init, made.predict, made.disagreement) == (jax.random.normal, linear, None)
 
 
-@pytest.mark.parametrize("kind", ["relative", "demonstration", "scalar"])
+@pytest.mark.parametrize("kind", ["relative", "demonstration", "scalar", "dcoach", "intent"])
 def test_members_that_are_the_same_do_what_one_does_and_do_not_disagree(kind):
     single, several = (registry.make(kind, sizes, ENV) for sizes in (ONE, FOUR))
     alone = single.init(jax.random.key(0)).replace(fitted=jnp.array(True))
@@ -53,8 +53,9 @@ def test_members_that_are_the_same_do_what_one_does_and_do_not_disagree(kind):
     one, mean = (b.act(m, ENV, OBS, BASE, everywhere, probes.SCALARS) for b, m in ((single, alone), (several, same)))
     np.testing.assert_allclose(one.actions, mean.actions, atol=1e-5)
     np.testing.assert_allclose(several.disagreement(same, ENV, OBS, BASE), 0, atol=1e-10)
-    apart = several.disagreement(several.init(jax.random.key(0)), ENV, OBS, BASE)
-    assert apart.min() > 1e-6
+    add = jax.vmap(lambda number, params: jax.tree.map(lambda leaf: leaf + 0.1 * number, params))
+    differing = same.replace(params=add(jnp.arange(4.0), same.params))
+    assert several.disagreement(differing, ENV, OBS, BASE).min() > 1e-6
     assert single.disagreement is None
 
 
@@ -106,6 +107,22 @@ def test_rounds_of_chosen_questions_fill_the_budget_and_fit_each_member_from_num
     chex.assert_tree_shape_prefix(guide.model.params, (4,))
     for kernel in (leaf for leaf in jax.tree.leaves(guide.model.params) if leaf.ndim == 3):
         assert all(not np.array_equal(kernel[i], kernel[j]) for i in range(4) for j in range(i))
+
+
+def test_members_of_deep_coach_are_corrected_each_as_one_alone_is_from_its_own_numbers():
+    single, several = (registry.make("dcoach", sizes, ENV) for sizes in (ONE, dataclasses.replace(ONE, ensemble=2)))
+    obs, asked = OBS[:4], BASE[:4]
+    labels = Label(obs, asked, actions.sense(asked, jax.vmap(ENV.best)(obs))[:, None], jnp.arange(4) < 3)
+    fit = lambda bundle, key, former: jax.jit(bundle.fit)(key, ENV, labels, former, probes.SCALARS)  # noqa: E731
+    former, key = several.init(jax.random.key(5)), jax.random.key(6)
+    assert several.disagreement(former, ENV, OBS, BASE).min() > 1e-6
+    both = fit(several, key, former)
+    assert both.params.learned.tolist() == [3, 3]
+    assert both.fitted.shape == ()
+    for number, own in enumerate(jax.random.split(key, 2)):
+        one = jax.tree.map(lambda leaf, number=number: leaf[number], (former.params, both.params))
+        alone = fit(single, own, former.replace(params=one[0]))
+        chex.assert_trees_all_close(alone.params, one[1], rtol=1e-4, atol=1e-6)
 
 
 def test_kinds_of_one_model_are_refused_where_members_are_wanted(monkeypatch):

@@ -30,10 +30,9 @@ BASE = actions.rotate(OBS, jnp.linspace(-3.0, 3.0, 16))
 EVERYWHERE = jnp.ones(16, bool)
 
 
-@pytest.fixture(scope="module")
-def fitted():
+def told(sizes):
     """A bundle and its model of 40 of the expert's answers about random actions."""
-    bundle = registry.make("intent", SIZES, ENV)
+    bundle = registry.make("intent", sizes, ENV)
     keys = jax.random.split(jax.random.key(3), 40)
     obs = jax.vmap(lambda key: ENV.reset(key)[1])(keys)
     asked = actions.uniform(jax.random.key(4), (40,))
@@ -42,6 +41,11 @@ def fitted():
     labels = Label(obs, asked, answers, jnp.ones(40, bool))
     former = bundle.init(jax.random.key(0))
     return bundle, jax.jit(bundle.fit)(jax.random.key(1), ENV, labels, former, probes.SCALARS)
+
+
+@pytest.fixture(scope="module")
+def fitted():
+    return told(SIZES)
 
 
 def acted(fitted, env, base=BASE, **scalars):
@@ -87,10 +91,10 @@ def test_without_a_possible_aim_actions_stay_as_they_are(fitted):
 def test_actions_stay_where_it_is_likelier_by_far_that_none_is_meant():
     aims = actions.evenly_spaced(3)
     for none, sure in ((math.log(3.9), True), (math.log(4.1), False)):
-        goal, followed = intent.likeliest(jnp.array([0.0, math.log(2.0), -jnp.inf, none]), aims)
+        goal, followed = intent.likeliest(jax.nn.softmax(jnp.array([0.0, math.log(2.0), -jnp.inf, none])), aims)
         np.testing.assert_array_equal(goal, aims[1])
         assert bool(followed) == sure
-    assert not intent.likeliest(jnp.array([-jnp.inf, -jnp.inf, -jnp.inf, 0.0]), aims)[1]
+    assert not intent.likeliest(jnp.array([0.0, 0.0, 0.0, 1.0]), aims)[1]
 
 
 def test_an_impossible_aim_has_no_weight(fitted):
@@ -99,3 +103,22 @@ def test_an_impossible_aim_has_no_weight(fitted):
     weights = jax.nn.softmax(jnp.asarray(network.apply(model.params, aims.features, aims.possible)))
     assert weights[3] == 0.0
     assert weights[1] > 0.9
+
+
+def test_members_weigh_aims_each_by_itself_and_their_mean_leads():
+    bundle, model = told(dataclasses.replace(SIZES, ensemble=3))
+    lead = acted((bundle, model), ENV).actions
+    np.testing.assert_allclose(actions.difference(ENV.best(OBS), lead), 0.0, atol=1e-5)
+    members = [jax.tree.map(lambda leaf, i=i: leaf[i], model.params) for i in range(3)]
+    assert not np.array_equal(*(one["params"]["Dense_0"]["kernel"] for one in members[1:]))
+    # One that believes in no aim does not decide for the others, however sure it is.
+    odd = {"params": members[0]["params"] | {"none": jnp.array([50.0])}}
+    members = [odd, *members[1:]]
+    outvoted = model.replace(params=jax.tree.map(lambda *leaves: jnp.stack(leaves), *members))
+    np.testing.assert_array_equal(acted((bundle, outvoted), ENV).actions, lead)
+    network, aims = intent.Weights(SIZES.aim_layers), ENV.aims(OBS[0])
+    shares = np.stack([jax.nn.softmax(network.apply(one, aims.features, aims.possible)) for one in members])
+    apart = bundle.disagreement(outvoted, ENV, OBS, BASE)
+    assert apart[0] > 10 * bundle.disagreement(model, ENV, OBS, BASE)[0]
+    np.testing.assert_allclose(apart[0], shares.var(0).sum(), rtol=1e-4)
+    np.testing.assert_array_equal(apart, bundle.disagreement(outvoted, ENV, OBS, OBS))  # whatever the action

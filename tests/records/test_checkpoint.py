@@ -211,6 +211,12 @@ def test_a_checkpoint_of_other_shapes_is_refused(tmp_path, change):
     with pytest.raises(UserError, match="of another configuration, or of another version") as refused:
         restore(tmp_path, other(change))
     assert "delete" not in str(refused.value)  # nothing is wrong with it
+    before = probes.files_of(tmp_path)
+    with checkpoints(tmp_path, read_only=True) as saved:
+        saved.compare({"policy": shapes(state())})
+        with pytest.raises(UserError, match="of another configuration, or of another version"):
+            saved.compare(other(change))
+    assert probes.files_of(tmp_path) == before
 
 
 def test_what_a_refused_checkpoint_leaves_behind_is_silent(tmp_path, caplog, monkeypatch):

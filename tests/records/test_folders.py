@@ -98,6 +98,21 @@ def test_resuming_names_several_options_and_those_that_only_one_side_has(out):
     refused(out, r"another scalars\.more: give", described(scalars={"more": 1}), resume=True)
 
 
+def test_what_a_description_does_not_say_counts_as_the_default():
+    defaults = {"scalars": {"answer": "best", "silence": 0.0}, "sizes": {"frame": "raw"}}
+
+    def apart(before, now):
+        forth, back = (sorted(folders.differences(*pair, defaults)) for pair in ((before, now), (now, before)))
+        assert forth == back
+        return forth
+
+    newer = described(scalars={"answer": "best", "silence": 0.0}, sizes={"frame": "raw"})
+    assert apart(DESCRIBED, newer) == []
+    assert apart(DESCRIBED, described(scalars={"answer": "nearest"}, sizes={"frame": "raw"})) == ["scalars.answer"]
+    assert apart(DESCRIBED, described(sizes={"frame": "action", "more": 1})) == ["sizes.frame", "sizes.more"]
+    assert apart({"split": "tuning"}, {"split": "tuning", "sizes": {"frame": "raw"}}) == ["sizes"]
+
+
 @pytest.mark.parametrize("content", [b"", b"{", b"\xff\xfe\x00", b"[]", b"3", b"null", b'{"format": -1}'])
 def test_resuming_from_a_damaged_description_is_refused(out, content):
     (out / "config.json").write_bytes(content)

@@ -19,8 +19,8 @@ from cuelearner_jax.loop import make_program, start_clock
 from cuelearner_jax.records import formats, label_files, results
 from cuelearner_jax.records.checkpoint import checkpoints
 from cuelearner_jax.records.folders import prepare_folder
-from cuelearner_jax.runs import lanes, runner, sweep, training
-from cuelearner_jax.runs.grid import Grid
+from cuelearner_jax.runs import kept, lanes, runner, sweep, training
+from cuelearner_jax.runs.grid import Grid, config_hash
 from cuelearner_jax.runs.kept import items
 from cuelearner_jax.runs.order import Order
 from cuelearner_jax.terminal import Interrupted
@@ -118,9 +118,9 @@ def newest(out, kind, grid=GRID):
         return found, saved.latest()
 
 
-def rows(out):
+def rows(out, but=()):
     table = results.read(out)
-    return table.drop_columns([name for name in VOLATILE if name in table.column_names]).to_pylist()
+    return table.drop_columns([name for name in (*VOLATILE, *but) if name in table.column_names]).to_pylist()
 
 
 def read_labels(out):
@@ -136,7 +136,7 @@ def whole(tmp_path_factory):
     return out
 
 
-def assert_same_run(out, whole):
+def assert_same_run(out, whole, but=()):
     for kind in GRID.guidance:
         (mine, number), (expected, last) = newest(out, kind), newest(whole, kind)
         assert number == last
@@ -145,7 +145,7 @@ def assert_same_run(out, whole):
             assert one.dtype == other.dtype
             assert np.asarray(probes.words(one)).tobytes() == np.asarray(probes.words(other)).tobytes()
         assert not (out / kind / results.JSONL).exists()
-    assert rows(out) == rows(whole)
+    assert rows(out, but) == rows(whole, but)
     for mine, expected in zip(read_labels(out), read_labels(whole), strict=True):
         np.testing.assert_array_equal(mine, expected)
 
@@ -167,6 +167,37 @@ def test_a_run_leaves_a_row_for_each_lane_and_evaluation(whole):
     assert len({row["train_guided_share"] for row in table if row["guidance"] == "relative" and row["step"] == 48}) > 1
     assert all(row["train_guided_share"] == 0 for row in table if row["guidance"] == "none" and row["step"])
     assert int(state["clock"]["clock"].update) == 96
+
+
+def test_a_run_begun_before_a_field_existed_goes_on_as_one_run(whole, tmp_path):
+    out = shutil.copytree(whole, tmp_path / "run")
+    probes.edit_json(out / "config.json", lambda told: [told["sizes"].pop("frame"), told["schedule"].pop("ask_at")])
+    shutil.rmtree(out / "none")
+    before = {row["config_hash"] for row in rows(out)}
+    run(out, resume=True)
+    assert_same_run(out, whole, but=("config_hash",))
+    told = formats.read("config", out / "config.json")
+    assert {row["config_hash"] for row in rows(out)} == before | {config_hash(told)}
+
+
+def test_a_checkpoint_whose_lanes_had_another_state_is_refused_before_anything_is_done(whole, tmp_path, monkeypatch):
+    out = shutil.copytree(whole, tmp_path / "run")
+    shutil.rmtree(out / "relative")
+    (out / "none" / results.PARQUET).unlink()
+    before = probes.files_of(out)
+    of_now = kept.items
+
+    def of_a_newer_program(blocks, clock, wall):
+        made = of_now(blocks, clock, wall)
+        return {**made, "rest": [block.replace(pace=(block.pace, block.failed)) for block in made["rest"]]}
+
+    monkeypatch.setattr(kept, "items", of_a_newer_program)
+    with pytest.raises(
+        UserError, match="of another version of the program: go on with that one, or start anew"
+    ) as told:
+        run(out, resume=True)
+    assert "\n" not in str(told.value)
+    assert probes.files_of(out) == before
 
 
 def test_the_same_command_gives_the_same_run(whole, tmp_path):

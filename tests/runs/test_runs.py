@@ -78,6 +78,25 @@ def test_everything_that_determines_results_is_described(out, name, config, grid
         check_folder(out, described(config, grid, **options), resume=True, overwrite=False)
 
 
+def at_defaults(values):
+    """Takes out of a description every field that has its default, as if it had been written before there were any."""
+    for group, standard in runs.defaults(TASK).items():
+        values[group] = {name: value for name, value in values[group].items() if standard.get(name, ...) != value}
+
+
+def test_a_run_described_before_a_field_existed_had_its_default(out):
+    probes.edit_json(out / "config.json", at_defaults)
+    told = formats.read("config", out / "config.json")
+    assert "frame" not in told["sizes"]
+    assert "ask_at" not in told["schedule"]
+    assert told["task"] == {"name": TASK.name}
+    check_folder(out, described(), resume=True, overwrite=False, defaults=runs.defaults(TASK))
+    assert runs.load(out, find)[1] == probes.CONFIG
+    other = described(probes.config(sizes={"frame": "action"}))
+    with pytest.raises(UserError, match=r"was run with another sizes\.frame: give"):
+        check_folder(out, other, resume=True, overwrite=False, defaults=runs.defaults(TASK))
+
+
 @pytest.mark.parametrize("folder", ["quickstart", "billiards_paper/shard-1-of-3", "navigation/relative-500"])
 def test_the_hash_of_a_configuration_is_that_of_its_recorded_results(folder):
     recorded = ROOT / "docs" / "data" / folder

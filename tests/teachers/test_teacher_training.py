@@ -119,11 +119,14 @@ def test_saving_again_replaces_the_network(made, tmp_path):
 
 def test_its_description_has_a_format_and_a_newer_one_is_refused(made, tmp_path):
     stored.save(tmp_path, made, {"config": to_json(CONFIG)})
-    assert formats.read("teacher", tmp_path / "teacher.json") == {"format": 2, "config": to_json(CONFIG)}
-    probes.edit_json(tmp_path / "teacher.json", lambda about: about.pop("format"))
+    current = formats.FORMATS["teacher"]
+    assert formats.read("teacher", tmp_path / "teacher.json") == {"format": current, "config": to_json(CONFIG)}
     assert stored.load(tmp_path, ENV, 0.0, 0.0).layers == CONFIG.layers
-    probes.edit_json(tmp_path / "teacher.json", lambda about: about.update(format=3))
+    probes.edit_json(tmp_path / "teacher.json", lambda about: about.update(format=current + 1))
     with pytest.raises(UserError, match="written by a newer cuelearner"):
+        stored.load(tmp_path, ENV, 0.0, 0.0)
+    probes.edit_json(tmp_path / "teacher.json", lambda about: about.pop("format"))
+    with pytest.raises(UserError, match=r"trained by an earlier cuelearner.*: train it anew"):
         stored.load(tmp_path, ENV, 0.0, 0.0)
 
 
@@ -139,9 +142,12 @@ def test_a_teacher_of_another_task_is_refused(made, tmp_path):
         stored.load(tmp_path, ENV, 0.0, 0.0)
 
 
-@pytest.mark.parametrize("text", ["{", "[]", "{}", json.dumps({"config": 3})])
+@pytest.mark.parametrize("text", ["{", "[]", json.dumps({"format": 3}), {"config": 3}])
 def test_a_damaged_description_is_refused(made, tmp_path, text):
     stored.save(tmp_path, made, {"config": to_json(CONFIG)})
-    (tmp_path / "teacher.json").write_text(text)
+    if isinstance(text, str):
+        (tmp_path / "teacher.json").write_text(text)
+    else:  # whole, but no teacher
+        formats.write("teacher", tmp_path / "teacher.json", text)
     with pytest.raises(UserError, match="damaged"):
         stored.load(tmp_path, ENV, 0.0, 0.0)

@@ -1,0 +1,65 @@
+"""Configurations as plain JSON values, and back."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from types import UnionType
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+
+from cuelearner_jax.errors import UserError
+
+
+def to_json(config: Any) -> dict[str, Any]:
+    """A configuration as plain JSON values."""
+    return json.loads(json.dumps(dataclasses.asdict(config)))
+
+
+def from_json(kind: type, values: dict[str, Any]) -> Any:
+    """A flat configuration dataclass (Sizes, Scalars, Schedule, a task's) from JSON values; lists become tuples.
+
+    Raises:
+        UserError: an unknown field.
+        TypeError: a value of another type than its field's.
+    """
+    known = {field.name for field in dataclasses.fields(kind)}
+    unknown = sorted(set(values) - known)
+    if unknown:
+        raise UserError(
+            f"unknown field {unknown[0]!r} for {kind.__name__}: the file was written by another version of cuelearner"
+        )
+    values = {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()}
+    types = get_type_hints(kind)
+    for name, value in values.items():
+        if not fits(value, types[name]):
+            raise TypeError(f"{name} is {value!r}, not {types[name]}")
+    return kind(**values)
+
+
+def fits(value: Any, kind: Any) -> bool:
+    """Is a value of a field's type? Of the types that configurations have; every value is of any other."""
+    origin, parts = get_origin(kind), get_args(kind)
+    if origin is Literal:
+        return any(type(value) is type(choice) and value == choice for choice in parts)
+    if origin in (Union, UnionType):
+        return any(fits(value, part) for part in parts)
+    if origin is tuple:
+        parts = parts[:1] * len(value) if isinstance(value, tuple) and parts[1:] == (...,) else parts
+        return isinstance(value, tuple) and len(value) == len(parts) and all(map(fits, value, parts))
+    if kind in (int, float):
+        return type(value) is int or (kind is float and type(value) is float)
+    return isinstance(value, kind) if isinstance(kind, type) else True
+
+
+def defaults(kind: type) -> dict[str, Any]:
+    """The JSON values of a configuration dataclass's fields, of those that have a default."""
+    fields = [field for field in dataclasses.fields(kind) if field.init]
+    plain = {field.name: field.default for field in fields if field.default is not dataclasses.MISSING}
+    made = {field.name: field.default_factory for field in fields if field.default_factory is not dataclasses.MISSING}
+    return json.loads(json.dumps({**plain, **{name: factory() for name, factory in made.items()}}))
+
+
+def digest(values: dict[str, Any]) -> str:
+    """Short hash of JSON values: equal configurations have equal hashes."""
+    return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:12]
