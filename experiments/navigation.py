@@ -1,12 +1,12 @@
 """Success and collisions of navigation under each form of guidance, as in the paper's figure (25 minutes on a GPU).
 
-    python experiments/navigation.py --out FOLDER [--parts relative-350 relative-500] [--dtype bfloat16]
+    python experiments/navigation.py --out FOLDER [--pieces relative-350 relative-500] [--dtype bfloat16] [--resume]
 
 Sixteen seeds that no setting was chosen on, 150,000 steps each, labels by the road-map teacher; validation in worlds of
 their own. Then 2,000 validation episodes of every agent, 500 in each of two styles of worlds that it never saw, and the
-curves. A part is one kind of guidance with one budget; with several devices, give each process its parts and device
-(CUDA_VISIBLE_DEVICES) and the same FOLDER. Interrupted parts are resumed, finished ones left as they are. Options that
-are not listed here are given to the sweeps (all of them: cuelearner sweep navigation --help).
+curves. A piece is one kind of guidance with one budget; with several devices, give each process its pieces and device
+(CUDA_VISIBLE_DEVICES) and the same FOLDER. With --resume interrupted pieces go on, finished ones are left as they are.
+Options that are not listed here are given to the sweeps (all of them: cuelearner sweep navigation --help).
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from pathlib import Path
 
 from cuelearner_jax.cli import main as cuelearner
 
-PARTS = {
+PIECES = {
     "relative-500": ("relative", "500"),
     "relative-350": ("relative", "350"),
     "relative-100": ("relative", "100"),
@@ -42,15 +42,15 @@ EVALUATIONS = {  # name: policy, style, episodes
 }
 
 
-def commands(out: Path, part: str, dtype: str, extra: list[str]) -> list[list[str]]:
-    """The command lines of one part, in their order."""
-    run = out / part
-    guidance, labels = PARTS[part]
+def commands(out: Path, piece: str, dtype: str, resume: bool, extra: list[str]) -> list[list[str]]:
+    """The command lines of one piece, in their order."""
+    run = out / piece
+    guidance, labels = PIECES[piece]
     options = [text for pair in {"--guidance": guidance, "--labels": labels, **SWEEP}.items() for text in pair]
-    resume = ["--resume"] if (run / "config.json").exists() else []
-    made = [["sweep", "navigation", *options, "--sizes.target-dtype", dtype, "--out", str(run), *extra, *resume]]
+    going_on = ["--resume"] if resume and (run / "config.json").exists() else []
+    made = [["sweep", "navigation", *options, "--sizes.target-dtype", dtype, "--out", str(run), *extra, *going_on]]
     for name, (policy, style, episodes) in EVALUATIONS.items():
-        measured = out / "evaluations" / f"{part}-{name}.json"
+        measured = out / "evaluations" / f"{piece}-{name}.json"
         if not measured.exists() and (policy == "agent" or guidance != "none"):
             asked = ["--policy", policy, "--envs", str(episodes), "--steps", str(episodes * LONGEST)]
             made.append(["evaluate", str(run), *asked, "--task.style", style, "--out", str(measured)])
@@ -63,12 +63,14 @@ def main() -> int:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
     )
     parser.add_argument("--out", type=Path, default=Path("runs/navigation"))
-    parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS), help="these alone")
+    parser.add_argument("--pieces", nargs="+", choices=PIECES, default=list(PIECES), help="these alone")
+    parser.add_argument("--resume", action="store_true", help="go on with pieces that were begun, leave finished ones")
     parser.add_argument("--dtype", choices=("float32", "bfloat16"), default="float32", help="of the targets' argmax")
     arguments, extra = parser.parse_known_args()
-    asked = [line for part in arguments.parts for line in commands(arguments.out, part, arguments.dtype, extra)]
-    if arguments.parts == list(PARTS):
-        runs = [str(arguments.out / part) for part in PARTS]
+    how = arguments.dtype, arguments.resume, extra
+    asked = [line for piece in arguments.pieces for line in commands(arguments.out, piece, *how)]
+    if arguments.pieces == list(PIECES):
+        runs = [str(arguments.out / piece) for piece in PIECES]
         for metric, sense in (("success", []), ("collision", ["--lower-is-better"])):
             folder = str(arguments.out / metric)
             asked.append(["report", *runs, "--metric", metric, *sense, "--out", folder, "--overwrite"])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -11,6 +11,7 @@ from cuelearner_jax.agent.choice import looked_at
 from cuelearner_jax.asking import label_slots
 from cuelearner_jax.devices import portions
 from cuelearner_jax.errors import UserError
+from cuelearner_jax.guidance.registry import registered
 from cuelearner_jax.runs.free_memory import free_bytes
 from cuelearner_jax.runs.lanes import LaneGroup
 from cuelearner_jax.types import TrainState
@@ -30,10 +31,11 @@ def memory_report(group: LaneGroup) -> str:
     block = group.shapes_of(group.cut[:1])[0]  # the blocks are alike
     count, width = group.cut.shape
     lanes, devices = len(group.seeds), group.mesh.size
-    kept = {option: count * size // devices for option, size in _at_rest(block).items()}
+    guide = _guide(group, block)
+    kept = {option: count * size // devices for option, size in _at_rest(block, guide).items()}
     examined = group.at_once if jax.default_backend() == "cpu" else min(group.at_once, portions().agents)
-    worked = {option: size * group.at_once for option, size in _training(group, block).items()}
-    worked |= {option: size * examined for option, size in _evaluating(group, block).items()}
+    worked = {option: size * group.at_once for option, size in _training(group, block, guide).items()}
+    worked |= {option: size * examined for option, size in _evaluating(group, block, guide).items()}
     worlds = {"--task": COPIES * state_bytes(jax.eval_shape(lambda env: env, group.env))}
     at_rest, working = sum(kept.values()), max(worked.values()) + worlds["--task"]
     each = f" on each of {devices} devices" if devices > 1 else ""
@@ -52,7 +54,27 @@ def memory_report(group: LaneGroup) -> str:
     )
 
 
-def _at_rest(block: TrainState) -> dict[str, int]:
+class _Guide(NamedTuple):
+    """What a guide's network has for one situation."""
+
+    option: str  # of its layers
+    units: int  # in all layers
+    widest: int  # in one
+    inputs: int  # beside the observation
+
+
+def _guide(group: LaneGroup, block: TrainState) -> _Guide:
+    """A network of the situation, or one that weighs each of its aims."""
+    sizes, kind = group.config.sizes, registered(group.guidance.name)
+    if kind is None or "aims" not in kind.needs:
+        return _Guide("--sizes.feedback-layers", sum(sizes.feedback_layers), max(sizes.feedback_layers), 0)
+    obs = jax.ShapeDtypeStruct(block.guide.obs.shape[-1:], block.guide.obs.dtype)
+    aims, features = jax.eval_shape(lambda env, obs: env.aims(obs), group.env, obs).features.shape
+    layers = [aims * width for width in sizes.aim_layers]
+    return _Guide("--sizes.aim-layers", sum(layers), max(layers), aims * features)
+
+
+def _at_rest(block: TrainState, layers: _Guide) -> dict[str, int]:
     """What a block keeps [bytes], by the option that decides it."""
     agent, guide = block.agent, block.guide
     parts = {
@@ -60,13 +82,13 @@ def _at_rest(block: TrainState) -> dict[str, int]:
         "--labels": guide.labels,
         "--sizes.num-envs": (agent.env, agent.obs, agent.guided),
         "--sizes.candidates": (guide.env, guide.obs),
-        "--sizes.feedback-layers": guide.model,
+        layers.option: guide.model,
     }
     found = {option: state_bytes(part) for option, part in parts.items()}
     return {**found, "--sizes.q-layers": state_bytes(block) - sum(found.values())}
 
 
-def _training(group: LaneGroup, block: TrainState) -> dict[str, int]:
+def _training(group: LaneGroup, block: TrainState, guide: _Guide) -> dict[str, int]:
     """What one lane takes beside that in each kind of work, of which one is done at a time [bytes], by option."""
     sizes, schedule = group.config.sizes, group.config.schedule
     looked = looked_at(sizes)
@@ -83,27 +105,29 @@ def _training(group: LaneGroup, block: TrainState) -> dict[str, int]:
     needed["--schedule.eval-every"] = 3 * FLOAT * (schedule.eval_every // sizes.num_envs)
     if group.largest_budget:
         obs = state_bytes(block.guide.obs) // (block.key.shape[0] * sizes.candidates)
-        layers = FLOAT * sum(sizes.feedback_layers)
-        needed["--sizes.fit-batch-size"] = sizes.ensemble * sizes.fit_batch_size * (3 * layers + COPIES * obs)
+        seen = COPIES * (obs + FLOAT * guide.inputs)
+        needed["--sizes.fit-batch-size"] = sizes.ensemble * sizes.fit_batch_size * (3 * FLOAT * guide.units + seen)
         needed["--sizes.fit-steps"] = 2 * FLOAT * sizes.fit_steps
         slots = label_slots(group.largest_budget, sizes)
         valued = min(sizes.num_envs * sizes.guide_directions, max(portions().actions, sizes.guide_directions))
         needed["--sizes.guide-directions"] = 4 * FLOAT * _widest(group) * valued * sizes.ensemble
         needed["--sizes.replay-steps"] = FLOAT * sizes.replay_steps * sizes.fit_batch_size
-        widest = FLOAT * sizes.ensemble * max(sizes.feedback_layers)
-        needed["--labels and --sizes.labels-per-round"] = slots * 2 * widest
+        widest = FLOAT * sizes.ensemble * guide.widest
+        needed[guide.option] = 4 * widest * sizes.num_envs
+        needed["--labels and --sizes.labels-per-round"] = slots * (2 * widest + FLOAT * guide.inputs)
         situation = state_bytes((block.guide.env, block.guide.obs)) // block.key.shape[0]
         needed["--sizes.candidates"] = COPIES * situation + 2 * sizes.candidates * widest
     return needed
 
 
-def _evaluating(group: LaneGroup, block: TrainState) -> dict[str, int]:
+def _evaluating(group: LaneGroup, block: TrainState, guide: _Guide) -> dict[str, int]:
     """The same of evaluations."""
     schedule = group.config.schedule
     lanes = block.key.shape[0] * group.config.sizes.candidates
     situation = state_bytes((block.guide.env, block.guide.obs)) // lanes
+    widest = max(_widest(group), guide.widest)
     return {
-        "--schedule.eval-envs": schedule.eval_envs * (COPIES * situation + 2 * FLOAT * _widest(group)),
+        "--schedule.eval-envs": schedule.eval_envs * (COPIES * situation + 2 * FLOAT * widest),
         "--schedule.eval-steps": METRICS * FLOAT * (schedule.eval_steps // schedule.eval_envs),
     }
 

@@ -6,7 +6,7 @@ import jax
 import numpy as np
 import probes
 import pytest
-from probes import Window
+from probes import Aimed, Window
 
 from cuelearner_jax import config as configuration
 from cuelearner_jax.config import LARGEST, RunConfig, Scalars, Schedule, Sizes
@@ -37,7 +37,7 @@ def report(config: RunConfig, kind: str, labels: int = 20) -> str:
     configuration.check(config)
     grid = Grid((kind,), (0, 1), (labels,))
     check_grid(grid)
-    env = jax.eval_shape(Window)
+    env = jax.eval_shape(Aimed)
     return memory_report.memory_report(LaneGroup(config, env, registry.make(kind, config.sizes, env), grid))
 
 
@@ -56,7 +56,7 @@ def test_any_whole_number_is_refused_or_fits(group, name):
         parts[group][name] = (value,) if isinstance(parts[group][name], tuple) else value
         changed = {part: dataclasses.replace(getattr(base, part), **values) for part, values in parts.items()}
         config = dataclasses.replace(base, **changed)
-        for kind in ("none", "relative"):
+        for kind in ("none", "relative", "intent"):
             try:
                 told = report(config, kind)
             except UserError as refusal:
@@ -87,6 +87,20 @@ LARGE = [
 def test_what_takes_the_memory_is_named(group, values, option):
     with pytest.raises(UserError, match=f"16.0 GB are free: .*lower {option}"):
         report(probes.config(**{group: values}), "relative")
+
+
+def test_layers_that_a_guide_has_not_take_no_memory():
+    for own, kind in (("aim", "intent"), ("feedback", "relative")):
+        wide = {f"{own}_layers": (10**6, 10**6)}
+        with pytest.raises(UserError, match=f"lower --sizes.{own}-layers"):
+            report(probes.config(sizes=wide), kind)
+    assert report(probes.config(sizes={"aim_layers": (10**6, 10**6)}), "relative") == report(probes.CONFIG, "relative")
+
+
+def test_a_guide_of_aims_takes_memory_for_each_of_them():
+    with pytest.raises(UserError, match="lower --labels"):
+        report(probes.config(sizes={"aim_layers": (1000,)}), "intent", labels=500_000)
+    assert report(probes.config(sizes={"feedback_layers": (1000,)}), "relative", labels=500_000)
 
 
 def test_fewer_lanes_are_advised_where_some_would_fit():
