@@ -76,7 +76,7 @@ class Aimed(Window):
     def aims(self, obs):
         turns = jnp.array((-1.0, 0.6, 2.5, -2.2))[jnp.array(self.order)]
         found = from_angle(jnp.arctan2(obs[1], obs[0])[None] + turns)
-        features = jnp.stack([jnp.cos(turns), jnp.sin(turns), turns], -1)
+        features = jnp.stack([jnp.cos(turns), jnp.sin(turns), turns, jnp.broadcast_to(obs[0], turns.shape)], -1)
         return Aims(found, features, jnp.array(self.possible)[jnp.array(self.order)])
 
 

@@ -178,8 +178,16 @@ def _check_disagreement(laws: Laws, kind: Kind, env: Any, sizes: GuideSizes, obs
     if guidance.disagreement is None:
         return
     model = guidance.init(jax.random.key(4))
+    model = model.replace(params=jax.tree.map(_moved, model.params))  # members may start out alike
     with laws.attempted("`disagreement` under jit", "it gets a model and a batch of situations and actions"):
         apart = jax.jit(guidance.disagreement)(model, env, obs, actions)
     laws.hold(apart.shape == (ROWS,), f"`disagreement` of {ROWS} rows has shape {apart.shape}: give one number a row")
     laws.hold(np.isfinite(apart).all() and (apart >= 0).all(), "`disagreement` is negative or not finite")
     laws.hold(jnp.ptp(apart) > 0, "`disagreement` is the same of all situations: it can choose none of them")
+
+
+def _moved(leaf: Array) -> Array:
+    """Parameters that are no longer those of the start, as after a fit."""
+    if not jnp.issubdtype(leaf.dtype, jnp.floating):
+        return leaf
+    return leaf + 0.1 * jax.random.normal(jax.random.key(leaf.size), leaf.shape)
