@@ -74,7 +74,7 @@ def draw_label_efficiency(variants: Sequence[Variant], title: str, metric: str) 
         draw_budgets(right, variants, [variant.mean for variant in variants], "mean over the curve")
         left.set_ylabel(axis_name(metric))
         handles, names = left.get_legend_handles_labels()
-        figure.legend(handles, names, loc="outside lower center", ncols=len(names))
+        figure.legend(handles, names, loc="outside lower center", ncols=min(5, len(names)))
         figure.suptitle(one_line(title), x=0.01, ha="left", fontweight="bold", fontsize=11)
     return figure
 
