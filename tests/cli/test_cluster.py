@@ -88,6 +88,12 @@ def command_of(out, shard):
     return int(re.findall(rf"process (\d+): .*--shard {shard}/2\n", logs)[0])
 
 
+def halted(process):
+    """Has a stopped process come to rest, with all of its threads? A signal takes a moment, and writers go on in it."""
+    states = [stat.read_text().rpartition(")")[2].split()[0] for stat in Path(f"/proc/{process}/task").glob("*/stat")]
+    return set(states) == {"T"}
+
+
 def test_submitted_twice_then_one_killed_then_submitted_again_gives_what_one_process_gives(whole, tmp_path, capsys):
     out = tmp_path / "run"
     command = [*LOCAL, "--out", str(out)]
@@ -96,6 +102,7 @@ def test_submitted_twice_then_one_killed_then_submitted_again_gives_what_one_pro
     processes = [command_of(out, shard) for shard in (1, 2)]
     for process in processes:
         os.kill(process, signal.SIGSTOP)  # both live, and hold their folders
+    until(lambda: all(map(halted, processes)))
     before = listing(out)
     assert main(command) == 2
     told = capsys.readouterr().err.splitlines()

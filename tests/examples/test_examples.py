@@ -9,6 +9,7 @@ import shlex
 import sys
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 from PIL import Image
@@ -43,6 +44,7 @@ def stranger():
     modules = {name: sys.modules.pop(name) for name in list(sys.modules) if name.split(".")[0] == "examples"}
     guidances._KINDS.pop("clone", None)
     tasks._registered.clear()
+    jax.clear_caches()  # what was traced with classes of modules that are imported anew
     try:
         yield
     finally:
