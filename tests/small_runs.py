@@ -1,6 +1,12 @@
 """The arguments of tiny runs, and what lies in a folder."""
 
+import threading
+from contextlib import contextmanager
 from pathlib import Path
+
+import pytest
+
+from cuelearner_jax.runs import sweep
 
 SMALL = [
     *("--sizes.q-layers", "16", "--sizes.feedback-layers", "16", "--sizes.directions", "36"),
@@ -21,3 +27,23 @@ def listing(folder: Path) -> dict[str, tuple[int, int]]:
         else []
     )
     return {str(path): (path.stat().st_size, path.stat().st_mtime_ns) for path in files}
+
+
+@contextmanager
+def stopping_at(when):
+    """Ctrl-C at the given look at the event (each round of labels and each stretch of steps looks once)."""
+
+    class Event(threading.Event):
+        looks = 0
+
+        def is_set(self):
+            Event.looks += 1
+            return Event.looks == when
+
+    @contextmanager
+    def interruptible():
+        yield Event()
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sweep, "interruptible", interruptible)
+        yield

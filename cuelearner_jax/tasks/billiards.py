@@ -136,7 +136,7 @@ BILLIARDS = Task(
             ),
             guidance=("none", "intent", "relative"),
             labels=(100, 500),
-            takes="16 seeds under one guidance: 10 to 12 minutes on one H200; one: hours on 2 cores",
+            takes="16 seeds under one guidance: 10 to 12 minutes on one H200; one: hours on 2 cores, counted",
         ),
         "easy": Preset(
             "larger balls and pockets, seen from the strike, the paper's networks, 1 million steps a seed",

@@ -1,11 +1,11 @@
 """Labels in instalments: who has been asked for how many, runs that go on in the middle, the guides' own quality."""
 
-import threading
 from contextlib import contextmanager
 
 import numpy as np
 import probes
 import pytest
+from small_runs import stopping_at
 
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.records import guides, label_files, results
@@ -82,26 +82,6 @@ def test_budgets_too_small_for_their_instalments_and_labels_of_files_are_refused
 
 
 # Runs.
-
-
-@contextmanager
-def stopping_at(when):
-    """Ctrl-C at the given look at the event (each round of labels and each stretch of steps looks once)."""
-
-    class Event(threading.Event):
-        looks = 0
-
-        def is_set(self):
-            Event.looks += 1
-            return Event.looks == when
-
-    @contextmanager
-    def interruptible():
-        yield Event()
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sweep, "interruptible", interruptible)
-        yield
 
 
 @contextmanager

@@ -2,7 +2,6 @@
 
 import json
 import shutil
-import threading
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -11,6 +10,7 @@ import numpy as np
 import probes
 import pyarrow.parquet as pq
 import pytest
+from small_runs import stopping_at
 
 from cuelearner_jax.asking import label_slots
 from cuelearner_jax.errors import UserError
@@ -62,26 +62,6 @@ def compiled_once():
         patch.setattr(training, "start_clock", committed(start_clock))
         patch.setattr(lanes, "make_program", made)
         patch.setattr(runner, "ROUNDS_A_CHUNK", 2)
-        yield
-
-
-@contextmanager
-def stopping_at(when):
-    """Ctrl-C at the given look at the event (each round of labels and each stretch of steps looks once)."""
-
-    class Event(threading.Event):
-        looks = 0
-
-        def is_set(self):
-            Event.looks += 1
-            return Event.looks == when
-
-    @contextmanager
-    def interruptible():
-        yield Event()
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sweep, "interruptible", interruptible)
         yield
 
 
