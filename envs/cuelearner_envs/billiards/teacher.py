@@ -1,4 +1,4 @@
-"""Billiards teachers: by exhaustive search, by search near what a network proposes, and a network's in another world."""
+"""Billiards teachers: by search of all directions, by search near a network's proposals, and a network alone."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ class LocalSearchTeacher(struct.PyTreeNode):
     """Plays, in the world in which it is asked, what a learned teacher proposes (`cuelearner_jax.types.Teacher`).
 
     The network finds the few directions round which a shot may succeed; simulated shots decide. So it knows the true
-    state, a turned strike and a slight tilt exactly, and the network's errors count only where it proposes nothing good.
+    state, a turned strike and a slight tilt exactly; the network's errors count only where it proposes nothing good.
     """
 
     teacher: Any  # a network with `values(obs, options)`

@@ -1,3 +1,4 @@
+import dataclasses
 import json
 import re
 
@@ -148,7 +149,7 @@ def test_a_learned_teacher_looks_at_the_table_and_not_at_the_sensor(easy):
 
 def test_a_configuration_names_the_search_near_a_networks_proposals():
     for changes in ({"teacher": "local_search"}, {"teacher": "learned", "acceleration": (0.0, 0.005)}):
-        config = BilliardsConfig("easy", **changes)
+        config = dataclasses.replace(BilliardsConfig("easy"), **changes)
         assert isinstance(make_teacher(config, make_environment(config)), LocalSearchTeacher)
     assert isinstance(learned(action_turn_deg=0.8)[1], Transferred)
 
@@ -158,7 +159,9 @@ def near(request, easy):
     """In a changed world: the search near proposals, the search of all directions, what these are worth, the states."""
     config = SCENARIOS[request.param].applied(BilliardsConfig("easy", teacher="local_search"))
     env = make_environment(config)
-    local = make_teacher(config, env).replace(directions=PROPOSALS)
+    local = make_teacher(config, env)
+    assert isinstance(local, LocalSearchTeacher)
+    local = local.replace(directions=PROPOSALS)
     full = SearchTeacher(env, local.aim_error, local.habit, PROPOSALS)
     states = easy[0]
     return local, full, searched(full, states), states, jax.vmap(env.observe)(states)
