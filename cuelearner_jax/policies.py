@@ -257,7 +257,9 @@ def policy_of(given: Any) -> Any:
     if hasattr(given, "act"):
         if any(leaf is given for leaf in jax.tree.leaves(given)):
             kind = type(given).__name__
-            raise UserError(f"a {kind} has `act` but is no pytree: make it a flax.struct.PyTreeNode, or give a function")
+            raise UserError(
+                f"a {kind} has `act` but is no pytree: make it a flax.struct.PyTreeNode, or give a function"
+            )
         return given
     if isinstance(given, jax.stages.Wrapped):
         return Opaque(given)

@@ -109,16 +109,15 @@ def adapt(
         rows = place(mesh, jax.tree.map(lambda leaf: jnp.asarray(leaf)[filled], labels), BY_LANE)
         block = program.take_labels(work.guidance, work.sizes, env, work.scalars, rows, block, mesh)
     else:
-        assert teacher is not None
-        teacher, number = place(mesh, teacher, SHARED), program.rounds(work.lanes, work.sizes)
+        assert teacher is not None  # asked for where no labels are given
+        asks: Teacher = place(mesh, teacher, SHARED)
+        number = program.rounds(work.lanes, work.sizes)
         tell = watch("labels")
         for done in range(number):
             tell(done, number)
             measure(block, done * work.sizes.labels_per_round)
             block = jax.block_until_ready(
-                program.ask_round(
-                    work.guidance, work.sizes, env, teacher, work.scalars, bases, block, mesh
-                )
+                program.ask_round(work.guidance, work.sizes, env, asks, work.scalars, bases, block, mesh)
             )
         tell(number, number)
     judged = measure.judged(block)
@@ -155,8 +154,9 @@ class _Measuring:
         return judging.judged(how.by, work.lanes, bases, after, usable)
 
     def _add(self, block: Adapting) -> judging.Metrics:
-        work = self.work
-        policy = program.adapted(work.guidance, work.sizes, work.judging.env, work.scalars, work.bases, block)
+        work, env = self.work, self.work.judging.env
+        assert env is not None
+        policy = program.adapted(work.guidance, work.sizes, env, work.scalars, work.bases, block)
         found = self._measured(policy, "the adapted policy")
         self.curve.append({"asked": np.asarray(block.guide.asked), "failed": np.asarray(block.failed), **found})
         return found

@@ -70,7 +70,9 @@ def told(policy: Any, named: str | None = None) -> Told:
 
 def _part(kind: type, values: Any) -> Told:
     """The fields of a configuration class, of an instance of it or of one that has more."""
-    return configuration.to_json(kind(**{field.name: getattr(values, field.name) for field in dataclasses.fields(kind)}))
+    return configuration.to_json(
+        kind(**{field.name: getattr(values, field.name) for field in dataclasses.fields(kind)})
+    )
 
 
 def arrays_of(policy: Any) -> Any:

@@ -20,7 +20,7 @@ from cuelearner_jax.terminal import console, progress_bars
 
 @dataclass(frozen=True)
 class Evaluate(Generic[TaskT]):
-    """Validate a run's newest checkpoints, or a task's teacher, heuristic or chance; in any changed world."""
+    """Validate a run, an adapted policy, or a task's teacher, heuristic or chance; in any changed world."""
 
     task: TaskT
     policy: str = "agent"
@@ -42,7 +42,8 @@ class Evaluate(Generic[TaskT]):
     scenario: str | None = None
     """The changed world of this name, see above; options of the task (--task.…) come on top of it."""
     out: Path | None = None
-    """Also write the measurements to this JSON file."""
+    """Also write the measurements to this JSON file. (Beside all these: --base package.module:NAME gives the code of a
+    policy folder that has some.)"""
 
 
 MOST_ENVS = 100_000  # that memory has room for
@@ -55,7 +56,7 @@ def run(arguments: list[str]) -> None:
     """Runs the command. Raises UserError for what cannot be evaluated."""
     source, rest = source_of(arguments, "evaluate", Evaluate)
     kind = Evaluate[source.task.config]  # pyright: ignore[reportInvalidTypeArguments]
-    default = kind(world_of(source, rest), policy="agent" if source.grid else "heuristic")
+    default = kind(world_of(source, rest), policy=source.default_policy)
     asked = parse(kind, rest, f"evaluate {source.folder}", default, about(Evaluate, source.task, policies=True))
     source = source.on(asked.robot)
     engine = source.task.engine(asked.engine)
@@ -111,11 +112,13 @@ def _measurements(measured: list[trained.Measured], title: str) -> Table:
     """Interquartile means over seeds with their intervals, a row for each guidance and budget."""
     from cuelearner_jax.report.statistics import interval
 
-    table = Table("guidance", "labels", "seeds", "steps", "metric", "mean", "95% interval", title=title)
+    within = ("within",) if any(row.bound_deg is not None for row in measured) else ()
+    table = Table("guidance", "labels", *within, "seeds", "steps", "metric", "mean", "95% interval", title=title)
     for column in table.columns:
         column.no_wrap = True
     for row in measured:
-        own = [row.guidance, str(row.labels), str(len(row.seeds)), str(row.step)]
+        bound = [f"{row.bound_deg:g} deg"] if row.bound_deg is not None else []
+        own = [row.guidance, str(row.labels), *bound, str(len(row.seeds)), str(row.step)]
         for name, values in row.metrics.items():
             if np.isfinite(values).all():
                 found = interval(values)
