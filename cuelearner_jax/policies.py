@@ -304,7 +304,7 @@ def wanted_actions(
     actions: Float[Array, "n action"],
     scalars: Any,
 ) -> Float[Array, "n action"]:
-    """What a teacher would have done instead of actions: its best, or, where `scalars.answer` says so, the nearest good.
+    """What a teacher would have done instead: its best, or, where `scalars.answer` says so, the nearest good action.
 
     `scalars` without such a field (`GuideScalars`) mean the best.
     """

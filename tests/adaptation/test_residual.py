@@ -1,5 +1,7 @@
 """Residual learning from optimal actions, on the bandit turned by a constant, through the program of adaptation."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -20,7 +22,7 @@ from cuelearner_jax.types import Label
 TURN_DEG, BOUND_DEG = 8.0, 12.0
 ENV = probes.Window(offset=0.6 + np.deg2rad(TURN_DEG))
 SIZES = GuideSizes(feedback_layers=(32, 32), labels_per_round=10, fit_steps=300, fit_batch_size=32)
-SCALARS = Scalars(eps_deg=BOUND_DEG, tau_max_deg=BOUND_DEG, feedback_learning_rate=5e-3, max_grad_norm=10.0)
+SCALARS = Scalars(eps_deg=BOUND_DEG, tau_max_deg=BOUND_DEG, k_max=10, feedback_learning_rate=5e-3, max_grad_norm=10.0)
 GUIDANCE = registry.made_for(residual.KIND, SIZES, spaces_of(ENV))
 OBS = actions.evenly_spaced(4)
 
@@ -63,7 +65,8 @@ def test_a_constant_shift_is_recovered(adapted):
 
 
 def test_it_is_the_residual_policy(adapted):
-    policy = lane_of(adapted[1], 0)
+    """Where it is applied once."""
+    policy = lane_of(adapted[1].replace(scalars=dataclasses.replace(SCALARS, k_max=1)), 0)
     network, unit = residual_model(SIZES, spaces_of(ENV)), jnp.deg2rad(BOUND_DEG)
     plain = Residual(
         policy.base, policy.model.params, policy.bound, lambda params, *seen: unit * network.predict(ENV, params, *seen)
@@ -76,7 +79,7 @@ def test_corrections_stay_within_the_bound():
     _, policy = asked(40, 3.0)  # the same programs, for bounds are values
     for lane in range(2):
         done = lane_of(policy, lane).act(jax.random.key(0), None, OBS)
-        away = np.rad2deg(actions.distance(done, policy.base.act(None, None, OBS)))
+        away = np.rad2deg(actions.distance(done, policy.base.act(jax.random.key(0), None, OBS)))
         np.testing.assert_allclose(away, 3.0, atol=1e-3)  # the needed ones are larger
 
 
