@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import _trajectories as trajectories
 import numpy as np
 from _pieces import chosen, listed
 
@@ -22,7 +23,7 @@ from cuelearner_jax.cli import main as cuelearner
 from cuelearner_jax.config import GuideSizes, RunConfig
 from cuelearner_jax.environment import actions_of, spaces_of
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.evaluate import episodes, watched_lanes
+from cuelearner_jax.evaluate import episodes, one_lane, watched_lanes
 from cuelearner_jax.guidance import registry as guidances
 from cuelearner_jax.policies import Agent, Corrected
 from cuelearner_jax.records import table as tables
@@ -61,6 +62,7 @@ class Piece(NamedTuple):
     split: str = "validation"  # of the episodes; settings are chosen on "tuning"
     bases: int | None = None  # at most so many
     judge_by: str = "reward"  # a model that is worse by this on tuning episodes is not used
+    ways: bool = False  # keep some ways that are walked before and after, for a picture?
     minutes: int = 10  # of an H100 or H200, a guess
     serves: str = ""  # which figure
 
@@ -108,6 +110,7 @@ class Bench(NamedTuple):
     piece: Piece
     envs: int
     steps: int
+    folder: Path  # of what is written
 
     def env(self, split: str) -> Any:
         """The world of a split: what is asked and learned in is "training"."""
@@ -160,7 +163,12 @@ def by_labels(kind: Any, bench: Bench) -> Iterator[Row]:
     found = adapting.adapt(asked, bench.task.make_teacher(bench.world, env))
     told = {"used": found.judged.used.astype(float), "failed": np.asarray(found.block.failed).astype(float)}
     told |= {"judged_before": found.judged.before, "judged_after": found.judged.after, "eps_deg": scalars.eps_deg}
-    metrics = bench.measured(found.policy(bench.env(piece.split)))
+    shown = bench.env(piece.split)
+    metrics = bench.measured(found.policy(shown))
+    if piece.ways:
+        last = len(bench.seeds) * (len(piece.labels) - 1)  # the first base with the largest budget
+        policies = {"before": one_lane(bench.agents, 0), "after": one_lane(found.policy(shown), last)}
+        trajectories.write(bench.folder, shown, policies, piece.split, bench.steps)
     yield {"base": bench.seeds[lanes.base], "labels": lanes.budget, "steps": 0, **told, **metrics}
 
 
@@ -221,7 +229,7 @@ def scaled(piece: Piece, scale: Scale) -> Piece | None:
     return piece._replace(labels=labels, steps=steps, every=between, settings=settings, bases=min(few) if few else None)
 
 
-def opened(folder: Path, study: Study, piece: Piece, scale: Scale) -> Bench:
+def opened(folder: Path, study: Study, piece: Piece, scale: Scale, out: Path) -> Bench:
     """Where a piece is run. Raises UserError if the folder holds no such agents."""
     source = PolicySource.of_run(folder, registry.find)
     if source.task.name != study.task:
@@ -235,7 +243,7 @@ def opened(folder: Path, study: Study, piece: Piece, scale: Scale) -> Bench:
     policies, seeds = several(source, env, world, "agent", None, None, source.grid.seeds[: piece.bases])
     agents = program.side_by_side(policies)
     steps = scale.steps if source.task.longest is None else source.task.longest(world)
-    return Bench(source.task, config, agents, np.array(seeds), world, piece, scale.envs, steps)
+    return Bench(source.task, config, agents, np.array(seeds), world, piece, scale.envs, steps, out)
 
 
 def run_piece(study: Study, piece: Piece, scale: Scale, bases: Path, out: Path, resume: bool) -> None:
@@ -247,7 +255,7 @@ def run_piece(study: Study, piece: Piece, scale: Scale, bases: Path, out: Path, 
     if folder.exists() and not resume:
         raise UserError(f"{folder} exists: give --resume to go on, or another --out")
     shutil.rmtree(folder, ignore_errors=True)  # what was begun is begun anew: it takes minutes
-    bench = opened(bases, study, piece, scale)
+    bench = opened(bases, study, piece, scale, folder)
     about = {"task": study.task, "world": piece.world, "method": piece.method, "variant": piece.variant}
     constants = {**about, "split": piece.split, "bound_deg": piece.bound_deg, **provenance()}
     with tables.TableWriter(folder, SCHEMA, constants) as writer:
@@ -279,7 +287,7 @@ def run(study: Study, about: str, arguments: Sequence[str] | None = None) -> int
     except ValueError as error:
         parser.error(str(error))
     if not asked.pieces:
-        pieces = [piece for piece in pieces if piece.split != "tuning"]
+        pieces = [piece for piece in pieces if piece.split != "tuning" or piece.world == UNCHANGED]
     if asked.list:
         print(listed(pieces))
         return 0

@@ -121,7 +121,7 @@ def sides() -> list[Piece]:
         pieces += [
             Piece(world, "none", minutes=2, serves=serves),
             Piece(world, "teacher", minutes=4, **asked),
-            Piece(world, "relative", labels=(100, 250, 500), minutes=12, **asked),
+            Piece(world, "relative", labels=(100, 250, 500), ways=True, minutes=12, **asked),
         ]
     return [*pieces, *compared("corridor_left", SIDE_BOUND_DEG, "passed_left", {"relative": RELATIVE})]
 
