@@ -28,6 +28,7 @@ from cuelearner_jax.types import Label
 
 HELD_OUT = 5  # every fifth label
 LABELS = "labels"  # what is judged by, in place of a metric
+STEPS = 100  # of an environment, where a task counts steps
 Metrics = dict[str, np.ndarray]
 
 
@@ -38,6 +39,14 @@ class Judged(NamedTuple):
     before: np.ndarray  # (lanes,)
     after: np.ndarray  # (lanes,)
     used: np.ndarray  # (lanes,) bool: is the model used? Not if it is worth less than nothing, or not finite
+
+
+def metrics_of(env: Environment) -> tuple[str, ...]:
+    """Names of what a roll-out measures in an environment."""
+    key = jax.random.key(0)
+    state, _ = jax.eval_shape(env.reset, key)
+    _, step = jax.eval_shape(env.step, key, state, jnp.zeros(actions_of(env).size))
+    return ("reward", *step.metrics, *step.outcome)
 
 
 def measured(
