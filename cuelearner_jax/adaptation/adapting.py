@@ -157,7 +157,7 @@ def adapt(
         UserError: policies cannot be judged as asked.
     """
     mesh = mesh or lane_mesh()
-    count = len(asked.lanes)
+    count = asked.lanes.number
     filled = np.minimum(np.arange(-(-count // mesh.size) * mesh.size), count - 1)  # the last is repeated, and dropped
     work = replace(asked, lanes=asked.lanes.rows(filled))
     env, bases = place(mesh, asked.env, SHARED), place(mesh, asked.bases, SHARED)

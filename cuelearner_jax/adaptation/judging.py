@@ -93,7 +93,7 @@ def judged(by: str, lanes: Lanes, bases: Metrics, policies: Metrics, usable: np.
     if by not in policies:
         raise UserError(f"there is no metric {by!r} to judge by{closest(by, [*policies, LABELS])}")
     before = np.asarray(bases[by])
-    before = np.broadcast_to(before, len(lanes)) if len(before) == 1 else before[lanes.base]
+    before = np.broadcast_to(before, lanes.number) if len(before) == 1 else before[lanes.base]
     after = np.asarray(policies[by])
     return Judged(by, before, after, np.asarray(usable) & (after >= before))  # NaN is worth less than anything
 
