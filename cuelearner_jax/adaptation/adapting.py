@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -10,13 +11,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
+from jaxtyping import Array
 
+from cuelearner_jax.actions import DIRECTIONS
 from cuelearner_jax.adaptation import judging, program
 from cuelearner_jax.adaptation.judging import Judged
 from cuelearner_jax.adaptation.program import Adapting, Lanes
 from cuelearner_jax.config import GuideSizes, Scalars
 from cuelearner_jax.devices import BY_LANE, SHARED, lane_mesh, place
 from cuelearner_jax.environment import Environment
+from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import Tell, untold
 from cuelearner_jax.guidance.bundle import Guidance
 from cuelearner_jax.policies import Guided, Policy
@@ -24,6 +28,7 @@ from cuelearner_jax.types import Label, Teacher
 
 # Seconds a fit on a CPU. The paper's networks are `GuideSizes()`.
 SIZES = GuideSizes(feedback_layers=(128, 128), fit_steps=400, fit_batch_size=64)
+REACH_QUANTILE = 0.95  # of the distances between labelled actions and a policy's own: how far labels reach from it
 BOUND_DEG = 45.0  # where nobody says how far corrections may lead
 PASSES = 20  # of which one turn by eps: a pass that turns by less has settled
 
@@ -73,6 +78,59 @@ class Adapted:
         return program.adapted(of.guidance, of.sizes, env, of.scalars, of.bases, self.block)
 
 
+def check_angles(bounds_deg: Sequence[float], scalars: Scalars) -> str:
+    """Whether bounds and the strength of labels go together.
+
+    Args:
+        bounds_deg: of the lanes [deg].
+        scalars: of refinement.
+
+    Returns:
+        What may be meant otherwise, or nothing.
+
+    Raises:
+        UserError: what cannot be, or could teach nothing.
+    """
+    eps, given = scalars.eps_deg, " ".join(f"{bound:g}" for bound in bounds_deg)
+    if not all(math.isfinite(bound) and 0 < bound <= 180 for bound in bounds_deg):
+        raise UserError(f"bound_deg is {given}: give an angle above 0 and up to 180")
+    if len(set(bounds_deg)) < len(bounds_deg):
+        raise UserError(f"bound_deg is {given}: give each bound once")
+    if eps > min(bounds_deg):
+        raise UserError(
+            f"labels of {eps:g} degrees say nothing within a bound of {min(bounds_deg):g}: give a smaller "
+            "scalars.eps_deg, about a tenth of the bound"
+        )
+    if scalars.tau_deg >= eps:
+        raise UserError(
+            f"scalars.tau_deg is {scalars.tau_deg:g} and a pass turns an action by {eps:g}, after which refinement "
+            f"would stop: give scalars.tau_deg {eps / PASSES:g}"
+        )
+    if scalars.k_max * eps >= max(bounds_deg):
+        return ""
+    return (
+        f"{scalars.k_max} passes of {eps:g} degrees do not reach the bound of {max(bounds_deg):g}: "
+        f"scalars.k_max {math.ceil(max(bounds_deg) / eps)} would"
+    )
+
+
+def reach(policy: Policy, obs: Any, action: Any) -> float:
+    """How far from a policy's own actions labels lie: the distance of 95% of them [deg].
+
+    Args:
+        policy: the policy.
+        obs: of the labels (labels, obs).
+        action: asked about (labels, action).
+    """
+    away = _distances(policy, jnp.asarray(obs), jnp.asarray(action))
+    return float(np.degrees(np.quantile(np.asarray(away), REACH_QUANTILE)))
+
+
+@jax.jit
+def _distances(policy: Any, obs: Array, action: Array) -> Array:
+    return DIRECTIONS.distance(policy.act(jax.random.key(0), None, obs), action)
+
+
 def settling(scalars: Scalars, eps_deg: float | None) -> Scalars:
     """Scalars with answers of that strength (None: as they are), and a threshold that is small beside it."""
     eps = scalars.eps_deg if eps_deg is None else eps_deg
@@ -99,7 +157,7 @@ def adapt(
         UserError: policies cannot be judged as asked.
     """
     mesh = mesh or lane_mesh()
-    count = len(asked.lanes)
+    count = asked.lanes.number
     filled = np.minimum(np.arange(-(-count // mesh.size) * mesh.size), count - 1)  # the last is repeated, and dropped
     work = replace(asked, lanes=asked.lanes.rows(filled))
     env, bases = place(mesh, asked.env, SHARED), place(mesh, asked.bases, SHARED)

@@ -28,6 +28,7 @@ from cuelearner_jax.types import Label
 
 HELD_OUT = 5  # every fifth label
 LABELS = "labels"  # what is judged by, in place of a metric
+STEPS = 100  # of an environment, where a task counts steps
 Metrics = dict[str, np.ndarray]
 
 
@@ -38,6 +39,14 @@ class Judged(NamedTuple):
     before: np.ndarray  # (lanes,)
     after: np.ndarray  # (lanes,)
     used: np.ndarray  # (lanes,) bool: is the model used? Not if it is worth less than nothing, or not finite
+
+
+def metrics_of(env: Environment) -> tuple[str, ...]:
+    """Names of what a roll-out measures in an environment."""
+    key = jax.random.key(0)
+    state, _ = jax.eval_shape(env.reset, key)
+    _, step = jax.eval_shape(env.step, key, state, jnp.zeros(actions_of(env).size))
+    return ("reward", *step.metrics, *step.outcome)
 
 
 def measured(
@@ -84,7 +93,7 @@ def judged(by: str, lanes: Lanes, bases: Metrics, policies: Metrics, usable: np.
     if by not in policies:
         raise UserError(f"there is no metric {by!r} to judge by{closest(by, [*policies, LABELS])}")
     before = np.asarray(bases[by])
-    before = np.broadcast_to(before, len(lanes)) if len(before) == 1 else before[lanes.base]
+    before = np.broadcast_to(before, lanes.number) if len(before) == 1 else before[lanes.base]
     after = np.asarray(policies[by])
     return Judged(by, before, after, np.asarray(usable) & (after >= before))  # NaN is worth less than anything
 

@@ -49,7 +49,9 @@ class Lanes(NamedTuple):
     budget: np.ndarray  # (lanes,) int: labels
     bound_deg: np.ndarray  # (lanes,) float: how far from the base's actions [deg]
 
-    def __len__(self) -> int:
+    @property
+    def number(self) -> int:
+        """How many there are."""
         return len(self.seed)
 
     def rows(self, index: Any) -> Lanes:

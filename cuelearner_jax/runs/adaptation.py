@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +15,6 @@ import numpy as np
 from cuelearner_jax.adaptation import adapting, judging, program, stored
 from cuelearner_jax.adaptation.adapting import Adaptation, Adapted, Judging
 from cuelearner_jax.config import GuideSizes, RunConfig, Scalars, Sizes, check_guide
-from cuelearner_jax.environment import actions_of, spaces_of
 from cuelearner_jax.errors import UserError, closest
 from cuelearner_jax.evaluate import Tell, untold
 from cuelearner_jax.guidance import registry as guidances
@@ -32,8 +30,6 @@ from cuelearner_jax.runs.trained import PolicySource
 from cuelearner_jax.terminal import console
 
 DEFAULT_KIND = KIND.name
-STEPS = 100  # of an environment when policies are judged, where a task counts steps
-REACH_QUANTILE = 0.95  # of the distances between labelled actions and a policy's own: how far labels reach from it
 MOST_ENVS = 100_000  # that memory has room for
 
 
@@ -97,7 +93,8 @@ def run(order: Order, watch: Callable[[str], Tell] = lambda what: untold) -> Ada
     check_grid(Grid((kind.name,), seeds, order.labels))
     file = _label_file(order, kind.name, seeds)
     bounds = order.bounds_deg or (_reach(bases, file, scalars) if file else adapting.BOUND_DEG,)
-    _check_angles(bounds, scalars)
+    if note := adapting.check_angles(bounds, scalars):
+        console.print(note)
     each = program.one_each(seeds, order.labels, bounds)
     lanes = program.product(1, seeds, order.labels, bounds) if shared else each
     how = _judging(order, env)
@@ -164,42 +161,7 @@ def _reach(bases: Any, file: label_files.LabelFile, scalars: Scalars) -> float:
     """How far labels reach from what the base policy does [deg]; at least eps."""
     if not isinstance(bases, Common):
         raise UserError("labels of several base policies reach differently far: give --bound-deg")
-    return max(reach(bases, file.labels.obs, file.labels.action), scalars.eps_deg)
-
-
-def reach(policy: Any, obs: Any, action: Any) -> float:
-    """How far from a policy's own actions labels lie: the distance of 95% of them [deg].
-
-    Args:
-        policy: the policy.
-        obs: of the labels (labels, obs).
-        action: asked about (labels, action).
-    """
-    own = jax.jit(lambda policy, obs: policy.act(jax.random.key(0), None, obs))(policy, jnp.asarray(obs))
-    away = np.asarray(actions_of(None).distance(own, jnp.asarray(action)))
-    return float(np.degrees(np.quantile(away, REACH_QUANTILE)))
-
-
-def _check_angles(bounds: tuple[float, ...], scalars: Scalars) -> None:
-    """Raises UserError for bounds that are none, or strengths of labels that do not fit them."""
-    if len(set(bounds)) < len(bounds) or not all(math.isfinite(bound) and 0 < bound <= 180 for bound in bounds):
-        given = " ".join(f"{bound:g}" for bound in bounds)
-        raise UserError(f"--bound-deg is {given}: give different angles above 0 and up to 180")
-    if scalars.eps_deg > min(bounds):
-        raise UserError(
-            f"labels of {scalars.eps_deg:g} degrees say nothing within a bound of {min(bounds):g}: give a smaller "
-            "--scalars.eps-deg, about a tenth of the bound"
-        )
-    if scalars.tau_deg >= scalars.eps_deg:
-        raise UserError(
-            f"scalars.tau_deg is {scalars.tau_deg:g} and a pass turns an action by {scalars.eps_deg:g}, after which it "
-            f"would stop: give --scalars.tau-deg {scalars.eps_deg / adapting.PASSES:g}"
-        )
-    if scalars.k_max * scalars.eps_deg < max(bounds):
-        console.print(
-            f"{scalars.k_max} passes of {scalars.eps_deg:g} degrees do not reach the bound of {max(bounds):g}: "
-            f"--scalars.k-max {math.ceil(max(bounds) / scalars.eps_deg)} would"
-        )
+    return max(adapting.reach(bases, file.labels.obs, file.labels.action), scalars.eps_deg)
 
 
 def _judging(order: Order, env: Any) -> Judging:
@@ -210,20 +172,12 @@ def _judging(order: Order, env: Any) -> Judging:
     unit = order.sizes.labels_per_round
     if order.judge_every < 0 or order.judge_every % unit:
         raise UserError(f"--judge-every is {order.judge_every}: give a multiple of sizes.labels_per_round ({unit})")
-    metrics = metrics_of(env)
+    metrics = judging.metrics_of(env)
     if by not in (*metrics, judging.LABELS):
         raise UserError(f"--judge-by is {by!r}, no metric of {task.name}{closest(by, [*metrics, judging.LABELS])}")
-    steps = task.longest(order.world) if task.longest else STEPS
+    steps = task.longest(order.world) if task.longest else judging.STEPS
     tuned = None if by == judging.LABELS else task.environment(order.world, "tuning")
     return Judging(tuned, envs, envs * steps, by, order.judge_every)
-
-
-def metrics_of(env: Any) -> tuple[str, ...]:
-    """Names of what a roll-out measures in an environment."""
-    key = jax.random.key(0)
-    state, _ = jax.eval_shape(env.reset, key)
-    _, step = jax.eval_shape(env.step, key, state, jnp.zeros(spaces_of(env).actions.size))
-    return ("reward", *step.metrics, *step.outcome)
 
 
 def told(found: Adapted) -> list[str]:

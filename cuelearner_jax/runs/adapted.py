@@ -63,7 +63,7 @@ class AdaptedLanes:
     def _arrays(self, env: Any) -> Any:
         values = self.values["policy"]
         try:
-            lanes = stored.shapes_of({**values, "base": {"policy": "uniform"}}, env, len(self.lanes))
+            lanes = stored.shapes_of({**values, "base": {"policy": "uniform"}}, env, self.lanes.number)
             like = {**lanes, "base": stored.shapes_of(values["base"], env, self.rows)}
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise formats.damaged("policy", self.folder / policy_folders.POLICY) from error
@@ -214,7 +214,7 @@ def _write_curve(place: Path, name: str, adapted: Adapted, task: Task) -> None:
     }
     lanes = {"seed": of.lanes.seed, "labels": of.lanes.budget, "bound_deg": of.lanes.bound_deg}
     with guides.GuideWriter(place, **constants) as writer:
-        done = np.full(len(of.lanes), -1)
+        done = np.full(of.lanes.number, -1)
         for row in adapted.curve:
             new = row["asked"] > done  # a lane that has its budget does not change any more
             done = row["asked"]

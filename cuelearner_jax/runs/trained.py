@@ -292,7 +292,7 @@ def _blocks(
             raise UserError(f"{source.folder} is under {kept.guidance} guidance: leave out --guidance")
         columns = (kept.lanes.seed, kept.lanes.budget, kept.lanes.bound_deg)
         policy = named.make(Parts(source.config, env, teacher, None, kept))
-        return [_Block(kept.guidance, *columns, 0, policy, np.zeros(len(kept.lanes), bool))]
+        return [_Block(kept.guidance, *columns, 0, policy, np.zeros(kept.lanes.number, bool))]
     loaded = source.load(kinds)
     blocks = []
     for lanes in loaded if failed_too else without_failed(loaded):
