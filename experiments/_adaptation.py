@@ -130,7 +130,7 @@ class Bench(NamedTuple):
     def scalars(self) -> Any:
         """The base agents' scalars with labels of the scenario's strength, refined within the bound."""
         eps = None if self.piece.world == UNCHANGED else self.task.scenario(self.piece.world).eps_deg
-        own = adapting.settling(self.config.scalars, eps)
+        own = adapting.settling(self.config.scalars, self.piece.settings.get("scalars.eps_deg", eps))
         own = dataclasses.replace(own, k_max=int(np.ceil(self.piece.bound_deg / own.eps_deg)) + 2)
         return self.set("scalars.", own)
 

@@ -131,12 +131,13 @@ def reached(curves: np.ndarray, after: Sequence[int], reference: np.ndarray, own
         own: is the method's own gain meant?
     """
     random = np.random.default_rng(0)
-    draws = [np.arange(len(curves)), *random.integers(0, len(curves), (DRAWS, len(curves)))]
-    found = []
-    for rows in draws:
-        curve = np.asarray(interquartile_mean(curves[rows]))
-        first, last = (curve[0], curve[-1]) if own else np.asarray(interquartile_mean(reference[rows]))
-        found.append(_crossing(curve, after, first + GAIN * (last - first)) if last > first else np.inf)
+    draws = np.concatenate([np.arange(len(curves))[None], random.integers(0, len(curves), (DRAWS, len(curves)))])
+    means = interquartile_mean(curves[draws], axis=1)
+    gains = means[:, [0, -1]] if own else interquartile_mean(reference[draws], axis=1)
+    found = [
+        _crossing(curve, after, first + GAIN * (last - first)) if last > first else np.inf
+        for curve, (first, last) in zip(means, gains, strict=True)
+    ]
     lower, upper = np.quantile(found[1:], [0.025, 0.975], method="nearest")
     return Reached(found[0], float(lower), float(upper))
 

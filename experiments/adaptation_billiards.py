@@ -125,7 +125,7 @@ SCALES = {
             "sizes.labels_per_round": 5,
             "sizes.fit_steps": 20,
             "sizes.fit_batch_size": 5,
-            "sizes.replay_capacity": 200,
+            "sizes.replay_capacity": 400,
             "schedule.learn_after": 20,
         },
         tuned_steps=(40, 20),
