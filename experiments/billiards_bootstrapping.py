@@ -121,6 +121,13 @@ def variations(world: str, options: Options, minutes: int) -> list[Piece]:
     return pieces
 
 
+def longer(world: str, options: Options, minutes: int) -> list[Piece]:
+    """Guided to the end, in as many episodes as it pays, by the model that guides best."""
+    options = {**options, **FRAME, "sizes.pace": True, "schedule.guidance-until": 1_000_000}
+    serves = "two thirds of the steps"
+    return [Piece(world, "longer", "intent", ("intent",), (500, 1_000), 16, options, minutes, serves)]
+
+
 def raw(world: str, options: Options, minutes: int) -> list[Piece]:
     """What networks on raw coordinates make of it."""
     options, serves = {**options, **RAW}, "the frame against raw coordinates"
@@ -143,10 +150,12 @@ PIECES = (
     *budgets("regulation", REGULATION, 16),
     *curves("regulation", REGULATION, 16),
     *variations("regulation", REGULATION, 16),
+    *longer("regulation", REGULATION, 10),
     *raw("regulation", REGULATION, 16),
     *budgets("easy", EASY, 8),
     *curves("easy", EASY, 8),
     *variations("easy", EASY, 8),
+    *longer("easy", EASY, 8),
     *raw("easy", EASY, 8),
     *full_length(26),
 )

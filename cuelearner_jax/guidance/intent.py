@@ -4,12 +4,14 @@
 likely, the others do not. One network weighs every aim by its features, with the same weights for all; it is fitted by
 the likelihood of the teacher's words, summed over what may have been meant. (Inferring goals from what somebody does or
 says: Baker, Saxe, Tenenbaum, "Action understanding as inverse planning", Cognition 2009.) A pass of refinement goes by
-at most eps toward the likeliest aim and ends there, so precision is the aim's and not the label's. Where the teacher
-seems to mean none of them, actions stay as they are: the same bad shot again and again is worse than the agent's own.
+at most eps toward an aim and ends there, so precision is the aim's and not the label's. Of aims about as likely as the
+likeliest it is the nearest one: where labels leave a choice, the agent's own action decides. Always the likeliest would
+be the same bad shot again and again where the model errs.
 """
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import flax.linen as nn
@@ -34,7 +36,7 @@ SPREAD_DEG = 1.0  # how far what a teacher means may lie from the aim that descr
 ELSEWHERE = 360  # evenly spaced actions that stand for "it means none of these"
 SLIPS = 0.02  # share of answers that say nothing: any of the words
 WORDS = 3
-DOUBT = 2.0  # where it is so many times likelier that no aim is meant, actions are left as they are
+AS_LIKELY = 0.8  # share of the largest probability from which on an aim counts as about as likely
 
 
 class Weights(nn.Module):
@@ -90,12 +92,15 @@ def evidence_of(env: Any, space: Actions, label: Label, eps: Float[Array, ""]) -
     return Evidence(aims.features, aims.possible, jnp.concatenate([of_aims, of_none]), label.valid)
 
 
-def likeliest(
-    share: Float[Array, " aims_and_none"], aims: Float[Array, "aims action"]
-) -> tuple[Float[Array, " action"], Bool[Array, ""]]:
-    """The aim of the largest probability, and whether that is enough to be followed."""
-    best = jnp.argmax(share[:-1])
-    return aims[best], DOUBT * share[best] > share[-1]
+def nearest_likely(
+    space: Actions,
+    share: Float[Array, " aims_and_none"],
+    aims: Float[Array, "aims action"],
+    action: Float[Array, " action"],
+) -> Float[Array, " action"]:
+    """Of the aims about as likely as the likeliest, the nearest to an action. One of them must be possible."""
+    likely = share[:-1] >= AS_LIKELY * share[:-1].max()
+    return aims[jnp.argmin(jnp.where(likely, space.distance(action[None], aims), jnp.inf))]
 
 
 def make(sizes: GuideSizes, spaces: Spaces) -> Guidance:
@@ -141,7 +146,7 @@ def make(sizes: GuideSizes, spaces: Spaces) -> Guidance:
     ) -> Refined:
         aims: Aims = jax.vmap(env.aims)(obs)
         share = weighing.predict(env, model.params, aims.features, aims.possible)
-        goals, sure = jax.vmap(likeliest)(share, aims.actions)
+        goals = jax.vmap(partial(nearest_likely, space))(share, aims.actions, actions)
 
         def residual(current: Float[Array, "n action"]) -> Float[Array, "n action"]:
             step = jnp.minimum(scalars.radians("eps"), space.distance(current, goals))
@@ -150,7 +155,7 @@ def make(sizes: GuideSizes, spaces: Spaces) -> Guidance:
         return refine(
             residual,
             actions,
-            active & sure & model.fitted,
+            active & model.fitted & aims.possible.any(-1),
             space=space,
             tau=scalars.radians("tau"),
             tau_max=scalars.radians("tau_max"),

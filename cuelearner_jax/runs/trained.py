@@ -125,9 +125,10 @@ class PolicySource:
         Raises UserError if it is neither, cannot be read, or no code is asked for where some is given.
         """
         if not policy_folders.is_one(folder):
+            run = cls.of_run(folder, find)
             if code is not None:
-                raise UserError(f"{folder} is no policy folder with code in it: leave out --base")
-            return cls.of_run(folder, find)
+                raise UserError(f"{folder} is a run, without code in its policies: leave out --base")
+            return run
         task, world, lanes = open_folder(folder, find, code)
         return cls(task, RunConfig(world), None, folder, adapted=lanes)
 

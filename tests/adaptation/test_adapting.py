@@ -161,19 +161,6 @@ def own_labels(shift, count, answer=1.0):
     return jax.tree.map(lambda leaf: np.asarray(leaf)[None], rows)
 
 
-def test_a_model_that_makes_the_policy_worse_is_not_used():
-    near = -5.0  # degrees off: within the window, so that the reward is 1
-    lanes = program.product(1, (0,), (40,), (180.0,))
-    base = Common(Shifted(jnp.array(near)))
-    # All of these answers are true, and say nothing of what lies beyond.
-    result = adapting.adapt(asked(base, lanes), labels=own_labels(near, 40), mesh=MESH)
-    assert (float(result.judged.before[0]), bool(result.judged.used[0])) == (1.0, False)
-    assert result.judged.after[0] < 0.5
-    np.testing.assert_array_equal(
-        one_lane(result.policy(ENV), 0).act(jax.random.key(0), None, OBS), base.policy.act(None, None, OBS)
-    )
-
-
 def test_without_a_simulator_held_out_answers_decide():
     how = dataclasses.replace(JUDGING, env=None, by="labels")
     lanes = program.product(1, (0, 1), (40,), (10.0,))
