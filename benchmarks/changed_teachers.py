@@ -60,7 +60,7 @@ def worths(teacher: SearchTeacher, state: Any) -> Any:
     return jax.lax.map(lambda one: expected_values(teacher.rewards(one), teacher.aim_error), state)
 
 
-def compare(name: str, table: str, tables: int, aim_error_deg: float) -> dict[str, Any]:
+def compare(name: str, table: Any, tables: int, aim_error_deg: float) -> dict[str, Any]:
     """One world's row."""
     before = BilliardsConfig(table, teacher="local_search", aim_error_deg=aim_error_deg)
     config = SCENARIOS[name].applied(before) if name in SCENARIOS else before
