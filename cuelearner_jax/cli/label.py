@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic
 
+import numpy as np
+
 from cuelearner_jax import config as configuration
 from cuelearner_jax.cli.parsing import about, out, parse, preset_of, taken, task_of
 from cuelearner_jax.cli.shared_options import Flag, TaskT, asking_kind, preset_kinds
@@ -59,6 +61,8 @@ class Label(Generic[TaskT]):
     """Label budget of the run's lane (default: the largest)."""
     of_seed: int | None = None
     """Seed of the run's lane (default: the first)."""
+    again: Path | None = None
+    """Instead: the questions of this page's file once more, for a second opinion; leave out the policy and --seed."""
     scenario: str | None = None
     """The changed world of this name, see above; options of the task (--task.…) come on top of it."""
     port: int = 0
@@ -123,8 +127,33 @@ def planned(task: Task, config: RunConfig, asked: Label[Any], named: str | None)
     if guidance.form is None:
         asking = [kind.name for kind in guidances.known() if kind.asks]
         raise UserError(f"guidance {guidance.name!r} asks for no labels: give --guidance {' or '.join(asking)}")
+    if asked.again is not None:
+        return _second(
+            Plan(task, merged, guidance, Base(uniform_in(env), ""), asked.labels, who=asked.who.strip()), asked, named
+        )
     base = _base(task, asked, named, env)
     return Plan(task, merged, guidance, base, asked.labels, asked.seed, asked.who.strip(), asked.bound_deg)
+
+
+def _second(plan: Plan, asked: Label[Any], named: str | None) -> Plan:
+    """The questions of another page's file. Raises UserError if there are none, or they are of another world."""
+    assert asked.again is not None
+    file = label_files.read(asked.again)
+    if file.session is None or file.people is None:
+        raise UserError(f"{asked.again} is no page's own file: its questions cannot be asked again")
+    if named is not None or asked.seed or asked.bound_deg is not None:
+        raise UserError("--again asks what another page asked: leave out the policy, --seed and --bound-deg")
+    for name, value in plan.world.items():
+        if file.task.get(name) != value:
+            raise UserError(f"{asked.again} asked in a world with another {name} ({file.task.get(name)}, not {value})")
+    found = label_files.found_in(asked.again)
+    assert found is not None  # it was read
+    actions = {row["item"]: np.asarray(row["action"], np.float32) for row in label_files.history(found)}
+    again = tuple(actions[number] for number in sorted(actions))
+    base = dataclasses.replace(plan.base, name=f"{file.session['base']} {file.session['base_digest']}".strip())
+    wanted, digest = min(plan.labels, len(again)), label_files.digest(asked.again)
+    seed = int(file.session["seed"])
+    return dataclasses.replace(plan, base=base, seed=seed, labels=wanted, again=again, again_of=digest)
 
 
 def _base(task: Task, asked: Label[Any], named: str | None, env: Any) -> Base:

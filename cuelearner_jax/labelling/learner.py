@@ -25,7 +25,7 @@ class Fitted(NamedTuple):
     labels: int = 0  # that it was fitted to
     number: int = 0  # of the fit, from 1; 0: there was none
     quality: Agreement | None = None  # with the labels that it was not trained on
-    diverged: bool = False  # was the last fit not finite? The one before it stays
+    problem: str = ""  # why there is none of the last fit: the one before it stays
 
 
 class Learner:
@@ -67,7 +67,7 @@ class Learner:
         scalars = self._plan.config.scalars
         model = jax.block_until_ready(self._fit(self._env, scalars, *self._given(labels, count)).model)
         if not all_finite(model):
-            self.newest = self.newest._replace(labels=count, diverged=True)
+            self.newest = self.newest._replace(labels=count, problem="the last fit diverged")
             return
         would = np.asarray(self._programs.answers(self._env, scalars, model, labels))
         kept = np.asarray(labels.valid) & held_out(len(labels.valid))
@@ -92,6 +92,10 @@ class Learner:
         def work() -> None:
             try:
                 self.fit(labels())
+            except Exception as error:  # labels are still kept, whatever becomes of the model
+                told = (str(error).splitlines() or [""])[0][:80]
+                problem = f"the last fit failed ({type(error).__name__}: {told})"
+                self.newest = self.newest._replace(labels=count, problem=problem)
             finally:
                 with self._lock:
                     self.running = False

@@ -180,8 +180,8 @@ class Page:
         newest = status.newest
         fitted = f"model {newest.number}, of {newest.labels} labels" if newest.number else "no model yet"
         self._model.text = f"{fitted}; fitting the next" if status.fitting else fitted
-        if newest.diverged:
-            self._model.text = f"{fitted}; the last fit diverged"
+        if newest.problem:
+            self._model.text = f"{fitted}; {newest.problem}"
         apart = f"agrees with labels kept apart: {newest.quality}" if newest.quality else ""
         self._quality.text = apart
         self._saved.text = f"{self.session.place}: {status.answered + status.unsure} answers saved"
@@ -192,9 +192,9 @@ class Page:
 def _left(minutes: float | None) -> str:
     if minutes is None:
         return ""
-    return (
-        f"{minutes:.0f} minutes left" if minutes >= 1.5 else "about a minute left" if minutes > 0.5 else "nearly done"
-    )
+    if minutes < 1.5:
+        return "about a minute left" if minutes > 0.5 else "nearly done"
+    return f"{minutes:.0f} minutes left"
 
 
 def _key(key: str) -> str:

@@ -50,6 +50,8 @@ class Plan:
     seed: int = 0
     who: str = "anonymous"
     bound_deg: float | None = None  # questions stay within this of the base's actions [deg]; None: anywhere
+    again: tuple[np.ndarray, ...] = ()  # actions that another session of this seed asked about: they are asked again
+    again_of: str = ""  # digest of its file
 
     @property
     def form(self) -> AnswerForm:
@@ -76,5 +78,6 @@ class Plan:
             "base": self.base.name,
             "base_digest": self.base.digest,
             "bound_deg": self.bound_deg,
+            **({"again_of": self.again_of} if self.again else {}),
             "observation": layout,
         }

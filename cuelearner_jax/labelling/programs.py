@@ -24,7 +24,6 @@ class Programs(NamedTuple):
     """Compiled functions of one form of guidance; each is called with arrays of the same shapes throughout."""
 
     question: Callable[..., Array]  # (env, scalars, base, guide, keys, bound) -> the action to ask about (action,)
-    proceed: Callable[..., GuideState]  # (env, guide, action, keys) -> the guide in the next situation
     fit: Callable[..., GuideState]  # (env, scalars, guide, lane_key, times) -> with a model of its labels
     refined: Callable[..., Array]  # (env, scalars, model, obs, action) -> what the model makes of an action (action,)
     answers: Callable[..., Array]  # (env, scalars, model, labels) -> what it would have answered (labels, width)
@@ -47,7 +46,6 @@ def programs(guidance: Guidance) -> Programs:
 
     return Programs(
         question=jax.jit(partial(asking.question, guidance)),
-        proceed=jax.jit(asking.proceed),
         fit=jax.jit(partial(asking.fit, guidance)),
         refined=jax.jit(refined),
         answers=jax.jit(answers),

@@ -22,6 +22,7 @@ import numpy as np
 from cuelearner_jax import asking
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.labelling.learner import Fitted, Learner
+from cuelearner_jax.labelling.living import advance, keys_of, lived
 from cuelearner_jax.labelling.plan import Plan
 from cuelearner_jax.labelling.programs import programs
 from cuelearner_jax.records import label_files
@@ -30,7 +31,6 @@ from cuelearner_jax.records.provenance import provenance
 from cuelearner_jax.types import GuideState, Label, Reel, Sketch
 
 RECENT = 50  # answers by which the pace is told
-SAME = 1e-5  # by which an observation may differ that is lived through anew
 
 
 class Item(NamedTuple):
@@ -87,14 +87,15 @@ class Session:
         tell("making the world")
         self.env = plan.task.environment(plan.config.task)
         self._programs = programs(plan.guidance)
-        self._key, k_model, k_env = jax.random.split(jax.random.key(plan.seed), 3)
+        self._keys = keys_of(plan.seed)
         slots = asking.label_slots(plan.labels, plan.config.sizes)
-        start = asking.start(plan.guidance, self.env, slots, plan.labels, k_model, k_env)
+        start = asking.start(plan.guidance, self.env, slots, plan.labels, self._keys.model, self._keys.start)
         named = plan.world, plan.form.name, plan.eps_deg, plan.form.meaning, plan.session(self.env)
         self._writer = label_files.LabelWriter(folder, *named, written_by=provenance())
         tell("preparing the model")
-        self._learner = Learner(plan, self.env, self._programs, start, self._key)
+        self._learner = Learner(plan, self.env, self._programs, start, self._keys.session)
         self._bound = None if plan.bound_deg is None else jnp.deg2rad(jnp.asarray(plan.bound_deg, jnp.float32))
+        self._acting = threading.Lock()  # one answer at a time; whoever waits for an item holds no other lock
         self._lock = threading.RLock()
         self._ahead = ThreadPoolExecutor(1, thread_name_prefix="ahead")  # the one thread that makes items
         self._listeners: list[Callable[[], None]] = []
@@ -118,31 +119,35 @@ class Session:
             answer = None if row.get("answer") is None else np.asarray(row["answer"], np.float32)
             self._rows[row["item"]] = Said(row["said"], obs, action, answer, row["seconds"])
         count = len(self._rows)
+        if set(self._rows) != set(range(count)):
+            raise UserError(f"{self._writer.path} lacks items, so it is no page's file: give another --out")
         if count:
             tell(f"going through {count} earlier questions")
-        guide = start
-        for number in range(count):
-            said = self._rows[number]
-            if not np.allclose(np.asarray(guide.obs), said.obs, atol=SAME):
-                tell("the earlier situations come out otherwise with this program: a new episode begins")
-                state, obs = self.env.reset(jax.random.fold_in(self._key, number))
-                guide, self._items = start.replace(env=state, obs=obs), {}
-                break
-            self._items[number] = Item(number, guide, said.action)
-            guide = self._followed(self._items[number])
-        undone = [number for number in self._items if self._rows[number].said == UNDONE]
+        told = [self._rows[number] for number in range(count)]
+        found = list(lived(self.env, self._keys, [(row.obs, row.action) for row in told]))
+        if len(found) <= count:
+            tell("the earlier situations come out otherwise with this program: a new episode begins")
+            found = [(None, None)] * count + [self.env.reset(jax.random.fold_in(self._keys.start, count))]
+        for number, (state, obs) in enumerate(found[:count]):
+            if obs is not None:
+                self._items[number] = Item(number, start.replace(env=state, obs=obs), told[number].action)
+        undone = [number for number in self._items if told[number].said == UNDONE]
         self.number, self._furthest = min(undone, default=count), count
         self._learner.fit(self._labels())
-        self._items[count] = self._asked(count, guide)
+        state, obs = found[count]
+        self._items[count] = self._asked(count, start.replace(env=state, obs=obs))
 
     # --- questions ---------------------------------------------------------------------------------------------------
 
     def _followed(self, item: Item) -> GuideState:
-        keys = asking.question_keys(self._key, item.number)
-        return self._programs.proceed(self.env, item.guide, jnp.asarray(item.action), keys)
+        key = asking.question_keys(self._keys.session, item.number).env
+        state, obs = advance(self.env, key, item.guide.env, jnp.asarray(item.action))
+        return item.guide.replace(env=state, obs=obs)
 
     def _asked(self, number: int, guide: GuideState) -> Item:
-        keys = asking.question_keys(self._key, number)
+        if number < len(self.plan.again):
+            return Item(number, guide, self.plan.again[number])
+        keys = asking.question_keys(self._keys.session, number)
         guide = guide.replace(model=self._learner.newest.model)
         scalars, base = self.plan.config.scalars, self.plan.base.policy
         action = self._programs.question(self.env, scalars, base, guide, keys, self._bound)
@@ -188,7 +193,7 @@ class Session:
     @property
     def done(self) -> bool:
         """Are as many answered as were wanted?"""
-        return self._counted(ANSWERED) >= self.plan.labels
+        return self._counted(ANSWERED) >= self.plan.labels or 0 < len(self.plan.again) <= self.number
 
     # --- answers -----------------------------------------------------------------------------------------------------
 
@@ -203,34 +208,38 @@ class Session:
         Raises:
             UserError: nothing can be saved any more.
         """
-        with self._lock:
-            if self.done or number != self.number:
-                return False
-            took = time.monotonic() - self._since
-            took = took if seconds is None or not 0 <= seconds <= took else seconds
-            self._keep(self._items[number], UNSURE if answer is None else ANSWERED, answer, took)
+        with self._acting:
+            with self._lock:
+                if self.done or number != self.number:
+                    return False
+                took = time.monotonic() - self._since
+                took = took if seconds is None or not 0 <= seconds <= took else seconds
+                self._keep(self._items[number], UNSURE if answer is None else ANSWERED, answer, took)
             self._next.result()
-            self.number = number + 1
-            self._furthest = max(self._furthest, self.number)
-            self._next = self._ahead.submit(self._ensure, self.number + 1)
-            self._since = time.monotonic()
+            self._show(number + 1)
         self._fit_if_due()
         return True
+
+    def _show(self, number: int) -> None:
+        """Moves to an item that is ready, and has the one after it made."""
+        with self._lock:
+            self.number, self._since = number, time.monotonic()
+            self._furthest = max(self._furthest, number)
+            self._next = self._ahead.submit(self._ensure, number + 1)
 
     def undo(self, number: int) -> bool:
         """Takes the answer before this question back and asks it again; False if there is none, or not this question.
 
         Raises UserError if nothing can be saved any more.
         """
-        with self._lock:
-            before = self._items.get(number - 1)
-            if number != self.number or before is None:
-                return False
-            self._keep(before, UNDONE, None, time.monotonic() - self._since)
-            self._ahead.submit(self._ensure, before.number).result()
-            self.number = before.number
-            self._next = self._ahead.submit(self._ensure, number)
-            self._since = time.monotonic()
+        with self._acting:
+            with self._lock:
+                before = self._items.get(number - 1)
+                if number != self.number or before is None:
+                    return False
+                self._keep(before, UNDONE, None, time.monotonic() - self._since)
+            self._ahead.submit(self._ensure, number - 1).result()
+            self._show(number - 1)
             return True
 
     def _keep(self, item: Item, said: str, answer: np.ndarray | None, seconds: float) -> None:
@@ -293,7 +302,7 @@ class Session:
             )
 
     def listen(self, heard: Callable[[], None]) -> Callable[[], None]:
-        """Has a function called, from any thread, when a fit begins and when its model is in use. Returns what ends it."""
+        """Has a function called, from any thread, when a fit begins or its model comes into use. Returns the end."""
         self._listeners.append(heard)
         return lambda: self._listeners.remove(heard)
 

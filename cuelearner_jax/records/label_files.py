@@ -210,6 +210,21 @@ def write(
     tables.write(path, pa.table(columns), SCHEMA, about=_about(task, answers, eps_deg, meaning))
 
 
+def write_file(path: Path, file: LabelFile, **told: Any) -> None:
+    """Writes labels as Parquet, in one step, with what a person's have beside them; `told`: see `LabelWriter`."""
+    columns = {"seed": pa.array(np.asarray(file.seeds, np.int64))}
+    for name in ROW:
+        columns[name] = pa.array(list(np.asarray(getattr(file.labels, name), np.float32)), SCHEMA.type(name))
+    if file.people is not None:
+        person = {**file.people._asdict(), "said": [ANSWERED] * len(file.seeds)}
+        columns |= {name: pa.array(list(person[name]), SCHEMA.type(name)) for name in PEOPLE}
+        if file.eps_deg is not None:
+            columns["eps_deg"] = pa.array([file.eps_deg] * len(file.seeds), pa.float64())
+    about = _about(file.task, file.answers, file.eps_deg, "")
+    session = {} if file.session is None else {"session": file.session}
+    tables.write(path, pa.table(columns), SCHEMA, about={**about, **session, **told})
+
+
 def read(path: Path) -> LabelFile:
     """The labels that stand in a Parquet or JSONL file, or a folder with one, of the current format or an older one.
 
