@@ -22,6 +22,7 @@ SWATCHES = (
     ("right", "turned clockwise"),
     ("refined", "what the model makes of it"),
 )
+KEYS = {" ": "space", "ArrowLeft": "←", "ArrowRight": "→", "ArrowUp": "↑", "ArrowDown": "↓"}  # for people
 
 
 class Page:
@@ -198,4 +199,4 @@ def _left(minutes: float | None) -> str:
 
 
 def _key(key: str) -> str:
-    return "space" if key == " " else key.upper() if len(key) == 1 else key
+    return KEYS.get(key, key.upper() if len(key) == 1 else key)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from functools import partial
+from functools import cache, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -29,8 +29,9 @@ class Programs(NamedTuple):
     answers: Callable[..., Array]  # (env, scalars, model, labels) -> what it would have answered (labels, width)
 
 
+@cache
 def programs(guidance: Guidance) -> Programs:
-    """Those of a guidance, not compiled yet."""
+    """Those of a guidance, not compiled yet; the same ones for the same guidance."""
 
     def refined(env: Any, scalars: Any, model: Any, obs: Array, action: Array) -> Array:
         return guidance.act(model, env, obs[None], action[None], jnp.ones(1, bool), scalars).actions[0]

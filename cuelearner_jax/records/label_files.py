@@ -336,7 +336,7 @@ def _check_same(path: Path, before: dict[str, Any], now: dict[str, Any]) -> None
         old, new = before.get(group) or {}, now.get(group) or {}
         parts += [(f"{group}.", name, old.get(name), new.get(name)) for name in {**old, **new} if old and new]
     differing = [part for part in parts if part[2] != part[3] and part[1] != "from"]
-    for prefix, name, old, new in reversed(differing):  # the parts of a group say more than the group
+    for prefix, name, old, new in differing:  # of a group its parts say more
         if prefix or name not in ("task", "session"):
             raise UserError(
                 f"{path} holds labels of another {prefix}{name} ({_short(old)}, asked for is {_short(new)}): "

@@ -1,0 +1,47 @@
+"""Sessions on the bandit, answered as its expert would."""
+
+import time
+
+import numpy as np
+import page_task
+import probes
+
+from cuelearner_jax.guidance import registry as guidances
+from cuelearner_jax.labelling.plan import Base, Plan
+from cuelearner_jax.policies import Uniform
+
+ENV = page_task.TASK.environment(probes.CONFIG.task)
+
+
+def plan(labels=20, kind="relative", base=None, **others):
+    """Of a session on the bandit."""
+    guidance = guidances.make(kind, probes.SIZES, ENV)
+    return Plan(page_task.TASK, probes.CONFIG, guidance, base or Base(Uniform(), "uniform"), labels, **others)
+
+
+def expert(item):
+    """What the expert answers: which way its best action lies, unless it is within half of eps (by angles)."""
+    best = np.asarray(ENV.best(item.guide.obs), float)
+    cross = item.action[0] * best[1] - item.action[1] * best[0]
+    apart = np.degrees(np.arctan2(cross, item.action @ best))
+    return np.array([0.0 if abs(apart) <= probes.SCALARS.eps_deg / 2 else np.sign(apart)], np.float32)
+
+
+def give(session, count):
+    """Answers so many questions; returns the items."""
+    items = []
+    for _ in range(count):
+        items.append(session.item)
+        assert session.answer(session.number, expert(session.item))
+    return items
+
+
+def settled(session, fits=None):
+    """Waits until nothing is fitted any more and the questions know of it."""
+    for _ in range(2000):
+        status = session.status()
+        if not status.fitting and (fits is None or status.newest.number >= fits):
+            break
+        time.sleep(0.005)
+    session._ahead.submit(lambda: None).result()
+    return session.status()
