@@ -42,8 +42,8 @@ class Merge:
 
     files: Files
     """Label files of one world, or folders of a page's."""
-    out: Path = Path("labels.parquet")
-    """The new file; one that is there is not replaced."""
+    out: Path | None = None
+    """The new file, .parquet; one that is there is not replaced."""
 
 
 @dataclass(frozen=True)
@@ -141,7 +141,6 @@ def _shape(file: LabelFile) -> Any:
 
 def _with_teacher(path: Path, file: LabelFile) -> comparing.Agreement:
     task = _task(file)
-    console.print(f"asking the teacher of {task.name} ...")
     found = label_files.found_in(path)
     assert found is not None  # it was read
     presets = [preset.config.scalars for preset in task.presets.values()]
@@ -161,8 +160,8 @@ def _free(place: Path) -> Path:
 
 
 def _merge(asked: Merge) -> None:
-    if asked.out.suffix != ".parquet":
-        raise UserError(f"--out is {asked.out}: give a name that ends in .parquet")
+    if asked.out is None or asked.out.suffix != ".parquet":
+        raise UserError("give --out a name that ends in .parquet")
     file = comparing.merged([label_files.read(path) for path in asked.files])
     sources = [f"{path.name} {label_files.digest(path)}" for path in asked.files]
     label_files.write_file(_free(asked.out), file, merged_from=sources)

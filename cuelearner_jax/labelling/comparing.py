@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import jax
@@ -40,7 +40,13 @@ def world_of(task: Task, file: LabelFile) -> Any:
         ) from error
 
 
-def with_teacher(task: Task, file: LabelFile, rows: list[dict[str, Any]], scalars: Scalars) -> Agreement:
+def with_teacher(
+    task: Task,
+    file: LabelFile,
+    rows: list[dict[str, Any]],
+    scalars: Scalars,
+    tell: Callable[[str], None] = lambda words: None,
+) -> Agreement:
     """How well a page's labels agree with the answers of the task's teacher, who makes no faults.
 
     Args:
@@ -48,6 +54,7 @@ def with_teacher(task: Task, file: LabelFile, rows: list[dict[str, Any]], scalar
         file: the labels.
         rows: all rows of it, see `label_files.history`; the situations are lived through anew.
         scalars: what counts of a teacher's answers, but for eps, which is the file's.
+        tell: is told what is being done.
 
     Raises:
         UserError: the task has no teacher, or the file's situations cannot be had again.
@@ -56,6 +63,7 @@ def with_teacher(task: Task, file: LabelFile, rows: list[dict[str, Any]], scalar
     if form is None or file.people is None or file.session is None:
         raise UserError("a teacher looks at situations, and this file's cannot be had again: it is no page's own file")
     config = world_of(task, file)
+    tell(f"asking the teacher of {task.name} about {len(rows)} questions")
     env = task.environment(config)
     teacher = task.make_teacher(config, env)
     items = {row["item"]: (np.asarray(row["obs"], np.float32), np.asarray(row["action"], np.float32)) for row in rows}

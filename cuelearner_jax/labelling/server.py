@@ -27,6 +27,7 @@ def bound(port: int) -> socket.socket:
     found.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         found.bind((HOST, port))
+        found.listen()  # from now on a browser waits for the page instead of being refused
     except OSError as error:
         found.close()
         raise UserError(f"port {port} of {HOST} cannot be had ({error.strerror}): give another --port") from error

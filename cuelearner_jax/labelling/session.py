@@ -28,6 +28,7 @@ from cuelearner_jax.labelling.programs import programs
 from cuelearner_jax.records import label_files
 from cuelearner_jax.records.label_files import ANSWERED, UNDONE, UNSURE
 from cuelearner_jax.records.provenance import provenance
+from cuelearner_jax.task import shape_of
 from cuelearner_jax.types import GuideState, Label, Reel, Sketch
 
 RECENT = 50  # answers by which the pace is told
@@ -84,14 +85,15 @@ class Session:
         if self._pictures.sketch is None:
             raise UserError(f"{plan.task.name} has no sketches to label by: give its body's Pictures `sketch`")
         self.plan = plan
+        shape = shape_of(plan.task, plan.config.task)
+        named = plan.world, plan.form.name, plan.eps_deg, plan.form.meaning, plan.session(shape)
+        self._writer = label_files.LabelWriter(folder, *named, written_by=provenance())
         tell("making the world")
         self.env = plan.task.environment(plan.config.task)
         self._programs = programs(plan.guidance)
         self._keys = keys_of(plan.seed)
         slots = asking.label_slots(plan.labels, plan.config.sizes)
         start = asking.start(plan.guidance, self.env, slots, plan.labels, self._keys.model, self._keys.start)
-        named = plan.world, plan.form.name, plan.eps_deg, plan.form.meaning, plan.session(self.env)
-        self._writer = label_files.LabelWriter(folder, *named, written_by=provenance())
         tell("preparing the model")
         self._learner = Learner(plan, self.env, self._programs, start, self._keys.session)
         self._bound = None if plan.bound_deg is None else jnp.deg2rad(jnp.asarray(plan.bound_deg, jnp.float32))
