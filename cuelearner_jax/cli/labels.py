@@ -144,9 +144,8 @@ def _with_teacher(path: Path, file: LabelFile) -> comparing.Agreement:
     found = label_files.found_in(path)
     assert found is not None  # it was read
     presets = [preset.config.scalars for preset in task.presets.values()]
-    return comparing.with_teacher(
-        task, file, label_files.history(found), presets[0] if presets else comparing.Scalars()
-    )
+    rows = label_files.history(found)
+    return comparing.with_teacher(task, file, rows, scalars, lambda words: console.print(f"{words} ..."))
 
 
 # --- merge and export ------------------------------------------------------------------------------------------------
