@@ -14,6 +14,7 @@ from rich.table import Table
 
 from cuelearner_jax.cli.parsing import HELP, out, parse, summary
 from cuelearner_jax.cli.shared_options import Flag
+from cuelearner_jax.config import Scalars
 from cuelearner_jax.errors import UserError, closest
 from cuelearner_jax.labelling import comparing
 from cuelearner_jax.records import label_files
@@ -144,7 +145,7 @@ def _with_teacher(path: Path, file: LabelFile) -> comparing.Agreement:
     found = label_files.found_in(path)
     assert found is not None  # it was read
     presets = [preset.config.scalars for preset in task.presets.values()]
-    rows = label_files.history(found)
+    scalars, rows = presets[0] if presets else Scalars(), label_files.history(found)
     return comparing.with_teacher(task, file, rows, scalars, lambda words: console.print(f"{words} ..."))
 
 
