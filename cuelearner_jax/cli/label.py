@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic
 
+import jax
 import numpy as np
 
 from cuelearner_jax import config as configuration
@@ -199,6 +200,9 @@ def _serving() -> Any:
             f"the page needs packages that are not installed ({error.name}): pip install 'cuelearner-jax[label]'"
         ) from error
     from cuelearner_jax.labelling.session import Session
+
+    # Before JAX starts: what a thread asks for is computed by that thread, at its own priority (`learner`).
+    jax.config.update("jax_cpu_enable_async_dispatch", False)
 
     def tell(address: str) -> None:
         out.print(f"open {address}")

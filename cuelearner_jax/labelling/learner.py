@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
+import sys
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -16,6 +19,17 @@ from cuelearner_jax.agent.learning import all_finite
 from cuelearner_jax.labelling.plan import Plan
 from cuelearner_jax.labelling.programs import Agreement, Programs, agreement, held_out
 from cuelearner_jax.types import GuidanceModel, GuideState, Label
+
+# A fit computes in its own thread alone, which makes way for whoever answers.
+ALONE = {"xla_cpu_multi_thread_eigen": False}
+NICE = 10  # of 19: what it gives way by
+
+
+def _step_back() -> None:
+    """Makes this thread give way to all others, where the system lets threads have priorities of their own."""
+    if sys.platform == "linux":
+        with contextlib.suppress(OSError):
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICE)
 
 
 class Fitted(NamedTuple):
@@ -45,8 +59,9 @@ class Learner:
         self.newest = Fitted(blank.model)
         self.running = False
         self._lock = threading.Lock()
-        self._pool = ThreadPoolExecutor(1, thread_name_prefix="fit")
-        self._fit = programs.fit.lower(env, plan.config.scalars, *self._given(blank.labels, 0)).compile()  # pyright: ignore[reportFunctionMemberAccess]
+        self._pool = ThreadPoolExecutor(1, thread_name_prefix="fit", initializer=_step_back)
+        lowered = programs.fit.lower(env, plan.config.scalars, *self._given(blank.labels, 0))  # pyright: ignore[reportFunctionMemberAccess]
+        self._fit = lowered.compile(compiler_options=ALONE if jax.default_backend() == "cpu" else None)
 
     def _given(self, labels: Label, count: int) -> tuple[GuideState, PRNGKeyArray, jax.Array]:
         guide = self._blank.replace(labels=jax.tree.map(jnp.asarray, labels), model=self.newest.model)
