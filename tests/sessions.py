@@ -1,6 +1,11 @@
 """Sessions on the bandit, answered as its expert would."""
 
+import contextlib
+import os
+import subprocess
+import sys
 import time
+from pathlib import Path
 
 import numpy as np
 import page_task
@@ -10,6 +15,8 @@ from cuelearner_jax.guidance import registry as guidances
 from cuelearner_jax.labelling.plan import Base, Plan
 from cuelearner_jax.policies import Uniform
 
+TESTS = Path(__file__).resolve().parent
+OWN = "page_task:TASK"  # as commands name it
 ENV = page_task.TASK.environment(probes.CONFIG.task)
 
 
@@ -45,3 +52,19 @@ def settled(session, fits=None):
         time.sleep(0.005)
     session._ahead.submit(lambda: None).result()
     return session.status()
+
+
+@contextlib.contextmanager
+def served(folder, *more):
+    """The command in a process of its own, once it has told its address: the process and that."""
+    paths = os.pathsep.join([str(TESTS), str(TESTS.parent), str(TESTS.parent / "envs")])
+    env = {**os.environ, "PYTHONPATH": paths, "PYTHONUNBUFFERED": "1"}
+    command = [sys.executable, "-m", "cuelearner_jax.cli", "label", OWN, "--out", str(folder), "--labels", "20", *more]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    with subprocess.Popen(command, env=env, **pipes) as process:
+        try:
+            told = next((line for line in process.stdout if line.startswith("open ")), "")
+            assert told, process.stderr.read()
+            yield process, told.split()[1]
+        finally:
+            process.kill()

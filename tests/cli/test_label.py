@@ -1,19 +1,14 @@
 """`cuelearner label` and `cuelearner labels`: the real command, what it refuses, and what takes its files."""
 
-import contextlib
 import csv
-import os
 import signal
-import subprocess
-import sys
 import urllib.error
 import urllib.request
-from pathlib import Path
 
 import numpy as np
 import probes
 import pytest
-from sessions import expert, plan
+from sessions import OWN, expert, plan, served
 
 from cuelearner_jax.cli import main
 from cuelearner_jax.labelling.plan import Base
@@ -21,9 +16,6 @@ from cuelearner_jax.labelling.session import Session
 from cuelearner_jax.policies import Uniform
 from cuelearner_jax.records import label_files
 from cuelearner_jax.records.folders import claimed
-
-TESTS = Path(__file__).resolve().parents[1]
-OWN = "page_task:TASK"
 
 
 @pytest.fixture(scope="module")
@@ -35,22 +27,6 @@ def labelled(tmp_path_factory):
             for number in range(12):
                 session.answer(number, turn * expert(session.item), seconds=0.0)
     return folder
-
-
-@contextlib.contextmanager
-def served(folder, *more):
-    """The command in a process of its own, once it has told its address: the process and that."""
-    paths = os.pathsep.join([str(TESTS), str(TESTS.parent), str(TESTS.parent / "envs")])
-    env = {**os.environ, "PYTHONPATH": paths, "PYTHONUNBUFFERED": "1"}
-    command = [sys.executable, "-m", "cuelearner_jax.cli", "label", OWN, "--out", str(folder), "--labels", "20", *more]
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    with subprocess.Popen(command, env=env, **pipes) as process:
-        try:
-            told = next((line for line in process.stdout if line.startswith("open ")), "")
-            assert told, process.stderr.read()
-            yield process, told.split()[1]
-        finally:
-            process.kill()
 
 
 def status_of(address, **headers):
