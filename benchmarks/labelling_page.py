@@ -219,13 +219,13 @@ def pictures(asked: argparse.Namespace, browser: Browser, work: Path) -> dict[st
             with served(asked, task, work / f"{task}{kind}", "--labels", "500", *more) as (_, address):
                 page = entered(browser, address)
                 rng = random.Random(2)
-                for _ in range(23 if not kind else 0):
+                for _ in range(13 if not kind else 0):
                     item = page.evaluate(ITEM)
                     page.keyboard.press(chosen(page, task, rng))
                     moved(page, item)
                     time.sleep(0.3)
                 if not kind:
-                    page.wait_for_function("() => document.body.innerText.includes('of 20 labels')", timeout=120_000)
+                    page.wait_for_function("() => document.body.innerText.includes('of 10 labels')", timeout=600_000)
                 page.close()
                 for name, look in LOOKS.items() if not kind else [("light", LOOKS["light"])]:
                     page = entered(browser, address, **look)

@@ -45,7 +45,7 @@ def give(session, count):
 
 def settled(session, fits=None):
     """Waits until nothing is fitted any more and the questions know of it."""
-    for _ in range(2000):
+    for _ in range(20_000):
         status = session.status()
         if not status.fitting and (fits is None or status.newest.number >= fits):
             break

@@ -2,24 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from typing import Any, SupportsFloat
 
 import numpy as np
 
-Point = tuple[float, float]
+Point = Any  # two numbers
+Points = Any  # rows of two numbers
 
 
-def number(value: float) -> str:
+def number(value: SupportsFloat) -> str:
     """A number, a millimetre precise where it is in metres."""
     return f"{float(value):.3f}".rstrip("0").rstrip(".") or "0"
 
 
-def points(rows: Iterable[Iterable[float]]) -> str:
+def points(rows: Points) -> str:
     """Points of a line."""
     return " ".join(",".join(map(number, row)) for row in np.asarray(list(rows), float))
 
 
-def element(name: str, body: str = "", **attributes: float | str) -> str:
+def element(name: str, body: str = "", **attributes: SupportsFloat | str) -> str:
     """An element; underscores of attributes' names become hyphens."""
     told = " ".join(
         f'{key.replace("_", "-")}="{value if isinstance(value, str) else number(value)}"'
@@ -33,7 +34,7 @@ def circle(at: Point, radius: float, style: str) -> str:
     return element("circle", cx=at[0], cy=at[1], r=radius, style=style)
 
 
-def polygon(rows: Iterable[Iterable[float]], style: str) -> str:
+def polygon(rows: Points, style: str) -> str:
     """A closed shape."""
     return element("polygon", points=points(rows), style=style)
 

@@ -58,7 +58,7 @@ def test_buttons_answer_what_is_on_the_page_and_it_tells_how_far_it_is(opened, t
         await press(user, "unsure", lambda: session.number == 11)
         await user.should_see("1 not known")
         await press(user, "undo", lambda: session.number == 10)
-        await user.should_see("model 1, of 10 labels", retries=50)
+        await user.should_see("model 1, of 10 labels", retries=600)
         await user.should_see("labels kept apart")
         user.find(marker="help").click()
         await user.should_see("counterclockwise: ←, A")

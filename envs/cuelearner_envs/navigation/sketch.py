@@ -33,8 +33,10 @@ def sketch(env: Navigation, state: Any) -> Sketch:
     world, goal, pose, ranges = jax.device_get(_seen(env, state))
     around = 2 * (AHEAD + BEHIND)  # a page may be wider than the sketch
     parts = [svg.rectangle(-around, -around, 2 * around, 2 * around, "fill:var(--floor)")]
-    solids = [(float(h), _box(row, h, pose)) for row, h in zip(world.boxes, world.box_heights, strict=True)]
-    solids += [(float(h), _disc(row, h, pose)) for row, h in zip(world.circles, world.circle_heights, strict=True)]
+    boxes = zip(world.boxes, world.box_heights.tolist(), strict=True)
+    discs = zip(world.circles, world.circle_heights.tolist(), strict=True)
+    solids = [(height, _box(row, height, pose)) for row, height in boxes]
+    solids += [(height, _disc(row, height, pose)) for row, height in discs]
     parts += [shape for _, shape in sorted(solids)]  # from above, the tall covers the low
     ends = _up(ranges[:, None] * np.stack([np.cos(BEAM_ANGLES), np.sin(BEAM_ANGLES)], axis=-1))
     parts.append(svg.polygon([(0.0, 0.0), *ends], "fill:var(--free);fill-opacity:0.25"))
