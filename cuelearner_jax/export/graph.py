@@ -171,7 +171,7 @@ class Builder:
             return value
         if not isinstance(value, Value):
             return jnp.reshape(value, shape)
-        return self.add("reshape", [value], shape, value.kind, shape=list(shape))
+        return self.add("reshape", [value], shape, value.kind, shape=list(map(int, shape)))
 
     def transposed(self, value: Known, axes: tuple[int, ...]) -> Known:
         """Axes in another order."""
@@ -179,15 +179,28 @@ class Builder:
             return value
         if not isinstance(value, Value):
             return jnp.transpose(value, axes)
-        return self.add("transpose", [value], tuple(value.shape[a] for a in axes), value.kind, axes=list(axes))
+        turned, axes = tuple(value.shape[a] for a in axes), tuple(map(int, axes))
+        return self.add("transpose", [value], turned, value.kind, axes=list(axes))
 
     def branch(self, jaxpr: Any, consts: list[Known], carried: list[Value]) -> Graph:
         """A jaxpr of carried values as a graph of its own, which may look at everything outside."""
         outer, self.ops = self.ops, []
         results = self.inlined(jaxpr.jaxpr, jaxpr.consts, [*consts, *carried])
-        graph = Graph([value.name for value in carried], [self.name(result) for result in results], self.ops)
-        self.ops = outer
-        return graph
+        made, self.ops = self.ops, outer
+        names = [value.name for value in carried]
+        return Graph(names, [self.name(result) for result in results], self._kept_inside(made, set(names)))
+
+    def _kept_inside(self, ops: list[list[Any]], changing: set[str]) -> list[list[Any]]:
+        """The operations that every pass must do again; those that hang on nothing that changes go before the loop."""
+        inside = []
+        for op in ops:
+            name, inputs, outputs, _ = op
+            if name == "while" or changing & set(inputs):
+                inside.append(op)
+                changing = changing | set(outputs)
+            else:
+                self.ops.append(op)
+        return inside
 
 
 def _computed(equation: Any, given: list[Any]) -> list[Any]:

@@ -47,7 +47,7 @@ def _reshaped(builder: Builder, equation: Any, given: list[Known]) -> list[Known
 
 def _reduction(op: str) -> Rule:
     def rule(builder: Builder, equation: Any, given: list[Known]) -> list[Known]:
-        return [builder.add(op, given, *_out(equation), axes=list(equation.params["axes"]))]
+        return [builder.add(op, given, *_out(equation), axes=list(map(int, equation.params["axes"])))]
 
     return rule
 

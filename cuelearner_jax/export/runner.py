@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -118,16 +119,16 @@ def _of_numpy(folder: Path, contract: dict[str, Any]) -> Batch:
     with np.load(folder / contract["artefact"]["file"], allow_pickle=False) as stored:
         graph = json.loads(stored["graph"].tobytes())
         constants = {name: stored[name] for name in stored.files if name != "graph"}
-    run = compiled(graph["ops"])
     (given,), (result,) = graph["inputs"], graph["outputs"]
+    run, alone = compiled(graph["ops"], {result}), threading.Lock()
 
     def decide(batch: np.ndarray) -> np.ndarray:
         actions = np.empty((len(batch), contract["action"]["size"]), np.float32)
-        for number, row in enumerate(batch):
-            values = {**constants, given: row}
-            with np.errstate(all="ignore"):  # as JAX does
+        with alone, np.errstate(all="ignore"):  # operations write where they wrote before; JAX warns of nothing either
+            for number, row in enumerate(batch):
+                values = {**constants, given: row}
                 run(values)
-            actions[number] = values[result]
+                actions[number] = values[result]
         return actions
 
     return decide
@@ -177,11 +178,12 @@ RUNNERS: dict[str, Callable[[Path, dict[str, Any]], Batch]] = {
 }
 
 
-def compiled(ops: list[list[Any]]) -> Run:
+def compiled(ops: list[list[Any]], kept: set[str] | None = None) -> Run:
     """A graph's operations as one function, which adds their results to the values it is given.
 
     Args:
         ops: each [name, inputs, outputs, attributes]; see `OPERATIONS`, `_loop` and `_highest`.
+        kept: what is looked at afterwards; given, large results are written where they were in the call before.
     """
     steps: list[Run] = []
     for name, inputs, outputs, attributes in ops:
@@ -189,10 +191,12 @@ def compiled(ops: list[list[Any]]) -> Run:
             steps.append(_loop(inputs, outputs, **attributes))
         elif name == "top_k":
             steps.append(_highest(inputs[0], *outputs, **attributes))
-        elif name in OPERATIONS:
-            steps.append(_step(OPERATIONS[name], inputs, outputs[0], attributes))
-        else:
+        elif name not in OPERATIONS:
             raise ContractError(f"this decision has an operation {name!r}, which this runner does not know: update it")
+        elif kept is not None and name in INTO:
+            steps.append(_into(OPERATIONS[name], inputs, outputs[0]))
+        else:
+            steps.append(_step(OPERATIONS[name], inputs, outputs[0], attributes))
 
     def run(values: Values) -> None:
         for step in steps:
@@ -204,6 +208,19 @@ def compiled(ops: list[list[Any]]) -> Run:
 def _step(function: Callable[..., Any], inputs: list[str], output: str, attributes: dict[str, Any]) -> Run:
     def step(values: Values) -> None:
         values[output] = function(*[values[name] for name in inputs], **attributes)
+
+    return step
+
+
+def _into(function: Callable[..., Any], inputs: list[str], output: str) -> Run:
+    """Writes into one array, call after call: new memory for large ones takes longer than the arithmetic."""
+    own: list[np.ndarray] = []
+
+    def step(values: Values) -> None:
+        given = [values[name] for name in inputs]
+        values[output] = function(*given, out=own[0]) if own else function(*given)
+        if not own and isinstance(values[output], np.ndarray):
+            own.append(values[output])
 
     return step
 
@@ -268,6 +285,7 @@ def _quotient(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 ONE = np.float32(1)
+INTO = ("add", "sub", "mul", "max", "min", "matmul")  # that can write where they are told
 
 # Of arrays in single precision, int32 or bool; all shapes are fixed. Elementwise ones take equal or broadcast shapes.
 OPERATIONS: dict[str, Callable[..., Any]] = {
