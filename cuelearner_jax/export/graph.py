@@ -114,13 +114,13 @@ class Builder:
 
         for equation in jaxpr.eqns:
             given = [read(atom) for atom in equation.invars]
-            values.update(zip(equation.outvars, self._done(equation, given), strict=True))
+            values.update(zip(equation.outvars, self._done(equation, given, jaxpr.debug_info), strict=True))
         return [read(atom) for atom in jaxpr.outvars]
 
-    def _done(self, equation: Any, given: list[Known]) -> list[Known]:
+    def _done(self, equation: Any, given: list[Known], origin: Any) -> list[Known]:
         name = equation.primitive.name
         if not any(isinstance(value, Value) for value in given):
-            return _computed(equation, given)
+            return _computed(equation, given, origin)
         if (inner := _called(equation)) is not None:
             return self.inlined(inner.jaxpr, inner.consts, given)
         drawn = any(isinstance(value, Value) and value.kind == "key" for value in given)
@@ -203,12 +203,12 @@ class Builder:
         return inside
 
 
-def _computed(equation: Any, given: list[Any]) -> list[Any]:
-    """What one equation gives of inputs that are known."""
+def _computed(equation: Any, given: list[Any], origin: Any) -> list[Any]:
+    """What one equation gives of inputs that are known; `origin` is what JAX tells of where it stood."""
     own = [atom for atom in equation.invars if not _is_literal(atom)]
     first = [number for number, atom in enumerate(own) if atom not in own[:number]]
     known = [value for atom, value in zip(equation.invars, given, strict=True) if not _is_literal(atom)]
-    alone = core.Jaxpr((), [own[number] for number in first], equation.outvars, [equation])
+    alone = core.Jaxpr((), [own[number] for number in first], equation.outvars, [equation], debug_info=origin)
     return core.jaxpr_as_fun(core.ClosedJaxpr(alone, ()))(*[known[number] for number in first])
 
 

@@ -188,9 +188,13 @@ def _sliced(w: _Writer, x: str, start: list[int], stop: list[int], step: list[in
 
 # By the names of `runner.OPERATIONS`: (writer, names of inputs, attributes) -> name of the output.
 NODES: dict[str, Callable[..., str]] = {
-    **{name.lower(): _plain(name) for name in ("Neg", "Abs", "Sign", "Floor", "Ceil", "Exp", "Log", "Sin", "Cos")},
-    **{name.lower(): _plain(name) for name in ("Tan", "Tanh", "Atan", "Sqrt", "Not", "Add", "Sub", "Mul", "Div")},
-    **{name.lower(): _plain(name) for name in ("Pow", "Max", "Min", "And", "Or", "Xor")},
+    **{
+        name.lower(): _plain(name)
+        for name in ("Neg", "Abs", "Sign", "Floor", "Ceil", "Round", "Exp", "Log", "Sin", "Cos")
+    },
+    **{name.lower(): _plain(name) for name in ("Neg", "Abs", "Sign", "Floor", "Ceil", "Round", "Exp", "Log", "Sin")},
+    **{name.lower(): _plain(name) for name in ("Cos", "Tan", "Tanh", "Atan", "Sqrt", "Not", "Add", "Sub", "Mul")},
+    **{name.lower(): _plain(name) for name in ("Div", "Pow", "Max", "Min", "And", "Or", "Xor")},
     "log1p": lambda w, x: w.node("Log", w.node("Add", x, w.number(1.0))),
     "expm1": lambda w, x: w.node("Sub", w.node("Exp", x), w.number(1.0)),
     "rsqrt": lambda w, x: w.node("Reciprocal", w.node("Sqrt", x)),

@@ -7,7 +7,7 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from jax.lax import GatherScatterMode
+from jax.lax import GatherScatterMode, RoundingMethod
 
 from cuelearner_jax.export.graph import KINDS, RULES, Builder, Known, Rule, Value
 
@@ -188,7 +188,7 @@ def _along(axis: int, axes: int, row: np.ndarray) -> np.ndarray:
 def _clipped(builder: Builder, start: Known, most: int, stride: int) -> Known:
     """stride * start, where a block that begins there still fits."""
     if not isinstance(start, Value):
-        return np.clip(np.asarray(start, np.int32), 0, most) * np.int32(stride)
+        return np.asarray(np.clip(np.asarray(start, np.int32), 0, most) * np.int32(stride))
     shape = start.shape
     start = builder.add("max", [start, np.zeros((), np.int32)], shape, "int32")
     start = builder.add("min", [start, np.asarray(most, np.int32)], shape, "int32")
@@ -267,6 +267,12 @@ def _dot_general(builder: Builder, equation: Any, given: list[Known]) -> list[Kn
     left = builder.reshaped(builder.transposed(left, (*left_batch, *left_free, *left_summed)), (*batch, m, k))
     right = builder.reshaped(builder.transposed(right, (*right_batch, *right_summed, *right_free)), (*batch, k, n))
     return [builder.reshaped(builder.add("matmul", [left, right], (*batch, m, n), kind), shape)]
+
+
+def _round(builder: Builder, equation: Any, given: list[Known]) -> list[Known]:
+    if equation.params["rounding_method"] != RoundingMethod.TO_NEAREST_EVEN:
+        raise NotImplementedError("rounding halves away from zero")
+    return [builder.add("round", given, *_out(equation))]
 
 
 def _cumsum(builder: Builder, equation: Any, given: list[Known]) -> list[Known]:
@@ -356,6 +362,6 @@ RULES.update(
         **{"integer_pow": _integer_pow, "select_n": _select, "clamp": _clamp, "broadcast_in_dim": _broadcast},
         **{"transpose": _transpose, "concatenate": _concatenate, "stack": _stack, "slice": _slice, "split": _split},
         **{"pad": _pad, "rev": _rev, "dynamic_slice": _dynamic_slice, "gather": _gather, "dot_general": _dot_general},
-        **{"cumsum": _cumsum, "top_k": _top_k, "while": _while, "scan": _scan, "cond": _cond},
+        **{"round": _round, "cumsum": _cumsum, "top_k": _top_k, "while": _while, "scan": _scan, "cond": _cond},
     }
 )

@@ -54,13 +54,15 @@ class Decision:
             raise ContractError(f"observations have shape {rows.shape}: the contract says ({size},) or (n, {size})")
         if not np.isfinite(batch).all():
             raise ContractError("an observation holds numbers that are not finite")
+        if not len(batch):
+            return np.zeros((0, self.contract["action"]["size"]), np.float32)
         actions = self._decide(np.ascontiguousarray(batch))
         return actions[0] if rows.ndim == 1 else actions
 
     def angle(self, obs: Any) -> np.ndarray:
         """The same as angles [rad], counterclockwise positive, 0 along x: () or (n,)."""
         actions = self(obs)
-        return np.arctan2(actions[..., 1], actions[..., 0])
+        return np.asarray(np.arctan2(actions[..., 1], actions[..., 0]))
 
     def check(self) -> float:
         """Decides the golden cases anew. Returns the largest difference of an entry from what is recorded.
@@ -294,6 +296,7 @@ OPERATIONS: dict[str, Callable[..., Any]] = {
     "sign": np.sign,
     "floor": np.floor,
     "ceil": np.ceil,
+    "round": np.rint,  # halves to the even one
     "exp": np.exp,
     "log": np.log,
     "log1p": np.log1p,
