@@ -1,9 +1,7 @@
-"""Policies by name: of a trained run's lanes, of a policy folder's, or of a task alone; evaluated, or picked out."""
+"""Policies by name: of a trained run's lanes, of a policy folder's, or of a task alone; picked out."""
 
 from __future__ import annotations
 
-import json
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,20 +9,18 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from cuelearner_jax.config import RunConfig, to_json
+from cuelearner_jax.config import RunConfig
 from cuelearner_jax.environment import actions_of, offers
 from cuelearner_jax.errors import UserError, closest
-from cuelearner_jax.evaluate import Tell, episodes, one_lane, part_of, untold, watched, watched_lanes
+from cuelearner_jax.evaluate import one_lane
 from cuelearner_jax.guidance import registry as guidances
 from cuelearner_jax.policies import Agent, Common, Corrected, Guided, Heuristic, Policy, Taught, uniform_in
 from cuelearner_jax.records import policy_folders
-from cuelearner_jax.records.provenance import provenance
-from cuelearner_jax.records.whole import replacing
 from cuelearner_jax.runs.adapted import AdaptedLanes, alone, open_folder
 from cuelearner_jax.runs.failures import without_failed
 from cuelearner_jax.runs.grid import Grid
 from cuelearner_jax.runs.opened import Lanes, Piece, lanes_of, open_run
-from cuelearner_jax.task import Rollout, Task, shape_of
+from cuelearner_jax.task import Task, shape_of
 from cuelearner_jax.terminal import console
 from cuelearner_jax.types import Teacher
 
@@ -193,73 +189,7 @@ class PolicySource:
         return loaded
 
 
-class Measured(NamedTuple):
-    """A policy's metrics under one guidance and budget."""
-
-    guidance: str
-    labels: int
-    step: int
-    seeds: np.ndarray  # (seeds,)
-    metrics: dict[str, np.ndarray]  # each (seeds,)
-    bound_deg: float | None = None  # of a policy folder's lanes [deg]
-
-
-def evaluate(
-    source: PolicySource,
-    world: Any,
-    name: str,
-    kinds: tuple[str, ...],
-    num_envs: int,
-    steps: int,
-    engine: Rollout | None = None,
-    watch: Callable[[str], Tell] = lambda kind: untold,
-) -> list[Measured]:
-    """Metrics of a policy on validation episodes of a world (a task configuration), for each guidance and budget.
-
-    Args:
-        source: where the policy comes from.
-        world: a task configuration.
-        name: of the policy.
-        kinds: of guidance of the run (none named: all).
-        num_envs, steps: as `evaluate.rollout` has them.
-        engine: a roll-out in other physics (default: the environment's own).
-        watch: by kind of guidance, who is told how far its lanes are.
-    """
-    named, key = POLICIES[name], episodes()
-    env = source.task.environment(world, "validation")
-    teacher = source.task.make_teacher(world, env) if named.taught else None
-    if not named.kept:
-        policy = named.make(Parts(source.config, env, teacher, None))
-        tell = watch(name)
-        if engine:
-            found = engine(policy, env, key, num_envs, steps, tell)
-        else:
-            found = watched(env, policy, key, num_envs, steps, tell)
-        metrics = {metric: np.asarray(value)[None] for metric, value in found.items()}
-        return [Measured("-", 0, 0, np.zeros(1, int), metrics)]
-    rows = []
-    for block in _blocks(source, named, env, teacher, kinds):
-        tell, policy, count = watch(block.guidance), block.policy, len(block.seeds)
-        if engine:
-            each = []
-            for lane in range(count):
-                each.append(engine(block.alone(lane), env, key, num_envs, steps, part_of(tell, lane, count)))
-            found = {metric: np.stack([measured[metric] for measured in each]) for metric in each[0]}
-        elif isinstance(policy, Common):
-            shared = watched(env, policy.policy, key, num_envs, steps, tell)
-            found = {metric: np.repeat(np.asarray(value)[None], count) for metric, value in shared.items()}
-        else:
-            found = watched_lanes(env, policy, key, num_envs, steps, tell)
-        variants = sorted(set(zip(block.bounds.tolist(), block.budgets.tolist(), strict=True)))
-        for bound, budget in variants:
-            own = (block.budgets == budget) & (block.bounds == bound)
-            metrics = {metric: np.asarray(values)[own] for metric, values in found.items()}
-            bounded = None if source.adapted is None else bound
-            rows.append(Measured(block.guidance, budget, block.step, block.seeds[own], metrics, bounded))
-    return rows
-
-
-class _Block(NamedTuple):
+class Block(NamedTuple):
     """Lanes of one kind of guidance at one step, and what they act with."""
 
     guidance: str
@@ -277,14 +207,14 @@ class _Block(NamedTuple):
         return self.policy.policy if isinstance(self.policy, Common) else one_lane(self.policy, lane)
 
 
-def _blocks(
+def blocks_of(
     source: PolicySource,
     named: Named,
     env: Any,
     teacher: Teacher | None,
     kinds: tuple[str, ...],
     failed_too: bool = False,
-) -> list[_Block]:
+) -> list[Block]:
     """A policy of a folder's lanes. Raises UserError if it cannot be had."""
     if source.adapted is not None:
         kept = source.adapted
@@ -293,13 +223,13 @@ def _blocks(
             raise UserError(f"{source.folder} is under {kept.guidance} guidance: leave out --guidance")
         columns = (kept.lanes.seed, kept.lanes.budget, kept.lanes.bound_deg)
         policy = named.make(Parts(source.config, env, teacher, None, kept))
-        return [_Block(kept.guidance, *columns, 0, policy, np.zeros(kept.lanes.number, bool))]
+        return [Block(kept.guidance, *columns, 0, policy, np.zeros(kept.lanes.number, bool))]
     loaded = source.load(kinds)
     blocks = []
     for lanes in loaded if failed_too else without_failed(loaded):
         policy = named.make(Parts(source.config, env, teacher, lanes))
         columns = (lanes.seeds, lanes.budgets, np.zeros(len(lanes.seeds)))
-        blocks.append(_Block(lanes.guidance.name, *columns, lanes.step, policy, np.asarray(lanes.policies["failed"])))
+        blocks.append(Block(lanes.guidance.name, *columns, lanes.step, policy, np.asarray(lanes.policies["failed"])))
     return blocks
 
 
@@ -349,7 +279,7 @@ def several(
     if not named.kept:
         return [named.make(Parts(source.config, env, teacher, None))], (0,)
     kinds = (kind,) if kind else (source.grid.guidance[-1],) if source.grid else ()
-    blocks = _blocks(source, named, env, teacher, kinds, failed_too=True)
+    blocks = blocks_of(source, named, env, teacher, kinds, failed_too=True)
     known = {
         part: np.concatenate([getattr(block, part) for block in blocks]) for part in ("seeds", "budgets", "bounds")
     }
@@ -381,45 +311,3 @@ def _listed(values: np.ndarray) -> str:
     if len(known) > 4 and known[-1] - known[0] == len(known) - 1:
         return f"{known[0]} to {known[-1]}"
     return ", ".join(f"{value:g}" if isinstance(value, np.floating) else str(value) for value in known)
-
-
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None
-
-
-def write(
-    path: Path,
-    source: PolicySource,
-    world: Any,
-    policy: str,
-    num_envs: int,
-    steps: int,
-    measured: list[Measured],
-    body: dict[str, str],
-) -> None:
-    """Measurements as JSON, with the world, the body if it is not the task's own, and where the numbers come from."""
-    rows = [
-        {
-            "guidance": row.guidance,
-            "labels": row.labels,
-            **({} if row.bound_deg is None else {"bound_deg": float(f"{row.bound_deg:g}")}),
-            "trained_steps": row.step,
-            "seeds": row.seeds.tolist(),
-            **{metric: [_finite(value) for value in values.tolist()] for metric, values in row.metrics.items()},
-        }
-        for row in measured
-    ]
-    contents = {
-        "subject": source.folder.name,
-        "world": {"name": source.task.name, **to_json(world)},
-        **({"files": files} if POLICIES[policy].taught and (files := source.task.files(world)) else {}),
-        "policy": policy,
-        **body,
-        "envs": num_envs,
-        "steps": steps,
-        **provenance(),
-        "rows": rows,
-    }
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(path) as file:
-        file.write(json.dumps(contents, indent=1) + "\n")

@@ -92,6 +92,7 @@ def _files(config: BilliardsConfig) -> dict[str, str]:
 def _pictures() -> Pictures:
     from cuelearner_envs.billiards import drawing  # takes seconds to load
     from cuelearner_envs.billiards.recording import record
+    from cuelearner_envs.billiards.sketch import reel, sketch
 
     return Pictures(
         record=record,
@@ -100,6 +101,8 @@ def _pictures() -> Pictures:
         question=lambda env, state, obs, action, file: drawing.question(
             env.table, state.positions, state.pocketed, action, file
         ),
+        sketch=sketch,
+        reel=reel,
     )
 
 

@@ -43,12 +43,15 @@ def make_teacher(config: NavigationConfig, env: Any) -> Teacher:
 def _pictures() -> Pictures:
     from cuelearner_envs.navigation import drawing  # takes seconds to load
     from cuelearner_envs.navigation.recording import record, situation
+    from cuelearner_envs.navigation.sketch import reel, sketch
 
     return Pictures(
         record=record,
         still=lambda env, frames, file: drawing.still(env.robot, frames, file),
         animate=lambda env, frames, file: drawing.animate(env.robot, frames, file),
         question=lambda env, state, obs, action, file: drawing.question(env.robot, situation(env, state, action), file),
+        sketch=sketch,
+        reel=reel,
     )
 
 
