@@ -159,7 +159,7 @@ BILLIARDS = Task(
                 Scalars(),
                 Schedule(
                     total_steps=2_000_000,
-                    guidance_until=1_000_000,
+                    guidance_until=500_000,  # as measured to help
                     eval_every=50_000,
                     checkpoint_every=250_000,
                     guide_eval_every=50,
