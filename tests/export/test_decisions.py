@@ -51,18 +51,16 @@ POLICIES = {
     "agent in the action's frame": lambda: agent(frame="action"),
     "agent near peaks": lambda: agent(coarse_directions=18, coarse_dtype="bfloat16", peaks=3),
     "heuristic": lambda: Heuristic(ENV),
-    "refined": lambda: guided("relative"),
     "refined within a bound": lambda: guided("relative", bound_deg=7.0, base=agent(frame="action"), frame="action"),
     "an ensemble": lambda: guided("demonstration", ensemble=3),
     "aims": lambda: guided("intent"),
-    "searched": lambda: guided("scalar", frame="action"),
     "residual": lambda: Residual(Heuristic(ENV), jnp.float32(0.4), 0.1, turned),
     "a function": lambda: Opaque(lambda obs: jnp.roll(obs, 1, -1)),
 }
 
 
 def write(policy, format, out, drawn=DRAWN):
-    return contract.write(policy, ENV.observation, action_of(ENV), drawn, format, out, {"subject": "test"})
+    return contract.write(policy, ENV.observation, action_of(ENV), lambda: drawn, format, out, {"subject": "test"})
 
 
 @pytest.fixture(scope="module")
