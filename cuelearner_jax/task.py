@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from cuelearner_jax.config import RunConfig
 from cuelearner_jax.environment import Environment
 from cuelearner_jax.errors import UserError, closest
-from cuelearner_jax.types import EnvState, Teacher
+from cuelearner_jax.types import EnvState, Reel, Sketch, Teacher
 
 # (policy, environment, key, environments, steps, tell) -> metrics by name, as `evaluate.rollout`; now and then it calls
 # `tell` with how far it is, and of how much
@@ -44,6 +44,10 @@ class Pictures(NamedTuple):
     # (environment, state, observation (obs,), action (action,), file): the situation as a person is asked about it,
     # with the action in question as an arrow; a PNG
     question: Callable[[Any, EnvState, Float[Array, " obs"], Float[Array, " action"], Path], None]
+    # (environment, state): the situation as a person labels it in a browser; None: nobody can
+    sketch: Callable[[Any, EnvState], Sketch] | None = None
+    # (environment, state, action (action,)): what the action leads to, to be seen in the sketch of the state
+    reel: Callable[[Any, EnvState, Float[Array, " action"]], Reel] | None = None
 
 
 @dataclass(frozen=True)
@@ -67,6 +71,7 @@ class Scenario:
     about: str
     changes: dict[str, Any]  # fields of the task's configuration
     bound_deg: float | None = None  # suggested bound of an adapted policy's corrections [deg]
+    eps_deg: float | None = None  # suggested strength of a label in it [deg]
 
     def applied(self, config: Any) -> Any:
         """The configuration with the changes in it."""

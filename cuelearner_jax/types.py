@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from enum import IntEnum
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
@@ -155,6 +155,32 @@ class TrainState(struct.PyTreeNode):
     key: PRNGKeyArray
     failed: Bool[Array, ""]  # did a loss, a gradient or a parameter stop being finite? It stays as it was before then
     pace: Pace | None = None  # None where the share of guided episodes is fixed
+
+
+class Sketch(NamedTuple):
+    """A situation as lines for a browser: SVG in a frame of its own, [m], y down.
+
+    Colours that hang on light or dark are the page's: `var(--floor)`, `var(--solid)`, `var(--low)`, `var(--ink)`,
+    `var(--free)`, `var(--hit)`, `var(--goal)`, `var(--body)`.
+    """
+
+    box: tuple[float, float, float, float]  # left, top, width, height of what is shown [m]
+    still: str  # elements of what stays as it is while an action is executed
+    movers: dict[str, str]  # elements of what moves, by name, drawn round (0, 0) and heading along +x
+    places: dict[str, tuple[float, float, float]]  # where they are: x, y [m], turn on the screen, clockwise [deg]
+    foot: tuple[float, float]  # where the arrow of an action begins [m]
+    reach: tuple[float, float]  # from there: beginning and end of that arrow [m]
+    turn: float  # counterclockwise angle on the screen of an action of angle 0 [deg]
+    aim: float = 0.0  # length of a thin line that goes on from the arrow [m]
+    words: str = ""  # about the situation, in a few words
+
+
+class Reel(NamedTuple):
+    """What an action leads to, as places of a sketch's movers."""
+
+    period: float  # between two frames [s]
+    frames: list[dict[str, tuple[float, float, float] | None]]  # of each mover, as `Sketch.places`; None: not seen
+    words: str = ""  # how it ended
 
 
 class Clock(struct.PyTreeNode):

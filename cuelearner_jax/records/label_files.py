@@ -2,19 +2,29 @@
 
 A label is what a teacher said of an action in a state: the answer, not what some model is to learn from it, so that one
 file serves every kind of guidance that takes this form of answer. A file holds one set of labels, or one for each seed
-of a run. `write` writes a whole file; `LabelWriter` one label at a time, each of which is safe once it is said.
+of a run. `write` writes a whole file; `LabelWriter` one row at a time, each of which is safe once the call returns.
 
-| column | type           | meaning                                                  |
-|--------|----------------|----------------------------------------------------------|
-| seed   | int            | whose label it is                                        |
-| obs    | list of floats | the task's observation at the question                   |
-| action | list of floats | the action asked about                                   |
-| answer | list of floats | what the teacher said; the file names the form of it     |
+| column  | type           | meaning                                                                              |
+|---------|----------------|--------------------------------------------------------------------------------------|
+| seed    | int            | whose label it is                                                                    |
+| obs     | list of floats | the task's observation at the question                                               |
+| action  | list of floats | the action asked about                                                               |
+| answer  | list of floats | what the teacher said; the file names the form of it; absent where nothing was said  |
+| item    | int            | people: number of the question, from 0                                               |
+| said    | string         | people: one of `SAID`; of several rows of one item the last one holds                |
+| eps_deg | float          | people: strength of the answer [deg], as the file's own                              |
+| seconds | float          | people: from the question on the screen to the answer [s]                            |
+| who     | string         | people: a name                                                                       |
+| when    | string         | people: time of the answer, ISO 8601 in UTC                                          |
+
+Rows of simulated teachers have the first four columns. A row is never changed: what is taken back stays, and a later
+row of the same item says so. Readers give the labels that stand.
 """
 
 from __future__ import annotations
 
 import hashlib
+from collections import Counter
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -31,12 +41,15 @@ SCHEMA = tables.Schema(
     stem="labels",
     mark="action",
     required=("seed", "obs", "action"),
-    integers=("seed",),
+    strings=("said", "who", "when"),
+    integers=("seed", "item"),
     lists=("obs", "action", "answer", "target"),  # target: of files of format 0, in place of the answer
     remedy=formats.REMEDIES["labels"],
 )
 JSONL, PARQUET = SCHEMA.jsonl, SCHEMA.parquet
 ROW = ("obs", "action", "answer")  # columns of lists
+PEOPLE = ("item", "said", "seconds", "who", "when")  # columns of rows that a person gave
+ANSWERED, UNSURE, UNDONE = SAID = ("answer", "unsure", "undone")  # an answer, "don't know", taken back
 LISTED = 20  # seeds that a message names
 CONVENTIONS = {
     "obs": "the task's observation at the question",
@@ -45,7 +58,16 @@ CONVENTIONS = {
     "eps_deg": "strength of an answer [deg], null where the form has none",
     "angles": "radians, counterclockwise positive",
 }
-TOLD = ("format", "task", "answers", "eps_deg")  # what must be the same for labels to share a file
+TOLD = ("format", "task", "answers", "eps_deg", "session")  # what must be the same for labels to share a file
+
+
+class People(NamedTuple):
+    """What a person's labels have beside what was said, (labels,) each."""
+
+    item: np.ndarray  # number of the question
+    seconds: np.ndarray  # taken for the answer [s]
+    who: np.ndarray  # names
+    when: np.ndarray  # ISO 8601
 
 
 class LabelFile(NamedTuple):
@@ -55,18 +77,28 @@ class LabelFile(NamedTuple):
     answers: str  # name of the form of the answers, see `guidance.answers`
     eps_deg: float | None  # strength of an answer [deg]; None where the form has none
     seeds: np.ndarray  # (labels,)
-    labels: Label  # rows (labels, ...), in the order they were given
+    labels: Label  # rows (labels, ...), in the order they were given; those that stand
+    people: People | None = None  # None: a simulated teacher's, or of several people's merged with such
+    session: dict[str, Any] | None = None  # how a page asked, see `labelling.session`
+    said: dict[str, int] | None = None  # rows of each kind (`SAID`), those that no longer stand included
 
 
 class LabelWriter(tables.TableWriter):
-    """Appends labels to `labels.jsonl` of a folder; each is on the disk when the call returns.
+    """Appends rows to `labels.jsonl` of a folder; each is on the disk when the call returns.
 
     Opening an existing file continues it: a torn last line, left by a crash, is dropped first, and a finished file
     (Parquet) becomes JSONL again.
     """
 
     def __init__(
-        self, folder: Path, task: dict[str, Any], answers: str, eps_deg: float | None, meaning: str = ""
+        self,
+        folder: Path,
+        task: dict[str, Any],
+        answers: str,
+        eps_deg: float | None,
+        meaning: str = "",
+        session: dict[str, Any] | None = None,
+        **told: Any,
     ) -> None:
         """Opens the file, creating it and the folder where needed.
 
@@ -76,44 +108,72 @@ class LabelWriter(tables.TableWriter):
             answers: form of the answers.
             eps_deg: strength of an answer [deg]; None where the form has none.
             meaning: of an answer's numbers, written into the file.
+            session: what else must be the same for labels to share a file.
+            told: what else a new file says of itself, such as the versions that wrote it.
 
         Raises:
             UserError: the folder holds labels of something else, or they cannot be read; nothing has been changed.
         """
-        about = _about(task, answers, eps_deg, meaning)
-        there = next((folder / name for name in (PARQUET, JSONL) if (folder / name).exists()), None)
+        about = {**_about(task, answers, eps_deg, meaning), **({} if session is None else {"session": session})}
+        there = found_in(folder)
         self._widths: dict[str, int] = {}
+        self._eps = about["eps_deg"]
         if there is not None:
             table, before = _told(there)
             if before is None and table.num_rows:
                 raise formats.damaged("labels", there)
-            differing = [] if before is None else [name for name in TOLD if before.get(name) != about[name]]
-            if differing:
-                raise UserError(f"{there} holds labels of another {', '.join(differing)}: give another folder")
-            if table.num_rows:
-                last = table.slice(table.num_rows - 1).to_pylist()[0]
-                self._widths = {name: len(last[name]) for name in ROW}
-        super().__init__(folder, SCHEMA, about=about)
+            if before is not None:
+                _check_same(there, before, about)
+            for name in ROW if table.num_rows else ():
+                answered = [values for values in table[name].to_pylist() if values is not None]
+                self._widths |= {name: len(answered[-1])} if answered else {}
+        super().__init__(folder, SCHEMA, about={**about, **told})
 
-    def append(self, *, seed: int, obs: np.ndarray, action: np.ndarray, answer: np.ndarray) -> None:
-        """Appends one label.
+    def append(
+        self, *, seed: int, obs: np.ndarray, action: np.ndarray, answer: np.ndarray | None, **person: Any
+    ) -> None:
+        """Appends one row.
 
         Args:
             seed: whose label it is.
             obs: the task's observation at the question, (obs,).
             action: the action asked about, (action,).
-            answer: what the teacher said, (width,).
+            answer: what the teacher said, (width,); None: nothing, or what was said is taken back.
+            person: the columns `PEOPLE`, of a person's label.
 
         Raises:
             ValueError: a number is not finite, or a width is not that of the labels before.
+            OSError: the disk takes no more; the file must be opened again before anything is appended.
         """
-        columns = {name: np.asarray(value, np.float32) for name, value in zip(ROW, (obs, action, answer), strict=True)}
+        values = {name: value for name, value in zip(ROW, (obs, action, answer), strict=True) if value is not None}
+        columns = {name: np.asarray(value, np.float32) for name, value in values.items()}
         for name, value in columns.items():
             if value.shape != (self._widths.setdefault(name, value.size),):
                 raise ValueError(f"{name} has the shape {value.shape}, expected ({self._widths[name]},)")
             if not np.isfinite(value).all():
                 raise ValueError(f"{name} is not finite: {value}")
-        super().append(seed=int(seed), **columns)
+        if person and (set(person) != set(PEOPLE) or person["said"] not in SAID):
+            raise ValueError(f"a person's row has the columns {', '.join(PEOPLE)}, and said one of {', '.join(SAID)}")
+        if person and (answer is not None) != (person["said"] == ANSWERED):
+            raise ValueError(f"a row that says {person['said']!r} has {'no' if answer is None else 'an'} answer")
+        strength = {"eps_deg": self._eps} if person and self._eps is not None else {}
+        super().append(seed=int(seed), **columns, **person, **strength)
+
+
+def found_in(place: Path) -> Path | None:
+    """The label file at a place: that file, or the one in that folder; None: there is none."""
+    if not place.is_dir():
+        return place if place.exists() else None
+    return next((place / name for name in (PARQUET, JSONL) if (place / name).exists()), None)
+
+
+def history(path: Path) -> list[dict[str, Any]]:
+    """Every row of a person's file, in the order of writing, those that no longer stand included; columns absent: None.
+
+    Raises UserError if the file is damaged.
+    """
+    table, _ = _told(path)
+    return table.to_pylist()
 
 
 def finish(folder: Path) -> Path:
@@ -150,18 +210,37 @@ def write(
     tables.write(path, pa.table(columns), SCHEMA, about=_about(task, answers, eps_deg, meaning))
 
 
+def write_file(path: Path, file: LabelFile, **told: Any) -> None:
+    """Writes labels as Parquet, in one step, with what a person's have beside them; `told`: see `LabelWriter`."""
+    columns = {"seed": pa.array(np.asarray(file.seeds, np.int64))}
+    for name in ROW:
+        columns[name] = pa.array(list(np.asarray(getattr(file.labels, name), np.float32)), SCHEMA.type(name))
+    if file.people is not None:
+        person = {**file.people._asdict(), "said": [ANSWERED] * len(file.seeds)}
+        columns |= {name: pa.array(list(person[name]), SCHEMA.type(name)) for name in PEOPLE}
+        if file.eps_deg is not None:
+            columns["eps_deg"] = pa.array([file.eps_deg] * len(file.seeds), pa.float64())
+    about = _about(file.task, file.answers, file.eps_deg, "")
+    session = {} if file.session is None else {"session": file.session}
+    tables.write(path, pa.table(columns), SCHEMA, about={**about, **session, **told})
+
+
 def read(path: Path) -> LabelFile:
-    """The labels of a Parquet or JSONL file, of the current format or an older one.
+    """The labels that stand in a Parquet or JSONL file, or a folder with one, of the current format or an older one.
 
     Raises:
         UserError: the file is missing, damaged, of a newer program, or holds no labels.
     """
-    if not path.is_file():
+    found = found_in(path)
+    if found is None or not found.is_file():
         raise UserError(f"no label file at {path}: give the path of a labels.parquet that a run or a person wrote")
+    path = found
     table, told = _told(path)
-    if not table.num_rows and told is not None:
-        raise UserError(f"{path} holds no labels: collect some first")
     try:
+        said = dict(Counter(table["said"].to_pylist())) if "said" in table.column_names else None
+        table = _standing(table)
+        if not table.num_rows and told is not None:
+            raise UserError(f"{path} holds no labels: collect some first")
         columns = {name: _array(table[name], name) for name in table.column_names}
         values = formats.upgrade("labels", {**(told or {}), "columns": columns}, path)
         columns, eps = values["columns"], values["eps_deg"]
@@ -169,10 +248,25 @@ def read(path: Path) -> LabelFile:
         if any(array.ndim != 2 for array in rows.values()) or not isinstance(values["answers"], str):
             raise ValueError("every column holds one list a label, and the form of the answers is a name")
         labels = Label(**rows, valid=np.ones(table.num_rows, bool))  # pyright: ignore[reportArgumentType]
-        named = dict(values["task"]), values["answers"]
-        return LabelFile(*named, None if eps is None else float(eps), columns["seed"], labels)
+        named = dict(values["task"]), values["answers"], None if eps is None else float(eps), columns["seed"], labels
+        people = None
+        if "item" in columns and not (columns["item"] < 0).any():
+            people = People(*(columns[name] for name in People._fields))
+        return LabelFile(*named, people, values.get("session"), said)
     except (KeyError, TypeError, ValueError) as error:
         raise formats.damaged("labels", path) from error
+
+
+def _standing(table: pa.Table) -> pa.Table:
+    """The rows that hold: of a person's item the last, if it is an answer; in the order of items."""
+    if not {"item", "said"} <= set(table.column_names):
+        return table
+    last: dict[Any, int] = {}
+    for row, (seed, item) in enumerate(zip(*(table[name].to_pylist() for name in ("seed", "item")), strict=True)):
+        last[(seed, row, None) if item is None else (seed, item, "item")] = row
+    said = table["said"].to_pylist()
+    kept = [row for _, row in sorted(last.items(), key=lambda entry: entry[0][:2]) if said[row] in (None, ANSWERED)]
+    return table.take(pa.array(kept, pa.int64()))
 
 
 def readable(path: Path) -> bool:
@@ -186,7 +280,7 @@ def readable(path: Path) -> bool:
 
 def digest(path: Path) -> str:
     """What tells a file's contents from others of the same name."""
-    return hashlib.sha256(path.read_bytes()).hexdigest()[:12]
+    return hashlib.sha256((found_in(path) or path).read_bytes()).hexdigest()[:12]
 
 
 def for_lanes(file: LabelFile, seeds: np.ndarray, budgets: np.ndarray, slots: int) -> Label:
@@ -235,6 +329,28 @@ def _about(task: dict[str, Any], answers: str, eps_deg: float | None, meaning: s
     }
 
 
+def _check_same(path: Path, before: dict[str, Any], now: dict[str, Any]) -> None:
+    """Raises UserError, with the first difference in words, unless labels may share a file."""
+    parts = [("", name, before.get(name), now.get(name)) for name in TOLD]
+    for group in ("task", "session"):
+        old, new = before.get(group) or {}, now.get(group) or {}
+        parts += [(f"{group}.", name, old.get(name), new.get(name)) for name in {**old, **new} if old and new]
+    differing = [part for part in parts if part[2] != part[3] and part[1] != "from"]
+    for prefix, name, old, new in differing:  # of a group its parts say more
+        if prefix or name not in ("task", "session"):
+            raise UserError(
+                f"{path} holds labels of another {prefix}{name} ({_short(old)}, asked for is {_short(new)}): "
+                "give the same, or another folder (--out)"
+            )
+    if differing:
+        raise UserError(f"{path} holds labels that were given otherwise ({differing[0][1]}): give another folder")
+
+
+def _short(value: Any) -> str:
+    text = str(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
 def _told(path: Path) -> tuple[pa.Table, dict[str, Any] | None]:
     """A file's table and what it says of itself, in whatever format; None: nothing."""
     table = tables.read(path, SCHEMA)
@@ -245,8 +361,12 @@ def _told(path: Path) -> tuple[pa.Table, dict[str, Any] | None]:
 
 
 def _array(column: pa.ChunkedArray, name: str) -> np.ndarray:
-    """A column as an array; ValueError if its lists are of several lengths."""
-    return np.array(column.to_pylist(), np.int64 if name in SCHEMA.integers else np.float32)
+    """A column as an array; ValueError if its lists are of several lengths. An item that has no number is -1."""
+    if name in SCHEMA.strings:
+        return np.array([value or "" for value in column.to_pylist()])
+    if name in SCHEMA.integers:
+        return np.array([-1 if value is None else value for value in column.to_pylist()], np.int64)
+    return np.array(column.to_pylist(), np.float32)
 
 
 def _padded(rows: np.ndarray, slots: int) -> np.ndarray:

@@ -67,6 +67,7 @@ def _files(config: BilliardsConfig) -> dict[str, str]:
 def _pictures() -> Pictures:
     from cuelearner_envs.billiards import drawing  # takes seconds to load
     from cuelearner_envs.billiards.recording import record
+    from cuelearner_envs.billiards.sketch import reel, sketch
 
     return Pictures(
         record=record,
@@ -75,6 +76,8 @@ def _pictures() -> Pictures:
         question=lambda env, state, obs, action, file: drawing.question(
             env.table, state.positions, state.pocketed, action, file
         ),
+        sketch=sketch,
+        reel=reel,
     )
 
 
@@ -87,14 +90,17 @@ PLAYER = Body(
 
 # The worlds of the paper's section on adaptation after training.
 SCENARIOS = {
-    "turned_strike": Scenario("every strike is turned by 0.8 degrees", {"action_turn_deg": 0.8}, bound_deg=1.0),
+    "turned_strike": Scenario(
+        "every strike is turned by 0.8 degrees", {"action_turn_deg": 0.8}, bound_deg=1.0, eps_deg=0.1
+    ),
     "shifted_balls": Scenario(
         "balls are seen 7.1 mm to the right of and above their places",
         {"observation_bias": (0.0071, 0.0071)},
         bound_deg=0.3,
+        eps_deg=0.1,
     ),
     "tilted_table": Scenario(
-        "the table is tilted: balls are drawn along y", {"acceleration": (0.0, 0.005)}, bound_deg=0.3
+        "the table is tilted: balls are drawn along y", {"acceleration": (0.0, 0.005)}, bound_deg=0.3, eps_deg=0.1
     ),
 }
 

@@ -66,7 +66,7 @@ def test_only_labels_that_count_are_written(path):
 def test_what_the_numbers_mean_is_written_in_the_file(path):
     written(path)
     meta = json.loads(pq.read_schema(path).metadata[META])
-    assert meta["format"] == 1
+    assert meta["format"] == 2
     assert meta["conventions"]["angles"] == "radians, counterclockwise positive"
     assert set(meta["conventions"]) >= set(NAMES)
 
@@ -141,7 +141,7 @@ def test_older_files_of_another_guidance_and_newer_files_are_refused(path):
     older(path, guidance="demonstration")
     with pytest.raises(UserError, match="not a label file"):
         files.read(path)
-    older(path, format=2)
+    older(path, format=3)
     with pytest.raises(UserError, match="written by a newer cuelearner"):
         files.read(path)
 
@@ -284,23 +284,26 @@ def test_a_finished_session_is_a_label_file_and_can_be_continued(tmp_path):
 
 @pytest.mark.parametrize(
     ("other", "named"),
-    [({"answers": "scalar"}, "answers"), ({"eps_deg": 5.0}, "eps_deg"), ({"answers": "scalar", "eps_deg": None},
-     "answers, eps_deg")],
-)  # fmt: skip
+    [
+        ({"answers": "scalar"}, r"answers \(relative, asked for is scalar\)"),
+        ({"eps_deg": 5.0}, r"eps_deg \(20.0, asked for is 5.0\)"),
+        ({"answers": "scalar", "eps_deg": None}, r"answers \(relative, asked for is scalar\)"),
+    ],
+)
 @pytest.mark.parametrize("done", [False, True])
 def test_labels_of_another_kind_are_not_mixed_in(tmp_path, other, named, done):
     said(tmp_path, range(3))
     if done:
         files.finish(tmp_path)
     before = probes.files_of(tmp_path)
-    with pytest.raises(UserError, match=f"holds labels of another {named}: give another folder"):
+    with pytest.raises(UserError, match=f"holds labels of another {named}: give the same, or another folder"):
         said(tmp_path, [3], **other)
     assert probes.files_of(tmp_path) == before
 
 
 def test_older_and_foreign_files_are_not_continued(tmp_path):
     older(tmp_path / files.PARQUET)
-    with pytest.raises(UserError, match="another format, answers"):
+    with pytest.raises(UserError, match="holds labels of another "):
         said(tmp_path, [3])
     (tmp_path / files.PARQUET).unlink()
     (tmp_path / files.JSONL).write_text('{"seed": 1, "obs": [1.0], "action": [1.0], "answer": [1.0]}\n')

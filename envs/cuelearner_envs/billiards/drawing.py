@@ -129,13 +129,14 @@ def animate(
 # --- the parts of a drawing ------------------------------------------------------------------------------------------
 
 
-def _rail_width(table: Table) -> float:
+def rail_width(table: Table) -> float:
+    """Width of the rail round the table [m]."""
     return max(0.62 * float(corner_gap(table)), 2.0 * float(table.ball_radius))
 
 
 def _limits(table: Table) -> tuple[float, float, float, float]:
     """left, right, bottom, top of a drawing [m]; the tray for pocketed balls is at the bottom."""
-    margin = _rail_width(table) + 0.008
+    margin = rail_width(table) + 0.008
     x, y = float(table.width) / 2 + margin, float(table.height) / 2 + margin
     return -x, x, -y - 3.4 * float(table.ball_radius), y
 
@@ -157,7 +158,7 @@ def _save(figure: Figure, file: str | os.PathLike[str], dpi: float) -> None:
 
 def _draw_room(axes: Axes, table: Table) -> None:
     """Everything that does not move."""
-    w, h, r, rail = float(table.width), float(table.height), float(table.ball_radius), _rail_width(table)
+    w, h, r, rail = float(table.width), float(table.height), float(table.ball_radius), rail_width(table)
     left, right, bottom, top = _limits(table)
     axes.set(xlim=(left, right), ylim=(bottom, top), aspect="equal")
     axes.axis("off")
@@ -205,7 +206,7 @@ class _Balls:
         points = float(table.ball_radius) / (right - left) * axes.figure.get_figure(root=True).get_figwidth() * 72
         self.discs, self.numbers = [], []
         for ball in range(table.balls):
-            colour = _ball_colour(ball)
+            colour = ball_colour(ball)
             look = {"facecolor": colour, "edgecolor": "#1a1a1a", "linewidth": 0.6, "zorder": 5}
             if ghosts:
                 look |= {"alpha": 0.35, "zorder": 3}
@@ -230,7 +231,8 @@ class _Balls:
             number.draw(renderer)
 
 
-def _ball_colour(ball: int) -> str:
+def ball_colour(ball: int) -> str:
+    """Of a ball, as a hexadecimal code."""
     return CUE if ball == 0 else TARGETS[(ball - 1) % len(TARGETS)]
 
 
@@ -266,7 +268,7 @@ def _draw_tracks(axes: Axes, table: Table, path: Trajectory) -> None:
             points = np.concatenate([points, np.asarray(before)[:, ball]])
         if alive and np.abs(np.diff(points, axis=0)).sum() > 1e-3:
             edge = [patheffects.withStroke(linewidth=2.6, foreground="#00000055")]
-            axes.plot(*points.T, color=_ball_colour(ball), linewidth=1.4, zorder=4, path_effects=edge)
+            axes.plot(*points.T, color=ball_colour(ball), linewidth=1.4, zorder=4, path_effects=edge)
 
 
 # --- films -----------------------------------------------------------------------------------------------------------

@@ -1,0 +1,265 @@
+"""The labelling page in a real browser, with real keys: nothing lost or doubled, how fast, and what it looks like.
+
+    python benchmarks/labelling_page.py paced --task navigation --out paced.json        500 labels, 5 a second
+    python benchmarks/labelling_page.py kills --task billiards --preset quickstart --out kills.json
+    python benchmarks/labelling_page.py pictures --task navigation billiards --to docs/figures
+
+`paced`: a script that sees only the page turns navigation's arrow toward the goal, with 10% mistakes and 10% "don't
+know"; in billiards it presses at random. Measured are a key's press to the next question painted, while a model is
+being fitted and otherwise, and whether every press is in the file once. Needs playwright and a Chromium
+(`--browser`).
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import os
+import random
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from playwright.sync_api import Browser, Page, sync_playwright
+
+from cuelearner_jax.records import label_files
+from cuelearner_jax.records.provenance import provenance
+
+KEYS = {"ArrowLeft": 1.0, "ArrowUp": 0.0, "ArrowRight": -1.0, "ArrowDown": None}
+# Times of each press: of the key, and of the first frame in which another question stands.
+WATCH = """
+window.taken = [];
+addEventListener("keydown", event => {
+  const scene = document.querySelector("svg.scene");
+  if (!scene || !event.key.startsWith("Arrow")) return;
+  const began = performance.now(), item = scene.dataset.item;
+  const fitting = document.body.innerText.includes("fitting");
+  const look = () => {
+    const now = document.querySelector("svg.scene");
+    if (now && now.dataset.item === item) { requestAnimationFrame(look); return; }
+    const painted = new MessageChannel();
+    painted.port1.onmessage = () => window.taken.push([performance.now() - began, fitting]);
+    painted.port2.postMessage(0);
+  };
+  requestAnimationFrame(look);
+}, true);
+"""
+# What the page shows of where to go: the angle from the arrow to the goal, counterclockwise [deg].
+TO_GOAL = """() => {
+  const scene = document.querySelector("svg.scene"), middle = one => {
+    const box = one.getBoundingClientRect();
+    return [box.x + box.width / 2, box.y + box.height / 2];
+  };
+  const [x, y] = middle(scene.querySelector(".mover"));
+  const at = one => { const [px, py] = middle(one); return Math.atan2(y - py, px - x) * 180 / Math.PI; };
+  const goal = scene.querySelector("[style*='--goal']"), tip = scene.querySelector(".arrow.asked polygon");
+  return ((at(goal) - at(tip) + 540) % 360) - 180;
+}"""
+ITEM = "() => { const one = document.querySelector('svg.scene'); return one ? +one.dataset.item : null; }"
+
+
+@contextlib.contextmanager
+def served(asked: argparse.Namespace, task: str, folder: Path, *more: str) -> Iterator[tuple[subprocess.Popen, str]]:
+    """The command, until it has told its address: the process and that."""
+    command = [sys.executable, "-m", "cuelearner_jax.cli", "label", task, "--preset", asked.preset]
+    command += ["--out", str(folder), *more]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env={**os.environ, "PYTHONUNBUFFERED": "1"})
+    try:
+        assert process.stdout is not None
+        told = next((line for line in process.stdout if line.startswith("open ")), None)
+        if told is None:
+            raise SystemExit(f"the page did not start: {process.wait()}")
+        yield process, told.split()[1]
+    finally:
+        process.kill()
+        process.wait()
+
+
+def entered(browser: Browser, address: str, **look: Any) -> Page:
+    """The page with its first question."""
+    known: dict[str, Any] = {"viewport": {"width": 1280, "height": 860}} | look
+    page = browser.new_page(**known)
+    page.add_init_script(WATCH)
+    for _ in range(100):
+        with contextlib.suppress(Exception):
+            page.goto(address)
+            break
+        time.sleep(0.1)
+    page.wait_for_selector("svg.scene")
+    return page
+
+
+def moved(page: Page, item: int, seconds: float = 30.0) -> None:
+    """Waits for another question than this one."""
+    page.wait_for_function(f"({ITEM})() !== {item}", timeout=seconds * 1000)
+
+
+def chosen(page: Page, task: str, rng: random.Random) -> str:
+    """The key that the script presses: it sees the page alone."""
+    if rng.random() < 0.1:
+        return "ArrowDown"
+    if task != "navigation":
+        return rng.choice(["ArrowLeft", "ArrowUp", "ArrowRight"])
+    apart = page.evaluate(TO_GOAL)
+    if abs(apart) <= 10.0:
+        return "ArrowUp"
+    left = (apart > 0) != (rng.random() < 0.1)
+    return "ArrowLeft" if left else "ArrowRight"
+
+
+def check(folder: Path, pressed: dict[int, str], saved: int) -> dict[str, int]:
+    """Presses that the file lacks or has otherwise, and rows that nobody pressed."""
+    found = label_files.found_in(folder)
+    assert found is not None
+    rows = label_files.history(found)
+    items = [row["item"] for row in rows]
+    answers = {row["item"]: None if row["answer"] is None else row["answer"][0] for row in rows}
+    lost = max(saved - len(set(items)), 0)
+    other = sum(answers[item] != KEYS[pressed[item]] for item in answers if item in pressed)
+    return {"rows": len(rows), "lost": lost, "doubled": len(items) - len(set(items)), "otherwise": other}
+
+
+def paced(asked: argparse.Namespace, browser: Browser, work: Path) -> dict[str, Any]:
+    """Labels at a pace: every press in the file once, and how long each took."""
+    rng, pressed, answered = random.Random(0), {}, 0
+    (task,) = asked.task
+    folder = asked.keep or work / task
+    began = time.time()
+    with served(asked, task, folder, "--labels", str(asked.labels)) as (process, address):
+        opened, page = time.time() - began, entered(browser, address)
+        start = time.perf_counter()
+        for number in range(10**6):
+            item = page.evaluate(ITEM)
+            if item is None:
+                break
+            time.sleep(max(0.0, start + number / asked.rate - time.perf_counter()))
+            key = pressed[item] = chosen(page, task, rng)
+            page.keyboard.press(key)
+            answered += KEYS[key] is not None
+            moved(page, item)
+        seconds = time.perf_counter() - start
+        page.wait_for_function("() => document.body.innerText.includes('All labels are given')")
+        taken = page.evaluate("window.taken")
+        side = page.locator(".side").inner_text()
+        process.send_signal(signal.SIGINT)
+        status = process.wait(60)
+    each = np.array([milliseconds for milliseconds, _ in taken])
+    fitting = np.array([bool(running) for _, running in taken])
+    quantiles = lambda values: [round(float(q), 1) for q in np.quantile(values, [0.5, 0.99, 1.0])]  # noqa: E731
+    return {
+        "opened_s": round(opened, 1),
+        "presses": len(pressed),
+        "answered": answered,
+        "seconds": round(seconds, 1),
+        "key_to_next_ms (median, p99, max)": quantiles(each),
+        "while_fitting_ms (median, p99, max)": quantiles(each[fitting]) if fitting.any() else None,
+        "presses_while_fitting": int(fitting.sum()),
+        "own_overhead_s": round(float(each.sum() / 1000), 1),
+        **check(folder, pressed, len(pressed)),
+        "exit_status": status,
+        "page": side.splitlines()[:6],
+    }
+
+
+def kills(asked: argparse.Namespace, browser: Browser, work: Path) -> dict[str, Any]:
+    """The command killed at random moments while keys are pressed, and opened again on the same file."""
+    rng, pressed, found = random.Random(1), {}, []
+    (task,) = asked.task
+    folder, saved = work / task, 0
+    for number in range(asked.kills):
+        with served(asked, task, folder, "--labels", "2000") as (process, address):
+            page = entered(browser, address)
+            end = time.perf_counter() + rng.uniform(0.3, 4.0)
+            with contextlib.suppress(Exception):  # of a page whose server has gone
+                while True:
+                    item = page.evaluate(ITEM)
+                    told = re.search(r"(\d+) answers saved", page.locator(".side").inner_text())
+                    saved = max(saved, int(told[1]) if told else 0)
+                    pressed[item] = rng.choice(list(KEYS))
+                    if time.perf_counter() > end:
+                        page.keyboard.press(pressed[item], delay=0)
+                        time.sleep(rng.uniform(0, 0.03))
+                        process.kill()
+                        break
+                    page.keyboard.press(pressed[item])
+                    moved(page, item, 5.0)
+            process.wait()
+            page.close()
+        found.append(check(folder, pressed, saved))
+        rows = label_files.history(folder / label_files.JSONL)
+        pressed = {item: key for item, key in pressed.items() if item < len(rows)}  # the last may not have arrived
+        print(number, found[-1], flush=True)
+    return {"kills": len(found), **{name: sum(one[name] for one in found) for name in ("lost", "doubled", "otherwise")},
+            "rows": found[-1]["rows"]}  # fmt: skip
+
+
+LOOKS = {
+    "light": {"color_scheme": "light"},
+    "dark": {"color_scheme": "dark"},
+    "phone_light": {"color_scheme": "light", "viewport": {"width": 390, "height": 844}},
+    "phone_dark": {"color_scheme": "dark", "viewport": {"width": 390, "height": 844}},
+}
+
+
+def pictures(asked: argparse.Namespace, browser: Browser, work: Path) -> dict[str, Any]:
+    """Each task's page in light and dark, on a desk and on a phone, once a model has been fitted."""
+    asked.to.mkdir(parents=True, exist_ok=True)
+    for task in asked.task:
+        for kind in asked.guidance or [""]:
+            more = ("--guidance", kind) if kind else ()
+            with served(asked, task, work / f"{task}{kind}", "--labels", "500", *more) as (_, address):
+                page = entered(browser, address)
+                rng = random.Random(2)
+                for _ in range(13 if not kind else 0):
+                    item = page.evaluate(ITEM)
+                    page.keyboard.press(chosen(page, task, rng))
+                    moved(page, item)
+                    time.sleep(0.3)
+                if not kind:
+                    page.wait_for_function("() => document.body.innerText.includes('of 10 labels')", timeout=600_000)
+                page.close()
+                for name, look in LOOKS.items() if not kind else [("light", LOOKS["light"])]:
+                    page = entered(browser, address, **look)
+                    time.sleep(1.0)
+                    page.screenshot(path=asked.to / f"label_{task}{f'_{kind}' if kind else ''}_{name}.png")
+                    page.close()
+    return {"pictures": sorted(str(file.name) for file in asked.to.glob("label_*.png"))}
+
+
+def main() -> None:
+    """Runs one of them."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=("paced", "kills", "pictures"))
+    parser.add_argument("--task", nargs="+", default=["navigation"])
+    parser.add_argument("--preset", default="paper")
+    parser.add_argument("--guidance", nargs="*", help="pictures: of these kinds instead of the task's own")
+    parser.add_argument("--labels", type=int, default=500)
+    parser.add_argument("--rate", type=float, default=5.0, help="presses a second")
+    parser.add_argument("--kills", type=int, default=20)
+    parser.add_argument("--keep", type=Path, help="paced: folder for the labels (default: one that is removed)")
+    parser.add_argument("--to", type=Path, default=Path("docs/figures"), help="folder for pictures")
+    parser.add_argument("--browser", default=shutil.which("chromium"), help="a Chromium")
+    parser.add_argument("--out", type=Path, help="write the figures to this JSON file")
+    asked = parser.parse_args()
+    with tempfile.TemporaryDirectory() as work, sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=asked.browser, args=["--no-sandbox"])
+        found = {"paced": paced, "kills": kills, "pictures": pictures}[asked.what](asked, browser, Path(work))
+        browser.close()
+    print(json.dumps(found, indent=1))
+    if asked.out:
+        asked.out.write_text(
+            json.dumps({"task": asked.task, "preset": asked.preset, **found, **provenance()}, indent=1)
+        )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,223 @@
+"""`cuelearner label`."""
+
+from __future__ import annotations
+
+import dataclasses
+import webbrowser
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Generic
+
+import jax
+import numpy as np
+
+from cuelearner_jax import config as configuration
+from cuelearner_jax.cli.parsing import about, out, parse, preset_of, taken, task_of
+from cuelearner_jax.cli.shared_options import Flag, TaskT, asking_kind, preset_kinds
+from cuelearner_jax.config import GuideScalars, GuideSizes, RunConfig
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.face.acting import as_policy, load_policy
+from cuelearner_jax.face.worlds import World
+from cuelearner_jax.guidance import registry as guidances
+from cuelearner_jax.labelling.plan import Base, Plan
+from cuelearner_jax.plugins import load
+from cuelearner_jax.policies import uniform_in
+from cuelearner_jax.records import label_files
+from cuelearner_jax.records.folders import claimed
+from cuelearner_jax.runs.grid import LARGEST_SEED
+from cuelearner_jax.runs.trained import PolicySource
+from cuelearner_jax.task import Task, shape_of
+from cuelearner_jax.tasks import registry
+from cuelearner_jax.terminal import Interrupted, console, interruptible
+
+UNIFORM = "uniform"
+MOST_LABELS = 100_000
+
+
+@dataclass(frozen=True)
+class Label(Generic[TaskT]):
+    """Label actions in a browser: those of chance, or of a policy (a run folder, a policy folder, package.module:NAME
+    of a function of observations)."""
+
+    task: TaskT
+    sizes: GuideSizes
+    scalars: GuideScalars
+    out: Path
+    """Folder of the labels; one that holds some already goes on where it stopped."""
+    labels: int = 500
+    """Answers that are wanted; to go on later, give more."""
+    guidance: str = ""
+    """Kind of guidance that is fitted while you label; it decides what you are asked for."""
+    who: str = "anonymous"
+    """A name for you, written beside each label."""
+    seed: int = 0
+    """Seed of the situations; the labels are this seed's."""
+    bound_deg: float | None = None
+    """Ask about actions within this of the policy's own alone [deg] (default: wherever the guidance leads)."""
+    policy: str = "agent"
+    """Who acts of a run: agent, guided or another, as for evaluate."""
+    of_guidance: str | None = None
+    """Kind of guidance of the run's lane (default: the run's last)."""
+    of_labels: int | None = None
+    """Label budget of the run's lane (default: the largest)."""
+    of_seed: int | None = None
+    """Seed of the run's lane (default: the first)."""
+    again: Path | None = None
+    """Instead: the questions of this page's file once more, for a second opinion; leave out the policy and --seed."""
+    scenario: str | None = None
+    """The changed world of this name, see above; options of the task (--task.…) come on top of it."""
+    port: int = 0
+    """Port on 127.0.0.1 (0: any that is free)."""
+    open: Flag[bool] = False
+    """Open the page in a browser of this machine."""
+
+
+OPTIONS = {"label": Label}
+
+
+def run(arguments: list[str]) -> None:
+    """Runs the command.
+
+    Raises:
+        UserError: bad input, a folder in use or with labels of something else.
+        Interrupted: Ctrl-C or SIGTERM; every answer is saved.
+    """
+    serve = _serving()
+    task, rest = task_of(arguments, "label", Label)
+    named, rest = (rest[0], rest[1:]) if rest and not rest[0].startswith("-") else (None, rest)
+    _, preset, rest = preset_of(task, rest)
+    kind = Label[task.config]  # pyright: ignore[reportInvalidTypeArguments]
+    world = _scenario(task, preset.config.task, rest)
+    parts = (_part(GuideSizes, preset.config.sizes), _part(GuideScalars, preset.config.scalars))
+    default = kind(
+        world, *parts, Path("labels") / task.name, guidance=asking_kind(preset_kinds(task, preset)), who="anonymous"
+    )
+    asked = parse(kind, rest, f"label {task.name}", default, about(Label, task))
+    plan = planned(task, preset.config, asked, named)
+    with claimed(asked.out), interruptible("the answer of the moment") as stopping:
+        finished = serve(plan, asked, stopping)
+        if finished:
+            out.print(f"done: {label_files.finish(asked.out)}")
+            return
+        raise Interrupted(f"stopped; every answer is in {asked.out}: the same command goes on")
+
+
+def planned(task: Task, config: RunConfig, asked: Label[Any], named: str | None) -> Plan:
+    """What is asked for. Raises UserError for what makes no sense."""
+    merged = RunConfig(
+        asked.task,
+        dataclasses.replace(config.sizes, **dataclasses.asdict(asked.sizes)),
+        dataclasses.replace(config.scalars, **dataclasses.asdict(asked.scalars)),
+        config.schedule,
+    )
+    configuration.check_guide(merged.sizes, merged.scalars)
+    if not 1 <= asked.labels <= MOST_LABELS:
+        raise UserError(f"--labels is {asked.labels}: give a number from 1 to {MOST_LABELS:,}")
+    if not 0 <= asked.seed < LARGEST_SEED:
+        raise UserError(f"--seed is {asked.seed}: give a number from 0 to {LARGEST_SEED - 1}")
+    if not 0 <= asked.port < 65536:
+        raise UserError(f"--port is {asked.port}: give a number from 0 to 65535")
+    if asked.bound_deg is not None and not 0 < asked.bound_deg <= 180:
+        raise UserError(f"--bound-deg is {asked.bound_deg:g}: give an angle above 0 and up to 180")
+    if not asked.who.strip():
+        raise UserError("--who is empty: give a name, or leave it out")
+    if merged.sizes.candidates > 1:
+        raise UserError("--sizes.candidates is above 1, but a page asks in situations as they come: leave it out")
+    env = shape_of(task, asked.task)
+    guidance = guidances.make(asked.guidance, merged.sizes, env)
+    if guidance.form is None:
+        asking = [kind.name for kind in guidances.known() if kind.asks]
+        raise UserError(f"guidance {guidance.name!r} asks for no labels: give --guidance {' or '.join(asking)}")
+    if asked.again is not None:
+        return _second(
+            Plan(task, merged, guidance, Base(uniform_in(env), ""), asked.labels, who=asked.who.strip()), asked, named
+        )
+    base = _base(task, asked, named, env)
+    return Plan(task, merged, guidance, base, asked.labels, asked.seed, asked.who.strip(), asked.bound_deg)
+
+
+def _second(plan: Plan, asked: Label[Any], named: str | None) -> Plan:
+    """The questions of another page's file. Raises UserError if there are none, or they are of another world."""
+    assert asked.again is not None
+    file = label_files.read(asked.again)
+    if file.session is None or file.people is None:
+        raise UserError(f"{asked.again} is no page's own file: its questions cannot be asked again")
+    if named is not None or asked.seed or asked.bound_deg is not None:
+        raise UserError("--again asks what another page asked: leave out the policy, --seed and --bound-deg")
+    for name, value in plan.world.items():
+        if file.task.get(name) != value:
+            raise UserError(f"{asked.again} asked in a world with another {name} ({file.task.get(name)}, not {value})")
+    found = label_files.found_in(asked.again)
+    assert found is not None  # it was read
+    actions = {row["item"]: np.asarray(row["action"], np.float32) for row in label_files.history(found)}
+    again = tuple(actions[number] for number in sorted(actions))
+    base = dataclasses.replace(plan.base, name=f"{file.session['base']} {file.session['base_digest']}".strip())
+    wanted, digest = min(plan.labels, len(again)), label_files.digest(asked.again)
+    seed = int(file.session["seed"])
+    return dataclasses.replace(plan, base=base, seed=seed, labels=wanted, again=again, again_of=digest)
+
+
+def _base(task: Task, asked: Label[Any], named: str | None, env: Any) -> Base:
+    """The policy that is asked about. Raises UserError if it cannot be had, or acts in another task."""
+    chosen = [name for name in ("of_guidance", "of_labels", "of_seed") if getattr(asked, name) is not None]
+    if named is None or (":" in named and not Path(named).exists()):
+        if chosen:
+            option = chosen[0].replace("_", "-")
+            raise UserError(f"--{option} chooses a lane of a run, and none is given: leave it out")
+        if named is None:
+            return Base(uniform_in(env), UNIFORM)
+        return Base(as_policy(load(named, object, "a policy")), named)
+    folder = Path(named)
+    if not folder.is_dir():
+        raise UserError(f"no policy at {named}: give a run folder, a policy folder or package.module:NAME")
+    if (folder / "config.json").is_file():
+        theirs = PolicySource.of_run(folder, lambda name: task if task.name == name else registry.find(name)).task
+        if theirs.name != task.name:
+            raise UserError(f"{folder} is a run of {theirs.name}, not of {task.name}: give one of the same task")
+    lane = {"guidance": asked.of_guidance, "labels": asked.of_labels, "seed": asked.of_seed}
+    found = load_policy(folder, policy=asked.policy, task=task, world=World(task, asked.task), **lane)
+    if found.observation and tuple(found.observation) != tuple(env.observation):
+        raise UserError(f"{folder} acts on other observations than this world has: give a policy of this world")
+    return Base(found.policy, f"{folder.resolve().name}, {asked.policy}")
+
+
+def _part(kind: type, values: Any) -> Any:
+    """The fields of a part of a configuration."""
+    return kind(**{field.name: getattr(values, field.name) for field in dataclasses.fields(kind)})
+
+
+def _scenario(task: Task, world: Any, arguments: list[str]) -> Any:
+    name, _ = taken(arguments, "--scenario", ", ".join(task.scenarios) or "none")
+    return world if name is None else task.scenario(name).applied(world)
+
+
+def _serving() -> Any:
+    """What serves a plan. Raises UserError if the packages that it needs are not installed."""
+    try:
+        from cuelearner_jax.labelling import server
+    except ImportError as error:
+        raise UserError(
+            f"the page needs packages that are not installed ({error.name}): pip install 'cuelearner-jax[label]'"
+        ) from error
+    from cuelearner_jax.labelling.session import Session
+
+    # Before JAX starts: what a thread asks for is computed by that thread, at its own priority (`learner`).
+    jax.config.update("jax_cpu_enable_async_dispatch", False)
+
+    def tell(address: str) -> None:
+        out.print(f"open {address}")
+
+    def serve(plan: Plan, asked: Label[Any], stopping: Any) -> bool:
+        with (
+            server.bound(asked.port) as port,
+            Session(plan, asked.out, lambda words: console.print(f"{words} ...")) as session,
+        ):
+
+            def open_page(address: str) -> None:
+                tell(address)
+                if asked.open:
+                    webbrowser.open(address)
+
+            return server.serve(session, port, stopping, open_page)
+
+    return serve

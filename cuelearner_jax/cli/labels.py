@@ -1,0 +1,203 @@
+"""`cuelearner labels inspect`, `merge` and `export`."""
+
+from __future__ import annotations
+
+import csv
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import tyro
+from rich.table import Table
+
+from cuelearner_jax.cli.parsing import HELP, out, parse, summary
+from cuelearner_jax.cli.shared_options import Flag
+from cuelearner_jax.config import Scalars
+from cuelearner_jax.errors import UserError, closest
+from cuelearner_jax.labelling import comparing
+from cuelearner_jax.records import label_files
+from cuelearner_jax.records.label_files import UNDONE, UNSURE, LabelFile
+from cuelearner_jax.records.whole import replacing
+from cuelearner_jax.task import Task, shape_of
+from cuelearner_jax.tasks import registry
+from cuelearner_jax.terminal import console
+
+Files = Annotated[tuple[Path, ...], tyro.conf.Positional]
+
+
+@dataclass(frozen=True)
+class Inspect:
+    """What label files hold: counts, pace, who agrees with whom."""
+
+    files: Files
+    """Label files, or folders of a page's; of two, how well they agree on the questions that both answered."""
+    teacher: Flag[bool] = False
+    """Also ask the task's teacher about a page's questions (takes a while: situations are lived through anew)."""
+
+
+@dataclass(frozen=True)
+class Merge:
+    """One file of several people's labels, or of several sittings'."""
+
+    files: Files
+    """Label files of one world, or folders of a page's."""
+    out: Path | None = None
+    """The new file, .parquet; one that is there is not replaced."""
+
+
+@dataclass(frozen=True)
+class Export:
+    """Labels as a plain table: a row a label, a column a number in CSV, lists in Parquet."""
+
+    files: Files
+    """One label file, or a folder of a page's."""
+    out: Path | None = None
+    """The new file, .csv or .parquet; one that is there is not replaced."""
+
+
+KINDS = {"inspect": Inspect, "merge": Merge, "export": Export}
+OPTIONS = {f"labels {name}": kind for name, kind in KINDS.items()}
+
+
+def run(arguments: list[str]) -> None:
+    """Runs one of the commands. Raises UserError for files that are none or do not fit together."""
+    if not arguments or arguments[0] in HELP:
+        print("usage: cuelearner labels inspect|merge|export FILE ... [OPTIONS]\n")
+        for name, kind in KINDS.items():
+            print(f"  {name:<9}{summary(kind)}")
+        raise SystemExit(0 if arguments else 2)
+    name, rest = arguments[0], arguments[1:]
+    if name not in KINDS:
+        raise UserError(f"unknown command 'labels {name}'{closest(name, KINDS)}")
+    asked = parse(KINDS[name], rest, f"labels {name}")
+    if not asked.files:
+        raise UserError(f"name a label file: cuelearner labels {name} FILE")
+    {"inspect": _inspect, "merge": _merge, "export": _export}[name](asked)
+
+
+# --- inspect ---------------------------------------------------------------------------------------------------------
+
+
+def _inspect(asked: Inspect) -> None:
+    files = [label_files.read(path) for path in asked.files]
+    table = Table("", *(str(path) for path in asked.files))
+    told = [_told(path, file, asked.teacher) for path, file in zip(asked.files, files, strict=True)]
+    for name in dict.fromkeys(name for one in told for name in one):
+        table.add_row(name, *(one.get(name, "") for one in told))
+    if len(files) == 2:
+        table.add_row("agree with each other", str(comparing.between(files[0], files[1], _shape(files[0]))))
+    out.print(table)
+
+
+def _told(path: Path, file: LabelFile, teacher: bool) -> dict[str, str]:
+    """What is known of a file, by name."""
+    world = ", ".join(f"{name} {value}" for name, value in file.task.items() if name not in ("name", "from"))
+    strength = "" if file.eps_deg is None else f", by {file.eps_deg:g} degrees"
+    facts = {"task": f"{file.task.get('name')} ({world})", "answers": f"{file.answers}{strength}"}
+    facts["labels"] = f"{len(file.seeds)}" + (
+        f" of {len(np.unique(file.seeds))} seeds" if len(np.unique(file.seeds)) > 1 else ""
+    )
+    form = comparing.form_of(file)
+    if form is not None and form.values is not None:
+        counts = Counter(np.asarray(file.labels.answer)[:, 0].tolist())
+        facts["of each answer"] = ", ".join(f"{value:g}: {counts.get(value, 0)}" for value in form.values)
+    if file.said:
+        facts["not known"], facts["taken back"] = (str(file.said.get(name, 0)) for name in (UNSURE, UNDONE))
+    if file.session:
+        base = " ".join(str(file.session[name]) for name in ("base", "base_digest") if file.session.get(name))
+        facts |= {
+            "actions of": base,
+            "fitted meanwhile": str(file.session.get("guidance")),
+            "seed": f"{file.session['seed']}",
+        }
+    if file.people is not None:
+        facts |= _pace(file.people)
+    if teacher:
+        facts["agrees with the teacher"] = str(_with_teacher(path, file))
+    return facts
+
+
+def _pace(people: label_files.People) -> dict[str, str]:
+    seconds = np.asarray(people.seconds, float)
+    total = seconds.sum()
+    counts = Counter(people.who.tolist())
+    return {
+        "by": ", ".join(f"{who} ({count})" for who, count in counts.items()),
+        "given": f"{min(people.when)} to {max(people.when)}",
+        "seconds a label": f"{np.median(seconds):.2f} median, {np.quantile(seconds, 0.9):.2f} for nine of ten",
+        "labels a minute": f"{60 * len(seconds) / total:.1f}" if total > 0 else "",
+    }
+
+
+def _task(file: LabelFile) -> Task:
+    return registry.find(str(file.task.get("name")))
+
+
+def _shape(file: LabelFile) -> Any:
+    task = _task(file)
+    return shape_of(task, comparing.world_of(task, file))
+
+
+def _with_teacher(path: Path, file: LabelFile) -> comparing.Agreement:
+    task = _task(file)
+    found = label_files.found_in(path)
+    assert found is not None  # it was read
+    presets = [preset.config.scalars for preset in task.presets.values()]
+    scalars, rows = presets[0] if presets else Scalars(), label_files.history(found)
+    return comparing.with_teacher(task, file, rows, scalars, lambda words: console.print(f"{words} ..."))
+
+
+# --- merge and export ------------------------------------------------------------------------------------------------
+
+
+def _free(place: Path) -> Path:
+    if place.exists():
+        raise UserError(f"{place} exists: give another --out")
+    place.parent.mkdir(parents=True, exist_ok=True)
+    return place
+
+
+def _merge(asked: Merge) -> None:
+    if asked.out is None or asked.out.suffix != ".parquet":
+        raise UserError("give --out a name that ends in .parquet")
+    file = comparing.merged([label_files.read(path) for path in asked.files])
+    sources = [f"{path.name} {label_files.digest(path)}" for path in asked.files]
+    label_files.write_file(_free(asked.out), file, merged_from=sources)
+    out.print(f"wrote {len(file.seeds)} labels of {len(asked.files)} files to {asked.out}")
+
+
+def _export(asked: Export) -> None:
+    if len(asked.files) != 1:
+        raise UserError("export takes one label file: merge several first")
+    place = asked.out
+    if place is None or place.suffix not in (".csv", ".parquet"):
+        raise UserError("give --out a name that ends in .csv or .parquet")
+    file = label_files.read(asked.files[0])
+    if place.suffix == ".parquet":
+        label_files.write_file(_free(place), file)
+    else:
+        rows = _flat(file)
+        with replacing(_free(place)) as target:
+            writer = csv.writer(target)
+            writer.writerow(rows)
+            writer.writerows(zip(*rows.values(), strict=True))
+    out.print(f"wrote {len(file.seeds)} labels to {place}")
+
+
+def _flat(file: LabelFile) -> dict[str, list[Any]]:
+    """Columns of plain numbers and words."""
+    columns: dict[str, list[Any]] = {"seed": file.seeds.tolist()}
+    if file.people is not None:
+        columns |= {name: getattr(file.people, name).tolist() for name in file.people._fields}
+    columns["eps_deg"] = [file.eps_deg] * len(file.seeds)
+    layout = (file.session or {}).get("observation") or []
+    names = [f"{part['name']}[{i}]" for part in layout for i in range(part["size"])]
+    width = file.labels.obs.shape[1]
+    named = {"action": None, "answer": None, "obs": names if len(names) == width else None}
+    for kind, given in named.items():
+        values = np.asarray(getattr(file.labels, kind))
+        for place in range(values.shape[1]):
+            columns[f"obs: {given[place]}" if given else f"{kind}[{place}]"] = values[:, place].tolist()
+    return columns

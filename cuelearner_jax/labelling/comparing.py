@@ -1,0 +1,137 @@
+"""Label files compared: with what a task's teacher would have answered, and two people's on the same questions."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from cuelearner_jax import config as configuration
+from cuelearner_jax.config import Scalars
+from cuelearner_jax.environment import Environment
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.guidance import registry as guidances
+from cuelearner_jax.guidance.bundle import AnswerForm
+from cuelearner_jax.labelling.living import keys_of, lived
+from cuelearner_jax.labelling.programs import Agreement, agreement, as_teacher
+from cuelearner_jax.records import label_files
+from cuelearner_jax.records.label_files import LabelFile
+from cuelearner_jax.task import Task
+from cuelearner_jax.types import Label
+
+
+def form_of(file: LabelFile) -> AnswerForm | None:
+    """The form of a file's answers; None: of a kind of guidance that is not known here."""
+    forms = {kind.form.name: kind.form for kind in guidances.known() if kind.form is not None}
+    return forms.get(file.answers)
+
+
+def world_of(task: Task, file: LabelFile) -> Any:
+    """The configuration in which a file's labels were given. Raises UserError if it is not this task's."""
+    values = {name: value for name, value in file.task.items() if name not in ("name", "from")}
+    try:
+        return configuration.from_json(task.config, values)
+    except TypeError as error:
+        raise UserError(
+            f"the file's world is none of {task.name} ({error}): it was written by another version"
+        ) from error
+
+
+def with_teacher(
+    task: Task,
+    file: LabelFile,
+    rows: list[dict[str, Any]],
+    scalars: Scalars,
+    tell: Callable[[str], None] = lambda words: None,
+) -> Agreement:
+    """How well a page's labels agree with the answers of the task's teacher, who makes no faults.
+
+    Args:
+        task: whose teacher is asked.
+        file: the labels.
+        rows: all rows of it, see `label_files.history`; the situations are lived through anew.
+        scalars: what counts of a teacher's answers, but for eps, which is the file's.
+        tell: is told what is being done.
+
+    Raises:
+        UserError: the task has no teacher, or the file's situations cannot be had again.
+    """
+    form = form_of(file)
+    if form is None or file.people is None or file.session is None:
+        raise UserError("a teacher looks at situations, and this file's cannot be had again: it is no page's own file")
+    config = world_of(task, file)
+    tell(f"asking the teacher of {task.name} about {len(rows)} questions")
+    env = task.environment(config)
+    teacher = task.make_teacher(config, env)
+    items = {row["item"]: (np.asarray(row["obs"], np.float32), np.asarray(row["action"], np.float32)) for row in rows}
+    situations = list(lived(env, keys_of(file.session["seed"]), [items[number] for number in range(len(items))]))
+    if len(situations) <= len(items):
+        raise UserError("the file's situations come out otherwise with this program: use the one that wrote it")
+    told = scalars if file.eps_deg is None else _with_eps(scalars, file.eps_deg)
+
+    @jax.jit
+    def one(env: Environment, teacher: Any, state: Any, obs: jax.Array, action: jax.Array) -> jax.Array:
+        return as_teacher(form, env, told, teacher, state, obs, action)
+
+    asked = [(*situations[item], jnp.asarray(items[item][1])) for item in file.people.item]
+    theirs = np.stack([np.asarray(one(env, teacher, *question)) for question in asked])
+    return agreement(form, env, np.asarray(file.labels.answer), theirs)
+
+
+def _with_eps(scalars: Scalars, eps_deg: float) -> Scalars:
+    return Scalars(**{**{name: getattr(scalars, name) for name in vars(scalars)}, "eps_deg": eps_deg})
+
+
+def between(one: LabelFile, other: LabelFile, env: Any) -> Agreement:
+    """How well two files agree on the questions that both answered: the same observation and the same action.
+
+    Raises UserError if their answers are of two forms or strengths.
+    """
+    form = form_of(one)
+    if form is None or (one.answers, one.eps_deg) != (other.answers, other.eps_deg):
+        raise UserError(f"the files hold {_called(one)} and {_called(other)} answers: give two of one form")
+    theirs = _by_question(other.labels)
+    mine = _by_question(one.labels)
+    both = [question for question in mine if question in theirs]
+    width = form.width
+    pairs = np.array([(mine[question], theirs[question]) for question in both], np.float32).reshape(-1, 2, width)
+    return agreement(form, env, pairs[:, 0], pairs[:, 1])
+
+
+def _called(file: LabelFile) -> str:
+    return file.answers if file.eps_deg is None else f"{file.answers} ({file.eps_deg:g} degrees)"
+
+
+def _by_question(labels: Label) -> dict[bytes, np.ndarray]:
+    rows = zip(np.asarray(labels.obs), np.asarray(labels.action), np.asarray(labels.answer), strict=True)
+    return {obs.tobytes() + action.tobytes(): answer for obs, action, answer in rows}
+
+
+def merged(files: Iterable[LabelFile]) -> LabelFile:
+    """One set of labels of several files' sets, one after the other.
+
+    Raises UserError if they differ in task, world or form, or a file holds several sets.
+    """
+    files = list(files)
+    first = files[0]
+    for file in files:
+        if len(np.unique(file.seeds)) > 1:
+            raise UserError("a file holds the labels of several seeds, which belong apart: merge files of one set each")
+        for name in ("task", "answers", "eps_deg"):
+            if getattr(file, name) != getattr(first, name):
+                raise UserError(
+                    f"the files differ in {name} ({getattr(first, name)}, {getattr(file, name)}): merge alike ones"
+                )
+    if len({(file.labels.obs.shape[1], file.labels.action.shape[1]) for file in files}) > 1:
+        raise UserError("the files' observations differ in size: merge files of one world")
+    labels = jax.tree.map(lambda *leaves: np.concatenate(leaves), *(file.labels for file in files))
+    told = [file.people for file in files if file.people is not None]
+    people = None
+    if len(told) == len(files):
+        parts = [np.concatenate(columns) for columns in zip(*told, strict=True)]
+        people = label_files.People(np.arange(len(parts[0])), *parts[1:])
+    seeds = np.zeros(len(labels.valid), np.int64)
+    return LabelFile(first.task, first.answers, first.eps_deg, seeds, labels, people)

@@ -1,0 +1,82 @@
+"""Who may talk to the page: browsers of this machine that were given its address.
+
+A page of another site can make a browser send requests to 127.0.0.1, and a name that it owns can lead there (DNS
+rebinding): so the host and the origin that a browser tells are checked, and a secret of the page's own address is
+needed, which a cookie then carries.
+"""
+
+from __future__ import annotations
+
+import secrets
+from http.cookies import CookieError, SimpleCookie
+from typing import Any
+from urllib.parse import parse_qs
+
+HEADERS = (
+    (b"referrer-policy", b"no-referrer"),  # the address has the token in it
+    (b"x-frame-options", b"DENY"),
+    (b"x-content-type-options", b"nosniff"),
+)
+
+
+class Gate:
+    """An ASGI application in front of another."""
+
+    def __init__(self, app: Any, port: int, token: str) -> None:
+        """Lets in who comes by `127.0.0.1:port` or `localhost:port` and knows the token."""
+        self.app, self.token, self.cookie = app, token, f"cuelearner-{port}"  # a cookie holds for all ports
+        self.hosts = {f"{name}:{port}" for name in ("127.0.0.1", "localhost")}
+
+    async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
+        """One connection."""
+        if scope["type"] not in ("http", "websocket"):
+            await self.app(scope, receive, send)
+            return
+        refusal, entering = self.refusal(scope)
+        if refusal is None:
+            await self.app(scope, receive, self._marked(send, entering) if scope["type"] == "http" else send)
+        elif scope["type"] == "websocket":
+            await receive()
+            await send({"type": "websocket.close", "code": 1008, "reason": refusal})
+        else:
+            start = {"type": "http.response.start", "status": 403, "headers": [(b"content-type", b"text/plain")]}
+            await send(start)
+            await send({"type": "http.response.body", "body": f"{refusal}\n".encode()})
+
+    def refusal(self, scope: Any) -> tuple[str | None, bool]:
+        """Why a connection is refused (None: it is not), and whether it brought the token in its address."""
+        told: dict[bytes, list[str]] = {}
+        for name, value in scope["headers"]:
+            told.setdefault(name.lower(), []).append(value.decode("latin-1"))
+        if len(told.get(b"host", [])) != 1 or told[b"host"][0].lower() not in self.hosts:
+            return "this page answers to 127.0.0.1 alone: open the address that the command printed", False
+        origins = told.get(b"origin", [])
+        if any(origin.lower() not in {f"http://{host}" for host in self.hosts} for origin in origins):
+            return "this page answers no other site", False
+        given = parse_qs(scope.get("query_string", b"").decode("latin-1")).get("token", [])
+        if any(self._right(token) for token in given):
+            return None, True
+        jar = SimpleCookie()
+        for header in told.get(b"cookie", []):
+            try:
+                jar.load(header)
+            except CookieError:
+                continue
+        if self.cookie in jar and self._right(jar[self.cookie].value):
+            return None, False
+        return "the token is missing or wrong: open the address that the command printed", False
+
+    def _right(self, token: str) -> bool:
+        return secrets.compare_digest(token.encode(), self.token.encode())
+
+    def _marked(self, send: Any, entering: bool) -> Any:
+        """`send` with headers that keep the page to itself."""
+        cookie = f"{self.cookie}={self.token}; HttpOnly; SameSite=Strict; Path=/"
+        extra = [*HEADERS, *([(b"set-cookie", cookie.encode())] if entering else [])]
+
+        async def marked(message: Any) -> None:
+            if message["type"] == "http.response.start":
+                message = {**message, "headers": [*message.get("headers", []), *extra]}
+            await send(message)
+
+        return marked

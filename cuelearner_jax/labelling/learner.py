@@ -1,0 +1,124 @@
+"""The model of a session: fitted by a thread of its own, from scratch, to all labels so far."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sys
+import threading
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import PRNGKeyArray
+
+from cuelearner_jax.agent.learning import all_finite
+from cuelearner_jax.labelling.plan import Plan
+from cuelearner_jax.labelling.programs import Agreement, Programs, agreement, held_out
+from cuelearner_jax.types import GuidanceModel, GuideState, Label
+
+# A fit computes in its own thread alone, which makes way for whoever answers.
+ALONE = {"xla_cpu_multi_thread_eigen": False}
+NICE = 10  # of 19: what it gives way by
+
+
+def _step_back() -> None:
+    """Makes this thread give way to all others, where the system lets threads have priorities of their own."""
+    if sys.platform == "linux":
+        with contextlib.suppress(OSError):
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICE)
+
+
+class Fitted(NamedTuple):
+    """A model, and what is known of it."""
+
+    model: GuidanceModel
+    labels: int = 0  # that it was fitted to
+    number: int = 0  # of the fit, from 1; 0: there was none
+    quality: Agreement | None = None  # with the labels that it was not trained on
+    problem: str = ""  # why there is none of the last fit: the one before it stays
+
+
+class Learner:
+    """Fits whenever as many labels as a round has are new; one fit at a time."""
+
+    def __init__(self, plan: Plan, env: Any, programs: Programs, blank: GuideState, key: PRNGKeyArray) -> None:
+        """Compiles the fit.
+
+        Args:
+            plan: of the session.
+            env: its world.
+            programs: its compiled functions.
+            blank: a guide that knows nothing.
+            key: of the session.
+        """
+        self._plan, self._env, self._programs, self._blank, self._key = plan, env, programs, blank, key
+        self.newest = Fitted(blank.model)
+        self.running = False
+        self._lock = threading.Lock()
+        self._pool = ThreadPoolExecutor(1, thread_name_prefix="fit", initializer=_step_back)
+        lowered = programs.fit.lower(env, plan.config.scalars, *self._given(blank.labels, 0))  # pyright: ignore[reportFunctionMemberAccess]
+        self._fit = lowered.compile(compiler_options=ALONE if jax.default_backend() == "cpu" else None)
+
+    def _given(self, labels: Label, count: int) -> tuple[GuideState, PRNGKeyArray, jax.Array]:
+        guide = self._blank.replace(labels=jax.tree.map(jnp.asarray, labels), model=self.newest.model)
+        return guide, self._key, jnp.asarray(count // self._plan.config.sizes.labels_per_round, jnp.int32)
+
+    def padded(self, rows: list[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> Label:
+        """Observations, actions and answers as labels of a session's slots."""
+        blank = jax.tree.map(np.array, self._blank.labels)
+        for slot, (obs, action, answer) in enumerate(rows[: len(blank.valid)]):
+            blank.obs[slot], blank.action[slot], blank.answer[slot], blank.valid[slot] = obs, action, answer, True
+        return blank
+
+    def fit(self, labels: Label) -> None:
+        """Fits to labels now, and waits for it."""
+        count = int(labels.valid.sum())
+        if not count:
+            return
+        scalars = self._plan.config.scalars
+        model = jax.block_until_ready(self._fit(self._env, scalars, *self._given(labels, count)).model)
+        if not all_finite(model):
+            self.newest = self.newest._replace(labels=count, problem="the last fit diverged")
+            return
+        would = np.asarray(self._programs.answers(self._env, scalars, model, labels))
+        kept = np.asarray(labels.valid) & held_out(len(labels.valid))
+        found = agreement(self._plan.form, self._env, would[kept], np.asarray(labels.answer)[kept])
+        self.newest = Fitted(model, count, self.newest.number + 1, found if found.count else None)
+
+    def due(self, count: int) -> bool:
+        """Are enough of so many labels new?"""
+        every = self._plan.config.sizes.labels_per_round
+        return count // every > self.newest.labels // every
+
+    def fit_later(self, labels: Callable[[], Label], count: int, done: Callable[[], None]) -> bool:
+        """Has the thread fit to what `labels` then gives, if enough is new and it has nothing to do; is it at it now?
+
+        `done` is called by that thread afterwards.
+        """
+        with self._lock:
+            if self.running or not self.due(count):
+                return False
+            self.running = True
+
+        def work() -> None:
+            try:
+                self.fit(labels())
+            except Exception as error:  # labels are still kept, whatever becomes of the model
+                told = (str(error).splitlines() or [""])[0][:80]
+                problem = f"the last fit failed ({type(error).__name__}: {told})"
+                self.newest = self.newest._replace(labels=count, problem=problem)
+            finally:
+                with self._lock:
+                    self.running = False
+            done()
+
+        self._pool.submit(work)
+        return True
+
+    def close(self) -> None:
+        """Waits for a fit that runs."""
+        self._pool.shutdown(wait=True, cancel_futures=True)

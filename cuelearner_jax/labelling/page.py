@@ -1,0 +1,202 @@
+"""The page: one question, its answers, and how far it is. Everything that counts is the session's."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from pathlib import Path
+from typing import Any
+
+from nicegui import run, ui
+from nicegui.events import GenericEventArguments
+
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.labelling import controls, view
+from cuelearner_jax.labelling.controls import Control
+from cuelearner_jax.labelling.session import Session, Status
+
+HERE = Path(__file__).parent
+SWATCHES = (
+    ("asked", "the action in question"),
+    ("left", "turned counterclockwise"),
+    ("right", "turned clockwise"),
+    ("refined", "what the model makes of it"),
+)
+KEYS = {" ": "space", "ArrowLeft": "←", "ArrowRight": "→", "ArrowUp": "↑", "ArrowDown": "↓"}  # for people
+
+
+class Page:
+    """What one browser shows of a session; several may show the same one."""
+
+    def __init__(self, session: Session, pages: set[Page], finish: Any = None) -> None:
+        """Builds the page in NiceGUI's current client.
+
+        Args:
+            session: whose question it shows.
+            pages: all pages of the session, which it joins while it is open.
+            finish: is called by the button that ends the work; None: there is none.
+        """
+        self.session, self._pages, self._finish = session, pages, finish
+        self.controls = controls.controls(session.plan.form)
+        self._loop = asyncio.get_running_loop()
+        self._client = ui.context.client
+        ui.add_css((HERE / "page.css").read_text())
+        keys = {key: name for name, control in self.controls.items() for key in control.keys}
+        script = (HERE / "page.js").read_text() + f"cue.keys = {json.dumps(keys)};"
+        ui.add_head_html(f"<script>{script}</script>")
+        with ui.element("main").classes("label-page"):
+            with ui.column().classes("w-full gap-2"):
+                self._asked = ui.label(controls.question(session.plan.form)).classes("big")
+                self._scene = ui.html("", sanitize=False).classes("stage")
+                self._answers()
+            with ui.element("aside").classes("side"):
+                self._side()
+        self._help = self._overlay()
+        ui.on("cue", self._heard)
+        pages.add(self)
+        stop = session.listen(self._model_changed)
+        self._client.on_delete(lambda: (pages.discard(self), stop()))
+        self.refresh()
+
+    # --- what it is made of ------------------------------------------------------------------------------------------
+
+    def _button(self, control: Control, **look: str) -> ui.button:
+        """A button that says the item on the screen with what it does."""
+        with ui.button(color=look.get("color", "primary")).props(look.get("props", "")) as button:
+            ui.html(f"{control.words}<span class=key>{control.shown}</span>", sanitize=False)
+        button.classes(control.colour).mark(control.name)
+        button.on(
+            "click",
+            lambda event, name=control.name: self._heard(event, name),
+            js_handler=f"() => cue.send({json.dumps(control.name)})",
+        )
+        return button
+
+    def _answers(self) -> None:
+        with ui.element("div").classes("answers"):
+            self._pressable = [self._button(control) for control in controls.answers(self.session.plan.form)]
+            self._pressable.append(self._button(controls.UNSURE, color="grey-7"))
+        ui.label("").classes("film-words")
+
+    def _side(self) -> None:
+        self._count = ui.label().classes("big")
+        self._bar = ui.linear_progress(value=0.0, show_value=False).props("rounded size=10px")
+        self._pace = ui.label()
+        self._left = ui.label()
+        ui.separator()
+        self._model = ui.label()
+        self._quality = ui.label()
+        ui.separator()
+        self._words = ui.label()
+        with ui.element("div").classes("hide-small"):
+            for name, about in SWATCHES if self.session.plan.form.by_eps else (SWATCHES[0], SWATCHES[3]):
+                ui.html(f'<span class=swatch style="background:var(--{name})"></span>{about}', sanitize=False)
+        with ui.element("div").classes("tools"):
+            for control in (controls.UNDO, controls.FILM, controls.HELP):
+                self._button(control, props="flat dense", color="")
+            dark = ui.dark_mode(None)
+            ui.button("light or dark", on_click=lambda: dark.set_value(not dark.value), color="").props("flat dense")
+        self._saved = ui.label().classes("text-caption")
+        self._trouble = ui.label().classes("trouble")
+        if self._finish is not None:
+            ui.button("finish", on_click=self._finish, color="grey-7").mark("finish")
+
+    def _overlay(self) -> ui.dialog:
+        with ui.dialog() as dialog, ui.card():
+            ui.label("Keys").classes("big")
+            for control in self.controls.values():
+                keys = ", ".join(dict.fromkeys(map(_key, control.keys)))
+                ui.label(f"{control.words}: {keys}")
+            ui.label(
+                "Each answer is saved before the next question shows. An answer can be taken back. Where you cannot "
+                "tell, say so: it costs nothing. The film shows what the arrow leads to."
+            )
+            ui.button("close", on_click=dialog.close)
+        return dialog
+
+    # --- what happens ------------------------------------------------------------------------------------------------
+
+    async def _heard(self, event: GenericEventArguments, name: str | None = None) -> None:
+        """Something was pressed; without a browser's word for it, it is about the question of the moment."""
+        told = event.args if isinstance(event.args, dict) and "name" in event.args else {"name": name}
+        if told["name"] == "help":
+            self._help.open() if not self._help.value else self._help.close()
+            return
+        item = told.get("item")
+        await self._act(str(told["name"]), self.session.number if item is None else int(item), told)
+
+    async def _act(self, name: str, number: int, told: dict[str, Any]) -> None:
+        if name.startswith("film"):
+            await self._show_film(name, number)
+            return
+        pressed, angle = self.controls.get(name), told.get("angle")
+        if pressed is None and not (name == "point" and self.session.plan.form.is_action and angle is not None):
+            return
+        try:
+            if name == "undo":
+                await run.io_bound(self.session.undo, number)
+            else:
+                answer = controls.given(self.session.plan.form, pressed, angle)
+                await run.io_bound(self.session.answer, number, answer, told.get("seconds"))
+        except UserError:
+            pass  # the status tells
+        for page in list(self._pages):
+            page.refresh()
+
+    async def _show_film(self, name: str, number: int) -> None:
+        item = self.session.item
+        if item is None or item.number != number:
+            return
+        eps = self.session.plan.config.scalars.eps_deg
+        way = {"film-left": eps, "film-right": -eps}.get(name, 0.0)
+        reel = await run.io_bound(self.session.film, number, view.turned(item.action, way))
+        if reel is not None:
+            with self._client:
+                ui.run_javascript(f"cue.play({view.film(item, reel)})")
+
+    def _model_changed(self) -> None:
+        """From any thread."""
+        self._loop.call_soon_threadsafe(self.refresh)
+
+    def refresh(self) -> None:
+        """Shows the session as it is."""
+        status, item = self.session.status(), self.session.item
+        plan = self.session.plan
+        self._scene.content = "" if item is None else view.picture(item, plan.form, plan.config.scalars.eps_deg)
+        if item is None:
+            self._asked.text = "All labels are given. Thank you."
+        else:
+            self._asked.text = controls.question(plan.form)
+            self._words.text = item.sketch.words if item.sketch else ""
+        for button in self._pressable:
+            button.set_enabled(item is not None and not status.trouble)
+        self._tell(status)
+
+    def _tell(self, status: Status) -> None:
+        unsure = f", {status.unsure} not known" if status.unsure else ""
+        self._count.text = f"{status.answered} of {status.labels}{unsure}"
+        self._bar.value = status.answered / status.labels
+        self._pace.text = f"{status.per_minute:.0f} labels a minute" if status.per_minute else "no labels yet"
+        self._left.text = _left(status.minutes_left)
+        newest = status.newest
+        fitted = f"model {newest.number}, of {newest.labels} labels" if newest.number else "no model yet"
+        self._model.text = f"{fitted}; fitting the next" if status.fitting else fitted
+        if newest.problem:
+            self._model.text = f"{fitted}; {newest.problem}"
+        apart = f"agrees with labels kept apart: {newest.quality}" if newest.quality else ""
+        self._quality.text = apart
+        self._saved.text = f"{self.session.place}: {status.answered + status.unsure} answers saved"
+        self._trouble.text = status.trouble
+        self._trouble.set_visibility(bool(status.trouble))
+
+
+def _left(minutes: float | None) -> str:
+    if minutes is None:
+        return ""
+    if minutes < 1.5:
+        return "about a minute left" if minutes > 0.5 else "nearly done"
+    return f"{minutes:.0f} minutes left"
+
+
+def _key(key: str) -> str:
+    return KEYS.get(key, key.upper() if len(key) == 1 else key)

@@ -1,0 +1,325 @@
+"""A session of labelling: what is asked next, what was said, and the model that is fitted meanwhile. Knows no page.
+
+Every answer is on the disk before the next question can be seen. Questions are prepared ahead and models are fitted by
+threads of their own: nobody who answers waits for either. A session that is opened again goes on where the file ends:
+its situations are lived through anew with the recorded actions.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from cuelearner_jax import asking
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.labelling.learner import Fitted, Learner
+from cuelearner_jax.labelling.living import advance, keys_of, lived
+from cuelearner_jax.labelling.plan import Plan
+from cuelearner_jax.labelling.programs import programs
+from cuelearner_jax.records import label_files
+from cuelearner_jax.records.label_files import ANSWERED, UNDONE, UNSURE
+from cuelearner_jax.records.provenance import provenance
+from cuelearner_jax.task import shape_of
+from cuelearner_jax.types import GuideState, Label, Reel, Sketch
+
+RECENT = 50  # answers by which the pace is told
+
+
+class Item(NamedTuple):
+    """A question: a situation and an action in it."""
+
+    number: int
+    guide: GuideState  # in that situation
+    action: np.ndarray  # (action,)
+    sketch: Sketch | None = None  # None: nobody is about to see it
+    refined: np.ndarray | None = None  # what the newest model makes of the action; None: there is none yet
+
+
+class Said(NamedTuple):
+    """What was said of an item."""
+
+    said: str  # one of `label_files.SAID`
+    obs: np.ndarray
+    action: np.ndarray
+    answer: np.ndarray | None
+    seconds: float
+
+
+class Status(NamedTuple):
+    """How far a session is."""
+
+    answered: int
+    unsure: int
+    labels: int  # wanted
+    per_minute: float | None  # answers, lately
+    minutes_left: float | None
+    fitting: bool
+    newest: Fitted
+    trouble: str  # why nothing can be saved any more; empty: all is well
+
+
+class Session:
+    """Asks, keeps, fits. Its methods may be called from any thread."""
+
+    def __init__(self, plan: Plan, folder: Path, tell: Callable[[str], None] = lambda words: None) -> None:
+        """Opens the file and prepares everything: afterwards nothing is compiled.
+
+        Args:
+            plan: what it is about.
+            folder: where `labels.jsonl` lies, or is to lie. Keep it claimed (`records.folders.claimed`).
+            tell: is told what is being prepared.
+
+        Raises:
+            UserError: the folder holds labels of something else, or nothing draws the task.
+        """
+        self._pictures = plan.task.pictures()
+        if self._pictures.sketch is None:
+            raise UserError(f"{plan.task.name} has no sketches to label by: give its body's Pictures `sketch`")
+        self.plan = plan
+        shape = shape_of(plan.task, plan.config.task)
+        named = plan.world, plan.form.name, plan.eps_deg, plan.form.meaning, plan.session(shape)
+        self._writer = label_files.LabelWriter(folder, *named, written_by=provenance())
+        tell("making the world")
+        self.env = plan.task.environment(plan.config.task)
+        self._programs = programs(plan.guidance)
+        self._keys = keys_of(plan.seed)
+        slots = asking.label_slots(plan.labels, plan.config.sizes)
+        start = asking.start(plan.guidance, self.env, slots, plan.labels, self._keys.model, self._keys.start)
+        tell("preparing the model")
+        self._learner = Learner(plan, self.env, self._programs, start, self._keys.session)
+        self._bound = None if plan.bound_deg is None else jnp.deg2rad(jnp.asarray(plan.bound_deg, jnp.float32))
+        self._acting = threading.Lock()  # one answer at a time; whoever waits for an item holds no other lock
+        self._lock = threading.RLock()
+        self._ahead = ThreadPoolExecutor(1, thread_name_prefix="ahead")  # the one thread that makes items
+        self._listeners: list[Callable[[], None]] = []
+        self._rows: dict[int, Said] = {}
+        self._items: dict[int, Item] = {}
+        self._trouble = ""
+        self._lived(start, tell)
+        tell("preparing questions")
+        self._ensure(self.number)
+        self._ensure(self.number + 1)
+        self.film(self.number, self._items[self.number].action)
+        self._next: Future[None] = self._ahead.submit(self._ensure, self.number + 1)
+        self._since = time.monotonic()
+
+    def _lived(self, start: GuideState, tell: Callable[[str], None]) -> None:
+        """Lives through what the file holds, fits a model to it, and asks where it ends."""
+        for row in label_files.history(self._writer.path):
+            if row.get("item") is None:
+                raise UserError(f"{self._writer.path} is no page's file: give another --out")
+            obs, action = (np.asarray(row[name], np.float32) for name in ("obs", "action"))
+            answer = None if row.get("answer") is None else np.asarray(row["answer"], np.float32)
+            self._rows[row["item"]] = Said(row["said"], obs, action, answer, row["seconds"])
+        count = len(self._rows)
+        if set(self._rows) != set(range(count)):
+            raise UserError(f"{self._writer.path} lacks items, so it is no page's file: give another --out")
+        if count:
+            tell(f"going through {count} earlier questions")
+        told = [self._rows[number] for number in range(count)]
+        found = list(lived(self.env, self._keys, [(row.obs, row.action) for row in told]))
+        if len(found) <= count:
+            tell("the earlier situations come out otherwise with this program: a new episode begins")
+            found = [(None, None)] * count + [self.env.reset(jax.random.fold_in(self._keys.start, count))]
+        for number, (state, obs) in enumerate(found[:count]):
+            if obs is not None:
+                self._items[number] = Item(number, start.replace(env=state, obs=obs), told[number].action)
+        undone = [number for number in self._items if told[number].said == UNDONE]
+        self.number, self._furthest = min(undone, default=count), count
+        self._learner.fit(self._labels())
+        state, obs = found[count]
+        self._items[count] = self._asked(count, start.replace(env=state, obs=obs))
+
+    # --- questions ---------------------------------------------------------------------------------------------------
+
+    def _followed(self, item: Item) -> GuideState:
+        key = asking.question_keys(self._keys.session, item.number).env
+        state, obs = advance(self.env, key, item.guide.env, jnp.asarray(item.action))
+        return item.guide.replace(env=state, obs=obs)
+
+    def _asked(self, number: int, guide: GuideState) -> Item:
+        if number < len(self.plan.again):
+            return Item(number, guide, self.plan.again[number])
+        keys = asking.question_keys(self._keys.session, number)
+        guide = guide.replace(model=self._learner.newest.model)
+        scalars, base = self.plan.config.scalars, self.plan.base.policy
+        action = self._programs.question(self.env, scalars, base, guide, keys, self._bound)
+        return Item(number, guide, np.asarray(action))
+
+    def _refined(self, item: Item) -> Item:
+        newest = self._learner.newest
+        action = jnp.asarray(item.action)
+        refined = self._programs.refined(self.env, self.plan.config.scalars, newest.model, item.guide.obs, action)
+        return item._replace(refined=np.asarray(refined) if newest.number else None)
+
+    def _ensure(self, number: int) -> None:
+        """Makes the item of a number ready to be seen; the one before it is there."""
+        assert self._pictures.sketch is not None
+        item = self._items.get(number) or self._asked(number, self._followed(self._items[number - 1]))
+        if item.sketch is None:
+            item = item._replace(sketch=self._pictures.sketch(self.env, item.guide.env))
+        self._items[number] = self._refined(item)
+
+    def _renew(self) -> None:
+        """By the newest model: what is prepared but was never seen is asked anew, what is seen is refined anew."""
+        coming, seen = self._items.get(self._furthest + 1), self._items.get(self.number)
+        anew = coming and self._refined(self._asked(coming.number, coming.guide)._replace(sketch=coming.sketch))
+        again = seen and self._refined(seen)
+        with self._lock:
+            if anew and self._furthest < anew.number:
+                self._items[anew.number] = anew
+            if again:
+                self._items[again.number] = again
+        self._tell_all()
+
+    @property
+    def place(self) -> Path:
+        """The file."""
+        return self._writer.path
+
+    @property
+    def item(self) -> Item | None:
+        """The question of the moment; None: all are answered."""
+        with self._lock:
+            return None if self.done else self._items[self.number]
+
+    @property
+    def done(self) -> bool:
+        """Are as many answered as were wanted?"""
+        return self._counted(ANSWERED) >= self.plan.labels or 0 < len(self.plan.again) <= self.number
+
+    # --- answers -----------------------------------------------------------------------------------------------------
+
+    def answer(self, number: int, answer: np.ndarray | None, seconds: float | None = None) -> bool:
+        """Keeps an answer and moves on; False if the question is another by now: it was answered, or taken back.
+
+        Args:
+            number: of the item that was on the screen.
+            answer: in the words of the form, (width,); None: don't know.
+            seconds: from the question on the screen to the answer (default: since it became the question).
+
+        Raises:
+            UserError: nothing can be saved any more.
+        """
+        with self._acting:
+            with self._lock:
+                if self.done or number != self.number:
+                    return False
+                took = time.monotonic() - self._since
+                took = took if seconds is None or not 0 <= seconds <= took else seconds
+                self._keep(self._items[number], UNSURE if answer is None else ANSWERED, answer, took)
+            self._next.result()
+            self._show(number + 1)
+        self._fit_if_due()
+        return True
+
+    def _show(self, number: int) -> None:
+        """Moves to an item that is ready, and has the one after it made."""
+        with self._lock:
+            self.number, self._since = number, time.monotonic()
+            self._furthest = max(self._furthest, number)
+            self._next = self._ahead.submit(self._ensure, number + 1)
+
+    def undo(self, number: int) -> bool:
+        """Takes the answer before this question back and asks it again; False if there is none, or not this question.
+
+        Raises UserError if nothing can be saved any more.
+        """
+        with self._acting:
+            with self._lock:
+                before = self._items.get(number - 1)
+                if number != self.number or before is None:
+                    return False
+                self._keep(before, UNDONE, None, time.monotonic() - self._since)
+            self._ahead.submit(self._ensure, number - 1).result()
+            self._show(number - 1)
+            return True
+
+    def _keep(self, item: Item, said: str, answer: np.ndarray | None, seconds: float) -> None:
+        if self._trouble:
+            raise UserError(self._trouble)
+        now = datetime.now(UTC).isoformat(timespec="milliseconds")
+        person = {"item": item.number, "said": said, "seconds": round(seconds, 3), "who": self.plan.who, "when": now}
+        obs = np.asarray(item.guide.obs)
+        try:
+            self._writer.append(seed=self.plan.seed, obs=obs, action=item.action, answer=answer, **person)
+        except OSError as error:
+            self._trouble = f"nothing can be saved ({error.strerror or error}): make room, then start this page again"
+            raise UserError(self._trouble) from error
+        self._rows[item.number] = Said(said, obs, item.action, answer, seconds)
+
+    # --- the model ---------------------------------------------------------------------------------------------------
+
+    def _labels(self) -> Label:
+        """What was answered, in the order of the items, padded."""
+        with self._lock:
+            rows = [self._rows[number] for number in sorted(self._rows)]
+        return self._learner.padded([(row.obs, row.action, row.answer) for row in rows if row.answer is not None])
+
+    def _fit_if_due(self) -> None:
+        if self._learner.fit_later(self._labels, self._counted(ANSWERED), self._fitted):
+            self._tell_all()
+
+    def _fitted(self) -> None:
+        self._ahead.submit(self._renew)
+        self._fit_if_due()
+
+    # --- what a page shows -------------------------------------------------------------------------------------------
+
+    def film(self, number: int, action: np.ndarray) -> Reel | None:
+        """What an action leads to in an item's situation; None where nothing films the task."""
+        if self._pictures.reel is None:
+            return None
+        return self._pictures.reel(self.env, self._items[number].guide.env, jnp.asarray(action, jnp.float32))
+
+    def _counted(self, said: str) -> int:
+        with self._lock:
+            return sum(one.said == said for one in self._rows.values())
+
+    def status(self) -> Status:
+        """How far it is."""
+        with self._lock:
+            answered = self._counted(ANSWERED)
+            given = [self._rows[number] for number in sorted(self._rows) if self._rows[number].said != UNDONE][-RECENT:]
+            seconds, heard = sum(row.seconds for row in given), sum(row.said == ANSWERED for row in given)
+            per_minute = 60 * heard / seconds if heard and seconds > 0 else None
+            return Status(
+                answered=answered,
+                unsure=self._counted(UNSURE),
+                labels=self.plan.labels,
+                per_minute=per_minute,
+                minutes_left=(self.plan.labels - answered) / per_minute if per_minute else None,
+                fitting=self._learner.running,
+                newest=self._learner.newest,
+                trouble=self._trouble,
+            )
+
+    def listen(self, heard: Callable[[], None]) -> Callable[[], None]:
+        """Has a function called, from any thread, when a fit begins or its model comes into use. Returns the end."""
+        self._listeners.append(heard)
+        return lambda: self._listeners.remove(heard)
+
+    def _tell_all(self) -> None:
+        for heard in list(self._listeners):
+            heard()
+
+    def close(self) -> None:
+        """Closes the file; a fit that runs is waited for."""
+        self._learner.close()
+        self._ahead.shutdown(wait=True, cancel_futures=True)
+        self._writer.close()
+
+    def __enter__(self) -> Session:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()

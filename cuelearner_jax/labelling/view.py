@@ -1,0 +1,102 @@
+"""A question as SVG: the sketch of its situation, the action as an arrow, and what answers would make of it."""
+
+from __future__ import annotations
+
+import html
+import json
+import math
+
+import numpy as np
+
+from cuelearner_jax.guidance.bundle import AnswerForm
+from cuelearner_jax.labelling.session import Item
+from cuelearner_jax.types import Reel, Sketch
+
+HAIR = 1 / 400  # of the sketch's width: a thin line
+TURNED_REACH = 1.25  # how much farther arrows reach that are turned, so that they can be told apart
+LEAST_TURN = 1.0  # of the refined action from the one in question, to be shown [deg]
+
+
+def angle_of(action: np.ndarray) -> float:
+    """Of a direction, counterclockwise [deg]."""
+    return math.degrees(math.atan2(float(action[1]), float(action[0])))
+
+
+def turned(action: np.ndarray, by_deg: float) -> np.ndarray:
+    """A direction turned counterclockwise."""
+    angle = math.radians(angle_of(action) + by_deg)
+    return np.array([math.cos(angle), math.sin(angle)], np.float32)
+
+
+def picture(item: Item, form: AnswerForm, eps_deg: float) -> str:
+    """An item with a sketch, as an SVG element; attributes `data-…` tell the page's script what it shows."""
+    assert item.sketch is not None
+    sketch, angle = item.sketch, angle_of(item.action)
+    parts = [f'<g class="still">{sketch.still}</g>']
+    for name, body in sketch.movers.items():
+        place = f'class="mover" data-mover="{html.escape(name)}" transform="{_moved(sketch, name)}"'
+        parts.append(f"<g {place}>{body}</g>")
+    if form.by_eps:
+        parts += [
+            _arrow(sketch, angle + way * eps_deg, name, TURNED_REACH) for way, name in ((1, "left"), (-1, "right"))
+        ]
+    parts.append(_line(sketch, angle))
+    parts.append(_arrow(sketch, angle, "asked"))
+    if item.refined is not None:
+        refined = angle_of(item.refined)
+        if abs((refined - angle + 180) % 360 - 180) >= LEAST_TURN:
+            parts.append(_arrow(sketch, refined, "refined", 0.8))
+    if form.is_action:
+        parts.append(_arrow(sketch, angle, "pointer"))
+    data = {
+        "item": item.number,
+        "foot": json.dumps(sketch.foot),
+        "turn": sketch.turn,
+        "points": int(form.is_action),
+        "places": json.dumps(sketch.places),
+        "angle": angle,
+    }
+    told = " ".join(f'data-{name}="{html.escape(str(value))}"' for name, value in data.items())
+    box = " ".join(f"{value:.4f}" for value in sketch.box)
+    words = html.escape(f"{sketch.words}; the arrow is the action in question")
+    return f'<svg class="scene" role="img" aria-label="{words}" viewBox="{box}" {told}>{"".join(parts)}</svg>'
+
+
+def film(item: Item, reel: Reel) -> str:
+    """A film for the page's script, as JSON."""
+    return json.dumps({"item": item.number, "period": reel.period, "frames": reel.frames, "words": reel.words})
+
+
+def _moved(sketch: Sketch, name: str) -> str:
+    x, y, turn = sketch.places[name]
+    return f"translate({x:.4f} {y:.4f}) rotate({turn:.2f})"
+
+
+def _point(sketch: Sketch, angle: float, along: float, across: float = 0.0) -> tuple[float, float]:
+    """A place on the screen, by its distances along and to the left of an action's direction."""
+    screen = math.radians(angle + sketch.turn)
+    cos, sin = math.cos(screen), math.sin(screen)
+    x, y = along * cos - across * sin, along * sin + across * cos
+    return sketch.foot[0] + x, sketch.foot[1] - y
+
+
+def _arrow(sketch: Sketch, angle: float, name: str, longer: float = 1.0) -> str:
+    first, last = sketch.reach[0], sketch.reach[0] + (sketch.reach[1] - sketch.reach[0]) * longer
+    hair = sketch.box[2] * HAIR
+    head, half = 7 * hair, 2.8 * hair
+    shaft = [_point(sketch, angle, first), _point(sketch, angle, last - 0.6 * head)]
+    tip = [_point(sketch, angle, last), *(_point(sketch, angle, last - head, side) for side in (half, -half))]
+    (x1, y1), (x2, y2) = shaft
+    corners = " ".join(f"{x:.4f},{y:.4f}" for x, y in tip)
+    line = f'<line x1="{x1:.4f}" y1="{y1:.4f}" x2="{x2:.4f}" y2="{y2:.4f}" stroke-width="{2.2 * hair:.5f}"/>'
+    return f'<g class="arrow {name}">{line}<polygon points="{corners}"/></g>'
+
+
+def _line(sketch: Sketch, angle: float) -> str:
+    if not sketch.aim:
+        return ""
+    (x1, y1), (x2, y2) = (_point(sketch, angle, along) for along in (sketch.reach[1], sketch.reach[1] + sketch.aim))
+    hair = sketch.box[2] * HAIR
+    dashes = f"{4 * hair:.5f} {3 * hair:.5f}"
+    place = f'x1="{x1:.4f}" y1="{y1:.4f}" x2="{x2:.4f}" y2="{y2:.4f}"'
+    return f'<line class="aim" {place} stroke-width="{0.8 * hair:.5f}" stroke-dasharray="{dashes}"/>'

@@ -1,0 +1,156 @@
+"""A robot among obstacles as lines for a browser, and where a direction leads: quick, and without matplotlib.
+
+The robot faces up, in the middle of the sketch's lower part; what its lidar perceives lies over what is there.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from cuelearner_envs import svg
+from cuelearner_envs.navigation.environment import Navigation
+from cuelearner_envs.navigation.lidar import BEAM_ANGLES
+from cuelearner_envs.navigation.robot import Robot
+from cuelearner_envs.navigation.world import FAR_AWAY
+from cuelearner_jax.actions import rotate
+from cuelearner_jax.types import Reel, Sketch
+
+AHEAD, BEHIND, ASIDE = 9.0, 4.0, 6.5  # that is shown [m]
+INSET = 0.5  # of a goal that lies farther away, from the edge [m]
+STEPS = 15  # of a film
+DOT = 0.05  # radius of a beam's end [m]
+WORDS = {"success": "the goal is reached", "collision": "collision", "fall": "it falls", "timeout": "out of time"}
+
+
+def sketch(env: Navigation, state: Any) -> Sketch:
+    """What lies round the robot, from above."""
+    world, goal, pose, ranges = jax.device_get(_seen(env, state))
+    around = 2 * (AHEAD + BEHIND)  # a page may be wider than the sketch
+    parts = [svg.rectangle(-around, -around, 2 * around, 2 * around, "fill:var(--floor)")]
+    boxes = zip(world.boxes, world.box_heights.tolist(), strict=True)
+    discs = zip(world.circles, world.circle_heights.tolist(), strict=True)
+    solids = [(height, _box(row, height, pose)) for row, height in boxes]
+    solids += [(height, _disc(row, height, pose)) for row, height in discs]
+    parts += [shape for _, shape in sorted(solids)]  # from above, the tall covers the low
+    ends = _up(ranges[:, None] * np.stack([np.cos(BEAM_ANGLES), np.sin(BEAM_ANGLES)], axis=-1))
+    parts.append(svg.polygon([(0.0, 0.0), *ends], "fill:var(--free);fill-opacity:0.25"))
+    met = ends[ranges < 0.999 * float(env.lidar.max_range)]
+    dots = "".join(f"M{svg.number(x)} {svg.number(y)}h0" for x, y in met)
+    line = f"fill:none;stroke:var(--hit);stroke-width:{2 * DOT};stroke-linecap:round"
+    parts.append(svg.element("path", d=dots, style=line))
+    at, away = _placed(goal[None], pose)[0], float(np.linalg.norm(goal - pose[:2]))
+    parts.append(_goal(at, float(env.goal_radius), away))
+    return Sketch(
+        box=(-ASIDE, -AHEAD, 2 * ASIDE, AHEAD + BEHIND),
+        still="".join(parts),
+        movers={"robot": _robot(env.robot)},
+        places={"robot": (0.0, 0.0, -90.0)},
+        foot=(0.0, 0.0),
+        reach=(0.55, 2.2),
+        turn=90.0,
+        aim=2.5,
+        words=f"{away:.1f} m from the goal",
+    )
+
+
+@jax.jit
+def _seen(env: Navigation, state: Any) -> Any:
+    return env.world(state.world), state.goal, state.pose, env.ranges(state)
+
+
+@jax.jit
+def _walked(env: Navigation, state: Any, action: jax.Array) -> tuple[Array, dict[str, Array]]:
+    heading = rotate(action, state.pose[2])
+
+    def one(state: Any, _: None) -> tuple[Any, tuple[Array, dict[str, Array]]]:
+        after = env.moved(state, rotate(heading, -state.pose[2]))
+        return after, (after.pose, env.ends(after)[0])
+
+    return jax.lax.scan(one, state, None, length=STEPS)[1]
+
+
+def reel(env: Navigation, state: Any, action: Float[Array, "2"]) -> Reel:
+    """The robot holds the direction, as seen on the map, for `STEPS` steps or until the episode ends."""
+    poses, outcomes = jax.device_get(_walked(env, state, jnp.asarray(action)))
+    start = np.asarray(state.pose, float)
+    ended = {name: np.flatnonzero(outcomes[name] > 0) for name in WORDS if name in outcomes}
+    ended = {name: int(steps[0]) for name, steps in ended.items() if len(steps)}
+    last = min(ended.values(), default=STEPS - 1)
+    period = float(env.period)
+    how = next((WORDS[name] for name, step in ended.items() if step == last), "the way is free")
+    frames: list[dict[str, tuple[float, float, float] | None]] = [{"robot": (0.0, 0.0, -90.0)}]
+    for pose in poses[: last + 1]:
+        x, y = _placed(pose[None, :2], start)[0]
+        turned = math.degrees(float(pose[2]) - start[2])
+        frames.append({"robot": (float(x), float(y), -90.0 - turned)})
+    return Reel(period / 2, frames, f"held for {(last + 1) * period:.1f} s: {how}")
+
+
+def _up(points: np.ndarray) -> np.ndarray:
+    """Points in the body's frame, ahead and to the left, as they are on the screen."""
+    return np.stack([-points[:, 1], -points[:, 0]], axis=-1)
+
+
+def _placed(points: np.ndarray, pose: np.ndarray) -> np.ndarray:
+    """Points of the world as they are on the screen."""
+    cos, sin = math.cos(float(pose[2])), math.sin(float(pose[2]))
+    return _up((np.asarray(points, float) - pose[:2]) @ np.array([[cos, -sin], [sin, cos]]))
+
+
+def _shown(points: np.ndarray, beyond: float = 0.0) -> bool:
+    """May something of what lies between these points be seen?"""
+    low, high = points.min(axis=0) - beyond, points.max(axis=0) + beyond
+    return bool(low[0] < ASIDE and high[0] > -ASIDE and low[1] < BEHIND and high[1] > -AHEAD)
+
+
+def _fill(height: float) -> str:
+    return "fill:var(--solid)" if height > 1.0 else "fill:var(--low)"
+
+
+def _box(row: np.ndarray, height: float, pose: np.ndarray) -> str:
+    if abs(row[0]) > FAR_AWAY / 2:
+        return ""
+    x, y, yaw, length, width = (float(value) for value in row)
+    corners = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * [length, width]
+    cos, sin = math.cos(yaw), math.sin(yaw)
+    found = _placed(corners @ np.array([[cos, sin], [-sin, cos]]) + [x, y], pose)
+    return svg.polygon(found, _fill(height)) if _shown(found) else ""
+
+
+def _disc(row: np.ndarray, height: float, pose: np.ndarray) -> str:
+    if abs(row[0]) > FAR_AWAY / 2:
+        return ""
+    at = _placed(row[None, :2], pose)
+    return svg.circle(tuple(at[0]), float(row[2]), _fill(height)) if _shown(at, float(row[2])) else ""
+
+
+def _goal(at: np.ndarray, radius: float, away: float) -> str:
+    low, high = np.array([-ASIDE, -AHEAD]) + INSET, np.array([ASIDE, BEHIND]) - INSET
+    ring = svg.circle(tuple(at), radius, "fill:var(--goal);fill-opacity:0.25;stroke:var(--goal);stroke-width:0.06")
+    if (at >= low).all() and (at <= high).all():
+        return ring + svg.circle(tuple(at), 0.16, "fill:var(--goal)")
+    # Farther away: where the way there leaves the sketch, as an arrow's head.
+    bounds = np.where(at > 0, high, -low) / np.maximum(np.abs(at), 1e-9)
+    edge = at * bounds.min()
+    turn = math.degrees(math.atan2(edge[1], edge[0]))
+    place = f"translate({svg.number(edge[0])} {svg.number(edge[1])}) rotate({svg.number(turn)})"
+    head = svg.polygon([(0.4, 0.0), (-0.3, -0.35), (-0.3, 0.35)], "fill:var(--goal)")
+    inside = edge * (1 - 1.6 / max(float(np.linalg.norm(edge)), 1.6))
+    words = svg.text(tuple(inside), 0.4, f"goal {away:.0f} m", "fill:var(--goal);font-weight:bold")
+    return svg.element("g", head, transform=place) + words
+
+
+def _robot(robot: Robot) -> str:
+    radius, offset = float(robot.disc_radius), float(robot.disc_offset)
+    bend = np.linspace(-math.pi / 2, math.pi / 2, 13)
+    front = np.stack([np.cos(bend), np.sin(bend)], axis=-1) * radius + [offset, 0.0]
+    hull = svg.polygon(np.concatenate([front, -front]), "fill:var(--body);stroke:white;stroke-width:0.03")
+    tip = offset + 0.6 * radius
+    back = tip - 1.1 * radius
+    return hull + svg.polygon([(tip, 0.0), (back, 0.6 * radius), (back, -0.6 * radius)], "fill:white")

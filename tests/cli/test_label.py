@@ -1,0 +1,142 @@
+"""`cuelearner label` and `cuelearner labels`: the real command, what it refuses, and what takes its files."""
+
+import csv
+import signal
+import urllib.error
+import urllib.request
+
+import numpy as np
+import probes
+import pytest
+from sessions import OWN, expert, plan, served
+
+from cuelearner_jax.cli import main
+from cuelearner_jax.labelling.plan import Base
+from cuelearner_jax.labelling.session import Session
+from cuelearner_jax.policies import Uniform
+from cuelearner_jax.records import label_files
+from cuelearner_jax.records.folders import claimed
+
+
+@pytest.fixture(scope="module")
+def labelled(tmp_path_factory):
+    """Folders of two people's labels of the same questions, one of another seed; nobody writes there."""
+    folder = tmp_path_factory.mktemp("labelled")
+    for name, seed, turn in (("one", 0, 1.0), ("two", 3, -1.0)):
+        with Session(plan(seed=seed, who=name), folder / name) as session:
+            for number in range(12):
+                session.answer(number, turn * expert(session.item), seconds=0.0)
+    return folder
+
+
+def status_of(address, **headers):
+    """What the page answers, to a request with these headers."""
+    try:
+        with urllib.request.urlopen(urllib.request.Request(address, headers=headers), timeout=20) as answer:
+            return answer.status, answer.headers, answer.read().decode()
+    except urllib.error.HTTPError as error:
+        return error.code, error.headers, error.read().decode()
+
+
+def test_the_page_is_served_to_who_knows_its_address_until_ctrl_c(tmp_path, refused):
+    pytest.importorskip("nicegui")
+    with served(tmp_path / "labels") as (process, address):
+        place = address.partition("?")[0]
+        assert place.startswith("http://127.0.0.1:")
+        status, headers, text = status_of(address)
+        assert status == 200
+        assert "Which way should the arrow turn?" in text
+        assert status_of(place, Cookie=headers["set-cookie"].partition(";")[0])[0] == 200
+        for told in ({}, {"Cookie": "x=1"}, {"Host": "evil.example"}, {"Origin": "http://evil.example"}):
+            assert status_of(address if told.keys() & {"Host", "Origin"} else place, **told)[0] == 403
+        again = ["label", OWN, "--out", tmp_path / "labels"]
+        refused(again, "is being written by another process", tmp_path / "labels")
+        process.send_signal(signal.SIGINT)
+        assert process.wait(60) == 130
+        assert "every answer is in" in process.stderr.read()
+    assert label_files.history(tmp_path / "labels" / label_files.JSONL) == []
+
+
+@pytest.mark.parametrize(
+    ("more", "says"),
+    [
+        (["--labels", "0"], "--labels is 0: give a number from 1"),
+        (["--guidance", "heuristic"], "guidance 'heuristic' asks for no labels: give --guidance relative or"),
+        (["--sizes.candidates", "3", "--sizes.ensemble", "2"], "--sizes.candidates is above 1"),
+        (["--bound-deg", "0"], "--bound-deg is 0: give an angle"),
+        (["--port", "70000"], "--port is 70000: give a number"),
+        (["--of-seed", "1"], "--of-seed chooses a lane of a run, and none is given"),
+        (["--who", " "], "--who is empty"),
+        (["--again", "nothing"], "no label file at nothing"),
+        (["--scalars.eps-deg", "-1"], "eps_deg"),
+    ],
+)
+def test_what_makes_no_sense_is_refused(more, says, refused, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    refused(["label", OWN, "--out", "labels", *more], says, tmp_path)
+
+
+def test_policies_that_cannot_be_had_are_refused(refused, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    refused(["label", OWN, "nowhere", "--out", "labels"], "no policy at nowhere: give a run folder", tmp_path)
+    refused(["label", OWN, "page_task:QUARTER", "--out", "labels"], "a float is no policy", tmp_path)
+    refused(["label", OWN, "page_task:NOTHING", "--out", "labels"], "has no 'NOTHING'", tmp_path)
+
+
+def test_a_file_of_something_else_is_refused(labelled, refused, tmp_path):
+    refused(["label", OWN, "--out", labelled / "two"], "another session.seed (3, asked", labelled)
+    refused(["label", OWN, "page_task:left_of", "--out", labelled / "one"], "another session.base (uniform", labelled)
+
+
+def test_a_run_of_another_task_is_no_policy_here(run_folder, refused, tmp_path):
+    command = ["label", OWN, run_folder, "--out", tmp_path / "labels"]
+    refused(command, "is a run of billiards, not of wandering", tmp_path)
+
+
+def test_labels_are_inspected(labelled, capsys):
+    assert main(["labels", "inspect", str(labelled / "one"), "--teacher"]) == 0
+    told = capsys.readouterr().out
+    for words in ("12", "relative, by 20 degrees", "one (12)", "100% of 12", "uniform"):
+        assert words in told, told
+    assert main(["labels", "inspect", str(labelled / "one"), str(labelled / "two")]) == 0
+    assert "no labels to compare" in capsys.readouterr().out
+
+
+def test_labels_are_merged_and_exported(labelled, tmp_path, refused, capsys):
+    both, flat, whole = tmp_path / "both.parquet", tmp_path / "both.csv", tmp_path / "again.parquet"
+    assert main(["labels", "merge", str(labelled / "one"), str(labelled / "two"), "--out", str(both)]) == 0
+    file = label_files.read(both)
+    assert file.people.who.tolist() == ["one"] * 12 + ["two"] * 12
+    assert main(["labels", "export", str(both), "--out", str(flat)]) == 0
+    assert main(["labels", "export", str(labelled / "two"), "--out", str(whole)]) == 0
+    rows = list(csv.DictReader(flat.open()))
+    assert len(rows) == 24
+    np.testing.assert_allclose([float(row["obs[1]"]) for row in rows], file.labels.obs[:, 1], rtol=1e-6)
+    assert [float(row["answer[0]"]) for row in rows] == file.labels.answer[:, 0].tolist()
+    one, two = label_files.read(labelled / "two"), label_files.read(whole)
+    assert (two.session, two.task, two.eps_deg) == (one.session, one.task, one.eps_deg)
+    np.testing.assert_array_equal(one.labels.answer, two.labels.answer)
+    refused(["labels", "merge", labelled / "one", "--out", both], "both.parquet exists: give another --out", tmp_path)
+    refused(["labels", "export", both, labelled / "one", "--out", "x.csv"], "takes one label file", tmp_path)
+    refused(["labels", "export", both, "--out", tmp_path / "x.txt"], "ends in .csv or .parquet", tmp_path)
+    refused(["labels", "inspect", both, "--teacher"], "cannot be had again", tmp_path)
+    refused(["labels", "mend"], "unknown command 'labels mend'", tmp_path)
+
+
+def test_runs_take_a_pages_folder(labelled, tmp_path):
+    from page_task import TASK
+
+    from cuelearner_jax.runs.grid import Grid
+    from cuelearner_jax.runs.order import Order, read_labels
+
+    order = Order(TASK, probes.CONFIG, Grid(("relative",), (5,), (12,)), tmp_path, labels_from=labelled / "one")
+    assert len(read_labels(order).seeds) == 12
+
+
+def test_a_page_that_is_kept_is_not_opened_twice(labelled, refused):
+    with claimed(labelled / "one"):
+        refused(["label", OWN, "--out", labelled / "one"], "is being written by another process", labelled)
+
+
+def test_a_base_is_told_apart_by_its_parameters():
+    assert Base(Uniform(), "uniform").digest == ""

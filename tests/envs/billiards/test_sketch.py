@@ -1,0 +1,48 @@
+"""Sketches of a table for a browser: balls where they are, films that end as the shot does."""
+
+import math
+from xml.etree import ElementTree
+
+import jax.numpy as jnp
+import pytest
+
+from cuelearner_envs.billiards import Table
+from cuelearner_envs.billiards.environment import Balls, Billiards
+from cuelearner_envs.billiards.sketch import reel, sketch
+
+ENV = Billiards(Table.one_ball().replace(max_events=24))
+
+
+def balls(positions, pocketed=(False, False)):
+    return Balls(jnp.array(positions), jnp.array(pocketed), jnp.zeros((), jnp.int32))
+
+
+def test_balls_and_the_arrow_are_where_they_should_be_with_y_downwards():
+    found = sketch(ENV, balls([[0.1, -0.1], [0.3, 0.15]]))
+    assert found.places == {"ball-0": pytest.approx((0.1, 0.1, 0)), "ball-1": pytest.approx((0.3, -0.15, 0))}
+    assert found.foot == pytest.approx((0.1, 0.1))
+    assert (found.turn, found.words) == (0.0, "1 of 1 on the table")
+    left, top, width, height = found.box
+    assert left < -0.4 < 0.4 < left + width
+    assert top < -0.2 < 0.2 < top + height
+    whole = ElementTree.fromstring(f"<svg>{found.still}{''.join(found.movers.values())}</svg>")
+    holes = [one for one in whole.iter("circle") if "15110e" in one.get("style")]
+    assert len(holes) == 4
+    radii = [float(ElementTree.fromstring(f"<g>{body}</g>")[0].get("r")) for body in found.movers.values()]
+    assert radii == [0.02, 0.02]
+    gone = sketch(ENV, balls([[0.1, -0.1], [0.3, 0.15]], (False, True)))
+    assert gone.words == "0 of 1 on the table"
+    assert gone.places["ball-1"][1] < -0.2  # beside the table
+
+
+def test_a_film_ends_as_the_shot_does():
+    along = jnp.array([math.cos(math.pi / 4), math.sin(math.pi / 4)])
+    state = balls([[0.1, -0.1], [0.3, 0.1]])
+    film = reel(ENV, state, along)  # the diagonal into the corner
+    assert film.words == "1 pocketed"
+    assert film.frames[0] == {"ball-0": pytest.approx((0.1, 0.1, 0)), "ball-1": pytest.approx((0.3, -0.1, 0))}
+    assert film.frames[-1]["ball-1"] is None
+    assert film.frames[-1]["ball-0"] is not None
+    assert 0 < film.period * len(film.frames) <= 3.0
+    turned = Billiards(ENV.table, action_turn=jnp.array(-math.pi / 4))  # a changed world's film is that world's
+    assert reel(turned, state, along).words == "nothing pocketed"

@@ -1,0 +1,169 @@
+"""The page without a browser: what it shows and what its buttons do, for each form of feedback."""
+
+import asyncio
+import html
+import json
+import math
+import re
+
+import numpy as np
+import pytest
+from sessions import expert
+
+pytest.importorskip("nicegui")
+from nicegui.testing.user_simulation import user_simulation
+
+from cuelearner_jax.guidance.answers import DEMONSTRATION, RELATIVE, SCALAR
+from cuelearner_jax.guidance.bundle import AnswerForm
+from cuelearner_jax.labelling import controls, view
+from cuelearner_jax.labelling.page import Page
+from cuelearner_jax.records import label_files
+
+
+def shown(session, acts):
+    """Opens the page of a session in a browser that is none, and has `acts` use it."""
+
+    async def used():
+        pages = set()
+        async with user_simulation(root=lambda: Page(session, pages) and None) as user:
+            await user.open("/")
+            await acts(user, pages)
+
+    asyncio.run(used())
+
+
+async def press(user, name, moved):
+    """Presses a button and waits until that has moved the session on."""
+    user.find(marker=name).click()
+    for _ in range(400):
+        await asyncio.sleep(0.01)
+        if moved():
+            return
+    raise AssertionError(f"{name} did nothing")
+
+
+def test_buttons_answer_what_is_on_the_page_and_it_tells_how_far_it_is(opened, tmp_path):
+    session = opened()
+    words = {1.0: "+1", 0.0: "0", -1.0: "-1"}
+    told = []
+
+    async def acts(user, pages):
+        await user.should_see("0 of 20")
+        await user.should_see("Which way should the arrow turn?")
+        for number in range(10):
+            right = expert(session.item)
+            told.append(float(right[0]))
+            await press(user, words[told[-1]], lambda number=number: session.number == number + 1)
+        await user.should_see("10 of 20")
+        await press(user, "unsure", lambda: session.number == 11)
+        await user.should_see("1 not known")
+        await press(user, "undo", lambda: session.number == 10)
+        await user.should_see("model 1, of 10 labels", retries=600)
+        await user.should_see("labels kept apart")
+        user.find(marker="help").click()
+        await user.should_see("counterclockwise: ←, A")
+
+    shown(session, acts)
+    file = label_files.read(tmp_path / "labels")
+    assert file.labels.answer[:, 0].tolist() == told
+    assert file.said == {"answer": 10, "unsure": 1, "undone": 1}
+
+
+def test_an_answer_names_its_item_and_pages_show_the_same(opened):
+    session = opened()
+
+    async def acts(user, pages):
+        (page,) = pages
+        told = {"name": "+1", "item": 0, "angle": None, "seconds": 0.0}
+        await page._act("+1", 0, told)
+        await page._act("+1", 0, told)  # the key again, before the next question came
+        assert session.number == 1
+        await page._act("nonsense", 1, {"name": "nonsense", "item": 1})
+        await page._act("point", 1, {"name": "point", "item": 1, "angle": 30.0})  # not of this form
+        assert session.number == 1
+        assert 'data-item="1"' in page._scene.content
+
+    shown(session, acts)
+
+
+def test_when_all_is_answered_the_page_says_so(opened):
+    session = opened(labels=2)
+
+    async def acts(user, pages):
+        for number in range(2):
+            await press(user, "0", lambda number=number: session.number == number + 1)
+        await user.should_see("All labels are given")
+        (page,) = pages
+        assert page._scene.content == ""
+        assert not any(button.enabled for button in page._pressable)
+
+    shown(session, acts)
+
+
+@pytest.mark.parametrize("kind", ["demonstration", "scalar"])
+def test_other_forms_of_feedback_have_a_page_of_the_same_parts(opened, tmp_path, kind):
+    session = opened(kind=kind)
+
+    async def acts(user, pages):
+        (page,) = pages
+        if kind == "demonstration":
+            await user.should_see("Point at what to do instead")
+            await page._act("point", 0, {"name": "point", "item": 0, "angle": 120.0, "seconds": 0.0})
+        else:
+            await user.should_see("Is the arrow good?")
+            await press(user, "yes", lambda: session.number == 1)
+        assert session.number == 1
+
+    shown(session, acts)
+    file = label_files.read(tmp_path / "labels")
+    wanted = [-0.5, math.sqrt(0.75)] if kind == "demonstration" else [1.0]
+    np.testing.assert_allclose(file.labels.answer, [wanted], atol=1e-6)
+    assert (file.answers, file.eps_deg) == (kind, None)
+    assert len(file.people.seconds) == 1
+
+
+def test_keys_are_told_apart_and_every_answer_is_one_of_the_form():
+    five = AnswerForm("five", 1, "worth", lambda *told: None, values=(0.0, 0.25, 0.5, 0.75, 1.0))
+    for form in (RELATIVE, DEMONSTRATION, SCALAR, five):
+        known = controls.controls(form)
+        keys = [key for control in known.values() for key in control.keys]
+        assert len(keys) == len(set(keys)) >= 5
+        answers = [control.answer for control in controls.answers(form)]
+        assert sorted(answers) == sorted((value,) for value in form.values or ())
+    assert controls.COUNTERCLOCKWISE.answer == (1.0,)
+    assert controls.given(RELATIVE, controls.UNSURE, None) is None
+
+
+def tip(svg, name):
+    """The tip of an arrow on the screen."""
+    corners = re.search(rf'class="arrow {name}">.*?points="([^"]*)"', svg)[1]
+    return np.array([float(part) for part in corners.split()[0].split(",")])
+
+
+def test_arrows_point_where_actions_do(opened):
+    session = opened()
+    item = session.item._replace(action=np.float32([0.6, 0.8]), refined=np.float32([-1.0, 0.0]))
+    svg = view.picture(item, RELATIVE, 20.0)
+    angle = math.degrees(math.atan2(0.8, 0.6))
+    for name, turned, length in (
+        ("asked", 0, 1),
+        ("left", 20, 1.25),
+        ("right", -20, 1.25),
+        ("refined", 180 - angle, 0.8),
+    ):
+        at = math.radians(angle + turned)
+        np.testing.assert_allclose(tip(svg, name), [length * math.cos(at), -length * math.sin(at)], atol=1e-3)
+    up = item._replace(sketch=item.sketch._replace(turn=90.0, foot=(1.0, 2.0)), action=np.float32([1.0, 0.0]))
+    np.testing.assert_allclose(tip(view.picture(up, RELATIVE, 20.0), "asked"), [1.0, 1.0], atol=1e-3)
+    assert json.loads(html.unescape(re.search('data-places="([^"]*)"', svg)[1])).keys() == {"dot"}
+    assert "refined" not in view.picture(item._replace(refined=item.action), RELATIVE, 20.0)
+    np.testing.assert_allclose(view.turned(item.action, 90.0), [-0.8, 0.6], atol=1e-6)
+
+
+def test_a_film_shows_what_the_action_leads_to(opened):
+    session = opened()
+    best = np.asarray(session.env.best(session.item.guide.obs))
+    assert session.film(0, best).words == "True"
+    assert session.film(0, view.turned(best, 90.0)).words == "False"
+    film = json.loads(view.film(session.item, session.film(0, best)))
+    assert (film["item"], film["frames"][-1]) == (0, {"dot": None})

@@ -1,0 +1,247 @@
+"""A session of labelling: nothing is lost or doubled, and its first round is that of a simulated teacher."""
+
+import errno
+from functools import partial
+from itertools import pairwise
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import page_task
+import probes
+import pytest
+from sessions import ENV, expert, give, plan, settled
+
+from cuelearner_jax import asking
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.guidance import registry as guidances
+from cuelearner_jax.labelling import comparing
+from cuelearner_jax.labelling.living import keys_of
+from cuelearner_jax.labelling.plan import Base
+from cuelearner_jax.labelling.programs import programs
+from cuelearner_jax.labelling.session import Session
+from cuelearner_jax.policies import Opaque, Uniform
+from cuelearner_jax.records import label_files
+from cuelearner_jax.records.label_files import JSONL
+
+
+def lines(folder):
+    return (folder / JSONL).read_bytes().count(b"\n") - 1  # without the head
+
+
+def test_an_answer_is_on_the_disk_before_the_next_question_and_said_twice_counts_once(opened, tmp_path):
+    session = opened()
+    folder = tmp_path / "labels"
+    for number in range(5):
+        item = session.item
+        assert item.number == number == lines(folder)
+        assert session.answer(number, expert(item), seconds=0.001 * number)
+        assert lines(folder) == number + 1
+        assert not session.answer(number, expert(item))  # a key that repeats, a second page, a message sent again
+        assert lines(folder) == number + 1
+        row = label_files.history(folder / JSONL)[-1]
+        np.testing.assert_array_equal(np.float32(row["obs"]), item.guide.obs)
+        np.testing.assert_array_equal(np.float32(row["action"]), item.action)
+        assert (row["item"], row["said"], row["answer"], row["who"]) == (number, "answer", [*expert(item)], "anonymous")
+        assert (row["seconds"], row["eps_deg"], row["seed"]) == (pytest.approx(0.001 * number), 20.0, 0)
+    assert not session.answer(7, np.zeros(1))  # not asked yet
+    assert lines(folder) == 5
+
+
+def test_the_next_situation_follows_from_the_action_asked_about(opened):
+    session = opened()
+    items = [*give(session, 6), session.item]
+    for before, after in pairwise(items):
+        x, y = np.asarray(before.guide.obs)
+        c, s = before.action
+        np.testing.assert_allclose(after.guide.obs, [x * c - y * s, x * s + y * c], atol=1e-6)
+
+
+def test_the_first_round_is_that_of_a_simulated_teacher(opened, tmp_path):
+    session = opened()
+    give(session, 10)
+    status = settled(session, fits=1)
+    guidance, keys = guidances.make("relative", probes.SIZES, ENV), keys_of(0)
+    guide = asking.start(guidance, ENV, 20, 20, keys.model, keys.start)
+    round_of = jax.jit(partial(asking.label_round, guidance, probes.SIZES))
+    taught = round_of(ENV, probes.Expert(ENV), probes.SCALARS, Uniform(), guide, keys.session)
+    file = label_files.read(tmp_path / "labels")
+    for name in ("obs", "action", "answer"):
+        np.testing.assert_allclose(getattr(file.labels, name), getattr(taught.labels, name)[:10], atol=1e-6)
+    # The same labels and the same step of the same stream, though the fit after the first has another number there.
+    told = guide.replace(labels=taught.labels)
+    refit = programs(guidance).fit(ENV, probes.SCALARS, told, keys.session, jnp.asarray(1))
+    chex.assert_trees_all_close(status.newest.model, refit.model, atol=1e-4)
+    assert (status.newest.labels, status.newest.number, status.newest.quality.count) == (10, 1, 2)
+
+
+def test_later_questions_are_refined_by_the_newest_model(opened):
+    session = opened()
+    give(session, 10)
+    newest = settled(session, fits=1).newest
+    prepared = session.number  # asked before the model was there, but seen
+    give(session, 1)
+    item = session.item
+    assert item.number == prepared + 1
+    keys = asking.question_keys(keys_of(0).session, item.number)
+    base = Uniform().act(keys.base, None, item.guide.obs[None])
+    act = jax.jit(session.plan.guidance.act)
+    refined = act(newest.model, ENV, item.guide.obs[None], base, jnp.ones(1, bool), probes.SCALARS).actions[0]
+    np.testing.assert_allclose(item.action, refined, atol=1e-5)
+    assert np.abs(item.action - base[0]).max() > 0.01
+    assert item.refined is not None
+
+
+def test_not_knowing_counts_for_nothing_and_an_answer_can_be_taken_back(opened, tmp_path):
+    session = opened()
+    give(session, 2)
+    assert session.answer(2, None)
+    assert (session.status().answered, session.status().unsure, session.number) == (2, 1, 3)
+    seen = session.item
+    assert session.undo(3)
+    assert not session.undo(3)
+    assert session.number == 2
+    assert session.undo(2)
+    assert session.status().answered == 1
+    again = session.item
+    assert again.number == 1
+    assert session.answer(1, -expert(again) + 1.0 if expert(again)[0] == 0 else -expert(again))
+    assert session.answer(2, np.ones(1))
+    np.testing.assert_array_equal(session.item.action, seen.action)
+    np.testing.assert_array_equal(session.item.guide.obs, seen.guide.obs)
+    file = label_files.read(tmp_path / "labels")
+    assert file.people.item.tolist() == [0, 1, 2]
+    assert file.labels.answer[2, 0] == 1.0
+    assert file.labels.answer[1, 0] != expert(again)[0]
+    assert file.said == {"answer": 4, "unsure": 1, "undone": 2}
+    first = opened("first")
+    assert not first.undo(0)
+    assert lines(tmp_path / "first") == 0
+
+
+def test_a_session_opened_again_goes_on_where_it_stopped(opened, tmp_path):
+    session = opened()
+    give(session, 11)
+    session.undo(11)
+    before, _ = session.item, session.close()
+    again = opened()
+    assert again.item.number == before.number == 10
+    np.testing.assert_array_equal(again.item.action, before.action)
+    np.testing.assert_array_equal(again.item.guide.obs, before.guide.obs)
+    assert again.status().answered == 10
+    assert again.status().newest.labels == 10
+    assert again.undo(10)
+    assert again.number == 9
+    give(again, 2)
+    assert again.number == 11
+    give(again, 9)
+    assert again.done
+    assert again.item is None
+    assert not again.answer(20, np.zeros(1))
+    assert label_files.read(tmp_path / "labels").people.item.tolist() == list(range(20))
+    assert again.undo(20)
+    assert again.item.number == 19
+
+
+def test_a_kill_at_any_byte_loses_no_line_that_was_whole(opened, tmp_path):
+    session = opened()
+    give(session, 6)
+    whole = (tmp_path / "labels" / JSONL).read_bytes()
+    ends = [place + 1 for place, byte in enumerate(whole) if byte == ord("\n")]
+    folder = tmp_path / "cut"
+    folder.mkdir()
+    rng = np.random.default_rng(0)
+    cuts = [*rng.integers(ends[0], len(whole), 3).tolist(), ends[3], len(whole) - 1]
+    for cut in cuts:
+        (folder / JSONL).write_bytes(whole[:cut])
+        kept = sum(end - 1 <= cut for end in ends) - 1  # a line without its end is whole too
+        assert len(label_files.history(folder / JSONL)) == kept
+    opened("cut")
+    assert lines(folder) == 6
+    assert label_files.read(folder).people.item.tolist() == [0, 1, 2, 3, 4, 5]
+
+
+def test_where_the_disk_takes_no_more_nothing_moves_on(opened, monkeypatch):
+    session = opened()
+    give(session, 1)
+
+    def full(**row):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(session._writer, "append", full)
+    for _ in range(2):
+        with pytest.raises(UserError, match=r"nothing can be saved \(No space left on device\): make room, then start"):
+            session.answer(1, np.zeros(1))
+    assert (session.number, session.status().answered) == (1, 1)
+    assert "nothing can be saved" in session.status().trouble
+
+
+def test_files_of_something_else_are_refused(opened, tmp_path):
+    opened()
+    for asked, named in (
+        ({"seed": 1}, "session.seed"),
+        ({"base": Base(Opaque(page_task.left_of, on_host=True), "mine")}, "session.base"),
+        ({"kind": "demonstration"}, "answers"),
+        ({"bound_deg": 5.0}, "session.bound_deg"),
+    ):
+        before = (tmp_path / "labels" / JSONL).read_bytes()
+        with pytest.raises(UserError, match=f"holds labels of another {named} "):
+            Session(plan(**asked), tmp_path / "labels")
+        assert (tmp_path / "labels" / JSONL).read_bytes() == before
+
+
+def test_situations_that_come_out_otherwise_are_followed_by_a_new_episode(opened, tmp_path, monkeypatch):
+    session = opened()
+    give(session, 4)
+    session.close()
+    monkeypatch.setattr("cuelearner_jax.labelling.session.lived", lambda *told: iter(()))
+    again = opened()
+    assert again.number == 4
+    assert not again.undo(4)  # nobody knows where that was
+    give(again, 1)
+    assert label_files.read(tmp_path / "labels").people.item.tolist() == [0, 1, 2, 3, 4]
+
+
+def test_a_policy_is_asked_about_within_a_bound(opened):
+    session = opened(base=Base(Opaque(page_task.left_of, on_host=True), "mine"), bound_deg=5.0)
+    items = give(session, 10)
+    for item in items:  # before the first fit: the policy's own actions
+        np.testing.assert_allclose(item.action, page_task.left_of(np.asarray(item.guide.obs)[None])[0], atol=1e-6)
+    settled(session, fits=1)
+    moved = []
+    for item in give(session, 6)[1:]:
+        own = page_task.left_of(np.asarray(item.guide.obs)[None])[0]
+        moved.append(np.degrees(np.arccos(np.clip(item.action @ own, -1, 1))))
+    assert 0.1 < max(moved) <= 5.0 + 1e-3
+
+
+def test_a_second_opinion_is_about_the_same_questions(opened, tmp_path):
+    first = opened()
+    items = give(first, 8)
+    file = label_files.read(tmp_path / "labels")
+    again = tuple(np.float32(row["action"]) for row in label_files.history(tmp_path / "labels" / JSONL))
+    second = opened("second", again=again, again_of="x", who="other")
+    for item in items:
+        np.testing.assert_array_equal(second.item.guide.obs, item.guide.obs)
+        np.testing.assert_array_equal(second.item.action, item.action)
+        turned = expert(item) if item.number < 6 else np.ones(1) - np.abs(expert(item))
+        second.answer(item.number, turned)
+    assert second.done
+    theirs = label_files.read(tmp_path / "second")
+    found = comparing.between(file, theirs, ENV)
+    same = sum(bool(expert(item)[0] == (1 - abs(expert(item)[0]))) for item in items[6:])
+    assert (found.count, found.value) == (8, (6 + same) / 8)
+    assert theirs.people.who.tolist() == ["other"] * 8
+    merged = comparing.merged([file, theirs])
+    assert merged.people.item.tolist() == list(range(16))
+
+
+def test_labels_are_compared_with_the_teacher_in_the_situations_they_were_given_in(opened, tmp_path):
+    session = opened()
+    give(session, 5)
+    session.answer(5, 1 - np.abs(expert(session.item)))  # wrong
+    rows = label_files.history(tmp_path / "labels" / JSONL)
+    file = label_files.read(tmp_path / "labels")
+    found = comparing.with_teacher(page_task.TASK, file, rows, probes.SCALARS)
+    assert (found.count, found.value) == (6, pytest.approx(5 / 6))

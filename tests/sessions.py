@@ -1,0 +1,70 @@
+"""Sessions on the bandit, answered as its expert would."""
+
+import contextlib
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import page_task
+import probes
+
+from cuelearner_jax.guidance import registry as guidances
+from cuelearner_jax.labelling.plan import Base, Plan
+from cuelearner_jax.policies import Uniform
+
+TESTS = Path(__file__).resolve().parent
+OWN = "page_task:TASK"  # as commands name it
+ENV = page_task.TASK.environment(probes.CONFIG.task)
+
+
+def plan(labels=20, kind="relative", base=None, **others):
+    """Of a session on the bandit."""
+    guidance = guidances.make(kind, probes.SIZES, ENV)
+    return Plan(page_task.TASK, probes.CONFIG, guidance, base or Base(Uniform(), "uniform"), labels, **others)
+
+
+def expert(item):
+    """What the expert answers: which way its best action lies, unless it is within half of eps (by angles)."""
+    best = np.asarray(ENV.best(item.guide.obs), float)
+    cross = item.action[0] * best[1] - item.action[1] * best[0]
+    apart = np.degrees(np.arctan2(cross, item.action @ best))
+    return np.array([0.0 if abs(apart) <= probes.SCALARS.eps_deg / 2 else np.sign(apart)], np.float32)
+
+
+def give(session, count):
+    """Answers so many questions; returns the items."""
+    items = []
+    for _ in range(count):
+        items.append(session.item)
+        assert session.answer(session.number, expert(session.item))
+    return items
+
+
+def settled(session, fits=None):
+    """Waits until nothing is fitted any more and the questions know of it."""
+    for _ in range(20_000):
+        status = session.status()
+        if not status.fitting and (fits is None or status.newest.number >= fits):
+            break
+        time.sleep(0.005)
+    session._ahead.submit(lambda: None).result()
+    return session.status()
+
+
+@contextlib.contextmanager
+def served(folder, *more):
+    """The command in a process of its own, once it has told its address: the process and that."""
+    paths = os.pathsep.join([str(TESTS), str(TESTS.parent), str(TESTS.parent / "envs")])
+    env = {**os.environ, "PYTHONPATH": paths, "PYTHONUNBUFFERED": "1"}
+    command = [sys.executable, "-m", "cuelearner_jax.cli", "label", OWN, "--out", str(folder), "--labels", "20", *more]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    with subprocess.Popen(command, env=env, **pipes) as process:
+        try:
+            told = next((line for line in process.stdout if line.startswith("open ")), "")
+            assert told, process.stderr.read()
+            yield process, told.split()[1]
+        finally:
+            process.kill()
