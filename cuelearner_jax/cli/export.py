@@ -31,6 +31,8 @@ class Export(Generic[TaskT]):
     """Kind of guidance of the run (default: its last)."""
     labels: int | None = None
     """Label budget of the lane (default: the largest)."""
+    bound_deg: float | None = None
+    """Bound of a policy folder's lane (default: the largest) [deg]."""
     seed: int | None = None
     """Seed of the lane (default: the first)."""
     scenario: str | None = None
@@ -51,17 +53,19 @@ def run(arguments: list[str]) -> None:
         return
     source, rest = source_of(arguments, "export", Export)
     kind = Export[source.task.config]  # pyright: ignore[reportInvalidTypeArguments]
-    default = kind(world_of(source, rest), "stablehlo", Path("exported"), "agent" if source.grid else "heuristic")
+    default = kind(world_of(source, rest), "stablehlo", Path("exported"), source.default_policy)
     formats = "formats (--format):\n" + "\n".join(f"  {name:<11}{one.about}" for name, one in FORMATS.items())
     told = f"{about(Export, source.task, policies=True)}\n\n{formats}"
     asked = parse(kind, rest, f"export {source.folder}", default, told)
-    source.check(asked.policy, asked.task, guidance=asked.guidance, labels=asked.labels, seed=asked.seed)
+    lane = {"guidance": asked.guidance, "labels": asked.labels, "seed": asked.seed, "bound-deg": asked.bound_deg}
+    source.check(asked.policy, asked.task, **lane)
     if trained.POLICIES[asked.policy].taught:
         raise UserError(f"policy {asked.policy!r} asks the teacher, who looks at the true state: choose another policy")
     contract.check_request(asked.format, asked.out)
     env = source.task.environment(asked.task)
-    policy = trained.one_policy(source, env, asked.task, asked.policy, asked.guidance, asked.labels, asked.seed)
-    lane = {"guidance": asked.guidance, "labels": asked.labels, "seed": asked.seed}
+    policy = trained.one_policy(
+        source, env, asked.task, asked.policy, asked.guidance, asked.labels, asked.seed, asked.bound_deg
+    )
     written = contract.write(
         policy,
         env.observation,

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from cuelearner_jax.environment import Environment
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.policies import Agent, Guided, Policy, Residual
+from cuelearner_jax.policies import Agent, Common, Guided, Policy, Residual
 
 TOLERANCE = 1e-5  # by which an entry of an action may differ elsewhere
 NUDGE = 1e-6  # of an entry of an observation, as much as rounding may do
@@ -42,7 +42,7 @@ def layers(policy: Any) -> Iterator[Any]:
     """A policy, the one whose actions it changes, and so on."""
     while policy is not None:
         yield policy
-        policy = getattr(policy, "base", None)
+        policy = policy.policy if isinstance(policy, Common) else getattr(policy, "base", None)
 
 
 def described(policy: Policy) -> list[dict[str, Any]]:
