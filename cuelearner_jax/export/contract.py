@@ -18,6 +18,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -69,6 +71,7 @@ def write(
         UserError: no such format; the folder is in use; the policy cannot be exported.
     """
     check_request(format, out)
+    policy = jax.tree.map(jnp.asarray, jax.device_get(policy))  # what was trained may lie on several devices
     size = sum(quantity.size for quantity in observation)
     found = traced(policy, size)
     artefact = FORMATS[format].make(policy, found, size, action.size)
