@@ -10,7 +10,7 @@ help:
 	@echo "make quickstart   train, report and film the small billiards example (two to three minutes)"
 	@echo "make test         run the tests (about 17 minutes on 2 idle cores)"
 	@echo "make test-quick   those of them that compile next to nothing (under 3 minutes)"
-	@echo "make smoke        one tiny sweep of every form of feedback on both tasks, and their reports (minutes on 2 cores)"
+	@echo "make smoke        one tiny sweep of every form of feedback and of every adaptation on both tasks (minutes on 2 cores)"
 	@echo "make fuzz         damaged run folders by chance, CASES=2000 SEED=0 (hours on 2 cores)"
 	@echo "make lint         ruff and pyright"
 	@echo "make format       what ruff can put right by itself"
@@ -43,6 +43,8 @@ quickstart: $(VENV)/.installed
 smoke: $(VENV)/.installed
 	$(BIN)/python experiments/billiards_bootstrapping.py --scale smoke --pieces easy/frame --resume
 	$(BIN)/python experiments/navigation_bootstrapping.py --scale smoke --pieces clutter/frame --resume
+	$(BIN)/python experiments/adaptation_billiards.py --scale smoke --pieces unchanged tilted_table --resume
+	$(BIN)/python experiments/adaptation_navigation.py --scale smoke --pieces unchanged turned_lidar corridor_left --resume
 
 test: $(VENV)/.tested
 	$(BIN)/python -m pytest -n 2 --dist loadfile

@@ -6,6 +6,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Generic
 
+import numpy as np
+
 from cuelearner_jax.adaptation import adapting
 from cuelearner_jax.cli.parsing import about, code_of, out, parse, source_of, taken, world_of
 from cuelearner_jax.cli.shared_options import Flag, TaskT, seeds_of
@@ -13,6 +15,7 @@ from cuelearner_jax.config import GuideSizes, Scalars
 from cuelearner_jax.errors import NotFinite, UserError
 from cuelearner_jax.evaluate import Tell
 from cuelearner_jax.plugins import REFERENCE
+from cuelearner_jax.records import label_files
 from cuelearner_jax.runs import adaptation
 from cuelearner_jax.runs.adaptation import Base, Order
 from cuelearner_jax.runs.trained import PolicySource
@@ -28,7 +31,7 @@ class Adapt(Generic[TaskT]):
     out: Path
     """The policy folder that is written."""
     labels: tuple[int, ...] = (500,)
-    """Label budgets."""
+    """Label budgets (with --labels-from by default all that the file has)."""
     bound_deg: tuple[float, ...] = ()
     """How far corrections may lead from the policy's own actions, one or more bounds [deg] (default: the scenario's, as
     far as the labels of a file reach, or else 45)."""
@@ -40,6 +43,9 @@ class Adapt(Generic[TaskT]):
     """Kind of guidance: what is asked, and what a model makes of the answers, see above."""
     scenario: str | None = None
     """The changed world of this name, see above; options of the task (--task.…) come on top of it."""
+    robot: str | None = None
+    """Another robot, see above (default: the task's own); with a folder, as anymal:FOLDER, one with your own walking
+    policy."""
     labels_from: Path | None = None
     """Use the labels of this file instead of asking the teacher."""
     judge_by: str = "reward"
@@ -66,9 +72,15 @@ def run(arguments: list[str]) -> None:
     world = world_of(source, rest)
     scenario, _ = taken(rest, "--scenario", ", ".join(source.task.scenarios) or "none")
     eps = source.task.scenario(scenario).eps_deg if scenario else None
+    labels, given = Adapt.labels, taken(rest, "--labels-from", "a labels.parquet")[0]
+    if given:  # what the file holds is the default
+        file = label_files.read(Path(given))
+        eps = file.eps_deg if file.eps_deg else eps
+        labels = (int(np.unique(file.seeds, return_counts=True)[1].min()),)
     default = kind(
         world,
         out=Path("policies") / source.folder.name,
+        labels=labels,
         base=Base(policy=source.default_policy),
         sizes=replace(adapting.SIZES, frame=source.config.sizes.frame),
         scalars=adapting.settling(source.config.scalars, eps),
@@ -114,7 +126,8 @@ def _order(source: PolicySource, code: Any, named: str | None, asked: Adapt[Any]
     if code is not None and asked.base != Base(policy=source.default_policy):
         raise UserError(f"--base.… chooses among the lanes of a folder, and {named} is none: leave it out")
     return Order(
-        source=source,
+        source=source.on(asked.robot),
+        robot=asked.robot,
         code=code,
         named=named,
         world=asked.task,

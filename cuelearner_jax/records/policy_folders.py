@@ -47,8 +47,8 @@ def writing(folder: Path, overwrite: bool) -> Iterator[Path]:
     Raises UserError as `check_free`.
     """
     check_free(folder, overwrite)
-    temporary = folder.with_name(folder.name + TEMPORARY)
-    shutil.rmtree(temporary, ignore_errors=True)  # of a process that was killed
+    folder = folder.resolve()  # what a link leads to, not the link
+    temporary = folder.with_name(f"{folder.name}.{os.getpid()}{TEMPORARY}")
     temporary.mkdir(parents=True)
     try:
         yield temporary

@@ -57,6 +57,7 @@ class Order:
     code: Any  # a policy from outside, to be adapted in place of one of the source's; None: none
     named: str | None  # package.module:NAME of the code, its own or that in the source's folder
     world: Any  # the changed world, a configuration of the task's
+    robot: str | None  # the source's task acts with it; None: its own
     out: Path
     labels: tuple[int, ...]
     bounds_deg: tuple[float, ...]  # none: as far as the labels of the file reach, or else `adapting.BOUND_DEG`
@@ -109,8 +110,8 @@ def run(order: Order, watch: Callable[[str], Tell] = lambda what: untold) -> Ada
         labels = label_files.for_lanes(file, lanes.seed, lanes.budget, slots)
     found = adapting.adapt(asked, teacher, labels, watch=watch)
     path = order.labels_from
-    named = f"{path.name} {label_files.digest(path)}" if path else None
-    adapted.write(order.out, found, task, order.world, origin, named, order.overwrite)
+    used = {"labels_from": f"{path.name} {label_files.digest(path)}" if path else None, "robot": order.robot}
+    adapted.write(order.out, found, task, order.world, origin, used, order.overwrite)
     return found
 
 

@@ -111,7 +111,7 @@ def write(
     task: Task,
     world: Any,
     origin: dict[str, Any],
-    labels_from: str | None = None,
+    used: dict[str, str | None] | None = None,
     overwrite: bool = False,
 ) -> None:
     """Writes a policy folder.
@@ -121,7 +121,7 @@ def write(
         adapted: the lanes.
         task, world: in which they were adapted.
         origin: what was adapted, in plain values: "folder" and which lanes of it, or "code".
-        labels_from: the label file that was used, if one was.
+        used: what else led to it, by name: the label file, another robot.
         overwrite: may it take the place of another policy folder?
 
     Raises:
@@ -153,7 +153,7 @@ def write(
             "before": _plain(judged.before),
             "after": _plain(judged.after),
         },
-        "labels_from": labels_from,
+        **{name: value for name, value in (used or {}).items() if value},
         "observation": [quantity._asdict() for quantity in env.observation],
         "conventions": CONVENTIONS,
         **provenance(),

@@ -130,8 +130,7 @@ def test_a_function_is_adapted_and_its_folder_evaluated(adapted, tmp_path):
 def test_labels_lie_beside_and_lead_to_the_same_policy(adapted, tmp_path):
     file = adapted / "labels-45deg.parquet"
     assert len(label_files.read(file).seeds) == 80
-    scalars = ["--scalars.eps-deg", "3", "--scalars.tau-deg", "0.1"]
-    command = [*CODE, *scalars, "--bound-deg", "45", "--labels", "20", "80", "--labels-from", str(file)]
+    command = [*CODE, "--bound-deg", "45", "--labels", "20", "80", "--labels-from", str(file)]
     assert main([*command, "--out", str(tmp_path / "again")]) == 0
     code = importlib.import_module("own_turned").straight
     both = [cl.load_policy(f, task="own_turned:TASK", base=code).policy for f in (adapted, tmp_path / "again")]
