@@ -71,7 +71,7 @@ $(VENV)/.documented: $(VENV)/.tested
 	@touch $@
 
 docs: $(VENV)/.documented
-	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
 
 bench: $(VENV)/.tested
 	$(BIN)/python benchmarks/billiards_speed.py
