@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 UV := $(BIN)/python -m uv
 UV_VERSION := $(shell sed -n 's/^uv==\([0-9.]*\).*/\1/p' constraints.txt)
 
-.PHONY: help setup quickstart smoke test test-quick fuzz lint format bench constraints clean
+.PHONY: help setup quickstart smoke test test-quick fuzz lint format docs bench constraints clean
 help:
 	@echo "make quickstart   train, report and film the small billiards example (two to three minutes)"
 	@echo "make test         run the tests (about 17 minutes on 2 idle cores)"
@@ -14,6 +14,7 @@ help:
 	@echo "make fuzz         damaged run folders by chance, CASES=2000 SEED=0 (hours on 2 cores)"
 	@echo "make lint         ruff and pyright"
 	@echo "make format       what ruff can put right by itself"
+	@echo "make docs         the pages of docs/ as a site, in site/ (under half a minute)"
 	@echo "make bench        the benchmarks of this machine (some minutes)"
 	@echo "make setup        only the set-up of all of these, in $(VENV)"
 	@echo "make constraints  resolve the pinned versions anew"
@@ -65,6 +66,13 @@ format: $(VENV)/.tested
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
+$(VENV)/.documented: $(VENV)/.tested
+	$(UV) pip install --python $(BIN)/python --constraints constraints.txt --group docs
+	@touch $@
+
+docs: $(VENV)/.documented
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
+
 bench: $(VENV)/.tested
 	$(BIN)/python benchmarks/billiards_speed.py
 	$(BIN)/python benchmarks/training_speed.py
@@ -72,7 +80,7 @@ bench: $(VENV)/.tested
 	$(BIN)/python benchmarks/lidar_parity.py
 
 constraints: $(BIN)/uv
-	$(UV) pip compile --quiet --upgrade --universal --python-version 3.11 --all-extras --group dev --no-annotate --no-header \
+	$(UV) pip compile --quiet --upgrade --universal --python-version 3.11 --all-extras --group dev --group docs --no-annotate --no-header \
 		--no-emit-index-url --no-emit-find-links pyproject.toml --output-file constraints.txt
 
 clean:

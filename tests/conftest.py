@@ -47,7 +47,7 @@ def strict_ranks(request):
 # their own to wait for.
 SLOW = (
     *("adaptation", "bench", "brax_bridge", "cli", "envs/anymal", "examples", "face", "teachers", "testing"),
-    "experiments/test_bootstrapping.py",
+    *("experiments/test_bootstrapping.py", "export/test_decisions.py", "records/test_tracking.py"),
     *("agent/test_choice.py", "agent/test_n_step.py", "records/test_checkpoint.py", "runs/test_runs.py"),
     *("runs/test_failures.py", "runs/test_given_labels.py", "runs/test_lanes.py", "runs/test_resume.py"),
     *("envs/billiards/test_environment.py", "envs/billiards/test_mirrors.py", "envs/billiards/test_parity.py"),
