@@ -132,7 +132,7 @@ def paced(asked: argparse.Namespace, browser: Browser, work: Path) -> dict[str, 
     """Labels at a pace: every press in the file once, and how long each took."""
     rng, pressed, answered = random.Random(0), {}, 0
     (task,) = asked.task
-    folder = asked.keep or work / task
+    folder = asked.keep or work / "labels"
     began = time.time()
     with served(asked, task, folder, "--labels", str(asked.labels)) as (process, address):
         opened, page = time.time() - began, entered(browser, address)
@@ -174,7 +174,7 @@ def kills(asked: argparse.Namespace, browser: Browser, work: Path) -> dict[str, 
     """The command killed at random moments while keys are pressed, and opened again on the same file."""
     rng, pressed, found = random.Random(1), {}, []
     (task,) = asked.task
-    folder, saved = work / task, 0
+    folder, saved = work / "labels", 0
     for number in range(asked.kills):
         with served(asked, task, folder, "--labels", "2000") as (process, address):
             page = entered(browser, address)
