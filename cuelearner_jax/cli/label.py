@@ -36,8 +36,10 @@ MOST_LABELS = 100_000
 
 @dataclass(frozen=True)
 class Label(Generic[TaskT]):
-    """Label actions in a browser: those of chance, or of a policy (a run folder, a policy folder, package.module:NAME
-    of a function of observations)."""
+    """Label actions of chance, or of a policy, in a browser.
+
+    A policy is named after the task: a run folder, a policy folder, or package.module:NAME of a function of
+    observations."""
 
     task: TaskT
     sizes: GuideSizes
