@@ -5,8 +5,8 @@
     world = cl.make("navigation", style="rooms")           # a task in one configuration
     teacher = cl.teacher_of(world)                          # who answers "more to the left", "already right", ...
     policy = cl.load_policy("docs/data/navigation_agent")   # policy(obs) -> action, of one or many observations
-    model = cl.ask(policy, world, teacher, labels=300)      # answers in rounds, and a model of them
-    better = cl.refine(policy, model)                       # a policy again, within a bound
+    better = cl.adapt(policy, world, teacher, labels=300)   # answers in rounds, a model of them, a policy again
+    better.save("policies/better")                          # a folder that load_policy and every command take
     run = cl.train(world, teacher, "quickstart", seeds=8)   # what `cuelearner sweep` does, results in memory
 
 What these take and give stands in their docstrings. Everything else is a room behind this face.
@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from cuelearner_jax.errors import UserError
     from cuelearner_jax.face.acting import CallablePolicy, load_policy
+    from cuelearner_jax.face.adaptation import AdaptedPolicy, adapt
     from cuelearner_jax.face.feedback import FeedbackModel, Labels, ask, fit_feedback, refine
     from cuelearner_jax.face.training import Run, train
     from cuelearner_jax.face.worlds import World, make, teacher_of
@@ -27,12 +28,14 @@ __version__ = "0.1.0"
 # Where each name lies. They are loaded when they are first used: tasks import the bottom rooms of this package, and the
 # command line needs little of it at a time.
 _PLACES = {
+    "AdaptedPolicy": "face.adaptation",
     "CallablePolicy": "face.acting",
     "FeedbackModel": "face.feedback",
     "Labels": "face.feedback",
     "Run": "face.training",
     "UserError": "errors",
     "World": "face.worlds",
+    "adapt": "face.adaptation",
     "ask": "face.feedback",
     "fit_feedback": "face.feedback",
     "load_policy": "face.acting",
@@ -43,12 +46,14 @@ _PLACES = {
 }
 
 __all__ = [
+    "AdaptedPolicy",
     "CallablePolicy",
     "FeedbackModel",
     "Labels",
     "Run",
     "UserError",
     "World",
+    "adapt",
     "ask",
     "fit_feedback",
     "load_policy",

@@ -27,6 +27,10 @@ class Quantity(NamedTuple):
     about: str = ""  # what it is, where from and in which order, in a few words
 
 
+# What `actions.DIRECTIONS` are, where an environment does not say more by its own `action`.
+DIRECTION = Quantity("direction", 2, "1", "unit vector (x, y) in the frame of the observation")
+
+
 class Features(NamedTuple):
     """An observation as it looks from actions. Networks take the two parts where they take observation and action."""
 
@@ -168,6 +172,11 @@ def offers(env: Any, name: str) -> bool:
 def actions_of(env: Any) -> Actions:
     """What an environment takes for actions: its `actions`, or directions in the plane."""
     return getattr(env, "actions", DIRECTIONS)
+
+
+def action_of(env: Any) -> Quantity:
+    """What an action is, in words: an environment's own `action`, or a direction."""
+    return getattr(env, "action", DIRECTION)
 
 
 class Spaces(NamedTuple):

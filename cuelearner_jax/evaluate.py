@@ -125,8 +125,8 @@ def _structure(policy: Policy) -> _Structure:
     return found
 
 
-def one_lane(policy: Policy, index: int) -> Any:
-    """One lane's policy out of a block's."""
+def one_lane(policy: Policy, index: int | ArrayLike) -> Any:
+    """One lane's policy out of a block's; by several indices (lanes,), a block of these lanes."""
     structure = _structure(policy)
     each, shared = structure.take_apart(policy)
     return structure.put_together([jnp.asarray(leaf)[index] for leaf in each], shared)

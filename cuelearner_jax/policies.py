@@ -6,6 +6,7 @@ A policy's `act` sees many environments at once. Its `axes` say which of its lea
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable
 from typing import Any, Protocol, runtime_checkable
 
@@ -18,7 +19,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from cuelearner_jax import types
 from cuelearner_jax.actions import DIRECTIONS, Actions
 from cuelearner_jax.agent.choice import greedy_actions
-from cuelearner_jax.config import AgentSizes, GuideScalars
+from cuelearner_jax.config import AgentSizes, GuideScalars, GuideSizes
 from cuelearner_jax.devices import portions
 from cuelearner_jax.environment import actions_of
 from cuelearner_jax.errors import UserError
@@ -113,6 +114,7 @@ class Guided(struct.PyTreeNode):
     scalars: GuideScalars
     guidance: Guidance = struct.field(pytree_node=False)
     bound: Float[Array, ""] | None = None  # to the way from the base's actions [rad]; None: wherever guidance leads
+    sizes: GuideSizes | None = struct.field(pytree_node=False, default=None)  # of the guidance: needed to store it
 
     def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
         """The base's actions as the guidance has them."""
@@ -124,8 +126,24 @@ class Guided(struct.PyTreeNode):
 
     @property
     def axes(self) -> Guided:
-        """Each lane has its own base and model."""
-        return self.replace(base=self.base.axes, model=BY_LANE, env=SHARED, scalars=SHARED, bound=SHARED)
+        """Each lane has its own base and model, and its own bound where there is more than one."""
+        bound = SHARED if self.bound is None or jnp.ndim(self.bound) == 0 else BY_LANE
+        return self.replace(base=self.base.axes, model=BY_LANE, env=SHARED, scalars=SHARED, bound=bound)
+
+
+class Common(struct.PyTreeNode):
+    """One policy that all lanes of a block share, whatever it is made of."""
+
+    policy: Any
+
+    def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
+        """What the policy does."""
+        return self.policy.act(key, states, obs)
+
+    @property
+    def axes(self) -> Common:
+        """No lane has anything of its own."""
+        return self.replace(policy=SHARED)
 
 
 class Corrected(struct.PyTreeNode):
@@ -195,7 +213,8 @@ class Opaque(struct.PyTreeNode):
         """What the function gives. Raises UserError if that has another shape."""
         if self.on_host:
             # Asked once while tracing: a complaint from inside a compiled program would be pages long.
-            self._called(np.zeros(obs.shape, obs.dtype))
+            with jax.ensure_compile_time_eval():  # the function may compute with JAX itself
+                self._called(np.zeros(obs.shape, obs.dtype))
             shape = jax.ShapeDtypeStruct((obs.shape[0], self.actions.size), jnp.float32)
             chosen = jax.pure_callback(self._called, shape, obs, vmap_method="expand_dims")
         else:
@@ -220,6 +239,44 @@ class Opaque(struct.PyTreeNode):
     def axes(self) -> Opaque:
         """It has nothing that JAX knows of."""
         return self
+
+
+def policy_of(given: Any) -> Any:
+    """Anything that acts as a policy.
+
+    Args:
+        given: a policy; a class or function that gives one when it is called with nothing; or a function of a batch of
+            observations: one that `jax.jit` made is compiled with what calls it, any other gets NumPy arrays.
+
+    Raises:
+        UserError: it is none of these, or a policy that is no pytree.
+    """
+    if callable(given) and not (hasattr(given, "act") and not isinstance(given, type)) and _takes_nothing(given):
+        given = given()
+    if hasattr(given, "act"):
+        if any(leaf is given for leaf in jax.tree.leaves(given)):
+            kind = type(given).__name__
+            raise UserError(
+                f"a {kind} has `act` but is no pytree: make it a flax.struct.PyTreeNode, or give a function"
+            )
+        return given
+    if isinstance(given, jax.stages.Wrapped):
+        return Opaque(given)
+    if callable(given):
+        return Opaque(given, on_host=True)
+    raise UserError(f"a {type(given).__name__} is no policy: give a function of observations (n, obs), or load one")
+
+
+def _takes_nothing(given: Callable[..., Any]) -> bool:
+    """Can it be called without arguments?"""
+    try:
+        parameters = inspect.signature(given).parameters.values()
+    except (TypeError, ValueError):  # of code that is not Python's
+        return False
+    variable = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
+    return all(one.default is not one.empty for one in parameters if one.kind not in variable) and not any(
+        one.kind in variable for one in parameters
+    )
 
 
 class Teaching(struct.PyTreeNode):

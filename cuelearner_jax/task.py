@@ -71,6 +71,7 @@ class Scenario:
     about: str
     changes: dict[str, Any]  # fields of the task's configuration
     bound_deg: float | None = None  # suggested bound of an adapted policy's corrections [deg]
+    eps_deg: float | None = None  # suggested strength of a label in it [deg]
 
     def applied(self, config: Any) -> Any:
         """The configuration with the changes in it."""

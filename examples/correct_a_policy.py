@@ -3,7 +3,7 @@
     python examples/correct_a_policy.py
 
 The policy walks to the goal with a compass that is 40 degrees off. Prints its success rate and that of the refined one
-over validation episodes. Two to three minutes on 2 cores.
+over validation episodes. A few minutes on 2 cores.
 """
 
 import numpy as np
@@ -21,12 +21,20 @@ def compass(obs):
     return obs[:, 271:273] @ TURN.T
 
 
-def main(worlds=64, labels=200, episodes_measured=100):
+def main(worlds=64, labels=200, episodes_judged=100, episodes_measured=100):
     """Success rates before and after so many answers."""
     world = cl.make("navigation", style="clutter", worlds=worlds)
     teacher = cl.teacher_of(world)
-    model = cl.ask(compass, world, teacher, labels=labels, eps_deg=20.0, bound_deg=90.0)
-    better = cl.refine(compass, model)
+    better = cl.adapt(
+        compass,
+        world,
+        teacher,
+        labels=labels,
+        eps_deg=20.0,
+        bound_deg=90.0,
+        judge_by="success",
+        judge_episodes=episodes_judged,
+    )
     env, key = world.environment("validation"), episodes()
     rates = []
     for name, policy in (("compass", as_policy(compass)), ("refined", better.policy)):

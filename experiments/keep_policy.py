@@ -1,12 +1,12 @@
-"""One lane of a trained run as a run folder of its own, without replay: small enough to keep and to render.
+"""Lanes of a trained run as a run folder of its own, without replay: small enough to keep, to render and to adapt.
 
-python experiments/keep_policy.py runs/navigation/relative-500 --seed 1000 --out runs/walker
+python experiments/keep_policy.py runs/navigation/relative-500 --seeds 1000 --out runs/walker
 """
 
 from __future__ import annotations
 
 import argparse
-import json
+from collections.abc import Sequence
 from pathlib import Path
 
 import jax
@@ -21,30 +21,32 @@ from cuelearner_jax.runs.trained import Lanes, PolicySource
 from cuelearner_jax.tasks import registry
 
 
-def keep(run: Path, out: Path, seed: int, kind: str | None, labels: int | None) -> None:
-    """Writes the run folder `out`. Raises UserError if the run has no such lane or `out` is in use."""
+def keep(run: Path, out: Path, seeds: Sequence[int], kind: str | None, labels: int | None) -> None:
+    """Writes the run folder `out`. Raises UserError if the run has not these lanes or `out` is in use."""
     if out.exists():
         raise UserError(f"{out} exists: give another --out")
     task, config, grid = load(run, registry.find)
     lanes = PolicySource(task, config, grid, run).load((kind or grid.guidance[-1],))[0]
     budget = int(lanes.budgets.max()) if labels is None else labels
-    found = np.flatnonzero((lanes.seeds == seed) & (lanes.budgets == budget))
-    if not len(found):
-        raise UserError(f"{run} has no lane of seed {seed} with {budget} labels")
+    rows = {int(lanes.seeds[row]): row for row in np.flatnonzero(lanes.budgets == budget)}
+    if missing := [seed for seed in seeds if seed not in rows]:
+        raise UserError(f"{run} has no lane of seed {missing[0]} with {budget} labels")
     described = formats.read("config", run / "config.json")
-    described["grid"] = {"guidance": [lanes.guidance.name], "seeds": [seed], "labels": [budget]}
+    described["grid"] = {"guidance": [lanes.guidance.name], "seeds": list(seeds), "labels": [budget]}
     out.mkdir(parents=True)
-    (out / "config.json").write_text(json.dumps(described, indent=1) + "\n")
-    write(out / lanes.guidance.name, lanes, int(found[0]))
+    formats.write("config", out / "config.json", described)
+    write(out / lanes.guidance.name, lanes, np.array([rows[seed] for seed in seeds]))
 
 
-def write(folder: Path, lanes: Lanes, index: int) -> None:
-    """The checkpoint of one lane's policy."""
-    policy = jax.tree.map(lambda leaf: leaf[index : index + 1], lanes.policies)
+def write(folder: Path, lanes: Lanes, rows: np.ndarray) -> None:
+    """The checkpoint of some lanes' policies."""
+    kept = jax.tree.map(lambda leaf: leaf[rows], lanes.policies)
+    policy, failed = {name: kept[name] for name in ("params", "guidance")}, kept["failed"]
     clock = start_clock().replace(step=np.int32(lanes.step))
-    cut = np.array([1, 1], np.int32)  # one block of one lane
+    cut = np.array([1, len(rows)], np.int32)  # one block of all lanes
     with checkpoints(folder / "checkpoints") as saved:
-        saved.save(lanes.step, {"policy": [policy], "clock": {"clock": clock, "wall_s": np.float32(0), "cut": cut}})
+        told = {"clock": clock, "wall_s": np.float32(0), "cut": cut}
+        saved.save(lanes.step, {"policy": [policy], "failed": [failed], "clock": told})
 
 
 def main() -> int:
@@ -52,12 +54,12 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("run", type=Path)
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--seed", type=int, required=True)
+    parser.add_argument("--seeds", type=int, nargs="+", required=True)
     parser.add_argument("--guidance", help="kind (default: the run's last)")
     parser.add_argument("--labels", type=int, help="budget (default: the largest)")
     asked = parser.parse_args()
     try:
-        keep(asked.run, asked.out, asked.seed, asked.guidance, asked.labels)
+        keep(asked.run, asked.out, asked.seeds, asked.guidance, asked.labels)
     except UserError as error:
         parser.error(str(error))
     return 0

@@ -22,7 +22,7 @@ ROWS = [
     ["policies"],
     ["asking", "evaluate"],
     ["export"],
-    ["loop", "adapt"],
+    ["loop", "adaptation"],
     ["teachers"],
     ["runs"],
     ["report"],

@@ -24,7 +24,10 @@ from cuelearner_jax.tasks import registry
 from cuelearner_jax.terminal import Interrupted, abandon, console
 
 # Each is a file beside this one with `run(arguments)` and `OPTIONS`, the options of what it does by its full name.
-COMMANDS = ("train", "sweep", "evaluate", "report", "render", "label", "labels", "teacher", "bench", "locomotion")
+COMMANDS = (
+    *("train", "sweep", "adapt", "evaluate", "report", "render", "label", "labels", "export"),
+    *("teacher", "bench", "locomotion"),
+)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -13,14 +13,15 @@ from cuelearner_jax.cli.parsing import about, out, parse, source_of, world_of
 from cuelearner_jax.cli.shared_options import TaskT
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import Tell
-from cuelearner_jax.runs import trained
+from cuelearner_jax.runs import measured
+from cuelearner_jax.runs.measured import Measured
 from cuelearner_jax.task import Task
 from cuelearner_jax.terminal import console, progress_bars
 
 
 @dataclass(frozen=True)
 class Evaluate(Generic[TaskT]):
-    """Validate a run's newest checkpoints, or a task's teacher, heuristic or chance; in any changed world."""
+    """Validate a run, an adapted policy, or a task's teacher, heuristic or chance; in any changed world."""
 
     task: TaskT
     policy: str = "agent"
@@ -42,7 +43,8 @@ class Evaluate(Generic[TaskT]):
     scenario: str | None = None
     """The changed world of this name, see above; options of the task (--task.…) come on top of it."""
     out: Path | None = None
-    """Also write the measurements to this JSON file."""
+    """Also write the measurements to this JSON file. (Beside all these: --base package.module:NAME gives the code of a
+    policy folder that has some.)"""
 
 
 MOST_ENVS = 100_000  # that memory has room for
@@ -55,7 +57,7 @@ def run(arguments: list[str]) -> None:
     """Runs the command. Raises UserError for what cannot be evaluated."""
     source, rest = source_of(arguments, "evaluate", Evaluate)
     kind = Evaluate[source.task.config]  # pyright: ignore[reportInvalidTypeArguments]
-    default = kind(world_of(source, rest), policy="agent" if source.grid else "heuristic")
+    default = kind(world_of(source, rest), policy=source.default_policy)
     asked = parse(kind, rest, f"evaluate {source.folder}", default, about(Evaluate, source.task, policies=True))
     source = source.on(asked.robot)
     engine = source.task.engine(asked.engine)
@@ -69,15 +71,15 @@ def run(arguments: list[str]) -> None:
             bar = bars.add_task(kind, total=None, note="")
             return lambda done, count: bars.update(bar, completed=done, total=count)
 
-        measured = trained.evaluate(source, asked.task, asked.policy, asked.guidance, envs, steps, engine, watch)
+        found = measured.evaluate(source, asked.task, asked.policy, asked.guidance, envs, steps, engine, watch)
     told = {"robot": asked.robot, "engine": asked.engine, "scenario": asked.scenario}
     told = {name: value for name, value in told.items() if value}
     robot = {"robot_digest": digest} if (digest := source.task.bodies[0].digest) else {}
     amount = f"{steps:,} steps a lane" if source.task.longest is None else f"{envs:,} episodes a lane"
     if asked.out:  # first: whoever reads the table may leave before its end
-        trained.write(asked.out, source, asked.task, asked.policy, envs, steps, measured, {**told, **robot})
-    out.print(_measurements(measured, ", ".join([asked.policy, *told.values(), amount])))
-    if any((row.metrics.get("finished", np.ones(1)) < 1).any() for row in measured):
+        measured.write(asked.out, source, asked.task, asked.policy, envs, steps, found, {**told, **robot})
+    out.print(_measurements(found, ", ".join([asked.policy, *told.values(), amount])))
+    if any((row.metrics.get("finished", np.ones(1)) < 1).any() for row in found):
         console.print("not every first episode has ended, so outcomes have no mean: give more --steps")
     if asked.out:
         out.print(f"wrote {asked.out}")
@@ -107,22 +109,23 @@ def _work(task: Task, asked: Evaluate[Any]) -> tuple[int, int]:
     return envs, steps
 
 
-def _measurements(measured: list[trained.Measured], title: str) -> Table:
+def _measurements(found: list[Measured], title: str) -> Table:
     """Interquartile means over seeds with their intervals, a row for each guidance and budget."""
     from cuelearner_jax.report.statistics import interval
 
     table = Table("guidance", "labels", "seeds", "steps", "metric", "mean", "95% interval", title=title)
     for column in table.columns:
         column.no_wrap = True
-    for row in measured:
+    for row in found:
         own = [row.guidance, str(row.labels), str(len(row.seeds)), str(row.step)]
+        below = "" if row.bound_deg is None else f"≤ {row.bound_deg:g} deg"
         for name, values in row.metrics.items():
             if np.isfinite(values).all():
-                found = interval(values)
-                spread = f"{float(found.lower):.3f} to {float(found.upper):.3f}" if len(values) > 1 else ""
-                table.add_row(*own, name, f"{float(found.estimate):.3f}", spread)
+                of = interval(values)
+                spread = f"{float(of.lower):.3f} to {float(of.upper):.3f}" if len(values) > 1 else ""
+                table.add_row(*own, name, f"{float(of.estimate):.3f}", spread)
             else:
                 table.add_row(*own, name, "none", f"of {len(values)}, {int(np.isfinite(values).sum())} have one")
-            own = [""] * len(own)
+            own, below = [below] + [""] * (len(own) - 1), ""
         table.add_section()
     return table

@@ -16,8 +16,11 @@ from typing import Any
 import tyro
 from rich.console import Console
 
+from cuelearner_jax import plugins
 from cuelearner_jax.errors import UserError, closest, no_space
 from cuelearner_jax.guidance import registry as guidances
+from cuelearner_jax.policies import policy_of
+from cuelearner_jax.records import policy_folders
 from cuelearner_jax.runs.trained import POLICIES, PolicySource
 from cuelearner_jax.task import Preset, Task
 from cuelearner_jax.tasks import registry
@@ -159,28 +162,35 @@ def _default_preset(task: Task) -> str:
 
 
 def source_of(arguments: list[str], command: str, kind: type) -> tuple[PolicySource, list[str]]:
-    """The run folder or task named first, and the other arguments; --task makes a task from outside known.
+    """The run folder, policy folder or task named first, and the other arguments.
+
+    --task makes a task from outside known, and --base the code in a policy.
 
     Raises:
-        UserError: there is no such run or task, or it cannot be had.
+        UserError: there is no such folder or task, or it cannot be had.
     """
     given, rest = _task_option(arguments)
     known = None if given is None else registry.resolve(given)
+    reference, rest = taken(rest, "--base", "package.module:NAME")
+    code = None if reference is None else code_of(reference)
     if known is None and (not rest or rest[0] in HELP):
-        print(f"usage: cuelearner {command} RUN_FOLDER|TASK [OPTIONS]\n\n{summary(kind)}\n\n{_tasks()}\n")
+        print(f"usage: cuelearner {command} FOLDER|TASK [OPTIONS]\n\n{summary(kind)}\n\n{_tasks()}\n")
         print(f"options and their defaults: cuelearner {command} {registry.names()[0]} --help")
         raise SystemExit(0 if arguments else 2)
     if rest and (known is None or not rest[0].startswith("-")):
         name, rest = rest[0], rest[1:]
         folder = Path(name)
-        if (folder / "config.json").exists() or (folder.exists() and name not in registry.names()):
-            return _run(folder, known), rest
+        holds = (folder / "config.json").exists() or policy_folders.is_one(folder)
+        if holds or (folder.exists() and name not in registry.names()):
+            return _of_folder(folder, known, code), rest
         if known is not None:
             raise UserError(f"{name!r} is no run folder of the task {known.name}: give one, or leave it out")
         if ":" not in name and name not in registry.names():
             raise UserError(f"{name!r} is neither a run folder nor a task ({', '.join(registry.names())})")
         known = registry.resolve(name)
     assert known is not None  # otherwise the first argument was taken for its name
+    if code is not None:
+        raise UserError("--base names the code in a policy folder: give that folder, or leave it out")
     _, preset, rest = preset_of(known, rest)
     return PolicySource(known, preset.config, None, Path(known.name)), rest
 
@@ -200,8 +210,10 @@ def about(kind: type, task: Task, policies: bool = False) -> str:
     groups = {"guidance (--guidance; your own as package.module:NAME)": {k.name: k.about for k in guidances.known()}}
     if policies:
         trained = {name: named.about for name, named in POLICIES.items() if named.trained}
-        untrained = {name: named.about for name, named in POLICIES.items() if not named.trained}
-        groups |= {"policies of a run (--policy)": trained, "policies of a run or a task alone": untrained}
+        adapted = {name: named.about for name, named in POLICIES.items() if named.adapted}
+        untrained = {name: named.about for name, named in POLICIES.items() if not named.kept}
+        groups |= {"policies of a run (--policy)": trained, "policies of a policy folder": adapted}
+        groups |= {"policies of any folder or a task alone": untrained}
     told = [summary(kind), _choices(task), *(f"{title}:\n{_rows(rows)}" for title, rows in groups.items())]
     return "\n\n".join(told)
 
@@ -210,11 +222,17 @@ def _task_option(arguments: list[str]) -> tuple[str | None, list[str]]:
     return taken(arguments, "--task", f"{', '.join(registry.names())}, or package.module:name")
 
 
-def _run(folder: Path, known: Task | None) -> PolicySource:
-    """A run folder. Raises UserError if it is none, or of another task than the one named beside it."""
-    source = PolicySource.of_run(folder, registry.find)
+def code_of(reference: str) -> Any:
+    """The policy that `package.module:NAME` leads to. Raises UserError if there is none (`policies.policy_of`)."""
+    return policy_of(plugins.load(reference, object, "a policy"))
+
+
+def _of_folder(folder: Path, known: Task | None, code: Any) -> PolicySource:
+    """A run or policy folder. Raises UserError if it is none, or of another task than the one named beside it."""
+    source = PolicySource.of_folder(folder, registry.find, code)
     if known is not None and known.name != source.task.name:
-        raise UserError(f"{folder} is a run of {source.task.name}, not of {known.name}: leave out --task")
+        what = "a run" if source.grid else "a policy"
+        raise UserError(f"{folder} is {what} of {source.task.name}, not of {known.name}: leave out --task")
     return source
 
 
@@ -241,7 +259,7 @@ def _choices(task: Task) -> str:
     default = f"; {_default_preset(task)} where none is given" if presets else ""
     groups = {
         f"presets (--preset{default})": presets,
-        "changed worlds (--scenario of evaluate and render)": scenarios,
+        "changed worlds (--scenario of adapt, evaluate and render)": scenarios,
         "robots (--robot of evaluate and render)": bodies,
     }
     # A line that is not indented would be taken for the end of the one above: the groups stand apart.

@@ -26,6 +26,8 @@ class Render(Generic[TaskT]):
     """Kind of guidance of the run (default: its last)."""
     labels: int | None = None
     """Label budget of the lane (default: the largest)."""
+    bound_deg: float | None = None
+    """Bound of a policy folder's lane (default: the largest) [deg]."""
     seed: int | None = None
     """Seed of the lane (default: the first)."""
     steps: int = 4
@@ -55,10 +57,11 @@ def run(arguments: list[str]) -> None:
     """Runs the command. Raises UserError for what cannot be drawn."""
     source, rest = source_of(arguments, "render", Render)
     kind = Render[source.task.config]  # pyright: ignore[reportInvalidTypeArguments]
-    default = kind(world_of(source, rest), Path("pictures"), policy="agent" if source.grid else "heuristic")
+    default = kind(world_of(source, rest), Path("pictures"), policy=source.default_policy)
     asked = parse(kind, rest, f"render {source.folder}", default, about(Render, source.task, policies=True))
     source = source.on(asked.robot)
-    source.check(asked.policy, asked.task, guidance=asked.guidance, labels=asked.labels, seed=asked.seed)
+    lane = {"guidance": asked.guidance, "labels": asked.labels, "seed": asked.seed, "bound-deg": asked.bound_deg}
+    source.check(asked.policy, asked.task, **lane)
     for name, least, most in (("steps", 1, MOST_STEPS), ("episode", 0, MOST_EPISODE)):
         if not least <= getattr(asked, name) <= most:
             raise UserError(f"--{name} is {getattr(asked, name)}: give a number from {least} to {most:,}")
@@ -69,7 +72,9 @@ def run(arguments: list[str]) -> None:
     filming.check_free(*wanted, overwrite=asked.overwrite)
     pictures = source.task.pictures()
     env = source.task.environment(asked.task, "validation")
-    policy = trained.one_policy(source, env, asked.task, asked.policy, asked.guidance, asked.labels, asked.seed)
+    policy = trained.one_policy(
+        source, env, asked.task, asked.policy, asked.guidance, asked.labels, asked.seed, asked.bound_deg
+    )
     if asked.question:
         filming.question(pictures, env, policy, asked.episode, files.question)
         out.print(f"wrote {files.question}")

@@ -7,11 +7,10 @@ from pathlib import Path
 from typing import Generic, Literal
 
 from cuelearner_jax.cli.parsing import about, out, parse, preset_of, task_of
-from cuelearner_jax.cli.shared_options import TaskT, Training, preset_kinds
-from cuelearner_jax.errors import UserError
+from cuelearner_jax.cli.shared_options import TaskT, Training, preset_kinds, seeds_of
 from cuelearner_jax.runs import submission, sweep
 from cuelearner_jax.runs.cluster import Job
-from cuelearner_jax.runs.grid import LARGEST_SEED, Grid
+from cuelearner_jax.runs.grid import Grid
 from cuelearner_jax.runs.order import Plan, planned
 from cuelearner_jax.runs.shards import Shard
 
@@ -56,7 +55,7 @@ def run(arguments: list[str]) -> None:
         first_seed=preset.first_seed,
     )
     asked = parse(kind, rest, f"sweep {task.name}", default, about(Sweep, task))
-    grid = Grid(asked.guidance, _seeds(asked.first_seed, asked.seeds), asked.labels)
+    grid = Grid(asked.guidance, seeds_of(asked.first_seed, asked.seeds), asked.labels)
     submission.check(asked.cluster, asked.shards, asked.job, asked.shard, asked.overwrite, asked.out)
     if asked.cluster:
 
@@ -68,14 +67,3 @@ def run(arguments: list[str]) -> None:
     shard = Shard.parse(asked.shard) if asked.shard else None
     sweep.run(asked.order(task, grid, shard))
     out.print(asked.done)
-
-
-def _seeds(first: int, count: int) -> tuple[int, ...]:
-    """Raises UserError, before any is made, where there are none or more than there can be."""
-    if count < 1:
-        raise UserError(f"--seeds is {count}: give --seeds of at least 1")
-    if first < 0 or first + count > LARGEST_SEED:
-        raise UserError(
-            f"--seeds {count} from --first-seed {first} on: seeds are numbers from 0 to {LARGEST_SEED - 1}, give others"
-        )
-    return tuple(range(first, first + count))

@@ -148,6 +148,10 @@ class GuideScalars(_Degrees, _Clipping):
     """Share of the questions that a guide which values actions asks about base actions even so, to find good ones."""
     correction_replay: int = 50
     """Newest corrections that a guide which goes on learning (deep COACH) keeps learning from."""
+    aim_share: float = 1.0
+    """A guide that reads intent takes the nearest of the aims at least this share as likely as the likeliest."""
+    aim_doubt: float = 2.0
+    """It leaves actions as they are where it is at least so many times likelier that no aim is meant."""
     ask_bound_deg: float = 180.0
     """From the second instalment on: questions and guided episodes stay within this of the agent's own action [deg]."""
     guided_probability: float = 0.5

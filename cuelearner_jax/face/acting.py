@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from cuelearner_jax.environment import Quantity
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.face.worlds import World
-from cuelearner_jax.policies import Opaque, Policy
+from cuelearner_jax.policies import Policy, policy_of
 from cuelearner_jax.runs import trained
 from cuelearner_jax.task import Task, shape_of
 from cuelearner_jax.tasks import registry
@@ -69,50 +68,51 @@ class CallablePolicy:
 
 
 def as_policy(given: Any) -> Policy:
-    """Anything that acts as a policy: a `CallablePolicy`, a policy, or a function of a batch of observations in NumPy.
+    """Anything that acts as a policy: a `CallablePolicy`, or what `policies.policy_of` takes.
 
     Raises UserError for what is none of them.
     """
-    if isinstance(given, CallablePolicy):
-        return given.policy
-    if hasattr(given, "act"):
-        return given
-    if isinstance(given, Callable):
-        return Opaque(given, on_host=True)
-    raise UserError(f"a {type(given).__name__} is no policy: give a function of observations (n, obs), or load one")
+    return given.policy if isinstance(given, CallablePolicy) else policy_of(given)
 
 
 def load_policy(
     folder: str | Path,
     *,
-    policy: str = "agent",
+    policy: str | None = None,
     guidance: str | None = None,
     labels: int | None = None,
+    bound_deg: float | None = None,
     seed: int | None = None,
+    base: Any = None,
     task: Task | str | None = None,
     world: World | None = None,
 ) -> CallablePolicy:
-    """What a lane of a finished run acts with.
+    """What a lane of a finished run acts with, or of a policy folder (`adapt`).
 
     Args:
-        folder: of the run, or of a sweep in pieces.
-        policy: "agent", "guided" or another that `cuelearner evaluate --help` lists.
+        folder: of the run, or of a sweep in pieces; or the policy folder.
+        policy: "agent", "guided" or another that `cuelearner evaluate --help` lists (default: the trained agent, or the
+            adapted policy).
         guidance: kind of guidance of the lane (default: the run's last).
         labels: its label budget (default: the largest).
+        bound_deg: of a policy folder: its bound [deg] (default: the largest).
         seed: its seed (default: the first).
+        base: the policy that was adapted, where it is code: the folder names it, and does not hold it.
         task: needed for a run of a task from outside the package, whose code is not loaded because a file names it.
         world: where it is to act, for policies that look at more than observations (default: as it was trained).
 
     Raises:
-        UserError: no such run, lane or policy.
+        UserError: no such folder, lane or policy.
     """
     if isinstance(task, str):
         task = registry.resolve(task)
     path = Path(folder)
-    source = trained.PolicySource.of_run(path, lambda name: task if task and task.name == name else registry.find(name))
-    known = source.task
+    code = None if base is None else as_policy(base)
+    find = lambda name: task if task and task.name == name else registry.find(name)  # noqa: E731
+    source = trained.PolicySource.of_folder(path, find, code)
+    known, name = source.task, policy or source.default_policy
     changed = world.config if world else source.config.task
-    source.check(policy, changed)
+    source.check(name, changed)
     env = known.environment(changed)
-    found = trained.one_policy(source, env, changed, policy, guidance, labels, seed)
-    return CallablePolicy(found, shape_of(known, changed).observation, trained.POLICIES[policy].taught)
+    found = trained.one_policy(source, env, changed, name, guidance, labels, seed, bound_deg)
+    return CallablePolicy(found, shape_of(known, changed).observation, trained.POLICIES[name].taught)

@@ -19,8 +19,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from cuelearner_jax import asking
 from cuelearner_jax.actions import DIRECTIONS
+from cuelearner_jax.adaptation import adapting, program
 from cuelearner_jax.agent.learning import all_finite
 from cuelearner_jax.config import GuideSizes, Scalars, check_guide
 from cuelearner_jax.environment import Spaces, spaces_of
@@ -31,12 +31,9 @@ from cuelearner_jax.guidance import given, registry
 from cuelearner_jax.guidance.answers import RELATIVE, check_teacher
 from cuelearner_jax.guidance.bundle import Guidance
 from cuelearner_jax.guidance.relative import KIND
-from cuelearner_jax.policies import Guided
+from cuelearner_jax.policies import Common, Guided
 from cuelearner_jax.records import label_files
 from cuelearner_jax.types import GuidanceModel, Label, Teacher
-
-REACH_QUANTILE = 0.95  # of the distances between labelled actions and a policy's own: how far labels reach from it
-SIZES = GuideSizes(feedback_layers=(128, 128), fit_steps=400, fit_batch_size=64)  # seconds a fit on a CPU
 
 
 class Labels(NamedTuple):
@@ -55,6 +52,8 @@ class FeedbackModel:
     model: GuidanceModel
     scalars: Scalars  # eps of the labels, and how actions are refined
     labels: Labels
+    sizes: GuideSizes  # that the guidance was made with
+    env: Any = None  # says how an observation looks from an action; nobody asks it in the raw frame
 
 
 def fit_feedback(
@@ -88,13 +87,13 @@ def fit_feedback(
         rows = jax.tree.map(lambda leaf: np.asarray(leaf)[own], file.labels)
         labels = Labels(rows.obs, rows.action, rows.answer[:, 0])
     labels = _checked(labels)
-    sizes, scalars = _settings(sizes, scalars, eps_deg)
+    sizes, scalars = settings(sizes, scalars, eps_deg)
     guidance = _relative(sizes, Spaces(labels.obs.shape[1], DIRECTIONS))
     valid = np.ones(len(labels.obs), bool)
     rows = Label(*(jnp.asarray(part) for part in (labels.obs, labels.action, labels.answer[:, None], valid)))
     k_init, k_fit = jax.random.split(jax.random.key(seed))
     fit = jax.jit(lambda key, rows, former, scalars: guidance.fit(key, None, rows, former, scalars))
-    return FeedbackModel(guidance, _finite(fit(k_fit, rows, guidance.init(k_init), scalars)), scalars, labels)
+    return FeedbackModel(guidance, _finite(fit(k_fit, rows, guidance.init(k_init), scalars)), scalars, labels, sizes)
 
 
 def ask(
@@ -127,24 +126,24 @@ def ask(
     """
     if labels < 1:
         raise UserError(f"labels is {labels}: give at least 1")
-    sizes, scalars = _settings(sizes, scalars, eps_deg)
+    sizes, scalars = settings(sizes, scalars, eps_deg)
     check_teacher(teacher, scalars)
-    scalars = _bounded(scalars, bound_deg)
-    base, env = as_policy(policy), world.env
-    guidance = _relative(sizes, spaces_of(env))
-    k_model, k_env, k_lane = jax.random.split(jax.random.key(seed), 3)
-    slots = asking.label_slots(labels, sizes)
-    guide = asking.start(guidance, env, slots, labels, k_model, k_env, sizes.candidates)
+    adapting.check_angles([bound_deg], scalars)
+    env, guidance = world.env, _relative(sizes, spaces_of(world.env))
+    lanes, base = program.product(1, (seed,), (labels,), (bound_deg,)), Common(as_policy(policy))
+    block = program.begin(guidance, sizes, env, lanes)
+    for _ in range(program.rounds(lanes, sizes)):
+        block = program.ask_round(guidance, sizes, env, teacher, scalars, base, block)
+    if block.failed.any():
+        raise diverged()
+    guide = jax.tree.map(lambda leaf: leaf[0], block.guide)
+    return FeedbackModel(guidance, guide.model, scalars, labels_of(guide.labels), sizes, env)
 
-    @jax.jit
-    def one_round(env: Any, teacher: Teacher, base: Any, scalars: Scalars, guide: Any) -> Any:
-        return asking.label_round(guidance, sizes, env, teacher, scalars, base, guide, k_lane)
 
-    for _ in range(slots // sizes.labels_per_round):
-        guide = one_round(env, teacher, base, scalars, guide)
-    given = jax.device_get(guide.labels)
-    asked = Labels(*(np.asarray(part)[given.valid] for part in (given.obs, given.action, given.answer[:, 0])))
-    return FeedbackModel(guidance, _finite(guide.model), scalars, asked)
+def labels_of(rows: Label) -> Labels:
+    """A lane's labels that count, as arrays."""
+    given = jax.device_get(rows)
+    return Labels(*(np.asarray(part)[given.valid] for part in (given.obs, given.action, given.answer[:, 0])))
 
 
 def refine(policy: Any, model: FeedbackModel, bound_deg: float | None = None) -> CallablePolicy:
@@ -161,7 +160,9 @@ def refine(policy: Any, model: FeedbackModel, bound_deg: float | None = None) ->
         UserError: a bound that is no positive angle.
     """
     base = as_policy(policy)
-    reach = max(_reach(base, model), model.scalars.eps_deg)
+    reach = max(adapting.reach(base, model.labels.obs, model.labels.action), model.scalars.eps_deg)
+    if bound_deg is not None and not 0 < bound_deg <= 180:
+        raise UserError(f"bound_deg is {bound_deg}: give an angle above 0 and up to 180")
     if bound_deg is not None and bound_deg > reach * 1.05 and bound_deg > model.scalars.eps_deg:
         warnings.warn(
             f"the labels lie within {reach:.1f} degrees of this policy's own actions, and refinement may lead up to "
@@ -169,34 +170,21 @@ def refine(policy: Any, model: FeedbackModel, bound_deg: float | None = None) ->
             "(cuelearner_jax.ask), or leave out bound_deg",
             stacklevel=2,
         )
-    scalars = _bounded(model.scalars, reach if bound_deg is None else bound_deg)
+    bound = jnp.deg2rad(jnp.float32(reach if bound_deg is None else bound_deg))
     observation = policy.observation if isinstance(policy, CallablePolicy) else ()
-    return CallablePolicy(Guided(base, model.model, None, scalars, model.guidance), observation)
-
-
-def _reach(base: Any, model: FeedbackModel) -> float:
-    """How far from a policy's own actions the labels lie [deg]."""
-    own = CallablePolicy(base)(model.labels.obs)
-    away = np.asarray(DIRECTIONS.distance(jnp.asarray(own), jnp.asarray(model.labels.action)))
-    return float(np.degrees(np.quantile(away, REACH_QUANTILE)))
+    guided = Guided(base, model.model, model.env, model.scalars, model.guidance, bound, model.sizes)
+    return CallablePolicy(guided, observation)
 
 
 def _relative(sizes: GuideSizes, spaces: Spaces) -> Guidance:
     return registry.made_for(KIND, sizes, spaces)
 
 
-def _settings(sizes: GuideSizes | None, scalars: Scalars | None, eps_deg: float | None) -> tuple[GuideSizes, Scalars]:
-    sizes, scalars = sizes or SIZES, scalars or Scalars()
-    if eps_deg is not None:
-        scalars = dataclasses.replace(scalars, eps_deg=eps_deg)
+def settings(sizes: GuideSizes | None, scalars: Scalars | None, eps_deg: float | None) -> tuple[GuideSizes, Scalars]:
+    """Sizes and scalars, by default those of `adapting`. Raises UserError for what cannot work."""
+    sizes, scalars = sizes or adapting.SIZES, adapting.settling(scalars or Scalars(), eps_deg)
     check_guide(sizes, scalars)
     return sizes, scalars
-
-
-def _bounded(scalars: Scalars, bound_deg: float) -> Scalars:
-    if not 0 < bound_deg <= 180:
-        raise UserError(f"bound_deg is {bound_deg}: give an angle above 0 and up to 180")
-    return dataclasses.replace(scalars, tau_max_deg=bound_deg)
 
 
 def _checked(labels: Labels) -> Labels:
@@ -218,5 +206,10 @@ def _checked(labels: Labels) -> Labels:
 def _finite(model: GuidanceModel) -> GuidanceModel:
     """A fitted model. Raises UserError if it is not finite."""
     if not all_finite(model):
-        raise UserError("the fit of the feedback model diverged: lower scalars.feedback_learning_rate")
+        raise diverged()
     return model
+
+
+def diverged() -> UserError:
+    """What is raised where a fit is no longer finite."""
+    return UserError("the fit of the feedback model diverged: lower scalars.feedback_learning_rate")

@@ -5,7 +5,9 @@ likely, the others do not. One network weighs every aim by its features, with th
 the likelihood of the teacher's words, summed over what may have been meant. (Inferring goals from what somebody does or
 says: Baker, Saxe, Tenenbaum, "Action understanding as inverse planning", Cognition 2009.) A pass of refinement goes by
 at most eps toward the likeliest aim and ends there, so precision is the aim's and not the label's. Where the teacher
-seems to mean none of them, actions stay as they are: the same bad shot again and again is worse than the agent's own.
+seems to mean none of them (`aim_doubt`), actions stay as they are: the same bad shot again and again is worse than the
+agent's own. With `aim_share` below 1 the nearest of the aims about as likely is taken, which earns more by itself but
+teaches agents less (docs/results/bootstrapping.md): they learn from a guide that always prefers the same shots.
 """
 
 from __future__ import annotations
@@ -34,7 +36,6 @@ SPREAD_DEG = 1.0  # how far what a teacher means may lie from the aim that descr
 ELSEWHERE = 360  # evenly spaced actions that stand for "it means none of these"
 SLIPS = 0.02  # share of answers that say nothing: any of the words
 WORDS = 3
-DOUBT = 2.0  # where it is so many times likelier that no aim is meant, actions are left as they are
 
 
 class Weights(nn.Module):
@@ -90,12 +91,18 @@ def evidence_of(env: Any, space: Actions, label: Label, eps: Float[Array, ""]) -
     return Evidence(aims.features, aims.possible, jnp.concatenate([of_aims, of_none]), label.valid)
 
 
-def likeliest(
-    share: Float[Array, " aims_and_none"], aims: Float[Array, "aims action"]
+def followed(
+    space: Actions,
+    share: Float[Array, " aims_and_none"],
+    aims: Float[Array, "aims action"],
+    action: Float[Array, " action"],
+    scalars: GuideScalars,
 ) -> tuple[Float[Array, " action"], Bool[Array, ""]]:
-    """The aim of the largest probability, and whether that is enough to be followed."""
-    best = jnp.argmax(share[:-1])
-    return aims[best], DOUBT * share[best] > share[-1]
+    """Of the aims about as likely as the likeliest the nearest to an action, and whether it is likely enough at all."""
+    most = share[:-1].max()
+    likely = share[:-1] >= scalars.aim_share * most
+    goal = aims[jnp.argmin(jnp.where(likely, space.distance(action[None], aims), jnp.inf))]
+    return goal, (most > 0.0) & (scalars.aim_doubt * most > share[-1])
 
 
 def make(sizes: GuideSizes, spaces: Spaces) -> Guidance:
@@ -141,7 +148,7 @@ def make(sizes: GuideSizes, spaces: Spaces) -> Guidance:
     ) -> Refined:
         aims: Aims = jax.vmap(env.aims)(obs)
         share = weighing.predict(env, model.params, aims.features, aims.possible)
-        goals, sure = jax.vmap(likeliest)(share, aims.actions)
+        goals, sure = jax.vmap(lambda *at: followed(space, *at, scalars))(share, aims.actions, actions)
 
         def residual(current: Float[Array, "n action"]) -> Float[Array, "n action"]:
             step = jnp.minimum(scalars.radians("eps"), space.distance(current, goals))

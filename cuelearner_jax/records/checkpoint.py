@@ -11,6 +11,7 @@ from __future__ import annotations
 import errno
 import gc
 import hashlib
+import json
 import logging
 import re
 import shutil
@@ -83,6 +84,11 @@ def _digests(flat: dict[str, Any]) -> dict[str, str]:
         return dict(zip(flat, pool.map(_digest, flat.values()), strict=True))
 
 
+def digest(tree: Any) -> str:
+    """Short SHA-256 of a tree's arrays: equal trees have equal ones."""
+    return hashlib.sha256(json.dumps(_digests(_flat(tree)), sort_keys=True).encode()).hexdigest()[:12]
+
+
 # What is said of a checkpoint that cannot be read.
 OTHERS = "it is of another configuration, or of another version of the program: go on with that one, or start anew"
 DAMAGED = "it is damaged; delete its folder to go back to the checkpoint before, or start the run anew"
@@ -141,7 +147,9 @@ def _settle() -> None:
 class Checkpoints:
     """The checkpoints of one program's run, in one folder; newest last."""
 
-    def __init__(self, folder: Path, read_only: bool = False) -> None:
+    def __init__(self, folder: Path, read_only: bool = False, damaged: str = DAMAGED) -> None:
+        """Of a folder. `damaged`: what to do about a checkpoint that is, in a message's words."""
+        self._damaged = damaged
         logging.getLogger("absl").setLevel(logging.CRITICAL)  # its threads log what `save` then raises
         self._folder = folder.resolve()
         self._manager = ocp.CheckpointManager(
@@ -225,7 +233,7 @@ class Checkpoints:
             # Orbax means to print TensorStore's details and prints the method that has them.
             told = re.sub(r"\.? See full TensorStore details.*", "", str(error), flags=re.DOTALL).strip()
             reason = told.splitlines()[0][:160] if told else type(error).__name__
-            remedy = OTHERS if isinstance(error, _OfAnother) else FORBIDDEN if _forbidden(error) else DAMAGED
+            remedy = OTHERS if isinstance(error, _OfAnother) else FORBIDDEN if _forbidden(error) else self._damaged
         with _quiet():
             _settle()
         raise UserError(f"checkpoint {number} in {self._folder} cannot be read ({reason}): {remedy}")
@@ -245,9 +253,9 @@ class Checkpoints:
 
 
 @contextmanager
-def checkpoints(folder: Path, read_only: bool = False) -> Iterator[Checkpoints]:
+def checkpoints(folder: Path, read_only: bool = False, damaged: str = DAMAGED) -> Iterator[Checkpoints]:
     """`Checkpoints` that close by themselves. `read_only` changes nothing on disk."""
-    manager = Checkpoints(folder, read_only)
+    manager = Checkpoints(folder, read_only, damaged)
     try:
         yield manager
     finally:

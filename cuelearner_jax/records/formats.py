@@ -5,6 +5,7 @@
 | `config`  | `config.json` of a run | its contents                                                            |
 | `labels`  | a label file           | what it says of itself, and its columns under `columns` as NumPy arrays |
 | `teacher` | `teacher.json`         | its contents                                                            |
+| `policy`  | `policy.json`          | its contents                                                            |
 
 A file tells its number under `format`; one without a number is of format 0. A change of what is written raises the
 number here and adds a step that leads there from the number before; readers know the current format only.
@@ -26,12 +27,13 @@ from cuelearner_jax.errors import UserError
 from cuelearner_jax.records.whole import replacing, unreadable
 
 DIGEST = "digest"  # the name under which a JSON file holds the digest of its other values
-FORMATS = {"config": 2, "labels": 2, "teacher": 3}
+FORMATS = {"config": 2, "labels": 2, "teacher": 3, "policy": 2}
 SEALED_SINCE = 2  # the format from which on a JSON file must carry a digest
 REMEDIES = {  # what a message says of a damaged file, after its path
     "config": "is damaged or of another program: restore it, or start anew with --overwrite",
     "labels": "is not a label file of cuelearner, or it is damaged: restore it, or write it anew",
     "teacher": "is damaged: restore it, or train the teacher anew",
+    "policy": "is damaged: restore it, or adapt the policy anew",
 }
 
 Values = dict[str, Any]
@@ -119,6 +121,11 @@ def _seen_in_another_order(values: Values) -> Values:
     )
 
 
+def _never_written(values: Values) -> Values:
+    """Policy folders began with a format whose files carry digests."""
+    raise ValueError("no program wrote this format")
+
+
 def _answers_of_targets(values: Values) -> Values:
     """Labels held what the model of relative feedback was to predict, rotate(action, h * eps) - action; now h."""
     kept = {name: value for name, value in values.items() if name not in ("guidance", "columns")}
@@ -145,4 +152,6 @@ STEPS: dict[tuple[str, int], Callable[[Values], Values]] = {
     ("teacher", 0): _only_numbered,
     ("teacher", 1): _only_numbered,
     ("teacher", 2): _seen_in_another_order,
+    ("policy", 0): _never_written,
+    ("policy", 1): _never_written,
 }

@@ -116,7 +116,7 @@ def load(folder: Path, find: Callable[[str], Task]) -> tuple[Task, RunConfig, Gr
         name, origin = values["task"].pop("name"), values["task"].pop("from", None)
         if origin is not None and not REFERENCE.fullmatch(origin):
             raise ValueError(f"{origin!r} names no code")
-        task = _known(find, name, origin, path)
+        task = known_task(find, name, origin, path)
         config = RunConfig(
             configuration.from_json(task.config, values["task"]),
             configuration.from_json(Sizes, values["sizes"]),
@@ -149,7 +149,7 @@ def _grid(values: dict[str, Any]) -> Grid:
     return Grid(kinds, seeds, labels)
 
 
-def _known(find: Callable[[str], Task], name: str, origin: str | None, path: Path) -> Task:
+def known_task(find: Callable[[str], Task], name: str, origin: str | None, path: Path) -> Task:
     """The task of a run. Raises UserError if it is not known, saying how one from outside becomes so."""
     try:
         return find(name)

@@ -86,8 +86,11 @@ def planned(order: Order) -> Plan:
     return Plan(order, described, labels)
 
 
-def _check_world(path: Path, told: dict[str, Any], task: Task, world: Any) -> None:
-    """Raises UserError unless labels are of a run's world, as far as labels depend on it."""
+def check_world(path: Path, told: dict[str, Any], task: Task, world: Any) -> None:
+    """Raises UserError unless labels are of a run's task and world, as far as labels depend on it."""
+    if told.get("name") != task.name:
+        name = told.get("name")
+        raise UserError(f"{path} holds labels of {name}, this run is {task.name}: give labels of the same task")
     values = {name: value for name, value in told.items() if name not in ("name", "from")}
     try:
         theirs = configuration.to_json(configuration.from_json(task.config, values))
@@ -108,10 +111,7 @@ def read_labels(order: Order) -> label_files.LabelFile:
     assert path is not None
     file = label_files.read(path)
     env = shape_of(order.task, config.task)
-    if file.task.get("name") != order.task.name:
-        name = file.task.get("name")
-        raise UserError(f"{path} holds labels of {name}, this run is {order.task.name}: give labels of the same task")
-    _check_world(path, file.task, order.task, config.task)
+    check_world(path, file.task, order.task, config.task)
     made = [guidances.make(kind, config.sizes, env) for kind in grid.guidance]
     asking = [guidance for guidance in made if guidance.form is not None]
     if not asking:

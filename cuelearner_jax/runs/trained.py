@@ -1,9 +1,7 @@
-"""Policies by name: of a trained run's lanes, or of a task alone; evaluated, or one of them picked out."""
+"""Policies by name: of a trained run's lanes, of a policy folder's, or of a task alone; picked out."""
 
 from __future__ import annotations
 
-import json
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,29 +9,30 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from cuelearner_jax.config import RunConfig, to_json
+from cuelearner_jax.config import RunConfig
 from cuelearner_jax.environment import actions_of, offers
 from cuelearner_jax.errors import UserError, closest
-from cuelearner_jax.evaluate import Tell, episodes, one_lane, part_of, untold, watched, watched_lanes
+from cuelearner_jax.evaluate import one_lane
 from cuelearner_jax.guidance import registry as guidances
-from cuelearner_jax.policies import Agent, Corrected, Guided, Heuristic, Policy, Taught, uniform_in
-from cuelearner_jax.records.provenance import provenance
-from cuelearner_jax.records.whole import replacing
+from cuelearner_jax.policies import Agent, Common, Corrected, Guided, Heuristic, Policy, Taught, uniform_in
+from cuelearner_jax.records import policy_folders
+from cuelearner_jax.runs.adapted import AdaptedLanes, alone, open_folder
 from cuelearner_jax.runs.failures import without_failed
 from cuelearner_jax.runs.grid import Grid
 from cuelearner_jax.runs.opened import Lanes, Piece, lanes_of, open_run
-from cuelearner_jax.task import Rollout, Task, shape_of
+from cuelearner_jax.task import Task, shape_of
 from cuelearner_jax.terminal import console
 from cuelearner_jax.types import Teacher
 
 
 class Parts(NamedTuple):
-    """What a named policy may be made of. `lanes` is None for a task alone."""
+    """What a named policy may be made of: `lanes` of a run, `adapted` of a policy folder."""
 
     config: RunConfig
     env: Any
     teacher: Teacher | None
     lanes: Lanes | None
+    adapted: AdaptedLanes | None = None
 
     @property
     def agent(self) -> Agent:
@@ -65,8 +64,19 @@ class Named(NamedTuple):
     about: str
     make: Callable[[Parts], Policy]
     trained: bool = False  # does it need a run?
+    adapted: bool = False  # does it need a policy folder?
     taught: bool = False  # does it ask the teacher?
     needs: tuple[str, ...] = ()  # optional members of an environment without which there is none
+
+    @property
+    def kept(self) -> bool:
+        """Does it lie in a folder?"""
+        return self.trained or self.adapted
+
+
+def _folder_of(parts: Parts) -> AdaptedLanes:
+    assert parts.adapted is not None
+    return parts.adapted
 
 
 POLICIES: dict[str, Named] = {
@@ -79,6 +89,8 @@ POLICIES: dict[str, Named] = {
         trained=True,
         taught=True,
     ),
+    "adapted": Named("the adapted policy", lambda parts: _folder_of(parts).policy(parts.env), adapted=True),
+    "base": Named("the policy that was adapted", lambda parts: _folder_of(parts).base(parts.env), adapted=True),
     "teacher": Named("the teacher", lambda parts: parts.taught(), taught=True),
     "heuristic": Named("the task's obvious action", lambda parts: Heuristic(parts.env), needs=("heuristic",)),
     "uniform": Named("chance", lambda parts: uniform_in(parts.env)),
@@ -87,19 +99,41 @@ POLICIES: dict[str, Named] = {
 
 @dataclass(frozen=True)
 class PolicySource:
-    """Where policies come from: a run folder, or a task alone."""
+    """Where policies come from: a run folder, a policy folder, or a task alone."""
 
     task: Task
     config: RunConfig
     grid: Grid | None
     folder: Path
     pieces: tuple[Piece, ...] = ()  # of a run; none named: all of it lies in its folder
+    adapted: AdaptedLanes | None = None  # of a policy folder
 
     @classmethod
     def of_run(cls, folder: Path, find: Callable[[str], Task]) -> PolicySource:
         """A run's, or those of a sweep in pieces; see `opened.open_run`."""
         found = open_run(folder, find)
         return cls(found.task, found.config, found.grid, folder, found.pieces)
+
+    @classmethod
+    def of_folder(cls, folder: Path, find: Callable[[str], Task], code: Any = None) -> PolicySource:
+        """A run's or a policy folder's. `code`: the policy that stands for code in the latter, named by the user.
+
+        Raises UserError if it is neither, cannot be read, or no code is asked for where some is given.
+        """
+        if not policy_folders.is_one(folder):
+            run = cls.of_run(folder, find)
+            if code is not None:
+                raise UserError(f"{folder} is a run, without code in its policies: leave out --base")
+            return run
+        task, world, lanes = open_folder(folder, find, code)
+        return cls(task, RunConfig(world), None, folder, adapted=lanes)
+
+    @property
+    def default_policy(self) -> str:
+        """Who acts where nobody is named."""
+        if self.adapted:
+            return "adapted"
+        return "agent" if self.grid else "heuristic"
 
     def on(self, robot: str | None) -> PolicySource:
         """The same with another robot of the task's (None: its own). Raises UserError if it has no such robot."""
@@ -114,19 +148,24 @@ class PolicySource:
         if policy not in POLICIES:
             raise UserError(f"unknown policy {policy!r}{closest(policy, POLICIES)}")
         if POLICIES[policy].trained and not self.grid:
-            untrained = ", ".join(name for name, named in POLICIES.items() if not named.trained)
-            raise UserError(f"policy {policy!r} needs a trained run: give a run folder, or one of {untrained}")
+            others = [name for name, named in POLICIES.items() if not named.kept or (named.adapted and self.adapted)]
+            raise UserError(f"policy {policy!r} needs a trained run: give a run folder, or one of {', '.join(others)}")
+        if POLICIES[policy].adapted and not self.adapted:
+            raise UserError(f"policy {policy!r} needs a policy folder: give one that `cuelearner adapt` left")
         given = [name for name, value in lanes.items() if value not in (None, ())]
-        if given and not POLICIES[policy].trained:
+        if given and not POLICIES[policy].kept:
             what = f"policy {policy!r} belongs to no lane of a run"
             raise UserError(f"--{given[0]} chooses nothing here, {what}: leave it out")
+        if self.grid and given and given[-1].endswith("bound-deg"):
+            raise UserError("--bound-deg chooses among the lanes of a policy folder, this is a run: leave it out")
         after = shape_of(self.task, changed)
         for need in POLICIES[policy].needs:
             if not offers(after, need):
                 raise UserError(f"{self.task.name} has no {need}: choose another policy")
-        if POLICIES[policy].trained and (size := shape_of(self.task, self.config.task).obs_size) != after.obs_size:
+        what = "run" if self.grid else "policy"
+        if POLICIES[policy].kept and (size := shape_of(self.task, self.config.task).obs_size) != after.obs_size:
             raise UserError(
-                f"the run's observations have {size} entries, this world's {after.obs_size}: keep its structure"
+                f"the {what}'s observations have {size} entries, this world's {after.obs_size}: keep its structure"
             )
 
     def load(self, kinds: tuple[str, ...] = ()) -> list[Lanes]:
@@ -150,135 +189,125 @@ class PolicySource:
         return loaded
 
 
-class Measured(NamedTuple):
-    """A policy's metrics under one guidance and budget."""
+class Block(NamedTuple):
+    """Lanes of one kind of guidance at one step, and what they act with."""
 
     guidance: str
-    labels: int
+    seeds: np.ndarray  # (lanes,)
+    budgets: np.ndarray  # (lanes,)
+    bounds: np.ndarray  # (lanes,) [deg]; of a run 0
     step: int
-    seeds: np.ndarray  # (seeds,)
-    metrics: dict[str, np.ndarray]  # each (seeds,)
+    policy: Any  # a block, or `Common`
+    failed: np.ndarray  # (lanes,) bool
+
+    def alone(self, lane: int) -> Any:
+        """One lane's policy."""
+        if isinstance(self.policy, Guided):
+            return alone(self.policy, lane)
+        return self.policy.policy if isinstance(self.policy, Common) else one_lane(self.policy, lane)
 
 
-def evaluate(
+def blocks_of(
     source: PolicySource,
-    world: Any,
-    name: str,
+    named: Named,
+    env: Any,
+    teacher: Teacher | None,
     kinds: tuple[str, ...],
-    num_envs: int,
-    steps: int,
-    engine: Rollout | None = None,
-    watch: Callable[[str], Tell] = lambda kind: untold,
-) -> list[Measured]:
-    """Metrics of a policy on validation episodes of a world (a task configuration), for each guidance and budget.
-
-    Args:
-        source: where the policy comes from.
-        world: a task configuration.
-        name: of the policy.
-        kinds: of guidance of the run (none named: all).
-        num_envs, steps: as `evaluate.rollout` has them.
-        engine: a roll-out in other physics (default: the environment's own).
-        watch: by kind of guidance, who is told how far its lanes are.
-    """
-    named, key = POLICIES[name], episodes()
-    env = source.task.environment(world, "validation")
-    teacher = source.task.make_teacher(world, env) if named.taught else None
-    if not named.trained:
-        policy = named.make(Parts(source.config, env, teacher, None))
-        tell = watch(name)
-        if engine:
-            found = engine(policy, env, key, num_envs, steps, tell)
-        else:
-            found = watched(env, policy, key, num_envs, steps, tell)
-        metrics = {metric: np.asarray(value)[None] for metric, value in found.items()}
-        return [Measured("-", 0, 0, np.zeros(1, int), metrics)]
-    rows = []
-    for lanes in without_failed(source.load(kinds)):
+    failed_too: bool = False,
+) -> list[Block]:
+    """A policy of a folder's lanes. Raises UserError if it cannot be had."""
+    if source.adapted is not None:
+        kept = source.adapted
+        known = [guidances.find(kind).name for kind in kinds]  # one from outside is known from here on
+        if known and kept.guidance not in known:
+            raise UserError(f"{source.folder} is under {kept.guidance} guidance: leave out --guidance")
+        columns = (kept.lanes.seed, kept.lanes.budget, kept.lanes.bound_deg)
+        policy = named.make(Parts(source.config, env, teacher, None, kept))
+        return [Block(kept.guidance, *columns, 0, policy, np.zeros(kept.lanes.number, bool))]
+    loaded = source.load(kinds)
+    blocks = []
+    for lanes in loaded if failed_too else without_failed(loaded):
         policy = named.make(Parts(source.config, env, teacher, lanes))
-        tell = watch(lanes.guidance.name)
-        if engine:
-            each, count = [], len(lanes.seeds)
-            for lane in range(count):
-                each.append(engine(one_lane(policy, lane), env, key, num_envs, steps, part_of(tell, lane, count)))
-            found = {metric: np.stack([measured[metric] for measured in each]) for metric in each[0]}
-        else:
-            found = watched_lanes(env, policy, key, num_envs, steps, tell)
-        for budget in np.unique(lanes.budgets):
-            own = lanes.budgets == budget
-            metrics = {metric: np.asarray(values)[own] for metric, values in found.items()}
-            rows.append(Measured(lanes.guidance.name, int(budget), lanes.step, lanes.seeds[own], metrics))
-    return rows
+        columns = (lanes.seeds, lanes.budgets, np.zeros(len(lanes.seeds)))
+        blocks.append(Block(lanes.guidance.name, *columns, lanes.step, policy, np.asarray(lanes.policies["failed"])))
+    return blocks
 
 
 def one_policy(
-    source: PolicySource, env: Any, world: Any, name: str, kind: str | None, labels: int | None, seed: int | None
-) -> Policy:
-    """A single policy: of one lane of a run, or of the task. Raises UserError if the run has no such lane."""
+    source: PolicySource,
+    env: Any,
+    world: Any,
+    name: str,
+    kind: str | None,
+    labels: int | None,
+    seed: int | None,
+    bound_deg: float | None = None,
+) -> Any:
+    """A single policy: of one lane of a folder, or of the task. Raises UserError if there is no such lane."""
+    seeds = () if seed is None else (seed,)
+    return several(source, env, world, name, kind, labels, seeds, bound_deg)[0][0]
+
+
+def several(
+    source: PolicySource,
+    env: Any,
+    world: Any,
+    name: str,
+    kind: str | None,
+    labels: int | None,
+    seeds: tuple[int, ...],
+    bound_deg: float | None = None,
+) -> tuple[list[Any], tuple[int, ...]]:
+    """Single policies of lanes of a folder that differ by their seeds alone (none named: the first), and the seeds.
+
+    Of the task, where the policy lies in no folder, and its seed is 0.
+
+    Args:
+        source: where they come from.
+        env, world: where they are to act.
+        name: of the policy.
+        kind: of guidance (None: the run's last).
+        labels: budget (None: the largest).
+        seeds: of the lanes.
+        bound_deg: of a policy folder's lanes (None: the largest).
+
+    Raises:
+        UserError: there is no such lane.
+    """
     named = POLICIES[name]
     teacher = source.task.make_teacher(world, env) if named.taught else None
-    if not named.trained:
-        return named.make(Parts(source.config, env, teacher, None))
-    assert source.grid is not None  # `check` has seen to it
-    loaded = source.load((kind or source.grid.guidance[-1],))
-    seeds, budgets = (np.concatenate([getattr(lanes, of) for lanes in loaded]) for of in ("seeds", "budgets"))
-    budget = int(budgets.max()) if labels is None else labels
-    seed = int(seeds[0]) if seed is None else seed
-    for lanes in loaded:
-        index = np.flatnonzero((lanes.seeds == seed) & (lanes.budgets == budget))
-        if len(index):
-            if lanes.policies["failed"][index[0]]:
-                console.print(f"seed {seed} failed, no longer finite: this is its last finite state")
-            return one_lane(named.make(Parts(source.config, env, teacher, lanes)), int(index[0]))
-    raise UserError(
-        f"no lane with seed {seed} and {budget} labels: the run has seeds {_listed(seeds)} "
-        f"and labels {_listed(budgets)}"
-    )
+    if not named.kept:
+        return [named.make(Parts(source.config, env, teacher, None))], (0,)
+    kinds = (kind,) if kind else (source.grid.guidance[-1],) if source.grid else ()
+    blocks = blocks_of(source, named, env, teacher, kinds, failed_too=True)
+    known = {
+        part: np.concatenate([getattr(block, part) for block in blocks]) for part in ("seeds", "budgets", "bounds")
+    }
+    budget = int(known["budgets"].max()) if labels is None else labels
+    bound = float(known["bounds"].max()) if bound_deg is None else bound_deg
+    found = []
+    for seed in seeds or (int(known["seeds"][0]),):
+        for block in blocks:
+            within = np.isclose(block.bounds, bound, rtol=1e-4)
+            index = np.flatnonzero((block.seeds == seed) & (block.budgets == budget) & within)
+            if len(index):
+                if block.failed[index[0]]:
+                    console.print(f"seed {seed} failed, no longer finite: this is its last finite state")
+                found.append(block.alone(int(index[0])))
+                break
+        else:
+            of = "run" if source.grid else "folder"
+            bounds = "" if source.grid else f" within {bound:g} degrees"
+            told = "" if source.grid else f" within {_listed(known['bounds'])} degrees"
+            raise UserError(
+                f"no lane with seed {seed} and {budget} labels{bounds}: the {of} has seeds {_listed(known['seeds'])} "
+                f"and labels {_listed(known['budgets'])}{told}"
+            )
+    return found, seeds or (int(known["seeds"][0]),)
 
 
 def _listed(values: np.ndarray) -> str:
     known = np.unique(values)
     if len(known) > 4 and known[-1] - known[0] == len(known) - 1:
         return f"{known[0]} to {known[-1]}"
-    return ", ".join(str(value) for value in known)
-
-
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None
-
-
-def write(
-    path: Path,
-    source: PolicySource,
-    world: Any,
-    policy: str,
-    num_envs: int,
-    steps: int,
-    measured: list[Measured],
-    body: dict[str, str],
-) -> None:
-    """Measurements as JSON, with the world, the body if it is not the task's own, and where the numbers come from."""
-    rows = [
-        {
-            "guidance": row.guidance,
-            "labels": row.labels,
-            "trained_steps": row.step,
-            "seeds": row.seeds.tolist(),
-            **{metric: [_finite(value) for value in values.tolist()] for metric, values in row.metrics.items()},
-        }
-        for row in measured
-    ]
-    contents = {
-        "subject": source.folder.name,
-        "world": {"name": source.task.name, **to_json(world)},
-        **({"files": files} if POLICIES[policy].taught and (files := source.task.files(world)) else {}),
-        "policy": policy,
-        **body,
-        "envs": num_envs,
-        "steps": steps,
-        **provenance(),
-        "rows": rows,
-    }
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(path) as file:
-        file.write(json.dumps(contents, indent=1) + "\n")
+    return ", ".join(f"{value:g}" if isinstance(value, np.floating) else str(value) for value in known)

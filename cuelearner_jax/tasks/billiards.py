@@ -90,14 +90,17 @@ PLAYER = Body(
 
 # The worlds of the paper's section on adaptation after training.
 SCENARIOS = {
-    "turned_strike": Scenario("every strike is turned by 0.8 degrees", {"action_turn_deg": 0.8}, bound_deg=1.0),
+    "turned_strike": Scenario(
+        "every strike is turned by 0.8 degrees", {"action_turn_deg": 0.8}, bound_deg=1.0, eps_deg=0.1
+    ),
     "shifted_balls": Scenario(
         "balls are seen 7.1 mm to the right of and above their places",
         {"observation_bias": (0.0071, 0.0071)},
         bound_deg=0.3,
+        eps_deg=0.1,
     ),
     "tilted_table": Scenario(
-        "the table is tilted: balls are drawn along y", {"acceleration": (0.0, 0.005)}, bound_deg=0.3
+        "the table is tilted: balls are drawn along y", {"acceleration": (0.0, 0.005)}, bound_deg=0.3, eps_deg=0.1
     ),
 }
 

@@ -89,7 +89,9 @@ ANYMAL = _anymal()
 
 # The worlds of the paper's section on adaptation after training.
 SCENARIOS = {
-    "turned_lidar": Scenario("the lidar is mounted turned by 15 degrees", {"lidar_rotation_deg": 15.0}, bound_deg=60.0),
+    "turned_lidar": Scenario(
+        "the lidar is mounted turned by 15 degrees", {"lidar_rotation_deg": 15.0}, bound_deg=60.0, eps_deg=2.0
+    ),
     "rooms": Scenario("rooms, doorways and thin obstacles", {"style": "rooms"}, bound_deg=180.0),
     "corridor": Scenario(
         "a corridor of obstacles, each to be passed left or right", {"style": "corridor"}, bound_deg=60.0

@@ -152,7 +152,7 @@ NONSENSE = [
     (lambda: cl.fit_feedback(own_labels(), sizes=SIZES, scalars=WILD), "the fit of the feedback model diverged"),
     (lambda: cl.fit_feedback("nowhere.parquet"), "no label file at nowhere.parquet"),
     (lambda: cl.ask(policy, WORLD, TEACHER, labels=0), "labels is 0"),
-    (lambda: cl.ask(policy, WORLD, TEACHER, labels=5, bound_deg=200.0), "bound_deg is 200.0"),
+    (lambda: cl.ask(policy, WORLD, TEACHER, labels=5, bound_deg=200.0), "bound_deg is 200:"),
     (lambda: cl.ask(42, WORLD, TEACHER, labels=5), "a int is no policy"),
     (lambda: cl.load_policy("nowhere"), "nowhere is no run folder"),
     (lambda: cl.train(WORLD, None, probes.CONFIG, guidance=["relative"], seeds=1), "asks a teacher: give one"),

@@ -14,7 +14,7 @@ import cuelearner_jax as cl
 from cuelearner_jax.cli import dispatch
 from cuelearner_jax.errors import NotFinite, UserError
 from cuelearner_jax.records import results
-from cuelearner_jax.runs import lanes, submission, sweep, trained
+from cuelearner_jax.runs import lanes, measured, submission, sweep, trained
 from cuelearner_jax.runs.cluster import Job
 from cuelearner_jax.runs.grid import Grid, load
 from cuelearner_jax.runs.order import Order, Plan
@@ -97,7 +97,7 @@ def test_evaluation_leaves_it_out_and_says_so(ended, capsys):
     for folder in (sick, healthy):
         _, config, grid = load(folder, {TASK.name: TASK}.__getitem__)
         source = trained.PolicySource(TASK, config, grid, folder)
-        found += trained.evaluate(source, config.task, "agent", (), 10, 10)
+        found += measured.evaluate(source, config.task, "agent", (), 10, 10)
         policies = source.load()[0].policies
         np.testing.assert_array_equal(policies["failed"], [False, folder == sick, False])
         assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(policies["params"]))
@@ -132,7 +132,7 @@ def test_diverging_from_the_command_line_and_from_python(tmp_path):
         sweep.run(Order(TASK, wild, grid, tmp_path / "run"))
     _, config, grid = load(tmp_path / "run", {TASK.name: TASK}.__getitem__)
     with pytest.raises(UserError, match="all of these lanes failed"):
-        trained.evaluate(trained.PolicySource(TASK, config, grid, tmp_path / "run"), config.task, "agent", (), 10, 10)
+        measured.evaluate(trained.PolicySource(TASK, config, grid, tmp_path / "run"), config.task, "agent", (), 10, 10)
     with pytest.warns(UserWarning, match=r"3 of 3 lanes failed, no longer finite .*: leave out the rows"):
         found = cl.train(
             cl.World(TASK, probes.WindowConfig()), None, wild, guidance=("none",), seeds=(3, 5, 8), progress=False

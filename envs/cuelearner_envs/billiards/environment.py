@@ -39,6 +39,8 @@ class Billiards(WholeObservations, struct.PyTreeNode):
     max_shots: int = struct.field(pytree_node=False, default=10)  # an episode is truncated after this many
     mirrors: bool = struct.field(pytree_node=False, default=False)  # offer the table's symmetries as data?
 
+    action = Quantity("direction", 2, "1", "unit vector in the table's frame; the cue ball is struck that way")
+
     @property
     def observation(self) -> tuple[Quantity, ...]:
         """Three entries a ball, the cue ball first; see `observe`."""

@@ -58,6 +58,7 @@ class Navigation(Described, struct.PyTreeNode):
         Quantity("goal: distance", 1, f"{FARTHEST:g} m"),
         Quantity("previous actions", 2 * REMEMBERED, "1", "unit vectors, the latest first; zeros before the first"),
     )
+    action = Quantity("direction", 2, "1", "unit vector in the body's frame, x ahead, y to the left; walked for a step")
 
     @property
     def symmetries(self) -> int:

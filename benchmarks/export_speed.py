@@ -1,0 +1,73 @@
+"""How long an exported decision takes: one observation at a time on one core, in every format.
+
+    python benchmarks/export_speed.py docs/data/navigation_agent
+
+The process keeps to one core before anything starts threads. Prints a table; `--out` writes it as JSON too.
+"""
+
+from __future__ import annotations
+
+import os
+
+os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})  # before anything counts cores
+os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1", JAX_PLATFORMS="cpu")
+
+import argparse  # noqa: E402
+import json  # noqa: E402
+import tempfile  # noqa: E402
+import time  # noqa: E402
+from pathlib import Path  # noqa: E402
+
+import numpy as np  # noqa: E402
+
+from cuelearner_jax.cli import main  # noqa: E402
+from cuelearner_jax.export.runner import GOLDEN, Decision  # noqa: E402
+from cuelearner_jax.records.provenance import provenance  # noqa: E402
+
+LIMIT_MS = 5.0
+
+
+def measured(folder: Path, calls: int) -> dict[str, float]:
+    """Milliseconds a decision about the golden observations, one by one."""
+    decide = Decision(folder)
+    with np.load(folder / GOLDEN) as golden:
+        observations = golden["obs"]
+    for obs in observations:
+        decide(obs)
+    taken = []
+    for number in range(calls):
+        obs = observations[number % len(observations)]
+        start = time.perf_counter()
+        decide(obs)
+        taken.append(time.perf_counter() - start)
+    low, median, high = np.percentile(taken, [5, 50, 95]) * 1e3
+    return {"p5_ms": round(low, 3), "median_ms": round(median, 3), "p95_ms": round(high, 3)}
+
+
+def run() -> None:
+    """Exports a run's policies in every format, and times them."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("policy", help="a run folder")
+    parser.add_argument("--policies", nargs="+", default=["agent", "guided"], help="which of the run's policies")
+    parser.add_argument("--formats", nargs="+", default=["stablehlo", "onnx", "numpy"])
+    parser.add_argument("--calls", type=int, default=300)
+    parser.add_argument("--out", type=Path, help="a JSON file")
+    asked = parser.parse_args()
+    rows = []
+    for policy in asked.policies:
+        for name in asked.formats:
+            with tempfile.TemporaryDirectory() as folder:
+                out = Path(folder) / "exported"
+                if main(["export", asked.policy, "--policy", policy, "--format", name, "--out", str(out)]):
+                    raise SystemExit(1)
+                found = measured(out, asked.calls)
+            rows.append({"policy": policy, "format": name, **found})
+            told = "  ".join(f"{key} {value:6.2f}" for key, value in found.items())
+            print(f"{policy:<8}{name:<11}{told}  {'' if found['median_ms'] <= LIMIT_MS else 'over the limit'}")
+    if asked.out:
+        contents = {"subject": Path(asked.policy).name, "calls": asked.calls, **provenance(), "rows": rows}
+        asked.out.write_text(json.dumps(contents, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    run()

@@ -1,0 +1,228 @@
+"""Adaptation from the first question to the judged policies: what the command, the face and experiments call."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh
+from jaxtyping import Array
+
+from cuelearner_jax.actions import DIRECTIONS
+from cuelearner_jax.adaptation import judging, program
+from cuelearner_jax.adaptation.judging import Judged
+from cuelearner_jax.adaptation.program import Adapting, Lanes
+from cuelearner_jax.config import GuideSizes, Scalars
+from cuelearner_jax.devices import BY_LANE, SHARED, lane_mesh, place
+from cuelearner_jax.environment import Environment
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.evaluate import Tell, untold
+from cuelearner_jax.guidance.bundle import Guidance
+from cuelearner_jax.policies import Guided, Policy
+from cuelearner_jax.types import Label, Teacher
+
+# Seconds a fit on a CPU. The paper's networks are `GuideSizes()`.
+SIZES = GuideSizes(feedback_layers=(128, 128), fit_steps=400, fit_batch_size=64)
+REACH_QUANTILE = 0.95  # of the distances between labelled actions and a policy's own: how far labels reach from it
+BOUND_DEG = 45.0  # where nobody says how far corrections may lead
+PASSES = 20  # of which one turn by eps: a pass that turns by less has settled
+
+
+@dataclass(frozen=True)
+class Judging:
+    """How policies are compared with their bases, and how often on the way."""
+
+    env: Environment | None  # the changed world with the episodes of `split`; None: there is no simulator
+    num_envs: int = 100
+    steps: int = 10_000  # that the environments share
+    by: str = "reward"  # a metric, or "labels"
+    every: int = 0  # labels between two measurements on the way (0: at the end alone)
+    split: str = "tuning"
+
+
+@dataclass(frozen=True)
+class Adaptation:
+    """What is to be adapted, to what, and how."""
+
+    guidance: Guidance
+    sizes: GuideSizes  # that the guidance was made with
+    scalars: Scalars
+    env: Environment  # the changed world, in which is asked
+    bases: Policy  # a block of base policies, or `Common`
+    lanes: Lanes
+    judging: Judging
+
+
+@dataclass(frozen=True)
+class Adapted:
+    """What adaptation has led to. Where a lane's model is not used, its policy is its base."""
+
+    asked: Adaptation
+    block: Adapting
+    judged: Judged
+    curve: list[dict[str, Any]]  # a row a measurement: "asked" (lanes,) labels so far, and metrics (lanes,) by name
+
+    @property
+    def labels(self) -> Label:
+        """All lanes' labels (lanes, slots, ...), as NumPy arrays."""
+        return jax.device_get(self.block.guide.labels)
+
+    def policy(self, env: Any) -> Guided:
+        """The lanes' policies in a world (see `program.adapted`)."""
+        of = self.asked
+        return program.adapted(of.guidance, of.sizes, env, of.scalars, of.bases, self.block)
+
+
+def check_angles(bounds_deg: Sequence[float], scalars: Scalars) -> str:
+    """Whether bounds and the strength of labels go together.
+
+    Args:
+        bounds_deg: of the lanes [deg].
+        scalars: of refinement.
+
+    Returns:
+        What may be meant otherwise, or nothing.
+
+    Raises:
+        UserError: what cannot be, or could teach nothing.
+    """
+    eps, given = scalars.eps_deg, " ".join(f"{bound:g}" for bound in bounds_deg)
+    if not all(math.isfinite(bound) and 0 < bound <= 180 for bound in bounds_deg):
+        raise UserError(f"bound_deg is {given}: give an angle above 0 and up to 180")
+    if len(set(bounds_deg)) < len(bounds_deg):
+        raise UserError(f"bound_deg is {given}: give each bound once")
+    if eps > min(bounds_deg):
+        raise UserError(
+            f"labels of {eps:g} degrees say nothing within a bound of {min(bounds_deg):g}: give a smaller "
+            "scalars.eps_deg, about a tenth of the bound"
+        )
+    if scalars.tau_deg >= eps:
+        raise UserError(
+            f"scalars.tau_deg is {scalars.tau_deg:g} and a pass turns an action by {eps:g}, after which refinement "
+            f"would stop: give scalars.tau_deg {eps / PASSES:g}"
+        )
+    if scalars.k_max * eps >= max(bounds_deg):
+        return ""
+    return (
+        f"{scalars.k_max} passes of {eps:g} degrees do not reach the bound of {max(bounds_deg):g}: "
+        f"scalars.k_max {math.ceil(max(bounds_deg) / eps)} would"
+    )
+
+
+def reach(policy: Policy, obs: Any, action: Any) -> float:
+    """How far from a policy's own actions labels lie: the distance of 95% of them [deg].
+
+    Args:
+        policy: the policy.
+        obs: of the labels (labels, obs).
+        action: asked about (labels, action).
+    """
+    away = _distances(policy, jnp.asarray(obs), jnp.asarray(action))
+    return float(np.degrees(np.quantile(np.asarray(away), REACH_QUANTILE)))
+
+
+@jax.jit
+def _distances(policy: Any, obs: Array, action: Array) -> Array:
+    return DIRECTIONS.distance(policy.act(jax.random.key(0), None, obs), action)
+
+
+def settling(scalars: Scalars, eps_deg: float | None) -> Scalars:
+    """Scalars with answers of that strength (None: as they are), and a threshold that is small beside it."""
+    eps = scalars.eps_deg if eps_deg is None else eps_deg
+    return replace(scalars, eps_deg=eps, tau_deg=min(scalars.tau_deg, eps / PASSES))
+
+
+def adapt(
+    asked: Adaptation,
+    teacher: Teacher | None = None,
+    labels: Label | None = None,
+    mesh: Mesh | None = None,
+    watch: Callable[[str], Tell] = lambda what: untold,
+) -> Adapted:
+    """Asks, fits and judges all lanes.
+
+    Args:
+        asked: see `Adaptation`.
+        teacher: who answers in rounds; None where labels are given.
+        labels: rows (lanes, slots, ...) in place of questions, fitted at once.
+        mesh: devices that share the lanes (default: all of this process's).
+        watch: by what is being done, who is told how far it is.
+
+    Raises:
+        UserError: policies cannot be judged as asked.
+    """
+    mesh = mesh or lane_mesh()
+    count = asked.lanes.number
+    filled = np.minimum(np.arange(-(-count // mesh.size) * mesh.size), count - 1)  # the last is repeated, and dropped
+    work = replace(asked, lanes=asked.lanes.rows(filled))
+    env, bases = place(mesh, asked.env, SHARED), place(mesh, asked.bases, SHARED)
+    block = place(mesh, program.begin(work.guidance, work.sizes, env, work.lanes), BY_LANE)
+    measure = _Measuring(work, mesh, watch)
+    if labels is not None:
+        rows = place(mesh, jax.tree.map(lambda leaf: jnp.asarray(leaf)[filled], labels), BY_LANE)
+        block = program.take_labels(work.guidance, work.sizes, env, work.scalars, rows, block, mesh)
+    else:
+        assert teacher is not None  # asked for where no labels are given
+        asks: Teacher = place(mesh, teacher, SHARED)
+        number = program.rounds(work.lanes, work.sizes)
+        tell = watch("labels")
+        for done in range(number):
+            tell(done, number)
+            measure(block, done * work.sizes.labels_per_round)
+            block = jax.block_until_ready(
+                program.ask_round(work.guidance, work.sizes, env, asks, work.scalars, bases, block, mesh)
+            )
+        tell(number, number)
+    judged = measure.judged(block)
+    curve = [{name: values[:count] for name, values in row.items()} for row in measure.curve]
+    block = jax.tree.map(lambda leaf: leaf[:count], judging.kept(block, judged.used))
+    cut = Judged(judged.by, *(column[:count] for column in judged[1:]))
+    return Adapted(asked, block, cut, curve)
+
+
+class _Measuring:
+    """What policies are worth, on the way and in the end."""
+
+    def __init__(self, work: Adaptation, mesh: Mesh, watch: Callable[[str], Tell]) -> None:
+        self.work, self.mesh, self.watch = work, mesh, watch
+        self.curve: list[dict[str, np.ndarray]] = []
+
+    def __call__(self, block: Adapting, asked: int) -> None:
+        """Adds a row if one is due."""
+        every = self.work.judging.every
+        if every and asked % every == 0:
+            self._add(block)
+
+    def judged(self, block: Adapting) -> Judged:
+        """What is used of the finished lanes."""
+        work, how = self.work, self.work.judging
+        if how.by == judging.LABELS:
+            found = judging.judged_by_labels(work.guidance, work.sizes, work.env, work.scalars, block)
+        if how.env is not None:
+            after = self._add(block)
+        if how.by == judging.LABELS:
+            return found
+        bases = self._measured(work.bases, "the policy as it was")
+        usable = ~np.asarray(block.failed) & np.asarray(block.guide.model.fitted)
+        return judging.judged(how.by, work.lanes, bases, after, usable)
+
+    def _add(self, block: Adapting) -> judging.Metrics:
+        work, env = self.work, self.work.judging.env
+        assert env is not None
+        policy = program.adapted(work.guidance, work.sizes, env, work.scalars, work.bases, block)
+        found = self._measured(policy, "the adapted policy")
+        self.curve.append({"asked": np.asarray(block.guide.asked), "failed": np.asarray(block.failed), **found})
+        return found
+
+    def _measured(self, policy: Policy, what: str) -> judging.Metrics:
+        how = self.work.judging
+        assert how.env is not None
+        mesh = self.mesh if not isinstance(policy, judging.Common) else None
+        if policy is self.work.bases:
+            mesh = None  # there may be another number of them
+        return judging.measured(how.env, policy, how.num_envs, how.steps, how.split, mesh, self.watch(what))

@@ -1,0 +1,149 @@
+"""Is an adapted policy worth more than its base? One that is worth less is not used.
+
+With a simulator both play the same episodes, none of which reported figures are measured on: those of the "tuning"
+split of the changed world. Without one, held-out labels are predicted, against answering "already right" always.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh
+from jaxtyping import Array, Float
+
+from cuelearner_jax.adaptation.program import Adapting, Lanes
+from cuelearner_jax.config import GuideSizes, Scalars
+from cuelearner_jax.devices import each_lane
+from cuelearner_jax.environment import Environment, actions_of
+from cuelearner_jax.errors import UserError, closest
+from cuelearner_jax.evaluate import Tell, episodes, evaluate_lanes, untold, watched, watched_lanes
+from cuelearner_jax.guidance.bundle import Guidance
+from cuelearner_jax.policies import Common, Policy
+from cuelearner_jax.types import Label
+
+HELD_OUT = 5  # every fifth label
+LABELS = "labels"  # what is judged by, in place of a metric
+STEPS = 100  # of an environment, where a task counts steps
+Metrics = dict[str, np.ndarray]
+
+
+class Judged(NamedTuple):
+    """What the base policies and the adapted ones are worth, lane by lane; more is better."""
+
+    by: str  # a metric, or "labels": the share of held-out answers that are predicted
+    before: np.ndarray  # (lanes,)
+    after: np.ndarray  # (lanes,)
+    used: np.ndarray  # (lanes,) bool: is the model used? Not if it is worth less than nothing, or not finite
+
+
+def metrics_of(env: Environment) -> tuple[str, ...]:
+    """Names of what a roll-out measures in an environment."""
+    key = jax.random.key(0)
+    state, _ = jax.eval_shape(env.reset, key)
+    _, step = jax.eval_shape(env.step, key, state, jnp.zeros(actions_of(env).size))
+    return ("reward", *step.metrics, *step.outcome)
+
+
+def measured(
+    env: Environment,
+    policy: Policy,
+    num_envs: int,
+    steps: int,
+    split: str = "tuning",
+    mesh: Mesh | None = None,
+    tell: Tell = untold,
+) -> Metrics:
+    """Metrics (lanes,) of a block of policies, or (1,) of one that all share, on the episodes of a split.
+
+    Args:
+        env: the changed world, of that split.
+        policy: a block, or `Common`.
+        num_envs, steps: as `evaluate.rollout` has them.
+        split: see `evaluate.SPLITS`.
+        mesh: devices that share the lanes (default: one).
+        tell: is told how far it is.
+    """
+    key = episodes(split)
+    if isinstance(policy, Common):
+        found = watched(env, policy.policy, key, num_envs, steps, tell)
+        return {name: np.asarray(value)[None] for name, value in found.items()}
+    if mesh is not None and mesh.size > 1:
+        found = evaluate_lanes(env, policy, key, mesh=mesh, num_envs=num_envs, steps=steps)
+        return jax.device_get(found)
+    return watched_lanes(env, policy, key, num_envs, steps, tell)
+
+
+def judged(by: str, lanes: Lanes, bases: Metrics, policies: Metrics, usable: np.ndarray) -> Judged:
+    """Compares metrics of base policies (bases,) or (1,) and of lanes (lanes,) on the same episodes.
+
+    Args:
+        by: the metric.
+        lanes: which base is whose.
+        bases, policies: from `measured`.
+        usable: (lanes,) bool: False where nothing could be fitted, or not to finite numbers.
+
+    Raises:
+        UserError: there is no such metric.
+    """
+    if by not in policies:
+        raise UserError(f"there is no metric {by!r} to judge by{closest(by, [*policies, LABELS])}")
+    before = np.asarray(bases[by])
+    before = np.broadcast_to(before, lanes.number) if len(before) == 1 else before[lanes.base]
+    after = np.asarray(policies[by])
+    return Judged(by, before, after, np.asarray(usable) & (after >= before))  # NaN is worth less than anything
+
+
+@partial(jax.jit, static_argnames=("guidance",))
+def _predicted(guidance: Guidance, env: Any, scalars: Any, block: Adapting) -> tuple[Array, Array]:
+    """Shares (lanes,) of held-out answers that are 0, and that a model of the others predicts."""
+    one_pass = dataclasses.replace(scalars, k_max=1, tau_max_deg=180.0)
+    space = actions_of(env)
+
+    def one(lane: Adapting) -> tuple[Array, Array]:
+        labels, key = lane.guide.labels, jax.random.fold_in(lane.key, HELD_OUT)
+        held = labels.valid & (jnp.arange(labels.valid.shape[0]) % HELD_OUT == HELD_OUT - 2)
+        others = labels.replace(valid=labels.valid & ~held)
+        model = guidance.fit(key, env, others, guidance.init(key), scalars)
+        right, zero = _right(labels, guidance.act(model, env, labels.obs, labels.action, held, one_pass).actions)
+        count = jnp.maximum(held.sum(), 1)
+        return jnp.sum(zero, where=held) / count, jnp.where(held.any(), jnp.sum(right, where=held) / count, jnp.nan)
+
+    def _right(labels: Label, moved: Float[Array, "n action"]) -> tuple[Array, Array]:
+        turn = space.sense(labels.action, moved) * space.distance(labels.action, moved) / scalars.radians("eps")
+        return jnp.round(jnp.clip(turn, -1, 1)) == labels.answer[:, 0], labels.answer[:, 0] == 0
+
+    return each_lane(one)(block)
+
+
+def judged_by_labels(
+    guidance: Guidance, sizes: GuideSizes, env: Environment, scalars: Scalars, block: Adapting
+) -> Judged:
+    """Compares a model with answering "already right" always, on every fifth label, to which it was not fitted.
+
+    The model that is kept is fitted to all of them; this one is made for the comparison alone.
+
+    Args:
+        guidance, sizes, env, scalars, block: as `program.ask_round` has them; the block has its labels.
+
+    Raises:
+        UserError: answers that say nothing about turning an action, or fewer than five.
+    """
+    form = guidance.form
+    if form is None or not form.by_eps:
+        told = form.name if form else "no"
+        raise UserError(f"{told} answers cannot be judged by held-out labels: give --judge-by a metric of the task")
+    if int(np.asarray(block.guide.labels.valid).sum(-1).min()) < HELD_OUT:
+        raise UserError(f"fewer than {HELD_OUT} labels cannot be judged by: give more, or --judge-by a metric")
+    zero, right = jax.device_get(_predicted(guidance, env, scalars, block))
+    return Judged(LABELS, zero, right, ~np.asarray(block.failed) & (right >= zero))
+
+
+def kept(block: Adapting, used: np.ndarray) -> Adapting:
+    """The block with models that leave actions alone where they are not to be used."""
+    model = block.guide.model
+    return block.replace(guide=block.guide.replace(model=model.replace(fitted=model.fitted & jnp.asarray(used))))

@@ -1,0 +1,219 @@
+"""The program of post-hoc adaptation: lanes of (base policy, seed, label budget, bound), asked and fitted together.
+
+A lane asks about what its base policy does, then about what its model so far makes of that (DAgger), never farther from
+the base than its bound, and fits its model anew after each round. Lanes differ by arrays alone: budgets are masks over
+labels, bounds are traced, and several base policies are one pytree with a leading axis. So any number of them is one
+compiled program: side by side on an accelerator, one by one on a CPU (`devices.each_lane`), shared out over a mesh.
+
+    lanes = product(bases=8, seeds=(0,), budgets=(100, 250, 500), bounds_deg=(60.0, 180.0))    # or `one_each`
+    block = begin(guidance, sizes, env, lanes)
+    for _ in range(rounds(lanes, sizes)):
+        block = ask_round(guidance, sizes, env, teacher, scalars, bases, block)
+    policy = adapted(guidance, sizes, env, scalars, bases, block)    # a block for `evaluate.evaluate_lanes`
+
+`bases` is a policy whose leaves that are `BY_LANE` in its `axes` have a row for each base (`side_by_side` stacks single
+policies), or `policies.Common(policy)` where there is but one. `guidance` is a bundle of `guidance.registry.make`,
+`sizes` those it was made with, `env` the changed world. `judging.judge` then keeps what is no worse than the base.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from itertools import product as combinations
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax.sharding import Mesh
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+from cuelearner_jax import asking
+from cuelearner_jax.agent.learning import all_finite
+from cuelearner_jax.config import GuideSizes, Scalars
+from cuelearner_jax.devices import BY_LANE, SHARED, each_lane, lane_mesh, over_lanes
+from cuelearner_jax.environment import Environment
+from cuelearner_jax.evaluate import one_lane
+from cuelearner_jax.guidance.bundle import Guidance
+from cuelearner_jax.policies import Guided, Policy
+from cuelearner_jax.types import GuideState, Label, Teacher
+
+
+class Lanes(NamedTuple):
+    """What is adapted: one row a lane."""
+
+    base: np.ndarray  # (lanes,) int: which of the base policies
+    seed: np.ndarray  # (lanes,) int: of everything random
+    budget: np.ndarray  # (lanes,) int: labels
+    bound_deg: np.ndarray  # (lanes,) float: how far from the base's actions [deg]
+
+    @property
+    def number(self) -> int:
+        """How many there are."""
+        return len(self.seed)
+
+    def rows(self, index: Any) -> Lanes:
+        """Some of the lanes."""
+        return Lanes(*(column[index] for column in self))
+
+
+def _lanes(rows: Sequence[tuple[int, int, int, float]]) -> Lanes:
+    kinds = (np.int32, np.int32, np.int32, np.float32)
+    return Lanes(*(np.array(column, kind) for column, kind in zip(zip(*rows, strict=True), kinds, strict=True)))
+
+
+def product(bases: int, seeds: Sequence[int], budgets: Sequence[int], bounds_deg: Sequence[float]) -> Lanes:
+    """Every base policy with every seed, budget and bound."""
+    rows = combinations(bounds_deg, budgets, range(bases), seeds)
+    return _lanes([(base, seed, budget, bound) for bound, budget, base, seed in rows])
+
+
+def one_each(seeds: Sequence[int], budgets: Sequence[int], bounds_deg: Sequence[float]) -> Lanes:
+    """As many base policies as seeds, each with a seed of its own, with every budget and bound."""
+    rows = combinations(bounds_deg, budgets, enumerate(seeds))
+    return _lanes([(base, seed, budget, bound) for bound, budget, (base, seed) in rows])
+
+
+def side_by_side(policies: Sequence[Any]) -> Any:
+    """Single policies of one make as a block, whose leaves that are `BY_LANE` have a row for each of them."""
+    first, axes = policies[0], policies[0].axes
+
+    def stacked(axis: Any, *parts: Any) -> Any:
+        if axis is None:
+            return parts[0]
+        return jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(leaf) for leaf in leaves]), *parts)
+
+    return jax.tree.map(stacked, axes, first, *policies[1:], is_leaf=lambda leaf: leaf is None)
+
+
+class Adapting(struct.PyTreeNode):
+    """A lane on its way; of a block every leaf has a leading axis of lanes."""
+
+    guide: GuideState
+    base: Int[Array, ""]  # which of the base policies
+    bound: Float[Array, ""]  # [rad]
+    key: PRNGKeyArray
+    failed: Bool[Array, ""]  # did its model stop being finite? It stays as it was before then
+
+
+def rounds(lanes: Lanes, sizes: GuideSizes) -> int:
+    """Rounds until the largest budget is asked for."""
+    return asking.label_slots(int(lanes.budget.max()), sizes) // sizes.labels_per_round
+
+
+@partial(jax.jit, static_argnames=("guidance", "sizes", "slots"))
+def _begin(guidance: Guidance, sizes: GuideSizes, slots: int, env: Any, columns: Any) -> Adapting:
+    def one(base: Array, seed: Array, budget: Array, bound: Array) -> Adapting:
+        k_model, k_env, k_lane = jax.random.split(jax.random.key(seed), 3)
+        guide = asking.start(guidance, env, slots, budget, k_model, k_env, sizes.candidates)
+        return Adapting(guide, base, bound, k_lane, jnp.array(False))
+
+    return each_lane(one)(*columns)
+
+
+def begin(guidance: Guidance, sizes: GuideSizes, env: Environment, lanes: Lanes) -> Adapting:
+    """Lanes that have asked nothing yet. Their number must divide among the devices of the mesh used later."""
+    slots = rounds(lanes, sizes) * sizes.labels_per_round
+    bound = jnp.deg2rad(jnp.asarray(lanes.bound_deg))
+    columns = (*(jnp.asarray(column) for column in (lanes.base, lanes.seed, lanes.budget)), bound)
+    return _begin(guidance, sizes, slots, env, columns)
+
+
+def _kept_finite(block: Adapting, guide: GuideState) -> Adapting:
+    """The lane with a new guide; where that is not finite the lane fails, and keeps the one that it had."""
+    failed = block.failed | ~all_finite((guide.model, guide.labels))
+    kept = jax.tree.map(lambda new, old: jnp.where(failed, old, new), guide, block.guide)
+    return block.replace(guide=kept, failed=failed)
+
+
+@partial(jax.jit, static_argnames=("guidance", "sizes", "mesh"))
+def _ask_round(
+    guidance: Guidance, sizes: GuideSizes, mesh: Mesh, env: Any, teacher: Any, scalars: Any, bases: Any, block: Adapting
+) -> Adapting:
+    def of_device(env: Any, teacher: Any, scalars: Any, bases: Any, block: Adapting) -> Adapting:
+        def one(lane: Adapting) -> Adapting:
+            base = one_lane(bases, lane.base)
+            guide = asking.label_round(
+                guidance, sizes, env, teacher, scalars, base, lane.guide, lane.key, bound=lane.bound
+            )
+            return _kept_finite(lane, guide)
+
+        return each_lane(one)(block)
+
+    return over_lanes(mesh, of_device, (*(SHARED,) * 4, BY_LANE), BY_LANE)(env, teacher, scalars, bases, block)
+
+
+def ask_round(
+    guidance: Guidance,
+    sizes: GuideSizes,
+    env: Environment,
+    teacher: Teacher,
+    scalars: Scalars,
+    bases: Policy,
+    block: Adapting,
+    mesh: Mesh | None = None,
+) -> Adapting:
+    """One round of questions to a simulated teacher in every lane, and the fit that follows it (`asking.label_round`).
+
+    A lane that has its budget stays as it is.
+
+    Args:
+        guidance: the bundle, which must ask.
+        sizes: those it was made with.
+        env: the changed world.
+        teacher: of that world.
+        scalars: of refinement, of fitting and of the teacher's faults; `tau_max_deg` bounds beside each lane's bound.
+        bases: see above.
+        block: the lanes.
+        mesh: devices that share the lanes (default: the first one alone).
+    """
+    mesh = mesh or lane_mesh(jax.local_devices()[:1])
+    return _ask_round(guidance, sizes, mesh, env, teacher, scalars, bases, block)
+
+
+@partial(jax.jit, static_argnames=("guidance", "sizes", "mesh"))
+def _take(
+    guidance: Guidance, sizes: GuideSizes, mesh: Mesh, env: Any, scalars: Any, labels: Label, block: Adapting
+) -> Adapting:
+    def of_device(env: Any, scalars: Any, labels: Label, block: Adapting) -> Adapting:
+        def one(labels: Label, lane: Adapting) -> Adapting:
+            guide = lane.guide.replace(labels=labels, asked=lane.guide.budget)
+            last = (lane.guide.budget - 1) // sizes.labels_per_round  # the fit that follows the last round
+            return _kept_finite(lane, asking.fit(guidance, env, scalars, guide, lane.key, last))
+
+        return each_lane(one)(labels, block)
+
+    return over_lanes(mesh, of_device, (SHARED, SHARED, BY_LANE, BY_LANE), BY_LANE)(env, scalars, labels, block)
+
+
+def take_labels(
+    guidance: Guidance,
+    sizes: GuideSizes,
+    env: Environment,
+    scalars: Scalars,
+    labels: Label,
+    block: Adapting,
+    mesh: Mesh | None = None,
+) -> Adapting:
+    """Labels (lanes, slots, ...) that were given elsewhere, fitted once, as the last round of asking for them fits.
+
+    A kind that fits from scratch has then the model of the lane that asked; one that goes on learning (deep COACH) is
+    corrected by all of them in one go, with other random numbers.
+    """
+    mesh = mesh or lane_mesh(jax.local_devices()[:1])
+    return _take(guidance, sizes, mesh, env, scalars, labels, block)
+
+
+def adapted(
+    guidance: Guidance, sizes: GuideSizes, env: Environment, scalars: Scalars, bases: Policy, block: Adapting
+) -> Guided:
+    """Every lane's policy: its base's actions under its model, within its bound.
+
+    Args:
+        guidance, sizes, scalars, bases, block: as for `ask_round`.
+        env: how observations look from actions; nobody asks it in the raw frame.
+    """
+    base = one_lane(bases, block.base)  # a row a lane
+    return Guided(base, block.guide.model, env, scalars, guidance, block.bound, sizes)

@@ -1,0 +1,162 @@
+"""Policies as plain values and arrays, and back.
+
+A policy is told as nested JSON values, each with the name of what acts under `policy`:
+
+| policy      | other values                                                                     | arrays             |
+|-------------|----------------------------------------------------------------------------------|--------------------|
+| `agent`     | `sizes`                                                                          | `params`           |
+| `heuristic` |                                                                                  |                    |
+| `uniform`   |                                                                                  |                    |
+| `guided`    | `guidance` (its kind), `sizes`, `scalars`, `bounded`, and `base`: another policy | `model`, `bound`   |
+| `code`      | `named`: package.module:NAME, or how Python calls it                             |                    |
+
+Code is never loaded because a file names it: whoever opens the policy gives it again.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from cuelearner_jax import config as configuration
+from cuelearner_jax.agent import view
+from cuelearner_jax.agent.networks import q_network
+from cuelearner_jax.config import AgentSizes, GuideSizes, Scalars
+from cuelearner_jax.environment import actions_of, offers, spaces_of
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.guidance import registry as guidances
+from cuelearner_jax.policies import Agent, Common, Corrected, Guided, Heuristic, Taught, uniform_in
+from cuelearner_jax.policies import Uniform as UniformPolicy
+
+Told = dict[str, Any]
+
+
+def told(policy: Any, named: str | None = None) -> Told:
+    """A policy, or a block of them, as plain values.
+
+    Args:
+        policy: the policy.
+        named: how the code in it is named, if there is any.
+
+    Raises:
+        UserError: it asks a teacher, or is refined in a way that cannot be kept.
+    """
+    if isinstance(policy, Common):
+        return told(policy.policy, named)
+    if isinstance(policy, Agent):
+        return {"policy": "agent", "sizes": _part(AgentSizes, policy.sizes)}
+    if isinstance(policy, UniformPolicy):
+        return {"policy": "uniform"}
+    if isinstance(policy, Heuristic):
+        return {"policy": "heuristic"}
+    if isinstance(policy, Taught | Corrected):
+        raise UserError("a policy that asks a teacher cannot be kept in a folder: give one that acts by itself")
+    if isinstance(policy, Guided):
+        if policy.sizes is None:
+            raise UserError("a policy under a guidance of unknown sizes cannot be kept in a folder: give them as sizes")
+        return {
+            "policy": "guided",
+            "guidance": policy.guidance.name,
+            "sizes": _part(GuideSizes, policy.sizes),
+            "scalars": _part(Scalars, policy.scalars),
+            "bounded": policy.bound is not None,
+            "base": told(policy.base, named),
+        }
+    return {"policy": "code", "named": named or "code"}
+
+
+def _part(kind: type, values: Any) -> Told:
+    """The fields of a configuration class, of an instance of it or of one that has more."""
+    return configuration.to_json(
+        kind(**{field.name: getattr(values, field.name) for field in dataclasses.fields(kind)})
+    )
+
+
+def arrays_of(policy: Any) -> Any:
+    """The arrays of a policy, or of a block of them."""
+    if isinstance(policy, Common):
+        return arrays_of(policy.policy)
+    if isinstance(policy, Agent):
+        return {"params": policy.params}
+    if isinstance(policy, Guided):
+        bound = {} if policy.bound is None else {"bound": policy.bound}
+        return {"base": arrays_of(policy.base), "model": policy.model, **bound}
+    return {}
+
+
+def shapes_of(values: Told, env: Any, rows: int | None = None) -> Any:
+    """The shapes of a policy's arrays.
+
+    Args:
+        values: from `told`.
+        env: of the policy's task, shapes in place of arrays will do.
+        rows: of a block of so many policies; None: of one.
+    """
+    spaces = spaces_of(env)
+
+    def one(values: Told) -> Any:
+        if values["policy"] == "agent":
+            sizes = configuration.from_json(AgentSizes, values["sizes"])
+            seen = [jnp.zeros(width) for width in view.widths(sizes.frame, spaces)]
+            return {"params": q_network(sizes.q_layers).init(jax.random.key(0), *seen)}
+        if values["policy"] == "guided":
+            bound = {"bound": jnp.zeros(())} if values["bounded"] else {}
+            return {"base": one(values["base"]), "model": _guidance(values, env).init(jax.random.key(0)), **bound}
+        return {}
+
+    shapes = jax.eval_shape(lambda: one(values))
+    leading = () if rows is None else (rows,)
+    return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct((*leading, *leaf.shape), leaf.dtype), shapes)
+
+
+def made(values: Told, arrays: Any, env: Any, code: Any = None) -> Any:
+    """The policy of plain values and arrays; the inverse of `told` and `arrays_of`.
+
+    Args:
+        values: from `told`.
+        arrays: of one policy, or of a block of them.
+        env: where it is to act.
+        code: the policy that stands for `code` (see `policies.policy_of`).
+
+    Raises:
+        UserError: the policy's code was not given, or it needs what the environment has not.
+        KeyError, TypeError, ValueError: the values make no sense.
+    """
+    kind = values["policy"]
+    if kind == "agent":
+        sizes = configuration.from_json(AgentSizes, values["sizes"])
+        return Agent(arrays["params"], sizes, actions_of(env), env)
+    if kind == "uniform":
+        return uniform_in(env)
+    if kind == "heuristic":
+        if not offers(env, "heuristic"):
+            raise UserError("the policy is the task's heuristic, and this world has none: choose another world")
+        return Heuristic(env)
+    if kind == "guided":
+        base = made(values["base"], arrays["base"], env, code)
+        sizes, scalars = (
+            configuration.from_json(of, values[part]) for of, part in ((GuideSizes, "sizes"), (Scalars, "scalars"))
+        )
+        return Guided(base, arrays["model"], env, scalars, _guidance(values, env), arrays.get("bound"), sizes)
+    if kind == "code":
+        if code is None:
+            raise UserError(
+                f"this policy is made of code, {values['named']}, which is not loaded because a file names it: add "
+                f"--base {values['named']} if you trust that code"
+            )
+        return code
+    raise ValueError(f"{kind!r} is no policy")
+
+
+def _guidance(values: Told, env: Any) -> Any:
+    """The bundle of a guided policy. Raises UserError if its kind is not known here."""
+    name = values["guidance"]
+    if guidances.registered(name) is None:
+        raise UserError(
+            f"the policy is under a guidance from outside, {name!r}: name its code by --guidance package.module:NAME, "
+            "if you trust that code"
+        )
+    return guidances.make(name, configuration.from_json(GuideSizes, values["sizes"]), env)

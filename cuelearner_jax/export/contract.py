@@ -1,0 +1,146 @@
+"""Writes a decision's folder: the decision, its contract, golden cases, and the file that runs it.
+
+contract.json    what goes in and what comes out, with units; versions; digests of the other files and of itself
+decision.*       the decision
+golden.npz       observations (cases, obs) and the actions (cases, action) that JAX decided on
+decide.py        runs the decision; a copy of `runner`
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import itertools
+import json
+import os
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from cuelearner_jax.environment import Quantity
+from cuelearner_jax.errors import UserError, closest
+from cuelearner_jax.export import runner
+from cuelearner_jax.export.decisions import TOLERANCE, clip_radius_deg, described, golden_cases
+from cuelearner_jax.export.formats import FORMATS, traced
+from cuelearner_jax.policies import Policy
+from cuelearner_jax.records.folders import in_use
+from cuelearner_jax.records.provenance import provenance
+from cuelearner_jax.records.whole import replacing
+
+ANGLE = "atan2(action[1], action[0]) [rad]: 0 along x, positive counterclockwise (from x to y)"
+
+
+def check_request(format: str, out: Path) -> None:
+    """Raises UserError unless a decision of that format can be written to a folder."""
+    if format not in FORMATS:
+        raise UserError(f"unknown format {format!r}{closest(format, FORMATS)}")
+    if in_use(out):
+        raise UserError(f"{out} is not empty: give another --out")
+
+
+def write(
+    policy: Policy,
+    observation: Sequence[Quantity],
+    action: Quantity,
+    drawn: Float[np.ndarray, "n obs"],
+    format: str,
+    out: Path,
+    source: dict[str, Any],
+) -> dict[str, Any]:
+    """Writes a policy's decision and replays its golden cases; the folder is there as a whole or not at all.
+
+    Args:
+        policy: whose decision it is.
+        observation: the slices of what it sees.
+        action: what it gives.
+        drawn: observations such as it will meet, among which golden cases are chosen.
+        format: a key of `FORMATS`.
+        out: the folder.
+        source: where the policy comes from, for the contract.
+
+    Returns:
+        The contract, with "difference": the largest one of a golden case, just now.
+
+    Raises:
+        UserError: no such format; the folder is in use; the policy cannot be exported.
+    """
+    check_request(format, out)
+    size = sum(quantity.size for quantity in observation)
+    found = traced(policy, size)
+    artefact = FORMATS[format].make(policy, found, size, action.size)
+    golden = golden_cases(policy, drawn)
+    cases = io.BytesIO()
+    np.savez(cases, obs=golden.obs, actions=golden.actions)
+    files = {
+        artefact.file: artefact.contents,
+        runner.GOLDEN: cases.getvalue(),
+        "decide.py": Path(runner.__file__).read_bytes(),
+    }
+    contract = {
+        "version": runner.VERSION,
+        "artefact": {"format": format, "file": artefact.file, **artefact.about},
+        "observation": {"size": size, "dtype": "float32", "slices": _slices(observation)},
+        "action": {
+            "name": action.name,
+            "size": action.size,
+            "unit": action.unit,
+            "about": action.about,
+            "dtype": "float32",
+            "angle": ANGLE,
+            "clip_radius_deg": clip_radius_deg(policy),
+        },
+        "batch": "observations (n, size), any n; every row is decided by itself",
+        "policy": described(policy),
+        "source": source,
+        "golden": {
+            "cases": len(golden.obs),
+            "tolerance": TOLERANCE,
+            "drawn": golden.drawn,
+            "steady": golden.steady,
+        },
+        "files": {name: hashlib.sha256(contents).hexdigest() for name, contents in files.items()},
+        **provenance(),
+    }
+    return {**contract, "difference": _written(out, files, contract)}
+
+
+def _slices(observation: Sequence[Quantity]) -> list[dict[str, Any]]:
+    ends = list(itertools.accumulate(quantity.size for quantity in observation))
+    return [
+        {"name": q.name, "from": end - q.size, "to": end, "size": q.size, "unit": q.unit, "about": q.about}
+        for q, end in zip(observation, ends, strict=True)
+    ]
+
+
+def _written(out: Path, files: dict[str, bytes], contract: dict[str, Any]) -> float:
+    """Writes everything beside the place, tries it there, and moves it."""
+    out.parent.mkdir(parents=True, exist_ok=True)
+    beside = out.with_name(f".{out.name}.{os.getpid()}")
+    beside.mkdir()
+    try:
+        for name, contents in files.items():
+            with replacing(beside / name, "wb") as file:
+                file.write(contents)
+        contract = json.loads(json.dumps(contract))
+        with replacing(beside / runner.CONTRACT) as file:
+            file.write(json.dumps({**contract, runner.DIGEST: runner.digest(contract)}, indent=1) + "\n")
+        difference = checked(beside)
+        beside.replace(out)
+    finally:
+        shutil.rmtree(beside, ignore_errors=True)
+    return difference
+
+
+def checked(folder: Path) -> float:
+    """Replays a folder's golden cases; returns the largest difference.
+
+    Raises UserError for a folder that is damaged, cannot be run here, or decides otherwise.
+    """
+    try:
+        return runner.Decision(folder).check()
+    except runner.ContractError as error:
+        raise UserError(str(error)) from error

@@ -1,0 +1,91 @@
+"""The formats that a decision is written in, by name."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.export import onnx_graph, rules
+from cuelearner_jax.export.decisions import CALLBACKS, decision_of, row_by_row
+from cuelearner_jax.export.graph import Traced, trace
+from cuelearner_jax.policies import Policy
+
+PLATFORMS = ("cpu", "cuda")  # that a decision in StableHLO runs on
+
+
+class Artefact(NamedTuple):
+    """A decision as a file."""
+
+    file: str
+    contents: bytes
+    about: dict[str, Any]  # what the contract says of it
+
+
+class Format(NamedTuple):
+    """A format."""
+
+    about: str
+    make: Callable[[Policy, Traced, int, int], Artefact]  # (policy, its graph, entries of observation and action)
+
+
+def _of_graph(traced: Traced, name: str) -> None:
+    """Raises UserError if the graph is not all of the decision."""
+    if traced.missing:
+        raise UserError(
+            f"--format {name} has no words for {', '.join(traced.missing)}, which this policy needs: "
+            "give --format stablehlo"
+        )
+
+
+def _numpy(policy: Policy, traced: Traced, obs_size: int, action_size: int) -> Artefact:
+    _of_graph(traced, "numpy")
+    graph = np.frombuffer(json.dumps(traced.graph.as_json()).encode(), np.uint8)
+    stored = io.BytesIO()
+    arrays: dict[str, Any] = {"graph": graph, **traced.constants}
+    np.savez(stored, **arrays)
+    return Artefact("decision.npz", stored.getvalue(), {"needs": "numpy"})
+
+
+def _onnx(policy: Policy, traced: Traced, obs_size: int, action_size: int) -> Artefact:
+    _of_graph(traced, "onnx")
+    contents = onnx_graph.serialized(traced, obs_size, action_size)
+    about = {"needs": "onnxruntime", "opset": onnx_graph.OPSET, "input": "obs", "output": "action"}
+    return Artefact("decision.onnx", contents, about)
+
+
+def _stablehlo(policy: Policy, traced: Traced, obs_size: int, action_size: int) -> Artefact:
+    from jax import export
+
+    shape = export.symbolic_shape(f"n, {obs_size}")
+    decide = jax.jit(row_by_row(policy))
+    exported = export.export(decide, platforms=PLATFORMS)(jax.ShapeDtypeStruct(shape, jnp.float32))
+    about = {"needs": "jax", "jax": jax.__version__, "platforms": list(PLATFORMS)}
+    return Artefact("decision.stablehlo", bytes(exported.serialize()), about)
+
+
+FORMATS = {
+    "stablehlo": Format("for JAX: the compiler's own language, for CPUs and NVIDIA GPUs", _stablehlo),
+    "onnx": Format("for onnxruntime and what else reads ONNX (extra `onnx`)", _onnx),
+    "numpy": Format("for NumPy alone: the parameters, and a file of Python that runs them", _numpy),
+}
+
+
+def traced(policy: Policy, obs_size: int) -> Traced:
+    """A policy's decision as a graph.
+
+    Raises UserError for a policy that acts at random, or holds code that is not JAX's.
+    """
+    assert rules.RULES  # they are registered by importing them
+    found = trace(decision_of(policy), obs_size)
+    if CALLBACKS & set(found.missing):
+        raise UserError("this policy calls a Python function, which no file can hold: export one of JAX functions")
+    if found.random:
+        raise UserError("this policy acts at random, and an exported one cannot: export one that does not")
+    return found

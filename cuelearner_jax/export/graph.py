@@ -1,0 +1,233 @@
+"""A function of one observation as a graph of few plain operations, which NumPy and ONNX can run.
+
+JAX traces the function; its calls are inlined, whatever does not hang on the observation is computed once, and what is
+left becomes the operations that `runner.OPERATIONS` lists. All shapes are fixed, for it is one observation: a batch is
+decided row by row.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.extend import core
+
+KINDS = {"float32": "float32", "int32": "int32", "uint32": "int32", "bool": "bool", "bfloat16": "float32"}
+
+
+class Value(NamedTuple):
+    """What an operation gives; its numbers are known when the graph runs."""
+
+    name: str
+    shape: tuple[int, ...]
+    kind: str  # float32, int32 or bool
+
+
+Known = Value | np.ndarray | jax.Array  # or what is known already
+
+
+@dataclasses.dataclass
+class Graph:
+    """Operations in an order in which they can be run: [name, inputs, outputs, attributes]."""
+
+    inputs: list[str]
+    outputs: list[str]
+    ops: list[list[Any]]
+
+    def as_json(self) -> dict[str, Any]:
+        """For a file, or as an attribute of a loop."""
+        return dataclasses.asdict(self)
+
+
+class Traced(NamedTuple):
+    """A function as a graph."""
+
+    graph: Graph
+    constants: dict[str, np.ndarray]
+    missing: tuple[str, ...]  # operations of JAX that it needs and this module does not know
+    random: bool  # does it hang on the key?
+
+
+Rule = Callable[["Builder", Any, list[Any]], list[Known]]  # (builder, equation, its inputs) -> its outputs
+RULES: dict[str, Rule] = {}
+
+
+def trace(function: Callable[[Any, Any], Any], obs_size: int) -> Traced:
+    """A function (key, observation (obs_size,)) -> action (action,) as a graph of the observation."""
+    key, obs = jax.random.key(0), jax.ShapeDtypeStruct((obs_size,), jnp.float32)
+    closed = jax.make_jaxpr(function)(key, obs)
+    builder = Builder()
+    drawn, given = Value("key", (), "key"), Value("obs", (obs_size,), "float32")
+    (result,) = builder.inlined(closed.jaxpr, closed.consts, [drawn, given])
+    ops, needed = _needed(builder.ops, {builder.name(result)})
+    constants = {name: array for name, array in builder.constants.items() if name in needed}
+    missing = tuple(sorted({name.removeprefix("missing:") for name in _names(ops) if name.startswith("missing:")}))
+    return Traced(Graph(["obs"], [builder.name(result)], ops), constants, missing, "key" in needed)
+
+
+def _needed(ops: list[list[Any]], wanted: set[str]) -> tuple[list[list[Any]], set[str]]:
+    """The operations that lead to what is wanted, and every name that they look at."""
+    kept, wanted = [], set(wanted)
+    for op in reversed(ops):
+        name, inputs, outputs, attributes = op
+        if not wanted & set(outputs):
+            continue
+        kept.append(op)
+        wanted |= set(inputs)
+        for part in ("test", "body") if name == "while" else ():
+            inner = attributes[part]
+            inner["ops"], found = _needed(inner["ops"], set(inner["outputs"]))
+            wanted |= found
+    return kept[::-1], wanted
+
+
+def _names(ops: list[list[Any]]) -> Iterator[str]:
+    for name, _, _, attributes in ops:
+        yield name
+        if name == "while":
+            yield from _names(attributes["test"]["ops"])
+            yield from _names(attributes["body"]["ops"])
+
+
+class Builder:
+    """Collects operations."""
+
+    def __init__(self) -> None:
+        """Nothing yet."""
+        self.ops: list[list[Any]] = []
+        self.constants: dict[str, np.ndarray] = {}
+        self._named: dict[int, tuple[Any, str]] = {}  # by identity; the array is kept, so that no other gets its place
+        self._numbers = itertools.count()
+
+    def inlined(self, jaxpr: Any, consts: Any, inputs: list[Known]) -> list[Known]:
+        """Adds what a jaxpr does to its inputs; returns its outputs."""
+        values: dict[Any, Known] = dict(zip(jaxpr.constvars, consts, strict=True))
+        values.update(zip(jaxpr.invars, inputs, strict=True))
+
+        def read(atom: Any) -> Known:
+            return np.asarray(atom.val, atom.aval.dtype) if _is_literal(atom) else values[atom]
+
+        for equation in jaxpr.eqns:
+            given = [read(atom) for atom in equation.invars]
+            values.update(zip(equation.outvars, self._done(equation, given, jaxpr.debug_info), strict=True))
+        return [read(atom) for atom in jaxpr.outvars]
+
+    def _done(self, equation: Any, given: list[Known], origin: Any) -> list[Known]:
+        name = equation.primitive.name
+        if not any(isinstance(value, Value) for value in given):
+            return _computed(equation, given, origin)
+        if (inner := _called(equation)) is not None:
+            return self.inlined(inner.jaxpr, inner.consts, given)
+        drawn = any(isinstance(value, Value) and value.kind == "key" for value in given)
+        if name not in RULES or drawn:
+            return self._missing(equation, given)
+        try:
+            found = RULES[name](self, equation, given)
+        except NotImplementedError:
+            return self._missing(equation, given)
+        return [
+            self.add("bfloat16", [value], value.shape, value.kind)
+            if name in ROUNDED and isinstance(value, Value) and str(var.aval.dtype) == "bfloat16"
+            else value
+            for value, var in zip(found, equation.outvars, strict=True)
+        ]
+
+    def _missing(self, equation: Any, given: list[Known]) -> list[Known]:
+        """An operation that there is no rule for: it may turn out that nothing hangs on it."""
+        outputs = [self.new(var.aval.shape, KINDS.get(str(var.aval.dtype), "key")) for var in equation.outvars]
+        known = [value.name for value in given if isinstance(value, Value)]
+        self.ops.append([f"missing:{equation.primitive.name}", known, [value.name for value in outputs], {}])
+        return list(outputs)
+
+    def new(self, shape: tuple[int, ...], kind: str) -> Value:
+        """A value with a name of its own."""
+        return Value(f"v{next(self._numbers)}", tuple(shape), kind)
+
+    def add(self, op: str, inputs: list[Known], shape: tuple[int, ...], kind: str, /, **attributes: Any) -> Value:
+        """Adds an operation with one output."""
+        output = self.new(shape, kind)
+        self.ops.append([op, [self.name(value) for value in inputs], [output.name], attributes])
+        return output
+
+    def name(self, value: Known) -> str:
+        """The name of a value; what is known becomes a constant."""
+        if isinstance(value, Value):
+            return value.name
+        if id(value) not in self._named:
+            name = f"c{len(self._named)}"
+            array = np.asarray(value)
+            self.constants[name] = array.astype(KINDS[str(array.dtype)])
+            self._named[id(value)] = (value, name)
+        return self._named[id(value)][1]
+
+    def reshaped(self, value: Known, shape: tuple[int, ...]) -> Known:
+        """The same numbers in another shape."""
+        if tuple(value.shape) == tuple(shape):
+            return value
+        if not isinstance(value, Value):
+            return jnp.reshape(value, shape)
+        return self.add("reshape", [value], shape, value.kind, shape=list(map(int, shape)))
+
+    def transposed(self, value: Known, axes: tuple[int, ...]) -> Known:
+        """Axes in another order."""
+        if tuple(axes) == tuple(range(len(axes))):
+            return value
+        if not isinstance(value, Value):
+            return jnp.transpose(value, axes)
+        turned, axes = tuple(value.shape[a] for a in axes), tuple(map(int, axes))
+        return self.add("transpose", [value], turned, value.kind, axes=list(axes))
+
+    def branch(self, jaxpr: Any, consts: list[Known], carried: list[Value]) -> Graph:
+        """A jaxpr of carried values as a graph of its own, which may look at everything outside."""
+        outer, self.ops = self.ops, []
+        results = self.inlined(jaxpr.jaxpr, jaxpr.consts, [*consts, *carried])
+        made, self.ops = self.ops, outer
+        names = [value.name for value in carried]
+        return Graph(names, [self.name(result) for result in results], self._kept_inside(made, set(names)))
+
+    def _kept_inside(self, ops: list[list[Any]], changing: set[str]) -> list[list[Any]]:
+        """The operations that every pass must do again; those that hang on nothing that changes go before the loop."""
+        inside = []
+        for op in ops:
+            name, inputs, outputs, _ = op
+            if name == "while" or changing & set(inputs):
+                inside.append(op)
+                changing = changing | set(outputs)
+            else:
+                self.ops.append(op)
+        return inside
+
+
+def _computed(equation: Any, given: list[Any], origin: Any) -> list[Any]:
+    """What one equation gives of inputs that are known; `origin` is what JAX tells of where it stood."""
+    own = [atom for atom in equation.invars if not _is_literal(atom)]
+    first = [number for number, atom in enumerate(own) if atom not in own[:number]]
+    known = [value for atom, value in zip(equation.invars, given, strict=True) if not _is_literal(atom)]
+    alone = core.Jaxpr((), [own[number] for number in first], equation.outvars, [equation], debug_info=origin)
+    return core.jaxpr_as_fun(core.ClosedJaxpr(alone, ()))(*[known[number] for number in first])
+
+
+def _is_literal(atom: Any) -> bool:
+    return isinstance(atom, core.Literal)
+
+
+def _called(equation: Any) -> Any:
+    """The jaxpr that an equation merely calls, or None."""
+    if equation.primitive.name in ("while", "cond", "scan"):
+        return None
+    for name in ("jaxpr", "call_jaxpr", "fun_jaxpr"):
+        if (found := equation.params.get(name)) is not None:
+            return found if hasattr(found, "consts") else core.ClosedJaxpr(found, ())
+    return None
+
+
+# What computes in bfloat16 where its result is of that type; the others only move numbers, or choose among them.
+ROUNDED = {
+    *("add", "sub", "mul", "div", "dot_general", "exp", "log", "log1p", "expm1", "sin", "cos", "tan", "tanh", "atan"),
+    *("atan2", "sqrt", "rsqrt", "square", "logistic", "pow", "integer_pow", "reduce_sum", "convert_element_type"),
+}

@@ -1,0 +1,232 @@
+"""A decision's graph in ONNX: a scan over the rows of a batch, whose body is the graph of one observation.
+
+Written operation by operation from the graph that NumPy runs. (A converter of JAX programs, jax2onnx 0.17, was
+tried: it has no rule for a dense layer under vmap, which ensembles and aims are made of, misses navigation's features
+by 6e-5, and wants an older Orbax than checkpoints are written with.)
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.export.graph import Traced
+
+OPSET, IR_VERSION = 18, 8  # of 2022: runtimes of several years take them
+
+
+def serialized(traced: Traced, obs_size: int, action_size: int) -> bytes:
+    """A model with the input `obs` (n, obs_size) and the output `action` (n, action_size).
+
+    Raises UserError if the package onnx is missing.
+    """
+    try:
+        from onnx import TensorProto, checker, helper, numpy_helper
+    except ImportError:
+        raise UserError("--format onnx needs the extra: pip install 'cuelearner-jax[onnx]'") from None
+    writer = _Writer(helper, TensorProto)
+    (result,) = traced.graph.outputs
+    nodes = writer.nodes(traced.graph.ops, {"obs": "row"}, "")
+    nodes.append(helper.make_node("Identity", [writer.names.get(result, result)], ["decided"]))
+    row = helper.make_tensor_value_info("row", TensorProto.FLOAT, [obs_size])
+    decided = helper.make_tensor_value_info("decided", TensorProto.FLOAT, [action_size])
+    body = helper.make_graph(nodes, "one_observation", [row], [decided])
+    batch = helper.make_tensor_value_info("obs", TensorProto.FLOAT, ["n", obs_size])
+    actions = helper.make_tensor_value_info("action", TensorProto.FLOAT, ["n", action_size])
+    constants = {**traced.constants, **writer.constants}
+    graph = helper.make_graph(
+        [helper.make_node("Scan", ["obs"], ["action"], body=body, num_scan_inputs=1)],
+        "decision",
+        [batch],
+        [actions],
+        [numpy_helper.from_array(np.asarray(array, order="C"), name) for name, array in constants.items()],
+    )
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], producer_name="cuelearner")
+    model.ir_version = IR_VERSION
+    checker.check_model(model)
+    return model.SerializeToString()
+
+
+class _Writer:
+    """Operations as nodes. Names are unique in the whole model: inner graphs see those outside."""
+
+    def __init__(self, helper: Any, types: Any) -> None:
+        self.helper = helper
+        self.kinds = {"float32": types.FLOAT, "int32": types.INT32, "bool": types.BOOL}
+        self.bfloat16, self.counter = types.BFLOAT16, types.INT64
+        self.constants: dict[str, np.ndarray] = {}
+        self.names: dict[str, str] = {}  # of the graph's values in this model, where they differ
+        self._made: list[Any] = []
+        self._numbers = itertools.count()
+
+    def nodes(self, ops: list[list[Any]], names: dict[str, str], suffix: str) -> list[Any]:
+        """Nodes of operations.
+
+        Args:
+            ops: the operations.
+            names: of values that are called otherwise here.
+            suffix: of the names of what they give.
+        """
+        outer, self._made = self._made, []
+        self.names.update(names)
+        for op, inputs, outputs, attributes in ops:
+            given: Any = [self.names.get(name, name) for name in inputs]
+            self.names.update({name: name + suffix for name in outputs})
+            results = [self.names[name] for name in outputs]
+            if op == "while":
+                self._loop(given, results, **attributes)
+            elif op == "top_k":
+                k = self.constant(np.array([attributes["k"]], np.int64))
+                self._made.append(
+                    self.helper.make_node("TopK", [given[0], k], [results[0], f"{results[1]}_64"], axis=-1)
+                )
+                self._named("Cast", [f"{results[1]}_64"], results[1], to=self.kinds["int32"])
+            else:
+                last = NODES[op](self, *given, **attributes)
+                self._named("Identity", [last], results[0])
+        made, self._made = self._made, outer
+        return made
+
+    def node(self, kind: str, *inputs: str, **attributes: Any) -> str:
+        """Adds a node; returns the name of its output."""
+        name = f"n{next(self._numbers)}"
+        self._named(kind, list(inputs), name, **attributes)
+        return name
+
+    def _named(self, kind: str, inputs: list[str], output: str, **attributes: Any) -> None:
+        self._made.append(self.helper.make_node(kind, inputs, [output], **attributes))
+
+    def constant(self, array: np.ndarray) -> str:
+        """The name of a constant."""
+        for name, known in self.constants.items():
+            if known.dtype == array.dtype and np.array_equal(known, array):
+                return name
+        name = f"k{len(self.constants)}"
+        self.constants[name] = array
+        return name
+
+    def whole(self, numbers: Any) -> str:
+        """The name of a row of whole numbers."""
+        return self.constant(np.array(numbers, np.int64).reshape(-1))
+
+    def number(self, value: float) -> str:
+        """The name of a number."""
+        return self.constant(np.array(value, np.float32))
+
+    def cast(self, value: str, kind: str) -> str:
+        """A value in another kind."""
+        return self.node("Cast", value, to=self.kinds[kind])
+
+    def _loop(self, given: list[str], results: list[str], carried: list[str], kinds: Any, test: Any, body: Any) -> None:
+        """Loop takes its condition from before and from the end of each pass; ours stands at a pass's beginning."""
+        first = self.nodes(test["ops"], dict(zip(carried, given, strict=True)), f"_t{next(self._numbers)}")
+        self._made += first
+        condition = self.names[test["outputs"][0]]
+        mark = f"_b{next(self._numbers)}"
+        inside = [name + mark for name in carried]
+        nodes = self.nodes(body["ops"], dict(zip(carried, inside, strict=True)), mark)
+        after = []
+        for number, name in enumerate(body["outputs"]):  # outputs of a graph must be nodes of its own
+            after.append(f"{self.names.get(name, name)}_{number}{mark}")
+            nodes.append(self.helper.make_node("Identity", [self.names.get(name, name)], [after[-1]]))
+        mark = f"_e{next(self._numbers)}"
+        nodes += self.nodes(test["ops"], dict(zip(carried, after, strict=True)), mark)
+        goes_on = f"goes_on{mark}"
+        nodes.append(self.helper.make_node("Identity", [self.names[test["outputs"][0]]], [goes_on]))
+        info = self.helper.make_tensor_value_info
+        takes = [info(f"pass{mark}", self.counter, []), info(f"go{mark}", self.kinds["bool"], [])]
+        takes += [info(name, self.kinds[kind], shape) for name, (kind, shape) in zip(inside, kinds, strict=True)]
+        gives = [info(goes_on, self.kinds["bool"], [])]
+        gives += [info(name, self.kinds[kind], shape) for name, (kind, shape) in zip(after, kinds, strict=True)]
+        graph = self.helper.make_graph(nodes, f"body{mark}", takes, gives)
+        self._made.append(self.helper.make_node("Loop", ["", condition, *given], results, body=graph))
+
+
+def _plain(kind: str, **fixed: Any) -> Callable[..., str]:
+    return lambda w, *inputs: w.node(kind, *inputs, **fixed)
+
+
+def _reduced(kind: str) -> Callable[..., str]:
+    return lambda w, x, axes: w.node(kind, x, w.whole(axes), keepdims=0)
+
+
+def _of_bools(kind: str) -> Callable[..., str]:
+    return lambda w, x, axes: w.cast(w.node(kind, w.cast(x, "int32"), w.whole(axes), keepdims=0), "bool")
+
+
+def _argument(kind: str) -> Callable[..., str]:
+    return lambda w, x, axis: w.cast(w.node(kind, x, axis=axis, keepdims=0), "int32")
+
+
+def _atan2(w: _Writer, y: str, x: str) -> str:
+    """From the arc tangent, which alone is there; exact to a few units of the last place."""
+    zero = w.number(0.0)
+    steep = w.node("Equal", x, zero)
+    slope = w.node("Atan", w.node("Div", y, w.node("Where", steep, w.number(1.0), x)))
+    up = w.node("Less", y, zero)
+    turned = w.node("Add", slope, w.node("Where", up, w.number(-math.pi), w.number(math.pi)))
+    straight = w.node("Mul", w.node("Sign", y), w.number(math.pi / 2))
+    return w.node("Where", steep, straight, w.node("Where", w.node("Less", x, zero), turned, slope))
+
+
+def _finite(w: _Writer, x: str) -> str:
+    return w.node("Not", w.node("Or", w.node("IsInf", x), w.node("IsNaN", x)))
+
+
+def _padded(w: _Writer, x: str, value: str, low: list[int], high: list[int]) -> str:
+    return w.node("Pad", x, w.whole([*low, *high]), value)
+
+
+def _sliced(w: _Writer, x: str, start: list[int], stop: list[int], step: list[int]) -> str:
+    return w.node("Slice", x, w.whole(start), w.whole(stop), w.whole(range(len(start))), w.whole(step))
+
+
+# By the names of `runner.OPERATIONS`: (writer, names of inputs, attributes) -> name of the output.
+NODES: dict[str, Callable[..., str]] = {
+    **{
+        name.lower(): _plain(name)
+        for name in ("Neg", "Abs", "Sign", "Floor", "Ceil", "Round", "Exp", "Log", "Sin", "Cos")
+    },
+    **{name.lower(): _plain(name) for name in ("Neg", "Abs", "Sign", "Floor", "Ceil", "Round", "Exp", "Log", "Sin")},
+    **{name.lower(): _plain(name) for name in ("Cos", "Tan", "Tanh", "Atan", "Sqrt", "Not", "Add", "Sub", "Mul")},
+    **{name.lower(): _plain(name) for name in ("Div", "Pow", "Max", "Min", "And", "Or", "Xor")},
+    "log1p": lambda w, x: w.node("Log", w.node("Add", x, w.number(1.0))),
+    "expm1": lambda w, x: w.node("Sub", w.node("Exp", x), w.number(1.0)),
+    "rsqrt": lambda w, x: w.node("Reciprocal", w.node("Sqrt", x)),
+    "square": lambda w, x: w.node("Mul", x, x),
+    "logistic": _plain("Sigmoid"),
+    "is_finite": _finite,
+    "bfloat16": lambda w, x: w.node("Cast", w.node("Cast", x, to=w.bfloat16), to=w.kinds["float32"]),
+    "rem": _plain("Mod", fmod=1),
+    "atan2": _atan2,
+    "eq": _plain("Equal"),
+    "ne": lambda w, x, y: w.node("Not", w.node("Equal", x, y)),
+    "lt": _plain("Less"),
+    "le": _plain("LessOrEqual"),
+    "gt": _plain("Greater"),
+    "ge": _plain("GreaterOrEqual"),
+    "select": _plain("Where"),
+    "cast": lambda w, x, dtype: w.cast(x, dtype),
+    "reshape": lambda w, x, shape: w.node("Reshape", x, w.whole(shape)),
+    "transpose": lambda w, x, axes: w.node("Transpose", x, perm=axes),
+    "broadcast": lambda w, x, shape: w.node("Expand", x, w.whole(shape)),
+    "concatenate": lambda w, *parts, axis: w.node("Concat", *parts, axis=axis),
+    "slice": _sliced,
+    "pad": _padded,
+    "take": lambda w, x, places: w.node("Gather", x, places, axis=0),
+    "matmul": _plain("MatMul"),
+    "sum": _reduced("ReduceSum"),
+    "prod": _reduced("ReduceProd"),
+    "largest": _reduced("ReduceMax"),
+    "smallest": _reduced("ReduceMin"),
+    "all": _of_bools("ReduceMin"),
+    "any": _of_bools("ReduceMax"),
+    "argmax": _argument("ArgMax"),
+    "argmin": _argument("ArgMin"),
+    "cumsum": lambda w, x, axis: w.node("CumSum", x, w.constant(np.array(axis, np.int64))),
+}

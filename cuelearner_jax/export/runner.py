@@ -1,0 +1,353 @@
+"""Runs a decision that `cuelearner export` wrote; a copy of this file lies beside every decision as `decide.py`.
+
+    from decide import Decision
+    decide = Decision("folder")        # verifies every file against the contract
+    action = decide(observation)       # (obs,) -> a unit vector (2,); or (n, obs) -> (n, 2)
+
+It needs Python and NumPy, nothing of cuelearner or JAX; decisions in ONNX also need onnxruntime, those in StableHLO
+need JAX. Every row of a batch is decided by itself.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+CONTRACT, GOLDEN = "contract.json", "golden.npz"
+VERSION = 1  # of contracts and graphs
+DIGEST = "digest"  # the name under which a contract holds the digest of its other values
+
+Values = dict[str, np.ndarray]
+Run = Callable[[Values], None]
+
+
+class ContractError(ValueError):
+    """A folder that holds no sound decision, or an observation that is not what its contract says. One line."""
+
+
+class Decision:
+    """An exported decision.
+
+    `contract` is what contract.json says: slices of the observation with sizes and units, the action's frame and sign.
+    """
+
+    def __init__(self, folder: str | Path) -> None:
+        """Reads a folder. Raises ContractError if a file is missing, damaged or changed, or cannot be run here."""
+        self.folder = Path(folder)
+        self.contract = read_contract(self.folder)
+        self._decide = RUNNERS[self.contract["artefact"]["format"]](self.folder, self.contract)
+
+    def __call__(self, obs: Any) -> np.ndarray:
+        """The action for an observation (obs,), or for each of a batch (n, obs): unit vectors (2,) or (n, 2).
+
+        Raises ContractError for an observation of another size, or one that is not finite.
+        """
+        rows, size = np.asarray(obs, np.float32), self.contract["observation"]["size"]
+        batch = rows[None] if rows.ndim == 1 else rows
+        if batch.ndim != 2 or batch.shape[1] != size:
+            raise ContractError(f"observations have shape {rows.shape}: the contract says ({size},) or (n, {size})")
+        if not np.isfinite(batch).all():
+            raise ContractError("an observation holds numbers that are not finite")
+        if not len(batch):
+            return np.zeros((0, self.contract["action"]["size"]), np.float32)
+        actions = self._decide(np.ascontiguousarray(batch))
+        return actions[0] if rows.ndim == 1 else actions
+
+    def angle(self, obs: Any) -> np.ndarray:
+        """The same as angles [rad], counterclockwise positive, 0 along x: () or (n,)."""
+        actions = self(obs)
+        return np.asarray(np.arctan2(actions[..., 1], actions[..., 0]))
+
+    def check(self) -> float:
+        """Decides the golden cases anew. Returns the largest difference of an entry from what is recorded.
+
+        Raises ContractError if that is more than the contract allows.
+        """
+        with np.load(self.folder / GOLDEN, allow_pickle=False) as golden:
+            obs, actions = golden["obs"], golden["actions"]
+        difference = float(np.abs(self(obs) - actions).max())
+        allowed = self.contract["golden"]["tolerance"]
+        if not difference <= allowed:
+            raise ContractError(
+                f"{self.folder} decides otherwise here than where it was exported: golden cases differ by "
+                f"{difference:.2g}, more than {allowed:g}; export it anew"
+            )
+        return difference
+
+
+def digest(values: dict[str, Any]) -> str:
+    """Of JSON values, whatever their order."""
+    return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
+
+
+def read_contract(folder: Path) -> dict[str, Any]:
+    """The contract of a folder whose files are all as they were written.
+
+    Raises ContractError for the first that is not.
+    """
+    path = folder / CONTRACT
+    try:
+        contract = json.loads(path.read_text(encoding="utf-8"))
+        told = contract.pop(DIGEST)
+        sound = told == digest(contract)
+    except OSError as error:
+        raise ContractError(f"{path} cannot be read ({error.strerror}): give a folder of cuelearner export") from None
+    except (ValueError, KeyError, AttributeError, TypeError, RecursionError):
+        sound, contract = False, {}
+    if not sound:
+        raise ContractError(f"{path} is damaged or was changed: export the policy anew")
+    if contract["version"] > VERSION:
+        raise ContractError(f"{path} was written by a newer cuelearner: use the decide.py beside it, or update")
+    for name, recorded in contract["files"].items():
+        try:
+            found = hashlib.sha256((folder / name).read_bytes()).hexdigest()
+        except OSError as error:
+            raise ContractError(f"{folder / name} cannot be read ({error.strerror}): export the policy anew") from None
+        if found != recorded:
+            raise ContractError(f"{folder / name} is not the file that was exported: export the policy anew")
+    return contract
+
+
+Batch = Callable[[np.ndarray], np.ndarray]  # observations (n, obs) -> actions (n, action)
+
+
+def _of_numpy(folder: Path, contract: dict[str, Any]) -> Batch:
+    with np.load(folder / contract["artefact"]["file"], allow_pickle=False) as stored:
+        graph = json.loads(stored["graph"].tobytes())
+        constants = {name: stored[name] for name in stored.files if name != "graph"}
+    (given,), (result,) = graph["inputs"], graph["outputs"]
+    run, alone = compiled(graph["ops"], {result}), threading.Lock()
+
+    def decide(batch: np.ndarray) -> np.ndarray:
+        actions = np.empty((len(batch), contract["action"]["size"]), np.float32)
+        with alone, np.errstate(all="ignore"):  # operations write where they wrote before; JAX warns of nothing either
+            for number, row in enumerate(batch):
+                values = {**constants, given: row}
+                run(values)
+                actions[number] = values[result]
+        return actions
+
+    return decide
+
+
+def _of_onnx(folder: Path, contract: dict[str, Any]) -> Batch:
+    try:
+        import onnxruntime
+    except ImportError:
+        raise ContractError("a decision in ONNX needs onnxruntime: pip install onnxruntime") from None
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1  # a robot has other work for its cores
+    options.log_severity_level = 3
+    try:
+        path = str(folder / contract["artefact"]["file"])
+        session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
+    except Exception as error:
+        told = " ".join(str(error).split())[:200]
+        version = onnxruntime.__version__
+        raise ContractError(f"onnxruntime {version} cannot run this decision ({told}): use another") from None
+    return lambda batch: np.asarray(session.run(None, {"obs": batch})[0])
+
+
+def _of_stablehlo(folder: Path, contract: dict[str, Any]) -> Batch:
+    try:
+        import jax
+        from jax import export
+    except ImportError:
+        raise ContractError("a decision in StableHLO needs JAX: pip install jax flatbuffers, or export NumPy") from None
+    stored = (folder / contract["artefact"]["file"]).read_bytes()
+    try:
+        call = jax.jit(export.deserialize(bytearray(stored)).call)
+        call(np.zeros((1, contract["observation"]["size"]), np.float32)).block_until_ready()
+    except Exception:
+        made = contract["artefact"]["jax"]
+        raise ContractError(
+            f"this decision was exported with JAX {made}, and JAX {jax.__version__} on {jax.default_backend()} cannot "
+            f"call it: use JAX {made}, or export the policy anew with this one"
+        ) from None
+    return lambda batch: np.asarray(call(batch))
+
+
+RUNNERS: dict[str, Callable[[Path, dict[str, Any]], Batch]] = {
+    "numpy": _of_numpy,
+    "onnx": _of_onnx,
+    "stablehlo": _of_stablehlo,
+}
+
+
+def compiled(ops: list[list[Any]], kept: set[str] | None = None) -> Run:
+    """A graph's operations as one function, which adds their results to the values it is given.
+
+    Args:
+        ops: each [name, inputs, outputs, attributes]; see `OPERATIONS`, `_loop` and `_highest`.
+        kept: what is looked at afterwards; given, large results are written where they were in the call before.
+    """
+    steps: list[Run] = []
+    for name, inputs, outputs, attributes in ops:
+        if name == "while":
+            steps.append(_loop(inputs, outputs, **attributes))
+        elif name == "top_k":
+            steps.append(_highest(inputs[0], *outputs, **attributes))
+        elif name not in OPERATIONS:
+            raise ContractError(f"this decision has an operation {name!r}, which this runner does not know: update it")
+        elif kept is not None and name in INTO:
+            steps.append(_into(OPERATIONS[name], inputs, outputs[0]))
+        else:
+            steps.append(_step(OPERATIONS[name], inputs, outputs[0], attributes))
+
+    def run(values: Values) -> None:
+        for step in steps:
+            step(values)
+
+    return run
+
+
+def _step(function: Callable[..., Any], inputs: list[str], output: str, attributes: dict[str, Any]) -> Run:
+    def step(values: Values) -> None:
+        values[output] = function(*[values[name] for name in inputs], **attributes)
+
+    return step
+
+
+def _into(function: Callable[..., Any], inputs: list[str], output: str) -> Run:
+    """Writes into one array, call after call: new memory for large ones takes longer than the arithmetic."""
+    own: list[np.ndarray] = []
+
+    def step(values: Values) -> None:
+        given = [values[name] for name in inputs]
+        values[output] = function(*given, out=own[0]) if own else function(*given)
+        if not own and isinstance(values[output], np.ndarray):
+            own.append(values[output])
+
+    return step
+
+
+def _loop(
+    inputs: list[str],
+    outputs: list[str],
+    carried: list[str],
+    kinds: list[Any],
+    test: dict[str, Any],
+    body: dict[str, Any],
+) -> Run:
+    """Repeats `body` on the carried values (of these kinds and shapes) as long as `test` of them holds."""
+    look, work = compiled(test["ops"]), compiled(body["ops"])
+
+    def run(values: Values) -> None:
+        values.update(zip(carried, [values[name] for name in inputs], strict=True))
+        while True:
+            look(values)
+            if not values[test["outputs"][0]]:
+                break
+            work(values)
+            values.update(zip(carried, [values[name] for name in body["outputs"]], strict=True))
+        values.update(zip(outputs, [values[name] for name in carried], strict=True))
+
+    return run
+
+
+def _highest(given: str, largest: str, places: str, k: int) -> Run:
+    """The k largest along the last axis, of equal ones the first, and where they are."""
+
+    def run(values: Values) -> None:
+        x = values[given]
+        order = np.argsort(-x, axis=-1, kind="stable")[..., :k].astype(np.int32)
+        values[largest], values[places] = np.take_along_axis(x, order, -1), order
+
+    return run
+
+
+def _rounded(x: np.ndarray) -> np.ndarray:
+    """To the nearest number that bfloat16 has, ties to even; kept in single precision."""
+    bits = np.atleast_1d(x).view(np.uint32)
+    up = ((bits >> np.uint32(16)) & np.uint32(1)) + np.uint32(0x7FFF)
+    return ((bits + up) & np.uint32(0xFFFF0000)).view(np.float32).reshape(x.shape)
+
+
+def _sliced(x: np.ndarray, start: list[int], stop: list[int], step: list[int]) -> np.ndarray:
+    return x[tuple(slice(*each) for each in zip(start, stop, step, strict=True))]
+
+
+def _argument(function: Callable[..., Any]) -> Callable[..., Any]:
+    return lambda x, axis: np.asarray(function(x, axis=axis), np.int32)
+
+
+def _reduction(function: Callable[..., Any]) -> Callable[..., Any]:
+    return lambda x, axes: np.asarray(function(x, axis=tuple(axes)), x.dtype)
+
+
+def _quotient(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Rounded toward zero where both are whole."""
+    return np.asarray(np.trunc(np.true_divide(x, y)), x.dtype) if x.dtype.kind in "iu" else np.divide(x, y)
+
+
+ONE = np.float32(1)
+INTO = ("add", "sub", "mul", "max", "min", "matmul")  # that can write where they are told
+
+# Of arrays in single precision, int32 or bool; all shapes are fixed. Elementwise ones take equal or broadcast shapes.
+OPERATIONS: dict[str, Callable[..., Any]] = {
+    "neg": np.negative,
+    "abs": np.abs,
+    "sign": np.sign,
+    "floor": np.floor,
+    "ceil": np.ceil,
+    "round": np.rint,  # halves to the even one
+    "exp": np.exp,
+    "log": np.log,
+    "log1p": np.log1p,
+    "expm1": np.expm1,
+    "sin": np.sin,
+    "cos": np.cos,
+    "tan": np.tan,
+    "tanh": np.tanh,
+    "atan": np.arctan,
+    "sqrt": np.sqrt,
+    "rsqrt": lambda x: ONE / np.sqrt(x),
+    "square": np.square,
+    "logistic": lambda x: ONE / (ONE + np.exp(-x)),
+    "is_finite": np.isfinite,
+    "not": np.logical_not,
+    "bfloat16": _rounded,
+    "add": np.add,
+    "sub": np.subtract,
+    "mul": np.multiply,
+    "div": _quotient,
+    "rem": np.fmod,
+    "pow": np.power,
+    "atan2": np.arctan2,
+    "max": np.maximum,
+    "min": np.minimum,
+    "and": np.logical_and,
+    "or": np.logical_or,
+    "xor": np.logical_xor,
+    "eq": np.equal,
+    "ne": np.not_equal,
+    "lt": np.less,
+    "le": np.less_equal,
+    "gt": np.greater,
+    "ge": np.greater_equal,
+    "select": np.where,  # (which, where true, where false)
+    "cast": lambda x, dtype: np.asarray(x).astype(dtype),
+    "reshape": np.reshape,
+    "transpose": np.transpose,
+    "broadcast": np.broadcast_to,
+    "concatenate": lambda *parts, axis: np.concatenate(parts, axis),
+    "slice": _sliced,
+    "pad": lambda x, value, low, high: np.pad(x, list(zip(low, high, strict=True)), constant_values=value),
+    "take": np.take,  # of x as one row
+    "matmul": np.matmul,
+    "sum": _reduction(np.sum),
+    "prod": _reduction(np.prod),
+    "largest": _reduction(np.max),
+    "smallest": _reduction(np.min),
+    "all": _reduction(np.all),
+    "any": _reduction(np.any),
+    "argmax": _argument(np.argmax),
+    "argmin": _argument(np.argmin),
+    "cumsum": lambda x, axis: np.cumsum(x, axis, dtype=x.dtype),
+}

@@ -1,0 +1,227 @@
+"""Policy folders: what `cuelearner adapt` leaves, written and opened again."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from cuelearner_jax import config as configuration
+from cuelearner_jax.adaptation import stored
+from cuelearner_jax.adaptation.adapting import Adapted
+from cuelearner_jax.adaptation.program import Lanes
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.evaluate import one_lane
+from cuelearner_jax.guidance.bundle import AnswerForm
+from cuelearner_jax.plugins import REFERENCE
+from cuelearner_jax.policies import Common, Guided
+from cuelearner_jax.records import formats, guides, label_files, policy_folders
+from cuelearner_jax.records.provenance import provenance
+from cuelearner_jax.runs.grid import known_task
+from cuelearner_jax.task import Task, shape_of
+from cuelearner_jax.types import Label
+
+CONVENTIONS = {
+    "action": "unit vector: the base policy's, refined by the model until a pass turns it by less than tau, within the "
+    "bound",
+    "angles": "degrees where a name ends in _deg, else radians; counterclockwise positive",
+}
+
+
+@dataclass(frozen=True)
+class AdaptedLanes:
+    """The lanes of a policy folder."""
+
+    folder: Path
+    values: dict[str, Any]  # what policy.json says
+    lanes: Lanes
+    used: np.ndarray  # (lanes,) bool
+    rows: int | None  # base policies, of which lanes have one each; None: they share one
+    code: Any  # the policy that stands for code, or None
+
+    @property
+    def guidance(self) -> str:
+        """The kind of guidance that was fitted last."""
+        return self.values["policy"]["guidance"]
+
+    def policy(self, env: Any) -> Guided:
+        """A block of the lanes' policies. Raises UserError if it cannot be had."""
+        values, arrays = self.values["policy"], self._arrays(env)
+        base = stored.made(values["base"], arrays["base"], env, self.code)
+        base = Common(base) if self.rows is None else one_lane(base, self.lanes.base)
+        made = stored.made({**values, "base": {"policy": "uniform"}}, arrays, env)
+        return replace(made, base=base)
+
+    def base(self, env: Any) -> Any:
+        """A block of the policies that were adapted, a row a lane, or `Common`. Raises UserError as `policy`."""
+        return self.policy(env).base
+
+    def _arrays(self, env: Any) -> Any:
+        values = self.values["policy"]
+        try:
+            lanes = stored.shapes_of({**values, "base": {"policy": "uniform"}}, env, self.lanes.number)
+            like = {**lanes, "base": stored.shapes_of(values["base"], env, self.rows)}
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            raise formats.damaged("policy", self.folder / policy_folders.POLICY) from error
+        return policy_folders.read_arrays(self.folder, like, self.values)
+
+
+def alone(policy: Guided, lane: int) -> Guided:
+    """One lane's policy out of a block's, its base as it is."""
+    one = one_lane(policy, lane)
+    return replace(one, base=one.base.policy) if isinstance(one.base, Common) else one
+
+
+def open_folder(folder: Path, find: Callable[[str], Task], code: Any = None) -> tuple[Task, Any, AdaptedLanes]:
+    """The task, the world (a configuration) and the lanes of a policy folder.
+
+    Args:
+        folder: the folder.
+        find: as `grid.load` has it.
+        code: the policy that stands for code in it; None: none was given.
+
+    Raises:
+        UserError: it cannot be read, is damaged, or of a task that is not known.
+    """
+    path = folder / policy_folders.POLICY
+    values = policy_folders.read(folder)
+    try:
+        name, origin = values["task"].pop("name"), values["task"].pop("from", None)
+        if origin is not None and not REFERENCE.fullmatch(origin):
+            raise ValueError(f"{origin!r} names no code")
+        task = known_task(find, name, origin, path)
+        world = configuration.from_json(task.config, values["task"])
+        told = values["lanes"]
+        columns = [np.array(told[column]) for column in ("base", "seeds", "labels", "bounds_deg")]
+        lanes, used = Lanes(*columns), np.array(told["used"], bool)
+        if len({len(column) for column in (*lanes, used)}) != 1 or values["policy"]["policy"] != "guided":
+            raise ValueError("the columns of its lanes are of several lengths")
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise formats.damaged("policy", path) from error
+    return task, world, AdaptedLanes(folder, values, lanes, used, values["rows"], code)
+
+
+def write(
+    folder: Path,
+    adapted: Adapted,
+    task: Task,
+    world: Any,
+    origin: dict[str, Any],
+    labels_from: str | None = None,
+    overwrite: bool = False,
+) -> None:
+    """Writes a policy folder.
+
+    Args:
+        folder: where to; it appears once it is whole.
+        adapted: the lanes.
+        task, world: in which they were adapted.
+        origin: what was adapted, in plain values: "folder" and which lanes of it, or "code".
+        labels_from: the label file that was used, if one was.
+        overwrite: may it take the place of another policy folder?
+
+    Raises:
+        UserError: the folder is in use, or the policy cannot be kept.
+    """
+    of, judged = adapted.asked, adapted.judged
+    env = shape_of(task, world)
+    block = adapted.policy(env)
+    bases = of.bases
+    rows = None if isinstance(bases, Common) else int(_rows(bases))
+    values = stored.told(replace(block, base=bases), origin.get("code"))
+    lanes = of.lanes
+    described = {
+        "task": {"name": task.name, **({"from": task.origin} if task.origin else {}), **configuration.to_json(world)},
+        **({"files": files} if (files := task.files(world)) else {}),
+        "of": origin,
+        "policy": values,
+        "rows": rows,
+        "lanes": {
+            "base": lanes.base.tolist(),
+            "seeds": lanes.seed.tolist(),
+            "labels": lanes.budget.tolist(),
+            "bounds_deg": [float(f"{bound:g}") for bound in lanes.bound_deg],
+            "used": judged.used.tolist(),
+        },
+        "judged": {
+            "by": judged.by,
+            "split": of.judging.split,
+            "before": _plain(judged.before),
+            "after": _plain(judged.after),
+        },
+        "labels_from": labels_from,
+        "observation": [quantity._asdict() for quantity in env.observation],
+        "conventions": CONVENTIONS,
+        **provenance(),
+    }
+    arrays = {**stored.arrays_of(replace(block, base=Common(of.bases))), "base": stored.arrays_of(bases)}
+    with policy_folders.writing(folder, overwrite) as place:
+        policy_folders.write(place, described, arrays)
+        _write_labels(place, adapted, task, world)
+        _write_curve(place, folder.name, adapted, task)
+
+
+def _rows(bases: Any) -> int:
+    """How many policies a block has; those that have nothing of their own are shared."""
+    leaves = jax.tree.leaves(stored.arrays_of(bases))
+    if not leaves:
+        raise UserError("base policies without arrays have no rows: share one among all lanes")
+    return leaves[0].shape[0]
+
+
+def _plain(values: np.ndarray) -> list[float | None]:
+    return [float(value) if np.isfinite(value) else None for value in values]
+
+
+def labels_name(lanes: Lanes, bound_deg: float) -> str:
+    """The label file of the lanes of a bound."""
+    several = len(np.unique(lanes.bound_deg)) > 1
+    return f"labels-{bound_deg:g}deg.parquet" if several else label_files.PARQUET
+
+
+def _write_labels(place: Path, adapted: Adapted, task: Task, world: Any) -> None:
+    """One file a bound, with a set a seed: that of the largest budget, of which smaller ones have the first labels."""
+    of = adapted.asked
+    form: AnswerForm | None = of.guidance.form
+    assert form is not None
+    told = {"name": task.name, **configuration.to_json(world)}
+    rows: Label = adapted.labels
+    largest = of.lanes.budget == of.lanes.budget.max()
+    for bound in np.unique(of.lanes.bound_deg):
+        own = np.flatnonzero(largest & (of.lanes.bound_deg == bound))
+        eps = of.scalars.eps_deg if form.by_eps else None
+        sets = jax.tree.map(lambda leaf, own=own: leaf[own], rows)
+        file = place / labels_name(of.lanes, float(bound))
+        label_files.write(file, told, form.name, eps, of.lanes.seed[own], sets, form.meaning)
+
+
+def _write_curve(place: Path, name: str, adapted: Adapted, task: Task) -> None:
+    """What the policies were worth after so many labels, as runs keep it of their guides."""
+    of = adapted.asked
+    if not adapted.curve:
+        return
+    constants = {
+        "run": name,
+        "task": task.name,
+        "guidance": of.guidance.name,
+        "split": of.judging.split,
+        "config_hash": "",
+        **provenance(),
+    }
+    lanes = {"seed": of.lanes.seed, "labels": of.lanes.budget, "bound_deg": of.lanes.bound_deg}
+    with guides.GuideWriter(place, **constants) as writer:
+        done = np.full(of.lanes.number, -1)
+        for row in adapted.curve:
+            new = row["asked"] > done  # a lane that has its budget does not change any more
+            done = row["asked"]
+            metrics = {f"guide_{metric}": row[metric] for metric in row if metric not in ("asked", "failed")}
+            columns = {**lanes, "asked": row["asked"], "failed": row["failed"].astype(float), **metrics}
+            number = -(-int(row["asked"].max()) // of.sizes.labels_per_round)
+            chosen = {column: np.asarray(values)[new] for column, values in columns.items()}
+            if new.any():
+                writer.append(round=number, step=0, wall_s=0.0, **chosen)
+    guides.finish(place)

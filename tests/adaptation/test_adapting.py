@@ -1,0 +1,240 @@
+"""Adaptation on the bandit, whose best direction is known: bounds, recovery, label files, judging, opaque functions."""
+
+import dataclasses
+from functools import cache
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import probes
+import pytest
+from flax import struct
+
+from cuelearner_jax import actions
+from cuelearner_jax.adaptation import adapting, judging, program
+from cuelearner_jax.adaptation.adapting import Adaptation, Judging
+from cuelearner_jax.adaptation.program import Lanes
+from cuelearner_jax.config import GuideSizes
+from cuelearner_jax.devices import lane_mesh
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.evaluate import one_lane
+from cuelearner_jax.guidance import registry as guidances
+from cuelearner_jax.policies import BY_LANE, Common, Opaque, policy_of
+from cuelearner_jax.types import Label
+
+HALF = 6.0  # half the width of the winning window [deg]
+ENV = probes.Window(half_width=jnp.deg2rad(jnp.array(HALF)))
+EXPERT = probes.Expert(ENV)
+SIZES = GuideSizes(feedback_layers=(32, 32), fit_steps=200, fit_batch_size=32)
+SCALARS = dataclasses.replace(probes.SCALARS, eps_deg=5.0, tau_deg=0.25)
+RELATIVE = guidances.make("relative", SIZES, ENV)
+OBS = actions.evenly_spaced(4)
+SHIFTS = (-25.0, 40.0)  # by which the base policies miss the best direction [deg]
+MESH = lane_mesh(jax.local_devices()[:1])
+JUDGING = Judging(ENV, num_envs=20, steps=200)
+
+
+class Shifted(struct.PyTreeNode):
+    """Misses the best direction by a constant angle [deg]."""
+
+    shift: jax.Array
+
+    def act(self, key, states, obs):
+        return actions.rotate(obs, 0.6 + jnp.deg2rad(self.shift))
+
+    @property
+    def axes(self):
+        return self.replace(shift=BY_LANE)
+
+
+BASES = program.side_by_side([Shifted(jnp.array(shift)) for shift in SHIFTS])
+LANES = program.product(2, (3,), (30, 80), (10.0, 60.0))
+
+
+def asked(bases=BASES, lanes=LANES, how=JUDGING):
+    return Adaptation(RELATIVE, SIZES, SCALARS, ENV, bases, lanes, how)
+
+
+@cache
+def found():
+    """All lanes, measured on the way."""
+    return adapting.adapt(asked(how=dataclasses.replace(JUDGING, every=10)), EXPERT, mesh=MESH)
+
+
+def degrees(turn):
+    return np.degrees(np.asarray(turn))
+
+
+def errors(policy, lane):
+    """How far a lane's actions lie from the best ones, over all observations [deg]."""
+    return degrees(actions.distance(one_lane(policy, lane).act(jax.random.key(0), None, OBS), actions.rotate(OBS, 0.6)))
+
+
+def test_lanes_are_every_combination_or_one_each():
+    assert LANES.number == 8
+    assert {*zip(*(column.tolist() for column in LANES), strict=True)} == {
+        (base, 3, budget, bound) for base in (0, 1) for budget in (30, 80) for bound in (10.0, 60.0)
+    }
+    each = program.one_each((4, 7, 9), (30,), (60.0,))
+    assert (each.base.tolist(), each.seed.tolist()) == ([0, 1, 2], [4, 7, 9])
+
+
+def test_a_constant_shift_is_recovered_to_within_eps():
+    policy = found().policy(ENV)
+    for lane in np.flatnonzero((LANES.budget == 80) & (LANES.bound_deg == 60)):
+        assert errors(policy, lane).max() < SCALARS.eps_deg
+    assert found().judged.used.all()
+    np.testing.assert_array_equal(found().judged.before, 0.0)
+    assert found().judged.after[(LANES.budget == 80) & (LANES.bound_deg == 60)].min() == 1.0
+
+
+def test_the_bound_is_never_exceeded():
+    policy, labels = found().policy(ENV), found().labels
+    for lane, bound in enumerate(LANES.bound_deg):
+        base = Shifted(jnp.array(SHIFTS[LANES.base[lane]]))
+        own = base.act(None, None, OBS)
+        moved = degrees(actions.distance(own, one_lane(policy, lane).act(jax.random.key(0), None, OBS)))
+        assert moved.max() <= bound + 1e-3
+        if bound == 10:  # too near to be right: as far as it may go
+            np.testing.assert_allclose(moved, bound, atol=0.5)
+        rows = jax.tree.map(lambda leaf, lane=lane: leaf[lane][labels.valid[lane]], labels)
+        away = degrees(actions.distance(base.act(None, None, rows.obs), rows.action))
+        assert away.max() <= bound + 1e-3
+        assert away[:10].max() < 1e-3  # the first round is about its own actions
+        assert away[10:].max() > 4.0  # later ones about refined ones
+    # However wild the model.
+    wild = found().block.replace(
+        guide=found().block.guide.replace(model=jax.tree.map(_blown, found().block.guide.model))
+    )
+    policy = program.adapted(RELATIVE, SIZES, ENV, SCALARS, BASES, wild)
+    everywhere = actions.evenly_spaced(100)
+    for lane, bound in enumerate(LANES.bound_deg):
+        own = Shifted(jnp.array(SHIFTS[LANES.base[lane]])).act(None, None, everywhere)
+        moved = actions.distance(own, one_lane(policy, lane).act(jax.random.key(0), None, everywhere))
+        assert degrees(moved).max() <= bound + 1e-3
+        assert degrees(moved).max() > bound / 2
+
+
+def _blown(leaf):
+    return leaf * 30 if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf
+
+
+def test_budgets_are_masks_and_lanes_do_not_know_each_other():
+    labels, block = found().labels, found().block
+    assert labels.valid.sum(-1).tolist() == LANES.budget.tolist()
+    for lane in np.flatnonzero(LANES.budget == 30):
+        alike = (LANES.bound_deg == LANES.bound_deg[lane]) & (LANES.base == LANES.base[lane])
+        (larger,) = np.flatnonzero((LANES.budget == 80) & alike)
+        first = jax.tree.map(lambda leaf, lane=lane: leaf[lane][:30], labels)
+        chex.assert_trees_all_equal(first, jax.tree.map(lambda leaf, lane=larger: leaf[lane][:30], labels))
+    lane = 5
+    own = program.side_by_side([Shifted(jnp.array(SHIFTS[LANES.base[lane]]))])
+    one = Lanes(*(column[[lane]] for column in LANES))._replace(base=np.zeros(1, np.int32))
+    alone = program.begin(RELATIVE, SIZES, ENV, one)
+    for _ in range(program.rounds(one, SIZES)):
+        alone = program.ask_round(RELATIVE, SIZES, ENV, EXPERT, SCALARS, own, alone, MESH)
+    kept = jax.tree.map(lambda leaf: leaf[lane], block.guide.model)
+    chex.assert_trees_all_equal(jax.tree.map(lambda leaf: leaf[0], alone.guide.model), kept)
+
+
+def test_the_curve_says_what_policies_were_worth_on_the_way():
+    curve = found().curve
+    assert [row["asked"].max() for row in curve] == list(range(0, 90, 10))
+    np.testing.assert_array_equal(curve[0]["reward"], found().judged.before)
+    np.testing.assert_array_equal(curve[-1]["reward"], found().judged.after)
+    assert curve[-1]["asked"].tolist() == LANES.budget.tolist()
+
+
+def test_given_labels_lead_where_asking_for_them_did():
+    labels = found().labels
+    given = adapting.adapt(asked(), labels=labels, mesh=MESH)
+    chex.assert_trees_all_equal(given.block.guide.model, found().block.guide.model)
+    np.testing.assert_array_equal(given.judged.after, found().judged.after)
+
+
+def own_labels(shift, count, answer=1.0):
+    """Answers about a policy's own actions alone, padded to whole rounds."""
+    obs = OBS[np.arange(count) % 4]
+    action = Shifted(jnp.array(shift)).act(None, None, obs)
+    rows = Label(obs, action, jnp.full((count, 1), answer), jnp.ones(count, bool))
+    return jax.tree.map(lambda leaf: np.asarray(leaf)[None], rows)
+
+
+def test_without_a_simulator_held_out_answers_decide():
+    how = dataclasses.replace(JUDGING, env=None, by="labels")
+    lanes = program.product(1, (0, 1), (40,), (10.0,))
+    base = Common(Shifted(jnp.array(-25.0)))
+    one = own_labels(-25.0, 40)
+    chance = np.random.default_rng(1).choice([-1.0, 0.0, 0.0, 0.0, 1.0], (1, 40, 1)).astype(np.float32)
+    noise = one.replace(answer=chance)
+    both = jax.tree.map(lambda *leaves: np.concatenate(leaves), one, noise)
+    judged = adapting.adapt(asked(base, lanes, how), labels=both, mesh=MESH).judged
+    assert judged.by == "labels"
+    assert (judged.before[0], judged.after[0], judged.used[0]) == (0.0, 1.0, True)
+    held = chance[0, 3::5, 0]
+    assert judged.before[1] == pytest.approx((held == 0).mean())
+    assert judged.after[1] <= judged.before[1]
+    few = program.begin(RELATIVE, SIZES, ENV, program.product(1, (0,), (4,), (10.0,)))
+    with pytest.raises(UserError, match="fewer than 5 labels"):
+        judging.judged_by_labels(RELATIVE, SIZES, ENV, SCALARS, few)
+
+
+def quarter(obs):
+    """A quarter turn, exact in any arithmetic."""
+    return (jnp if isinstance(obs, jax.Array) else np).stack([-obs[:, 1], obs[:, 0]], -1)
+
+
+def test_an_opaque_function_gives_what_the_same_in_jax_gives():
+    lanes = program.product(1, (0,), (30,), (60.0,))
+    policies = [policy_of(quarter), policy_of(jax.jit(quarter))]
+    assert [policy.on_host for policy in policies] == [True, False]
+    blocks = [program.begin(RELATIVE, SIZES, ENV, lanes)] * 2
+    for _ in range(program.rounds(lanes, SIZES)):
+        blocks = [
+            program.ask_round(RELATIVE, SIZES, ENV, EXPERT, SCALARS, Common(policy), block)
+            for policy, block in zip(policies, blocks, strict=True)
+        ]
+    assert blocks[0].guide.labels.valid.sum() == 30
+    chex.assert_trees_all_equal(*blocks)
+
+
+class Actor:
+    """Has `act`, and is no pytree."""
+
+    def act(self, key, states, obs):
+        return obs
+
+
+def test_what_is_a_policy():
+    assert isinstance(policy_of(lambda: Shifted(jnp.array(1.0))), Shifted)
+    shifted = Shifted(jnp.array(1.0))
+    assert policy_of(shifted) is shifted
+    assert isinstance(policy_of(quarter), Opaque)
+    for bad, says in ((Actor, "is no pytree"), (42, "a int is no policy")):
+        with pytest.raises(UserError, match=says):
+            policy_of(bad)
+
+
+@pytest.mark.parametrize(
+    ("bounds", "changes", "says"),
+    [
+        ([0.0], {}, "bound_deg is 0"),
+        ([float("nan")], {}, "bound_deg is nan"),
+        ([10.0, 10.0], {}, "give each bound once"),
+        ([0.3], {}, "labels of 5 degrees say nothing within a bound of 0.3"),
+        ([10.0], {"eps_deg": 0.2}, "give scalars.tau_deg 0.01"),
+    ],
+)
+def test_angles_that_do_not_go_together_are_refused(bounds, changes, says):
+    with pytest.raises(UserError, match=says):
+        adapting.check_angles(bounds, dataclasses.replace(SCALARS, **changes))
+
+
+def test_defaults_go_together():
+    for eps in (0.1, 2.0, 20.0):
+        scalars = adapting.settling(probes.SCALARS, eps)
+        assert scalars.tau_deg <= eps / 20
+        adapting.check_angles([45.0], scalars)
+    assert "scalars.k_max 1800 would" in adapting.check_angles([180.0], adapting.settling(SCALARS, 0.1))
+    assert judging.metrics_of(ENV) == ("reward", "hit")

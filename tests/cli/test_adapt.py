@@ -1,0 +1,280 @@
+"""Policies adapted on the command line: a run's, code's and adapted ones, in folders that every command takes."""
+
+import importlib
+import json
+import shutil
+import sys
+from pathlib import Path
+
+import chex
+import jax
+import numpy as np
+import pytest
+from damaged_folders import DAMAGES
+from small_runs import listing
+
+import cuelearner_jax as cl
+from cuelearner_jax.adaptation import stored
+from cuelearner_jax.cli import main
+from cuelearner_jax.policies import Guided
+from cuelearner_jax.records import guides, label_files, policy_folders
+from cuelearner_jax.records.checkpoint import checkpoints
+from cuelearner_jax.tasks import registry
+
+OWN = '''
+import dataclasses
+import jax, jax.numpy as jnp, numpy as np, probes
+from cuelearner_jax.task import Body, Preset, Scenario, Task
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    half_width_deg: float = 8.0
+    """Half the width of the winning window [deg]."""
+    offset_deg: float = 0.0
+    """Where the best direction lies from what is seen [deg]."""
+
+def environment(config, split):
+    return probes.Window(*jnp.deg2rad(jnp.array([config.half_width_deg, config.offset_deg])))
+
+CONFIG = dataclasses.replace(probes.CONFIG, task=Config())
+TASK = Task(
+    "turned", "a bandit", Config, (Body("point", "", environment),), teacher=lambda config, env: probes.Expert(env),
+    presets={"small": Preset("seconds", CONFIG, labels=(10,))},
+    scenarios={"aslant": Scenario("the best direction is turned", {"offset_deg": -20.0}, bound_deg=45.0, eps_deg=5.0)},
+)
+
+def straight(obs):
+    return obs.copy()
+
+COMPILED = jax.jit(lambda obs: obs)
+
+def narrow(obs):
+    return obs[:, :1]
+
+def failing(obs):
+    raise RuntimeError("out of ink")
+'''
+TASK = ["--task", "own_turned:TASK"]
+FIT = ["--sizes.feedback-layers", "32", "--sizes.fit-steps", "200", "--sizes.fit-batch-size", "32"]
+FIT += ["--scalars.feedback-learning-rate", "0.005"]
+CODE = ["adapt", "own_turned:straight", *TASK, "--scenario", "aslant", *FIT, "--judge-episodes", "20"]
+EVALUATE = ["--steps", "2000", "--envs", "20"]  # as many as are judged on, so that one program does both
+ANGLES = np.linspace(0, 6, 40, dtype=np.float32)
+SEEN = np.stack([np.cos(ANGLES), np.sin(ANGLES)], -1)
+
+
+def forget():
+    registry._registered.clear()
+    sys.modules.pop("own_turned", None)
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("turned")
+    (folder / "own_turned.py").write_text(OWN)
+    return folder
+
+
+@pytest.fixture(autouse=True)
+def there(home, monkeypatch):
+    """In the folder of the file, in a process that has not met the task."""
+    monkeypatch.chdir(home)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    forget()
+    yield
+    forget()
+
+
+@pytest.fixture
+def adapted(home):
+    """A Python function adapted to the changed world, with two budgets and two bounds."""
+    out = home / "adapted"
+    if not out.exists():
+        lanes = ["--labels", "20", "80", "--bound-deg", "3", "45", "--judge-every", "10"]
+        assert main([*CODE, *lanes, "--scalars.eps-deg", "3", "--scalars.tau-deg", "0.1", "--out", str(out)]) == 0
+        forget()
+    return out
+
+
+def measured(tmp_path, *command):
+    out = tmp_path / f"{len(list(tmp_path.iterdir()))}.json"
+    assert main(["evaluate", *map(str, command), *EVALUATE, "--out", str(out)]) == 0
+    return json.loads(out.read_text())["rows"]
+
+
+def own(*names):
+    """The policy folder's code, as it is named again."""
+    return [*TASK, "--base", *(names or ("own_turned:straight",))]
+
+
+def test_a_function_is_adapted_and_its_folder_evaluated(adapted, tmp_path):
+    values = json.loads((adapted / "policy.json").read_text())
+    assert values["task"]["offset_deg"] == -20.0
+    assert values["of"] == {"code": "own_turned:straight"}
+    assert values["policy"]["base"] == {"policy": "code", "named": "own_turned:straight"}
+    rows = measured(tmp_path, adapted, *own())
+    assert [(row["labels"], row["bound_deg"]) for row in rows] == [(20, 3.0), (80, 3.0), (20, 45.0), (80, 45.0)]
+    rewards = [row["reward"][0] for row in rows]
+    assert rewards[:2] == [0.0, 0.0]  # 17 of 20 degrees off
+    assert rewards[3] == 1.0
+    (before,) = {row["reward"][0] for row in measured(tmp_path, adapted, *own(), "--policy", "base")}
+    assert before == 0.0
+    curve = guides.read_guides(adapted)
+    assert curve is not None
+    curve = curve.to_pylist()
+    kept = {(row["bound_deg"], row["labels"], row["asked"]) for row in curve}
+    assert kept == {(b, n, k) for b in (3.0, 45.0) for n in (20, 80) for k in range(0, n + 1, 10)}
+    assert max(row["guide_reward"] for row in curve if row["bound_deg"] == 45.0) == 1.0
+
+
+def test_labels_lie_beside_and_lead_to_the_same_policy(adapted, tmp_path):
+    file = adapted / "labels-45deg.parquet"
+    assert len(label_files.read(file).seeds) == 80
+    scalars = ["--scalars.eps-deg", "3", "--scalars.tau-deg", "0.1"]
+    command = [*CODE, *scalars, "--bound-deg", "45", "--labels", "20", "80", "--labels-from", str(file)]
+    assert main([*command, "--out", str(tmp_path / "again")]) == 0
+    code = importlib.import_module("own_turned").straight
+    both = [cl.load_policy(f, task="own_turned:TASK", base=code).policy for f in (adapted, tmp_path / "again")]
+    models = [policy.model for policy in both if isinstance(policy, Guided)]
+    assert len(models) == 2
+    chex.assert_trees_all_equal(*models)
+    assert (tmp_path / "again" / "labels.parquet").exists()
+
+
+def test_what_is_adapted_saved_and_loaded_acts_bitwise_alike(home, tmp_path):
+    world = cl.World(registry.resolve("own_turned:TASK"), importlib.import_module("own_turned").Config(offset_deg=25.0))
+    code = importlib.import_module("own_turned").COMPILED
+    settings = {"eps_deg": 5.0, "judge_episodes": 20}
+    better = cl.adapt(code, world, cl.teacher_of(world), labels=80, **settings)
+    assert better.used
+    assert better.judged == ("reward", 0.0, 1.0)
+    assert len(better.labels.obs) == 80
+    better.save(tmp_path / "better")
+    with pytest.raises(cl.UserError, match="is not empty: give --overwrite"):
+        better.save(tmp_path / "better")
+    loaded = cl.load_policy(tmp_path / "better", base=code)
+    np.testing.assert_array_equal(loaded(SEEN), better(SEEN))
+    np.testing.assert_array_equal(loaded(SEEN[0]), better(SEEN)[0])
+    shift = np.degrees(np.arccos(np.clip((loaded(SEEN[[0]]) * SEEN[0]).sum(), -1, 1)))
+    assert abs(shift - 25.0) < 5.0
+    with pytest.raises(cl.UserError, match="not loaded because a file names it"):
+        cl.load_policy(tmp_path / "better")
+
+
+def test_lanes_of_a_run_are_adapted_one_each_and_again(home, tmp_path):
+    run, out, chain = home / "run", tmp_path / "out", tmp_path / "chain"
+    sweep = ["sweep", "own_turned:TASK", "--guidance", "none", "--seeds", "2", "--schedule.total-steps", "960"]
+    assert main([*sweep, "--schedule.eval-every", "960", "--schedule.checkpoint-every", "960", "--out", str(run)]) == 0
+    adapt = ["adapt", str(run), "--scenario", "aslant", *FIT, "--labels", "40", "--judge-episodes", "20"]
+    assert main([*adapt, "--base.seeds", "1", "0", "--out", str(out)]) == 0
+    values = json.loads((out / "policy.json").read_text())
+    assert (values["lanes"]["seeds"], values["lanes"]["base"], values["rows"]) == ([1, 0], [0, 1], 2)
+    assert values["of"] == {"folder": "run", "policy": "agent", "seeds": [1, 0]}
+    (row,) = measured(tmp_path, out)
+    (alone,) = measured(tmp_path, run, "--scenario", "aslant")
+    (base,) = measured(tmp_path, out, "--policy", "base")
+    assert row["seeds"] == base["seeds"] == alone["seeds"][::-1] == [1, 0]
+    assert base["reward"] == alone["reward"][::-1]
+    assert np.mean(row["reward"]) > np.mean(base["reward"])
+    agent = cl.load_policy(run, seed=0)
+    np.testing.assert_array_equal(cl.load_policy(out, policy="base", seed=0)(SEEN), agent(SEEN))
+    assert main([*["adapt", str(out), *FIT, "--labels", "10"], "--base.seeds", "0", "--out", str(chain)]) == 0
+    moved = cl.load_policy(chain, policy="base")(SEEN)
+    np.testing.assert_array_equal(moved, cl.load_policy(out, seed=0)(SEEN))
+
+
+def test_a_model_that_makes_it_worse_is_not_used_and_said_to_be(home):
+    world = cl.World(registry.resolve("own_turned:TASK"), importlib.import_module("own_turned").Config(offset_deg=5.0))
+    code = importlib.import_module("own_turned").straight
+    labels = cl.Labels(SEEN, SEEN, np.ones(len(SEEN)))  # all true: more to the left; and silent on what lies there
+    with pytest.warns(UserWarning, match="worse than before, so the model is not used"):
+        kept = cl.adapt(code, world, labels=labels, bound_deg=180.0, eps_deg=5.0, judge_episodes=20)
+    assert not kept.used
+    assert kept.judged[1] == 1.0
+    assert kept.judged[2] < 0.5
+    np.testing.assert_allclose(kept(SEEN), SEEN, atol=1e-6)
+
+
+def test_what_cannot_be_is_refused(adapted, refused, tmp_path):
+    new = ["--out", tmp_path / "new"]
+    refused(["adapt", "own_turned:straight", *new], "is to act in some task: name it, as --task", tmp_path)
+    plain = ["adapt", "own_turned:straight", *TASK, *new]
+    refused([*plain, "--labels", "0"], "a label budget of 0 teaches nothing", tmp_path)
+    refused([*plain, "--bound-deg", "200"], "bound_deg is 200: give an angle", tmp_path)
+    refused([*plain, "--bound-deg", "0.3"], "say nothing within a bound of 0.3: give a smaller", tmp_path)
+    refused([*plain, "--guidance", "none"], "asks nothing that could be learned from", tmp_path)
+    refused([*plain, "--guidance", "relativ"], "did you mean 'relative'", tmp_path)
+    refused([*plain, "--judge-by", "hits"], "no metric of turned, did you mean 'hit'", tmp_path)
+    refused([*plain, "--judge-episodes", "0"], "--judge-episodes is 0", tmp_path)
+    refused([*plain, "--judge-every", "7"], "--judge-every is 7: give a multiple", tmp_path)
+    refused([*plain, "--base.seeds", "3"], "own_turned:straight is none: leave it out", tmp_path)
+    refused([*plain, "--labels-from", tmp_path / "no.parquet"], "no label file at", tmp_path)
+    refused(["adapt", "own_turned:narrow", *TASK, *new], "returned actions of shape (1, 1)", tmp_path)
+    refused(["adapt", "own_turned:failing", *TASK, *new], "RuntimeError: out of ink): mend it first", tmp_path)
+    refused(["adapt", "own_turned:OWN", *TASK, *new], "has no 'OWN'", tmp_path)
+    refused(["adapt", "own_turned:TASK", *TASK, *new], "a Task is no policy", tmp_path)
+    refused([*CODE, "--out", adapted], "is not empty: give --overwrite", adapted)
+    refused([*CODE, "--out", adapted.parent, "--overwrite"], "is not a policy folder", adapted)
+    refused(["evaluate", adapted, *TASK], "add --base own_turned:straight if you trust that code", adapted)
+    refused(["evaluate", adapted, *own(), "--policy", "agent"], "needs a trained run", adapted)
+    refused(["evaluate", "--task=own_turned:TASK", "--policy", "adapted"], "needs a policy folder", adapted)
+    refused(["evaluate", "--task=own_turned:TASK", "--base", "own_turned:straight"], "leave it out", adapted)
+    forget()
+    refused(["evaluate", adapted], "add --task own_turned:TASK if you trust that code", adapted)
+    with pytest.raises(cl.UserError, match=r"no lane with seed 0 and 80 labels within 7 degrees.*3, 45 degrees"):
+        cl.load_policy(adapted, task="own_turned:TASK", bound_deg=7.0, base=lambda obs: obs)
+
+
+def test_a_damaged_folder_is_refused_or_whole(adapted, tmp_path):
+    acts = lambda folder: cl.load_policy(folder, task="own_turned:TASK", base=lambda obs: obs)(SEEN)  # noqa: E731
+    whole = acts(adapted)
+    files = [path.relative_to(adapted) for path in sorted(adapted.rglob("*")) if path.is_file()]
+    needed = [path for path in files if path.parts[0] in ("arrays", "policy.json")]
+    cases = [(path, damage) for path in needed for damage in DAMAGES]
+    for number, (path, damage) in enumerate([*cases[:: len(cases) // 10], (Path("policy.json"), "flipped")]):
+        folder = tmp_path / f"damaged-{number}"
+        shutil.copytree(adapted, folder)
+        DAMAGES[damage](folder / path, 0x5EED0000 + 7919 * number)
+        before = listing(folder)
+        try:
+            np.testing.assert_array_equal(acts(folder), whole)
+        except cl.UserError as error:
+            assert "\n" not in str(error)
+            assert "adapt the policy anew" in str(error) or "run folder" in str(error), (path, damage, str(error))
+        assert listing(folder) == before
+    other = tmp_path / "other"
+    shutil.copytree(adapted, other)
+    values = json.loads((other / "policy.json").read_text())
+    values["lanes"]["used"][0] = not values["lanes"]["used"][0]
+    (other / "policy.json").write_text(json.dumps(values))
+    with pytest.raises(cl.UserError, match="is damaged: restore it, or adapt the policy anew"):
+        acts(other)
+    mixed = tmp_path / "mixed"  # of two folders, each of them whole
+    shutil.copytree(adapted, mixed)
+    shutil.rmtree(mixed / "arrays")
+    edited = policy_folders.read_arrays(adapted, _shapes(adapted), policy_folders.read(adapted))
+    (mixed / "spare").mkdir()
+    policy_folders.write(
+        mixed / "spare", {}, jax.tree.map(lambda leaf: leaf if leaf.dtype == bool else leaf + 1, edited)
+    )
+    (mixed / "spare" / "arrays").rename(mixed / "arrays")
+    with pytest.raises(cl.UserError, match="holds the arrays of another policy"):
+        acts(mixed)
+
+
+def _shapes(folder):
+    with checkpoints(folder / "arrays", read_only=True) as saved:
+        assert saved.latest() == 0
+    values, env = policy_folders.read(folder), registry.find("turned").environment(registry.find("turned").config())
+    lanes = stored.shapes_of({**values["policy"], "base": {"policy": "uniform"}}, env, len(values["lanes"]["seeds"]))
+    return {**lanes, "base": {}}
+
+
+def test_help_names_what_there_is_to_choose_from(capsys):
+    with pytest.raises(SystemExit) as stop:
+        main(["adapt", *TASK, "--help"])
+    assert stop.value.code == 0
+    told = capsys.readouterr().out
+    assert "aslant" in told
+    assert "--bound-deg" in told
+    assert jax.default_backend() == "cpu"

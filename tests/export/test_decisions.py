@@ -1,0 +1,269 @@
+"""Exported decisions: the policies' own in every format, the contract that lies beside them, and what is refused."""
+
+import dataclasses
+import hashlib
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import onnxruntime
+import pytest
+from probes import SCALARS, SIZES, Aimed, Expert, Window
+
+from cuelearner_jax.agent import view
+from cuelearner_jax.agent.networks import q_network
+from cuelearner_jax.environment import Quantity, action_of, spaces_of
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.export import contract, decisions, formats, onnx_graph, runner
+from cuelearner_jax.guidance import registry as guidances
+from cuelearner_jax.policies import Agent, Corrected, Guided, Heuristic, Opaque, Residual, uniform_in
+
+ENV = Aimed()
+ANGLES = np.linspace(0.0, 6.0, 40)
+DRAWN = np.stack([np.cos(ANGLES), np.sin(ANGLES)], -1).astype(np.float32)
+
+
+def agent(**sizes):
+    sizes = dataclasses.replace(SIZES, directions=72, **sizes)
+    own, turned = view.widths(sizes.frame, spaces_of(ENV))
+    params = q_network(sizes.q_layers).init(jax.random.key(4), jnp.zeros(own), jnp.zeros(turned))
+    return Agent(params, sizes, env=ENV)
+
+
+def guided(kind, bound_deg=None, base=None, **sizes):
+    """An untrained guide moves actions as a trained one does."""
+    guidance = guidances.make(kind, dataclasses.replace(SIZES, **sizes), ENV)
+    model = guidance.init(jax.random.key(5)).replace(fitted=jnp.array(True))
+    bound = None if bound_deg is None else jnp.deg2rad(jnp.float32(bound_deg))
+    return Guided(base or Heuristic(ENV), model, ENV, SCALARS, guidance, bound)
+
+
+def turned(params, obs, actions):
+    return params * actions[:, ::-1] * obs[:, :1]
+
+
+POLICIES = {
+    "agent in the action's frame": lambda: agent(frame="action"),
+    "agent near peaks": lambda: agent(coarse_directions=18, coarse_dtype="bfloat16", peaks=3),
+    "heuristic": lambda: Heuristic(ENV),
+    "refined": lambda: guided("relative"),
+    "refined within a bound": lambda: guided("relative", bound_deg=7.0, base=agent(frame="action"), frame="action"),
+    "an ensemble": lambda: guided("demonstration", ensemble=3),
+    "aims": lambda: guided("intent"),
+    "searched": lambda: guided("scalar", frame="action"),
+    "residual": lambda: Residual(Heuristic(ENV), jnp.float32(0.4), 0.1, turned),
+    "a function": lambda: Opaque(lambda obs: jnp.roll(obs, 1, -1)),
+}
+
+
+def write(policy, format, out, drawn=DRAWN):
+    return contract.write(policy, ENV.observation, action_of(ENV), drawn, format, out, {"subject": "test"})
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """One decision in every format."""
+    home = tmp_path_factory.mktemp("exported")
+    for format in formats.FORMATS:
+        write(guided("relative", bound_deg=7.0, base=agent()), format, home / format)
+    return home
+
+
+@pytest.mark.parametrize("name", POLICIES)
+def test_numpy_and_onnx_decide_as_jax_does(name):
+    policy = POLICIES[name]()
+    wanted = np.asarray(jax.jit(policy.act)(jax.random.key(0), None, jnp.asarray(DRAWN)))
+    assert np.ptp(wanted, 0).max() > 0.1
+    traced = formats.traced(policy, DRAWN.shape[1])
+    run, (result,) = runner.compiled(traced.graph.ops, set(traced.graph.outputs)), traced.graph.outputs
+    found = []
+    for obs in DRAWN:
+        values = {**traced.constants, "obs": obs}
+        run(values)
+        found.append(np.array(values[result]))
+    session = onnxruntime.InferenceSession(onnx_graph.serialized(traced, 2, 2))
+    for actions in (np.stack(found), session.run(None, {"obs": DRAWN})[0]):
+        apart = np.abs(actions - wanted).max(-1)
+        assert (apart <= 1e-5).mean() >= 0.9, apart  # where two values tie, either is right
+
+
+def test_a_batch_of_any_size_is_decided_row_by_row(folder):
+    for format in formats.FORMATS:
+        decide = runner.Decision(folder / format)
+        whole = decide(DRAWN)
+        np.testing.assert_array_equal(decide(DRAWN[:7]), whole[:7])
+        np.testing.assert_array_equal(decide(DRAWN[3]), whole[3])
+        np.testing.assert_allclose(decide.angle(DRAWN[3]), np.arctan2(whole[3, 1], whole[3, 0]))
+        assert decide(DRAWN[:0]).shape == (0, 2)
+        for wrong in (np.zeros(3), np.zeros((2, 2, 2)), np.array([np.nan, 0.0])):
+            with pytest.raises(runner.ContractError, match="observation"):
+                decide(wrong)
+
+
+def test_the_contract_says_what_goes_in_and_what_comes_out(folder):
+    told = json.loads((folder / "numpy" / runner.CONTRACT).read_text())
+    assert told["observation"]["slices"] == [
+        {"name": "context", "from": 0, "to": 2, "size": 2, "unit": "1", "about": ""}
+    ]
+    assert told["action"]["angle"].startswith("atan2(action[1], action[0]) [rad]")
+    assert "positive counterclockwise" in told["action"]["angle"]
+    assert told["action"]["clip_radius_deg"] == pytest.approx(7.0)
+    outer, inner = told["policy"]
+    assert (outer["layer"], outer["guidance"], outer["most_passes"]) == ("guided", "relative", SCALARS.k_max)
+    assert (inner["layer"], inner["directions"], inner["frame"]) == ("agent", 72, "raw")
+    assert f"jax {jax.__version__}" in told["versions"]
+    for name, recorded in told["files"].items():
+        assert hashlib.sha256((folder / "numpy" / name).read_bytes()).hexdigest() == recorded
+    assert set(told["files"]) | {runner.CONTRACT} == {file.name for file in (folder / "numpy").iterdir()}
+
+
+def test_the_bound_holds_in_the_exported_decision(folder):
+    base = np.asarray(agent().act(jax.random.key(0), None, jnp.asarray(DRAWN)))
+    for format in formats.FORMATS:
+        found = runner.Decision(folder / format)(DRAWN)
+        turn = np.rad2deg(np.arccos(np.clip((found * base).sum(-1), -1, 1)))
+        assert 1.0 < turn.max() <= 7.01
+
+
+def test_numpy_runs_without_jax_and_without_this_package(folder):
+    """In a process whose only module beside NumPy is the file that lies in the folder."""
+    program = (
+        "import sys; sys.path.insert(0, '.'); from decide import Decision; found = Decision('.').check();"
+        "assert not {'jax', 'cuelearner_jax'} & {name.split('.')[0] for name in sys.modules}; print(found)"
+    )
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    command, there = [sys.executable, "-c", program], folder / "numpy"
+    done = subprocess.run(command, cwd=there, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert float(done.stdout) <= 1e-5
+
+
+def copied(folder, tmp_path):
+    there = tmp_path / "copy"
+    there.mkdir()
+    for file in folder.iterdir():
+        (there / file.name).write_bytes(file.read_bytes())
+    return there
+
+
+def sealed(folder, change):
+    """The contract changed by somebody who writes the digests anew."""
+    told = json.loads((folder / runner.CONTRACT).read_text())
+    told.pop(runner.DIGEST)
+    change(told)
+    told["files"] = {name: hashlib.sha256((folder / name).read_bytes()).hexdigest() for name in told["files"]}
+    (folder / runner.CONTRACT).write_text(json.dumps({**told, runner.DIGEST: runner.digest(told)}))
+
+
+def test_a_folder_that_is_damaged_or_changed_is_refused(folder, tmp_path):
+    there = copied(folder / "numpy", tmp_path)
+    for name in ("decision.npz", "golden.npz", "decide.py", runner.CONTRACT):
+        before = (there / name).read_bytes()
+        (there / name).write_bytes(before[:50] + bytes([before[50] ^ 1]) + before[51:])
+        with pytest.raises(UserError, match=name):
+            contract.checked(there)
+        (there / name).write_bytes(before)
+    text = (there / runner.CONTRACT).read_text()
+    (there / runner.CONTRACT).write_text(text.replace('"unit": "1"', '"unit": "m"'))
+    with pytest.raises(UserError, match="was changed"):
+        contract.checked(there)
+    (there / runner.CONTRACT).write_text(text)
+    (there / "golden.npz").unlink()
+    with pytest.raises(UserError, match=r"golden.npz cannot be read"):
+        contract.checked(there)
+    with pytest.raises(UserError, match="cannot be read"):
+        contract.checked(tmp_path / "nowhere")
+
+
+def test_a_decision_that_is_another_one_is_found_by_its_golden_cases(folder, tmp_path):
+    there = copied(folder / "numpy", tmp_path)
+    with np.load(there / runner.GOLDEN) as golden:
+        obs, actions = golden["obs"], golden["actions"]
+    actions[5] = -actions[5]
+    np.savez(there / runner.GOLDEN, obs=obs, actions=actions)
+    sealed(there, lambda told: None)
+    with pytest.raises(UserError, match="golden cases differ by"):
+        contract.checked(there)
+
+
+def test_what_this_program_cannot_run_is_told_in_one_line(folder, tmp_path):
+    there = copied(folder / "stablehlo", tmp_path)
+    (there / "decision.stablehlo").write_bytes((there / "decision.stablehlo").read_bytes()[:3000])
+    sealed(there, lambda told: told["artefact"].update(jax="0.99.1"))
+    with pytest.raises(UserError, match=r"exported with JAX 0\.99\.1, and JAX .* cannot call it") as refused:
+        contract.checked(there)
+    assert "\n" not in str(refused.value)
+    sealed(there, lambda told: told.update(version=runner.VERSION + 1))
+    with pytest.raises(UserError, match="newer cuelearner"):
+        contract.checked(there)
+
+
+@pytest.mark.parametrize(
+    ("policy", "says"),
+    [
+        (lambda: uniform_in(ENV), "acts at random"),
+        (lambda: guided("relative", base=uniform_in(ENV)), "acts at random"),
+        (lambda: Corrected(agent(), Expert(Window()), SCALARS), "asks a teacher"),
+        (lambda: Opaque(lambda obs: obs, on_host=True), "calls a Python function"),
+    ],
+)
+def test_policies_that_no_file_can_hold_are_refused(policy, says, tmp_path):
+    for format in formats.FORMATS:
+        with pytest.raises(UserError, match=says):
+            write(policy(), format, tmp_path / "out")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_only_stablehlo_can_say_is_refused_of_the_others(tmp_path):
+    policy = Opaque(lambda obs: jnp.sort(obs, -1))
+    for format in ("numpy", "onnx"):
+        with pytest.raises(UserError, match="no words for sort"):
+            write(policy, format, tmp_path / "out")
+    assert write(policy, "stablehlo", tmp_path / "out")["difference"] == 0.0
+    with pytest.raises(UserError, match="is not empty"):
+        write(policy, "stablehlo", tmp_path / "out")
+
+
+def test_without_onnx_its_extra_is_named(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "onnx", None)
+    with pytest.raises(UserError, match=r"cuelearner-jax\[onnx\]"):
+        write(agent(), "onnx", tmp_path / "out")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_golden_cases_are_those_that_rounding_does_not_turn():
+    """A policy that jumps at the context (1, 0): only observations far from the jump are kept."""
+    policy = Opaque(lambda obs: jnp.where(obs[:, 1:] > 0, 1.0, -1.0) * jnp.array([[0.6, 0.8]]))
+    drawn = np.concatenate([np.stack([np.ones(20), np.linspace(-1e-8, 1e-8, 20)], -1), DRAWN[1:]]).astype(np.float32)
+    golden = decisions.golden_cases(policy, drawn)
+    assert golden.drawn == len(drawn)
+    assert len(DRAWN) - 1 <= golden.steady <= len(DRAWN) + 8  # of the twenty near the jump, chance may leave a few
+    with pytest.raises(UserError, match="hang on the last digits"):
+        decisions.golden_cases(policy, drawn[9:11])
+
+
+def test_observations_are_starts_and_what_follows():
+    found = decisions.observations(Window(), agent(), 40)
+    assert found.shape == (40, 2)
+    np.testing.assert_allclose(np.linalg.norm(found, axis=-1), 1.0, rtol=1e-6)
+
+
+def test_actions_have_words_of_their_own_or_the_default():
+    class Named(Window):
+        action = Quantity("way", 2, "1", "in the robot's frame")
+
+    assert action_of(Named()).name == "way"
+    assert action_of(Window()).about.startswith("unit vector")
+
+
+def test_every_operation_can_be_said_in_onnx():
+    assert set(onnx_graph.NODES) == set(runner.OPERATIONS)
+
+
+def test_the_runner_is_what_lies_beside_a_decision(folder):
+    assert (folder / "onnx" / "decide.py").read_bytes() == Path(runner.__file__).read_bytes()
