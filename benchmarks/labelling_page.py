@@ -218,14 +218,13 @@ def pictures(asked: argparse.Namespace, browser: Browser, work: Path) -> dict[st
             more = ("--guidance", kind) if kind else ()
             with served(asked, task, work / f"{task}{kind}", "--labels", "500", *more) as (_, address):
                 page = entered(browser, address)
-                rng = random.Random(2)
-                for _ in range(13 if not kind else 0):
+                rng, wanted = random.Random(2), 0 if kind else 12
+                while int(re.match(r"\d+", page.locator(".side").inner_text())[0]) < wanted:  # pyright: ignore[reportOptionalSubscript]
                     item = page.evaluate(ITEM)
                     page.keyboard.press(chosen(page, task, rng))
                     moved(page, item)
-                    time.sleep(0.3)
-                if not kind:
-                    page.wait_for_function("() => document.body.innerText.includes('of 10 labels')", timeout=600_000)
+                if wanted:
+                    page.wait_for_function("() => document.body.innerText.includes('model 1')", timeout=300_000)
                 page.close()
                 for name, look in LOOKS.items() if not kind else [("light", LOOKS["light"])]:
                     page = entered(browser, address, **look)
