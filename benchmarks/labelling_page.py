@@ -2,7 +2,9 @@
 
     python benchmarks/labelling_page.py paced --task navigation --out paced.json        500 labels, 5 a second
     python benchmarks/labelling_page.py kills --task billiards --preset quickstart --out kills.json
-    python benchmarks/labelling_page.py pictures --task navigation billiards --to docs/figures
+    python benchmarks/labelling_page.py pictures --task navigation --preset quickstart
+    python benchmarks/labelling_page.py pictures --task billiards --preset quickstart --more="--task.table regulation"
+    python benchmarks/labelling_page.py pictures --task navigation --preset quickstart --guidance demonstration scalar
 
 `paced`: a script that sees only the page turns navigation's arrow toward the goal, with 10% mistakes and 10% "don't
 know"; in billiards it presses at random. Measured are a key's press to the next question painted, while a model is
@@ -18,6 +20,7 @@ import json
 import os
 import random
 import re
+import shlex
 import shutil
 import signal
 import subprocess
@@ -71,7 +74,7 @@ ITEM = "() => { const one = document.querySelector('svg.scene'); return one ? +o
 def served(asked: argparse.Namespace, task: str, folder: Path, *more: str) -> Iterator[tuple[subprocess.Popen, str]]:
     """The command, until it has told its address: the process and that."""
     command = [sys.executable, "-m", "cuelearner_jax.cli", "label", task, "--preset", asked.preset]
-    command += ["--out", str(folder), *more]
+    command += ["--out", str(folder), *shlex.split(asked.more), *more]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env={**os.environ, "PYTHONUNBUFFERED": "1"})
     try:
         assert process.stdout is not None
@@ -241,6 +244,7 @@ def main() -> None:
     parser.add_argument("--task", nargs="+", default=["navigation"])
     parser.add_argument("--preset", default="paper")
     parser.add_argument("--guidance", nargs="*", help="pictures: of these kinds instead of the task's own")
+    parser.add_argument("--more", default="", help="further options of cuelearner label, in one word")
     parser.add_argument("--labels", type=int, default=500)
     parser.add_argument("--rate", type=float, default=5.0, help="presses a second")
     parser.add_argument("--kills", type=int, default=20)
