@@ -38,6 +38,7 @@ def picture(item: Item, form: AnswerForm, eps_deg: float) -> str:
         place = f'class="mover" data-mover="{html.escape(name)}" transform="{_moved(sketch, name)}"'
         parts.append(f"<g {place}>{body}</g>")
     if form.by_eps:
+        longer = min(max(APART / eps_deg, TURNED_REACH[0]), TURNED_REACH[1])
         parts += [_arrow(sketch, angle + way * eps_deg, name, longer) for way, name in ((1, "left"), (-1, "right"))]
     parts.append(_line(sketch, angle))
     parts.append(_arrow(sketch, angle, "asked"))
