@@ -42,6 +42,9 @@ COMPARED: dict[str, dict[str, Mapping[str, Any]]] = {
         "share-60": {"scalars.nearest_share": 0.6},
         "raw": {"sizes.frame": "raw"},
         "eps-05": {"scalars.eps_deg": 0.05},
+        "eps-30": {"scalars.eps_deg": 0.3},
+        "aim-25": {"scalars.nearest_aim_deg": 0.25},
+        "slow": {"scalars.feedback_learning_rate": 3e-4},
     },
     "residual": {
         "three-times": {},
