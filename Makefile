@@ -5,15 +5,16 @@ BIN := $(VENV)/bin
 UV := $(BIN)/python -m uv
 UV_VERSION := $(shell sed -n 's/^uv==\([0-9.]*\).*/\1/p' constraints.txt)
 
-.PHONY: help setup quickstart smoke test test-quick fuzz lint format bench constraints clean
+.PHONY: help setup quickstart smoke test test-quick fuzz lint format docs bench constraints clean
 help:
 	@echo "make quickstart   train, report and film the small billiards example (two to three minutes)"
 	@echo "make test         run the tests (about 17 minutes on 2 idle cores)"
 	@echo "make test-quick   those of them that compile next to nothing (under 3 minutes)"
-	@echo "make smoke        one tiny sweep of every form of feedback on both tasks, and their reports (minutes on 2 cores)"
+	@echo "make smoke        one tiny sweep of every form of feedback and of every adaptation on both tasks (minutes on 2 cores)"
 	@echo "make fuzz         damaged run folders by chance, CASES=2000 SEED=0 (hours on 2 cores)"
 	@echo "make lint         ruff and pyright"
 	@echo "make format       what ruff can put right by itself"
+	@echo "make docs         the pages of docs/ as a site, in site/ (under half a minute)"
 	@echo "make bench        the benchmarks of this machine (some minutes)"
 	@echo "make setup        only the set-up of all of these, in $(VENV)"
 	@echo "make constraints  resolve the pinned versions anew"
@@ -42,6 +43,8 @@ quickstart: $(VENV)/.installed
 smoke: $(VENV)/.installed
 	$(BIN)/python experiments/billiards_bootstrapping.py --scale smoke --pieces easy/frame --resume
 	$(BIN)/python experiments/navigation_bootstrapping.py --scale smoke --pieces clutter/frame --resume
+	$(BIN)/python experiments/adaptation_billiards.py --scale smoke --pieces unchanged tilted_table --resume
+	$(BIN)/python experiments/adaptation_navigation.py --scale smoke --pieces unchanged turned_lidar corridor_left --resume
 
 test: $(VENV)/.tested
 	$(BIN)/python -m pytest -n 2 --dist loadfile
@@ -63,6 +66,13 @@ format: $(VENV)/.tested
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
+$(VENV)/.documented: $(VENV)/.tested
+	$(UV) pip install --python $(BIN)/python --constraints constraints.txt --group docs
+	@touch $@
+
+docs: $(VENV)/.documented
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
+
 bench: $(VENV)/.tested
 	$(BIN)/python benchmarks/billiards_speed.py
 	$(BIN)/python benchmarks/training_speed.py
@@ -70,7 +80,7 @@ bench: $(VENV)/.tested
 	$(BIN)/python benchmarks/lidar_parity.py
 
 constraints: $(BIN)/uv
-	$(UV) pip compile --quiet --upgrade --universal --python-version 3.11 --all-extras --group dev --no-annotate --no-header \
+	$(UV) pip compile --quiet --upgrade --universal --python-version 3.11 --all-extras --group dev --group docs --no-annotate --no-header \
 		--no-emit-index-url --no-emit-find-links pyproject.toml --output-file constraints.txt
 
 clean:

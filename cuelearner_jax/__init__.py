@@ -7,6 +7,7 @@
     policy = cl.load_policy("docs/data/navigation_agent")   # policy(obs) -> action, of one or many observations
     better = cl.adapt(policy, world, teacher, labels=300)   # answers in rounds, a model of them, a policy again
     better.save("policies/better")                          # a folder that load_policy and every command take
+    cl.export_policy(better, "walker", world, "numpy")      # a file that runs without JAX, and its contract
     run = cl.train(world, teacher, "quickstart", seeds=8)   # what `cuelearner sweep` does, results in memory
 
 What these take and give stands in their docstrings. Everything else is a room behind this face.
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from cuelearner_jax.errors import UserError
     from cuelearner_jax.face.acting import CallablePolicy, load_policy
     from cuelearner_jax.face.adaptation import AdaptedPolicy, adapt
+    from cuelearner_jax.face.exporting import export_policy, load_exported
     from cuelearner_jax.face.feedback import FeedbackModel, Labels, ask, fit_feedback, refine
     from cuelearner_jax.face.training import Run, train
     from cuelearner_jax.face.worlds import World, make, teacher_of
@@ -37,7 +39,9 @@ _PLACES = {
     "World": "face.worlds",
     "adapt": "face.adaptation",
     "ask": "face.feedback",
+    "export_policy": "face.exporting",
     "fit_feedback": "face.feedback",
+    "load_exported": "face.exporting",
     "load_policy": "face.acting",
     "make": "face.worlds",
     "refine": "face.feedback",
@@ -55,7 +59,9 @@ __all__ = [
     "World",
     "adapt",
     "ask",
+    "export_policy",
     "fit_feedback",
+    "load_exported",
     "load_policy",
     "make",
     "refine",

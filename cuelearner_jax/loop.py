@@ -137,13 +137,23 @@ class Lane(NamedTuple):
     guidance: Guidance
     learner: Learner
     largest_budget: int
+    noisy: bool = False  # are actions turned at random?
 
-    def init(self, env: Environment, key: PRNGKeyArray, budget: Int[Array, ""]) -> TrainState:
-        """A fresh lane. Budgets do not touch the random numbers: lanes of one seed start alike."""
+    def init(
+        self, env: Environment, key: PRNGKeyArray, budget: Int[Array, ""] | int, params: Params | None = None
+    ) -> TrainState:
+        """A fresh lane. Budgets do not touch the random numbers: lanes of one seed start alike.
+
+        `params`: of a finished agent, to go on from (None: random ones).
+        """
         k_q, k_guidance, k_ask, k_env = jax.random.split(jax.random.fold_in(key, Stream.INIT), 4)
         slots = label_slots(self.largest_budget, self.sizes)
+        agent = self.learner.init(env, k_q, k_env)
+        if params is not None:
+            follows = None if agent.target_params is None else jax.tree.map(jnp.copy, params)
+            agent = agent.replace(params=params, target_params=follows)
         return TrainState(
-            agent=self.learner.init(env, k_q, k_env),
+            agent=agent,
             guide=asking.start(self.guidance, env, slots, budget, k_guidance, k_ask, self.sizes.candidates),
             key=key,
             failed=jnp.array(False),
@@ -250,13 +260,22 @@ class Lane(NamedTuple):
         base = jax.lax.cond(
             clock.step < schedule.random_steps,
             lambda: self.learner.actions.uniform(key, (self.sizes.num_envs,)),
-            lambda: self.learner.greedy(env, agent),
+            lambda: self.turned(scalars, self.learner.greedy(env, agent), key),
         )
         return jax.lax.cond(
             guides(clock, schedule),
             lambda: self.guide(env, scalars, schedule, clock, state, base),
             lambda: untouched(base),
         )
+
+    def turned(
+        self, scalars: Scalars, actions: Float[Array, "num_envs action"], key: PRNGKeyArray
+    ) -> Float[Array, "num_envs action"]:
+        """Actions each turned by a normal angle; as they are where there is no noise."""
+        if not self.noisy:
+            return actions
+        turns = jax.random.normal(key, (actions.shape[0],))
+        return self.learner.actions.toward(actions, turns, scalars.radians("action_noise"))
 
     def guide(
         self,
@@ -286,4 +305,5 @@ def guides(clock: Clock, schedule: Schedule) -> Bool[Array, ""]:
 
 def make_lane(config: RunConfig, guidance: Guidance, env: Environment, largest_budget: int) -> Lane:
     """The loop of one lane for an environment, whose shapes alone are looked at."""
-    return Lane(config.sizes, guidance, learner(config.sizes, config.bootstraps, env), largest_budget)
+    learns = learner(config.sizes, config.bootstraps, env)
+    return Lane(config.sizes, guidance, learns, largest_budget, config.noisy)

@@ -23,7 +23,7 @@ from cuelearner_jax.config import AgentSizes, GuideScalars, GuideSizes
 from cuelearner_jax.devices import portions
 from cuelearner_jax.environment import actions_of
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.guidance.answers import relative_feedback
+from cuelearner_jax.guidance.answers import in_mind, relative_feedback
 from cuelearner_jax.guidance.bounding import act_within
 from cuelearner_jax.guidance.bundle import Guidance
 from cuelearner_jax.guidance.refining import refine
@@ -156,14 +156,15 @@ class Corrected(struct.PyTreeNode):
 
     def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
         """The base's actions, told the way until they are right."""
-        best, eps = best_actions(self.teacher, states, obs), self.scalars.radians("eps")
+        first, eps = self.base.act(key, states, obs), self.scalars.radians("eps")
+        best = wanted_actions(self.teacher, states, obs, first, self.scalars)
 
         def told(action: Array, best: Array) -> Array:
             return self.actions.toward(action, relative_feedback(action, best, eps), eps) - action
 
         return refine(
             lambda current: jax.vmap(told)(current, best),
-            self.base.act(key, states, obs),
+            first,
             jnp.ones(obs.shape[0], bool),
             space=self.actions,
             tau=self.scalars.radians("tau"),
@@ -294,6 +295,23 @@ def best_actions(teacher: Teacher, states: EnvState, obs: Float[Array, "n obs"])
     """A teacher's actions in n situations; few at a time, for one by search simulates hundreds of actions of each."""
     ask = lambda pair: teacher.best_action(*pair)  # noqa: E731
     return jax.lax.map(ask, (states, obs), batch_size=min(len(obs), portions().states))
+
+
+def wanted_actions(
+    teacher: Teacher,
+    states: EnvState,
+    obs: Float[Array, "n obs"],
+    actions: Float[Array, "n action"],
+    scalars: Any,
+) -> Float[Array, "n action"]:
+    """What a teacher would have done instead: its best, or, where `scalars.answer` says so, the nearest good action.
+
+    `scalars` without such a field (`GuideScalars`) mean the best.
+    """
+    if getattr(scalars, "answer", "best") == "best":
+        return best_actions(teacher, states, obs)
+    ask = lambda row: in_mind(teacher, row[0], row[1], row[2], scalars)  # noqa: E731
+    return jax.lax.map(ask, (states, obs, actions), batch_size=min(len(obs), portions().states))
 
 
 def uniform_in(env: Any) -> Uniform:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from cuelearner_jax.cli import main as cuelearner
 
@@ -105,7 +105,7 @@ def report_command(experiment: Experiment, world: str, out: Path, scale: str) ->
     return [*words, "--out", str(out / world / "report"), "--overwrite"]
 
 
-def chosen(experiment: Experiment, names: Sequence[str]) -> list[Piece]:
+def chosen(experiment: Any, names: Sequence[str]) -> list[Any]:
     """The pieces of these names, or below these folders, in the order of the data; all of them for no name.
 
     Raises ValueError for a name that none has.
@@ -116,11 +116,12 @@ def chosen(experiment: Experiment, names: Sequence[str]) -> list[Piece]:
     return [piece for piece in experiment.pieces if not names or any(_below(piece, name) for name in names)]
 
 
-def _below(piece: Piece, name: str) -> bool:
+def _below(piece: Any, name: str) -> bool:
     return f"{piece.path}/".startswith(f"{name.rstrip('/')}/")
 
 
-def _listed(pieces: Sequence[Piece]) -> str:
+def listed(pieces: Sequence[Any]) -> str:
+    """Pieces with what they take and serve, a line each."""
     width = max(len(piece.path) for piece in pieces)
     rows = [f"{piece.path:<{width}} {piece.lanes:4} lanes  {piece.minutes:3} min  {piece.serves}" for piece in pieces]
     hours = sum(piece.minutes for piece in pieces) / 60
@@ -145,7 +146,7 @@ def run(experiment: Experiment, about: str, arguments: Sequence[str] | None = No
     except ValueError as error:
         parser.error(str(error))
     if asked.list:
-        print(_listed(pieces))
+        print(listed(pieces))
         return 0
     out = asked.out if asked.scale == "paper" else asked.out / asked.scale
     commands = []

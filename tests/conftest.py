@@ -47,12 +47,13 @@ def strict_ranks(request):
 # their own to wait for.
 SLOW = (
     *("adaptation", "bench", "brax_bridge", "cli", "envs/anymal", "examples", "face", "teachers", "testing"),
-    "experiments/test_bootstrapping.py",
+    *("experiments/test_bootstrapping.py", "export/test_decisions.py", "records/test_tracking.py"),
     *("agent/test_choice.py", "agent/test_n_step.py", "records/test_checkpoint.py", "runs/test_runs.py"),
     *("runs/test_failures.py", "runs/test_given_labels.py", "runs/test_lanes.py", "runs/test_resume.py"),
     *("envs/billiards/test_environment.py", "envs/billiards/test_mirrors.py", "envs/billiards/test_parity.py"),
     *("envs/billiards/test_teacher.py", "envs/navigation/test_drawing.py", "envs/navigation/test_environment.py"),
     *("envs/navigation/test_episodes.py", "envs/navigation/test_roadmap.py", "envs/navigation/test_worlds.py"),
+    *("envs/navigation/test_sides.py", "adaptation/test_finetuning.py", "adaptation/test_residual.py"),
     *("test_asking.py", "test_devices.py", "test_environment.py", "test_evaluate.py", "test_loop.py"),
     *("tasks/test_registry.py", "test_policies.py"),
 )

@@ -70,7 +70,7 @@ def run(arguments: list[str]) -> None:
         policy,
         env.observation,
         action_of(env),
-        decisions.observations(env, policy),
+        lambda: decisions.observations(env, policy),
         asked.format,
         asked.out,
         {

@@ -35,6 +35,8 @@ class Training(Generic[TaskT]):
     """Use the labels of this file instead of asking the teacher."""
     tuning: Flag[bool] = False
     """Evaluate on episodes set aside for choosing settings, not on those of reported figures."""
+    track: str | None = None
+    """Also write curves, means over seeds, for tensorboard or wandb (offline), below the run's folder."""
 
     def order(self, task: Task, grid: Grid, shard: Shard | None = None) -> Order:
         """What is asked for, of a task and a grid."""
@@ -48,6 +50,7 @@ class Training(Generic[TaskT]):
             labels_from=self.labels_from,
             shard=shard,
             split="tuning" if self.tuning else "validation",
+            track=self.track,
         )
 
     @property

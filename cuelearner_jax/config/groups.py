@@ -126,6 +126,9 @@ class AgentScalars(_Clipping):
     """Share of the n-step return in a target; the rest is the one-step return."""
     polyak: float = 0.005
     """Rate at which the target network follows."""
+    action_noise_deg: float = 0.0
+    """Every action that is not drawn uniformly is turned by a normal angle of this standard deviation while the agent
+    learns [deg]."""
 
 
 @dataclass(frozen=True)
@@ -243,3 +246,8 @@ class RunConfig(Generic[TaskT]):
     def bootstraps(self) -> bool:
         """Do targets look at the next observation?"""
         return self.scalars.discount > 0
+
+    @property
+    def noisy(self) -> bool:
+        """Are actions turned at random while the agent learns?"""
+        return self.scalars.action_noise_deg > 0

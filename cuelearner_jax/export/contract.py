@@ -14,10 +14,12 @@ import itertools
 import json
 import os
 import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -46,7 +48,7 @@ def write(
     policy: Policy,
     observation: Sequence[Quantity],
     action: Quantity,
-    drawn: Float[np.ndarray, "n obs"],
+    drawn: Callable[[], Float[np.ndarray, "n obs"]],
     format: str,
     out: Path,
     source: dict[str, Any],
@@ -57,7 +59,7 @@ def write(
         policy: whose decision it is.
         observation: the slices of what it sees.
         action: what it gives.
-        drawn: observations such as it will meet, among which golden cases are chosen.
+        drawn: gives observations such as it will meet, among which golden cases are chosen.
         format: a key of `FORMATS`.
         out: the folder.
         source: where the policy comes from, for the contract.
@@ -69,10 +71,11 @@ def write(
         UserError: no such format; the folder is in use; the policy cannot be exported.
     """
     check_request(format, out)
+    policy = jax.tree.map(jnp.asarray, jax.device_get(policy))  # what was trained may lie on several devices
     size = sum(quantity.size for quantity in observation)
     found = traced(policy, size)
     artefact = FORMATS[format].make(policy, found, size, action.size)
-    golden = golden_cases(policy, drawn)
+    golden = golden_cases(policy, drawn())
     cases = io.BytesIO()
     np.savez(cases, obs=golden.obs, actions=golden.actions)
     files = {

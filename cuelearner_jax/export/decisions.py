@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from cuelearner_jax.environment import Environment
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.policies import Agent, Guided, Policy, Residual
+from cuelearner_jax.policies import Agent, Common, Guided, Policy, Residual
 
 TOLERANCE = 1e-5  # by which an entry of an action may differ elsewhere
 NUDGE = 1e-6  # of an entry of an observation, as much as rounding may do
@@ -42,7 +42,7 @@ def layers(policy: Any) -> Iterator[Any]:
     """A policy, the one whose actions it changes, and so on."""
     while policy is not None:
         yield policy
-        policy = getattr(policy, "base", None)
+        policy = policy.policy if isinstance(policy, Common) else getattr(policy, "base", None)
 
 
 def described(policy: Policy) -> list[dict[str, Any]]:
@@ -77,8 +77,6 @@ def clip_radius_deg(policy: Policy) -> float | None:
 
 def observations(env: Environment, policy: Policy, count: int = WALKERS * STEPS) -> Float[np.ndarray, "n obs"]:
     """What a policy meets in a world: starts of episodes, and what follows from its own actions."""
-    k_reset, k_run = jax.random.split(jax.random.key(count))
-    state, obs = jax.vmap(env.reset)(jax.random.split(k_reset, WALKERS))
 
     def step(walk: tuple[Any, Array], key: PRNGKeyArray) -> tuple[tuple[Any, Array], Array]:
         state, obs = walk
@@ -86,9 +84,14 @@ def observations(env: Environment, policy: Policy, count: int = WALKERS * STEPS)
         state, found = jax.vmap(env.step)(jax.random.split(key, WALKERS), state, action)
         return (state, found.obs), obs
 
-    keys = jax.random.split(k_run, -(-count // WALKERS))
-    _, seen = jax.jit(lambda walk, keys: jax.lax.scan(step, walk, keys))((state, obs), keys)
-    return np.asarray(seen).reshape(-1, seen.shape[-1])[:count]
+    @jax.jit
+    def walked(key: PRNGKeyArray) -> Array:
+        k_reset, k_run = jax.random.split(key)
+        start = jax.vmap(env.reset)(jax.random.split(k_reset, WALKERS))
+        return jax.lax.scan(step, start, jax.random.split(k_run, -(-count // WALKERS)))[1]
+
+    seen = np.asarray(walked(jax.random.key(count)))
+    return seen.reshape(-1, seen.shape[-1])[:count]
 
 
 class Golden(NamedTuple):

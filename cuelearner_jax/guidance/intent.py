@@ -12,6 +12,7 @@ teaches agents less (docs/results/bootstrapping.md): they learn from a guide tha
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import flax.linen as nn
@@ -148,7 +149,7 @@ def make(sizes: GuideSizes, spaces: Spaces) -> Guidance:
     ) -> Refined:
         aims: Aims = jax.vmap(env.aims)(obs)
         share = weighing.predict(env, model.params, aims.features, aims.possible)
-        goals, sure = jax.vmap(lambda *at: followed(space, *at, scalars))(share, aims.actions, actions)
+        goals, sure = jax.vmap(partial(followed, space), (0, 0, 0, None))(share, aims.actions, actions, scalars)
 
         def residual(current: Float[Array, "n action"]) -> Float[Array, "n action"]:
             step = jnp.minimum(scalars.radians("eps"), space.distance(current, goals))

@@ -15,7 +15,7 @@ from cuelearner_jax.environment import spaces_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guidance import given
 from cuelearner_jax.guidance import registry as guidances
-from cuelearner_jax.records import formats, label_files, results
+from cuelearner_jax.records import formats, label_files, results, tracking
 from cuelearner_jax.records.folders import CONFIG, check_folder
 from cuelearner_jax.runs import instalments
 from cuelearner_jax.runs.grid import Grid, check_grid, defaults, describe
@@ -36,6 +36,7 @@ class Order:
     labels_from: Path | None = None  # a label file in place of the teacher
     shard: Shard | None = None  # its share of the seeds alone, in its own folder below `out`
     split: str = "validation"  # episodes of the evaluations
+    track: str | None = None  # where it can be followed, see `records.tracking`
 
 
 @dataclass(frozen=True)
@@ -63,6 +64,7 @@ class Plan:
 def planned(order: Order) -> Plan:
     """What `run` does with an order. Raises UserError for what it would refuse, but for too little memory."""
     configuration.check(order.config)
+    tracking.check(order.track)
     names = tuple(guidances.find(kind).name for kind in order.grid.guidance)  # one of one's own is named by its module
     order = dataclasses.replace(order, grid=dataclasses.replace(order.grid, guidance=names))
     check_grid(order.grid)

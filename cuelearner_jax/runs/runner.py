@@ -12,7 +12,7 @@ from rich.progress import Progress, TaskID
 from cuelearner_jax import config as configuration
 from cuelearner_jax.environment import Environment
 from cuelearner_jax.records import guides as guide_records
-from cuelearner_jax.records import label_files, provenance, results
+from cuelearner_jax.records import label_files, provenance, results, tracking
 from cuelearner_jax.records.checkpoint import Checkpoints, checkpoints
 from cuelearner_jax.records.guides import GuideWriter
 from cuelearner_jax.runs.failures import LISTED, variant_name
@@ -58,10 +58,14 @@ class Runner:
         with checkpoints(self.folder / "checkpoints") as saved:
             self._restore(saved)
             constants = self._constants()
-            with results.ResultsWriter(self.folder, **constants) as writer, self._guide_table(constants) as guides:
+            with (
+                results.ResultsWriter(self.folder, **constants) as writer,
+                self._guide_table(constants) as guides,
+                tracking.opened(self.order.track, self.folder, self.described, self.training.step) as tracker,
+            ):
                 while True:
                     self._label(saved, guides, teacher, labels)
-                    self._train(saved, writer)
+                    self._train(saved, writer, tracker)
                     if self.training.done:
                         break
         if self.group.guidance.asks:
@@ -178,7 +182,7 @@ class Runner:
         eps = config.scalars.eps_deg if form.by_eps else None
         label_files.write(self.folder / label_files.PARQUET, task, form.name, eps, seeds, labels, form.meaning)
 
-    def _train(self, saved: Checkpoints, writer: results.ResultsWriter) -> None:
+    def _train(self, saved: Checkpoints, writer: results.ResultsWriter, tracker: tracking.Tracker | None) -> None:
         now, schedule = self.training, self.group.config.schedule
         if self._bar is None:
             self._bar = self.bars.add_task(
@@ -186,6 +190,8 @@ class Runner:
             )
         for row in now.stretches():
             writer.append(**row)
+            if tracker is not None:
+                tracker.log(now.step, tracking.means(row))
             self._tell_failed(f"at step {now.step:,}")
             if now.step == 0:
                 continue

@@ -8,11 +8,15 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from cuelearner_envs.navigation.config import NavigationConfig, make_environment
-from cuelearner_envs.navigation.roadmap import make_teacher
+import jax.numpy as jnp
+
+from cuelearner_envs.navigation.config import SIDES, NavigationConfig, make_environment
+from cuelearner_envs.navigation.roadmap import make_sided_teacher
+from cuelearner_envs.navigation.roadmap import make_teacher as make_road_map
 from cuelearner_jax.config import RunConfig, Scalars, Schedule, Sizes
 from cuelearner_jax.environment import Environment
 from cuelearner_jax.task import Body, Pictures, Preset, Scenario, Task
+from cuelearner_jax.types import Teacher
 
 NAVIGATION_SIZES = Sizes(
     directions=360,
@@ -28,6 +32,12 @@ NAVIGATION_SIZES = Sizes(
 NAVIGATION_SCALARS = Scalars(
     learning_rate=0.001, discount=0.995, eps_deg=20.0, scalar_within_deg=20.0, max_grad_norm=10.0, polyak=0.05
 )
+
+
+def make_teacher(config: NavigationConfig, env: Any) -> Teacher:
+    """The road map of an environment's worlds; with a preferred side, of worlds whose other side is closed."""
+    side = SIDES[config.preferred_side]
+    return make_sided_teacher(env, jnp.float32(side)) if side else make_road_map(env)
 
 
 def _pictures() -> Pictures:
@@ -96,6 +106,14 @@ SCENARIOS = {
     "corridor": Scenario(
         "a corridor of obstacles, each to be passed left or right", {"style": "corridor"}, bound_deg=60.0
     ),
+    **{
+        f"corridor_{side}": Scenario(
+            f"the corridor, and a wish: pass every obstacle on the {side}",
+            {"style": "corridor", "preferred_side": side},
+            bound_deg=60.0,
+        )
+        for side in ("left", "right")
+    },
 }
 
 NAVIGATION = Task(
@@ -103,7 +121,7 @@ NAVIGATION = Task(
     about="reach a goal without a map, by a lidar",
     config=NavigationConfig,
     bodies=(SIMPLE, ANYMAL),
-    teacher=lambda config, env: make_teacher(env),
+    teacher=make_teacher,
     scenarios=SCENARIOS,
     longest=lambda config: config.max_steps,
     labels_hold=("worlds", "world_seed", "max_steps", "mirrors"),  # a label is of what one scan shows

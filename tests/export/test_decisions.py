@@ -13,13 +13,15 @@ import jax.numpy as jnp
 import numpy as np
 import onnxruntime
 import pytest
-from probes import SCALARS, SIZES, Aimed, Expert, Window
+from probes import SCALARS, SIZES, Aimed, Expert, Window, WindowConfig, make_task
 
+import cuelearner_jax as cl
 from cuelearner_jax.agent import view
 from cuelearner_jax.agent.networks import q_network
 from cuelearner_jax.environment import Quantity, action_of, spaces_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.export import contract, decisions, formats, onnx_graph, runner
+from cuelearner_jax.face.acting import CallablePolicy
 from cuelearner_jax.guidance import registry as guidances
 from cuelearner_jax.policies import Agent, Corrected, Guided, Heuristic, Opaque, Residual, uniform_in
 
@@ -51,18 +53,16 @@ POLICIES = {
     "agent in the action's frame": lambda: agent(frame="action"),
     "agent near peaks": lambda: agent(coarse_directions=18, coarse_dtype="bfloat16", peaks=3),
     "heuristic": lambda: Heuristic(ENV),
-    "refined": lambda: guided("relative"),
     "refined within a bound": lambda: guided("relative", bound_deg=7.0, base=agent(frame="action"), frame="action"),
     "an ensemble": lambda: guided("demonstration", ensemble=3),
     "aims": lambda: guided("intent"),
-    "searched": lambda: guided("scalar", frame="action"),
     "residual": lambda: Residual(Heuristic(ENV), jnp.float32(0.4), 0.1, turned),
     "a function": lambda: Opaque(lambda obs: jnp.roll(obs, 1, -1)),
 }
 
 
 def write(policy, format, out, drawn=DRAWN):
-    return contract.write(policy, ENV.observation, action_of(ENV), drawn, format, out, {"subject": "test"})
+    return contract.write(policy, ENV.observation, action_of(ENV), lambda: drawn, format, out, {"subject": "test"})
 
 
 @pytest.fixture(scope="module")
@@ -267,3 +267,17 @@ def test_every_operation_can_be_said_in_onnx():
 
 def test_the_runner_is_what_lies_beside_a_decision(folder):
     assert (folder / "onnx" / "decide.py").read_bytes() == Path(runner.__file__).read_bytes()
+
+
+def test_from_python(tmp_path):
+    world = cl.World(make_task(), WindowConfig())
+    policy = CallablePolicy(Opaque(lambda obs: jnp.roll(obs, 1, -1)), world.observation)
+    written = cl.export_policy(policy, tmp_path / "out", world, "numpy")
+    assert written["source"]["world"] == {"name": "window", "half_width_deg": 28.0}
+    decide = cl.load_exported(tmp_path / "out")
+    np.testing.assert_allclose(decide(np.array([0.6, 0.8])), [0.8, 0.6], atol=1e-6)
+    narrow = CallablePolicy(policy.policy, (Quantity("other", 3, "1"),))
+    with pytest.raises(UserError, match="have 3 entries, this world's 2"):
+        cl.export_policy(narrow, tmp_path / "other", world)
+    with pytest.raises(UserError, match="cannot be read"):
+        cl.load_exported(tmp_path / "other")

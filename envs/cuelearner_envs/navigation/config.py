@@ -17,6 +17,8 @@ from cuelearner_jax.errors import UserError, closest
 
 Style = Literal["clutter", "rooms", "corridor"]
 
+SIDES = {"none": 0, "left": 1, "right": -1}
+
 MOST_WORLDS = 1 << 24  # replay keeps a world's number in single precision, which is exact up to here
 
 # Folded into the key of the worlds: what is trained in is never validated in.
@@ -45,6 +47,8 @@ class NavigationConfig:
     """Changed world: standard deviation of a beam's error [m]."""
     lidar_dropout: float = 0.0
     """Changed world: probability that a beam reads the full range."""
+    preferred_side: Literal["none", "left", "right"] = "none"
+    """Changed wish, in a corridor: the teacher passes every obstacle on this side."""
     mirrors: bool = False
     """Multiply transitions by their mirror images, whatever the guidance; labels stay as they were given."""
 
@@ -53,6 +57,10 @@ def check(config: NavigationConfig) -> None:
     """Raises UserError with one line for the first value that cannot work."""
     if config.style not in STYLES:
         raise UserError(f"task.style is {config.style!r}{closest(config.style, STYLES)}")
+    if config.preferred_side not in SIDES:
+        raise UserError(f"task.preferred_side is {config.preferred_side!r}{closest(config.preferred_side, SIDES)}")
+    if config.preferred_side != "none" and config.style != "corridor":
+        raise UserError(f"task.preferred_side is {config.preferred_side}: that needs --task.style corridor")
     check_number("worlds", config.worlds, 1, MOST_WORLDS, whole=True)
     check_number("world_seed", config.world_seed, 0, MOST_SEED, whole=True)
     check_number("max_steps", config.max_steps, 1, MOST_STEPS, whole=True)
@@ -78,4 +86,5 @@ def make_environment(config: NavigationConfig, split: str = "training") -> Navig
         max_steps=jnp.int32(config.max_steps),
         goal_radius=jnp.float32(config.goal_radius),
         mirrors=config.mirrors,
+        sides=config.style == "corridor",
     )

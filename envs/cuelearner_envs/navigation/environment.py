@@ -14,6 +14,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray
 
 from cuelearner_envs.navigation.lidar import BEAMS, Lidar
 from cuelearner_envs.navigation.robot import Motion, Robot, collides, walk
+from cuelearner_envs.navigation.sides import heading, passed
 from cuelearner_envs.navigation.world import World
 from cuelearner_envs.navigation.worlds import FARTHEST
 from cuelearner_jax.actions import inward, retract, rotate, to_angle
@@ -36,13 +37,14 @@ class Walker(struct.PyTreeNode):
     world: Int[Array, ""]
     route: Int[Array, ""]  # of that world
     steps: Int[Array, ""]  # taken in this episode
+    passed: Float[Array, "2"] | None = None  # obstacles on the left and on the right in this episode, where they count
 
 
 AnyWalker = Any  # a `Walker`, or what another body has in its place: pose, goal, previous, world, route and steps
 
 
 class Navigation(Described, struct.PyTreeNode):
-    """The environment (`cuelearner_jax.environment.Environment`). Everything but the last field is traced."""
+    """The environment (`cuelearner_jax.environment.Environment`). Everything but the last two fields is traced."""
 
     worlds: World  # leading axis: worlds
     robot: Robot = Robot()
@@ -51,6 +53,7 @@ class Navigation(Described, struct.PyTreeNode):
     period: Scalar = 0.2  # duration of a step [s]
     goal_radius: Scalar = 0.5  # nearer than this, the goal is reached [m]
     mirrors: bool = struct.field(pytree_node=False, default=False)  # offer the mirror image as data?
+    sides: bool = struct.field(pytree_node=False, default=False)  # say on which side obstacles were passed?
 
     observation = (
         Quantity("lidar", BEAMS, "1", "exp(-distance / 1 m) of each beam, from -135 to +135 degrees, counterclockwise"),
@@ -76,7 +79,7 @@ class Navigation(Described, struct.PyTreeNode):
 
     def step(self, key: PRNGKeyArray, state: AnyWalker, action: Float[Array, "2"]) -> tuple[AnyWalker, Step]:
         """Walks for one period in the direction; a new episode follows an end."""
-        after = self.moved(state, action)
+        after = self.counted(state, self.moved(state, action))
         outcome, terminated, truncated = self.ends(after)
         following = jax.tree.map(lambda new, old: jnp.where(terminated | truncated, new, old), self._start(key), after)
         step = Step(
@@ -102,9 +105,26 @@ class Navigation(Described, struct.PyTreeNode):
         success = self.arrived(after) & ~failed
         terminated = success | failed
         truncated = (after.steps >= self.max_steps) & ~terminated
-        named = {"success": success, **failures, "timeout": truncated}
+        named = {"success": success, **failures, "timeout": truncated, **self.sides_taken(after)}
         outcome = {name: value.astype(jnp.float32) for name, value in named.items()}
         return {**outcome, "duration": after.steps * jnp.asarray(self.period)}, terminated, truncated
+
+    def counted(self, before: AnyWalker, after: AnyWalker) -> AnyWalker:
+        """The state after a step with the obstacles that it passed, where these count."""
+        if not self.sides:
+            return after
+        world, ahead = self.world(before.world), heading(self.worlds.starts[before.world, before.route], before.goal)
+        return after.replace(passed=before.passed + passed(world, ahead, before.pose[:2], after.pose[:2]))
+
+    def sides_taken(self, state: AnyWalker) -> dict[str, Bool[Array, ""]]:
+        """Whether all obstacles passed so far were passed on one side, or some on either; none holds before the first.
+
+        Nothing where sides do not count.
+        """
+        if not self.sides:
+            return {}
+        left, right = state.passed > 0
+        return {"passed_left": left & ~right, "passed_right": right & ~left, "passed_both": left & right}
 
     def moved(self, state: AnyWalker, action: Float[Array, "2"]) -> AnyWalker:
         """The state after a step, without a reset."""
@@ -228,7 +248,8 @@ class Navigation(Described, struct.PyTreeNode):
 
     def _start(self, key: PRNGKeyArray) -> AnyWalker:
         pose, goal, world, route = self.start(key)
-        return self.placed(self.at_rest(pose), goal, jnp.zeros((REMEMBERED, 2)), world, route)
+        state = self.placed(self.at_rest(pose), goal, jnp.zeros((REMEMBERED, 2)), world, route)
+        return state.replace(passed=jnp.zeros(2)) if self.sides else state
 
     def at_rest(self, pose: Float[Array, "3"]) -> Float[Array, "3"]:
         """The place of a body that stands still at a pose."""

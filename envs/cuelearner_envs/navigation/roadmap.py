@@ -7,7 +7,9 @@ spaces" (1996). Nodes are drawn at random, most of them close round the solids, 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +19,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from cuelearner_envs.navigation.environment import AnyWalker, Navigation
 from cuelearner_envs.navigation.geometry import clearance, line_clearance
 from cuelearner_envs.navigation.robot import Robot
+from cuelearner_envs.navigation.sides import closed, heading
 from cuelearner_envs.navigation.world import World
 from cuelearner_jax.actions import from_angle, retract, rotate
 
@@ -146,15 +149,51 @@ class RoadMapTeacher(struct.PyTreeNode):
         return rotate(retract(place - state.pose[:2]), -state.pose[2])
 
 
+class SidedTeacher(struct.PyTreeNode):
+    """Passes every obstacle on one side of it: its maps are of worlds with the other side closed (`types.Teacher`)."""
+
+    env: Navigation
+    side: Float[Array, ""]  # +1: on the left, -1: on the right
+    maps: RoadMap  # leading axes: worlds, and which side of them is closed, above and below
+    to_goals: Float[Array, "worlds closed routes nodes"]  # `distances` of each route's goal
+
+    def best_action(self, state: AnyWalker, obs: Float[Array, " obs"]) -> Float[Array, "2"]:
+        """The direction of the shortest way to the goal that passes on its side. Looks at the true state."""
+        # Who goes along x and passes on the left passes above; below is then closed.
+        above = -self.side * heading(self.env.worlds.starts[state.world, state.route], state.goal)
+        which = state.world, jnp.where(above > 0, 0, 1)
+        world = closed(self.env.world(state.world), above)
+        roadmap = jax.tree.map(lambda leaf: leaf[which], self.maps)
+        to_goal = self.to_goals[(*which, state.route)]
+        place, _ = way(roadmap, world, self.env.robot, to_goal, state.pose[:2], state.goal)
+        return rotate(retract(place - state.pose[:2]), -state.pose[2])
+
+
 @jax.jit
 def make_teacher(env: Navigation) -> RoadMapTeacher:
     """Road maps of all worlds of an environment."""
+    return RoadMapTeacher(env, *_each(env, partial(_mapped, env)))
 
-    def of_world(pair: tuple[PRNGKeyArray, World]) -> tuple[RoadMap, jax.Array]:
-        roadmap = build(pair[0], pair[1], env.robot)
-        return roadmap, jax.vmap(partial(distances, roadmap, pair[1], env.robot))(pair[1].goals)
 
+@jax.jit
+def make_sided_teacher(env: Navigation, side: Float[Array, ""]) -> SidedTeacher:
+    """Road maps of all worlds with either side of their obstacles closed; `side`: +1 to pass on the left, -1 right."""
+
+    def both(key: PRNGKeyArray, world: World) -> tuple[RoadMap, jax.Array]:
+        found = [_mapped(env, key, closed(world, above)) for above in (1.0, -1.0)]
+        return jax.tree.map(lambda *leaves: jnp.stack(leaves), *found)
+
+    return SidedTeacher(env, side, *_each(env, both))
+
+
+def _mapped(env: Navigation, key: PRNGKeyArray, world: World) -> tuple[RoadMap, Float[Array, "routes nodes"]]:
+    """A world's map, and the lengths of the ways to each route's goal."""
+    roadmap = build(key, world, env.robot)
+    return roadmap, jax.vmap(partial(distances, roadmap, world, env.robot))(world.goals)
+
+
+def _each(env: Navigation, mapped: Callable[[PRNGKeyArray, World], Any]) -> Any:
+    """What `mapped` gives of each world (leading axis: worlds)."""
     count = env.worlds.starts.shape[0]
     keys = jax.random.split(jax.random.key(0), count)
-    maps, to_goals = jax.lax.map(of_world, (keys, env.worlds), batch_size=min(count, 16))
-    return RoadMapTeacher(env, maps, to_goals)
+    return jax.lax.map(lambda pair: mapped(*pair), (keys, env.worlds), batch_size=min(count, 16))

@@ -1,0 +1,59 @@
+"""Export from Python: what `cuelearner export` does, and exported decisions to call."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cuelearner_jax.config import to_json
+from cuelearner_jax.environment import Quantity, action_of
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.export import contract, decisions, runner
+from cuelearner_jax.face.acting import CallablePolicy, as_policy
+from cuelearner_jax.face.worlds import World
+
+
+def export_policy(policy: Any, out: str | Path, world: World, format: str = "stablehlo") -> dict[str, Any]:
+    """Writes a policy's whole decision as a file, with a contract of what goes in and what comes out.
+
+    Args:
+        policy: one that was loaded, adapted or refined, or anything else made of JAX functions that acts.
+        out: a new folder.
+        world: in which it acts: it names the slices of the observation, and golden cases are taken from it.
+        format: "stablehlo", "onnx" or "numpy".
+
+    Returns:
+        The contract, with "difference": the largest one of a golden case in the file that was written.
+
+    Raises:
+        UserError: the folder is in use; the policy acts at random, asks a teacher, holds Python code, or does not fit.
+    """
+    contract.check_request(format, Path(out))
+    wanted, given = (sum(quantity.size for quantity in seen) for seen in (_seen(policy), world.observation))
+    if wanted not in (0, given):
+        raise UserError(f"the policy's observations have {wanted} entries, this world's {given}: keep its structure")
+    acting, env = as_policy(policy), world.env
+    about = {"subject": type(policy).__name__, "world": {"name": world.task.name, **to_json(world.config)}}
+    drawn = lambda: decisions.observations(env, acting)  # noqa: E731
+    return contract.write(acting, env.observation, action_of(env), drawn, format, Path(out), about)
+
+
+def load_exported(folder: str | Path) -> runner.Decision:
+    """An exported decision, verified and called once: `decide(obs)` as a policy, `decide.contract`, `decide.check()`.
+
+    Raises:
+        UserError: the folder is damaged, or cannot be run here.
+    """
+    try:
+        decide = runner.Decision(folder)
+        decide(np.zeros(decide.contract["observation"]["size"], np.float32))
+    except runner.ContractError as error:
+        raise UserError(str(error)) from error
+    return decide
+
+
+def _seen(policy: Any) -> tuple[Quantity, ...]:
+    """What a policy expects to see; nothing where that is not known."""
+    return policy.observation if isinstance(policy, CallablePolicy) else ()

@@ -1,0 +1,318 @@
+"""What the experiments on adaptation have in common: pieces of a study, who adapts, and the tables that they leave.
+
+A piece is one method in one changed world, over all base agents of a run folder and all its budgets (or steps), in
+lanes of one program. Its rows go to FOLDER/TASK/WORLD/PIECE/adaptation.jsonl while it runs, .parquet once it is done.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import shutil
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import _trajectories as trajectories
+import numpy as np
+from _pieces import chosen, listed
+
+from cuelearner_jax.adaptation import adapting, program, residual
+from cuelearner_jax.adaptation.finetuning import FineTuning, every
+from cuelearner_jax.cli import main as cuelearner
+from cuelearner_jax.config import GuideSizes, RunConfig
+from cuelearner_jax.environment import actions_of, spaces_of
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.evaluate import episodes, one_lane, watched_lanes
+from cuelearner_jax.guidance import registry as guidances
+from cuelearner_jax.policies import Agent, Corrected
+from cuelearner_jax.records import table as tables
+from cuelearner_jax.records.provenance import provenance
+from cuelearner_jax.runs.trained import PolicySource, several
+from cuelearner_jax.task import Task
+from cuelearner_jax.tasks import registry
+
+SCHEMA = tables.Schema(
+    stem="adaptation",
+    mark="base",
+    required=("task", "world", "method", "variant", "split", "base", "labels", "steps"),
+    strings=("task", "world", "method", "variant", "split", "commit", "versions", "hardware", "command"),
+    integers=("base", "labels", "steps"),
+    remedy="is damaged: delete its folder and run the piece again",
+)
+UNCHANGED = "unchanged"  # the world that the base agents were trained in
+SEED = 0  # of labels, fits and fine-tuning; the base agents have seeds of their own
+JUDGED = 500  # environments at most in which it is decided whether a model is used
+Row = dict[str, Any]
+
+
+class Piece(NamedTuple):
+    """One method in one world."""
+
+    world: str  # a scenario of the task's, or `UNCHANGED`
+    method: str  # a key of `METHODS`
+    variant: str = ""  # of its settings, where there are several
+    bound_deg: float = 180.0
+    labels: tuple[int, ...] = ()  # budgets
+    settings: Mapping[str, Any] = {}  # "sizes.…" and "scalars.…" of the guide or of the learning agent, "task.…"
+    rates: tuple[float, ...] = ()  # of fine-tuning: its step sizes,
+    noises_deg: tuple[float, ...] = ()  # and its noises
+    steps: int = 0  # of fine-tuning
+    every: int = 0  # of them between two measurements
+    split: str = "validation"  # of the episodes; settings are chosen on "tuning"
+    bases: int | None = None  # at most so many
+    judge_by: str = "reward"  # a model that is worse by this on tuning episodes is not used
+    ways: bool = False  # keep some ways that are walked before and after, for a picture?
+    minutes: int = 10  # of an H100 or H200, a guess
+    serves: str = ""  # which figure
+
+    @property
+    def path(self) -> str:
+        """Of its folder, and what it is called on the command line."""
+        name = f"{self.method}-{self.variant}" if self.variant else self.method
+        return f"{'tuning/' if self.split == 'tuning' else ''}{self.world}/{name}"
+
+    @property
+    def lanes(self) -> int:
+        """For each base agent."""
+        return max(1, len(self.labels)) * max(1, len(self.rates)) * max(1, len(self.noises_deg))
+
+
+class Scale(NamedTuple):
+    """How much of every piece is run."""
+
+    about: str
+    envs: int  # of an evaluation
+    steps: int  # of each of them
+    bases: int | None = None
+    labels: Mapping[int, int] | None = None  # budgets that are kept, and what they become
+    settings: Mapping[str, Any] = {}
+    tuned_steps: tuple[int, int] | None = None  # steps of fine-tuning, and between two measurements
+    train: Sequence[str] = ()  # options of `cuelearner sweep` for base agents where none are given
+
+
+class Study(NamedTuple):
+    """The pieces of one task."""
+
+    task: str
+    pieces: tuple[Piece, ...]
+    scales: Mapping[str, Scale]
+
+
+@lru_cache(maxsize=4)
+def environment(task: str, world: Any, split: str) -> Any:
+    """That of a world; made once, for a thousand halls take a while."""
+    return registry.find(task).environment(world, split)
+
+
+class Bench(NamedTuple):
+    """Where a piece is run: its base agents, and the world."""
+
+    task: Task
+    config: RunConfig  # of the base agents' run
+    agents: Agent  # a block
+    seeds: np.ndarray  # (bases,)
+    world: Any  # a configuration
+    piece: Piece
+    envs: int
+    steps: int
+    folder: Path  # of what is written
+
+    def env(self, split: str) -> Any:
+        """The world of a split: what is asked and learned in is "training"."""
+        return environment(self.task.name, self.world, split)
+
+    def measured(self, policy: Any, split: str | None = None) -> Row:
+        """Metrics (lanes,) of a block of policies on the episodes of a split (default: the piece's)."""
+        split = split or self.piece.split
+        return watched_lanes(self.env(split), policy, episodes(split), self.envs, self.envs * self.steps)
+
+    def set(self, group: str, values: Any) -> Any:
+        """A group of a configuration with the piece's settings of that name; tuples for lists."""
+        own = {name.partition(".")[2]: value for name, value in self.piece.settings.items() if name.startswith(group)}
+        known = {field.name for field in dataclasses.fields(values)}
+        return dataclasses.replace(values, **{name: value for name, value in own.items() if name in known})
+
+    def scalars(self) -> Any:
+        """The base agents' scalars with labels of the scenario's strength, refined within the bound."""
+        eps = None if self.piece.world == UNCHANGED else self.task.scenario(self.piece.world).eps_deg
+        own = adapting.settling(self.config.scalars, self.piece.settings.get("scalars.eps_deg", eps))
+        own = dataclasses.replace(own, k_max=int(np.ceil(self.piece.bound_deg / own.eps_deg)) + 2)
+        return self.set("scalars.", own)
+
+
+def measured_as_they_are(bench: Bench) -> Iterator[Row]:
+    """The base agents themselves."""
+    agents = bench.agents.replace(env=bench.env(bench.piece.split))
+    yield {"base": bench.seeds, "labels": 0, "steps": 0, **bench.measured(agents)}
+
+
+def corrected(bench: Bench) -> Iterator[Row]:
+    """Under the teacher's own answers, refined as a model of them would, within the same bound."""
+    env = bench.env(bench.piece.split)
+    scalars = dataclasses.replace(bench.scalars(), tau_max_deg=bench.piece.bound_deg)
+    teacher = bench.task.make_teacher(bench.world, env)
+    policy = Corrected(bench.agents.replace(env=env), teacher, scalars, actions_of(env))
+    yield {"base": bench.seeds, "labels": 0, "steps": 0, **bench.measured(policy)}
+
+
+def by_labels(kind: Any, bench: Bench) -> Iterator[Row]:
+    """Adapted by labels of a kind of guidance, every budget a lane of its own."""
+    piece, env = bench.piece, bench.env("training")
+    sizes = bench.set("sizes.", GuideSizes(frame=bench.config.sizes.frame))
+    scalars = bench.scalars()
+    guidance = guidances.made_for(kind, sizes, spaces_of(env))
+    lanes = program.product(len(bench.seeds), (SEED,), piece.labels, (piece.bound_deg,))
+    envs = min(bench.envs, JUDGED)
+    judge = adapting.Judging(bench.env("tuning"), envs, envs * bench.steps, piece.judge_by)
+    asked = adapting.Adaptation(guidance, sizes, scalars, env, bench.agents, lanes, judge)
+    found = adapting.adapt(asked, bench.task.make_teacher(bench.world, env))
+    told = {"used": found.judged.used.astype(float), "failed": np.asarray(found.block.failed).astype(float)}
+    told |= {"judged_before": found.judged.before, "judged_after": found.judged.after, "eps_deg": scalars.eps_deg}
+    shown = bench.env(piece.split)
+    metrics = bench.measured(found.policy(shown))
+    if piece.ways:
+        last = len(bench.seeds) * (len(piece.labels) - 1)  # the first base with the largest budget
+        policies = {"before": one_lane(bench.agents, 0), "after": one_lane(found.policy(shown), last)}
+        trajectories.write(bench.folder, shown, policies, piece.split, bench.steps)
+    yield {"base": bench.seeds[lanes.base], "labels": lanes.budget, "steps": 0, **told, **metrics}
+
+
+def by_residuals(bench: Bench) -> Iterator[Row]:
+    """The correction itself, learned from optimal actions, in units of the bound."""
+    settings = {"scalars.eps_deg": bench.piece.bound_deg, "scalars.tau_max_deg": bench.piece.bound_deg}
+    settings |= {"scalars.k_max": 3, **bench.piece.settings}
+    yield from by_labels(residual.KIND, bench._replace(piece=bench.piece._replace(settings=settings)))
+
+
+def fine_tuned(bench: Bench) -> Iterator[Row]:
+    """Agents that go on learning, measured on the way; every step size and noise is a lane of its own."""
+    piece, env = bench.piece, bench.env("training")
+    own = dataclasses.replace(
+        bench.config,
+        task=bench.world,
+        sizes=bench.set("sizes.", bench.config.sizes),
+        scalars=bench.set("scalars.", bench.config.scalars),
+        schedule=bench.set("schedule.", dataclasses.replace(bench.config.schedule, learn_after=1_000)),
+    )
+    lanes = every(len(bench.seeds), (SEED,), piece.rates, piece.noises_deg)
+    tuning = FineTuning(own, env, bench.agents, lanes)
+    shown = bench.env(piece.split)
+    settings = {"learning_rate": lanes.learning_rate, "noise_deg": lanes.noise_deg, "base": bench.seeds[lanes.base]}
+    while True:
+        failed = tuning.failed.astype(float)
+        metrics = bench.measured(tuning.policy(shown))
+        yield {**settings, "labels": 0, "steps": tuning.step, "failed": failed, **metrics}
+        if tuning.step >= piece.steps:
+            return
+        tuning.train(piece.every)
+
+
+def _kind(name: str) -> Callable[[Bench], Iterator[Row]]:
+    return lambda bench: by_labels(guidances.find(name), bench)
+
+
+METHODS: dict[str, Callable[[Bench], Iterator[Row]]] = {
+    "none": measured_as_they_are,
+    "teacher": corrected,
+    "relative": _kind("relative"),
+    "dcoach": _kind("dcoach"),
+    "residual": by_residuals,
+    "finetuning": fine_tuned,
+}
+
+
+def scaled(piece: Piece, scale: Scale) -> Piece | None:
+    """A piece at a scale, or None where nothing of it is left."""
+    labels = piece.labels
+    if scale.labels is not None and labels:
+        labels = tuple(scale.labels[budget] for budget in labels if budget in scale.labels)
+        if not labels:
+            return None
+    steps, between = scale.tuned_steps if scale.tuned_steps and piece.steps else (piece.steps, piece.every)
+    few = [count for count in (piece.bases, scale.bases) if count]
+    settings = {**piece.settings, **scale.settings}
+    return piece._replace(labels=labels, steps=steps, every=between, settings=settings, bases=min(few) if few else None)
+
+
+def opened(folder: Path, study: Study, piece: Piece, scale: Scale, out: Path) -> Bench:
+    """Where a piece is run. Raises UserError if the folder holds no such agents."""
+    source = PolicySource.of_run(folder, registry.find)
+    if source.task.name != study.task:
+        raise UserError(f"{folder} holds agents of {source.task.name}: give --bases a run of {study.task}")
+    assert source.grid is not None
+    config = source.config
+    world = config.task if piece.world == UNCHANGED else source.task.scenario(piece.world).applied(config.task)
+    own = {name.partition(".")[2]: value for name, value in piece.settings.items() if name.startswith("task.")}
+    world = dataclasses.replace(world, **own)
+    env = environment(source.task.name, world, "training")
+    policies, seeds = several(source, env, world, "agent", None, None, source.grid.seeds[: piece.bases])
+    agents = program.side_by_side(policies)
+    steps = scale.steps if source.task.longest is None else source.task.longest(world)
+    return Bench(source.task, config, agents, np.array(seeds), world, piece, scale.envs, steps, out)
+
+
+def run_piece(study: Study, piece: Piece, scale: Scale, bases: Path, out: Path, resume: bool) -> None:
+    """Runs a piece and finishes its table. Raises UserError if it is there already and is not to be gone on with."""
+    folder = out / study.task / piece.path
+    if (folder / SCHEMA.parquet).exists() and resume:
+        print(f"{piece.path}: finished")
+        return
+    if folder.exists() and not resume:
+        raise UserError(f"{folder} exists: give --resume to go on, or another --out")
+    shutil.rmtree(folder, ignore_errors=True)  # what was begun is begun anew: it takes minutes
+    bench = opened(bases, study, piece, scale, folder)
+    about = {"task": study.task, "world": piece.world, "method": piece.method, "variant": piece.variant}
+    constants = {**about, "split": piece.split, "bound_deg": piece.bound_deg, **provenance()}
+    with tables.TableWriter(folder, SCHEMA, constants) as writer:
+        for row in METHODS[piece.method](bench):
+            count = len(row["base"])
+            # A column is a number for all, or one a lane.
+            writer.append(**{name: np.broadcast_to(np.asarray(value), (count,)) for name, value in row.items()})
+            shown = {name: float(np.mean(value)) for name, value in row.items() if name in ("reward", "success")}
+            told = ", ".join(f"{name} {value:.3f}" for name, value in shown.items())
+            print(f"{piece.path}: {row['steps'] or ''} {told}", flush=True)
+    tables.finish(folder, SCHEMA)
+
+
+def run(study: Study, about: str, arguments: Sequence[str] | None = None) -> int:
+    """Runs pieces, one after the other; returns the exit status."""
+    parser = argparse.ArgumentParser(
+        description=about, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
+    )
+    scales = "; ".join(f"{name}: {scale.about}" for name, scale in study.scales.items())
+    parser.add_argument("--bases", type=Path, help="run folder of the base agents (smoke trains tiny ones by itself)")
+    parser.add_argument("--scale", choices=list(study.scales), default="paper", help=scales)
+    parser.add_argument("--pieces", nargs="+", default=[], metavar="NAME", help="these alone, or all below a folder")
+    parser.add_argument("--out", type=Path, default=Path("runs/adaptation"), help="folder")
+    parser.add_argument("--resume", action="store_true", help="leave finished pieces, begin interrupted ones anew")
+    parser.add_argument("--list", action="store_true", help="list the pieces and stop")
+    asked = parser.parse_args(arguments)
+    try:
+        pieces = chosen(study, asked.pieces)
+    except ValueError as error:
+        parser.error(str(error))
+    if not asked.pieces:
+        pieces = [piece for piece in pieces if piece.split != "tuning" or piece.world == UNCHANGED]
+    if asked.list:
+        print(listed(pieces))
+        return 0
+    scale = study.scales[asked.scale]
+    out = asked.out if asked.scale == "paper" else asked.out / asked.scale
+    bases = asked.bases
+    if bases is None and not scale.train:
+        parser.error("give --bases the run folder of the base agents")
+    if bases is None:
+        bases = out / study.task / "bases"
+        begun = ["--resume"] if (bases / "config.json").exists() else []
+        if status := cuelearner(["sweep", study.task, *scale.train, "--out", str(bases), *begun]):
+            return status
+    try:
+        for piece in pieces:
+            if at_scale := scaled(piece, scale):
+                run_piece(study, at_scale, scale, bases, out, asked.resume)
+    except UserError as error:
+        print(error)
+        return 2
+    return 0

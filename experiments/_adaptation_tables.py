@@ -1,0 +1,154 @@
+"""Tables of recorded adaptation: what methods reach, and after how many labels or steps."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from _adaptation import SCHEMA, UNCHANGED
+
+from cuelearner_jax.records import table as tables
+from cuelearner_jax.report.statistics import interquartile_mean, interval
+
+NAMES = {
+    "none": "not adapted",
+    "teacher": "the teacher itself, within the bound",
+    "relative": "relative labels",
+    "residual": "residual, optimal corrections",
+    "dcoach": "deep COACH",
+    "finetuning": "RL fine-tuning",
+}
+GAIN = 0.95  # of a gain, after how many labels it is asked for
+DRAWS = 2_000
+Row = dict[str, Any]
+
+
+class Line(NamedTuple):
+    """A method after some labels or steps."""
+
+    method: str
+    variant: str
+    after: int  # labels, or steps of fine-tuning
+    bases: np.ndarray  # (bases,), ascending
+    columns: dict[str, np.ndarray]  # metrics (bases,)
+
+    @property
+    def name(self) -> str:
+        """As tables show it."""
+        return NAMES[self.method] + (f" ({self.variant})" if self.variant else "")
+
+
+def read(folder: Path) -> list[Row]:
+    """The rows of all finished pieces of a task."""
+    rows = []
+    for file in sorted(folder.rglob(SCHEMA.parquet)):
+        rows += tables.read(file, SCHEMA).to_pylist()
+    return rows
+
+
+def lines(rows: Sequence[Row], world: str, split: str = "validation", least: float = 0.0) -> list[Line]:
+    """What is known of a world, in the order of `NAMES`.
+
+    `least`: base agents that earn less in the unchanged world, on tuning episodes, are left out.
+    """
+    alone = [row for row in rows if row["world"] == UNCHANGED and row["split"] == "tuning"]
+    poor = {row["base"] for row in alone if row["reward"] < least}
+    found: dict[tuple, list[Row]] = {}
+    for row in rows:
+        if row["world"] == world and row["split"] == split and row["base"] not in poor:
+            settings = (row.get("learning_rate"), row.get("noise_deg")) if split == "tuning" else ()
+            found.setdefault((row["method"], row["variant"], row["labels"] or row["steps"], settings), []).append(row)
+    result = []
+    for (method, variant, after, settings), several in found.items():
+        own = sorted(several, key=lambda row: row["base"])
+        numbers = [name for name, value in own[0].items() if isinstance(value, float)]
+        columns = {name: np.array([np.nan if row[name] is None else row[name] for row in own]) for name in numbers}
+        told = ", ".join([variant] * bool(variant) + [f"{value:g}" for value in settings if value is not None])
+        result.append(Line(method, told, after, np.array([row["base"] for row in own]), columns))
+    order = list(NAMES)
+    return sorted(result, key=lambda line: (order.index(line.method), line.variant, line.after))
+
+
+def spread(values: np.ndarray, digits: int = 3) -> str:
+    """The interquartile mean over bases with its interval."""
+    own = values[np.isfinite(values)]
+    if not len(own):
+        return "none"
+    found = interval(own)
+    estimate = f"{float(found.estimate):.{digits}f}"
+    if len(own) == 1:
+        return estimate
+    return f"{estimate} [{float(found.lower):.{digits}f}, {float(found.upper):.{digits}f}]"
+
+
+def percent(values: np.ndarray) -> str:
+    """The same of shares, in percent."""
+    return spread(100 * values, 1)
+
+
+def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """As Markdown."""
+    return "\n".join("| " + " | ".join(cells) + " |" for cells in [header, ["---"] * len(header), *rows])
+
+
+def matched(line: Line, other: Line, name: str) -> tuple[np.ndarray, np.ndarray]:
+    """A metric of two lines over the bases that both have."""
+    _, mine, its = np.intersect1d(line.bases, other.bases, return_indices=True)
+    return line.columns[name][mine], other.columns[name][its]
+
+
+def share(line: Line, whole: Line) -> np.ndarray:
+    """Reward as a share of the same base's in the unchanged world."""
+    own, before = matched(line, whole, "reward")
+    return own / np.maximum(before, 1e-9)
+
+
+class Reached(NamedTuple):
+    """After how many labels or steps a level is reached."""
+
+    estimate: float  # infinite: it is not
+    lower: float
+    upper: float
+
+    def told(self, last: int) -> str:
+        """In words; `last`: labels or steps of the longest."""
+
+        def number(value: float) -> str:
+            return f"{value:,.0f}" if np.isfinite(value) else f"above {last:,}"
+
+        return f"{number(self.estimate)} [{number(self.lower)}, {number(self.upper)}]"
+
+
+def reached(curves: np.ndarray, after: Sequence[int], reference: np.ndarray, own: bool) -> Reached:
+    """When a method's curve has made `GAIN` of a gain.
+
+    Args:
+        curves: (bases, points) of the method, the first at 0 labels or steps.
+        after: labels or steps of the points.
+        reference: (bases, 2): another method's first and last point; its gain is meant unless the `own` one is.
+        own: is the method's own gain meant?
+    """
+    random = np.random.default_rng(0)
+    draws = np.concatenate([np.arange(len(curves))[None], random.integers(0, len(curves), (DRAWS, len(curves)))])
+    means = interquartile_mean(curves[draws], axis=1)
+    gains = means[:, [0, -1]] if own else interquartile_mean(reference[draws], axis=1)
+    found = [
+        _crossing(curve, after, first + GAIN * (last - first)) if last > first else np.inf
+        for curve, (first, last) in zip(means, gains, strict=True)
+    ]
+    lower, upper = np.quantile(found[1:], [0.025, 0.975], method="nearest")
+    return Reached(found[0], float(lower), float(upper))
+
+
+def _crossing(curve: np.ndarray, after: Sequence[int], level: float) -> float:
+    """Where straight lines between points first come to a level."""
+    at = np.flatnonzero(curve >= level)
+    if not len(at):
+        return np.inf
+    if at[0] == 0:
+        return float(after[0])
+    low, high = at[0] - 1, at[0]
+    part = (level - curve[low]) / (curve[high] - curve[low])
+    return float(after[low] + part * (after[high] - after[low]))

@@ -1,0 +1,154 @@
+"""Finished billiards agents in three changed worlds: labels about their shots against fine-tuning and other baselines.
+
+    python experiments/adaptation_billiards.py --list
+    python experiments/adaptation_billiards.py --bases RUN --out FOLDER [--pieces tilted_table] [--resume]
+    python experiments/adaptation_page.py --data FOLDER
+
+RUN is the folder of a run of the preset `regulation`; all of its seeds are adapted. The pieces are data below: a method
+in a world, in lanes of one program. Those below `tuning/`, on the episodes on which settings are chosen, run only when
+they are named. At the scale `quick` a piece takes minutes, at `smoke` seconds on a CPU, with agents of its own making.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from _adaptation import UNCHANGED, Piece, Scale, Study, run
+from _pieces import option
+from billiards_bootstrapping import SCALES as TRAINING
+
+BOUNDS_DEG = {"turned_strike": 1.0, "shifted_balls": 0.3, "tilted_table": 0.3}
+BUDGETS = (25, 50, 100, 250, 500)
+TUNED, TUNING_BASES = (250,), 4
+LEAST = 0.4  # reward of a base agent in the unchanged world, on tuning episodes: others are no finished agents
+
+# The teacher is one that plays its shots in the changed world, and means the shot that is nearest to the agent's own.
+ASKED: Mapping[str, Any] = {
+    "task.teacher": "local_search",
+    "scalars.answer": "nearest",
+    "scalars.nearest_aim_deg": 0.1,
+    "scalars.nearest_share": 0.9,
+}
+LEARNING: Mapping[str, Any] = {"task.teacher": "local_search", "sizes.num_envs": 10, "sizes.replay_capacity": 100_000}
+# As chosen on tuning episodes, see docs/results/adaptation.md.
+RATES, NOISES_DEG, STEPS, EVERY = (0.01,), (0.3,), 100_000, 5_000
+
+# Settings that are compared on tuning episodes, by method.
+COMPARED: dict[str, dict[str, Mapping[str, Any]]] = {
+    "relative": {
+        "nearest": {},
+        "best": {"scalars.answer": "best"},
+        "share-60": {"scalars.nearest_share": 0.6},
+        "raw": {"sizes.frame": "raw"},
+        "eps-05": {"scalars.eps_deg": 0.05},
+    },
+    "residual": {
+        "three-times": {},
+        "once": {"scalars.k_max": 1, "scalars.refined_fraction": 0.0},
+        "slow": {"scalars.feedback_learning_rate": 3e-4},
+    },
+    "dcoach": {
+        "default": {},
+        "fast": {"scalars.feedback_learning_rate": 3e-3},
+        "slow": {"scalars.feedback_learning_rate": 1e-4},
+    },
+    "teacher": {
+        "nearest": {},
+        "best": {"scalars.answer": "best"},
+        "share-60": {"scalars.nearest_share": 0.6},
+        "aim-25": {"scalars.nearest_aim_deg": 0.25},
+    },
+}
+SWEPT_RATES, SWEPT_NOISES_DEG = (0.001, 0.01, 0.05, 0.1), (0.0, 0.15, 0.6)
+
+
+def compared(world: str, bound: float) -> list[Piece]:
+    """Every method with every setting that is tried."""
+    pieces = [
+        Piece(
+            world,
+            method,
+            variant,
+            bound,
+            () if method == "teacher" else TUNED,
+            {**ASKED, **settings},
+            split="tuning",
+            bases=TUNING_BASES,
+            minutes=4,
+            serves=f"settings of {method}",
+        )
+        for method, variants in COMPARED.items()
+        for variant, settings in variants.items()
+    ]
+    swept = {"rates": SWEPT_RATES, "noises_deg": SWEPT_NOISES_DEG, "steps": 20_000, "every": 5_000}
+    learns = Piece(world, "finetuning", settings=LEARNING, split="tuning", bases=TUNING_BASES, minutes=8, **swept)
+    return [*pieces, learns._replace(serves="settings of finetuning")]
+
+
+def reported(world: str, bound: float) -> list[Piece]:
+    """The figure of a world."""
+    serves = "reward as a share of the original"
+    asked = {"bound_deg": bound, "settings": ASKED, "serves": serves}
+    learns = {"rates": RATES, "noises_deg": NOISES_DEG, "steps": STEPS, "every": EVERY}
+    return [
+        Piece(world, "none", minutes=1, serves=serves),
+        Piece(world, "teacher", minutes=2, **asked),
+        *(Piece(world, method, labels=BUDGETS, minutes=8, **asked) for method in ("relative", "residual", "dcoach")),
+        Piece(world, "finetuning", settings=LEARNING, minutes=15, serves=serves, **learns),
+    ]
+
+
+PIECES = (
+    Piece(UNCHANGED, "none", minutes=1, serves="what is whole"),
+    Piece(UNCHANGED, "none", split="tuning", minutes=1, serves="which agents are finished"),
+    *(piece for world, bound in BOUNDS_DEG.items() for piece in reported(world, bound)),
+    *(piece for world, bound in BOUNDS_DEG.items() for piece in compared(world, bound)),
+)
+
+
+def bases(**options: Any) -> list[str]:
+    """How tiny base agents are trained."""
+    own = {**TRAINING["smoke"].options, "preset": "regulation", "guidance": "none", "seeds": 2, **options}
+    return [word for name, value in own.items() for word in option(name, value)]
+
+
+SCALES = {
+    "smoke": Scale(
+        "seconds a piece on a CPU, to see that everything runs",
+        envs=4,
+        steps=3,
+        bases=2,
+        labels={25: 5, 50: 10, 250: 10},
+        settings={
+            "sizes.feedback_layers": (16,),
+            "sizes.labels_per_round": 5,
+            "sizes.fit_steps": 20,
+            "sizes.fit_batch_size": 5,
+            "sizes.replay_capacity": 400,
+            "schedule.learn_after": 20,
+        },
+        tuned_steps=(40, 20),
+        train=bases(),
+    ),
+    "quick": Scale(
+        "a minute a piece on an accelerator, to see where it goes",
+        envs=100,
+        steps=20,
+        bases=4,
+        labels={100: 100, 250: 250, 500: 500},
+        tuned_steps=(10_000, 2_500),
+    ),
+    "paper": Scale("what is reported", envs=200, steps=50),
+}
+
+STUDY = Study("billiards", PIECES, SCALES)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs what is asked for; returns the exit status."""
+    return run(STUDY, __doc__ or "", arguments)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,181 @@
+"""Finished navigation agents with a turned lidar, in rooms, and in a corridor where one side is preferred.
+
+    python experiments/adaptation_navigation.py --list
+    python experiments/adaptation_navigation.py --bases RUN --out FOLDER [--pieces turned_lidar] [--resume]
+    python experiments/adaptation_page.py --data FOLDER
+
+RUN is the folder of a run of the task; all of its seeds are adapted. The pieces are data below: a method in a world, in
+lanes of one program. Those below `tuning/`, on the episodes on which settings are chosen, run only when they are named.
+At the scale `quick` a piece takes minutes, at `smoke` seconds on a CPU, with agents of its own making.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from _adaptation import UNCHANGED, Piece, Scale, Study, run
+from _pieces import option
+from navigation_bootstrapping import SCALES as TRAINING
+
+LIDAR, ROOMS = "turned_lidar", "rooms"
+LIDAR_BOUND_DEG, ROOMS_BOUNDS_DEG, SIDE_BOUND_DEG = 60.0, (60.0, 180.0), 60.0
+BUDGETS = (50, 100, 250, 500)
+TUNED, TUNING_BASES = (250,), 4
+
+FRAME: Mapping[str, Any] = {"sizes.frame": "action"}
+ROOMY: Mapping[str, Any] = {**FRAME, "scalars.eps_deg": 20.0}  # in rooms small turns lead nowhere
+SIDED: Mapping[str, Any] = {**FRAME, "scalars.eps_deg": 20.0}
+LEARNING: Mapping[str, Any] = {"sizes.num_envs": 10, "sizes.replay_capacity": 50_000}
+# As chosen on tuning episodes, see docs/results/adaptation.md.
+RATES, NOISES_DEG, STEPS, EVERY = (0.001,), (5.0,), 50_000, 5_000
+
+# Settings that are compared on tuning episodes, by world and method.
+RELATIVE: dict[str, Mapping[str, Any]] = {
+    "frame": FRAME,
+    "raw": {"sizes.frame": "raw"},
+    "eps-5": {**FRAME, "scalars.eps_deg": 5.0},
+    "eps-10": {**FRAME, "scalars.eps_deg": 10.0},
+    "eps-20": {**FRAME, "scalars.eps_deg": 20.0},
+}
+OTHERS: dict[str, dict[str, Mapping[str, Any]]] = {
+    "residual": {
+        "three-times": FRAME,
+        "once": {**FRAME, "scalars.k_max": 1, "scalars.refined_fraction": 0.0},
+        "raw": {"sizes.frame": "raw"},
+    },
+    "dcoach": {
+        "frame": {**FRAME, "scalars.eps_deg": 20.0},
+        "raw": {"sizes.frame": "raw", "scalars.eps_deg": 20.0},
+        "slow": {**FRAME, "scalars.eps_deg": 20.0, "scalars.feedback_learning_rate": 3e-4},
+    },
+}
+SWEPT_RATES, SWEPT_NOISES_DEG = (0.0001, 0.001, 0.01), (0.0, 5.0, 20.0)
+
+
+def compared(world: str, bound: float, judge_by: str, methods: Mapping[str, Mapping[str, Any]]) -> list[Piece]:
+    """Methods with every setting that is tried."""
+    return [
+        Piece(
+            world,
+            method,
+            variant,
+            bound,
+            TUNED,
+            settings,
+            split="tuning",
+            bases=TUNING_BASES,
+            judge_by=judge_by,
+            minutes=5,
+            serves=f"settings of {method}",
+        )
+        for method, variants in methods.items()
+        for variant, settings in variants.items()
+    ]
+
+
+def lidar() -> list[Piece]:
+    """The table of the turned lidar."""
+    world, serves, bound = LIDAR, "success with a turned lidar", LIDAR_BOUND_DEG
+    asked = {"bound_deg": bound, "labels": BUDGETS, "settings": FRAME, "judge_by": "success", "serves": serves}
+    learns = {"settings": LEARNING, "rates": RATES, "noises_deg": NOISES_DEG, "steps": STEPS, "every": EVERY}
+    swept = {"settings": LEARNING, "rates": SWEPT_RATES, "noises_deg": SWEPT_NOISES_DEG}
+    return [
+        Piece(world, "none", minutes=2, serves=serves),
+        Piece(world, "teacher", bound_deg=bound, minutes=4, serves=serves),
+        *(Piece(world, method, minutes=15, **asked) for method in ("relative", "residual", "dcoach")),
+        Piece(world, "finetuning", minutes=25, serves=serves, **learns),
+        *compared(world, bound, "success", {"relative": RELATIVE, **OTHERS}),
+        Piece(
+            world,
+            "finetuning",
+            split="tuning",
+            bases=TUNING_BASES,
+            steps=20_000,
+            every=5_000,
+            minutes=20,
+            serves="settings of finetuning",
+            **swept,
+        ),
+    ]
+
+
+def rooms() -> list[Piece]:
+    """The table of the rooms: unadapted, and learned and by the road map within either bound."""
+    pieces = [Piece(ROOMS, "none", minutes=2, serves="success in rooms")]
+    for bound in ROOMS_BOUNDS_DEG:
+        asked = {"variant": f"{bound:g}", "bound_deg": bound, "serves": "success in rooms"}
+        pieces.append(Piece(ROOMS, "teacher", minutes=5, settings=ROOMY, **asked))
+        pieces.append(
+            Piece(ROOMS, "relative", labels=(250, 500, 1_000), settings=ROOMY, judge_by="success", minutes=20, **asked)
+        )
+    return [*pieces, *compared(ROOMS, 180.0, "success", {"relative": RELATIVE})]
+
+
+def sides() -> list[Piece]:
+    """The preferred side in the corridor."""
+    pieces = []
+    for side in ("left", "right"):
+        world, judge_by, serves = f"corridor_{side}", f"passed_{side}", "the preferred side"
+        asked = {"bound_deg": SIDE_BOUND_DEG, "settings": SIDED, "judge_by": judge_by, "serves": serves}
+        pieces += [
+            Piece(world, "none", minutes=2, serves=serves),
+            Piece(world, "teacher", minutes=4, **asked),
+            Piece(world, "relative", labels=(100, 250, 500), ways=True, minutes=12, **asked),
+        ]
+    return [*pieces, *compared("corridor_left", SIDE_BOUND_DEG, "passed_left", {"relative": RELATIVE})]
+
+
+UNADAPTED = Piece(UNCHANGED, "none", minutes=2, serves="what is whole")
+PIECES = tuple(
+    sorted(
+        [UNADAPTED, *lidar(), *rooms(), *sides()], key=lambda piece: piece.split == "tuning"
+    )  # those of tables first
+)
+
+
+def bases() -> list[str]:
+    """How tiny base agents are trained."""
+    own = {**TRAINING["smoke"].options, "preset": "paper", "sizes.num-envs": 10, "guidance": "none", "seeds": 2}
+    return [word for name, value in own.items() for word in option(name, value)]
+
+
+SCALES = {
+    "smoke": Scale(
+        "seconds a piece on a CPU, to see that everything runs",
+        envs=4,
+        steps=0,
+        bases=2,
+        labels={50: 5, 250: 10},
+        settings={
+            "sizes.feedback_layers": (16,),
+            "sizes.labels_per_round": 5,
+            "sizes.fit_steps": 20,
+            "sizes.fit_batch_size": 5,
+            "sizes.replay_capacity": 400,
+            "schedule.learn_after": 20,
+        },
+        tuned_steps=(40, 20),
+        train=bases(),
+    ),
+    "quick": Scale(
+        "minutes a piece on an accelerator, to see where it goes",
+        envs=200,
+        steps=0,
+        bases=4,
+        labels={100: 100, 250: 250, 500: 500},
+        tuned_steps=(10_000, 2_500),
+    ),
+    "paper": Scale("what is reported", envs=2_000, steps=0),
+}
+
+STUDY = Study("navigation", PIECES, SCALES)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs what is asked for; returns the exit status."""
+    return run(STUDY, __doc__ or "", arguments)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,241 @@
+"""Writes the tables of docs/results/adaptation.md from recorded pieces, and nothing else of it.
+
+    python experiments/adaptation_page.py --data docs/data/adaptation --page docs/results/adaptation.md
+
+The data are what `adaptation_billiards.py` and `adaptation_navigation.py` leave in their `--out` (TASK/WORLD/PIECE). A
+table goes between the lines `<!-- NAME -->` and `<!-- end of NAME -->` of the page, in place of what was there; figures
+are written beside the data.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from _adaptation import UNCHANGED
+from _adaptation_tables import GAIN, NAMES, Line, Row, lines, matched, percent, reached, read, share, spread, table
+from _trajectories import FILE, draw
+from adaptation_billiards import BOUNDS_DEG, LEAST
+from bootstrapping_page import rendered
+from matplotlib.figure import Figure
+
+from cuelearner_jax.report.figures import colour_of, save_figure
+
+CURVES = ("relative", "residual", "dcoach", "finetuning")
+SIDES = ("left", "right")
+COLOURS = {"residual": "#E69F00", "finetuning": "#4d4d4d"}
+
+
+def whole_of(rows: Sequence[Row], least: float) -> Line | None:
+    """The base agents in the unchanged world."""
+    found = lines(rows, UNCHANGED, least=least)
+    return found[0] if found else None
+
+
+def after(line: Line) -> str:
+    """Labels or steps, as a cell."""
+    if line.method == "finetuning":
+        return f"{line.after:,} steps"
+    return f"{line.after:,} labels" if line.after else ""
+
+
+def shown(known: Sequence[Line]) -> list[Line]:
+    """What tables show: of fine-tuning a few of its measurements."""
+    steps = [line.after for line in known if line.method == "finetuning" and line.after]
+    few = {value for value in steps if value in (min(steps), max(steps)) or value * 4 == max(steps)} if steps else set()
+    return [line for line in known if line.method != "finetuning" or line.after in few]
+
+
+def billiards(rows: Sequence[Row], folder: Path, seen: str) -> str:
+    """The three worlds: rewards, shares of the original, and when the gain is made."""
+    whole = whole_of(rows, LEAST)
+    if whole is None:
+        return ""
+    original = f"The base agents: {len(whole.bases)}, of a reward of {spread(whole.columns['reward'])} unchanged."
+    parts, curves = [original], {}
+    for world, bound in BOUNDS_DEG.items():
+        known = lines(rows, world, least=LEAST)
+        if not known:
+            continue
+        cells = [
+            [line.name, after(line), spread(line.columns["reward"]), percent(share(line, whole)), _used(line)]
+            for line in shown(known)
+        ]
+        header = ["", "after", "reward", "of the original [%]", "models used"]
+        parts.append(f"**{world}**, bound {bound:g} degrees:\n\n{table(header, cells)}")
+        curves[world] = curve_points(known, "reward", whole)
+        parts.append(_gains(curves[world]))
+    if any(curves.values()):
+        figure(curves, folder / "shares", "share of the original reward", (1.0, "original"))
+        parts.insert(1, f"![reward as a share of the original]({seen}/shares.png)")
+    return "\n\n".join(part for part in parts if part)
+
+
+def _used(line: Line) -> str:
+    return f"{100 * line.columns['used'].mean():.0f}%" if "used" in line.columns else ""
+
+
+Points = dict[str, tuple[list[int], np.ndarray]]  # method -> labels or steps, values (bases, points)
+
+
+def curve_points(known: Sequence[Line], metric: str, whole: Line | None = None) -> Points:
+    """What methods reach over labels or steps, from not adapted on, over the bases that all have."""
+    start = [line for line in known if line.method == "none"]
+    if not start:
+        return {}
+    found: Points = {}
+    for method in CURVES:
+        own = [line for line in known if line.method == method]
+        own = own if any(line.after == 0 for line in own) else [*start, *own]
+        if len(own) < 2:
+            continue
+        base = whole or start[0]
+        columns = [
+            share(line, whole) if whole else matched(line, base, metric)[0]
+            for line in sorted(own, key=lambda line: line.after)
+        ]
+        if len({len(column) for column in columns}) == 1:
+            found[method] = sorted(line.after for line in own), np.stack(columns, axis=1)
+    return found
+
+
+def _gains(points: Points) -> str:
+    """When each method has made its own gain, and that of relative labels."""
+    if CURVES[0] not in points:
+        return ""
+    reference = points[CURVES[0]][1][:, [0, -1]]
+    rows = []
+    for method, (labels, values) in points.items():
+        if len(values) != len(reference):
+            continue
+        mine, theirs = (reached(values, labels, reference, own) for own in (True, False))
+        unit = "steps" if method == "finetuning" else "labels"
+        told = ["never gained" if not np.isfinite(mine.estimate) else f"{mine.told(labels[-1])} {unit}"]
+        rows.append([NAMES[method], *told, f"{theirs.told(labels[-1])} {unit}"])
+    header = ["", f"{GAIN:.0%} of its own gain", f"{GAIN:.0%} of the gain of relative labels"]
+    return table(header, rows)
+
+
+def figure(curves: dict[str, Points], stem: Path, ylabel: str, level: tuple[float, str] | None) -> None:
+    """Curves over labels and steps on one logarithmic axis, a panel a world."""
+    drawn = Figure(figsize=(3.2 * len(curves) + 0.6, 3.2), layout="constrained")
+    for axes, (world, points) in zip(drawn.subplots(1, len(curves), squeeze=False)[0], curves.items(), strict=True):
+        for method, (labels, values) in points.items():
+            low, middle, high = np.quantile(values, [0.25, 0.5, 0.75], axis=0)
+            colour = COLOURS.get(method) or colour_of(method)
+            x = np.maximum(labels, 10)  # the first point, of no labels, at the left end
+            axes.plot(x, middle, color=colour, marker="o", markersize=3, label=NAMES[method])
+            axes.fill_between(x, low, high, color=colour, alpha=0.15, linewidth=0)
+        if level:
+            axes.axhline(level[0], color="#999999", linestyle="--", linewidth=1, label=level[1])
+        axes.set(xscale="log", title=world, xlabel="labels, or steps of fine-tuning")
+    drawn.axes[0].set_ylabel(ylabel)
+    handles, names = drawn.axes[0].get_legend_handles_labels()
+    drawn.legend(handles, names, loc="outside lower center", ncols=min(5, len(names)), frameon=False)
+    save_figure(drawn, stem)
+
+
+def outcomes(rows: Sequence[Row], world: str, whole: Line | None) -> str:
+    """Success, collisions and time-outs in a world, and how much of what was lost has come back."""
+    known = lines(rows, world)
+    start = next((line for line in known if line.method == "none"), None)
+    if start is None:
+        return ""
+    cells = []
+    for line in ([whole] if whole else []) + shown(known):
+        name = "unchanged world" if line is whole else line.name
+        back = ""
+        if whole is not None and line is not whole and line is not start:
+            now, before = matched(line, start, "success")
+            lost = matched(whole, start, "success")[0].mean() - before.mean()
+            back = f"{100 * (now.mean() - before.mean()) / lost:.0f}%" if lost > 0 else ""
+        own = [percent(line.columns[metric]) for metric in ("success", "collision", "timeout")]
+        cells.append([name, after(line), *own, back, _used(line)])
+    header = ["", "after", "success [%]", "collisions [%]", "time-outs [%]", "of the loss", "models used"]
+    return table(header, cells)
+
+
+def lidar(rows: Sequence[Row], folder: Path, seen: str) -> str:
+    """The turned lidar."""
+    world = "turned_lidar"
+    text = outcomes(rows, world, whole_of(rows, 0.0))
+    points = curve_points(lines(rows, world), "success")
+    if points:
+        figure({world: points}, folder / "lidar", "success", None)
+        text += f"\n\n{_gains(points)}\n\n![success with a turned lidar]({seen}/lidar.png)"
+    return text.strip()
+
+
+def rooms(rows: Sequence[Row], folder: Path, seen: str) -> str:
+    """The rooms; nothing has been lost that could come back."""
+    return outcomes(rows, "rooms", None)
+
+
+def sides(rows: Sequence[Row], folder: Path, seen: str) -> str:
+    """The preferred side: of episodes that passed an obstacle, how many passed all of theirs where it was wanted."""
+    cells, drawn = [], {}
+    for side in SIDES:
+        for line in lines(rows, f"corridor_{side}"):
+            each = {name: line.columns[f"passed_{name}"] for name in (*SIDES, "both")}
+            passed = np.maximum(sum(each.values()), 1e-9)
+            wanted, mixed = each[side] / passed, each["both"] / passed
+            cells.append(
+                [side, line.name, after(line), percent(line.columns["success"]), percent(wanted), percent(mixed)]
+            )
+        kept = folder / f"corridor_{side}" / CURVES[0] / FILE
+        if kept.exists():
+            drawn[f"adapted to pass on the {side}"] = kept
+    if not cells:
+        return ""
+    text = table(["wanted", "", "after", "success [%]", "all on the wanted side [%]", "on both sides [%]"], cells)
+    if drawn:
+        draw(drawn, folder / "trajectories")
+        text += f"\n\n![ways in a corridor]({seen}/trajectories.png)"
+    return text
+
+
+def settings(rows: Sequence[Row], metric: str) -> str:
+    """What was compared on tuning episodes, the best first."""
+    parts = []
+    for world in dict.fromkeys(row["world"] for row in rows if row["split"] == "tuning" and row["world"] != UNCHANGED):
+        wanted = f"passed_{world.rpartition('_')[2]}" if world.startswith("corridor_") else metric
+        known = [line for line in lines(rows, world, "tuning") if np.isfinite(line.columns[wanted]).all()]
+        last = max((line.after for line in known if line.method == "finetuning"), default=0)
+        known = [line for line in known if line.method != "finetuning" or line.after == last]
+        known.sort(key=lambda line: (list(NAMES).index(line.method), -float(np.mean(line.columns[wanted]))))
+        cells = [[line.name, after(line), str(len(line.bases)), spread(line.columns[wanted])] for line in known]
+        parts.append(f"**{world}**:\n\n{table(['', 'after', 'bases', wanted], cells)}")
+    return "\n\n".join(parts)
+
+
+def sections(data: Path, page: Path) -> dict[str, str]:
+    """The text of every part of the page of which there are data."""
+    found = {}
+    tasks = {"billiards": {"billiards": billiards}, "navigation": {"lidar": lidar, "rooms": rooms, "sides": sides}}
+    for task, parts in tasks.items():
+        folder = data / task
+        rows = read(folder) if folder.exists() else []
+        seen = Path(os.path.relpath(folder, page.parent)).as_posix()
+        for name, part in parts.items():
+            found[name] = part(rows, folder, seen)
+        found[f"{task}-settings"] = settings(rows, "reward" if task == "billiards" else "success")
+    return {name: text for name, text in found.items() if text}
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Writes the page; returns the exit status."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path, default=Path("docs/data/adaptation"))
+    parser.add_argument("--page", type=Path, default=Path("docs/results/adaptation.md"))
+    asked = parser.parse_args(arguments)
+    found = sections(asked.data, asked.page)
+    asked.page.write_text(rendered(asked.page.read_text(encoding="utf-8"), found), encoding="utf-8")
+    print(f"wrote {asked.page}: {', '.join(found) or 'nothing new'}")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

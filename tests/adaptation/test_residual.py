@@ -1,0 +1,98 @@
+"""Residual learning from optimal actions, on the bandit turned by a constant, through the program of adaptation."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import probes
+import pytest
+from flax import struct
+
+from cuelearner_jax import actions
+from cuelearner_jax.adaptation import program, residual
+from cuelearner_jax.config import GuideSizes, Scalars
+from cuelearner_jax.environment import spaces_of
+from cuelearner_jax.guidance import registry
+from cuelearner_jax.guidance.fitting import lessons
+from cuelearner_jax.guidance.model import residual_model
+from cuelearner_jax.policies import Common, Residual
+from cuelearner_jax.types import Label
+
+TURN_DEG, BOUND_DEG = 8.0, 12.0
+ENV = probes.Window(offset=0.6 + np.deg2rad(TURN_DEG))
+SIZES = GuideSizes(feedback_layers=(32, 32), labels_per_round=10, fit_steps=300, fit_batch_size=32)
+SCALARS = Scalars(eps_deg=BOUND_DEG, tau_max_deg=BOUND_DEG, k_max=10, feedback_learning_rate=5e-3, max_grad_norm=10.0)
+GUIDANCE = registry.made_for(residual.KIND, SIZES, spaces_of(ENV))
+OBS = actions.evenly_spaced(4)
+
+
+@struct.dataclass
+class Finished:
+    """Aims where the window was before the world changed."""
+
+    def act(self, key, states, obs):
+        return jax.vmap(probes.Window().best)(obs)
+
+
+def asked(budget, bound_deg):
+    """Lanes of a budget and bound after all of their rounds."""
+    lanes = program.product(bases=1, seeds=(0, 1), budgets=(budget,), bounds_deg=(bound_deg,))
+    bases = Common(Finished())
+    block = program.begin(GUIDANCE, SIZES, ENV, lanes)
+    for _ in range(program.rounds(lanes, SIZES)):
+        block = program.ask_round(GUIDANCE, SIZES, ENV, probes.Expert(ENV), SCALARS, bases, block)
+    return block, program.adapted(GUIDANCE, SIZES, ENV, SCALARS, bases, block)
+
+
+@pytest.fixture(scope="module")
+def adapted():
+    return asked(40, BOUND_DEG)
+
+
+def lane_of(policy, index):
+    """A lane's policy, whose base all lanes share."""
+    model, bound = jax.tree.map(lambda leaf: leaf[index], (policy.model, policy.bound))
+    return policy.replace(model=model, bound=bound)
+
+
+def test_a_constant_shift_is_recovered(adapted):
+    _, policy = adapted
+    for lane in range(2):
+        done = lane_of(policy, lane).act(jax.random.key(0), None, OBS)
+        off = np.rad2deg(actions.distance(done, jax.vmap(ENV.best)(OBS)))
+        assert off.max() < TURN_DEG / 4
+
+
+def test_it_is_the_residual_policy(adapted):
+    """Where it is applied once."""
+    policy = lane_of(adapted[1].replace(scalars=dataclasses.replace(SCALARS, k_max=1)), 0)
+    network, unit = residual_model(SIZES, spaces_of(ENV)), jnp.deg2rad(BOUND_DEG)
+    plain = Residual(
+        policy.base, policy.model.params, policy.bound, lambda params, *seen: unit * network.predict(ENV, params, *seen)
+    )
+    expected = plain.act(jax.random.key(0), None, OBS)
+    np.testing.assert_allclose(policy.act(jax.random.key(0), None, OBS), expected, atol=1e-6)
+
+
+def test_corrections_stay_within_the_bound():
+    _, policy = asked(40, 3.0)  # the same programs, for bounds are values
+    for lane in range(2):
+        done = lane_of(policy, lane).act(jax.random.key(0), None, OBS)
+        away = np.rad2deg(actions.distance(done, policy.base.act(jax.random.key(0), None, OBS)))
+        np.testing.assert_allclose(away, 3.0, atol=1e-3)  # the needed ones are larger
+
+
+def test_targets_are_the_needed_corrections_cut_off():
+    """From the direction x to 5 and to 90 degrees counterclockwise, at 12 degrees and in units of these."""
+    shown = actions.from_angle(jnp.deg2rad(jnp.array([5.0, 90.0])))
+    x = jnp.tile(jnp.array([[1.0, 0.0]]), (2, 1))
+    rows = lessons(Label(OBS[:2], x, shown, jnp.ones(2, bool)), GUIDANCE.target, SCALARS)
+    wanted = actions.from_angle(jnp.deg2rad(jnp.array([5.0, 12.0]))) - x
+    np.testing.assert_allclose(rows.target, wanted, atol=1e-6)
+
+
+def test_nothing_moves_before_the_first_fit():
+    model = GUIDANCE.init(jax.random.key(0))
+    moved = GUIDANCE.act(model, ENV, OBS, OBS, jnp.ones(4, bool), SCALARS)
+    np.testing.assert_array_equal(moved.actions, OBS)

@@ -1,0 +1,41 @@
+"""`cuelearner export` as it is typed: what it writes, what it checks, what it refuses."""
+
+import json
+
+import numpy as np
+
+from cuelearner_jax.cli import main
+from cuelearner_jax.export import runner
+from cuelearner_jax.face.acting import load_policy
+
+
+def test_a_runs_guided_agent_is_exported_and_checked(run_folder, refused, tmp_path, capsys):
+    out = tmp_path / "new" / "decision"
+    export = ["export", str(run_folder), "--policy", "guided", "--labels", "20", "--seed", "2001"]
+    assert main([*export, "--format", "numpy", "--out", str(out)]) == 0
+    assert "golden cases replayed" in capsys.readouterr().out
+    told = json.loads((out / runner.CONTRACT).read_text())
+    assert told["source"]["policy"] == "guided"
+    assert told["source"]["world"]["name"] == "billiards"
+    assert [each["layer"] for each in told["policy"]] == ["guided", "agent"]
+    assert [each["unit"] for each in told["observation"]["slices"][:2]] == ["m", "1"]
+    with np.load(out / runner.GOLDEN) as golden:
+        obs, actions = golden["obs"], golden["actions"]
+    own = load_policy(run_folder, policy="guided", labels=20, seed=2001)
+    np.testing.assert_allclose(own(obs), actions, atol=1e-5)
+    assert main(["export", "--check", str(out)]) == 0
+    assert "is as it was exported" in capsys.readouterr().out
+
+    def no(command, says):
+        refused([str(part) for part in command], says, tmp_path)
+
+    no([*export, "--format", "numpy", "--out", out], "is not empty")
+    no([*export, "--format", "torch", "--out", tmp_path / "b"], "unknown format 'torch'")
+    no(["export", run_folder, "--policy", "guide", "--format", "numpy", "--out", tmp_path / "b"], "acts at random")
+    no(["export", run_folder, "--policy", "teacher", "--format", "numpy", "--out", tmp_path / "b"], "asks the teacher")
+    no(["export", run_folder, "--seed", "5", "--format", "numpy", "--out", tmp_path / "b"], "no lane with seed 5")
+    no(["export", "--check", out, "--format", "numpy"], "nothing else")
+    no(["export", "--check", run_folder], "contract.json cannot be read")
+    golden = out / runner.GOLDEN
+    golden.write_bytes(golden.read_bytes()[:-1])
+    no(["export", "--check", out], "is not the file that was exported")

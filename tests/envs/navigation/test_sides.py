@@ -1,0 +1,120 @@
+"""On which side obstacles are passed: counted by hand, and a teacher that keeps to one side."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from cuelearner_envs.navigation.config import NavigationConfig, make_environment
+from cuelearner_envs.navigation.environment import Navigation
+from cuelearner_envs.navigation.geometry import line_clearance
+from cuelearner_envs.navigation.layouts import BOXES, CIRCLES
+from cuelearner_envs.navigation.roadmap import RoadMapTeacher, SidedTeacher, make_sided_teacher
+from cuelearner_envs.navigation.sides import closed, heading, passed
+from cuelearner_envs.navigation.world import FAR_AWAY, World
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.evaluate import episodes, rollout
+from cuelearner_jax.policies import Taught
+from cuelearner_jax.tasks.navigation import make_teacher
+
+# A corridor of 20 m by 4.6 m with a box in the middle, a circle at x = 5 and the walls of all worlds.
+WALLS = [[10.1, 0, 0, 0.1, 2.5], [-10.1, 0, 0, 0.1, 2.5], [0, 2.4, 0, 10.2, 0.1], [0, -2.4, 0, 10.2, 0.1]]
+FAR = [FAR_AWAY, FAR_AWAY]
+WORLD = World(
+    boxes=jnp.array([*WALLS, [0, 0.1, 0.3, 0.4, 0.3], *[[*FAR, 0, 0.01, 0.01]] * (BOXES - 5)], jnp.float32),
+    box_heights=jnp.ones(BOXES),
+    circles=jnp.array([[5.0, 0.0, 0.4], *[[*FAR, 0.01]] * (CIRCLES - 1)]),
+    circle_heights=jnp.ones(CIRCLES),
+    extent=jnp.array([20.0, 4.6]),
+    starts=jnp.tile(jnp.array([[-6.0, 0.0]]), (16, 1)),
+    goals=jnp.tile(jnp.array([[8.0, 0.0]]), (16, 1)),
+)
+passes = jax.jit(passed)
+
+STEPS = [  # ahead, before, after, (passed on the left, on the right)
+    (1, (-0.1, 1.0), (0.1, 1.0), (1, 0)),  # toward larger x and above the box: it stays on the right
+    (1, (-0.1, -1.0), (0.1, -1.0), (0, 1)),
+    (-1, (0.1, 1.0), (-0.1, 1.0), (0, 1)),  # the other way round above is on the right
+    (-1, (0.1, -1.0), (-0.1, -1.0), (1, 0)),
+    (1, (0.1, 1.0), (-0.1, 1.0), (0, 0)),  # backward
+    (1, (0.1, 1.0), (0.3, 1.0), (0, 0)),  # beside it, past its middle
+    (1, (0.0, 1.0), (0.0, 1.4), (0, 0)),  # along the line itself
+    (1, (-0.2, -0.5), (0.0, 1.0), (1, 0)),  # ends on the line, which counts once
+    (1, (-0.1, -0.9), (0.1, 0.9), (0, 1)),  # crosses it at 0, which is below the box's middle
+    (1, (-0.1, 1.0), (5.1, -1.0), (1, 1)),  # both at once: at 0.96 and at -0.96
+    (1, (4.9, -0.01), (5.1, -0.01), (0, 1)),
+]
+
+
+@pytest.mark.parametrize(("ahead", "before", "after", "counted"), STEPS)
+def test_an_obstacle_is_passed_where_the_line_through_its_middle_is_crossed_forward(ahead, before, after, counted):
+    found = passes(WORLD, jnp.float32(ahead), jnp.array(before), jnp.array(after))
+    np.testing.assert_array_equal(found, counted)
+
+
+def test_ways_have_a_direction():
+    assert heading(jnp.array([1.0, 0.0]), jnp.array([3.0, 9.0])) == 1
+    assert heading(jnp.array([1.0, 0.0]), jnp.array([-3.0, 9.0])) == -1
+
+
+def test_a_closed_side_lets_nothing_through_and_the_other_stays_open():
+    room = jax.jit(line_clearance)
+    for side in (1.0, -1.0):
+        barred = closed(WORLD, side)
+        for x in (0.0, 5.0):
+            ends = [jnp.array([x - 0.5, 1.5 * side]), jnp.array([x + 0.5, 1.5 * side])]
+            assert room(barred, *ends) <= 0 < room(WORLD, *ends)
+            ends = [jnp.array([x - 0.5, -1.5 * side]), jnp.array([x + 0.5, -1.5 * side])]
+            assert room(barred, *ends) == room(WORLD, *ends)
+
+
+# The corridor twice, walked through in either direction.
+BACK = WORLD.replace(starts=WORLD.goals, goals=WORLD.starts)
+TWO = Navigation(jax.tree.map(lambda *leaves: jnp.stack(leaves), WORLD, BACK), max_steps=jnp.int32(120), sides=True)
+
+
+def test_the_sides_of_an_episode_are_its_outcome():
+    state, _ = TWO.reset(jax.random.key(0))
+    for counts, names in [
+        ((0, 0), []),
+        ((2, 0), ["passed_left"]),
+        ((0, 1), ["passed_right"]),
+        ((1, 1), ["passed_both"]),
+    ]:
+        outcome = TWO.ends(state.replace(passed=jnp.array(counts, jnp.float32)))[0]
+        assert [name for name, value in outcome.items() if name.startswith("passed") and value == 1] == names
+    assert "passed_left" not in TWO.replace(sides=False).ends(state)[0]
+
+
+walked = jax.jit(lambda teacher, env: rollout(Taught(teacher), env, episodes("tuning"), 20, 20 * 120))
+
+
+@pytest.mark.parametrize(("wish", "side"), [("left", 1.0), ("right", -1.0)])
+def test_a_teacher_passes_where_it_is_wanted(wish, side):
+    found = walked(make_sided_teacher(TWO, jnp.float32(side)), TWO)
+    assert found["success"] == 1
+    assert found[f"passed_{wish}"] == 1
+
+
+def test_a_wish_chooses_the_teacher_and_corridors_count_sides():
+    def made(**changes):
+        config = NavigationConfig(worlds=4, **changes)
+        env = jax.eval_shape(lambda: make_environment(config))
+        return env.sides, type(jax.eval_shape(lambda env: make_teacher(config, env), env))
+
+    assert made(style="corridor", preferred_side="left") == (True, SidedTeacher)
+    assert made(style="corridor") == (True, RoadMapTeacher)
+    assert made() == (False, RoadMapTeacher)
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"style": "corridor", "preferred_side": "rigth"}, "task.preferred_side is 'rigth', did you mean 'right'?"),
+        ({"preferred_side": "left"}, "task.preferred_side is left: that needs --task.style corridor"),
+    ],
+)
+def test_a_wish_that_cannot_be_is_refused(changes, told):
+    with pytest.raises(UserError) as refused:
+        make_environment(NavigationConfig(**changes))
+    assert told in str(refused.value)

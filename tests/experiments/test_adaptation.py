@@ -1,0 +1,224 @@
+"""The studies of adaptation: every piece can be run, and the tables say what hand-made rows say."""
+
+import dataclasses
+import importlib
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cuelearner_jax.config import GuideSizes, RunConfig, Schedule, Sizes, check, check_guide
+from cuelearner_jax.guidance.answers import check_teacher
+from cuelearner_jax.records import table as tables
+from cuelearner_jax.tasks import registry
+
+FOLDER = Path(__file__).parents[2] / "experiments"
+NAMES = ("_adaptation", "_adaptation_tables", "_trajectories", "adaptation_billiards", "adaptation_navigation")
+PRESETS = {"billiards": "regulation", "navigation": "paper"}
+
+
+@pytest.fixture(scope="module")
+def modules():
+    """Those of the experiments, as Python finds them when it runs one of the files."""
+    sys.path.insert(0, str(FOLDER))
+    yield {name: importlib.import_module(name) for name in (*NAMES, "adaptation_page")}
+    sys.path.remove(str(FOLDER))
+
+
+@pytest.fixture(params=["billiards", "navigation"])
+def study(request, modules):
+    return modules[f"adaptation_{request.param}"].STUDY
+
+
+def bench_of(modules, study, piece):
+    """Where a piece would be run, but for its agents and their world's arrays."""
+    task = registry.find(study.task)
+    config = task.presets[PRESETS[study.task]].config
+    return modules["_adaptation"].Bench(task, config, None, np.arange(2), None, piece, 4, 3, Path())
+
+
+@pytest.mark.parametrize("scale", ["smoke", "paper"])
+def test_every_piece_has_settings_that_can_be(study, scale, modules):
+    known = modules["_adaptation"]
+    groups = {"sizes": Sizes, "schedule": Schedule}
+    for piece in study.pieces:
+        left = known.scaled(piece, study.scales[scale])
+        if left is None:
+            continue
+        bench = bench_of(modules, study, left)
+        names = {name.partition(".")[0]: set() for name in left.settings}
+        for name in left.settings:
+            names[name.partition(".")[0]].add(name.partition(".")[2])
+        groups |= {"scalars": type(bench.config.scalars), "task": bench.task.config}
+        for group, fields in names.items():
+            assert fields <= {field.name for field in dataclasses.fields(groups[group])}, piece.path
+        if left.labels:
+            scalars = bench.scalars()
+            check_guide(bench.set("sizes.", GuideSizes()), scalars)
+            assert scalars.k_max * scalars.eps_deg >= left.bound_deg or "scalars.k_max" in left.settings
+        if left.method == "finetuning":
+            sizes, schedule = bench.set("sizes.", bench.config.sizes), bench.config.schedule
+            check(RunConfig(bench.config.task, sizes, bench.config.scalars, schedule))
+            assert left.steps % left.every == left.every % sizes.num_envs == 0
+            assert min(left.rates) > 0
+
+
+def test_pieces_are_told_apart_and_worlds_are_scenarios(study):
+    assert len({piece.path for piece in study.pieces}) == len(study.pieces)
+    scenarios = registry.find(study.task).scenarios
+    for piece in study.pieces:
+        assert piece.world in (*scenarios, "unchanged")
+        assert 0 < piece.minutes <= 30
+        assert (piece.split == "tuning") == piece.path.startswith("tuning/")
+    reported = {piece.world for piece in study.pieces if piece.split != "tuning"}
+    assert reported == {*scenarios, "unchanged"} - {"corridor"}  # which has two wishes
+
+
+def test_the_teacher_of_billiards_knows_the_nearest_good_shot(modules):
+    """Every world has one, and none is refused."""
+    data = modules["adaptation_billiards"]
+    task = registry.find("billiards")
+    for piece in data.PIECES:
+        if piece.method in ("relative", "teacher") and piece.split != "tuning":
+            bench = bench_of(modules, data.STUDY, piece)
+            world = task.scenario(piece.world).applied(bench.config.task)
+            world = dataclasses.replace(world, teacher=piece.settings["task.teacher"])
+            scalars = bench.scalars()
+            assert (scalars.eps_deg, scalars.tau_max_deg) == (0.1, 180.0)
+            check_teacher(task.make_teacher(world, task.environment(world)), scalars)
+
+
+def wrote(modules, folder, rows, **constants):
+    """A finished piece with these rows."""
+    schema = modules["_adaptation"].SCHEMA
+    common = {"task": "billiards", "variant": "", "split": "validation", **constants}
+    with tables.TableWriter(folder, schema, common) as writer:
+        for row in rows:
+            writer.append(**{"labels": 0, "steps": 0, **row})
+    tables.finish(folder, schema)
+
+
+@pytest.fixture
+def recorded(modules, tmp_path):
+    """Four base agents, one of them unfinished, in a world that takes half of their reward."""
+    whole = np.array([0.5, 0.4, 0.45, 0.1])
+    bases = np.arange(4)
+    for split in ("validation", "tuning"):
+        row = {"base": bases, "reward": whole}
+        wrote(modules, tmp_path / "billiards" / split, [row], world="unchanged", method="none", split=split)
+    world = "tilted_table"
+    place = tmp_path / "billiards" / world
+    wrote(modules, place / "none", [{"base": bases, "reward": whole / 2}], world=world, method="none")
+    points = [(100, 0.6), (200, 0.9)]
+    rows = [{"base": bases, "labels": after, "reward": part * whole, "used": 1.0} for after, part in points]
+    wrote(modules, place / "relative", rows, world=world, method="relative")
+    points = [(0, 0.5), (1_000, 0.6), (2_000, 0.8), (4_000, 1.0)]
+    rows = [{"base": bases, "steps": after, "reward": part * whole} for after, part in points]
+    wrote(modules, place / "finetuning", rows, world=world, method="finetuning")
+    return tmp_path
+
+
+def test_tables_say_what_rows_say(modules, recorded):
+    found = modules["_adaptation_tables"]
+    rows = found.read(recorded / "billiards")
+    known = found.lines(rows, "tilted_table", least=0.4)
+    assert [(line.method, line.after) for line in known if line.method != "finetuning"] == [
+        ("none", 0),
+        ("relative", 100),
+        ("relative", 200),
+    ]
+    assert all(line.bases.tolist() == [0, 1, 2] for line in known)  # the fourth is no finished agent
+    whole = found.lines(rows, "unchanged", least=0.4)[0]
+    np.testing.assert_allclose(found.share(known[2], whole), 0.9)
+    assert found.percent(found.share(known[2], whole)) == "90.0 [90.0, 90.0]"
+    assert len(found.lines(rows, "tilted_table")[0].bases) == 4
+
+
+def test_a_gain_is_made_where_lines_between_points_say(modules, recorded):
+    """Of relative labels 0.5 -> 0.6 -> 0.9: 95% of 0.4 is reached at 0.88, 28/30 of the way from 100 to 200."""
+    found, page = modules["_adaptation_tables"], modules["adaptation_page"]
+    rows = found.read(recorded / "billiards")
+    known = found.lines(rows, "tilted_table", least=0.4)
+    points = page.curve_points(known, "reward", found.lines(rows, "unchanged", least=0.4)[0])
+    labels, values = points["relative"]
+    assert labels == [0, 100, 200]
+    reference = values[:, [0, -1]]
+    made = found.reached(values, labels, reference, own=True)
+    assert made.estimate == pytest.approx(100 + 100 * 0.28 / 0.3)
+    assert (made.lower, made.upper) == pytest.approx((made.estimate, made.estimate))  # all agents are alike
+    steps, values = points["finetuning"]
+    assert found.reached(values, steps, reference, own=False).estimate == pytest.approx(2_000 + 2_000 * 0.08 / 0.2)
+    never = found.reached(values * 0.5, steps, reference, own=False)
+    assert never.told(4_000) == "above 4,000 [above 4,000, above 4,000]"
+
+
+def test_the_page_holds_tables_where_there_are_rows(modules, recorded):
+    page = modules["adaptation_page"]
+    text = (FOLDER.parent / "docs" / "results" / "adaptation.md").read_text(encoding="utf-8")
+    (recorded / "page.md").write_text(text, encoding="utf-8")
+    asked = ["--data", str(recorded), "--page", str(recorded / "page.md")]
+    assert page.main(asked) == 0
+    written = (recorded / "page.md").read_text(encoding="utf-8")
+    assert "| relative labels | 200 labels | 0.405 [0.360, 0.450] | 90.0 [90.0, 90.0] | 100% |" in written
+    assert "| RL fine-tuning | 3,400 [3,400, 3,400] steps | 2,800 [2,800, 2,800] steps |" not in written
+    assert "<!-- lidar -->\n<!-- end of lidar -->" in written
+    assert (recorded / "billiards" / "shares.png").exists()
+    assert page.main(asked) == 0
+    assert (recorded / "page.md").read_text(encoding="utf-8") == written
+    names = page.sections(recorded, recorded / "page.md")
+    assert set(names) == {"billiards"}
+
+
+def test_the_preferred_side_is_counted_among_those_who_passed_anything(modules, tmp_path):
+    row = {"base": np.arange(2), "success": 0.8, "passed_left": 0.6, "passed_right": 0.1, "passed_both": 0.1}
+    world = {"task": "navigation", "world": "corridor_left", "method": "none"}
+    wrote(modules, tmp_path / "navigation" / "none", [row], **world)
+    rows = modules["_adaptation_tables"].read(tmp_path / "navigation")
+    text = modules["adaptation_page"].sides(rows, tmp_path, "data")
+    assert "| left | not adapted |  | 80.0 [80.0, 80.0] | 75.0 [75.0, 75.0] | 12.5 [12.5, 12.5] |" in text
+
+
+def test_a_piece_is_finished_resumed_and_refused(modules, tmp_path, capsys, monkeypatch):
+    data, known = modules["adaptation_billiards"], modules["_adaptation"]
+    monkeypatch.setattr(known, "opened", lambda *_: None)  # what `make smoke` runs
+    monkeypatch.setitem(known.METHODS, "none", lambda bench: [{"base": [7, 8], "labels": 0, "steps": 0, "reward": 0.5}])
+    asked = ["--bases", "run", "--out", str(tmp_path), "--pieces", "turned_strike/none"]
+    assert data.main(asked) == 0
+    file = tmp_path / "billiards" / "turned_strike" / "none" / "adaptation.parquet"
+    rows = tables.read(file, known.SCHEMA).to_pylist()
+    assert [(row["base"], row["reward"], row["world"], row["split"]) for row in rows] == [
+        (7, 0.5, "turned_strike", "validation"),
+        (8, 0.5, "turned_strike", "validation"),
+    ]
+    written = file.stat().st_mtime_ns
+    capsys.readouterr()
+    assert data.main([*asked, "--resume"]) == 0
+    assert "turned_strike/none: finished" in capsys.readouterr().out
+    assert data.main(asked) == 2
+    assert "give --resume to go on" in capsys.readouterr().out
+    assert file.stat().st_mtime_ns == written
+    with pytest.raises(SystemExit):
+        data.main(["--pieces", "turned_strike/nobody"])
+    with pytest.raises(SystemExit):
+        data.main([])
+    assert "give --bases the run folder of the base agents" in capsys.readouterr().err
+
+
+def test_agents_of_another_task_are_refused(modules, tmp_path, capsys):
+    data = modules["adaptation_billiards"]
+    agent = FOLDER.parent / "docs" / "data" / "navigation_agent"
+    assert data.main(["--bases", str(agent), "--out", str(tmp_path), "--pieces", "turned_strike/none"]) == 2
+    assert "holds agents of navigation: give --bases a run of billiards" in capsys.readouterr().out
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_guide_to_billiards_says_what_was_measured_of_its_teachers():
+    root = FOLDER.parent
+    rows = json.loads((root / "benchmarks" / "results" / "changed_teachers.json").read_text())["rows"]
+    told = (root / "docs" / "billiards.md").read_text(encoding="utf-8")
+    for who, name in (("local_search", "`local_search`"), ("learned, unaware", "`learned`, unaware")):
+        shares = [100 * row[who]["of_the_best"] for row in rows]
+        cells = [f"{share:.1f}%" if share > 99 else f"{share:.0f}%" for share in shares]
+        assert f"| {name} | {' | '.join(cells)} |" in told
