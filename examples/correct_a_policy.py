@@ -9,7 +9,7 @@ over validation episodes. A few minutes on 2 cores.
 import numpy as np
 
 import cuelearner_jax as cl
-from cuelearner_jax.evaluate import episodes, evaluate_policy
+from cuelearner_jax.evaluate import episodes, watched
 from cuelearner_jax.face.acting import as_policy
 
 ANGLE = np.radians(40.0)
@@ -38,7 +38,7 @@ def main(worlds=64, labels=200, episodes_judged=100, episodes_measured=100):
     env, key = world.environment("validation"), episodes()
     rates = []
     for name, policy in (("compass", as_policy(compass)), ("refined", better.policy)):
-        found = evaluate_policy(env, policy, key, episodes_measured, 200 * episodes_measured)
+        found = watched(env, policy, key, episodes_measured, 200 * episodes_measured)
         rates.append(float(found["success"]))
         print(f"{name}: success {rates[-1]:.2f}, collision {float(found['collision']):.2f}")
     return rates
