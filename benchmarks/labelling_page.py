@@ -2,7 +2,9 @@
 
     python benchmarks/labelling_page.py paced --task navigation --out paced.json        500 labels, 5 a second
     python benchmarks/labelling_page.py kills --task billiards --preset quickstart --out kills.json
-    python benchmarks/labelling_page.py pictures --task navigation billiards --to docs/figures
+    python benchmarks/labelling_page.py pictures --task navigation --preset quickstart
+    python benchmarks/labelling_page.py pictures --task billiards --preset quickstart --more="--task.table regulation"
+    python benchmarks/labelling_page.py pictures --task navigation --preset quickstart --guidance demonstration scalar
 
 `paced`: a script that sees only the page turns navigation's arrow toward the goal, with 10% mistakes and 10% "don't
 know"; in billiards it presses at random. Measured are a key's press to the next question painted, while a model is
@@ -18,6 +20,7 @@ import json
 import os
 import random
 import re
+import shlex
 import shutil
 import signal
 import subprocess
@@ -71,7 +74,7 @@ ITEM = "() => { const one = document.querySelector('svg.scene'); return one ? +o
 def served(asked: argparse.Namespace, task: str, folder: Path, *more: str) -> Iterator[tuple[subprocess.Popen, str]]:
     """The command, until it has told its address: the process and that."""
     command = [sys.executable, "-m", "cuelearner_jax.cli", "label", task, "--preset", asked.preset]
-    command += ["--out", str(folder), *more]
+    command += ["--out", str(folder), *shlex.split(asked.more), *more]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env={**os.environ, "PYTHONUNBUFFERED": "1"})
     try:
         assert process.stdout is not None
@@ -132,7 +135,7 @@ def paced(asked: argparse.Namespace, browser: Browser, work: Path) -> dict[str, 
     """Labels at a pace: every press in the file once, and how long each took."""
     rng, pressed, answered = random.Random(0), {}, 0
     (task,) = asked.task
-    folder = asked.keep or work / task
+    folder = asked.keep or work / "labels"
     began = time.time()
     with served(asked, task, folder, "--labels", str(asked.labels)) as (process, address):
         opened, page = time.time() - began, entered(browser, address)
@@ -174,7 +177,7 @@ def kills(asked: argparse.Namespace, browser: Browser, work: Path) -> dict[str, 
     """The command killed at random moments while keys are pressed, and opened again on the same file."""
     rng, pressed, found = random.Random(1), {}, []
     (task,) = asked.task
-    folder, saved = work / task, 0
+    folder, saved = work / "labels", 0
     for number in range(asked.kills):
         with served(asked, task, folder, "--labels", "2000") as (process, address):
             page = entered(browser, address)
@@ -218,14 +221,13 @@ def pictures(asked: argparse.Namespace, browser: Browser, work: Path) -> dict[st
             more = ("--guidance", kind) if kind else ()
             with served(asked, task, work / f"{task}{kind}", "--labels", "500", *more) as (_, address):
                 page = entered(browser, address)
-                rng = random.Random(2)
-                for _ in range(13 if not kind else 0):
+                rng, wanted = random.Random(2), 0 if kind else 12
+                while int(re.match(r"\d+", page.locator(".side").inner_text())[0]) < wanted:  # pyright: ignore[reportOptionalSubscript]
                     item = page.evaluate(ITEM)
                     page.keyboard.press(chosen(page, task, rng))
                     moved(page, item)
-                    time.sleep(0.3)
-                if not kind:
-                    page.wait_for_function("() => document.body.innerText.includes('of 10 labels')", timeout=600_000)
+                if wanted:
+                    page.wait_for_function("() => document.body.innerText.includes('model 1')", timeout=300_000)
                 page.close()
                 for name, look in LOOKS.items() if not kind else [("light", LOOKS["light"])]:
                     page = entered(browser, address, **look)
@@ -242,6 +244,7 @@ def main() -> None:
     parser.add_argument("--task", nargs="+", default=["navigation"])
     parser.add_argument("--preset", default="paper")
     parser.add_argument("--guidance", nargs="*", help="pictures: of these kinds instead of the task's own")
+    parser.add_argument("--more", default="", help="further options of cuelearner label, in one word")
     parser.add_argument("--labels", type=int, default=500)
     parser.add_argument("--rate", type=float, default=5.0, help="presses a second")
     parser.add_argument("--kills", type=int, default=20)

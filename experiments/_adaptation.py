@@ -10,6 +10,7 @@ import argparse
 import dataclasses
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -99,6 +100,12 @@ class Study(NamedTuple):
     scales: Mapping[str, Scale]
 
 
+@lru_cache(maxsize=4)
+def environment(task: str, world: Any, split: str) -> Any:
+    """That of a world; made once, for a thousand halls take a while."""
+    return registry.find(task).environment(world, split)
+
+
 class Bench(NamedTuple):
     """Where a piece is run: its base agents, and the world."""
 
@@ -114,7 +121,7 @@ class Bench(NamedTuple):
 
     def env(self, split: str) -> Any:
         """The world of a split: what is asked and learned in is "training"."""
-        return self.task.environment(self.world, split)
+        return environment(self.task.name, self.world, split)
 
     def measured(self, policy: Any, split: str | None = None) -> Row:
         """Metrics (lanes,) of a block of policies on the episodes of a split (default: the piece's)."""
@@ -239,7 +246,7 @@ def opened(folder: Path, study: Study, piece: Piece, scale: Scale, out: Path) ->
     world = config.task if piece.world == UNCHANGED else source.task.scenario(piece.world).applied(config.task)
     own = {name.partition(".")[2]: value for name, value in piece.settings.items() if name.startswith("task.")}
     world = dataclasses.replace(world, **own)
-    env = source.task.environment(world)
+    env = environment(source.task.name, world, "training")
     policies, seeds = several(source, env, world, "agent", None, None, source.grid.seeds[: piece.bases])
     agents = program.side_by_side(policies)
     steps = scale.steps if source.task.longest is None else source.task.longest(world)

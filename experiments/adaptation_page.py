@@ -203,6 +203,8 @@ def settings(rows: Sequence[Row], metric: str) -> str:
     for world in dict.fromkeys(row["world"] for row in rows if row["split"] == "tuning" and row["world"] != UNCHANGED):
         wanted = f"passed_{world.rpartition('_')[2]}" if world.startswith("corridor_") else metric
         known = [line for line in lines(rows, world, "tuning") if np.isfinite(line.columns[wanted]).all()]
+        last = max((line.after for line in known if line.method == "finetuning"), default=0)
+        known = [line for line in known if line.method != "finetuning" or line.after == last]
         known.sort(key=lambda line: (list(NAMES).index(line.method), -float(np.mean(line.columns[wanted]))))
         cells = [[line.name, after(line), str(len(line.bases)), spread(line.columns[wanted])] for line in known]
         parts.append(f"**{world}**:\n\n{table(['', 'after', 'bases', wanted], cells)}")

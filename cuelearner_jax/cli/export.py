@@ -76,7 +76,7 @@ def run(arguments: list[str]) -> None:
         {
             "subject": source.folder.name,
             "policy": asked.policy,
-            **{name: value for name, value in lane.items() if value is not None},
+            **{name.replace("-", "_"): value for name, value in lane.items() if value is not None},
             "world": {"name": source.task.name, **to_json(asked.task)},
             "config": digest(to_json(source.config)),
         },

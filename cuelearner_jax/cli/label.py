@@ -12,18 +12,20 @@ import jax
 import numpy as np
 
 from cuelearner_jax import config as configuration
-from cuelearner_jax.cli.parsing import about, out, parse, preset_of, taken, task_of
+from cuelearner_jax.adaptation import adapting
+from cuelearner_jax.cli.parsing import about, code_of, out, parse, preset_of, taken, task_of
 from cuelearner_jax.cli.shared_options import Flag, TaskT, asking_kind, preset_kinds
 from cuelearner_jax.config import GuideScalars, GuideSizes, RunConfig
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.face.acting import as_policy, load_policy
+from cuelearner_jax.face.acting import load_policy
 from cuelearner_jax.face.worlds import World
 from cuelearner_jax.guidance import registry as guidances
 from cuelearner_jax.labelling.plan import Base, Plan
-from cuelearner_jax.plugins import load
+from cuelearner_jax.plugins import REFERENCE
 from cuelearner_jax.policies import uniform_in
 from cuelearner_jax.records import label_files
 from cuelearner_jax.records.folders import claimed
+from cuelearner_jax.runs import adaptation
 from cuelearner_jax.runs.grid import LARGEST_SEED
 from cuelearner_jax.runs.trained import PolicySource
 from cuelearner_jax.task import Task, shape_of
@@ -36,8 +38,10 @@ MOST_LABELS = 100_000
 
 @dataclass(frozen=True)
 class Label(Generic[TaskT]):
-    """Label actions in a browser: those of chance, or of a policy (a run folder, a policy folder, package.module:NAME
-    of a function of observations)."""
+    """Label actions of chance, or of a policy, in a browser.
+
+    A policy is named after the task: a run folder, a policy folder, or package.module:NAME of a function of
+    observations."""
 
     task: TaskT
     sizes: GuideSizes
@@ -53,9 +57,10 @@ class Label(Generic[TaskT]):
     seed: int = 0
     """Seed of the situations; the labels are this seed's."""
     bound_deg: float | None = None
-    """Ask about actions within this of the policy's own alone [deg] (default: wherever the guidance leads)."""
-    policy: str = "agent"
-    """Who acts of a run: agent, guided or another, as for evaluate."""
+    """Ask about actions within this of the policy's own alone [deg] (default: the scenario's, or wherever the guidance
+    leads)."""
+    policy: str | None = None
+    """Who acts of a folder: agent, guided, adapted or another, as for evaluate (default: the agent, or the adapted)."""
     of_guidance: str | None = None
     """Kind of guidance of the run's lane (default: the run's last)."""
     of_labels: int | None = None
@@ -87,13 +92,26 @@ def run(arguments: list[str]) -> None:
     named, rest = (rest[0], rest[1:]) if rest and not rest[0].startswith("-") else (None, rest)
     _, preset, rest = preset_of(task, rest)
     kind = Label[task.config]  # pyright: ignore[reportInvalidTypeArguments]
-    world = _scenario(task, preset.config.task, rest)
-    parts = (_part(GuideSizes, preset.config.sizes), _part(GuideScalars, preset.config.scalars))
+    scenario, _ = taken(rest, "--scenario", ", ".join(task.scenarios) or "none")
+    changed = task.scenario(scenario) if scenario else None
+    world = changed.applied(preset.config.task) if changed else preset.config.task
+    source = _source(task, named)
+    sizes, scalars, bound = preset.config.sizes, preset.config.scalars, None
+    if named is not None:  # as `adapt` corrects it
+        frame = source.config.sizes.frame if source else sizes.frame
+        sizes = dataclasses.replace(adapting.SIZES, frame=frame)
+        scalars = adapting.settling(scalars, changed.eps_deg if changed else None)
+        bound = changed.bound_deg if changed else None
     default = kind(
-        world, *parts, Path("labels") / task.name, guidance=asking_kind(preset_kinds(task, preset)), who="anonymous"
+        world,
+        _part(GuideSizes, sizes),
+        _part(GuideScalars, scalars),
+        Path("labels") / task.name,
+        guidance=asking_kind(preset_kinds(task, preset)) if named is None else adaptation.DEFAULT_KIND,
+        bound_deg=bound,
     )
     asked = parse(kind, rest, f"label {task.name}", default, about(Label, task))
-    plan = planned(task, preset.config, asked, named)
+    plan = planned(task, preset.config, asked, named, source)
     with claimed(asked.out), interruptible("the answer of the moment") as stopping:
         finished = serve(plan, asked, stopping)
         if finished:
@@ -102,7 +120,9 @@ def run(arguments: list[str]) -> None:
         raise Interrupted(f"stopped; every answer is in {asked.out}: the same command goes on")
 
 
-def planned(task: Task, config: RunConfig, asked: Label[Any], named: str | None) -> Plan:
+def planned(
+    task: Task, config: RunConfig, asked: Label[Any], named: str | None, source: PolicySource | None = None
+) -> Plan:
     """What is asked for. Raises UserError for what makes no sense."""
     merged = RunConfig(
         asked.task,
@@ -132,7 +152,7 @@ def planned(task: Task, config: RunConfig, asked: Label[Any], named: str | None)
         return _second(
             Plan(task, merged, guidance, Base(uniform_in(env), ""), asked.labels, who=asked.who.strip()), asked, named
         )
-    base = _base(task, asked, named, env)
+    base = _base(task, asked, named, source, env)
     return Plan(task, merged, guidance, base, asked.labels, asked.seed, asked.who.strip(), asked.bound_deg)
 
 
@@ -157,38 +177,38 @@ def _second(plan: Plan, asked: Label[Any], named: str | None) -> Plan:
     return dataclasses.replace(plan, base=base, seed=seed, labels=wanted, again=again, again_of=digest)
 
 
-def _base(task: Task, asked: Label[Any], named: str | None, env: Any) -> Base:
-    """The policy that is asked about. Raises UserError if it cannot be had, or acts in another task."""
-    chosen = [name for name in ("of_guidance", "of_labels", "of_seed") if getattr(asked, name) is not None]
-    if named is None or (":" in named and not Path(named).exists()):
-        if chosen:
-            option = chosen[0].replace("_", "-")
-            raise UserError(f"--{option} chooses a lane of a run, and none is given: leave it out")
-        if named is None:
-            return Base(uniform_in(env), UNIFORM)
-        return Base(as_policy(load(named, object, "a policy")), named)
+def _source(task: Task, named: str | None) -> PolicySource | None:
+    """The folder that holds the policy; None: it is chance, or code. Raises UserError if it is of another task."""
+    if named is None or (REFERENCE.fullmatch(named) and not Path(named).exists()):
+        return None
     folder = Path(named)
     if not folder.is_dir():
         raise UserError(f"no policy at {named}: give a run folder, a policy folder or package.module:NAME")
-    if (folder / "config.json").is_file():
-        theirs = PolicySource.of_run(folder, lambda name: task if task.name == name else registry.find(name)).task
-        if theirs.name != task.name:
-            raise UserError(f"{folder} is a run of {theirs.name}, not of {task.name}: give one of the same task")
+    found = PolicySource.of_folder(folder, lambda name: task if task.name == name else registry.find(name))
+    if found.task.name != task.name:
+        raise UserError(f"{folder} is of {found.task.name}, not of {task.name}: give one of the same task")
+    return found
+
+
+def _base(task: Task, asked: Label[Any], named: str | None, source: PolicySource | None, env: Any) -> Base:
+    """The policy that is asked about. Raises UserError if it cannot be had, or sees something else."""
+    chosen = [name for name in ("policy", "of_guidance", "of_labels", "of_seed") if getattr(asked, name) is not None]
+    if source is None:
+        if chosen:
+            option = chosen[0].replace("_", "-")
+            raise UserError(f"--{option} chooses in a folder, and none is given: leave it out")
+        return Base(uniform_in(env), UNIFORM) if named is None else Base(code_of(named), named)
     lane = {"guidance": asked.of_guidance, "labels": asked.of_labels, "seed": asked.of_seed}
-    found = load_policy(folder, policy=asked.policy, task=task, world=World(task, asked.task), **lane)
+    world = World(task, asked.task)
+    found = load_policy(source.folder, policy=asked.policy, task=task, world=world, **lane)
     if found.observation and tuple(found.observation) != tuple(env.observation):
-        raise UserError(f"{folder} acts on other observations than this world has: give a policy of this world")
-    return Base(found.policy, f"{folder.resolve().name}, {asked.policy}")
+        raise UserError(f"{source.folder} acts on other observations than this world has: give a policy of this world")
+    return Base(found.policy, f"{source.folder.resolve().name}, {asked.policy or source.default_policy}")
 
 
 def _part(kind: type, values: Any) -> Any:
     """The fields of a part of a configuration."""
     return kind(**{field.name: getattr(values, field.name) for field in dataclasses.fields(kind)})
-
-
-def _scenario(task: Task, world: Any, arguments: list[str]) -> Any:
-    name, _ = taken(arguments, "--scenario", ", ".join(task.scenarios) or "none")
-    return world if name is None else task.scenario(name).applied(world)
 
 
 def _serving() -> Any:

@@ -22,7 +22,7 @@ from cuelearner_jax.types import GuidanceModel, GuideState, Label
 
 # A fit computes in its own thread alone, which makes way for whoever answers.
 ALONE = {"xla_cpu_multi_thread_eigen": False}
-NICE = 10  # of 19: what it gives way by
+NICE = 5  # of 19: what it gives way by
 
 
 def _step_back() -> None:

@@ -75,7 +75,7 @@ class Page:
     def _answers(self) -> None:
         with ui.element("div").classes("answers"):
             self._pressable = [self._button(control) for control in controls.answers(self.session.plan.form)]
-            self._pressable.append(self._button(controls.UNSURE, color="grey-7"))
+            self._pressable.append(self._button(controls.UNSURE, color="grey-7").classes("wide"))
         ui.label("").classes("film-words")
 
     def _side(self) -> None:
@@ -185,7 +185,8 @@ class Page:
             self._model.text = f"{fitted}; {newest.problem}"
         apart = f"agrees with labels kept apart: {newest.quality}" if newest.quality else ""
         self._quality.text = apart
-        self._saved.text = f"{self.session.place}: {status.answered + status.unsure} answers saved"
+        place = "/".join(self.session.place.parts[-2:])
+        self._saved.text = f"{place}: {status.answered + status.unsure} answers saved"
         self._trouble.text = status.trouble
         self._trouble.set_visibility(bool(status.trouble))
 

@@ -13,7 +13,8 @@ from cuelearner_jax.labelling.session import Item
 from cuelearner_jax.types import Reel, Sketch
 
 HAIR = 1 / 400  # of the sketch's width: a thin line
-TURNED_REACH = 1.25  # how much farther arrows reach that are turned, so that they can be told apart
+TURNED_REACH = 1.25, 3.5  # how much farther arrows reach that are turned: the more the less they are,
+APART = 10.0  # by this over eps [deg], so that they can be told apart
 LEAST_TURN = 1.0  # of the refined action from the one in question, to be shown [deg]
 
 
@@ -37,9 +38,8 @@ def picture(item: Item, form: AnswerForm, eps_deg: float) -> str:
         place = f'class="mover" data-mover="{html.escape(name)}" transform="{_moved(sketch, name)}"'
         parts.append(f"<g {place}>{body}</g>")
     if form.by_eps:
-        parts += [
-            _arrow(sketch, angle + way * eps_deg, name, TURNED_REACH) for way, name in ((1, "left"), (-1, "right"))
-        ]
+        longer = min(max(APART / eps_deg, TURNED_REACH[0]), TURNED_REACH[1])
+        parts += [_arrow(sketch, angle + way * eps_deg, name, longer) for way, name in ((1, "left"), (-1, "right"))]
     parts.append(_line(sketch, angle))
     parts.append(_arrow(sketch, angle, "asked"))
     if item.refined is not None:

@@ -124,7 +124,7 @@ class LabelWriter(tables.TableWriter):
                 raise formats.damaged("labels", there)
             if before is not None:
                 _check_same(there, before, about)
-            for name in ROW if table.num_rows else ():
+            for name in set(ROW) & set(table.column_names):
                 answered = [values for values in table[name].to_pylist() if values is not None]
                 self._widths |= {name: len(answered[-1])} if answered else {}
         super().__init__(folder, SCHEMA, about={**about, **told})

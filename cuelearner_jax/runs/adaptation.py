@@ -177,21 +177,24 @@ def _judging(order: Order, env: Any) -> Judging:
     if by not in (*metrics, judging.LABELS):
         raise UserError(f"--judge-by is {by!r}, no metric of {task.name}{closest(by, [*metrics, judging.LABELS])}")
     steps = task.longest(order.world) if task.longest else judging.STEPS
-    tuned = None if by == judging.LABELS else task.environment(order.world, "tuning")
+    plays = by != judging.LABELS or order.judge_every
+    tuned = task.environment(order.world, "tuning") if plays else None
     return Judging(tuned, envs, envs * steps, by, order.judge_every)
 
 
 def told(found: Adapted) -> list[str]:
     """What adaptation has led to, a line for each budget and bound."""
     lanes, judged, lines = found.asked.lanes, found.judged, []
-    what = "of the held-out answers predicted" if judged.by == judging.LABELS else f"{judged.by} on tuning episodes"
     for bound, budget in sorted({*zip(lanes.bound_deg.tolist(), lanes.budget.tolist(), strict=True)}):
         own = (lanes.bound_deg == bound) & (lanes.budget == budget)
-        before, after = (float(np.mean(values[own])) for values in (judged.before, judged.after))
-        lines.append(f"{budget} labels within {bound:g} degrees: {what} {before:.4g} before, {after:.4g} after")
+        before, after = (f"{float(np.mean(values[own])):.4g}" for values in (judged.before, judged.after))
+        if judged.by == judging.LABELS:
+            worth, worse = f"predicts {after} of held-out answers, always 'already right' {before}", "fewer than that"
+        else:
+            worth, worse = f"{judged.by} on tuning episodes {before} before, {after} after", "worse than before"
+        lines.append(f"{budget} labels within {bound:g} degrees: {worth}")
         left = lanes.seed[own & ~judged.used]
         if len(left):
             which = f"seed {left[0]}" if len(left) == 1 else f"{len(left)} of {int(own.sum())} seeds"
-            worse = "worse than always saying already right" if judged.by == judging.LABELS else "worse than before"
             lines[-1] += f"; {which}: {worse}, so the model is not used and the policy stays what it was"
     return lines

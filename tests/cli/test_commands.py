@@ -146,7 +146,8 @@ def test_the_overview_has_a_line_for_each_command_and_the_version_can_be_asked_f
     assert main(["--help"]) == 0
     told = capsys.readouterr().out
     locomotion = ("locomotion train", "locomotion evaluate")
-    for name in ("train", "sweep", "evaluate", "report", "render", "teacher train", "bench", *locomotion):
+    labels = ("label", "labels inspect", "labels merge", "labels export")
+    for name in ("train", "sweep", "evaluate", "report", "render", "teacher train", "bench", *labels, *locomotion):
         assert re.search(rf"^  {name} +[A-Z].*\.$", told, re.MULTILINE), name
     assert main(["--version"]) == 0
     assert re.fullmatch(r"cuelearner \d+\.\d+\.\d+\n", capsys.readouterr().out)

@@ -65,7 +65,7 @@ def test_the_page_is_served_to_who_knows_its_address_until_ctrl_c(tmp_path, refu
         (["--sizes.candidates", "3", "--sizes.ensemble", "2"], "--sizes.candidates is above 1"),
         (["--bound-deg", "0"], "--bound-deg is 0: give an angle"),
         (["--port", "70000"], "--port is 70000: give a number"),
-        (["--of-seed", "1"], "--of-seed chooses a lane of a run, and none is given"),
+        (["--of-seed", "1"], "--of-seed chooses in a folder, and none is given"),
         (["--who", " "], "--who is empty"),
         (["--again", "nothing"], "no label file at nothing"),
         (["--scalars.eps-deg", "-1"], "eps_deg"),
@@ -79,7 +79,7 @@ def test_what_makes_no_sense_is_refused(more, says, refused, tmp_path, monkeypat
 def test_policies_that_cannot_be_had_are_refused(refused, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     refused(["label", OWN, "nowhere", "--out", "labels"], "no policy at nowhere: give a run folder", tmp_path)
-    refused(["label", OWN, "page_task:QUARTER", "--out", "labels"], "a float is no policy", tmp_path)
+    refused(["label", OWN, "page_task:QUARTER", "--out", "labels"], "is no policy", tmp_path)
     refused(["label", OWN, "page_task:NOTHING", "--out", "labels"], "has no 'NOTHING'", tmp_path)
 
 
@@ -90,7 +90,7 @@ def test_a_file_of_something_else_is_refused(labelled, refused, tmp_path):
 
 def test_a_run_of_another_task_is_no_policy_here(run_folder, refused, tmp_path):
     command = ["label", OWN, run_folder, "--out", tmp_path / "labels"]
-    refused(command, "is a run of billiards, not of wandering", tmp_path)
+    refused(command, "is of billiards, not of wandering", tmp_path)
 
 
 def test_labels_are_inspected(labelled, capsys):

@@ -2,6 +2,7 @@
 
 import dataclasses
 import importlib
+import json
 import sys
 from pathlib import Path
 
@@ -211,3 +212,13 @@ def test_agents_of_another_task_are_refused(modules, tmp_path, capsys):
     assert data.main(["--bases", str(agent), "--out", str(tmp_path), "--pieces", "turned_strike/none"]) == 2
     assert "holds agents of navigation: give --bases a run of billiards" in capsys.readouterr().out
     assert not list(tmp_path.iterdir())
+
+
+def test_the_guide_to_billiards_says_what_was_measured_of_its_teachers():
+    root = FOLDER.parent
+    rows = json.loads((root / "benchmarks" / "results" / "changed_teachers.json").read_text())["rows"]
+    told = (root / "docs" / "billiards.md").read_text(encoding="utf-8")
+    for who, name in (("local_search", "`local_search`"), ("learned, unaware", "`learned`, unaware")):
+        shares = [100 * row[who]["of_the_best"] for row in rows]
+        cells = [f"{share:.1f}%" if share > 99 else f"{share:.0f}%" for share in shares]
+        assert f"| {name} | {' | '.join(cells)} |" in told

@@ -144,6 +144,16 @@ def test_a_session_opened_again_goes_on_where_it_stopped(opened, tmp_path):
     assert again.item.number == 19
 
 
+def test_a_session_of_nothing_but_dont_knows_is_opened_again(opened, tmp_path):
+    session = opened()
+    for number in range(2):
+        session.answer(number, None)
+    session.close()
+    assert opened().number == 2
+    with pytest.raises(UserError, match="holds no labels"):
+        label_files.read(tmp_path / "labels")
+
+
 def test_a_kill_at_any_byte_loses_no_line_that_was_whole(opened, tmp_path):
     session = opened()
     give(session, 6)
