@@ -1,8 +1,13 @@
 """An exported navigation policy at work in C MuJoCo, without JAX: a robot with a lidar crosses a hall of obstacles.
 
-cuelearner export docs/data/navigation_agent --format numpy --out runs/walker
-python examples/exported_in_mujoco.py runs/walker
+    cuelearner export docs/data/navigation_agent --format numpy --out runs/walker
+    python examples/exported_in_mujoco.py runs/walker
+
+Prints how the walk ends.
 """
+
+# pyright: reportAttributeAccessIssue=false
+# (MuJoCo's compiled module has no stubs)
 
 import sys
 

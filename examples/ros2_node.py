@@ -9,7 +9,11 @@ holds in the world's frame while the body turns under it, as it did in training.
 goal, and when what it heard is older than half a second.
 """
 
+# pyright: reportMissingImports=false
+# (ROS 2 brings its own Python packages)
+
 import sys
+from typing import Any
 
 import numpy as np
 
@@ -40,9 +44,11 @@ class Walk:
         if {each["name"]: each["size"] for each in observed} != wanted:
             raise ValueError(f"{folder} sees {', '.join(self.slices)}: this node is for the navigation task")
         self.beams = np.deg2rad(np.linspace(-135.0, 135.0, 271))
-        self.scan = self.pose = self.goal = None  # (ranges (271,), time), ((x, y, yaw), time), (x, y)
+        self.scan: Any = None  # (ranges (271,) [m], time)
+        self.pose: Any = None  # ((x, y, yaw), time)
+        self.goal: Any = None  # (x, y) [m]
         self.previous = np.zeros((3, 2))
-        self.direction = None  # decided last, in the frame of the odometry
+        self.direction: Any = None  # decided last, in the frame of the odometry
 
     def hear_scan(self, message, now):
         """A LaserScan. Raises ValueError if it does not reach as far round as the policy looks."""

@@ -50,7 +50,6 @@ def turned(params, obs, actions):
 
 
 POLICIES = {
-    "agent in the action's frame": lambda: agent(frame="action"),
     "agent near peaks": lambda: agent(coarse_directions=18, coarse_dtype="bfloat16", peaks=3),
     "heuristic": lambda: Heuristic(ENV),
     "refined within a bound": lambda: guided("relative", bound_deg=7.0, base=agent(frame="action"), frame="action"),

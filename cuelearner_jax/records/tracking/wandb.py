@@ -15,8 +15,15 @@ class Tracker:
         """A run of its own below the folder, named as the folders above say; one that goes on gets another."""
         folder.mkdir(parents=True, exist_ok=True)
         kind, run = folder.parent.name, folder.parent.parent.name
-        named = {"project": "cuelearner", "group": run, "name": f"{run} {kind}"}
-        self._run = wandb.init(mode="offline", dir=str(folder), config=described, reinit="create_new", **named)
+        self._run = wandb.init(
+            mode="offline",
+            dir=str(folder),
+            config=described,
+            reinit="create_new",
+            project="cuelearner",
+            group=run,
+            name=f"{run} {kind}",
+        )
 
     def log(self, step: int, metrics: dict[str, float]) -> None:
         """One point of each curve."""
