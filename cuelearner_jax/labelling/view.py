@@ -80,10 +80,20 @@ def _point(sketch: Sketch, angle: float, along: float, across: float = 0.0) -> t
     return sketch.foot[0] + x, sketch.foot[1] - y
 
 
+def _room(sketch: Sketch, angle: float) -> float:
+    """From the foot along a direction to the edge of what is shown."""
+    (x, y), (left, top, width, height) = sketch.foot, sketch.box
+    away_x, away_y = (one - other for one, other in zip(_point(sketch, angle, 1.0), sketch.foot, strict=True))
+    across = (left + width - x if away_x > 0 else x - left) / max(abs(away_x), 1e-9)
+    down = (top + height - y if away_y > 0 else y - top) / max(abs(away_y), 1e-9)
+    return min(across, down)
+
+
 def _arrow(sketch: Sketch, angle: float, name: str, longer: float = 1.0) -> str:
     first, last = sketch.reach[0], sketch.reach[0] + (sketch.reach[1] - sketch.reach[0]) * longer
     hair = sketch.box[2] * HAIR
     head, half = 7 * hair, 2.8 * hair
+    last = max(min(last, _room(sketch, angle) - 2 * hair), first + head)
     shaft = [_point(sketch, angle, first), _point(sketch, angle, last - 0.6 * head)]
     tip = [_point(sketch, angle, last), *(_point(sketch, angle, last - head, side) for side in (half, -half))]
     (x1, y1), (x2, y2) = shaft
