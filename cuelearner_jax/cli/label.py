@@ -94,8 +94,9 @@ def run(arguments: list[str]) -> None:
     kind = Label[task.config]  # pyright: ignore[reportInvalidTypeArguments]
     scenario, _ = taken(rest, "--scenario", ", ".join(task.scenarios) or "none")
     changed = task.scenario(scenario) if scenario else None
-    world = changed.applied(preset.config.task) if changed else preset.config.task
     source = _source(task, named)
+    world = source.config.task if source else preset.config.task
+    world = changed.applied(world) if changed else world
     sizes, scalars, bound = preset.config.sizes, preset.config.scalars, None
     if named is not None:  # as `adapt` corrects it
         frame = source.config.sizes.frame if source else sizes.frame

@@ -15,6 +15,7 @@ from cuelearner_jax.types import Reel, Sketch
 HAIR = 1 / 400  # of the sketch's width: a thin line
 TURNED_REACH = 1.25, 3.5  # how much farther arrows reach that are turned: the more the less they are,
 APART = 10.0  # by this over eps [deg], so that they can be told apart
+HALO = ' class="halo"', 3.8  # so that arrows stand out on any ground
 LEAST_TURN = 1.0  # of the refined action from the one in question, to be shown [deg]
 
 
@@ -80,16 +81,28 @@ def _point(sketch: Sketch, angle: float, along: float, across: float = 0.0) -> t
     return sketch.foot[0] + x, sketch.foot[1] - y
 
 
+def _room(sketch: Sketch, angle: float) -> float:
+    """From the foot along a direction to the edge of what is shown."""
+    (x, y), (left, top, width, height) = sketch.foot, sketch.box
+    away_x, away_y = (one - other for one, other in zip(_point(sketch, angle, 1.0), sketch.foot, strict=True))
+    across = (left + width - x if away_x > 0 else x - left) / max(abs(away_x), 1e-9)
+    down = (top + height - y if away_y > 0 else y - top) / max(abs(away_y), 1e-9)
+    return min(across, down)
+
+
 def _arrow(sketch: Sketch, angle: float, name: str, longer: float = 1.0) -> str:
     first, last = sketch.reach[0], sketch.reach[0] + (sketch.reach[1] - sketch.reach[0]) * longer
     hair = sketch.box[2] * HAIR
     head, half = 7 * hair, 2.8 * hair
+    last = max(min(last, _room(sketch, angle) - 2 * hair), first + head)
     shaft = [_point(sketch, angle, first), _point(sketch, angle, last - 0.6 * head)]
     tip = [_point(sketch, angle, last), *(_point(sketch, angle, last - head, side) for side in (half, -half))]
     (x1, y1), (x2, y2) = shaft
     corners = " ".join(f"{x:.4f},{y:.4f}" for x, y in tip)
-    line = f'<line x1="{x1:.4f}" y1="{y1:.4f}" x2="{x2:.4f}" y2="{y2:.4f}" stroke-width="{2.2 * hair:.5f}"/>'
-    return f'<g class="arrow {name}">{line}<polygon points="{corners}"/></g>'
+    place = f'x1="{x1:.4f}" y1="{y1:.4f}" x2="{x2:.4f}" y2="{y2:.4f}"'
+    halo, line = (f'<line{kind} {place} stroke-width="{width * hair:.5f}"/>' for kind, width in (HALO, ("", 2.2)))
+    head_drawn = f'<polygon points="{corners}" stroke-width="{1.6 * hair:.5f}"/>'
+    return f'<g class="arrow {name}">{halo}{line}{head_drawn}</g>'
 
 
 def _line(sketch: Sketch, angle: float) -> str:

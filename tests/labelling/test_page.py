@@ -155,6 +155,9 @@ def test_arrows_point_where_actions_do(opened):
         np.testing.assert_allclose(tip(svg, name), [length * math.cos(at), -length * math.sin(at)], atol=1e-3)
     up = item._replace(sketch=item.sketch._replace(turn=90.0, foot=(1.0, 2.0)), action=np.float32([1.0, 0.0]))
     np.testing.assert_allclose(tip(view.picture(up, RELATIVE, 20.0), "asked"), [1.0, 1.0], atol=1e-3)
+    edge = up._replace(sketch=up.sketch._replace(box=(0.0, 1.5, 2.0, 2.0)))  # half a metre ahead the picture ends
+    x, y = tip(view.picture(edge, RELATIVE, 20.0), "asked")
+    assert (x, 1.5 < y < 1.55) == (pytest.approx(1.0, abs=1e-3), True)
     assert json.loads(html.unescape(re.search('data-places="([^"]*)"', svg)[1])).keys() == {"dot"}
     assert "refined" not in view.picture(item._replace(refined=item.action), RELATIVE, 20.0)
     np.testing.assert_allclose(view.turned(item.action, 90.0), [-0.8, 0.6], atol=1e-6)
