@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import webbrowser
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Generic
 
@@ -37,6 +37,22 @@ MOST_LABELS = 100_000
 
 
 @dataclass(frozen=True)
+class Lane:
+    """Which lane of the folder is asked about."""
+
+    policy: str | None = None
+    """Which of its policies, as for evaluate (default: the agent, or the adapted)."""
+    guidance: str | None = None
+    """Kind of guidance of the lane (default: the run's last)."""
+    labels: int | None = None
+    """Its label budget (default: the largest)."""
+    bound_deg: float | None = None
+    """Of a policy folder: its bound (default: the largest) [deg]."""
+    seed: int | None = None
+    """Its seed (default: the first)."""
+
+
+@dataclass(frozen=True)
 class Label(Generic[TaskT]):
     """Label actions of chance, or of a policy, in a browser.
 
@@ -59,14 +75,6 @@ class Label(Generic[TaskT]):
     bound_deg: float | None = None
     """Ask about actions within this of the policy's own alone [deg] (default: the scenario's, or wherever the guidance
     leads)."""
-    policy: str | None = None
-    """Who acts of a folder: agent, guided, adapted or another, as for evaluate (default: the agent, or the adapted)."""
-    of_guidance: str | None = None
-    """Kind of guidance of the run's lane (default: the run's last)."""
-    of_labels: int | None = None
-    """Label budget of the run's lane (default: the largest)."""
-    of_seed: int | None = None
-    """Seed of the run's lane (default: the first)."""
     again: Path | None = None
     """Instead: the questions of this page's file once more, for a second opinion; leave out the policy and --seed."""
     scenario: str | None = None
@@ -75,6 +83,7 @@ class Label(Generic[TaskT]):
     """Port on 127.0.0.1 (0: any that is free)."""
     open: Flag[bool] = False
     """Open the page in a browser of this machine."""
+    base: Lane = field(default_factory=Lane)
 
 
 OPTIONS = {"label": Label}
@@ -193,18 +202,15 @@ def _source(task: Task, named: str | None) -> PolicySource | None:
 
 def _base(task: Task, asked: Label[Any], named: str | None, source: PolicySource | None, env: Any) -> Base:
     """The policy that is asked about. Raises UserError if it cannot be had, or sees something else."""
-    chosen = [name for name in ("policy", "of_guidance", "of_labels", "of_seed") if getattr(asked, name) is not None]
+    lane = asked.base
     if source is None:
-        if chosen:
-            option = chosen[0].replace("_", "-")
-            raise UserError(f"--{option} chooses in a folder, and none is given: leave it out")
+        if lane != Lane():
+            raise UserError("--base.… chooses in a folder, and none is given: leave it out")
         return Base(uniform_in(env), UNIFORM) if named is None else Base(code_of(named), named)
-    lane = {"guidance": asked.of_guidance, "labels": asked.of_labels, "seed": asked.of_seed}
-    world = World(task, asked.task)
-    found = load_policy(source.folder, policy=asked.policy, task=task, world=world, **lane)
+    found = load_policy(source.folder, task=task, world=World(task, asked.task), **dataclasses.asdict(lane))
     if found.observation and tuple(found.observation) != tuple(env.observation):
         raise UserError(f"{source.folder} acts on other observations than this world has: give a policy of this world")
-    return Base(found.policy, f"{source.folder.resolve().name}, {asked.policy or source.default_policy}")
+    return Base(found.policy, f"{source.folder.resolve().name}, {lane.policy or source.default_policy}")
 
 
 def _part(kind: type, values: Any) -> Any:

@@ -65,7 +65,7 @@ def test_the_page_is_served_to_who_knows_its_address_until_ctrl_c(tmp_path, refu
         (["--sizes.candidates", "3", "--sizes.ensemble", "2"], "--sizes.candidates is above 1"),
         (["--bound-deg", "0"], "--bound-deg is 0: give an angle"),
         (["--port", "70000"], "--port is 70000: give a number"),
-        (["--of-seed", "1"], "--of-seed chooses in a folder, and none is given"),
+        (["--base.seed", "1"], "--base.… chooses in a folder, and none is given"),
         (["--who", " "], "--who is empty"),
         (["--again", "nothing"], "no label file at nothing"),
         (["--scalars.eps-deg", "-1"], "eps_deg"),
