@@ -45,7 +45,7 @@ OPTIONS = {"export": Export}
 
 def run(arguments: list[str]) -> None:
     """Runs the command. Raises UserError for what cannot be exported, or does not hold its contract."""
-    folder, rest = taken(arguments, "--check", "a folder that was exported")
+    folder, rest = taken(arguments, "--check", "the folders that were exported")
     if folder is not None:
         if rest:
             raise UserError(f"--check takes a folder and nothing else: leave out {rest[0]}")
