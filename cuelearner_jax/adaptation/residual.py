@@ -13,61 +13,26 @@ named as `cuelearner_jax.adaptation.residual:KIND`.
 
 from __future__ import annotations
 
-from functools import partial
-from typing import Any
-
-import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, Float
 
 from cuelearner_jax.config import GuideScalars, GuideSizes
 from cuelearner_jax.environment import Spaces
 from cuelearner_jax.guidance.answers import DEMONSTRATION
 from cuelearner_jax.guidance.bundle import Guidance
-from cuelearner_jax.guidance.fitting import fit_least_squares, lessons
+from cuelearner_jax.guidance.correcting import correcting
 from cuelearner_jax.guidance.kind import Kind
-from cuelearner_jax.guidance.model import residual_model
-from cuelearner_jax.guidance.questions import about_refined
-from cuelearner_jax.guidance.refining import Refined, refine
-from cuelearner_jax.types import GuidanceModel, Label
+from cuelearner_jax.types import Label
 
 
 def make(sizes: GuideSizes, spaces: Spaces) -> Guidance:
     """The bundle for an environment's spaces."""
     space = spaces.actions
-    network = residual_model(sizes, spaces)
-
-    def init(key: PRNGKeyArray) -> GuidanceModel:
-        return GuidanceModel(network.init(key), jnp.array(False))
 
     def target(label: Label, scalars: GuideScalars) -> Float[Array, " action"]:
         """The needed correction, cut off at the bound."""
         return space.clip(label.answer, label.action, scalars.radians("tau_max")) - label.action
 
-    def fit(key: PRNGKeyArray, env: Any, labels: Label, former: GuidanceModel, scalars: GuideScalars) -> GuidanceModel:
-        rows = lessons(labels, target, scalars)
-        rows = rows.replace(target=rows.target / scalars.radians("eps"))
-        predict = partial(network.predict, env)
-        return fit_least_squares(key, rows, scalars, init=network.init, apply=predict, sizes=sizes)
-
-    def act(
-        model: GuidanceModel,
-        env: Any,
-        obs: Float[Array, "n obs"],
-        actions: Float[Array, "n action"],
-        active: Bool[Array, " n"],
-        scalars: GuideScalars,
-    ) -> Refined:
-        return refine(
-            lambda current: scalars.radians("eps") * network.predict(env, model.params, obs, current),
-            actions,
-            active & model.fitted,
-            space=space,
-            tau=scalars.radians("tau"),
-            tau_max=scalars.radians("tau_max"),
-            k_max=scalars.k_max,
-        )
-
-    return Guidance("residual", DEMONSTRATION, init, about_refined(act), target, fit, act, network.disagreement)
+    return correcting("residual", DEMONSTRATION, target, sizes, spaces)
 
 
 KIND = Kind("residual", "the correction itself, from optimal actions", make, form=DEMONSTRATION, colour="#D55E00")
