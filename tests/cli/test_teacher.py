@@ -54,10 +54,10 @@ def test_a_teacher_that_does_not_fit_is_refused(trained, refused, tmp_path):
     new = ["--out", tmp_path / "new"]
     refused([*RUN, "--task.teacher", tmp_path / "nowhere", *new], "give its folder (--task.teacher FOLDER)", tmp_path)
     refused([*RUN, "--task.teacher", trained, "--task.table", "easy", *new], "learned with --task.table one", tmp_path)
-    refused([*RUN, "--task.teacher", trained, "--task.acceleration", "0", "0.005", *new], "this world's", tmp_path)
+    refused([*RUN, "--task.teacher", trained, "--task.acceleration", "0", "0.05", *new], "this world's", tmp_path)
     navigation = tmp_path / "navigation"
     shutil.copytree(trained, navigation)
     edit_json(navigation / "teacher.json", lambda about: about.update(task={"name": "navigation"}))
     refused([*RUN, "--task.teacher", navigation, *new], "is one of navigation, not of billiards", tmp_path)
-    tilted = ["evaluate", "billiards", "--preset", "easy", "--policy", "teacher", "--scenario", "tilted_table"]
-    refused(tilted, "knows nothing of this world's --task.acceleration 0.0 0.005: use the search teacher", tmp_path)
+    steep = ["evaluate", "billiards", "--preset", "easy", "--policy", "teacher", "--task.acceleration", "0", "0.05"]
+    refused(steep, "knows nothing of this world's --task.acceleration 0.0 0.05: use the search teacher", tmp_path)

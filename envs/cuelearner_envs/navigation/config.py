@@ -47,10 +47,10 @@ class NavigationConfig:
     """Changed world: standard deviation of a beam's error [m]."""
     lidar_dropout: float = 0.0
     """Changed world: probability that a beam reads the full range."""
-    preferred_side: Literal["none", "left", "right"] = "none"
-    """Changed wish, in a corridor: the teacher passes every obstacle on this side."""
     mirrors: bool = False
     """Multiply transitions by their mirror images, whatever the guidance; labels stay as they were given."""
+    preferred_side: Literal["none", "left", "right"] = "none"
+    """Changed wish, in a corridor: the teacher passes every obstacle on this side."""
 
 
 def check(config: NavigationConfig) -> None:
