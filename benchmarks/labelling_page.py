@@ -32,7 +32,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from playwright.sync_api import Browser, Page, sync_playwright
+from playwright.sync_api import Browser, Page, sync_playwright  # pyright: ignore[reportMissingImports]
 
 from cuelearner_jax.records import label_files
 from cuelearner_jax.records.provenance import provenance
