@@ -46,6 +46,15 @@ SEED = 0  # of labels, fits and fine-tuning; the base agents have seeds of their
 JUDGED = 500  # environments at most in which it is decided whether a model is used
 Row = dict[str, Any]
 
+SMALL: Mapping[str, Any] = {  # what every method has at the scale smoke
+    "sizes.feedback_layers": (16,),
+    "sizes.labels_per_round": 5,
+    "sizes.fit_steps": 20,
+    "sizes.fit_batch_size": 5,
+    "sizes.replay_capacity": 400,
+    "schedule.learn_after": 20,
+}
+
 
 class Piece(NamedTuple):
     """One method in one world."""

@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from _adaptation import UNCHANGED, Piece, Scale, Study, run
+from _adaptation import SMALL, UNCHANGED, Piece, Scale, Study, run
 from _pieces import option
 from billiards_bootstrapping import SCALES as TRAINING
 
@@ -123,14 +123,7 @@ SCALES = {
         steps=3,
         bases=2,
         labels={25: 5, 50: 10, 250: 10},
-        settings={
-            "sizes.feedback_layers": (16,),
-            "sizes.labels_per_round": 5,
-            "sizes.fit_steps": 20,
-            "sizes.fit_batch_size": 5,
-            "sizes.replay_capacity": 400,
-            "schedule.learn_after": 20,
-        },
+        settings=SMALL,
         tuned_steps=(40, 20),
         train=bases(),
     ),

@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from _adaptation import UNCHANGED, Piece, Scale, Study, run
+from _adaptation import SMALL, UNCHANGED, Piece, Scale, Study, run
 from _pieces import option
 from navigation_bootstrapping import SCALES as TRAINING
 
@@ -147,14 +147,7 @@ SCALES = {
         steps=0,
         bases=2,
         labels={50: 5, 250: 10},
-        settings={
-            "sizes.feedback_layers": (16,),
-            "sizes.labels_per_round": 5,
-            "sizes.fit_steps": 20,
-            "sizes.fit_batch_size": 5,
-            "sizes.replay_capacity": 400,
-            "schedule.learn_after": 20,
-        },
+        settings=SMALL,
         tuned_steps=(40, 20),
         train=bases(),
     ),
