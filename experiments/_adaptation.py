@@ -147,7 +147,8 @@ class Bench(NamedTuple):
         """The base agents' scalars with labels of the scenario's strength, refined within the bound."""
         eps = None if self.piece.world == UNCHANGED else self.task.scenario(self.piece.world).eps_deg
         own = adapting.settling(self.config.scalars, self.piece.settings.get("scalars.eps_deg", eps))
-        own = dataclasses.replace(own, k_max=int(np.ceil(self.piece.bound_deg / own.eps_deg)) + 2)
+        reached = int(np.ceil(self.piece.bound_deg / own.eps_deg)) + 2  # passes of which each turns by eps
+        own = dataclasses.replace(own, k_max=max(own.k_max, reached))  # a model that is not sure turns by less
         return self.set("scalars.", own)
 
 

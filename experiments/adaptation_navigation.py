@@ -24,6 +24,7 @@ BUDGETS = (50, 100, 250, 500)
 TUNED, TUNING_BASES = (250,), 4
 
 FRAME: Mapping[str, Any] = {"sizes.frame": "action"}
+TURN: Mapping[str, Any] = {**FRAME, "sizes.sees_turn": True}
 ROOMY: Mapping[str, Any] = {**FRAME, "scalars.eps_deg": 20.0}  # in rooms small turns lead nowhere
 SIDED: Mapping[str, Any] = {**FRAME, "scalars.eps_deg": 20.0}
 LEARNING: Mapping[str, Any] = {"sizes.num_envs": 10, "sizes.replay_capacity": 50_000}
@@ -37,10 +38,19 @@ RELATIVE: dict[str, Mapping[str, Any]] = {
     "eps-5": {**FRAME, "scalars.eps_deg": 5.0},
     "eps-10": {**FRAME, "scalars.eps_deg": 10.0},
     "eps-20": {**FRAME, "scalars.eps_deg": 20.0},
+    "turn": TURN,
+    "turn-5": {**TURN, "scalars.eps_deg": 5.0},
+    "turn-10": {**TURN, "scalars.eps_deg": 10.0},
+    "turn-20": {**TURN, "scalars.eps_deg": 20.0},
+    "turn-raw": {**TURN, "sizes.frame": "raw", "scalars.eps_deg": 10.0},
+    "turn-slow": {**TURN, "scalars.eps_deg": 10.0, "scalars.feedback_learning_rate": 3e-4},
+    "turn-small": {**TURN, "scalars.eps_deg": 10.0, "sizes.feedback_layers": (64, 64)},
+    "turn-members": {**TURN, "scalars.eps_deg": 10.0, "sizes.ensemble": 5},
 }
 OTHERS: dict[str, dict[str, Mapping[str, Any]]] = {
     "residual": {
         "three-times": FRAME,
+        "turn": TURN,
         "once": {**FRAME, "scalars.k_max": 1, "scalars.refined_fraction": 0.0},
         "raw": {"sizes.frame": "raw"},
     },
@@ -126,10 +136,13 @@ def sides() -> list[Piece]:
     return [*pieces, *compared("corridor_left", SIDE_BOUND_DEG, "passed_left", {"relative": RELATIVE})]
 
 
-UNADAPTED = Piece(UNCHANGED, "none", minutes=2, serves="what is whole")
+UNADAPTED = [
+    Piece(UNCHANGED, "none", minutes=2, serves="what is whole"),
+    Piece(UNCHANGED, "none", split="tuning", minutes=2, serves="which agents are finished"),
+]
 PIECES = tuple(
     sorted(
-        [UNADAPTED, *lidar(), *rooms(), *sides()], key=lambda piece: piece.split == "tuning"
+        [*UNADAPTED, *lidar(), *rooms(), *sides()], key=lambda piece: piece.split == "tuning"
     )  # those of tables first
 )
 
