@@ -226,9 +226,7 @@ class Navigation(Described, struct.PyTreeNode):
         slices = jax.vmap(lambda number: jax.lax.dynamic_slice(twice, (number,), (RING + 1,)))(numbers.ravel())
         slices = slices.reshape(*count, RING + 1)
         around = slices[..., :-1] + near * (slices[..., 1:] - slices[..., :-1])
-        vectors = jnp.concatenate([obs[BEAMS : BEAMS + 2], obs[BEAMS + 3 : PLAIN]]).reshape(
-            -1, 2
-        )  # goal, previous actions
+        vectors = jnp.concatenate([obs[BEAMS : BEAMS + 2], obs[BEAMS + 3 : PLAIN]]).reshape(-1, 2)
         shape = (*count, *vectors.shape)
         seen = inward(jnp.broadcast_to(vectors, shape), jnp.broadcast_to(actions[..., None, :], shape))
         tried = [way_tried.turned(obs[PLAIN:], actions)] if obs.shape[0] > PLAIN else []
@@ -238,9 +236,9 @@ class Navigation(Described, struct.PyTreeNode):
     def aims(self, obs: Float[Array, " obs"]) -> Aims:
         """Directions every 5 degrees, the goal's first: how far the body could walk there, and what a detour it is.
 
-        No aim is a direction in which the body would touch within two steps what the lidar sees. One network weighs
-        each from its own side: ways of three widths there and beside it, detours, goal and previous actions, and, of an
-        observation with a memory, how much of the way so far lies there.
+        No aim is a direction in which the lidar does not look, or in which the body would soon touch what it sees. One
+        network weighs each from its own side: ways of three widths there and beside it, detours, goal and previous
+        actions, and, of an observation with a memory, how much of the way so far lies there.
         """
         return aims_of(obs)
 
