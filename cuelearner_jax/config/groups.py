@@ -86,6 +86,9 @@ class GuideSizes(_Seeing):
     """Members of the guidance model, each fitted to all labels; it predicts their mean."""
     candidates: int = 1
     """Situations among which each question is chosen: where the members disagree most (1: as they come)."""
+    question_every: int = 1
+    """Steps from one question of a simulated teacher to the next (1: every situation is asked about): questions farther
+    apart are of more different situations."""
 
 
 @dataclass(frozen=True)
