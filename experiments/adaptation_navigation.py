@@ -53,29 +53,29 @@ OTHERS: dict[str, dict[str, Mapping[str, Any]]] = {
 # In rooms: what helps, each by itself and together. A round is 50 questions, so that a thousand are 20 fits.
 EACH: Mapping[str, Any] = {**FRAME, "scalars.eps_deg": 20.0, "sizes.labels_per_round": 50}
 SPACED, MEMORY = {"sizes.question_every": 10}, {"task.memory": True}
-ACTIVE: Mapping[str, Any] = {"sizes.ensemble": 5, "sizes.candidates": 16}
-WIDE = {"sizes.aim_layers": (64, 64)}
+# The likeliest way is always gone: in doubt the base would act, which walks into walls.
+SURE: Mapping[str, Any] = {**EACH, **SPACED, "scalars.aim_doubt": 1000.0, "sizes.aim_layers": (64, 64)}
+MEMBERS, ACTIVE = {"sizes.ensemble": 5}, {"sizes.ensemble": 5, "sizes.candidates": 16, "sizes.question_every": 1}
 IN_ROOMS: dict[str, dict[str, Mapping[str, Any]]] = {
-    "relative": {
-        "each": EACH,
-        "spaced": {**EACH, **SPACED},
-        "spaced-memory": {**EACH, **SPACED, **MEMORY},
-        "active": {**EACH, **ACTIVE},
-    },
     "intent": {
-        "each": EACH,
+        "members-memory": {**SURE, **MEMBERS, **MEMORY},
+        "members": {**SURE, **MEMBERS},
+        "active-memory": {**SURE, **ACTIVE, **MEMORY},
+        "memory": {**SURE, **MEMORY},
+        "doubting": {**SURE, **MEMBERS, **MEMORY, "scalars.aim_doubt": 2.0},
+        "small": {**SURE, **MEMBERS, **MEMORY, "sizes.aim_layers": (32, 32)},
+        "close": {**SURE, **MEMBERS, **MEMORY, "sizes.question_every": 1},
+        "eps-10": {**SURE, **MEMBERS, **MEMORY, "scalars.eps_deg": 10.0},
+        "eps-40": {**SURE, **MEMBERS, **MEMORY, "scalars.eps_deg": 40.0},
+    },
+    "relative": {
+        "close": EACH,
         "spaced": {**EACH, **SPACED},
+        "spaced-members": {**EACH, **SPACED, **MEMBERS},
         "spaced-memory": {**EACH, **SPACED, **MEMORY},
-        "spaced-memory-wide": {**EACH, **SPACED, **MEMORY, **WIDE},
-        "spaced-memory-eps-10": {**EACH, **SPACED, **MEMORY, "scalars.eps_deg": 10.0},
-        "spaced-memory-eps-40": {**EACH, **SPACED, **MEMORY, "scalars.eps_deg": 40.0},
-        "active": {**EACH, **ACTIVE},
-        "active-memory": {**EACH, **ACTIVE, **MEMORY},
-        "active-memory-wide": {**EACH, **ACTIVE, **MEMORY, **WIDE},
-        "ensemble-memory": {**EACH, **SPACED, **MEMORY, "sizes.ensemble": 5},
     },
 }
-BEST_IN_ROOMS = IN_ROOMS["intent"]["ensemble-memory"]
+BEST_IN_ROOMS = IN_ROOMS["intent"]["members-memory"]
 SWEPT_RATES, SWEPT_NOISES_DEG = (0.0001, 0.001, 0.01), (0.0, 5.0, 20.0)
 
 
