@@ -192,7 +192,7 @@ SCALES = {
         envs=200,
         steps=0,
         bases=4,
-        labels={100: 100, 250: 250, 500: 500},
+        labels={100: 100, 250: 250, 500: 500, 1_000: 1_000},
         tuned_steps=(10_000, 2_500),
     ),
     "paper": Scale("what is reported", envs=2_000, steps=0),

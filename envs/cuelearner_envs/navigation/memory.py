@@ -56,10 +56,11 @@ def around(trail: Float[Array, "places 2"], pose: Float[Array, "3"]) -> Float[Ar
 def turned(seen: Float[Array, " seen"], directions: Float[Array, "*n 2"]) -> Float[Array, "*n seen"]:
     """The ring as it looks from directions: its middle, between sectors 17 and 18, is then the direction itself."""
     rings = seen.reshape(len(REACHES), SECTORS)
-    shift = to_angle(directions)[..., None] * (SECTORS / (2 * jnp.pi)) + jnp.arange(SECTORS)
+    first = to_angle(directions)[..., None] * (SECTORS / (2 * jnp.pi))
+    shift = first + jnp.arange(SECTORS, dtype=jnp.float32).reshape((1,) * (first.ndim - 1) + (SECTORS,))
     first = jnp.floor(shift)
     before, after = (rings[:, jnp.mod(first.astype(jnp.int32) + step, SECTORS)] for step in (0, 1))
-    mixed = before + (shift - first) * (after - before)
+    mixed = before + (shift - first)[None] * (after - before)
     return jnp.moveaxis(mixed, 0, -2).reshape(*directions.shape[:-1], -1)
 
 
