@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray
 
 from cuelearner_jax.config import GuideScalars, GuideSizes, Scalars
 from cuelearner_jax.environment import Environment, actions_of
@@ -205,6 +205,24 @@ def ask(
     return proceed(env, told.replace(env=guide.env, obs=guide.obs), actions, keys)
 
 
+def walked(
+    guidance: Guidance,
+    env: Environment,
+    scalars: GuideScalars,
+    base: Policy,
+    guide: GuideState,
+    keys: Key[Array, " steps"],
+    bound: Float[Array, ""] | None = None,
+) -> GuideState:
+    """The guide after steps in which it acts as it would ask, and nobody answers; `bound`: see `question`."""
+
+    def step(guide: GuideState, key: PRNGKeyArray) -> tuple[GuideState, None]:
+        own = QuestionKeys(*jax.random.split(key, 4))
+        return proceed(env, guide, question(guidance, env, scalars, base, guide, own, bound), own), None
+
+    return jax.lax.scan(step, guide, keys)[0]
+
+
 def label_round(
     guidance: Guidance,
     sizes: GuideSizes,
@@ -227,7 +245,12 @@ def label_round(
     first, until = guide.asked, guide.budget if until is None else until
 
     def one(guide: GuideState, offset: Int[Array, ""]) -> tuple[GuideState, None]:
-        return ask(guidance, env, teacher, scalars, base, guide, lane_key, first + offset, bound), None
+        asked = ask(guidance, env, teacher, scalars, base, guide, lane_key, first + offset, bound)
+        if sizes.question_every == 1:
+            return asked, None
+        key = jax.random.fold_in(jax.random.fold_in(lane_key, Stream.WALK), first + offset)
+        keys = jax.random.split(key, sizes.question_every - 1)
+        return walked(guidance, env, scalars, base, asked, keys, bound), None
 
     asked, _ = jax.lax.scan(one, guide, jnp.arange(sizes.labels_per_round))
     fitted = fit(guidance, env, scalars, asked, lane_key, first // sizes.labels_per_round)

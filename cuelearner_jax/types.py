@@ -199,3 +199,4 @@ class Stream(IntEnum):
     ASK = 1
     FIT = 2
     TRAIN = 3
+    WALK = 4

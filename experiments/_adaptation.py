@@ -227,6 +227,7 @@ METHODS: dict[str, Callable[[Bench], Iterator[Row]]] = {
     "none": measured_as_they_are,
     "teacher": corrected,
     "relative": _kind("relative"),
+    "intent": _kind("intent"),
     "dcoach": _kind("dcoach"),
     "residual": by_residuals,
     "finetuning": fine_tuned,
