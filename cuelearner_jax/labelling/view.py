@@ -16,7 +16,8 @@ HAIR = 1 / 400  # of the sketch's width: a thin line
 TURNED_REACH = 1.25, 3.5  # how much farther arrows reach that are turned: the more the less they are,
 APART = 10.0  # by this over eps [deg], so that they can be told apart
 HALO = ' class="halo"', 3.8  # so that arrows stand out on any ground
-LEAST_TURN = 1.0  # of the refined action from the one in question, to be shown [deg]
+FAN, WIDEST = 6.0, 60.0  # turns are drawn larger than they are if eps would be less than this, but not above that [deg]
+LEAST_TURN = 1.0  # of the refined action from the one in question as they are drawn, to be shown [deg]
 
 
 def angle_of(action: np.ndarray) -> float:
@@ -30,6 +31,11 @@ def turned(action: np.ndarray, by_deg: float) -> np.ndarray:
     return np.array([math.cos(angle), math.sin(angle)], np.float32)
 
 
+def magnified(eps_deg: float) -> int:
+    """How many times larger than they are turns are drawn: so that one by eps can be seen."""
+    return max(round(FAN / eps_deg), 1) if eps_deg < FAN / 2 else 1
+
+
 def picture(item: Item, form: AnswerForm, eps_deg: float) -> str:
     """An item with a sketch, as an SVG element; attributes `data-…` tell the page's script what it shows."""
     assert item.sketch is not None
@@ -38,17 +44,22 @@ def picture(item: Item, form: AnswerForm, eps_deg: float) -> str:
     for name, body in sketch.movers.items():
         place = f'class="mover" data-mover="{html.escape(name)}" transform="{_moved(sketch, name)}"'
         parts.append(f"<g {place}>{body}</g>")
+    times = magnified(eps_deg) if form.by_eps else 1
     if form.by_eps:
-        longer = min(max(APART / eps_deg, TURNED_REACH[0]), TURNED_REACH[1])
-        parts += [_arrow(sketch, angle + way * eps_deg, name, longer) for way, name in ((1, "left"), (-1, "right"))]
+        drawn = times * eps_deg
+        longer = min(max(APART / drawn, TURNED_REACH[0]), TURNED_REACH[1])
+        parts += [_arrow(sketch, angle + way * drawn, name, longer) for way, name in ((1, "left"), (-1, "right"))]
     parts.append(_line(sketch, angle))
     parts.append(_arrow(sketch, angle, "asked"))
     if item.refined is not None:
-        refined = angle_of(item.refined)
-        if abs((refined - angle + 180) % 360 - 180) >= LEAST_TURN:
-            parts.append(_arrow(sketch, refined, "refined", 0.8))
+        turn = (angle_of(item.refined) - angle + 180) % 360 - 180
+        turn = math.copysign(min(times * abs(turn), max(WIDEST, abs(turn))), turn)
+        if abs(turn) >= LEAST_TURN:
+            parts.append(_arrow(sketch, angle + turn, "refined", 0.8))
     if form.is_action:
         parts.append(_arrow(sketch, angle, "pointer"))
+    if times > 1:
+        parts.append(_note(sketch, f"turns drawn {times} times as large: {eps_deg:g}° is seen as {times * eps_deg:g}°"))
     data = {
         "item": item.number,
         "foot": json.dumps(sketch.foot),
@@ -103,6 +114,12 @@ def _arrow(sketch: Sketch, angle: float, name: str, longer: float = 1.0) -> str:
     halo, line = (f'<line{kind} {place} stroke-width="{width * hair:.5f}"/>' for kind, width in (HALO, ("", 2.2)))
     head_drawn = f'<polygon points="{corners}" stroke-width="{1.6 * hair:.5f}"/>'
     return f'<g class="arrow {name}">{halo}{line}{head_drawn}</g>'
+
+
+def _note(sketch: Sketch, words: str) -> str:
+    hair, (left, top, _, _) = sketch.box[2] * HAIR, sketch.box
+    place = f'x="{left + 4 * hair:.4f}" y="{top + 9 * hair:.4f}" font-size="{7 * hair:.5f}"'
+    return f'<text class="note" {place} stroke-width="{1.6 * hair:.5f}">{html.escape(words)}</text>'
 
 
 def _line(sketch: Sketch, angle: float) -> str:

@@ -163,6 +163,28 @@ def test_arrows_point_where_actions_do(opened):
     np.testing.assert_allclose(view.turned(item.action, 90.0), [-0.8, 0.6], atol=1e-6)
 
 
+def test_small_turns_are_drawn_larger_and_the_page_says_so(opened):
+    session = opened()
+
+    def drawn(name, eps, refined=None):
+        """Degrees from the arrow in question to another one."""
+        apart = view.turned(np.float32([0.6, 0.8]), refined) if refined else None
+        item = session.item._replace(action=np.float32([0.6, 0.8]), refined=apart)
+        svg = view.picture(item, RELATIVE, eps)
+        found = [math.degrees(math.atan2(-y, x)) for x, y in (tip(svg, name), tip(svg, "asked"))]
+        return (
+            (found[0] - found[1] + 180) % 360 - 180,
+            "60 times as large: 0.1° is seen as 6°" in svg,
+            'class="note' in svg,
+        )
+
+    assert drawn("left", 0.1) == (pytest.approx(6.0, abs=0.05), True, True)
+    assert drawn("right", 0.1) == (pytest.approx(-6.0, abs=0.05), True, True)
+    assert drawn("left", 5.0) == (pytest.approx(5.0, abs=0.05), False, False)
+    for refined, seen in ((0.3, 18.0), (-0.3, -18.0), (20.0, 60.0), (100.0, 100.0)):  # never past what it is, or 60
+        assert drawn("refined", 0.1, refined)[0] == pytest.approx(seen, abs=0.1)
+
+
 def test_a_film_shows_what_the_action_leads_to(opened):
     session = opened()
     best = np.asarray(session.env.best(session.item.guide.obs))
