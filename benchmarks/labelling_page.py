@@ -5,6 +5,9 @@
     python benchmarks/labelling_page.py pictures --task navigation --preset quickstart
     python benchmarks/labelling_page.py pictures --task billiards --preset quickstart --more="--task.table regulation"
     python benchmarks/labelling_page.py pictures --task navigation --preset quickstart --guidance demonstration scalar
+    python benchmarks/labelling_page.py pictures --task billiards --preset quickstart --called small \\
+        --more="--task.table regulation --scalars.eps-deg 0.1"
+    python benchmarks/labelling_page.py pictures --task examples.reach:TASK --preset quickstart
 
 `paced`: a script that sees only the page turns navigation's arrow onto the shortest way past what is drawn, but 10% of
 its keys are "don't know" and 10% of the others one of the two wrong ones; in billiards it presses at random. Measured
@@ -212,7 +215,10 @@ def pictures(asked: argparse.Namespace, browser: Browser, work: Path) -> dict[st
     for task in asked.task:
         for kind in asked.guidance or [""]:
             more = ("--guidance", kind) if kind else ()
-            with served(asked, task, work / f"{task}{kind}", "--labels", "500", *more) as (_, address):
+            called = "_".join(
+                part for part in (task.rpartition(":")[0].rpartition(".")[2] or task, kind, asked.called) if part
+            )
+            with served(asked, task, work / called, "--labels", "500", *more) as (_, address):
                 page = entered(browser, address)
                 rng, wanted = random.Random(2), 0 if kind else 12
                 while int(re.match(r"\d+", page.locator(".side").inner_text())[0]) < wanted:  # pyright: ignore[reportOptionalSubscript]
@@ -222,10 +228,10 @@ def pictures(asked: argparse.Namespace, browser: Browser, work: Path) -> dict[st
                 if wanted:
                     page.wait_for_function("() => document.body.innerText.includes('model 1')", timeout=300_000)
                 page.close()
-                for name, look in LOOKS.items() if not kind else [("light", LOOKS["light"])]:
+                for name, look in LOOKS.items() if not (kind or asked.called) else [("light", LOOKS["light"])]:
                     page = entered(browser, address, **look)
                     time.sleep(1.0)
-                    page.screenshot(path=asked.to / f"label_{task}{f'_{kind}' if kind else ''}_{name}.png")
+                    page.screenshot(path=asked.to / f"label_{called}_{name}.png")
                     page.close()
     return {"pictures": sorted(str(file.name) for file in asked.to.glob("label_*.png"))}
 
@@ -243,6 +249,7 @@ def main() -> None:
     parser.add_argument("--kills", type=int, default=20)
     parser.add_argument("--keep", type=Path, help="paced: folder for the labels (default: one that is removed)")
     parser.add_argument("--to", type=Path, default=Path("docs/figures"), help="folder for pictures")
+    parser.add_argument("--called", default="", help="pictures: a word for their names, of a page with further options")
     parser.add_argument("--browser", default=shutil.which("chromium"), help="a Chromium")
     parser.add_argument("--out", type=Path, help="write the figures to this JSON file")
     asked = parser.parse_args()
