@@ -15,8 +15,11 @@ from cuelearner_jax.types import Reel, Sketch
 HAIR = 1 / 400  # of the sketch's width: a thin line
 TURNED_REACH = 1.25, 3.5  # how much farther arrows reach that are turned: the more the less they are,
 APART = 10.0  # by this over eps [deg], so that they can be told apart
+HEAD = 7.0  # length of an arrow's head [hairs]
 HALO = ' class="halo"', 3.8  # so that arrows stand out on any ground
-FAN, WIDEST = 6.0, 60.0  # turns are drawn larger than they are if eps would be less than this, but not above that [deg]
+TIPS = 8.0  # turns are drawn larger than they are where tips would be nearer than this [hairs],
+STEEPEST = 30.0  # but eps no larger than this [deg],
+WIDEST = 60.0  # and a refined action no farther away, unless it is [deg]
 LEAST_TURN = 1.0  # of the refined action from the one in question as they are drawn, to be shown [deg]
 
 
@@ -31,9 +34,19 @@ def turned(action: np.ndarray, by_deg: float) -> np.ndarray:
     return np.array([math.cos(angle), math.sin(angle)], np.float32)
 
 
-def magnified(eps_deg: float) -> int:
-    """How many times larger than they are turns are drawn: so that one by eps can be seen."""
-    return max(round(FAN / eps_deg), 1) if eps_deg < FAN / 2 else 1
+def magnified(item: Item, eps_deg: float) -> int:
+    """How many times larger than they are turns of an item's action are drawn: so that one by eps can be seen."""
+    assert item.sketch is not None
+    sketch, hair = item.sketch, item.sketch.box[2] * HAIR
+    far = _ends(sketch, angle_of(item.action), TURNED_REACH[1])[1]
+    seen = min(math.degrees(math.asin(min(TIPS * hair / far, 1.0))), STEEPEST)
+    return math.ceil(seen / eps_deg) if eps_deg < 0.75 * seen else 1
+
+
+def note(item: Item, form: AnswerForm, eps_deg: float) -> str:
+    """What a person has to know about the picture; empty: nothing."""
+    times = magnified(item, eps_deg) if form.by_eps else 1
+    return f"turns are drawn {times} times as large: {eps_deg:g}° as {times * eps_deg:g}°" if times > 1 else ""
 
 
 def picture(item: Item, form: AnswerForm, eps_deg: float) -> str:
@@ -44,7 +57,7 @@ def picture(item: Item, form: AnswerForm, eps_deg: float) -> str:
     for name, body in sketch.movers.items():
         place = f'class="mover" data-mover="{html.escape(name)}" transform="{_moved(sketch, name)}"'
         parts.append(f"<g {place}>{body}</g>")
-    times = magnified(eps_deg) if form.by_eps else 1
+    times = magnified(item, eps_deg) if form.by_eps else 1
     if form.by_eps:
         drawn = times * eps_deg
         longer = min(max(APART / drawn, TURNED_REACH[0]), TURNED_REACH[1])
@@ -58,8 +71,6 @@ def picture(item: Item, form: AnswerForm, eps_deg: float) -> str:
             parts.append(_arrow(sketch, angle + turn, "refined", 0.8))
     if form.is_action:
         parts.append(_arrow(sketch, angle, "pointer"))
-    if times > 1:
-        parts.append(_note(sketch, f"turns drawn {times} times as large: {eps_deg:g}° is seen as {times * eps_deg:g}°"))
     data = {
         "item": item.number,
         "foot": json.dumps(sketch.foot),
@@ -101,11 +112,17 @@ def _room(sketch: Sketch, angle: float) -> float:
     return min(across, down)
 
 
+def _ends(sketch: Sketch, angle: float, longer: float = 1.0) -> tuple[float, float]:
+    """Where an arrow begins and ends, from the foot: within what is shown, but never too short for its head [m]."""
+    hair, (first, last) = sketch.box[2] * HAIR, sketch.reach
+    last = first + (last - first) * longer
+    return first, max(min(last, _room(sketch, angle) - 2 * hair), first + HEAD * hair)
+
+
 def _arrow(sketch: Sketch, angle: float, name: str, longer: float = 1.0) -> str:
-    first, last = sketch.reach[0], sketch.reach[0] + (sketch.reach[1] - sketch.reach[0]) * longer
     hair = sketch.box[2] * HAIR
-    head, half = 7 * hair, 2.8 * hair
-    last = max(min(last, _room(sketch, angle) - 2 * hair), first + head)
+    head, half = HEAD * hair, 2.8 * hair
+    first, last = _ends(sketch, angle, longer)
     shaft = [_point(sketch, angle, first), _point(sketch, angle, last - 0.6 * head)]
     tip = [_point(sketch, angle, last), *(_point(sketch, angle, last - head, side) for side in (half, -half))]
     (x1, y1), (x2, y2) = shaft
@@ -114,12 +131,6 @@ def _arrow(sketch: Sketch, angle: float, name: str, longer: float = 1.0) -> str:
     halo, line = (f'<line{kind} {place} stroke-width="{width * hair:.5f}"/>' for kind, width in (HALO, ("", 2.2)))
     head_drawn = f'<polygon points="{corners}" stroke-width="{1.6 * hair:.5f}"/>'
     return f'<g class="arrow {name}">{halo}{line}{head_drawn}</g>'
-
-
-def _note(sketch: Sketch, words: str) -> str:
-    hair, (left, top, _, _) = sketch.box[2] * HAIR, sketch.box
-    place = f'x="{left + 4 * hair:.4f}" y="{top + 9 * hair:.4f}" font-size="{7 * hair:.5f}"'
-    return f'<text class="note" {place} stroke-width="{1.6 * hair:.5f}">{html.escape(words)}</text>'
 
 
 def _line(sketch: Sketch, angle: float) -> str:
