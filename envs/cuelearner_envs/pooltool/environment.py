@@ -45,11 +45,11 @@ class PooltoolBilliards(Billiards, kw_only=True):
             jax.ShapeDtypeStruct((), jnp.bool_),
         )
         call = partial(_played, self.outline, self.processes)
-        found = Shot(
-            *jax.pure_callback(call, shapes, balls.positions, balls.pocketed, angle, vmap_method="broadcast_all")
+        positions, *rest = jax.pure_callback(
+            call, shapes, balls.positions, balls.pocketed, angle, vmap_method="broadcast_all"
         )
-        places = jnp.where(found.pocketed[:, None], parking(self.table), found.positions)
-        return found.replace(positions=places.astype(jnp.float32))
+        places = jnp.where(rest[0][:, None], parking(self.table), positions)
+        return Shot(places.astype(jnp.float32), *rest)
 
 
 def _played(
@@ -74,23 +74,26 @@ def make_environment(config: BilliardsConfig) -> PooltoolBilliards:
     plain = make_billiards(config)
     if any(config.acceleration):
         raise UserError("pooltool's table is level: leave out --task.acceleration")
-    size: Table = getattr(Table, config.table)()
-    outline = Outline(
-        width=size.width,
-        height=size.height,
-        ball_radius=size.ball_radius,
-        hole_width=size.hole_width,
-        corner_gap=CORNER_GAP * size.hole_width,
-        cushion_radius=size.cushion_radius,
-        pocket_margin=size.pocket_margin,
-        side_pockets=size.side_pockets,
-        strike_speed=STRIKE_SPEED,
-    )
     return PooltoolBilliards(
         table=plain.table,
         action_turn=plain.action_turn,
         observation_bias=plain.observation_bias,
         max_shots=plain.max_shots,
         mirrors=plain.mirrors,
-        outline=outline,
+        outline=outline_of(getattr(Table, config.table)()),
+    )
+
+
+def outline_of(table: Table) -> Outline:
+    """A table's sizes, with the strike of here."""
+    return Outline(
+        width=float(table.width),
+        height=float(table.height),
+        ball_radius=float(table.ball_radius),
+        hole_width=float(table.hole_width),
+        corner_gap=CORNER_GAP * float(table.hole_width),
+        cushion_radius=float(table.cushion_radius),
+        pocket_margin=float(table.pocket_margin),
+        side_pockets=table.side_pockets,
+        strike_speed=STRIKE_SPEED,
     )

@@ -7,6 +7,9 @@ billiards", 2005), balls meet without friction. The constants are its own of a p
 cushions' height are scaled with our ball's radius.
 """
 
+# pyright: reportMissingImports=false
+# The package need not be there.
+
 from __future__ import annotations
 
 import math

@@ -5,6 +5,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import threading
 from concurrent.futures import ProcessPoolExecutor
 from functools import lru_cache
 
@@ -43,9 +44,17 @@ def _play(outline: Outline, positions: np.ndarray, pocketed: np.ndarray, angles:
 @lru_cache(maxsize=1)
 def _pool(count: int) -> ProcessPoolExecutor:
     """Processes that wait for shots until this one ends. They are begun anew: a copy of one with threads may hang."""
-    return ProcessPoolExecutor(count, multiprocessing.get_context("spawn"), _leave_interrupts)
+    return ProcessPoolExecutor(count, multiprocessing.get_context("spawn"), _attend)
 
 
-def _leave_interrupts() -> None:
-    """An interrupt is for the process that waits, which then ends these."""
+def _attend() -> None:
+    """An interrupt is for the process that waits, which then ends these; and none of them outlives it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    assert parent is not None  # it was begun by one
+    parent.join()
+    os._exit(1)
