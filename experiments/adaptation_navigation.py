@@ -1,4 +1,4 @@
-"""Finished navigation agents with a turned lidar, in rooms, and in a corridor where one side is preferred.
+"""Finished navigation agents with a turned lidar, in rooms, in a corridor with a preferred side, and on a quadruped.
 
     python experiments/adaptation_navigation.py --list
     python experiments/adaptation_navigation.py --bases RUN --out FOLDER [--pieces turned_lidar] [--resume]
@@ -18,7 +18,7 @@ from _adaptation import SMALL, UNCHANGED, Piece, Scale, Study, run
 from _pieces import option
 from navigation_bootstrapping import SCALES as TRAINING
 
-LIDAR, ROOMS = "turned_lidar", "rooms"
+LIDAR, ROOMS, QUADRUPED = "turned_lidar", "rooms", "anymal"
 LIDAR_BOUND_DEG, ROOMS_BOUNDS_DEG, SIDE_BOUND_DEG = 60.0, (60.0, 180.0), 60.0
 BUDGETS = (50, 100, 250, 500)
 TUNED, TUNING_BASES = (250,), 4
@@ -172,13 +172,33 @@ def sides() -> list[Piece]:
     return [*pieces, *compared("corridor_left", SIDE_BOUND_DEG, "passed_left", {"relative": RELATIVE})]
 
 
+def quadruped() -> list[Piece]:
+    """The kinematic robot's agents on the quadruped: in their own halls, in the corridor, and there with a wish.
+
+    Labels are asked while it walks; its physics takes most of the time.
+    """
+    pieces = []
+    for world, judge_by, serves, settings in (
+        (UNCHANGED, "success", "success on the quadruped", FRAME),
+        ("corridor_left", "passed_left", "the preferred side on the quadruped", SIDED),
+    ):
+        changed = {"robot": QUADRUPED, "serves": serves}
+        asked = {**changed, "bound_deg": SIDE_BOUND_DEG, "settings": settings}
+        pieces += [
+            Piece(world, "none", minutes=5, **changed),
+            Piece(world, "teacher", minutes=8, **asked),
+            Piece(world, "relative", labels=(100, 250, 500), judge_by=judge_by, minutes=25, **asked),
+        ]
+    return pieces
+
+
 UNADAPTED = [
     Piece(UNCHANGED, "none", minutes=2, serves="what is whole"),
     Piece(UNCHANGED, "none", split="tuning", minutes=2, serves="which agents are finished"),
 ]
 PIECES = tuple(
     sorted(
-        [*UNADAPTED, *lidar(), *rooms(), *sides()], key=lambda piece: piece.split == "tuning"
+        [*UNADAPTED, *lidar(), *rooms(), *sides(), *quadruped()], key=lambda piece: piece.split == "tuning"
     )  # those of tables first
 )
 
