@@ -36,9 +36,9 @@ from cuelearner_jax.tasks.billiards import SHIPPED_TEACHERS
 from cuelearner_jax.teachers import stored
 
 TABLE = "regulation"
-# Chosen on tuning racks. Labels are about the policy's own shots, which one pass turns by up to the strength of one label:
-# a few hundred of them teach in which situations it misses on which side, not where the perfect shot lies to a tenth of a
-# degree. Asked about refined shots, and refined in many small passes, the same model made the policy worse.
+# Chosen on tuning racks. Labels are about the policy's own shots, which one pass turns by up to the strength of a
+# label: some hundred of them teach on which side it misses in which situations, not where the perfect shot lies to a
+# tenth of a degree. Refined in small passes, and asked about refined shots, it gained less (see docs/adaptation.md).
 EPS_DEG = BOUND_DEG = 0.3
 SCALARS = Scalars(eps_deg=EPS_DEG, tau_deg=EPS_DEG / 20, k_max=1, refined_fraction=0.0)
 SIZES = GuideSizes(frame="action", feedback_layers=(128, 128), fit_steps=400, fit_batch_size=64)
@@ -60,7 +60,7 @@ class Scale(NamedTuple):
 
 
 SCALES = {
-    "smoke": Scale(2, 1, 2, (5, 10), (0,), 1, GuideSizes("action", (16,), fit_steps=20, fit_batch_size=5)),
+    "smoke": Scale(2, 1, 2, (10, 20), (0,), 1, GuideSizes("action", (16,), fit_steps=20, fit_batch_size=5)),
     "paper": Scale(200, 40, 10, (250, 500), (0, 1), 5, SIZES),
 }
 
@@ -147,7 +147,7 @@ def measured(base: Any, scale: Scale, processes: int, known: Sequence[Row]) -> I
 def mean(values: Any) -> str:
     """A mean over racks with its 95% bootstrap interval."""
     values = np.asarray(values, float)
-    if len(values) < 2 or np.ptp(values) == 0:
+    if len(values) < 2 or np.ptp(values) < 1e-9:
         return f"{values.mean():.3f}"
     found = scipy.stats.bootstrap((values,), np.mean, n_resamples=2_000, rng=np.random.default_rng(0))
     return f"{values.mean():.3f} [{found.confidence_interval.low:.3f}, {found.confidence_interval.high:.3f}]"
