@@ -155,7 +155,8 @@ class Bench(NamedTuple):
         """The base agents' scalars with labels of the scenario's strength, refined within the bound."""
         eps = None if self.piece.world == UNCHANGED else self.task.scenario(self.piece.world).eps_deg
         own = adapting.settling(self.config.scalars, self.piece.settings.get("scalars.eps_deg", eps))
-        own = dataclasses.replace(own, k_max=int(np.ceil(self.piece.bound_deg / own.eps_deg)) + 2)
+        reached = int(np.ceil(self.piece.bound_deg / own.eps_deg)) + 2  # passes of which each turns by eps
+        own = dataclasses.replace(own, k_max=max(own.k_max, reached))  # a model that is not sure turns by less
         return self.set("scalars.", own)
 
 
@@ -234,6 +235,7 @@ METHODS: dict[str, Callable[[Bench], Iterator[Row]]] = {
     "none": measured_as_they_are,
     "teacher": corrected,
     "relative": _kind("relative"),
+    "intent": _kind("intent"),
     "dcoach": _kind("dcoach"),
     "residual": by_residuals,
     "finetuning": fine_tuned,

@@ -114,7 +114,15 @@ def check_guide(sizes: GuideSizes, scalars: GuideScalars) -> None:
     """Raises UserError with one line for the first value of a guide's that cannot work."""
     check_whole(sizes, "sizes")
     check_whole(scalars, "scalars")
-    positive = ("labels_per_round", "fit_steps", "fit_batch_size", "validate_every", "ensemble", "candidates")
+    positive = (
+        "labels_per_round",
+        "fit_steps",
+        "fit_batch_size",
+        "validate_every",
+        "ensemble",
+        "candidates",
+        "question_every",
+    )
     _check_positive(sizes, (*positive, "guide_directions", "replay_steps"))
     if sizes.candidates > 1 and sizes.ensemble == 1:
         raise UserError(

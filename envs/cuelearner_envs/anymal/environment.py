@@ -21,6 +21,7 @@ from cuelearner_envs.navigation.config import make_environment as make_navigatio
 from cuelearner_envs.navigation.environment import Navigation, latest_first
 from cuelearner_envs.navigation.lidar import scan_tilted
 from cuelearner_jax.actions import difference, from_angle, rotate
+from cuelearner_jax.errors import UserError
 
 Scalar = float | Float[Array, ""]
 SENSOR_NOISE = 0.02  # standard deviation of a scanner's own error [m]
@@ -157,6 +158,8 @@ def make_environment(
 
     It walks by a policy (default: the shipped one).
     """
+    if config.memory:
+        raise UserError("task.memory is of the simple robot: leave it out, or choose --robot simple")
     plain = make_navigation(config, split)
     noise = jnp.hypot(plain.lidar.noise, SENSOR_NOISE)
     return LeggedNavigation(
