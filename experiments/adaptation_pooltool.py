@@ -39,7 +39,7 @@ from cuelearner_jax.teachers import stored
 TABLE = "regulation"
 # Chosen on tuning racks. Labels are about the policy's own shots, which one pass turns by up to the strength of a
 # label: some hundred of them teach on which side it misses in which situations, not where the perfect shot lies to a
-# tenth of a degree. Refined in small passes, and asked about refined shots, it gained less (see docs/adaptation.md).
+# tenth of a degree. Refined in small passes, and asked about refined shots, it gained less.
 EPS_DEG = BOUND_DEG = 0.3
 SCALARS = Scalars(eps_deg=EPS_DEG, tau_deg=EPS_DEG / 20, k_max=1, refined_fraction=0.0)
 SIZES = GuideSizes(frame="action", feedback_layers=(128, 128), fit_steps=400, fit_batch_size=64)
