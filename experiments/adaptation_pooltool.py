@@ -218,7 +218,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         came, begun = provenance(), time.monotonic()
         for row in measured(base, SCALES[given.scale], given.processes, rows):
             took, begun = time.monotonic() - begun, time.monotonic()
-            rows.append({**row, "rewards": np.round(row["rewards"], 4).tolist(), "seconds": round(took)})
+            row |= {"rewards": np.round(row["rewards"], 4).tolist(), "seconds": round(took), "commit": came["commit"]}
+            rows.append(row)
             given.out.mkdir(parents=True, exist_ok=True)
             file.write_text(
                 json.dumps({**about, **came, "bound_deg": BOUND_DEG, "eps_deg": EPS_DEG, "rows": rows}) + "\n"
