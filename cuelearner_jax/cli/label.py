@@ -144,6 +144,8 @@ def planned(
         config.schedule,
     )
     configuration.check_guide(merged.sizes, merged.scalars)
+    if merged.sizes.sees_turn:
+        raise UserError("the page's own model does not see turns: leave out --sizes.sees-turn, and give it to `adapt`")
     if not 1 <= asked.labels <= MOST_LABELS:
         raise UserError(f"--labels is {asked.labels}: give a number from 1 to {MOST_LABELS:,}")
     if not 0 <= asked.seed < LARGEST_SEED:

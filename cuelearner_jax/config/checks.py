@@ -22,6 +22,8 @@ def check(config: RunConfig) -> None:
     check_whole(schedule, "schedule")
     _check_sizes(sizes)
     check_guide(sizes, config.scalars)
+    if sizes.sees_turn:
+        raise UserError("sizes.sees_turn is for adaptation, whose base policy is no random one: leave it out")
     if config.scalars.pace_window < 1:
         raise UserError(f"scalars.pace_window is {config.scalars.pace_window}: give at least 1 episode")
     if config.scalars.pace_floor > 0.5:

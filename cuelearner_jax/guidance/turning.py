@@ -62,7 +62,7 @@ def turned(
 def _hats(turns: Float[Array, " n"], reach: Float[Array, ""]) -> Float[Array, "n knots"]:
     """The weight of each knot at each turn: they add up to 1."""
     place = (jnp.clip(turns / reach, -1, 1) + 1) * (KNOTS - 1) / 2
-    return jnp.maximum(0.0, 1.0 - jnp.abs(place[:, None] - jnp.arange(KNOTS)))
+    return jnp.maximum(0.0, 1.0 - jnp.abs(place[:, None] - jnp.arange(KNOTS)[None]))
 
 
 def height(part: Part, turns: Float[Array, " n"]) -> Float[Array, " n"]:
