@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from cuelearner_jax.adaptation.adapting import check_angles
 from cuelearner_jax.config import GuideSizes, RunConfig, Schedule, Sizes, check, check_guide
 from cuelearner_jax.guidance.answers import check_teacher
 from cuelearner_jax.records import table as tables
@@ -223,3 +224,30 @@ def test_the_guide_to_billiards_says_what_was_measured_of_its_teachers():
         shares = [100 * row[who]["of_the_best"] for row in rows]
         cells = [f"{share:.1f}%" if share > 99 else f"{share:.0f}%" for share in shares]
         assert f"| {name} | {' | '.join(cells)} |" in told
+
+
+@pytest.fixture(scope="module")
+def pooltool(modules):
+    return importlib.import_module("adaptation_pooltool")
+
+
+def test_the_study_on_pooltools_table_has_settings_that_can_be(pooltool):
+    assert check_angles([pooltool.BOUND_DEG], pooltool.SCALARS) == ""
+    for scale in pooltool.SCALES.values():
+        check_guide(scale.sizes, pooltool.SCALARS)
+        assert list(scale.labels) == sorted(scale.labels)
+        assert all(budget % scale.sizes.labels_per_round == 0 for budget in scale.labels)
+
+
+def test_the_table_of_pooltool_compares_rack_by_rack(pooltool):
+    """On the first rack both seeds gain 0.2, on the second 0.1 and 0.3."""
+    before = {"what": "not adapted", "seed": 0, "labels": 0, "rewards": [0.2, 0.4]}
+    adapted = [
+        {"what": "adapted", "seed": 0, "labels": 500, "rewards": [0.4, 0.5]},
+        {"what": "adapted", "seed": 1, "labels": 500, "rewards": [0.4, 0.7]},
+    ]
+    teacher = {"what": "teacher", "seed": 0, "labels": 0, "rewards": [0.5]}  # played on the first rack alone
+    lines = pooltool.table([before, teacher, *adapted]).splitlines()
+    assert lines[2].startswith("| not adapted |  | 0.300")
+    assert lines[3] == "| teacher |  | 0.500 | 0.300 |"
+    assert lines[4] == "| adapted | 500 | 0.500 [0.400, 0.600] | 0.200 |"

@@ -7,9 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import cuelearner_jax as cl
 from cuelearner_envs.billiards.config import BilliardsConfig
 from cuelearner_envs.billiards.config import make_environment as make_billiards
 from cuelearner_envs.billiards.environment import Balls
+from cuelearner_envs.billiards.teacher import NearbyTeacher
 from cuelearner_envs.pooltool import environment as foreign
 from cuelearner_envs.pooltool.processes import play_many
 from cuelearner_jax.errors import UserError
@@ -51,6 +53,16 @@ def test_to_agents_it_is_the_same_table(monkeypatch):
     reset = jax.jit(lambda env: env.reset(jax.random.key(3)))
     for one, other in zip(jax.tree.leaves(reset(theirs)), jax.tree.leaves(reset(ours)), strict=True):
         np.testing.assert_array_equal(one, other)
+
+
+def test_its_teacher_plays_shots_there_whatever_the_learned_one_thinks(monkeypatch):
+    monkeypatch.setattr(foreign, "find_spec", lambda name: object())
+    world = cl.make("billiards", robot="pooltool", teacher="learned")
+    teacher = cl.teacher_of(world)
+    assert isinstance(teacher, NearbyTeacher)
+    assert isinstance(teacher.env, foreign.PooltoolBilliards)
+    with pytest.raises(UserError, match="unknown robot 'pooltol', did you mean 'pooltool'"):
+        cl.make("billiards", robot="pooltol")
 
 
 @needs_pooltool
