@@ -8,6 +8,8 @@
     python benchmarks/labelling_page.py pictures --task billiards --preset quickstart --called small \\
         --more="--task.table regulation --scalars.eps-deg 0.1"
     python benchmarks/labelling_page.py pictures --task examples.reach:TASK --preset quickstart
+    python benchmarks/labelling_page.py pictures --task navigation --preset quickstart --called anymal \\
+        --more="--robot anymal --task.worlds 16"
 
 `paced`: a script that sees only the page turns navigation's arrow onto the shortest way past what is drawn, but 10% of
 its keys are "don't know" and 10% of the others one of the two wrong ones; in billiards it presses at random. Measured

@@ -1,6 +1,7 @@
 """`cuelearner label` and `cuelearner labels`: the real command, what it refuses, and what takes its files."""
 
 import csv
+import dataclasses
 import signal
 import urllib.error
 import urllib.request
@@ -10,12 +11,14 @@ import probes
 import pytest
 from sessions import OWN, expert, plan, served
 
-from cuelearner_jax.cli import main
+from cuelearner_jax.cli import label, main
 from cuelearner_jax.labelling.plan import Base
 from cuelearner_jax.labelling.session import Session
 from cuelearner_jax.policies import Uniform
 from cuelearner_jax.records import label_files
 from cuelearner_jax.records.folders import claimed
+from cuelearner_jax.task import shape_of
+from cuelearner_jax.tasks import registry as tasks
 
 
 @pytest.fixture(scope="module")
@@ -141,3 +144,12 @@ def test_a_page_that_is_kept_is_not_opened_twice(labelled, refused):
 
 def test_a_base_is_told_apart_by_its_parameters():
     assert Base(Uniform(), "uniform").digest == ""
+
+
+def test_the_file_names_another_robot_and_that_one_has_a_page():
+    task = tasks.find("navigation")
+    assert [label._robot(task, name) for name in (None, "simple", "anymal")] == ["", "", "anymal"]
+    env = shape_of(plan().task, plan().config.task)
+    assert "robot" not in plan().session(env)
+    assert dataclasses.replace(plan(), robot="anymal").session(env)["robot"] == "anymal"
+    assert task.on("anymal").pictures().sketch is task.pictures().sketch
