@@ -49,10 +49,13 @@ class Agent(struct.PyTreeNode):
     sizes: AgentSizes = struct.field(pytree_node=False)
     actions: Actions = struct.field(pytree_node=False, default=DIRECTIONS)
     env: Any = None  # says how an observation looks from an action; nobody asks it in the raw frame
+    # Entries of an observation that it was trained with, where a changed world adds some at the end; None: all.
+    sees: int | None = struct.field(pytree_node=False, default=None)
 
     def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
         """The action with the largest value."""
-        return greedy_actions(self.sizes, self.actions, self.env, self.params, obs)
+        seen = obs if self.sees is None else obs[:, : self.sees]
+        return greedy_actions(self.sizes, self.actions, self.env, self.params, seen)
 
     @property
     def axes(self) -> Agent:

@@ -16,6 +16,7 @@ NAMES = {
     "none": "not adapted",
     "teacher": "the teacher itself, within the bound",
     "relative": "relative labels",
+    "intent": "relative labels, read as intent",
     "residual": "residual, optimal corrections",
     "dcoach": "deep COACH",
     "finetuning": "RL fine-tuning",

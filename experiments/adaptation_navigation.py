@@ -1,4 +1,4 @@
-"""Finished navigation agents with a turned lidar, in rooms, and in a corridor where one side is preferred.
+"""Finished navigation agents with a turned lidar, in rooms, in a corridor with a preferred side, and on a quadruped.
 
     python experiments/adaptation_navigation.py --list
     python experiments/adaptation_navigation.py --bases RUN --out FOLDER [--pieces turned_lidar] [--resume]
@@ -18,12 +18,13 @@ from _adaptation import SMALL, UNCHANGED, Piece, Scale, Study, run
 from _pieces import option
 from navigation_bootstrapping import SCALES as TRAINING
 
-LIDAR, ROOMS = "turned_lidar", "rooms"
+LIDAR, ROOMS, QUADRUPED = "turned_lidar", "rooms", "anymal"
 LIDAR_BOUND_DEG, ROOMS_BOUNDS_DEG, SIDE_BOUND_DEG = 60.0, (60.0, 180.0), 60.0
 BUDGETS = (50, 100, 250, 500)
 TUNED, TUNING_BASES = (250,), 4
 
 FRAME: Mapping[str, Any] = {"sizes.frame": "action"}
+TURN: Mapping[str, Any] = {**FRAME, "sizes.sees_turn": True}
 ROOMY: Mapping[str, Any] = {**FRAME, "scalars.eps_deg": 20.0}  # in rooms small turns lead nowhere
 SIDED: Mapping[str, Any] = {**FRAME, "scalars.eps_deg": 20.0}
 LEARNING: Mapping[str, Any] = {"sizes.num_envs": 10, "sizes.replay_capacity": 50_000}
@@ -37,10 +38,19 @@ RELATIVE: dict[str, Mapping[str, Any]] = {
     "eps-5": {**FRAME, "scalars.eps_deg": 5.0},
     "eps-10": {**FRAME, "scalars.eps_deg": 10.0},
     "eps-20": {**FRAME, "scalars.eps_deg": 20.0},
+    "turn": TURN,
+    "turn-5": {**TURN, "scalars.eps_deg": 5.0},
+    "turn-10": {**TURN, "scalars.eps_deg": 10.0},
+    "turn-20": {**TURN, "scalars.eps_deg": 20.0},
+    "turn-raw": {**TURN, "sizes.frame": "raw", "scalars.eps_deg": 10.0},
+    "turn-slow": {**TURN, "scalars.eps_deg": 10.0, "scalars.feedback_learning_rate": 3e-4},
+    "turn-small": {**TURN, "scalars.eps_deg": 10.0, "sizes.feedback_layers": (64, 64)},
+    "turn-members": {**TURN, "scalars.eps_deg": 10.0, "sizes.ensemble": 5},
 }
 OTHERS: dict[str, dict[str, Mapping[str, Any]]] = {
     "residual": {
         "three-times": FRAME,
+        "turn": TURN,
         "once": {**FRAME, "scalars.k_max": 1, "scalars.refined_fraction": 0.0},
         "raw": {"sizes.frame": "raw"},
     },
@@ -50,6 +60,32 @@ OTHERS: dict[str, dict[str, Mapping[str, Any]]] = {
         "slow": {**FRAME, "scalars.eps_deg": 20.0, "scalars.feedback_learning_rate": 3e-4},
     },
 }
+# In rooms: what helps, each by itself and together. A round is 50 questions, so that a thousand are 20 fits.
+EACH: Mapping[str, Any] = {**FRAME, "scalars.eps_deg": 20.0, "sizes.labels_per_round": 50}
+SPACED, MEMORY = {"sizes.question_every": 10}, {"task.memory": True}
+# The likeliest way is always gone: in doubt the base would act, which walks into walls.
+SURE: Mapping[str, Any] = {**EACH, **SPACED, "scalars.aim_doubt": 1000.0, "sizes.aim_layers": (64, 64)}
+MEMBERS, ACTIVE = {"sizes.ensemble": 5}, {"sizes.ensemble": 5, "sizes.candidates": 16, "sizes.question_every": 1}
+IN_ROOMS: dict[str, dict[str, Mapping[str, Any]]] = {
+    "intent": {
+        "members-memory": {**SURE, **MEMBERS, **MEMORY},
+        "members": {**SURE, **MEMBERS},
+        "active-memory": {**SURE, **ACTIVE, **MEMORY},
+        "memory": {**SURE, **MEMORY},
+        "doubting": {**SURE, **MEMBERS, **MEMORY, "scalars.aim_doubt": 2.0},
+        "small": {**SURE, **MEMBERS, **MEMORY, "sizes.aim_layers": (32, 32)},
+        "close": {**SURE, **MEMBERS, **MEMORY, "sizes.question_every": 1},
+        "eps-10": {**SURE, **MEMBERS, **MEMORY, "scalars.eps_deg": 10.0},
+        "eps-40": {**SURE, **MEMBERS, **MEMORY, "scalars.eps_deg": 40.0},
+    },
+    "relative": {
+        "close": EACH,
+        "spaced": {**EACH, **SPACED},
+        "spaced-members": {**EACH, **SPACED, **MEMBERS},
+        "spaced-memory": {**EACH, **SPACED, **MEMORY},
+    },
+}
+BEST_IN_ROOMS = IN_ROOMS["intent"]["members-memory"]
 SWEPT_RATES, SWEPT_NOISES_DEG = (0.0001, 0.001, 0.01), (0.0, 5.0, 20.0)
 
 
@@ -101,7 +137,11 @@ def lidar() -> list[Piece]:
 
 
 def rooms() -> list[Piece]:
-    """The table of the rooms: unadapted, and learned and by the road map within either bound."""
+    """The table of the rooms: unadapted, and learned and by the road map within either bound.
+
+    The paper's labels, refined in the action frame; then read as intent among the ways that the lidar sees, asked in
+    situations farther apart, with and without a memory of the way tried.
+    """
     pieces = [Piece(ROOMS, "none", minutes=2, serves="success in rooms")]
     for bound in ROOMS_BOUNDS_DEG:
         asked = {"variant": f"{bound:g}", "bound_deg": bound, "serves": "success in rooms"}
@@ -109,7 +149,13 @@ def rooms() -> list[Piece]:
         pieces.append(
             Piece(ROOMS, "relative", labels=(250, 500, 1_000), settings=ROOMY, judge_by="success", minutes=20, **asked)
         )
-    return [*pieces, *compared(ROOMS, 180.0, "success", {"relative": RELATIVE})]
+        asked["variant"], settings = f"{bound:g}-memory", BEST_IN_ROOMS
+        pieces.append(
+            Piece(ROOMS, "intent", labels=(250, 500, 1_000), settings=settings, judge_by="success", minutes=15, **asked)
+        )
+    tried = compared(ROOMS, 180.0, "success", {"relative": RELATIVE})
+    ablation = compared(ROOMS, 180.0, "success", IN_ROOMS)
+    return [*pieces, *tried, *(piece._replace(labels=(250, 1_000)) for piece in ablation)]
 
 
 def sides() -> list[Piece]:
@@ -126,10 +172,33 @@ def sides() -> list[Piece]:
     return [*pieces, *compared("corridor_left", SIDE_BOUND_DEG, "passed_left", {"relative": RELATIVE})]
 
 
-UNADAPTED = Piece(UNCHANGED, "none", minutes=2, serves="what is whole")
+def quadruped() -> list[Piece]:
+    """The kinematic robot's agents on the quadruped: in their own halls, in the corridor, and there with a wish.
+
+    Labels are asked while it walks; its physics takes most of the time.
+    """
+    pieces = []
+    for world, judge_by, serves, settings in (
+        (UNCHANGED, "success", "success on the quadruped", FRAME),
+        ("corridor_left", "passed_left", "the preferred side on the quadruped", SIDED),
+    ):
+        changed = {"robot": QUADRUPED, "serves": serves}
+        asked = {**changed, "bound_deg": SIDE_BOUND_DEG, "settings": settings}
+        pieces += [
+            Piece(world, "none", minutes=5, **changed),
+            Piece(world, "teacher", minutes=8, **asked),
+            Piece(world, "relative", labels=(100, 250, 500), judge_by=judge_by, minutes=25, **asked),
+        ]
+    return pieces
+
+
+UNADAPTED = [
+    Piece(UNCHANGED, "none", minutes=2, serves="what is whole"),
+    Piece(UNCHANGED, "none", split="tuning", minutes=2, serves="which agents are finished"),
+]
 PIECES = tuple(
     sorted(
-        [UNADAPTED, *lidar(), *rooms(), *sides()], key=lambda piece: piece.split == "tuning"
+        [*UNADAPTED, *lidar(), *rooms(), *sides(), *quadruped()], key=lambda piece: piece.split == "tuning"
     )  # those of tables first
 )
 
@@ -156,7 +225,7 @@ SCALES = {
         envs=200,
         steps=0,
         bases=4,
-        labels={100: 100, 250: 250, 500: 500},
+        labels={100: 100, 250: 250, 500: 500, 1_000: 1_000},
         tuned_steps=(10_000, 2_500),
     ),
     "paper": Scale("what is reported", envs=2_000, steps=0),

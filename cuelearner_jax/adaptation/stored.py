@@ -4,7 +4,7 @@ A policy is told as nested JSON values, each with the name of what acts under `p
 
 | policy      | other values                                                                     | arrays             |
 |-------------|----------------------------------------------------------------------------------|--------------------|
-| `agent`     | `sizes`                                                                          | `params`           |
+| `agent`     | `sizes`, and `sees` where that is not the whole observation                      | `params`           |
 | `heuristic` |                                                                                  |                    |
 | `uniform`   |                                                                                  |                    |
 | `guided`    | `guidance` (its kind), `sizes`, `scalars`, `bounded`, and `base`: another policy | `model`, `bound`   |
@@ -47,7 +47,8 @@ def told(policy: Any, named: str | None = None) -> Told:
     if isinstance(policy, Common):
         return told(policy.policy, named)
     if isinstance(policy, Agent):
-        return {"policy": "agent", "sizes": _part(AgentSizes, policy.sizes)}
+        sees = {} if policy.sees is None else {"sees": policy.sees}
+        return {"policy": "agent", "sizes": _part(AgentSizes, policy.sizes), **sees}
     if isinstance(policy, UniformPolicy):
         return {"policy": "uniform"}
     if isinstance(policy, Heuristic):
@@ -100,7 +101,8 @@ def shapes_of(values: Told, env: Any, rows: int | None = None) -> Any:
     def one(values: Told) -> Any:
         if values["policy"] == "agent":
             sizes = configuration.from_json(AgentSizes, values["sizes"])
-            seen = [jnp.zeros(width) for width in view.widths(sizes.frame, spaces)]
+            own = spaces if values.get("sees") is None else spaces_of(env, values["sees"])
+            seen = [jnp.zeros(width) for width in view.widths(sizes.frame, own)]
             return {"params": q_network(sizes.q_layers).init(jax.random.key(0), *seen)}
         if values["policy"] == "guided":
             bound = {"bound": jnp.zeros(())} if values["bounded"] else {}
@@ -128,7 +130,7 @@ def made(values: Told, arrays: Any, env: Any, code: Any = None) -> Any:
     kind = values["policy"]
     if kind == "agent":
         sizes = configuration.from_json(AgentSizes, values["sizes"])
-        return Agent(arrays["params"], sizes, actions_of(env), env)
+        return Agent(arrays["params"], sizes, actions_of(env), env, values.get("sees"))
     if kind == "uniform":
         return uniform_in(env)
     if kind == "heuristic":

@@ -22,6 +22,8 @@ def check(config: RunConfig) -> None:
     check_whole(schedule, "schedule")
     _check_sizes(sizes)
     check_guide(sizes, config.scalars)
+    if sizes.sees_turn:
+        raise UserError("sizes.sees_turn is for adaptation, whose base policy is no random one: leave it out")
     if config.scalars.pace_window < 1:
         raise UserError(f"scalars.pace_window is {config.scalars.pace_window}: give at least 1 episode")
     if config.scalars.pace_floor > 0.5:
@@ -114,7 +116,15 @@ def check_guide(sizes: GuideSizes, scalars: GuideScalars) -> None:
     """Raises UserError with one line for the first value of a guide's that cannot work."""
     check_whole(sizes, "sizes")
     check_whole(scalars, "scalars")
-    positive = ("labels_per_round", "fit_steps", "fit_batch_size", "validate_every", "ensemble", "candidates")
+    positive = (
+        "labels_per_round",
+        "fit_steps",
+        "fit_batch_size",
+        "validate_every",
+        "ensemble",
+        "candidates",
+        "question_every",
+    )
     _check_positive(sizes, (*positive, "guide_directions", "replay_steps"))
     if sizes.candidates > 1 and sizes.ensemble == 1:
         raise UserError(

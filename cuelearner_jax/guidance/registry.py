@@ -84,6 +84,8 @@ def made_for(kind: Kind, sizes: GuideSizes, spaces: Spaces) -> Guidance:
     made = kind.make(sizes, spaces)
     if made.form != kind.form or made.name != kind.name:
         raise ValueError(f"guidance {kind.name!r} was made with another name or form of answers than its kind has")
+    if sizes.sees_turn and made.onward is None:
+        raise UserError(f"guidance {kind.name!r} does not see how far actions were turned: leave out --sizes.sees-turn")
     if made.asks and made.disagreement is None and sizes.ensemble > 1:
         raise UserError(
             f"guidance {kind.name!r} has one model, no ensemble of them: leave out --sizes.ensemble and "

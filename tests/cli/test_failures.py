@@ -18,7 +18,6 @@ ARGUMENTS = [
     ([*QUICK, "--task.table", "snooker"], "'one_ball', 'easy', 'regulation'"),
     ([*QUICK, "--guidance", "relativ"], "unknown guidance 'relativ', did you mean 'relative'"),
     ([*QUICK, "--guidance", "none", "none"], "give each kind once"),
-    (["train", "navigation", "--guidance", "intent"], "'intent' needs an environment with `aims`"),
     ([*QUICK, "--labels", "0"], "teaches nothing"),
     ([*QUICK, "--labels", "10", "10"], "give each budget once"),
     ([*QUICK, "--seeds", "0"], "give --seeds"),

@@ -10,6 +10,7 @@ import probes
 import pytest
 
 from cuelearner_jax import actions
+from cuelearner_jax.errors import UserError
 from cuelearner_jax.guidance import intent, registry
 from cuelearner_jax.guidance.answers import RELATIVE
 from cuelearner_jax.types import Label
@@ -41,6 +42,11 @@ def told(sizes):
     labels = Label(obs, asked, answers, jnp.ones(40, bool))
     former = bundle.init(jax.random.key(0))
     return bundle, jax.jit(bundle.fit)(jax.random.key(1), ENV, labels, former, probes.SCALARS)
+
+
+def test_who_reads_intent_needs_aims():
+    with pytest.raises(UserError, match="needs an environment with `aims`"):
+        registry.make("intent", SIZES, probes.Window())
 
 
 @pytest.fixture(scope="module")

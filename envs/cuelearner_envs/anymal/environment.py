@@ -21,6 +21,7 @@ from cuelearner_envs.navigation.config import make_environment as make_navigatio
 from cuelearner_envs.navigation.environment import Navigation, latest_first
 from cuelearner_envs.navigation.lidar import scan_tilted
 from cuelearner_jax.actions import difference, from_angle, rotate
+from cuelearner_jax.errors import UserError
 
 Scalar = float | Float[Array, ""]
 SENSOR_NOISE = 0.02  # standard deviation of a scanner's own error [m]
@@ -43,6 +44,7 @@ class LeggedWalker(struct.PyTreeNode):
     route: Int[Array, ""]  # of that world
     steps: Int[Array, ""]  # taken in this episode
     fallen: Bool[Array, ""]
+    passed: Float[Array, "2"] | None = None  # as of `navigation.environment.Walker`
 
     @property
     def pose(self) -> Float[Array, "3"]:
@@ -156,6 +158,8 @@ def make_environment(
 
     It walks by a policy (default: the shipped one).
     """
+    if config.memory:
+        raise UserError("task.memory is of the simple robot: leave it out, or choose --robot simple")
     plain = make_navigation(config, split)
     noise = jnp.hypot(plain.lidar.noise, SENSOR_NOISE)
     return LeggedNavigation(
@@ -166,5 +170,6 @@ def make_environment(
         period=plain.period,
         goal_radius=plain.goal_radius,
         mirrors=plain.mirrors,
+        sides=plain.sides,
         walking=walking_policy.load() if walking is None else walking,
     )

@@ -49,6 +49,9 @@ class NavigationConfig:
     """Changed world: probability that a beam reads the full range."""
     mirrors: bool = False
     """Multiply transitions by their mirror images, whatever the guidance; labels stay as they were given."""
+    memory: bool = False
+    """Does the robot remember where it has been? 72 numbers of it then end the observation; policies that were trained
+    without them see the rest."""
     preferred_side: Literal["none", "left", "right"] = "none"
     """Changed wish, in a corridor: the teacher passes every obstacle on this side."""
 
@@ -87,4 +90,5 @@ def make_environment(config: NavigationConfig, split: str = "training") -> Navig
         goal_radius=jnp.float32(config.goal_radius),
         mirrors=config.mirrors,
         sides=config.style == "corridor",
+        memory=config.memory,
     )

@@ -12,18 +12,22 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray
 
+from cuelearner_envs.navigation import memory as way_tried
+from cuelearner_envs.navigation.aims import aims_of
 from cuelearner_envs.navigation.lidar import BEAMS, Lidar
 from cuelearner_envs.navigation.robot import Motion, Robot, collides, walk
 from cuelearner_envs.navigation.sides import heading, passed
 from cuelearner_envs.navigation.world import World
 from cuelearner_envs.navigation.worlds import FARTHEST
 from cuelearner_jax.actions import inward, retract, rotate, to_angle
-from cuelearner_jax.environment import Described, Features, Quantity
+from cuelearner_jax.environment import Aims, Described, Features, Quantity
 from cuelearner_jax.types import Step
 
 REMEMBERED = 3  # actions in the observation
+PLAIN = BEAMS + 3 + 2 * REMEMBERED  # entries of an observation without a memory
 RING = 360  # directions all round in which `features` gives how near things are: as far apart as beams are
 UNSEEN = -1.0  # what it gives where the lidar does not look; nearness is from 0 to 1
+WAY_TRIED = Quantity("way so far", way_tried.SEEN, "1", "how much of it lies 1 m and 2.5 m off in 36 directions")
 Scalar = float | Float[Array, ""]
 
 
@@ -38,13 +42,15 @@ class Walker(struct.PyTreeNode):
     route: Int[Array, ""]  # of that world
     steps: Int[Array, ""]  # taken in this episode
     passed: Float[Array, "2"] | None = None  # obstacles on the left and on the right in this episode, where they count
+    trail: Float[Array, "places 2"] | None = None  # the way so far, where it is remembered (`memory.longer`) [m]
+    tried: Float[Array, " seen"] | None = None  # what is remembered of it (`memory.around`)
 
 
 AnyWalker = Any  # a `Walker`, or what another body has in its place: pose, goal, previous, world, route and steps
 
 
 class Navigation(Described, struct.PyTreeNode):
-    """The environment (`cuelearner_jax.environment.Environment`). Everything but the last two fields is traced."""
+    """The environment (`cuelearner_jax.environment.Environment`). Everything but the last three fields is traced."""
 
     worlds: World  # leading axis: worlds
     robot: Robot = Robot()
@@ -54,14 +60,20 @@ class Navigation(Described, struct.PyTreeNode):
     goal_radius: Scalar = 0.5  # nearer than this, the goal is reached [m]
     mirrors: bool = struct.field(pytree_node=False, default=False)  # offer the mirror image as data?
     sides: bool = struct.field(pytree_node=False, default=False)  # say on which side obstacles were passed?
+    memory: bool = struct.field(pytree_node=False, default=False)  # does the robot remember where it has been?
 
-    observation = (
+    perceived = (
         Quantity("lidar", BEAMS, "1", "exp(-distance / 1 m) of each beam, from -135 to +135 degrees, counterclockwise"),
         Quantity("goal: direction", 2, "1", "unit vector in the body's frame"),
         Quantity("goal: distance", 1, f"{FARTHEST:g} m"),
         Quantity("previous actions", 2 * REMEMBERED, "1", "unit vectors, the latest first; zeros before the first"),
     )
     action = Quantity("direction", 2, "1", "unit vector in the body's frame, x ahead, y to the left; walked for a step")
+
+    @property
+    def observation(self) -> tuple[Quantity, ...]:
+        """What the entries of an observation mean; those of the memory, if there is one, come last."""
+        return (*self.perceived, WAY_TRIED) if self.memory else self.perceived
 
     @property
     def symmetries(self) -> int:
@@ -110,7 +122,10 @@ class Navigation(Described, struct.PyTreeNode):
         return {**outcome, "duration": after.steps * jnp.asarray(self.period)}, terminated, truncated
 
     def counted(self, before: AnyWalker, after: AnyWalker) -> AnyWalker:
-        """The state after a step with the obstacles that it passed, where these count."""
+        """The state after a step with the obstacles that it passed, where these count, and the way remembered."""
+        if self.memory:
+            trail = way_tried.longer(before.trail, before.steps, before.pose[:2])
+            after = after.replace(trail=trail, tried=way_tried.around(trail, after.pose))
         if not self.sides:
             return after
         world, ahead = self.world(before.world), heading(self.worlds.starts[before.world, before.route], before.goal)
@@ -144,20 +159,21 @@ class Navigation(Described, struct.PyTreeNode):
         """What ends an episode in failure, by name; at most one holds."""
         return {"collision": self.collided(state)}
 
-    def place(self, state: AnyWalker) -> Float[Array, "3"]:
-        """Where the sensor is, with the body: what replay keeps of it."""
-        return state.pose
+    def place(self, state: AnyWalker) -> Float[Array, " place"]:
+        """Where the sensor is, with the body, and what is remembered of the way: what replay keeps of it."""
+        return jnp.concatenate([state.pose, state.tried]) if self.memory else state.pose
 
     def placed(
         self,
-        place: Float[Array, "3"],
+        place: Float[Array, " place"],
         goal: Float[Array, "2"],
         previous: Float[Array, "3 2"],
         world: Int[Array, ""],
         route: Int[Array, ""],
     ) -> AnyWalker:
         """A state at rest at a place."""
-        return Walker(place, jnp.zeros(2), goal, previous, world, route, jnp.zeros((), jnp.int32))
+        state = Walker(place[:3], jnp.zeros(2), goal, previous, world, route, jnp.zeros((), jnp.int32))
+        return state.replace(trail=way_tried.nothing(), tried=place[3:]) if self.memory else state
 
     def collided(self, state: AnyWalker) -> Bool[Array, ""]:
         """Does the body touch anything?"""
@@ -173,6 +189,7 @@ class Navigation(Described, struct.PyTreeNode):
         - 271 entries: how near the lidar's beams end, from right behind to left behind, exp(-distance / 1 m) of
         - 2: direction to the goal in the body's frame; 1: distance to the goal over 15 m
         - 6: the last three actions, the latest first
+        - with a memory 72: how much of the way so far lies in each direction (`memory.around`)
         """
         offset = rotate(state.goal - state.pose[:2], -state.pose[2])
         distance = jnp.linalg.norm(offset)
@@ -182,6 +199,7 @@ class Navigation(Described, struct.PyTreeNode):
                 retract(offset),
                 distance[None] / FARTHEST,
                 state.previous.ravel(),
+                *([state.tried] if self.memory else []),
             ]
         )
 
@@ -195,7 +213,8 @@ class Navigation(Described, struct.PyTreeNode):
         - own, 1: the distance to the goal
         - turned, 370: nearness all round in steps of one degree, from behind by way of the right, the direction itself
           in the middle (of the two nearest beams, by how near they are); `UNSEEN` where the lidar does not look; goal
-          and previous actions along and across the direction; the direction in the body's frame
+          and previous actions along and across the direction; the direction in the body's frame; of an observation
+          with a memory 72 more, that as it looks from the direction
         """
         count = actions.shape[:-1]
         ring = jnp.concatenate([obs[:BEAMS], jnp.full(RING - BEAMS, UNSEEN)])  # from -135 degrees on, counterclockwise
@@ -207,19 +226,31 @@ class Navigation(Described, struct.PyTreeNode):
         slices = jax.vmap(lambda number: jax.lax.dynamic_slice(twice, (number,), (RING + 1,)))(numbers.ravel())
         slices = slices.reshape(*count, RING + 1)
         around = slices[..., :-1] + near * (slices[..., 1:] - slices[..., :-1])
-        vectors = jnp.concatenate([obs[BEAMS : BEAMS + 2], obs[BEAMS + 3 :]]).reshape(-1, 2)  # goal, previous actions
+        vectors = jnp.concatenate([obs[BEAMS : BEAMS + 2], obs[BEAMS + 3 : PLAIN]]).reshape(-1, 2)
         shape = (*count, *vectors.shape)
         seen = inward(jnp.broadcast_to(vectors, shape), jnp.broadcast_to(actions[..., None, :], shape))
-        turned = jnp.concatenate([around, seen.reshape(*count, -1), actions], axis=-1)
+        tried = [way_tried.turned(obs[PLAIN:], actions)] if obs.shape[0] > PLAIN else []
+        turned = jnp.concatenate([around, seen.reshape(*count, -1), actions, *tried], axis=-1)
         return Features(obs[BEAMS + 2 : BEAMS + 3], turned)
+
+    def aims(self, obs: Float[Array, " obs"]) -> Aims:
+        """Directions every 5 degrees, the goal's first: how far the body could walk there, and what a detour it is.
+
+        No aim is a direction in which the lidar does not look, or in which the body would soon touch what it sees. One
+        network weighs each from its own side: ways of three widths there and beside it, detours, goal and previous
+        actions, and, of an observation with a memory, how much of the way so far lies there.
+        """
+        return aims_of(obs)
 
     def mirror(
         self, which: Int[Array, ""] | int, obs: Float[Array, " obs"], vector: Float[Array, "2"]
     ) -> tuple[Float[Array, " obs"], Float[Array, "2"]]:
         """0: as it is; 1: left and right exchanged. Exact unless the sensor is turned."""
         sign = jnp.array([1.0, -1.0])
-        goal, distance, previous = obs[BEAMS : BEAMS + 2], obs[BEAMS + 2], obs[BEAMS + 3 :].reshape(REMEMBERED, 2)
-        image = jnp.concatenate([obs[:BEAMS][::-1], goal * sign, distance[None], (previous * sign[None]).ravel()])
+        goal, distance, previous = obs[BEAMS : BEAMS + 2], obs[BEAMS + 2], obs[BEAMS + 3 : PLAIN].reshape(REMEMBERED, 2)
+        tried = [way_tried.mirrored(obs[PLAIN:])] if self.memory else []
+        parts = [obs[:BEAMS][::-1], goal * sign, distance[None], (previous * sign[None]).ravel(), *tried]
+        image = jnp.concatenate(parts)
         return jnp.where(which == 1, image, obs), jnp.where(which == 1, vector * sign, vector)
 
     def remember(self, state: AnyWalker, obs: Float[Array, " obs"]) -> Float[Array, " memory"]:
@@ -251,9 +282,9 @@ class Navigation(Described, struct.PyTreeNode):
         state = self.placed(self.at_rest(pose), goal, jnp.zeros((REMEMBERED, 2)), world, route)
         return state.replace(passed=jnp.zeros(2)) if self.sides else state
 
-    def at_rest(self, pose: Float[Array, "3"]) -> Float[Array, "3"]:
-        """The place of a body that stands still at a pose."""
-        return pose
+    def at_rest(self, pose: Float[Array, "3"]) -> Float[Array, " place"]:
+        """The place of a body that stands still at a pose and remembers nothing."""
+        return jnp.concatenate([pose, jnp.zeros(way_tried.SEEN)]) if self.memory else pose
 
 
 def _remembered(memory: Float[Array, " memory"]) -> tuple[jax.Array, ...]:

@@ -1,0 +1,84 @@
+"""The ways that somebody may have in mind who sees a scan: directions all round, and how far the body could walk there.
+
+Geometry alone, from an observation. What a beam hits is a point; a disc that walks in a direction is stopped by the
+points within its radius of the line (the scan in configuration space: Lozano-Perez, 1983). Directions are counted from
+the goal's, so that it is one of them, and each sees its neighbours: a doorway's edge is where the way beside it ends.
+"""
+
+from __future__ import annotations
+
+import math
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from cuelearner_envs.navigation import memory
+from cuelearner_envs.navigation.lidar import BEAM_ANGLES, BEAMS, MAX_RANGE
+from cuelearner_envs.navigation.world import FAR_AWAY
+from cuelearner_envs.navigation.worlds import FARTHEST
+from cuelearner_jax.actions import from_angle, rotate, to_angle
+from cuelearner_jax.environment import Aims
+
+WAYS = 72  # every 5 degrees
+RADII = (0.28, 0.42, 0.55)  # of the discs: the body's own, nearly its reach, what a road map keeps clear [m]
+BESIDE = (0, 1, -1, 2, -2, 4, -4, 8, -8)  # neighbours that a way sees, in steps of 5 degrees
+# A way on which the first two discs are stopped sooner is none [m]: the body's front is 0.2 m ahead, a step is 0.2 m,
+# and a body that turns needs more room than one that goes straight.
+ROOM = (0.6, 0.1)
+SCALE = 5.0  # of lengths among the features [m]
+UNSEEN = -1.0  # nearness where the lidar does not look
+
+
+def aims_of(obs: Float[Array, " obs"]) -> Aims:
+    """The ways of a situation; see `Navigation.aims`."""
+    goal, away = obs[BEAMS : BEAMS + 2], obs[BEAMS + 2] * FARTHEST
+    ways = rotate(jnp.broadcast_to(goal, (WAYS, 2)), jnp.arange(WAYS) * (2 * jnp.pi / WAYS))
+    free = free_ways(obs, ways)
+    seen = jnp.abs(to_angle(ways)) <= -BEAM_ANGLES[0] + math.radians(0.5)
+    near = jnp.where(seen[None], jnp.exp(-free), UNSEEN)
+    beside = [jnp.roll(near, -step, axis=1) for step in BESIDE]
+    previous = obs[BEAMS + 3 : BEAMS + 9].reshape(-1, 2)
+    rows = [*_lengths(ways, free[1], goal, away), *_seen_from(ways, goal[None]), *_seen_from(ways, previous)]
+    rows += [jnp.full(WAYS, away / SCALE), ways[:, 0], ways[:, 1], seen.astype(jnp.float32)]
+    if obs.shape[0] > BEAMS + 9:
+        tried = memory.turned(obs[BEAMS + 9 :], ways).reshape(WAYS, -1, memory.SECTORS)
+        middle = memory.SECTORS // 2
+        rows += [tried[:, :, middle + step : middle + step + 2].mean(-1).T for step in (-1, -5, 3)]
+    features = jnp.concatenate([row.reshape(-1, WAYS) for row in [*beside, *rows]]).T
+    return Aims(ways, features, (free[0] > ROOM[0]) & (free[1] > ROOM[1]) & seen)
+
+
+def free_ways(obs: Float[Array, " obs"], ways: Float[Array, "n 2"]) -> Float[Array, "radii n"]:
+    """How far a disc of each radius could walk in directions before it touches what the lidar sees [m], to 10 m."""
+    ranges = -jnp.log(jnp.maximum(obs[:BEAMS], math.exp(-MAX_RANGE)))
+    hit = ranges < MAX_RANGE - 0.01
+    points = jnp.where(hit[:, None], ranges[:, None] * from_angle(jnp.asarray(BEAM_ANGLES)), FAR_AWAY)
+    along = ways[:, :1] * points[None, :, 0] + ways[:, 1:] * points[None, :, 1]
+    across = ways[:, :1] * points[None, :, 1] - ways[:, 1:] * points[None, :, 0]
+
+    def of_disc(radius: float) -> Float[Array, " n"]:
+        chord = radius**2 - jnp.square(across)
+        stop = along - jnp.sqrt(jnp.maximum(chord, 0.0))
+        return jnp.clip(jnp.where((chord > 0) & (along > 0), stop, MAX_RANGE).min(-1), 0.0, MAX_RANGE)
+
+    return jnp.stack([of_disc(radius) for radius in RADII])
+
+
+def _lengths(
+    ways: Float[Array, "ways 2"], free: Float[Array, " ways"], goal: Float[Array, "2"], away: Float[Array, ""]
+) -> list[Float[Array, " ways"]]:
+    """What a way is worth as a detour: to its end, or past what stops its neighbours, and on straight to the goal."""
+    end = jnp.minimum(free, away)
+    corners = [jnp.minimum(jnp.minimum(jnp.roll(free, side), jnp.roll(free, 2 * side)), end) for side in (-1, 1)]
+
+    def left(length: Float[Array, " ways"]) -> Float[Array, " ways"]:
+        return jnp.linalg.norm(length[:, None] * ways - (away * goal)[None], axis=-1)
+
+    detours = [jnp.clip((length + left(length) - away) / SCALE, 0.0, 3.0) for length in (end, *corners)]
+    return [*detours, left(end) / SCALE, jnp.clip(free - away, -1.0, 1.0), free / SCALE]
+
+
+def _seen_from(ways: Float[Array, "ways 2"], vectors: Float[Array, "n 2"]) -> list[Float[Array, "n ways"]]:
+    """Vectors along and across the ways."""
+    x, y = vectors[:, :1], vectors[:, 1:]
+    return [x * ways[None, :, 0] + y * ways[None, :, 1], y * ways[None, :, 0] - x * ways[None, :, 1]]
