@@ -37,7 +37,8 @@ def test_the_part_of_the_turn_ends_where_answers_change_their_sign():
     turns = jnp.linspace(-10, 10, 81)
     part = turning.fitted(turns, jnp.sign(4.0 - turns), jnp.ones(81, bool))
     before, after, beyond = turning.height(part, jnp.array([3.0, 5.0, 25.0]))
-    assert 0 < before < 1 and -1 < after < 0
+    assert 0 < before < 1
+    assert -1 < after < 0
     assert float(beyond) == pytest.approx(float(part.heights[-1]))  # level where nothing was asked about
     # With half of the answers turned round it says nothing, and of no label it knows nothing.
     contrary = jnp.where(jnp.arange(81) % 2, 1.0, -1.0)
