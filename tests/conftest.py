@@ -35,13 +35,15 @@ def lies_in(path, places):
     return any(TESTS / place in (path, *path.parents) for place in places)
 
 
-@pytest.fixture(scope="module", autouse=True)
-def strict_ranks(request):
-    """Raises at implicit rank promotion, but in the tests of `LOOSE_RANKS`."""
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item):
+    """Makes implicit rank promotion an error, but in the tests of `LOOSE_RANKS`.
+
+    For all threads and before any fixture: what is traced with another setting is traced and compiled once more.
+    """
     import jax  # reads the settings above
 
-    with jax.numpy_rank_promotion("allow" if lies_in(request.path, LOOSE_RANKS) else "raise"):
-        yield
+    jax.config.update("jax_numpy_rank_promotion", "allow" if lies_in(item.path, LOOSE_RANKS) else "raise")
 
 
 # What `make test-quick` leaves out: files and folders with a compile of more than a few seconds, or with processes of

@@ -1,15 +1,17 @@
 """`cuelearner export` as it is typed: what it writes, what it checks, what it refuses."""
 
 import json
+from functools import partial
 
 import numpy as np
 
 from cuelearner_jax.cli import main
-from cuelearner_jax.export import runner
+from cuelearner_jax.export import contract, decisions, runner
 from cuelearner_jax.face.acting import load_policy
 
 
-def test_a_runs_guided_agent_is_exported_and_checked(run_folder, refused, tmp_path, capsys):
+def test_a_runs_guided_agent_is_exported_and_checked(run_folder, refused, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(contract, "golden_cases", partial(decisions.golden_cases, most=6))  # NumPy takes a second each
     out = tmp_path / "new" / "decision"
     export = ["export", str(run_folder), "--policy", "guided", "--labels", "20", "--seed", "2001"]
     assert main([*export, "--format", "numpy", "--out", str(out)]) == 0

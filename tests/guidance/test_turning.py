@@ -102,5 +102,5 @@ def test_without_the_option_labels_keep_no_base():
 def test_training_and_kinds_that_do_not_correct_refuse_it():
     with pytest.raises(UserError, match="for adaptation"):
         check(RunConfig(None, Sizes(sees_turn=True)))
-    with pytest.raises(UserError, match=r"leave out --sizes\.sees-turn"):
+    with pytest.raises(UserError, match=r"leave out --sizes.sees-turn"):
         registry.make("demonstration", SIZES, ENV)

@@ -3,6 +3,7 @@
 import json
 import shutil
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 
 import jax
@@ -116,9 +117,28 @@ def whole(tmp_path_factory):
     return out
 
 
+@pytest.fixture(scope="module")
+def stopped(tmp_path_factory):
+    """A run that was stopped at step 48 of its first kind."""
+    out = tmp_path_factory.mktemp("stopped") / "run"
+    with stopping_at(6 + 3), pytest.raises(Interrupted):
+        run(out)
+    return out
+
+
+def copied(folder, tmp_path):
+    return Path(shutil.copytree(folder, tmp_path / "copy" / "run"))
+
+
+@cache
+def kept_by(whole):
+    """Each kind's newest checkpoint of a run that nobody changes."""
+    return {kind: newest(whole, kind) for kind in GRID.guidance}
+
+
 def assert_same_run(out, whole, but=()):
     for kind in GRID.guidance:
-        (mine, number), (expected, last) = newest(out, kind), newest(whole, kind)
+        (mine, number), (expected, last) = newest(out, kind), kept_by(whole)[kind]
         assert number == last
         assert jax.tree.structure(mine) == jax.tree.structure(expected)
         for one, other in zip(jax.tree.leaves(mine), jax.tree.leaves(expected), strict=True):
@@ -140,7 +160,7 @@ def test_a_run_leaves_a_row_for_each_lane_and_evaluation(whole):
     assert len({row["train_loss"] for row in last}) == 6  # six lanes, six results
     assert all(row["guide_reward"] is not None for row in table if row["step"] == 0)
     assert {row["config_hash"] for row in table} == {table[0]["config_hash"]}
-    state, number = newest(whole, "relative")
+    state, number = kept_by(whole)["relative"]
     assert number == 6 + 96
     assert state["rest"][0].agent.target_params is not None
     assert (state["rest"][0].pace.sums.episodes > 0).all()
@@ -260,10 +280,8 @@ def test_resuming_a_finished_run_changes_nothing(whole):
     assert probes.files_of(whole) == before
 
 
-def test_a_torn_last_row_is_written_anew(whole, tmp_path):
-    out = tmp_path / "run"
-    with stopping_at(6 + 3), pytest.raises(Interrupted):
-        run(out)
+def test_a_torn_last_row_is_written_anew(stopped, whole, tmp_path):
+    out = copied(stopped, tmp_path)
     with (out / "relative" / results.JSONL).open("a") as file:
         file.write('{"step": 48, "se')
     run(out, resume=True)
@@ -326,10 +344,8 @@ def test_the_labels_that_a_run_wrote_give_its_guidance_again(whole, tmp_path):
         np.testing.assert_array_equal(mine, theirs)
 
 
-def test_a_damaged_checkpoint_is_refused_and_the_one_before_serves(whole, tmp_path):
-    out = tmp_path / "run"
-    with stopping_at(6 + 3), pytest.raises(Interrupted):
-        run(out)
+def test_a_damaged_checkpoint_is_refused_and_the_one_before_serves(stopped, whole, tmp_path):
+    out = copied(stopped, tmp_path)
     newest_folder = out / "relative" / "checkpoints" / str(6 + 48)
     for path in (newest_folder / "rest").rglob("*"):
         if path.is_file():
@@ -357,19 +373,6 @@ def refused(out, message):
         run(out, resume=True)
     assert "\n" not in str(refusal.value)
     assert probes.files_of(out) == before
-
-
-@pytest.fixture(scope="module")
-def stopped(tmp_path_factory):
-    """A run that was stopped at step 48 of its first kind."""
-    out = tmp_path_factory.mktemp("stopped") / "run"
-    with stopping_at(6 + 3), pytest.raises(Interrupted):
-        run(out)
-    return out
-
-
-def copied(folder, tmp_path):
-    return Path(shutil.copytree(folder, tmp_path / "copy" / "run"))
 
 
 @pytest.mark.parametrize(
