@@ -47,10 +47,10 @@ smoke: $(VENV)/.installed
 	$(BIN)/python experiments/adaptation_navigation.py --scale smoke --pieces unchanged turned_lidar corridor_left --resume
 
 test: $(VENV)/.tested
-	$(BIN)/python -m pytest -n 2 --dist loadfile
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
 test-quick: $(VENV)/.tested
-	$(BIN)/python -m pytest -n 2 --dist loadfile -m "not slow"
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder -m "not slow"
 
 CASES ?= 2000
 SEED ?= 0

@@ -5,11 +5,14 @@
     python benchmarks/labelling_page.py pictures --task navigation --preset quickstart
     python benchmarks/labelling_page.py pictures --task billiards --preset quickstart --more="--task.table regulation"
     python benchmarks/labelling_page.py pictures --task navigation --preset quickstart --guidance demonstration scalar
+    python benchmarks/labelling_page.py pictures --task billiards --preset quickstart --called small \\
+        --more="--task.table regulation --scalars.eps-deg 0.1"
+    python benchmarks/labelling_page.py pictures --task examples.reach:TASK --preset quickstart
 
-`paced`: a script that sees only the page turns navigation's arrow toward the goal, with 10% mistakes and 10% "don't
-know"; in billiards it presses at random. Measured are a key's press to the next question painted, while a model is
-being fitted and otherwise, and whether every press is in the file once. Needs playwright and a Chromium
-(`--browser`).
+`paced`: a script that sees only the page turns navigation's arrow onto the shortest way past what is drawn, but 10% of
+its keys are "don't know" and 10% of the others one of the two wrong ones; in billiards it presses at random. Measured
+are a key's press to the next question painted, while a model is being fitted and otherwise, and whether every press is
+in the file once. Needs playwright and a Chromium (`--browser`).
 """
 
 from __future__ import annotations
@@ -32,12 +35,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from _way import Scene
 from playwright.sync_api import Browser, Page, sync_playwright  # pyright: ignore[reportMissingImports]
 
 from cuelearner_jax.records import label_files
 from cuelearner_jax.records.provenance import provenance
 
 KEYS = {"ArrowLeft": 1.0, "ArrowUp": 0.0, "ArrowRight": -1.0, "ArrowDown": None}
+UNSURE, MISTAKES = 0.1, 0.1  # shares of a script's keys, and of its answers
+RIGHT_DEG = 10.0  # half of navigation's eps: an arrow this near the way is left as it is
 # Times of each press: of the key, and of the first frame in which another question stands.
 WATCH = """
 window.taken = [];
@@ -56,17 +62,7 @@ addEventListener("keydown", event => {
   requestAnimationFrame(look);
 }, true);
 """
-# What the page shows of where to go: the angle from the arrow to the goal, counterclockwise [deg].
-TO_GOAL = """() => {
-  const scene = document.querySelector("svg.scene"), middle = one => {
-    const box = one.getBoundingClientRect();
-    return [box.x + box.width / 2, box.y + box.height / 2];
-  };
-  const [x, y] = middle(scene.querySelector(".mover"));
-  const at = one => { const [px, py] = middle(one); return Math.atan2(y - py, px - x) * 180 / Math.PI; };
-  const goal = scene.querySelector("[style*='--goal']"), tip = scene.querySelector(".arrow.asked polygon");
-  return ((at(goal) - at(tip) + 540) % 360) - 180;
-}"""
+DRAWN = "document.querySelector('svg.scene').outerHTML"
 ITEM = "() => { const one = document.querySelector('svg.scene'); return one ? +one.dataset.item : null; }"
 
 
@@ -108,15 +104,15 @@ def moved(page: Page, item: int, seconds: float = 30.0) -> None:
 
 def chosen(page: Page, task: str, rng: random.Random) -> str:
     """The key that the script presses: it sees the page alone."""
-    if rng.random() < 0.1:
+    if rng.random() < UNSURE:
         return "ArrowDown"
     if task != "navigation":
         return rng.choice(["ArrowLeft", "ArrowUp", "ArrowRight"])
-    apart = page.evaluate(TO_GOAL)
-    if abs(apart) <= 10.0:
-        return "ArrowUp"
-    left = (apart > 0) != (rng.random() < 0.1)
-    return "ArrowLeft" if left else "ArrowRight"
+    scene = Scene(page.evaluate(DRAWN))
+    apart = (scene.to_goal() - scene.asked + 180) % 360 - 180
+    right = "ArrowUp" if abs(apart) <= RIGHT_DEG else "ArrowLeft" if apart > 0 else "ArrowRight"
+    wrong = [key for key, said in KEYS.items() if said is not None and key != right]
+    return rng.choice(wrong) if rng.random() < MISTAKES else right
 
 
 def check(folder: Path, pressed: dict[int, str], saved: int) -> dict[str, int]:
@@ -219,7 +215,10 @@ def pictures(asked: argparse.Namespace, browser: Browser, work: Path) -> dict[st
     for task in asked.task:
         for kind in asked.guidance or [""]:
             more = ("--guidance", kind) if kind else ()
-            with served(asked, task, work / f"{task}{kind}", "--labels", "500", *more) as (_, address):
+            called = "_".join(
+                part for part in (task.rpartition(":")[0].rpartition(".")[2] or task, kind, asked.called) if part
+            )
+            with served(asked, task, work / called, "--labels", "500", *more) as (_, address):
                 page = entered(browser, address)
                 rng, wanted = random.Random(2), 0 if kind else 12
                 while int(re.match(r"\d+", page.locator(".side").inner_text())[0]) < wanted:  # pyright: ignore[reportOptionalSubscript]
@@ -229,10 +228,10 @@ def pictures(asked: argparse.Namespace, browser: Browser, work: Path) -> dict[st
                 if wanted:
                     page.wait_for_function("() => document.body.innerText.includes('model 1')", timeout=300_000)
                 page.close()
-                for name, look in LOOKS.items() if not kind else [("light", LOOKS["light"])]:
+                for name, look in LOOKS.items() if not (kind or asked.called) else [("light", LOOKS["light"])]:
                     page = entered(browser, address, **look)
                     time.sleep(1.0)
-                    page.screenshot(path=asked.to / f"label_{task}{f'_{kind}' if kind else ''}_{name}.png")
+                    page.screenshot(path=asked.to / f"label_{called}_{name}.png")
                     page.close()
     return {"pictures": sorted(str(file.name) for file in asked.to.glob("label_*.png"))}
 
@@ -250,6 +249,7 @@ def main() -> None:
     parser.add_argument("--kills", type=int, default=20)
     parser.add_argument("--keep", type=Path, help="paced: folder for the labels (default: one that is removed)")
     parser.add_argument("--to", type=Path, default=Path("docs/figures"), help="folder for pictures")
+    parser.add_argument("--called", default="", help="pictures: a word for their names, of a page with further options")
     parser.add_argument("--browser", default=shutil.which("chromium"), help="a Chromium")
     parser.add_argument("--out", type=Path, help="write the figures to this JSON file")
     asked = parser.parse_args()

@@ -49,13 +49,14 @@ def share(budget: int, instalment: int, instalments: int, sizes: GuideSizes) -> 
     return min(-(-rounds * (instalment + 1) // instalments) * sizes.labels_per_round, budget)
 
 
-def empty_labels(slots: int, obs_size: int, action_size: int, answer_width: int) -> Label:
-    """`slots` rows of padding."""
+def empty_labels(slots: int, obs_size: int, action_size: int, answer_width: int, with_base: bool = False) -> Label:
+    """`slots` rows of padding. `with_base`: is kept what was proposed before any correction?"""
     return Label(
         obs=jnp.zeros((slots, obs_size)),
         action=jnp.zeros((slots, action_size)),
         answer=jnp.zeros((slots, answer_width)),
         valid=jnp.zeros((slots,), bool),
+        base=jnp.zeros((slots, action_size)) if with_base else None,
     )
 
 
@@ -77,12 +78,22 @@ def start(
     state, obs = env.reset(k_env) if candidates == 1 else jax.vmap(env.reset)(jax.random.split(k_env, candidates))
     return GuideState(
         model=guidance.init(k_model),
-        labels=empty_labels(slots, env.obs_size, actions_of(env).size, guidance.answer_width),
+        labels=empty_labels(
+            slots, env.obs_size, actions_of(env).size, guidance.answer_width, guidance.onward is not None
+        ),
         budget=jnp.asarray(budget, jnp.int32),
         asked=jnp.zeros((), jnp.int32),
         env=state,
         obs=obs,
     )
+
+
+def proposed(base: Policy, guide: GuideState, keys: QuestionKeys) -> Float[Array, "*candidates action"]:
+    """What the base policy does in the guide's situation, or in each of its candidates."""
+    if guide.obs.ndim > 1:
+        return base.act(keys.base, guide.env, guide.obs)
+    states = jax.tree.map(lambda leaf: leaf[None], guide.env)
+    return base.act(keys.base, states, guide.obs[None])[0]
 
 
 def question(
@@ -101,15 +112,14 @@ def question(
     if bound is not None:
         scalars = within(scalars, bound)
 
-    def one(key: PRNGKeyArray, obs: Array, proposed: Array) -> Array:
-        asked = guidance.question(key, guide.model, env, obs, proposed, scalars)
-        return asked if bound is None else actions_of(env).clip(asked, proposed, bound)
+    def one(key: PRNGKeyArray, obs: Array, first: Array) -> Array:
+        asked = guidance.question(key, guide.model, env, obs, first, scalars)
+        return asked if bound is None else actions_of(env).clip(asked, first, bound)
 
+    actions = proposed(base, guide, keys)
     if guide.obs.ndim > 1:
-        proposed = base.act(keys.base, guide.env, guide.obs)
-        return jax.vmap(one)(jax.random.split(keys.question, len(guide.obs)), guide.obs, proposed)
-    states = jax.tree.map(lambda leaf: leaf[None], guide.env)
-    return one(keys.question, guide.obs, base.act(keys.base, states, guide.obs[None])[0])
+        return jax.vmap(one)(jax.random.split(keys.question, len(guide.obs)), guide.obs, actions)
+    return one(keys.question, guide.obs, actions)
 
 
 def chosen(
@@ -134,9 +144,13 @@ def record(
     action: Float[Array, " action"],
     answer: Float[Array, " answer"],
     answered: Bool[Array, ""] | bool,
+    base: Float[Array, " action"] | None = None,
 ) -> GuideState:
-    """The guide with an answer in the row `position` of its labels; it counts within the budget alone."""
-    label = Label(guide.obs, action, answer, jnp.asarray(answered) & (position < guide.budget))
+    """The guide with an answer in the row `position` of its labels; it counts within the budget alone.
+
+    `base`: what was proposed in place of the action, if labels keep that.
+    """
+    label = Label(guide.obs, action, answer, jnp.asarray(answered) & (position < guide.budget), base)
     put = lambda rows, row: jax.lax.dynamic_update_index_in_dim(rows, row, position, 0)  # noqa: E731
     asked = jnp.minimum(position + 1, guide.budget)
     return guide.replace(labels=jax.tree.map(put, guide.labels, label), asked=asked)
@@ -185,7 +199,9 @@ def ask(
     actions = question(guidance, env, scalars, base, guide, keys, bound)
     there, action = chosen(guidance, env, guide, actions)
     answer, answered = guidance.form.answer(keys.answer, env, teacher, there.env, there.obs, action, scalars)
-    told = record(there, position, action, answer, answered)
+    # Compiled with the question, which computes the same, this costs nothing.
+    first = proposed(base, guide, keys) if guidance.onward else None
+    told = record(there, position, action, answer, answered, first)
     return proceed(env, told.replace(env=guide.env, obs=guide.obs), actions, keys)
 
 

@@ -8,7 +8,7 @@ neighbours: not by a bit on a CPU, on an accelerator up to the order in which su
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -36,6 +36,8 @@ from cuelearner_jax.guidance.bundle import Guidance
 from cuelearner_jax.guidance.refining import Refined, untouched
 from cuelearner_jax.policies import Agent, Uniform
 from cuelearner_jax.types import Clock, GuideState, Label, Params, Stream, Teacher, TrainState
+
+PROGRAMS_KEPT = 8  # compiled ones that a process holds for its next runs
 
 
 class Program(NamedTuple):
@@ -70,6 +72,8 @@ def make_program(
 ) -> Program:
     """Compiles (on first use) the loop for one kind of guidance.
 
+    Another run of the same sizes, guidance and shapes in this process is given the same program, compiled already.
+
     Args:
         config: sizes and whether targets bootstrap are taken from here; scalars and schedule are passed at each call.
         env: gives shapes; any environment of the same structure may be passed at the calls.
@@ -77,8 +81,25 @@ def make_program(
         mesh: devices that share the lanes, whose number they must divide into (default: the first device alone).
         lanes: that each device is expected to take at once; how fast it is may hang on it, nothing else.
     """
-    mesh = mesh or lane_mesh(jax.local_devices()[:1])
-    lane = make_lane(config, guidance, env, largest_budget)
+    leaves, structure = jax.tree.flatten(jax.eval_shape(lambda env: env, env))
+    lane = (config.sizes, config.bootstraps, config.noisy, guidance, largest_budget)
+    return _program_of(*lane, structure, tuple(leaves), mesh or lane_mesh(jax.local_devices()[:1]), lanes)
+
+
+@lru_cache(maxsize=PROGRAMS_KEPT)
+def _program_of(
+    sizes: Sizes,
+    bootstraps: bool,
+    noisy: bool,
+    guidance: Guidance,
+    largest_budget: int,
+    structure: Any,
+    leaves: tuple[jax.ShapeDtypeStruct, ...],
+    mesh: Mesh,
+    lanes: int,
+) -> Program:
+    """The program of lanes in environments of this structure and these shapes."""
+    lane = _lane_of(sizes, bootstraps, noisy, guidance, largest_budget, jax.tree.unflatten(structure, leaves))
 
     def init(env, seeds, budgets, root):
         keys = jax.vmap(lambda seed: jax.random.fold_in(root, seed))(seeds)
@@ -305,5 +326,10 @@ def guides(clock: Clock, schedule: Schedule) -> Bool[Array, ""]:
 
 def make_lane(config: RunConfig, guidance: Guidance, env: Environment, largest_budget: int) -> Lane:
     """The loop of one lane for an environment, whose shapes alone are looked at."""
-    learns = learner(config.sizes, config.bootstraps, env)
-    return Lane(config.sizes, guidance, learns, largest_budget, config.noisy)
+    return _lane_of(config.sizes, config.bootstraps, config.noisy, guidance, largest_budget, env)
+
+
+def _lane_of(
+    sizes: Sizes, bootstraps: bool, noisy: bool, guidance: Guidance, largest_budget: int, env: Environment
+) -> Lane:
+    return Lane(sizes, guidance, learner(sizes, bootstraps, env), largest_budget, noisy)

@@ -95,6 +95,7 @@ class Label(struct.PyTreeNode):
     action: Float[Array, " action"]  # the action asked about
     answer: Float[Array, " answer"]  # in its form's words; relative: h in {-1, 0, +1}, see `guidance.answers`
     valid: Bool[Array, ""]  # False: padding, past this lane's budget, or no answer
+    base: Float[Array, " action"] | None = None  # what was proposed before any correction; None: no model looks at it
 
 
 class GuidanceModel(struct.PyTreeNode):

@@ -9,7 +9,8 @@ the folder above this one:
     cuelearner render runs/reach --task examples.reach:TASK --steps 40 --out pictures
     cuelearner render runs/reach --task examples.reach:TASK --question --out pictures
 
-One seed of it: `cuelearner train examples.reach:TASK --preset quickstart --out runs/reach-one`.
+One seed of it: `cuelearner train examples.reach:TASK --preset quickstart --out runs/reach-one`. People label it in a
+browser: `cuelearner label examples.reach:TASK --out labels/reach`.
 """
 
 from __future__ import annotations
@@ -27,15 +28,16 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from cuelearner_envs import film
+from cuelearner_envs import film, svg
 from cuelearner_envs.bounds import MOST_STEPS, check_number
 from cuelearner_jax.actions import from_angle, retract, rotate
 from cuelearner_jax.config import RunConfig, Scalars, Schedule, Sizes
 from cuelearner_jax.environment import Quantity, WholeObservations
 from cuelearner_jax.task import Body, Pictures, Preset, Scenario, Task
-from cuelearner_jax.types import Policy, Step
+from cuelearner_jax.types import Policy, Reel, Sketch, Step
 
 PERIOD = 0.1  # of a step [s]
+FILM = 20  # steps that the film on the labelling page shows
 GOAL_RADIUS = 0.08  # nearer than this, the buoy is reached [m]
 BOAT, BUOY, WIND, ARROW, WATER = "#0072B2", "#009E73", "#7f7f7f", "#E69F00", "#f3f8fb"
 
@@ -259,11 +261,50 @@ def _pixels(way: list[Frame]) -> np.ndarray:
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
 
+# ------------------------------------------------------------------------------------------- the labelling page
+
+
+def sketch(env: Reach, state: Boat) -> Sketch:
+    """The lake as a person sees it in a browser; y points down there. Boat and buoy are in view."""
+    boat, buoy, wind = (np.asarray(each, float) * [1, -1] for each in (state.place, state.buoy, state.wind))
+    half = max(1.4, 0.5 + 0.6 * float(np.linalg.norm(buoy - boat)))
+    left, top = (boat + buoy) / 2 - half
+    lake = svg.rectangle(left - half, top - half, 4 * half, 4 * half, "fill:var(--floor)")
+    ring = svg.circle(tuple(buoy), GOAL_RADIUS, "fill:var(--goal)")
+    corner = np.array([left, top]) + 0.35
+    way = svg.points([corner - 0.25 * wind, corner + 0.25 * wind])
+    blows = svg.element("polyline", points=way, style="fill:none;stroke:var(--low);stroke-width:0.02")
+    head = svg.circle(tuple(corner + 0.25 * wind), 0.03, "fill:var(--low)")  # where the wind blows to
+    told = svg.text((corner[0] - 0.15, corner[1] + 0.35), 0.09, "wind, to the dot", "fill:var(--ink)", "start")
+    return Sketch(
+        box=(left, top, 2 * half, 2 * half),
+        still=lake + ring + blows + head + told,
+        movers={"boat": svg.polygon([(0.09, 0.0), (-0.06, 0.05), (-0.06, -0.05)], "fill:var(--body)")},
+        places={"boat": (*boat, 0.0)},
+        foot=tuple(boat),
+        reach=(0.11, 0.45),
+        turn=0.0,
+        aim=0.5,
+        words=f"{np.linalg.norm(buoy - boat):.1f} m from the buoy, wind {np.linalg.norm(wind):.1f} m/s",
+    )
+
+
+def reel(env: Reach, state: Boat, action: Float[Array, "2"]) -> Reel:
+    """Where the boat gets if it is sent there again and again."""
+    frames, heading = [], -np.degrees(np.arctan2(*np.asarray(action)[::-1]))
+    for _ in range(FILM):
+        frames.append({"boat": (float(state.place[0]), -float(state.place[1]), float(heading))})
+        if jnp.linalg.norm(state.buoy - state.place) < GOAL_RADIUS:
+            return Reel(PERIOD, frames, "the buoy is reached")
+        state = env.moved(state, action)
+    return Reel(PERIOD, frames, f"after {PERIOD * FILM:.0f} s: not there")
+
+
 # ------------------------------------------------------------------------------------------------------ the task
 
 
 def _pictures() -> Pictures:
-    return Pictures(record=record, still=still, animate=animate, question=question)
+    return Pictures(record=record, still=still, animate=animate, question=question, sketch=sketch, reel=reel)
 
 
 TASK = Task(

@@ -72,15 +72,23 @@ class Piece(NamedTuple):
     split: str = "validation"  # of the episodes; settings are chosen on "tuning"
     bases: int | None = None  # at most so many
     judge_by: str = "reward"  # a model that is worse by this on tuning episodes is not used
+    robot: str | None = None  # what acts there, where that is changed
     ways: bool = False  # keep some ways that are walked before and after, for a picture?
     minutes: int = 10  # of an H100 or H200, a guess
     serves: str = ""  # which figure
 
     @property
+    def place(self) -> str:
+        """What tables call the changed world."""
+        if self.robot is None:
+            return self.world
+        return self.robot if self.world == UNCHANGED else f"{self.world}_{self.robot}"
+
+    @property
     def path(self) -> str:
         """Of its folder, and what it is called on the command line."""
         name = f"{self.method}-{self.variant}" if self.variant else self.method
-        return f"{'tuning/' if self.split == 'tuning' else ''}{self.world}/{name}"
+        return f"{'tuning/' if self.split == 'tuning' else ''}{self.place}/{name}"
 
     @property
     def lanes(self) -> int:
@@ -110,9 +118,9 @@ class Study(NamedTuple):
 
 
 @lru_cache(maxsize=4)
-def environment(task: str, world: Any, split: str) -> Any:
+def environment(task: str, world: Any, split: str, robot: str | None = None) -> Any:
     """That of a world; made once, for a thousand halls take a while."""
-    return registry.find(task).environment(world, split)
+    return registry.find(task).on(robot).environment(world, split)
 
 
 class Bench(NamedTuple):
@@ -130,7 +138,7 @@ class Bench(NamedTuple):
 
     def env(self, split: str) -> Any:
         """The world of a split: what is asked and learned in is "training"."""
-        return environment(self.task.name, self.world, split)
+        return environment(self.task.name, self.world, split, self.piece.robot)
 
     def measured(self, policy: Any, split: str | None = None) -> Row:
         """Metrics (lanes,) of a block of policies on the episodes of a split (default: the piece's)."""
@@ -147,7 +155,8 @@ class Bench(NamedTuple):
         """The base agents' scalars with labels of the scenario's strength, refined within the bound."""
         eps = None if self.piece.world == UNCHANGED else self.task.scenario(self.piece.world).eps_deg
         own = adapting.settling(self.config.scalars, self.piece.settings.get("scalars.eps_deg", eps))
-        own = dataclasses.replace(own, k_max=int(np.ceil(self.piece.bound_deg / own.eps_deg)) + 2)
+        reached = int(np.ceil(self.piece.bound_deg / own.eps_deg)) + 2  # passes of which each turns by eps
+        own = dataclasses.replace(own, k_max=max(own.k_max, reached))  # a model that is not sure turns by less
         return self.set("scalars.", own)
 
 
@@ -251,12 +260,13 @@ def opened(folder: Path, study: Study, piece: Piece, scale: Scale, out: Path) ->
     source = PolicySource.of_run(folder, registry.find)
     if source.task.name != study.task:
         raise UserError(f"{folder} holds agents of {source.task.name}: give --bases a run of {study.task}")
+    source = source.on(piece.robot)
     assert source.grid is not None
     config = source.config
     world = config.task if piece.world == UNCHANGED else source.task.scenario(piece.world).applied(config.task)
     own = {name.partition(".")[2]: value for name, value in piece.settings.items() if name.startswith("task.")}
     world = dataclasses.replace(world, **own)
-    env = environment(source.task.name, world, "training")
+    env = environment(source.task.name, world, "training", piece.robot)
     policies, seeds = several(source, env, world, "agent", None, None, source.grid.seeds[: piece.bases])
     agents = program.side_by_side(policies)
     steps = scale.steps if source.task.longest is None else source.task.longest(world)
@@ -273,7 +283,7 @@ def run_piece(study: Study, piece: Piece, scale: Scale, bases: Path, out: Path, 
         raise UserError(f"{folder} exists: give --resume to go on, or another --out")
     shutil.rmtree(folder, ignore_errors=True)  # what was begun is begun anew: it takes minutes
     bench = opened(bases, study, piece, scale, folder)
-    about = {"task": study.task, "world": piece.world, "method": piece.method, "variant": piece.variant}
+    about = {"task": study.task, "world": piece.place, "method": piece.method, "variant": piece.variant}
     constants = {**about, "split": piece.split, "bound_deg": piece.bound_deg, **provenance()}
     with tables.TableWriter(folder, SCHEMA, constants) as writer:
         for row in METHODS[piece.method](bench):

@@ -30,6 +30,7 @@ ASKED: Mapping[str, Any] = {
     "scalars.nearest_aim_deg": 0.1,
     "scalars.nearest_share": 0.9,
 }
+TURN: Mapping[str, Any] = {"sizes.sees_turn": True}
 LEARNING: Mapping[str, Any] = {"task.teacher": "local_search", "sizes.num_envs": 10, "sizes.replay_capacity": 100_000}
 # As chosen on tuning episodes, see docs/results/adaptation.md.
 RATES, NOISES_DEG, STEPS, EVERY = (0.01,), (0.3,), 100_000, 5_000
@@ -45,9 +46,19 @@ COMPARED: dict[str, dict[str, Mapping[str, Any]]] = {
         "eps-30": {"scalars.eps_deg": 0.3},
         "aim-25": {"scalars.nearest_aim_deg": 0.25},
         "slow": {"scalars.feedback_learning_rate": 3e-4},
+        "turn": TURN,
+        "turn-slow": {**TURN, "scalars.feedback_learning_rate": 3e-4},
+        "turn-best": {**TURN, "scalars.answer": "best"},
+        "turn-share-60": {**TURN, "scalars.nearest_share": 0.6},
+        "turn-aim-25": {**TURN, "scalars.nearest_aim_deg": 0.25},
+        "turn-eps-20": {**TURN, "scalars.eps_deg": 0.2},
+        "turn-few-steps": {**TURN, "sizes.fit_steps": 400},
+        "turn-small": {**TURN, "sizes.feedback_layers": (64, 64)},
+        "turn-members": {**TURN, "sizes.ensemble": 5},
     },
     "residual": {
         "three-times": {},
+        "turn": TURN,
         "once": {"scalars.k_max": 1, "scalars.refined_fraction": 0.0},
         "slow": {"scalars.feedback_learning_rate": 3e-4},
     },

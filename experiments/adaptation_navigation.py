@@ -1,4 +1,4 @@
-"""Finished navigation agents with a turned lidar, in rooms, and in a corridor where one side is preferred.
+"""Finished navigation agents with a turned lidar, in rooms, in a corridor with a preferred side, and on a quadruped.
 
     python experiments/adaptation_navigation.py --list
     python experiments/adaptation_navigation.py --bases RUN --out FOLDER [--pieces turned_lidar] [--resume]
@@ -18,12 +18,13 @@ from _adaptation import SMALL, UNCHANGED, Piece, Scale, Study, run
 from _pieces import option
 from navigation_bootstrapping import SCALES as TRAINING
 
-LIDAR, ROOMS = "turned_lidar", "rooms"
+LIDAR, ROOMS, QUADRUPED = "turned_lidar", "rooms", "anymal"
 LIDAR_BOUND_DEG, ROOMS_BOUNDS_DEG, SIDE_BOUND_DEG = 60.0, (60.0, 180.0), 60.0
 BUDGETS = (50, 100, 250, 500)
 TUNED, TUNING_BASES = (250,), 4
 
 FRAME: Mapping[str, Any] = {"sizes.frame": "action"}
+TURN: Mapping[str, Any] = {**FRAME, "sizes.sees_turn": True}
 ROOMY: Mapping[str, Any] = {**FRAME, "scalars.eps_deg": 20.0}  # in rooms small turns lead nowhere
 SIDED: Mapping[str, Any] = {**FRAME, "scalars.eps_deg": 20.0}
 LEARNING: Mapping[str, Any] = {"sizes.num_envs": 10, "sizes.replay_capacity": 50_000}
@@ -37,10 +38,19 @@ RELATIVE: dict[str, Mapping[str, Any]] = {
     "eps-5": {**FRAME, "scalars.eps_deg": 5.0},
     "eps-10": {**FRAME, "scalars.eps_deg": 10.0},
     "eps-20": {**FRAME, "scalars.eps_deg": 20.0},
+    "turn": TURN,
+    "turn-5": {**TURN, "scalars.eps_deg": 5.0},
+    "turn-10": {**TURN, "scalars.eps_deg": 10.0},
+    "turn-20": {**TURN, "scalars.eps_deg": 20.0},
+    "turn-raw": {**TURN, "sizes.frame": "raw", "scalars.eps_deg": 10.0},
+    "turn-slow": {**TURN, "scalars.eps_deg": 10.0, "scalars.feedback_learning_rate": 3e-4},
+    "turn-small": {**TURN, "scalars.eps_deg": 10.0, "sizes.feedback_layers": (64, 64)},
+    "turn-members": {**TURN, "scalars.eps_deg": 10.0, "sizes.ensemble": 5},
 }
 OTHERS: dict[str, dict[str, Mapping[str, Any]]] = {
     "residual": {
         "three-times": FRAME,
+        "turn": TURN,
         "once": {**FRAME, "scalars.k_max": 1, "scalars.refined_fraction": 0.0},
         "raw": {"sizes.frame": "raw"},
     },
@@ -162,10 +172,33 @@ def sides() -> list[Piece]:
     return [*pieces, *compared("corridor_left", SIDE_BOUND_DEG, "passed_left", {"relative": RELATIVE})]
 
 
-UNADAPTED = Piece(UNCHANGED, "none", minutes=2, serves="what is whole")
+def quadruped() -> list[Piece]:
+    """The kinematic robot's agents on the quadruped: in their own halls, in the corridor, and there with a wish.
+
+    Labels are asked while it walks; its physics takes most of the time.
+    """
+    pieces = []
+    for world, judge_by, serves, settings in (
+        (UNCHANGED, "success", "success on the quadruped", FRAME),
+        ("corridor_left", "passed_left", "the preferred side on the quadruped", SIDED),
+    ):
+        changed = {"robot": QUADRUPED, "serves": serves}
+        asked = {**changed, "bound_deg": SIDE_BOUND_DEG, "settings": settings}
+        pieces += [
+            Piece(world, "none", minutes=5, **changed),
+            Piece(world, "teacher", minutes=8, **asked),
+            Piece(world, "relative", labels=(100, 250, 500), judge_by=judge_by, minutes=25, **asked),
+        ]
+    return pieces
+
+
+UNADAPTED = [
+    Piece(UNCHANGED, "none", minutes=2, serves="what is whole"),
+    Piece(UNCHANGED, "none", split="tuning", minutes=2, serves="which agents are finished"),
+]
 PIECES = tuple(
     sorted(
-        [UNADAPTED, *lidar(), *rooms(), *sides()], key=lambda piece: piece.split == "tuning"
+        [*UNADAPTED, *lidar(), *rooms(), *sides(), *quadruped()], key=lambda piece: piece.split == "tuning"
     )  # those of tables first
 )
 

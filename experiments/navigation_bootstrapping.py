@@ -13,6 +13,7 @@ of their own in FOLDER.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 
 from _pieces import Experiment, Options, Piece, Scale, run
 
@@ -41,6 +42,8 @@ FAULTS: dict[str, Options] = {
     "indifferent": {"scalars.indifference-deg": 20.0},
     "biased": {"scalars.teacher-bias-deg": 10.0},
 }
+# Given on the labelling page by a script that sees the page alone, and errs (docs/labels.md).
+PAGE = Path(__file__).parents[1] / "docs/data/labelling/navigation/labels.parquet"
 WAYS: dict[str, Options] = {
     "instalments": {"schedule.ask-at": (0, 20_000, 40_000), "scalars.ask-bound-deg": 60.0},
     "ensemble": {"sizes.ensemble": 5},
@@ -79,6 +82,12 @@ def variations(minutes: int) -> list[Piece]:
         for name, way in WAYS.items()
     ]
     paced = {**options, "sizes.pace": True}
+    given: Options = {**options, "labels-from": PAGE}
+    pieces.append(
+        Piece(
+            "clutter", "page", "relative", relative, (450, 500), SEEDS, given, minutes // 2, "labels given on the page"
+        )
+    )
     random = {**paced, **FAULTS["random"]}
     serves = "guidance never costs"
     pieces += [
@@ -95,7 +104,7 @@ SCALES = {
     "smoke": Scale(
         "seconds a piece on a CPU, to see that everything runs",
         seeds=2,
-        labels={25: 5, 350: 10, 500: 15},
+        labels={25: 5, 350: 10, 450: 14, 500: 15},
         options={
             "task.worlds": 2,
             "task.max-steps": 20,

@@ -14,11 +14,12 @@ TESTS = Path(__file__).resolve().parent
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(TESTS.parent / ".jax_cache"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.2")
-# Compiling is most of what the tests take: a third of it with LLVM's first level and XLA's former emitters, and what
-# they assert holds with any.
-flags = ["--xla_backend_optimization_level=1"]
+# Compiling is most of what the tests take: half of it with none of LLVM's optimisations, XLA's former emitters and
+# each program in one piece (two workers fill two cores as it is), and what they assert holds with any.
+flags = ["--xla_backend_optimization_level=0"]
 if jaxlib.version.__version_info__ < (0, 11):  # JAX does not start with a flag that it no longer knows
-    flags.append("--xla_cpu_use_fusion_emitters=false")
+    flags += ["--xla_cpu_use_fusion_emitters=false", "--xla_cpu_parallel_codegen_split_count=1"]
+os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")  # nobody reads where an operation came from
 os.environ["XLA_FLAGS"] = " ".join([*flags, os.environ.get("XLA_FLAGS", "")]).strip()
 
 # What starts the tests may ignore signals, as a shell does for work in the background, and processes pass that on.
@@ -60,7 +61,8 @@ SLOW = (
 
 
 def pytest_collection_modifyitems(items):
-    """Marks the tests of `SLOW`."""
+    """Marks the tests of `SLOW`, and has them begin first: what is left for the end can be shared out evenly."""
     for item in items:
         if lies_in(item.path, SLOW):
             item.add_marker(pytest.mark.slow)
+    items.sort(key=lambda item: item.get_closest_marker("slow") is None)  # keeps the order among equals

@@ -165,7 +165,7 @@ def adapt(
     measure = _Measuring(work, mesh, watch)
     if labels is not None:
         rows = place(mesh, jax.tree.map(lambda leaf: jnp.asarray(leaf)[filled], labels), BY_LANE)
-        block = program.take_labels(work.guidance, work.sizes, env, work.scalars, rows, block, mesh)
+        block = program.take_labels(work.guidance, work.sizes, env, work.scalars, bases, rows, block, mesh)
     else:
         assert teacher is not None  # asked for where no labels are given
         asks: Teacher = place(mesh, teacher, SHARED)

@@ -109,7 +109,7 @@ def _predicted(guidance: Guidance, env: Any, scalars: Any, block: Adapting) -> t
         held = labels.valid & (jnp.arange(labels.valid.shape[0]) % HELD_OUT == HELD_OUT - 2)
         others = labels.replace(valid=labels.valid & ~held)
         model = guidance.fit(key, env, others, guidance.init(key), scalars)
-        right, zero = _right(labels, guidance.act(model, env, labels.obs, labels.action, held, one_pass).actions)
+        right, zero = _right(labels, guidance.moved_on(model, env, labels, held, one_pass).actions)
         count = jnp.maximum(held.sum(), 1)
         return jnp.sum(zero, where=held) / count, jnp.where(held.any(), jnp.sum(right, where=held) / count, jnp.nan)
 

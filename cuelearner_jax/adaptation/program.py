@@ -175,17 +175,26 @@ def ask_round(
 
 @partial(jax.jit, static_argnames=("guidance", "sizes", "mesh"))
 def _take(
-    guidance: Guidance, sizes: GuideSizes, mesh: Mesh, env: Any, scalars: Any, labels: Label, block: Adapting
+    guidance: Guidance,
+    sizes: GuideSizes,
+    mesh: Mesh,
+    env: Any,
+    scalars: Any,
+    bases: Any,
+    labels: Label,
+    block: Adapting,
 ) -> Adapting:
-    def of_device(env: Any, scalars: Any, labels: Label, block: Adapting) -> Adapting:
+    def of_device(env: Any, scalars: Any, bases: Any, labels: Label, block: Adapting) -> Adapting:
         def one(labels: Label, lane: Adapting) -> Adapting:
+            if guidance.onward:  # files do not keep what the base policy does: it tells again
+                labels = labels.replace(base=one_lane(bases, lane.base).act(lane.key, None, labels.obs))
             guide = lane.guide.replace(labels=labels, asked=lane.guide.budget)
             last = (lane.guide.budget - 1) // sizes.labels_per_round  # the fit that follows the last round
             return _kept_finite(lane, asking.fit(guidance, env, scalars, guide, lane.key, last))
 
         return each_lane(one)(labels, block)
 
-    return over_lanes(mesh, of_device, (SHARED, SHARED, BY_LANE, BY_LANE), BY_LANE)(env, scalars, labels, block)
+    return over_lanes(mesh, of_device, (*(SHARED,) * 3, BY_LANE, BY_LANE), BY_LANE)(env, scalars, bases, labels, block)
 
 
 def take_labels(
@@ -193,6 +202,7 @@ def take_labels(
     sizes: GuideSizes,
     env: Environment,
     scalars: Scalars,
+    bases: Policy,
     labels: Label,
     block: Adapting,
     mesh: Mesh | None = None,
@@ -203,7 +213,7 @@ def take_labels(
     corrected by all of them in one go, with other random numbers.
     """
     mesh = mesh or lane_mesh(jax.local_devices()[:1])
-    return _take(guidance, sizes, mesh, env, scalars, labels, block)
+    return _take(guidance, sizes, mesh, env, scalars, bases, labels, block)
 
 
 def adapted(

@@ -79,6 +79,9 @@ class Label(Generic[TaskT]):
     """Instead: the questions of this page's file once more, for a second opinion; leave out the policy and --seed."""
     scenario: str | None = None
     """The changed world of this name, see above; options of the task (--task.…) come on top of it."""
+    robot: str | None = None
+    """Another robot, see above (default: the task's own); with a folder, as anymal:FOLDER, one with your own walking
+    policy."""
     port: int = 0
     """Port on 127.0.0.1 (0: any that is free)."""
     open: Flag[bool] = False
@@ -153,6 +156,7 @@ def planned(
         raise UserError("--who is empty: give a name, or leave it out")
     if merged.sizes.candidates > 1:
         raise UserError("--sizes.candidates is above 1, but a page asks in situations as they come: leave it out")
+    robot, task = _robot(task, asked.robot), task.on(asked.robot)
     env = shape_of(task, asked.task)
     guidance = guidances.make(asked.guidance, merged.sizes, env)
     if guidance.form is None:
@@ -160,10 +164,18 @@ def planned(
         raise UserError(f"guidance {guidance.name!r} asks for no labels: give --guidance {' or '.join(asking)}")
     if asked.again is not None:
         return _second(
-            Plan(task, merged, guidance, Base(uniform_in(env), ""), asked.labels, who=asked.who.strip()), asked, named
+            Plan(task, merged, guidance, Base(uniform_in(env), ""), asked.labels, who=asked.who.strip(), robot=robot),
+            asked,
+            named,
         )
     base = _base(task, asked, named, source, env)
-    return Plan(task, merged, guidance, base, asked.labels, asked.seed, asked.who.strip(), asked.bound_deg)
+    return Plan(task, merged, guidance, base, asked.labels, asked.seed, asked.who.strip(), asked.bound_deg, robot)
+
+
+def _robot(task: Task, name: str | None) -> str:
+    """How a file names the robot; empty: it is the task's own. Raises UserError if there is no such robot."""
+    body = task.on(name).bodies[0]
+    return "" if body.name == task.bodies[0].name else f"{body.name} {body.digest}".strip()
 
 
 def _second(plan: Plan, asked: Label[Any], named: str | None) -> Plan:
@@ -177,6 +189,8 @@ def _second(plan: Plan, asked: Label[Any], named: str | None) -> Plan:
     for name, value in plan.world.items():
         if file.task.get(name) != value:
             raise UserError(f"{asked.again} asked in a world with another {name} ({file.task.get(name)}, not {value})")
+    if (other := file.session.get("robot", "")) != plan.robot:
+        raise UserError(f"{asked.again} asked about {other or 'its own robot'}: give the same --robot")
     found = label_files.found_in(asked.again)
     assert found is not None  # it was read
     actions = {row["item"]: np.asarray(row["action"], np.float32) for row in label_files.history(found)}

@@ -84,6 +84,9 @@ class GuideSizes(_Seeing):
     """Gradient steps on earlier corrections after each new one, of a guide that goes on learning (deep COACH)."""
     ensemble: int = 1
     """Members of the guidance model, each fitted to all labels; it predicts their mean."""
+    sees_turn: bool = False
+    """Does a guide that corrects actions see how far each has been turned already, in units of eps? What is right hangs
+    on what the base policy did, so this is for adaptation."""
     candidates: int = 1
     """Situations among which each question is chosen: where the members disagree most (1: as they come)."""
     question_every: int = 1

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import json
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
@@ -101,6 +102,8 @@ class Builder:
         """Nothing yet."""
         self.ops: list[list[Any]] = []
         self.constants: dict[str, np.ndarray] = {}
+        self._done_before: dict[str, Value] = {}  # by what was done to which values
+        self._narrow: dict[str, Value] = {}  # by the name of a broadcast value: what it was made of
         self._named: dict[int, tuple[Any, str]] = {}  # by identity; the array is kept, so that no other gets its place
         self._numbers = itertools.count()
 
@@ -149,10 +152,23 @@ class Builder:
         return Value(f"v{next(self._numbers)}", tuple(shape), kind)
 
     def add(self, op: str, inputs: list[Known], shape: tuple[int, ...], kind: str, /, **attributes: Any) -> Value:
-        """Adds an operation with one output."""
-        output = self.new(shape, kind)
-        self.ops.append([op, [self.name(value) for value in inputs], [output.name], attributes])
-        return output
+        """Adds an operation with one output, unless the same has been done before."""
+        if op in WIDENING:
+            inputs = self._narrowed(inputs, tuple(shape))
+        names = [self.name(value) for value in inputs]
+        done = json.dumps([op, names, attributes])
+        if done not in self._done_before:
+            output = self._done_before[done] = self.new(shape, kind)
+            self.ops.append([op, names, [output.name], attributes])
+            if op == "broadcast" and isinstance(inputs[0], Value):
+                self._narrow[output.name] = inputs[0]
+        return self._done_before[done]
+
+    def _narrowed(self, inputs: list[Known], shape: tuple[int, ...]) -> list[Known]:
+        """Inputs as they were before they were broadcast, where another one has the shape of the result anyway."""
+        narrow = [self._narrow.get(value.name) if isinstance(value, Value) else None for value in inputs]
+        wide = any(found is None and tuple(value.shape) == shape for value, found in zip(inputs, narrow, strict=True))
+        return [found if wide and found else value for value, found in zip(inputs, narrow, strict=True)]
 
     def name(self, value: Known) -> str:
         """The name of a value; what is known becomes a constant."""
@@ -185,8 +201,10 @@ class Builder:
     def branch(self, jaxpr: Any, consts: list[Known], carried: list[Value]) -> Graph:
         """A jaxpr of carried values as a graph of its own, which may look at everything outside."""
         outer, self.ops = self.ops, []
+        before = dict(self._done_before)
         results = self.inlined(jaxpr.jaxpr, jaxpr.consts, [*consts, *carried])
         made, self.ops = self.ops, outer
+        self._done_before = before  # what is done inside is not there outside
         names = [value.name for value in carried]
         return Graph(names, [self.name(result) for result in results], self._kept_inside(made, set(names)))
 
@@ -226,6 +244,11 @@ def _called(equation: Any) -> Any:
     return None
 
 
+# What broadcasts its inputs itself.
+WIDENING = {
+    *("add", "sub", "mul", "div", "rem", "pow", "atan2", "max", "min", "and", "or", "xor", "select"),
+    *("eq", "ne", "lt", "le", "gt", "ge"),
+}
 # What computes in bfloat16 where its result is of that type; the others only move numbers, or choose among them.
 ROUNDED = {
     *("add", "sub", "mul", "div", "dot_general", "exp", "log", "log1p", "expm1", "sin", "cos", "tan", "tanh", "atan"),

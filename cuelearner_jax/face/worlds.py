@@ -56,18 +56,19 @@ class World:
         return jax.jit(self.env.step)(key, state, action)
 
 
-def make(name: str | Task, *, scenario: str | None = None, **changes: Any) -> World:
+def make(name: str | Task, *, scenario: str | None = None, robot: str | None = None, **changes: Any) -> World:
     """A world of a task.
 
     Args:
         name: of the task ("billiards", "navigation", one of an installed package, `package.module:NAME`), or the task.
         scenario: a changed world of the task's by name.
+        robot: what acts there (default: the task's own), "anymal" in navigation, "pooltool" in billiards.
         changes: fields of its configuration, as `cuelearner evaluate TASK --help` lists them under "task options".
 
     Raises:
-        UserError: no such task, scenario or field.
+        UserError: no such task, scenario, robot or field.
     """
-    task = registry.resolve(name) if isinstance(name, str) else name
+    task = (registry.resolve(name) if isinstance(name, str) else name).on(robot)
     config = task.config()
     if scenario is not None:
         config = task.scenario(scenario).applied(config)

@@ -108,6 +108,24 @@ class ActFunction(Protocol):
 
 
 @runtime_checkable
+class OnwardFunction(Protocol):
+    """What to execute in place of actions that have been corrected already."""
+
+    def __call__(
+        self,
+        model: GuidanceModel,
+        env: Any,
+        obs: Float[Array, "n obs"],
+        first: Float[Array, "n action"],
+        actions: Float[Array, "n action"],
+        active: Bool[Array, " n"],
+        scalars: GuideScalars,
+    ) -> Refined:
+        """As `ActFunction`, of `actions` that were `first` before anything corrected them."""
+        ...
+
+
+@runtime_checkable
 class DisagreementFunction(Protocol):
     """How far the members of a model are apart."""
 
@@ -129,11 +147,26 @@ class Guidance(NamedTuple):
     fit: FitFunction
     act: ActFunction
     disagreement: DisagreementFunction | None = None  # None: its model has no members
+    onward: OnwardFunction | None = None  # None: its model does not see what an action was before (`sizes.sees_turn`)
 
     @property
     def asks(self) -> bool:
         """Does it ask a teacher?"""
         return self.form is not None
+
+    def moved_on(
+        self,
+        model: GuidanceModel,
+        env: Any,
+        labels: Label,
+        active: Bool[Array, " n"],
+        scalars: GuideScalars,
+    ) -> Refined:
+        """What it would make of the actions that labels (n, ...) are about."""
+        if self.onward is None:
+            return self.act(model, env, labels.obs, labels.action, active, scalars)
+        assert labels.base is not None  # of a guidance that sees it
+        return self.onward(model, env, labels.obs, labels.base, labels.action, active, scalars)
 
     @property
     def answer_width(self) -> int:

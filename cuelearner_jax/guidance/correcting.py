@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from cuelearner_jax.config import GuideScalars, GuideSizes
 from cuelearner_jax.environment import Spaces
+from cuelearner_jax.guidance import turning
 from cuelearner_jax.guidance.bundle import AnswerForm, Guidance, TargetFunction
 from cuelearner_jax.guidance.fitting import fit_least_squares, lessons
 from cuelearner_jax.guidance.model import residual_model
@@ -38,6 +39,8 @@ def correcting(
         sizes: of the network and its fitting.
         spaces: the environment's.
     """
+    if sizes.sees_turn:
+        return turning.correcting(name, form, target, sizes, spaces)
     network = residual_model(sizes, spaces)
 
     def init(key: PRNGKeyArray) -> GuidanceModel:

@@ -110,6 +110,11 @@ def fit_model(
     return fitted_members(sizes.ensemble, fit, key, init)
 
 
+def held_out(count: int) -> Bool[Array, " count"]:
+    """Which of so many labels validate a fit and are not trained on."""
+    return (jnp.arange(count) % VALIDATION_STRIDE) == VALIDATION_STRIDE - 1
+
+
 def _fit_network(
     key: PRNGKeyArray,
     init: Callable[[PRNGKeyArray], Params],
@@ -120,9 +125,9 @@ def _fit_network(
     redrawn: Redrawn,
     sizes: GuideSizes,
 ) -> GuidanceModel:
-    held_out = (jnp.arange(rows.valid.shape[0]) % VALIDATION_STRIDE) == VALIDATION_STRIDE - 1
-    validation = rows.valid & held_out
-    training = rows.valid & ~held_out
+    held = held_out(rows.valid.shape[0])
+    validation = rows.valid & held
+    training = rows.valid & ~held
     draw = _subset(training)
     key_init, key_steps = jax.random.split(key)
     adam = optimizer(scalars)

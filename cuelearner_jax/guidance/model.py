@@ -27,8 +27,14 @@ class GuideModel(NamedTuple):
     disagreement: DisagreementFunction | None = None  # for the bundle; None: there is but one network
 
 
-def guide_model(sizes: GuideSizes, spaces: Spaces, outputs: int) -> GuideModel:
+def guide_model(sizes: GuideSizes, spaces: Spaces, outputs: int, beside: int = 0) -> GuideModel:
     """A network whose outputs are numbers, such as the value of an action; with `ensemble` several, and their mean.
+
+    Args:
+        sizes: of the network.
+        spaces: the environment's.
+        outputs: how many numbers.
+        beside: numbers that it sees beside observation and action: actions then have so many entries more, at the end.
 
     Raises UserError for a frame in which the environment cannot be seen.
     """
@@ -36,21 +42,27 @@ def guide_model(sizes: GuideSizes, spaces: Spaces, outputs: int) -> GuideModel:
     own, turned = view.widths(sizes.frame, spaces)
 
     def init(key: PRNGKeyArray) -> Params:
-        return network.init(key, jnp.zeros(own), jnp.zeros(turned))
+        return network.init(key, jnp.zeros(own), jnp.zeros(turned + beside))
 
     def predict(
         env: Any, params: Params, obs: Float[Array, "n obs"], actions: Float[Array, "n action"]
     ) -> Float[Array, "n outputs"]:
-        return applied(network)(params, *view.seen(sizes.frame, env, obs, actions))
+        bare, known = jnp.split(actions, [spaces.actions.size], -1)
+        of_obs, of_action = view.seen(sizes.frame, env, obs, bare)
+        return applied(network)(params, of_obs, jnp.concatenate([of_action, known], -1) if beside else of_action)
 
     return GuideModel(*ensemble(sizes.ensemble, init, predict))
 
 
-def residual_model(sizes: GuideSizes, spaces: Spaces) -> GuideModel:
-    """A network whose outputs are something to add to the action, whichever frame it sees them in."""
-    inner = guide_model(sizes, spaces, spaces.actions.size)
+def residual_model(sizes: GuideSizes, spaces: Spaces, beside: int = 0) -> GuideModel:
+    """A network whose outputs are something to add to the action, whichever frame it sees them in.
+
+    `beside`: see `guide_model`.
+    """
+    inner = guide_model(sizes, spaces, spaces.actions.size, beside)
 
     def predict(env: Any, params: Params, obs: jax.Array, actions: jax.Array) -> jax.Array:
-        return view.outward(sizes.frame, spaces, inner.predict(env, params, obs, actions), actions)
+        outputs = inner.predict(env, params, obs, actions)
+        return view.outward(sizes.frame, spaces, outputs, actions[..., : spaces.actions.size])
 
     return GuideModel(inner.init, predict, inner.disagreement)

@@ -62,7 +62,7 @@ def with_teacher(
     form = form_of(file)
     if form is None or file.people is None or file.session is None:
         raise UserError("a teacher looks at situations, and this file's cannot be had again: it is no page's own file")
-    config = world_of(task, file)
+    config, task = world_of(task, file), task.on(str(file.session.get("robot", "")).partition(" ")[0] or None)
     tell(f"asking the teacher of {task.name} about {len(rows)} questions")
     env = task.environment(config)
     teacher = task.make_teacher(config, env)

@@ -47,6 +47,7 @@ class Page:
         with ui.element("main").classes("label-page"):
             with ui.column().classes("w-full gap-2"):
                 self._asked = ui.label(controls.question(session.plan.form)).classes("big")
+                self._note = ui.label().classes("note")
                 self._scene = ui.html("", sanitize=False).classes("stage")
                 self._answers()
             with ui.element("aside").classes("side"):
@@ -163,6 +164,7 @@ class Page:
         status, item = self.session.status(), self.session.item
         plan = self.session.plan
         self._scene.content = "" if item is None else view.picture(item, plan.form, plan.config.scalars.eps_deg)
+        self._note.text = "" if item is None else view.note(item, plan.form, plan.config.scalars.eps_deg)
         if item is None:
             self._asked.text = "All labels are given. Thank you."
         else:

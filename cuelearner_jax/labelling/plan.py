@@ -50,6 +50,7 @@ class Plan:
     seed: int = 0
     who: str = "anonymous"
     bound_deg: float | None = None  # questions stay within this of the base's actions [deg]; None: anywhere
+    robot: str = ""  # its body and what that walks by, where it is not the task's own
     again: tuple[np.ndarray, ...] = ()  # actions that another session of this seed asked about: they are asked again
     again_of: str = ""  # digest of its file
 
@@ -78,6 +79,7 @@ class Plan:
             "base": self.base.name,
             "base_digest": self.base.digest,
             "bound_deg": self.bound_deg,
+            **({"robot": self.robot} if self.robot else {}),
             **({"again_of": self.again_of} if self.again else {}),
             "observation": layout,
         }

@@ -15,8 +15,12 @@ from cuelearner_jax.types import Reel, Sketch
 HAIR = 1 / 400  # of the sketch's width: a thin line
 TURNED_REACH = 1.25, 3.5  # how much farther arrows reach that are turned: the more the less they are,
 APART = 10.0  # by this over eps [deg], so that they can be told apart
+HEAD = 7.0  # length of an arrow's head [hairs]
 HALO = ' class="halo"', 3.8  # so that arrows stand out on any ground
-LEAST_TURN = 1.0  # of the refined action from the one in question, to be shown [deg]
+TIPS = 8.0  # turns are drawn larger than they are where tips would be nearer than this [hairs],
+STEEPEST = 30.0  # but eps no larger than this [deg],
+WIDEST = 60.0  # and a refined action no farther away, unless it is [deg]
+LEAST_TURN = 1.0  # of the refined action from the one in question as they are drawn, to be shown [deg]
 
 
 def angle_of(action: np.ndarray) -> float:
@@ -30,6 +34,21 @@ def turned(action: np.ndarray, by_deg: float) -> np.ndarray:
     return np.array([math.cos(angle), math.sin(angle)], np.float32)
 
 
+def magnified(item: Item, eps_deg: float) -> int:
+    """How many times larger than they are turns of an item's action are drawn: so that one by eps can be seen."""
+    assert item.sketch is not None
+    sketch, hair = item.sketch, item.sketch.box[2] * HAIR
+    far = _ends(sketch, angle_of(item.action), TURNED_REACH[1])[1]
+    seen = min(math.degrees(math.asin(min(TIPS * hair / far, 1.0))), STEEPEST)
+    return math.ceil(seen / eps_deg) if eps_deg < 0.75 * seen else 1
+
+
+def note(item: Item, form: AnswerForm, eps_deg: float) -> str:
+    """What a person has to know about the picture; empty: nothing."""
+    times = magnified(item, eps_deg) if form.by_eps else 1
+    return f"turns are drawn {times} times as large: {eps_deg:g}° as {times * eps_deg:g}°" if times > 1 else ""
+
+
 def picture(item: Item, form: AnswerForm, eps_deg: float) -> str:
     """An item with a sketch, as an SVG element; attributes `data-…` tell the page's script what it shows."""
     assert item.sketch is not None
@@ -38,15 +57,18 @@ def picture(item: Item, form: AnswerForm, eps_deg: float) -> str:
     for name, body in sketch.movers.items():
         place = f'class="mover" data-mover="{html.escape(name)}" transform="{_moved(sketch, name)}"'
         parts.append(f"<g {place}>{body}</g>")
+    times = magnified(item, eps_deg) if form.by_eps else 1
     if form.by_eps:
-        longer = min(max(APART / eps_deg, TURNED_REACH[0]), TURNED_REACH[1])
-        parts += [_arrow(sketch, angle + way * eps_deg, name, longer) for way, name in ((1, "left"), (-1, "right"))]
+        drawn = times * eps_deg
+        longer = min(max(APART / drawn, TURNED_REACH[0]), TURNED_REACH[1])
+        parts += [_arrow(sketch, angle + way * drawn, name, longer) for way, name in ((1, "left"), (-1, "right"))]
     parts.append(_line(sketch, angle))
     parts.append(_arrow(sketch, angle, "asked"))
     if item.refined is not None:
-        refined = angle_of(item.refined)
-        if abs((refined - angle + 180) % 360 - 180) >= LEAST_TURN:
-            parts.append(_arrow(sketch, refined, "refined", 0.8))
+        turn = (angle_of(item.refined) - angle + 180) % 360 - 180
+        turn = math.copysign(min(times * abs(turn), max(WIDEST, abs(turn))), turn)
+        if abs(turn) >= LEAST_TURN:
+            parts.append(_arrow(sketch, angle + turn, "refined", 0.8))
     if form.is_action:
         parts.append(_arrow(sketch, angle, "pointer"))
     data = {
@@ -90,11 +112,17 @@ def _room(sketch: Sketch, angle: float) -> float:
     return min(across, down)
 
 
+def _ends(sketch: Sketch, angle: float, longer: float = 1.0) -> tuple[float, float]:
+    """Where an arrow begins and ends, from the foot: within what is shown, but never too short for its head [m]."""
+    hair, (first, last) = sketch.box[2] * HAIR, sketch.reach
+    last = first + (last - first) * longer
+    return first, max(min(last, _room(sketch, angle) - 2 * hair), first + HEAD * hair)
+
+
 def _arrow(sketch: Sketch, angle: float, name: str, longer: float = 1.0) -> str:
-    first, last = sketch.reach[0], sketch.reach[0] + (sketch.reach[1] - sketch.reach[0]) * longer
     hair = sketch.box[2] * HAIR
-    head, half = 7 * hair, 2.8 * hair
-    last = max(min(last, _room(sketch, angle) - 2 * hair), first + head)
+    head, half = HEAD * hair, 2.8 * hair
+    first, last = _ends(sketch, angle, longer)
     shaft = [_point(sketch, angle, first), _point(sketch, angle, last - 0.6 * head)]
     tip = [_point(sketch, angle, last), *(_point(sketch, angle, last - head, side) for side in (half, -half))]
     (x1, y1), (x2, y2) = shaft

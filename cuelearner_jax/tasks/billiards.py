@@ -12,8 +12,10 @@ import jax.numpy as jnp
 
 from cuelearner_envs import billiards
 from cuelearner_envs.billiards.config import BilliardsConfig, make_environment
-from cuelearner_envs.billiards.teacher import LocalSearchTeacher, SearchTeacher, Transferred
+from cuelearner_envs.billiards.environment import Billiards
+from cuelearner_envs.billiards.teacher import LocalSearchTeacher, NearbyTeacher, SearchTeacher, Transferred
 from cuelearner_jax.config import RunConfig, Scalars, Schedule, Sizes
+from cuelearner_jax.environment import Environment
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.task import Body, Pictures, Preset, Scenario, Task
 from cuelearner_jax.teachers import stored
@@ -62,6 +64,8 @@ def make_teacher(config: BilliardsConfig, env: Any) -> Teacher:
     told = _learned_in(folder, config)
     own = make_environment(told)
     network = stored.load(folder, own, aim_error, habit)
+    if type(env) is not Billiards:  # other physics, of which a network knows only where to try
+        return NearbyTeacher(Transferred(network, own, env), env, aim_error)
     if config.teacher == LOCAL_SEARCH or told.acceleration != config.acceleration:
         return LocalSearchTeacher(network, own, env, aim_error, habit)
     return Transferred(network, own, env)
@@ -113,6 +117,19 @@ PLAYER = Body(
     pictures=_pictures,
 )
 
+
+def _foreign(config: BilliardsConfig, split: str) -> Environment:
+    from cuelearner_envs.pooltool.environment import make_environment
+
+    return make_environment(config)
+
+
+POOLTOOL = Body(
+    name="pooltool",
+    about="strikes on a table with cloth, spin and cushions, simulated by pooltool in processes of their own",
+    environment=_foreign,
+)
+
 # The worlds of the paper's section on adaptation after training.
 SCENARIOS = {
     "turned_strike": Scenario(
@@ -133,7 +150,7 @@ BILLIARDS = Task(
     name="billiards",
     about="pocket the target balls with one shot a step",
     config=BilliardsConfig,
-    bodies=(PLAYER,),
+    bodies=(PLAYER, POOLTOOL),
     teacher=make_teacher,
     files=_files,
     scenarios=SCENARIOS,

@@ -71,11 +71,14 @@ def _judged(*arguments: Any) -> dict[str, Any]:
 def _legged_pictures() -> Pictures:
     from cuelearner_envs.anymal import recording
 
+    above = _pictures()  # as the simple robot: it has a pose and the same lidar
     return Pictures(
         record=recording.record,
         still=lambda env, frames, file: recording.still(frames, file),
         animate=lambda env, frames, file: recording.animate(frames, file),
-        question=_pictures().question,  # from above, as the simple robot: it has a pose and the same lidar
+        question=above.question,
+        sketch=above.sketch,
+        reel=above.reel,
     )
 
 

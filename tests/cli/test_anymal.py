@@ -16,12 +16,12 @@ AGENT = Path(__file__).parents[2] / "docs" / "data" / "navigation_agent"
 FEW = ["--episodes", "3", "--task.worlds", "8", "--task.max-steps", "4"]
 
 REFUSED = [
-    (["evaluate", "billiards", "--robot", "anymal"], "billiards has no robots to choose from: leave out --robot"),
+    (["evaluate", "billiards", "--robot", "anymal"], "unknown robot 'anymal'"),
     (["evaluate", "navigation", "--robot", "anymall"], "unknown robot 'anymall', did you mean 'anymal'"),
     (["evaluate", "navigation", "--engine", "mujoco"], "--engine mujoco needs --robot: choose one of anymal"),
     (["evaluate", "navigation", "--robot", "anymal", "--engine", "bullet"], "unknown engine 'bullet'"),
     (["evaluate", "navigation", "--robot", "anymal", "--policy", "agent"], "needs a trained run"),
-    (["render", "billiards", "--robot", "anymal"], "billiards has no robots"),
+    (["render", "billiards", "--robot", "pooltool"], "billiards has no pictures of pooltool: evaluate it instead"),
     (["evaluate", "navigation", "--robot", "anymal:nowhere"], "no walking policy in nowhere: train one with"),
     (["render", "navigation", "--robot", "simple:nowhere"], "simple takes no folder: leave out 'nowhere'"),
     (["locomotion", "walk"], "unknown command 'locomotion walk': choose one of train, evaluate"),

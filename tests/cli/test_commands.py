@@ -183,15 +183,29 @@ def test_tuning_episodes_are_others_and_stay_out_of_reports(run_folder, tmp_path
 
 
 @pytest.mark.parametrize("command", ["train", "sweep", "evaluate", "report", "render", "teacher", "bench"])
-def test_the_installed_command_explains_itself(command):
+def test_every_command_explains_itself(command, capsys):
     task = {"teacher": ["train", "billiards"], "report": []}.get(command, ["billiards"])
-    done = subprocess.run([*ENTRY, command, *task, "--help"], check=False, capture_output=True, text=True, timeout=120)
+    with pytest.raises(SystemExit) as stopped:
+        main([command, *task, "--help"])
+    assert not stopped.value.code
+    explained(command, *capsys.readouterr())
+
+
+def test_the_installed_command_explains_itself():
+    done = subprocess.run(
+        [*ENTRY, "sweep", "billiards", "--help"], check=False, capture_output=True, text=True, timeout=120
+    )
     assert done.returncode == 0
-    assert "--out" in done.stdout
-    assert done.stderr == ""
+    explained("sweep", done.stdout, done.stderr)
+
+
+def explained(command, out, err):
+    """What is told of a command."""
+    assert "--out" in out
+    assert err == ""
     if command in ("train", "sweep", "evaluate", "render"):
-        assert "(--preset; paper where none is given)" in done.stdout
-        assert re.search(r"^  quickstart  .*minutes on 2 cores\)$", done.stdout, re.MULTILINE)
+        assert "(--preset; paper where none is given)" in out
+        assert re.search(r"^  quickstart  .*minutes on 2 cores\)$", out, re.MULTILINE)
 
 
 def test_the_installed_command_fails_in_one_line(tmp_path):

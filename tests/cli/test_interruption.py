@@ -7,12 +7,13 @@ from pathlib import Path
 import pytest
 from small_runs import SMALL
 
+from cuelearner_jax.cli import main
 from cuelearner_jax.records import results
 
 ENTRY = [str(Path(sys.executable).with_name("cuelearner"))]
 STEPS = 2000
 LONG = [*SMALL, "--schedule.total-steps", str(STEPS), "--guidance", "none", "--seeds", "2"]
-COMMAND = [*ENTRY, "sweep", "billiards", "--preset", "quickstart", *LONG]
+COMMAND = ["sweep", "billiards", "--preset", "quickstart", *LONG]
 
 
 def rows(folder):
@@ -21,7 +22,7 @@ def rows(folder):
 
 
 def start_and_wait_for(folder, step, *options):
-    process = subprocess.Popen([*COMMAND, "--out", str(folder), *options], stderr=subprocess.PIPE, text=True)
+    process = subprocess.Popen([*ENTRY, *COMMAND, "--out", str(folder), *options], stderr=subprocess.PIPE, text=True)
     for _ in range(1200):
         file = folder / "none" / "results.jsonl"
         if file.exists() and f'"step": {step}' in file.read_text():
@@ -35,7 +36,7 @@ def start_and_wait_for(folder, step, *options):
 @pytest.fixture(scope="module")
 def uninterrupted(tmp_path_factory):
     folder = tmp_path_factory.mktemp("whole") / "run"
-    subprocess.run([*COMMAND, "--out", str(folder)], check=True, capture_output=True, timeout=300)
+    assert main([*COMMAND, "--out", str(folder)]) == 0
     return rows(folder)
 
 
@@ -50,7 +51,7 @@ def test_ctrl_c_and_sigterm_save_and_resume_goes_on_as_if_never_stopped(tmp_path
         reached = max(row["step"] for row in rows(folder))
         assert str(reached) in {path.name for path in (folder / "none" / "checkpoints").iterdir()}
         assert reached < STEPS
-    subprocess.run([*COMMAND, "--out", str(folder), "--resume"], check=True, capture_output=True, timeout=300)
+    assert main([*COMMAND, "--out", str(folder), "--resume"]) == 0
     assert rows(folder) == uninterrupted
 
 
@@ -59,10 +60,7 @@ def test_kill_loses_one_stretch_at_most_and_resume_goes_on(tmp_path, uninterrupt
     process = start_and_wait_for(folder, 300)
     process.kill()
     process.communicate(timeout=60)
-    resumed = subprocess.run(
-        [*COMMAND, "--out", str(folder), "--resume"], check=False, capture_output=True, timeout=300
-    )
-    assert resumed.returncode == 0
+    assert main([*COMMAND, "--out", str(folder), "--resume"]) == 0
     assert rows(folder) == uninterrupted
     saved = sorted(int(path.name) for path in (folder / "none" / "checkpoints").iterdir() if path.name.isdigit())
     assert saved[-1] == STEPS

@@ -67,6 +67,7 @@ def test_the_page_is_served_to_who_knows_its_address_until_ctrl_c(tmp_path, refu
         (["--port", "70000"], "--port is 70000: give a number"),
         (["--base.seed", "1"], "--base.… chooses in a folder, and none is given"),
         (["--who", " "], "--who is empty"),
+        (["--robot", "anymal"], "has no robots to choose from"),
         (["--again", "nothing"], "no label file at nothing"),
         (["--scalars.eps-deg", "-1"], "eps_deg"),
     ],

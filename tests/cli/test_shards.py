@@ -21,6 +21,7 @@ from cuelearner_jax.runs.shards import Shard
 ENTRY = [str(Path(sys.executable).with_name("cuelearner"))]
 SWEEP = ["sweep", "billiards", "--preset", "quickstart", *SMALL, "--seeds", "3", "--first-seed", "7"]
 SWEEP += ["--guidance", "none"]
+TESTS = Path(__file__).parents[1]
 
 
 def rows(*folders):
@@ -81,7 +82,7 @@ def test_other_options_for_a_piece_that_has_begun_are_refused(refused, tmp_path)
     refused([*second, "--seeds", "4"], "is a piece of a sweep with another shard.seeds: give the same", tmp_path)
 
 
-def test_a_piece_that_was_killed_goes_on_with_the_same_command(tmp_path):
+def test_a_piece_that_was_killed_goes_on_with_the_same_command(tmp_path, capsys):
     command = [*SWEEP, "--schedule.total-steps", "1000", "--shard", "1/2"]
     calm, killed = tmp_path / "calm", tmp_path / "killed"
     assert main([*command, "--out", str(calm)]) == 0
@@ -92,11 +93,12 @@ def test_a_piece_that_was_killed_goes_on_with_the_same_command(tmp_path):
             break
         time.sleep(0.05)
     process.send_signal(signal.SIGSTOP)  # it lives, and holds its folder
-    twice = subprocess.run([*ENTRY, *command, "--out", str(killed)], capture_output=True, text=True, check=False)
+    capsys.readouterr()
+    twice = main([*command, "--out", str(killed)])
     process.send_signal(signal.SIGKILL)
     assert process.wait() == -signal.SIGKILL
-    assert twice.returncode == 2
-    assert "is being written by another process" in twice.stderr
+    assert twice == 2
+    assert "is being written by another process" in capsys.readouterr().err
     assert main([*command, "--out", str(killed)]) == 0
     assert rows(killed) == rows(calm)
 
@@ -126,8 +128,10 @@ def test_a_table_that_the_disk_has_no_room_for_is_reported(tmp_path):
     # Every file but the shortest is too large for this process.
     script = "import resource, sys; resource.setrlimit(resource.RLIMIT_FSIZE, (3000, 3000));"
     script += "from cuelearner_jax.cli import main; sys.exit(main(sys.argv[1:]))"
-    command = [sys.executable, "-c", script, *SWEEP, "--out", str(tmp_path / "run")]
-    env = {**os.environ, "JAX_ENABLE_COMPILATION_CACHE": "false"}  # JAX warns of programs that it can't keep
+    bandit = ["sweep", "page_task:TASK", "--guidance", "none", "--seeds", "2"]  # whose programs are soon compiled
+    command = [sys.executable, "-c", script, *bandit, "--out", str(tmp_path / "run")]
+    env = {**os.environ, "PYTHONPATH": os.pathsep.join([str(TESTS), *sys.path])}
+    env["JAX_ENABLE_COMPILATION_CACHE"] = "false"  # JAX warns of programs that it can't keep
     done = subprocess.run(command, capture_output=True, text=True, check=False, env=env)
     assert done.returncode == 1
     told = [line for line in done.stderr.splitlines() if " lanes, " not in line and not line.startswith("none  ")]

@@ -166,6 +166,20 @@ def test_a_run_goes_on_with_the_same_command(runs, home):
     assert json.loads(described)["grid"]["guidance"] == ["none", "clone"]
 
 
+def test_the_boats_page_shows_where_things_are_and_where_an_action_leads():
+    reach = importlib.import_module("examples.reach")
+    env = reach.make_environment(reach.ReachConfig(wind=0.0))
+    boat = reach.Boat(np.float32([0.2, 0.1]), np.float32([0.2, 0.6]), np.zeros(2, np.float32), np.int32(0))
+    found = reach.sketch(env, boat)
+    assert found.places["boat"] == pytest.approx((0.2, -0.1, 0.0))
+    assert 'cx="0.2" cy="-0.6"' in found.still  # the buoy, half a metre up
+    there, away = (reach.reel(env, boat, np.float32([0.0, up])) for up in (1.0, -1.0))
+    assert (there.words, len(there.frames)) == ("the buoy is reached", 6)  # at 0.1 m a step, seen before and after
+    assert there.frames[-1]["boat"] == pytest.approx((0.2, -0.6, -90.0), abs=1e-5)
+    assert away.words.endswith("not there")
+    assert len(away.frames) == reach.FILM
+
+
 def test_the_parts_keep_the_laws(tmp_path):
     reach, clone, brax, policy = (
         importlib.import_module(f"examples.{name}") for name in ("reach", "clone", "brax_task", "policy")

@@ -69,7 +69,7 @@ def test_wandb_is_asked_to_stay_offline(tmp_path, monkeypatch):
         tracker.log(100, {"reward": 1.0})
         assert not ended
     assert (asked["mode"], asked["group"], asked["name"]) == ("offline", "run", "run relative")
-    assert asked["config"] == {"seeds": 3}
+    assert (asked["config"], asked["settings"]) == ({"seeds": 3}, {"silent": True})
     assert (logged, ended) == ([(100, {"reward": 1.0})], [True])
 
 

@@ -24,6 +24,7 @@ class Tracker:
             project="cuelearner",
             group=run,
             name=f"{run} {kind}",
+            settings={"silent": True},  # its summary of forty lines would stand between ours
         )
 
     def log(self, step: int, metrics: dict[str, float]) -> None:

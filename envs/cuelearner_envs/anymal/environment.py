@@ -44,6 +44,7 @@ class LeggedWalker(struct.PyTreeNode):
     route: Int[Array, ""]  # of that world
     steps: Int[Array, ""]  # taken in this episode
     fallen: Bool[Array, ""]
+    passed: Float[Array, "2"] | None = None  # as of `navigation.environment.Walker`
 
     @property
     def pose(self) -> Float[Array, "3"]:
@@ -169,5 +170,6 @@ def make_environment(
         period=plain.period,
         goal_radius=plain.goal_radius,
         mirrors=plain.mirrors,
+        sides=plain.sides,
         walking=walking_policy.load() if walking is None else walking,
     )

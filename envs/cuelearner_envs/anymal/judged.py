@@ -46,7 +46,7 @@ def _after(
     fallen: jax.Array,
 ) -> tuple[LeggedWalker, jax.Array, Any]:
     """The state that a step of another engine has led to, what is seen there, and what has ended."""
-    state = state.replace(
+    after = state.replace(
         body=body,
         last_action=last,
         told=told,
@@ -54,7 +54,8 @@ def _after(
         steps=state.steps + 1,
         fallen=state.fallen | fallen,
     )
-    return state, env.observe(state), env.ends(state)
+    after = env.counted(state, after)
+    return after, env.observe(after), env.ends(after)
 
 
 class Course:

@@ -12,7 +12,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from cuelearner_envs.billiards.aims import aims_of
-from cuelearner_envs.billiards.physics import simulate
+from cuelearner_envs.billiards.physics import Shot, simulate
 from cuelearner_envs.billiards.table import Table, parking, rack
 from cuelearner_jax.actions import retract, rotate, to_angle
 from cuelearner_jax.environment import Aims, Features, Quantity, WholeObservations
@@ -71,7 +71,7 @@ class Billiards(WholeObservations, struct.PyTreeNode):
     def step(self, key: PRNGKeyArray, state: Balls, action: Float[Array, "2"]) -> tuple[Balls, Step]:
         """Plays one shot; a new rack follows the last one of an episode."""
         k_place, k_reset = jax.random.split(key)
-        shot = simulate(self.table, state.positions, state.pocketed, to_angle(action) + self.action_turn)
+        shot = self.shot(state, to_angle(action) + self.action_turn)
         foul = shot.pocketed[0]
         reward = jnp.where(foul, 0, (shot.pocketed & ~state.pocketed)[1:].sum()).astype(jnp.float32)
         replaced = state.positions.at[0].set(_free_place(k_place, self.table, state))
@@ -99,6 +99,10 @@ class Billiards(WholeObservations, struct.PyTreeNode):
             outcome={},
         )
         return jax.tree.map(lambda new, old: jnp.where(ended, new, old), racked, after), step
+
+    def shot(self, balls: Balls, angle: Float[Array, ""]) -> Shot:
+        """What striking the cue ball in the direction `angle` [rad] leads to."""
+        return simulate(self.table, balls.positions, balls.pocketed, angle)
 
     def observe(self, balls: Balls) -> Float[Array, " obs"]:
         """x [m], y [m] and a flag for the cue ball, then for the targets from the highest y down, then by x.

@@ -9,7 +9,7 @@ import pytest
 from flax import struct
 
 from cuelearner_envs.billiards.config import BilliardsConfig, make_environment
-from cuelearner_envs.billiards.teacher import PROPOSALS, LocalSearchTeacher, SearchTeacher, Transferred
+from cuelearner_envs.billiards.teacher import PROPOSALS, LocalSearchTeacher, NearbyTeacher, SearchTeacher, Transferred
 from cuelearner_jax import actions
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import episodes, rollout
@@ -282,3 +282,41 @@ def test_the_nearest_good_shot_is_that_of_the_averaged_values(wins):
         there = actions.rotate(asked, -np.deg2rad(turned))  # the strike that there is what `asked` is here
         near = jax.jit(jax.vmap(lambda state, obs, t=teacher, a=there: t.nearest_good(state, obs, a, spread, share)))
         np.testing.assert_allclose(degrees(near(*few)), wanted - turned, atol=0.01)
+
+
+class Given(struct.PyTreeNode):
+    """Proposes what it was given."""
+
+    action: jax.Array
+
+    def best_action(self, state, obs):
+        return self.action
+
+
+@jax.jit
+def nearby(states, obs, centres):
+    """Best and nearest good within 3 degrees of the centres."""
+
+    def one(state, obs, centre):
+        teacher = NearbyTeacher(Given(centre), ONE, AIM, jnp.deg2rad(3.0), 61)
+        return teacher.best_action(state, obs), teacher.nearest_good(state, obs, centre, AIM, 0.9)
+
+    return jax.vmap(one)(states, obs, centres)
+
+
+@pytest.mark.parametrize("off_deg", [-1.5, 2.0])
+def test_a_teacher_of_what_is_near_points_to_the_middle_of_what_succeeds(chosen, off_deg):
+    """Asked from beside a winning shot it finds its window, and tells the way there."""
+    beside = actions.rotate(chosen, jnp.deg2rad(off_deg))
+    middle, nearest = nearby(STATES, OBS, beside)
+    turns = [np.rad2deg(np.asarray(actions.difference(beside, found))) for found in (middle, nearest)]
+    assert float(play(ONE, STATES, middle).reward.mean()) > 0.9
+    assert (np.abs(turns[0]) <= 3.0 + 1e-3).all()
+    assert (np.sign(turns[0]) == -np.sign(off_deg)).mean() > 0.8
+    assert (np.abs(turns[1]) <= np.abs(turns[0]) + 1e-3).all()
+
+
+def test_a_teacher_of_what_is_near_leaves_alone_what_it_cannot_better():
+    away = jnp.tile(jnp.array([-1.0, 0.0]), (RACKS, 1))
+    for found in nearby(STATES, OBS, away):
+        np.testing.assert_allclose(found, away, atol=1e-6)

@@ -1,0 +1,207 @@
+"""A policy of our billiards table on pooltool's: cloth, spin and cushions that nobody here wrote, corrected by labels.
+
+    python experiments/adaptation_pooltool.py --out FOLDER [--policy RUN] [--processes 2] [--resume]
+
+The policy (default: the shipped network that expects rewards, as an agent) acts on pooltool's table unchanged, and is
+adapted there by `cl.adapt`: the teacher plays shots near what the policy does, within the bound, and says whether the
+better ones lie to the left or to the right. Fewer labels are the first of the most, fitted anew. Every policy plays the
+same fresh racks, ten shots on each; the interval is over racks. Needs the extra `pooltool`. At the scale `paper` it
+takes a quarter of an hour on 2 free cores, mostly shots in pooltool, one of which takes 10 ms of a core; `smoke` two
+minutes. FOLDER/pooltool.json grows with each measurement.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Iterator, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.stats
+
+import cuelearner_jax as cl
+from cuelearner_envs.billiards.teacher import NearbyTeacher
+from cuelearner_jax.config import AgentSizes, GuideSizes, Scalars
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.evaluate import episodes
+from cuelearner_jax.policies import Agent, Taught, Teaching
+from cuelearner_jax.records.provenance import provenance
+from cuelearner_jax.tasks.billiards import SHIPPED_TEACHERS
+from cuelearner_jax.teachers import stored
+
+TABLE = "regulation"
+BOUND_DEG, EPS_DEG = 1.0, 0.1
+AIM_DEG = 0.1  # the teacher prefers the middle of what succeeds, for a player who errs by that
+TRIED = 21  # shots for an answer: every tenth of a degree within the bound
+SCALARS = Scalars(eps_deg=EPS_DEG, tau_deg=EPS_DEG / 20, k_max=12)
+SIZES = GuideSizes(frame="action", feedback_layers=(128, 128), fit_steps=400, fit_batch_size=64)
+Row = dict[str, Any]
+
+
+class Scale(NamedTuple):
+    """How much is played."""
+
+    racks: int  # of a measurement
+    taught: int  # racks on which the teacher itself plays
+    shots: int  # on each
+    labels: tuple[int, ...]  # budgets, the largest last
+    seeds: tuple[int, ...]  # of labels and fits
+    judged: int  # tuning episodes, of 100 shots, by which a model is judged
+    sizes: GuideSizes
+
+
+SCALES = {
+    "smoke": Scale(2, 1, 2, (5, 10), (0,), 1, GuideSizes("action", (16,), fit_steps=20, fit_batch_size=5)),
+    "paper": Scale(200, 40, 10, (100, 250, 500), (0, 1), 5, SIZES),
+}
+
+
+def shipped() -> Agent:
+    """The shipped teacher's network as an agent: every direction's expected reward, and the largest is taken."""
+    own = cl.make("billiards", table=TABLE).env
+    network = stored.load(SHIPPED_TEACHERS / TABLE, own, 0.0, 0.0)
+    sizes = AgentSizes(frame="action", q_layers=network.layers, coarse_directions=360, peaks=4)
+    return Agent(network.params, sizes, env=own)
+
+
+@partial(jax.jit, static_argnames="racks")
+def _racked(env: Any, key: Any, racks: int) -> tuple[Any, Any]:
+    return jax.vmap(env.reset)(jax.random.split(key, racks))
+
+
+@jax.jit
+def _shot(env: Any, policy: Any, key: Any, state: Any, obs: Any) -> tuple[Any, Any, Any]:
+    k_act, k_env = jax.random.split(key)
+    action = policy.act(k_act, state, obs)
+    state, step = jax.vmap(env.step)(jax.random.split(k_env, obs.shape[0]), state, action)
+    return state, step.obs, step.reward
+
+
+def played(env: Any, policy: Any, racks: int, shots: int, split: str = "validation") -> np.ndarray:
+    """Reward a shot (racks,) of a policy on fresh racks, the same whoever plays."""
+    k_rack, k_play = jax.random.split(episodes(split))
+    state, obs = _racked(env, k_rack, racks)
+    rewards = []
+    for shot in range(shots):
+        state, obs, reward = _shot(env, policy, jax.random.fold_in(k_play, shot), state, obs)
+        rewards.append(np.asarray(reward))
+    return np.mean(rewards, axis=0)
+
+
+def near(base: Any, env: Any) -> NearbyTeacher:
+    """Who answers: plays shots within the bound of what the base policy does."""
+    return NearbyTeacher(Teaching(base), env, jnp.deg2rad(AIM_DEG), jnp.deg2rad(BOUND_DEG), TRIED)
+
+
+def adapted(base: Any, env: Any, scale: Scale, seed: int) -> Iterator[tuple[int, cl.AdaptedPolicy]]:
+    """The policy after the largest number of labels, then after the first ones of these."""
+    asked = partial(
+        cl.adapt,
+        base,
+        env,
+        bound_deg=BOUND_DEG,
+        sizes=scale.sizes,
+        scalars=SCALARS,
+        seed=seed,
+        judge_episodes=scale.judged,
+    )
+    most = asked(near(base, env), labels=scale.labels[-1])
+    yield scale.labels[-1], most
+    for budget in scale.labels[-2::-1]:
+        yield budget, asked(labels=cl.Labels(*(column[:budget] for column in most.labels)))
+
+
+def measured(base: Any, scale: Scale, processes: int, known: Sequence[Row]) -> Iterator[Row]:
+    """All measurements but the known ones, each as soon as it is there."""
+    own, world = cl.make("billiards", table=TABLE), cl.make("billiards", table=TABLE, robot="pooltool")
+    env = world.env.replace(processes=processes)  # pyright: ignore[reportAttributeAccessIssue]
+    done = {(row["what"], row["seed"], row["labels"]) for row in known}
+    plain = [
+        ("own table", own.env, base, scale.racks),
+        ("not adapted", env, base, scale.racks),
+        ("teacher", env, Taught(near(base, env)), scale.taught),
+    ]
+    for what, where, policy, racks in plain:
+        if (what, 0, 0) not in done:
+            yield {"what": what, "seed": 0, "labels": 0, "rewards": played(where, policy, racks, scale.shots)}
+    for seed in scale.seeds:
+        if all(("adapted", seed, budget) in done for budget in scale.labels):
+            continue
+        for budget, policy in adapted(base, env, scale, seed):
+            answers = np.bincount(np.asarray(policy.labels.answer, int).ravel() + 1, minlength=3).tolist()
+            told = {"used": policy.used, "judged": list(policy.judged[1:]), "answers": answers}
+            if ("adapted", seed, budget) not in done:
+                rewards = played(env, policy.policy, scale.racks, scale.shots)
+                yield {"what": "adapted", "seed": seed, "labels": budget, **told, "rewards": rewards}
+
+
+def mean(values: Any) -> str:
+    """A mean over racks with its 95% bootstrap interval."""
+    values = np.asarray(values, float)
+    if len(values) < 2 or np.ptp(values) == 0:
+        return f"{values.mean():.3f}"
+    found = scipy.stats.bootstrap((values,), np.mean, n_resamples=2_000, rng=np.random.default_rng(0))
+    return f"{values.mean():.3f} [{found.confidence_interval.low:.3f}, {found.confidence_interval.high:.3f}]"
+
+
+def table(rows: Sequence[Row]) -> str:
+    """What was measured, seeds together; gains are of each rack."""
+    kinds = dict.fromkeys((row["what"], row["labels"]) for row in sorted(rows, key=lambda row: row["labels"]))
+    rewards = {
+        kind: np.mean([row["rewards"] for row in rows if (row["what"], row["labels"]) == kind], axis=0)
+        for kind in kinds
+    }
+    before = rewards.get(("not adapted", 0))
+    lines = ["| policy | labels | reward a shot | gain |", "|---|---|---|---|"]
+    for (what, labels), own in rewards.items():
+        gain = "" if before is None or what in ("own table", "not adapted") else mean(own - before[: len(own)])
+        lines.append(f"| {what} | {labels or ''} | {mean(own)} | {gain} |")
+    return "\n".join(lines)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Measures, writes after each measurement, and prints the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--policy", type=Path, help="run folder or policy folder (default: the shipped network)")
+    parser.add_argument("--scale", choices=list(SCALES), default="paper")
+    parser.add_argument("--processes", type=int, default=0, help="that play in pooltool (0: one for each processor)")
+    parser.add_argument("--out", type=Path, default=Path("runs/adaptation_pooltool"), help="folder")
+    parser.add_argument("--resume", action="store_true", help="keep what FOLDER/pooltool.json has")
+    asked = parser.parse_args(arguments)
+    if asked.processes < 0:
+        parser.error(f"--processes is {asked.processes}: give 0 or more")
+    file, rows = asked.out / "pooltool.json", []
+    about = {"scale": asked.scale, "policy": asked.policy.name if asked.policy else "shipped network"}
+    if file.exists():
+        found = json.loads(file.read_text())
+        if not asked.resume or {name: found[name] for name in about} != about:
+            parser.error(f"{file} exists, of {found['policy']} at the scale {found['scale']}: give another --out")
+        rows = found["rows"]
+    try:
+        base = cl.load_policy(asked.policy).policy if asked.policy else shipped()
+        came, begun = provenance(), time.monotonic()
+        for row in measured(base, SCALES[asked.scale], asked.processes, rows):
+            took, begun = time.monotonic() - begun, time.monotonic()
+            rows.append({**row, "rewards": np.round(row["rewards"], 4).tolist(), "seconds": round(took)})
+            asked.out.mkdir(parents=True, exist_ok=True)
+            file.write_text(json.dumps({**about, **came, "bound_deg": BOUND_DEG, "rows": rows}) + "\n")
+            told = f"{row['what']} (seed {row['seed']}, {row['labels']} labels)"
+            print(f"{told}: {mean(row['rewards'])} after {took:.0f} s", flush=True)
+    except UserError as error:
+        print(error)
+        return 2
+    except KeyboardInterrupt:
+        print(f"\ninterrupted: --resume goes on from {file}")
+        return 130
+    print(table(rows))
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
