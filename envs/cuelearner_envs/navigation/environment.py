@@ -76,6 +76,11 @@ class Navigation(Described, struct.PyTreeNode):
         return (*self.perceived, WAY_TRIED) if self.memory else self.perceived
 
     @property
+    def plain_size(self) -> int:
+        """Entries of an observation that come before what a memory adds."""
+        return PLAIN
+
+    @property
     def symmetries(self) -> int:
         """Identity, and left and right exchanged: body, lidar and motion are symmetric, worlds are as likely as not."""
         return 2 if self.mirrors else 1

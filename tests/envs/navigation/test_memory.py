@@ -59,6 +59,7 @@ def remembered():
 def test_a_memory_adds_to_what_is_seen_and_changes_nothing(remembered):
     states, seen = walked(FORGETS)
     assert (FORGETS.obs_size, REMEMBERS.obs_size) == (PLAIN, PLAIN + memory.SEEN)
+    assert FORGETS.plain_size == REMEMBERS.plain_size == PLAIN
     np.testing.assert_array_equal(remembered[1][:, :PLAIN], seen)
     np.testing.assert_array_equal(remembered[0].pose, states.pose)
 
