@@ -1,6 +1,7 @@
 """The memory of the way tried, and the ways that aims are: laws of geometry, and what stays as it was without them."""
 
 import math
+from pathlib import Path
 
 import chex
 import jax
@@ -19,6 +20,8 @@ from cuelearner_jax.agent.networks import q_network
 from cuelearner_jax.config import AgentSizes
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.policies import Agent
+from cuelearner_jax.runs.trained import PolicySource
+from cuelearner_jax.tasks import registry
 
 WORLD = World(
     boxes=jnp.array([[6.1, 0, 0, 0.1, 4.2], [-6.1, 0, 0, 0.1, 4.2], [0, 4.1, 0, 6.2, 0.1], [0, -4.1, 0, 6.2, 0.1]]),
@@ -130,3 +133,11 @@ def test_aims_are_ways_with_room_and_the_goal_comes_first(remembered):
     plain = jax.jit(jax.vmap(FORGETS.aims))(remembered[1][:, :PLAIN])
     np.testing.assert_array_equal(plain.possible, possible)
     np.testing.assert_array_equal(plain.features, aims.features[..., : plain.features.shape[-1]])
+
+
+def test_agents_are_let_into_a_world_with_a_memory_and_their_guides_are_not():
+    folder = Path(__file__).parents[3] / "docs" / "data" / "navigation_agent"
+    source, changed = PolicySource.of_run(folder, registry.find), NavigationConfig(worlds=1, memory=True)
+    source.check("agent", changed)
+    with pytest.raises(UserError, match="have 280 entries, this world's 352"):
+        source.check("guided", changed)
