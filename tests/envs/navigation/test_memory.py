@@ -126,12 +126,13 @@ def test_aims_are_ways_with_room_and_the_goal_comes_first(remembered):
     aims = jax.jit(jax.vmap(REMEMBERS.aims))(remembered[1])
     np.testing.assert_allclose(aims.actions[:, 0], remembered[1][:, 271:273], atol=1e-6)
     behind = np.abs(np.arctan2(aims.actions[..., 1], aims.actions[..., 0])) > math.radians(136)
-    possible = np.asarray(aims.possible)
+    possible = np.asarray(aims.open)
+    assert np.asarray(aims.possible).all()
     assert not possible[behind].any()
     free = jax.jit(jax.vmap(free_ways))(remembered[1], aims.actions)
     assert np.asarray(free[:, 0])[possible].min() > ROOM[0]
     plain = jax.jit(jax.vmap(FORGETS.aims))(remembered[1][:, :PLAIN])
-    np.testing.assert_array_equal(plain.possible, possible)
+    np.testing.assert_array_equal(plain.open, possible)
     np.testing.assert_array_equal(plain.features, aims.features[..., : plain.features.shape[-1]])
 
 
