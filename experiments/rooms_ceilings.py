@@ -110,6 +110,7 @@ class Clone(struct.PyTreeNode):
         if not self.ways:
             return DIRECTIONS.retract(self.towards(self.params, obs))
         aims, likely = self.weighed(self.params, obs)
+        assert aims.open is not None
         best = jnp.where(aims.open, likely, -jnp.inf).argmax(-1)
         return jnp.take_along_axis(aims.actions, best[:, None, None], axis=1)[:, 0]
 
