@@ -118,6 +118,7 @@ class Aims(NamedTuple):
     actions: Float[Array, "aims action"]
     features: Float[Array, "aims features"]  # what tells good ones from bad ones, of the order of one
     possible: Bool[Array, " aims"]  # False: none of these, here
+    open: Bool[Array, " aims"] | None = None  # False: may be meant, but is not to be done; None: all that are meant may
 
 
 @runtime_checkable

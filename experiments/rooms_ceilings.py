@@ -34,7 +34,7 @@ from jaxtyping import Array, Float
 from cuelearner_envs.navigation.config import NavigationConfig
 from cuelearner_jax.actions import DIRECTIONS
 from cuelearner_jax.agent.networks import applied, residual_network
-from cuelearner_jax.environment import spaces_of
+from cuelearner_jax.environment import Aims, spaces_of
 from cuelearner_jax.evaluate import episodes, evaluate_policy, watched_lanes
 from cuelearner_jax.guidance.intent import Weights
 from cuelearner_jax.policies import BY_LANE, SHARED, Taught, best_actions
@@ -84,11 +84,11 @@ class Clone(struct.PyTreeNode):
         assert spaces.features is not None
         return residual_network(self.layers, 2).init(key, *(jnp.zeros(width) for width in spaces.features))
 
-    def weighed(self, params: Any, obs: Float[Array, "n obs"]) -> tuple[Array, Array]:
-        """The ways of situations (n, ways, 2), and how likely each is (n, ways), as logarithms."""
+    def weighed(self, params: Any, obs: Float[Array, "n obs"]) -> tuple[Aims, Array]:
+        """The ways of situations, and how likely each is (n, ways), as logarithms."""
         aims = jax.vmap(self.env.aims)(obs)
         rows = jax.vmap(Weights(self.layers).apply, (None, 0, 0))(params, aims.features, aims.possible)
-        return aims.actions, jax.nn.log_softmax(jnp.maximum(jnp.asarray(rows)[:, :-1], -30.0))
+        return aims, jax.nn.log_softmax(jnp.maximum(jnp.asarray(rows)[:, :-1], -30.0))
 
     def towards(self, params: Any, obs: Float[Array, "n obs"]) -> Float[Array, "n 2"]:
         """The network's output as a vector in the body's frame; it is one in the frame of the goal's direction."""
@@ -100,8 +100,8 @@ class Clone(struct.PyTreeNode):
         """How far the clone is from what the road map does."""
         if not self.ways:
             return jnp.mean(jnp.sum(jnp.square(self.towards(params, obs) - best), -1))
-        ways, likely = self.weighed(params, obs)
-        away = DIRECTIONS.distance(ways, best[:, None])
+        aims, likely = self.weighed(params, obs)
+        away = DIRECTIONS.distance(aims.actions, best[:, None])
         wanted = jax.nn.softmax(-jnp.square(away / jnp.deg2rad(FROM_HERE_DEG)) / 2)
         return -jnp.mean(jnp.sum(wanted * likely, -1))
 
@@ -109,8 +109,10 @@ class Clone(struct.PyTreeNode):
         """What the road map would do, as far as it has learned."""
         if not self.ways:
             return DIRECTIONS.retract(self.towards(self.params, obs))
-        ways, likely = self.weighed(self.params, obs)
-        return jnp.take_along_axis(ways, likely.argmax(-1)[:, None, None], axis=1)[:, 0]
+        aims, likely = self.weighed(self.params, obs)
+        assert aims.open is not None
+        best = jnp.where(aims.open, likely, -jnp.inf).argmax(-1)
+        return jnp.take_along_axis(aims.actions, best[:, None, None], axis=1)[:, 0]
 
     @property
     def axes(self) -> Any:

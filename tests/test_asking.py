@@ -13,7 +13,7 @@ import pytest
 from cuelearner_jax import actions, asking, loop
 from cuelearner_jax.guidance import registry as guidances
 from cuelearner_jax.loop import start_clock
-from cuelearner_jax.policies import Agent, Heuristic, Taught, Uniform
+from cuelearner_jax.policies import Agent, Heuristic, Taught, Teaching, Uniform
 
 ENV, EXPERT = probes.Window(), probes.Expert(probes.Window())
 RELATIVE = guidances.make("relative", probes.SIZES, ENV)
@@ -109,6 +109,17 @@ def test_after_a_question_comes_what_its_action_leads_to():
     moved = asking.proceed(ENV, begun().replace(env=ENV.reset(jax.random.key(4))[0]), action, keys)
     np.testing.assert_array_equal(moved.env, state)
     np.testing.assert_array_equal(moved.obs, step.obs)
+
+
+def test_questions_may_lie_steps_apart():
+    """The chain's two places follow each other, so that every second step is at the first."""
+    env, sizes = probes.Chain(jnp.array(False)), dataclasses.replace(probes.SIZES, question_every=2)
+    bundle = guidances.make("relative", sizes, env)
+    base = Heuristic(env)
+    ask = jax.jit(partial(asking.label_round, bundle, sizes))
+    found = ask(env, Teaching(base), probes.SCALARS, base, begun(env=env, guidance=bundle), LANE_KEY)
+    np.testing.assert_array_equal(found.labels.obs[:ROUND], np.tile(env.observe(0), (ROUND, 1)))
+    assert int(found.asked) == ROUND
 
 
 def test_an_answer_stands_in_its_row_and_changes_nothing_else():

@@ -149,6 +149,8 @@ def make(sizes: GuideSizes, spaces: Spaces) -> Guidance:
     ) -> Refined:
         aims: Aims = jax.vmap(env.aims)(obs)
         share = weighing.predict(env, model.params, aims.features, aims.possible)
+        if aims.open is not None:
+            share = share.at[:, :-1].multiply(aims.open)
         goals, sure = jax.vmap(partial(followed, space), (0, 0, 0, None))(share, aims.actions, actions, scalars)
 
         def residual(current: Float[Array, "n action"]) -> Float[Array, "n action"]:

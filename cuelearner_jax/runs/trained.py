@@ -145,7 +145,7 @@ class PolicySource:
         """Raises UserError unless the policy can be had and acts in the changed world.
 
         What was trained sees the observations that it was trained on; other policies act in any world. An agent also
-        acts where something was added at the observations' end.
+        acts where a world says that it adds to them at their end (`plain_size`).
         `lanes`: options that choose among a run's lanes, by name; one that is given must choose something.
         """
         if policy not in POLICIES:
@@ -169,7 +169,7 @@ class PolicySource:
         if not POLICIES[policy].kept:
             return
         known = shape_of(self.task, self.config.task)
-        longer = known.observation == after.observation[: len(known.observation)] and policy in SEE_THEIR_OWN
+        longer = getattr(after, "plain_size", None) == known.obs_size and policy in SEE_THEIR_OWN
         if (size := known.obs_size) != after.obs_size and not longer:
             raise UserError(
                 f"the {what}'s observations have {size} entries, this world's {after.obs_size}: keep its structure"

@@ -44,6 +44,23 @@ def told(sizes):
     return bundle, jax.jit(bundle.fit)(jax.random.key(1), ENV, labels, former, probes.SCALARS)
 
 
+class Shut(probes.Aimed):
+    """Its expert means the second aim, which nobody is to follow."""
+
+    def aims(self, obs):
+        return super().aims(obs)._replace(open=jnp.array([True, False, True, True]))
+
+
+def test_what_is_not_open_may_be_meant_and_is_not_followed(fitted):
+    bundle, model = fitted
+    scalars = dataclasses.replace(probes.SCALARS, aim_doubt=1e9, k_max=200)
+    found = bundle.act(model, Shut(), OBS, BASE, EVERYWHERE, scalars).actions
+    second = actions.rotate(OBS, jnp.asarray(0.6))
+    meant = bundle.act(model, ENV, OBS, BASE, EVERYWHERE, scalars).actions
+    np.testing.assert_allclose(actions.distance(meant, second), 0.0, atol=1e-3)
+    assert np.asarray(actions.distance(found, second)).min() > 0.5
+
+
 def test_who_reads_intent_needs_aims():
     with pytest.raises(UserError, match="needs an environment with `aims`"):
         registry.make("intent", SIZES, probes.Window())

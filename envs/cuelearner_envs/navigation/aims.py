@@ -22,8 +22,8 @@ from cuelearner_jax.environment import Aims
 WAYS = 72  # every 5 degrees
 RADII = (0.28, 0.42, 0.55)  # of the discs: the body's own, nearly its reach, what a road map keeps clear [m]
 BESIDE = (0, 1, -1, 2, -2, 4, -4, 8, -8)  # neighbours that a way sees, in steps of 5 degrees
-# A way on which the first two discs are stopped sooner is none [m]: the body's front is 0.2 m ahead, a step is 0.2 m,
-# and a body that turns needs more room than one that goes straight.
+# A way on which the first two discs are stopped sooner is not open [m]: the body's front is 0.2 m ahead, a step is
+# 0.2 m, and a body that turns needs more room than one that goes straight.
 ROOM = (0.6, 0.1)
 SCALE = 5.0  # of lengths among the features [m]
 UNSEEN = -1.0  # nearness where the lidar does not look
@@ -45,7 +45,8 @@ def aims_of(obs: Float[Array, " obs"]) -> Aims:
         middle = memory.SECTORS // 2
         rows += [tried[:, :, middle + step : middle + step + 2].mean(-1).T for step in (-1, -5, 3)]
     features = jnp.concatenate([row.reshape(-1, WAYS) for row in [*beside, *rows]]).T
-    return Aims(ways, features, (free[0] > ROOM[0]) & (free[1] > ROOM[1]) & seen)
+    room = (free[0] > ROOM[0]) & (free[1] > ROOM[1]) & seen
+    return Aims(ways, features, jnp.ones(WAYS, bool), room)
 
 
 def free_ways(obs: Float[Array, " obs"], ways: Float[Array, "n 2"]) -> Float[Array, "radii n"]:

@@ -76,6 +76,11 @@ class Navigation(Described, struct.PyTreeNode):
         return (*self.perceived, WAY_TRIED) if self.memory else self.perceived
 
     @property
+    def plain_size(self) -> int:
+        """Entries of an observation that come before what a memory adds."""
+        return PLAIN
+
+    @property
     def symmetries(self) -> int:
         """Identity, and left and right exchanged: body, lidar and motion are symmetric, worlds are as likely as not."""
         return 2 if self.mirrors else 1
@@ -236,7 +241,7 @@ class Navigation(Described, struct.PyTreeNode):
     def aims(self, obs: Float[Array, " obs"]) -> Aims:
         """Directions every 5 degrees, the goal's first: how far the body could walk there, and what a detour it is.
 
-        No aim is a direction in which the lidar does not look, or in which the body would soon touch what it sees. One
+        Any may be meant; open are those where the lidar looks and the body would not soon touch what it sees. One
         network weighs each from its own side: ways of three widths there and beside it, detours, goal and previous
         actions, and, of an observation with a memory, how much of the way so far lies there.
         """

@@ -1,6 +1,7 @@
 """The memory of the way tried, and the ways that aims are: laws of geometry, and what stays as it was without them."""
 
 import math
+from pathlib import Path
 
 import chex
 import jax
@@ -19,6 +20,8 @@ from cuelearner_jax.agent.networks import q_network
 from cuelearner_jax.config import AgentSizes
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.policies import Agent
+from cuelearner_jax.runs.trained import PolicySource
+from cuelearner_jax.tasks import registry
 
 WORLD = World(
     boxes=jnp.array([[6.1, 0, 0, 0.1, 4.2], [-6.1, 0, 0, 0.1, 4.2], [0, 4.1, 0, 6.2, 0.1], [0, -4.1, 0, 6.2, 0.1]]),
@@ -59,6 +62,7 @@ def remembered():
 def test_a_memory_adds_to_what_is_seen_and_changes_nothing(remembered):
     states, seen = walked(FORGETS)
     assert (FORGETS.obs_size, REMEMBERS.obs_size) == (PLAIN, PLAIN + memory.SEEN)
+    assert FORGETS.plain_size == REMEMBERS.plain_size == PLAIN
     np.testing.assert_array_equal(remembered[1][:, :PLAIN], seen)
     np.testing.assert_array_equal(remembered[0].pose, states.pose)
 
@@ -122,10 +126,19 @@ def test_aims_are_ways_with_room_and_the_goal_comes_first(remembered):
     aims = jax.jit(jax.vmap(REMEMBERS.aims))(remembered[1])
     np.testing.assert_allclose(aims.actions[:, 0], remembered[1][:, 271:273], atol=1e-6)
     behind = np.abs(np.arctan2(aims.actions[..., 1], aims.actions[..., 0])) > math.radians(136)
-    possible = np.asarray(aims.possible)
+    possible = np.asarray(aims.open)
+    assert np.asarray(aims.possible).all()
     assert not possible[behind].any()
     free = jax.jit(jax.vmap(free_ways))(remembered[1], aims.actions)
     assert np.asarray(free[:, 0])[possible].min() > ROOM[0]
     plain = jax.jit(jax.vmap(FORGETS.aims))(remembered[1][:, :PLAIN])
-    np.testing.assert_array_equal(plain.possible, possible)
+    np.testing.assert_array_equal(plain.open, possible)
     np.testing.assert_array_equal(plain.features, aims.features[..., : plain.features.shape[-1]])
+
+
+def test_agents_are_let_into_a_world_with_a_memory_and_their_guides_are_not():
+    folder = Path(__file__).parents[3] / "docs" / "data" / "navigation_agent"
+    source, changed = PolicySource.of_run(folder, registry.find), NavigationConfig(worlds=1, memory=True)
+    source.check("agent", changed)
+    with pytest.raises(UserError, match="have 280 entries, this world's 352"):
+        source.check("guided", changed)
