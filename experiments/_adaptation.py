@@ -54,6 +54,11 @@ SMALL: Mapping[str, Any] = {  # what every method has at the scale smoke
     "sizes.replay_capacity": 400,
     "schedule.learn_after": 20,
 }
+MODEST: Mapping[str, Any] = {  # models that 2 cores fit in seconds, as `cuelearner adapt` has them
+    "sizes.feedback_layers": adapting.SIZES.feedback_layers,
+    "sizes.fit_steps": adapting.SIZES.fit_steps,
+    "sizes.fit_batch_size": adapting.SIZES.fit_batch_size,
+}
 
 
 class Piece(NamedTuple):
@@ -106,6 +111,7 @@ class Scale(NamedTuple):
     labels: Mapping[int, int] | None = None  # budgets that are kept, and what they become
     settings: Mapping[str, Any] = {}
     tuned_steps: tuple[int, int] | None = None  # steps of fine-tuning, and between two measurements
+    directions: int | None = None  # among which base agents choose, in place of their own number
     train: Sequence[str] = ()  # options of `cuelearner sweep` for base agents where none are given
 
 
@@ -269,6 +275,10 @@ def opened(folder: Path, study: Study, piece: Piece, scale: Scale, out: Path) ->
     env = environment(source.task.name, world, "training", piece.robot)
     policies, seeds = several(source, env, world, "agent", None, None, source.grid.seeds[: piece.bases])
     agents = program.side_by_side(policies)
+    if scale.directions:
+        agents = agents.replace(
+            sizes=dataclasses.replace(agents.sizes, directions=scale.directions, coarse_directions=0)
+        )
     steps = scale.steps if source.task.longest is None else source.task.longest(world)
     return Bench(source.task, config, agents, np.array(seeds), world, piece, scale.envs, steps, out)
 

@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from _adaptation import SMALL, UNCHANGED, Piece, Scale, Study, run
+from _adaptation import MODEST, SMALL, UNCHANGED, Piece, Scale, Study, run
 from _pieces import option
 from billiards_bootstrapping import SCALES as TRAINING
 
@@ -137,6 +137,14 @@ SCALES = {
         settings=SMALL,
         tuned_steps=(40, 20),
         train=bases(),
+    ),
+    "cpu": Scale(
+        "ten minutes a piece on 2 cores: smaller models, fewer episodes",
+        envs=100,
+        steps=20,
+        labels={100: 100, 250: 250},
+        settings=MODEST,
+        tuned_steps=(10_000, 2_500),
     ),
     "quick": Scale(
         "a minute a piece on an accelerator, to see where it goes",

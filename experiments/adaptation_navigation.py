@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from _adaptation import SMALL, UNCHANGED, Piece, Scale, Study, run
+from _adaptation import MODEST, SMALL, UNCHANGED, Piece, Scale, Study, run
 from _pieces import option
 from navigation_bootstrapping import SCALES as TRAINING
 
@@ -182,7 +182,7 @@ def quadruped() -> list[Piece]:
         (UNCHANGED, "success", "success on the quadruped", FRAME),
         ("corridor_left", "passed_left", "the preferred side on the quadruped", SIDED),
     ):
-        changed = {"robot": QUADRUPED, "serves": serves}
+        changed: dict[str, Any] = {"robot": QUADRUPED, "serves": serves}
         asked = {**changed, "bound_deg": SIDE_BOUND_DEG, "settings": settings}
         pieces += [
             Piece(world, "none", minutes=5, **changed),
@@ -219,6 +219,15 @@ SCALES = {
         settings=SMALL,
         tuned_steps=(40, 20),
         train=bases(),
+    ),
+    "cpu": Scale(
+        "ten minutes a piece on 2 cores: smaller models, fewer episodes, bases with 36 directions",
+        envs=200,
+        steps=0,
+        labels={100: 100, 250: 250, 500: 500, 1_000: 1_000},
+        settings=MODEST,
+        tuned_steps=(10_000, 2_500),
+        directions=36,
     ),
     "quick": Scale(
         "minutes a piece on an accelerator, to see where it goes",
