@@ -60,6 +60,7 @@ def run(arguments: list[str]) -> None:
     default = kind(world_of(source, rest), Path("pictures"), policy=source.default_policy)
     asked = parse(kind, rest, f"render {source.folder}", default, about(Render, source.task, policies=True))
     source = source.on(asked.robot)
+    pictures = source.task.pictures()
     lane = {"guidance": asked.guidance, "labels": asked.labels, "seed": asked.seed, "bound-deg": asked.bound_deg}
     source.check(asked.policy, asked.task, **lane)
     for name, least, most in (("steps", 1, MOST_STEPS), ("episode", 0, MOST_EPISODE)):
@@ -70,7 +71,6 @@ def run(arguments: list[str]) -> None:
     files = filming.files(asked.out, "-".join(name for name in names if name), asked.film)
     wanted = (files.question,) if asked.question else (files.film, files.still)
     filming.check_free(*wanted, overwrite=asked.overwrite)
-    pictures = source.task.pictures()
     env = source.task.environment(asked.task, "validation")
     policy = trained.one_policy(
         source, env, asked.task, asked.policy, asked.guidance, asked.labels, asked.seed, asked.bound_deg
