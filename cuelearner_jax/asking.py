@@ -109,6 +109,19 @@ def question(
 
     `bound`: questions stay within it of what the base policy does [rad]; None: wherever the guidance leads.
     """
+    return _asked_of(guidance, env, scalars, guide, proposed(base, guide, keys), keys, bound)
+
+
+def _asked_of(
+    guidance: Guidance,
+    env: Environment,
+    scalars: GuideScalars,
+    guide: GuideState,
+    first: Float[Array, "*candidates action"],
+    keys: QuestionKeys,
+    bound: Float[Array, ""] | None,
+) -> Float[Array, "*candidates action"]:
+    """What is asked about where the base policy proposes `first`; see `question`."""
     if bound is not None:
         scalars = within(scalars, bound)
 
@@ -116,26 +129,29 @@ def question(
         asked = guidance.question(key, guide.model, env, obs, first, scalars)
         return asked if bound is None else actions_of(env).clip(asked, first, bound)
 
-    actions = proposed(base, guide, keys)
     if guide.obs.ndim > 1:
-        return jax.vmap(one)(jax.random.split(keys.question, len(guide.obs)), guide.obs, actions)
-    return one(keys.question, guide.obs, actions)
+        return jax.vmap(one)(jax.random.split(keys.question, len(guide.obs)), guide.obs, first)
+    return one(keys.question, guide.obs, first)
 
 
 def chosen(
-    guidance: Guidance, env: Environment, guide: GuideState, actions: Float[Array, "*candidates action"]
-) -> tuple[GuideState, Float[Array, " action"]]:
-    """The guide in the one situation to ask in, and the action to ask about there.
+    guidance: Guidance,
+    env: Environment,
+    guide: GuideState,
+    actions: Float[Array, "*candidates action"],
+    first: Float[Array, "*candidates action"],
+) -> tuple[GuideState, Float[Array, " action"], Float[Array, " action"]]:
+    """The guide in the one situation to ask in, the action to ask about there, and what was proposed there at first.
 
     Of several candidates it is the one on which the members of the guide's model disagree most (query by committee:
     Seung, Opper, Sompolinsky, 1992); before the first fit, when they know nothing, the first.
     """
     if guidance.disagreement is None or guide.obs.ndim == 1:
-        return guide, actions
+        return guide, actions, first
     apart = guidance.disagreement(guide.model, env, guide.obs, actions)
     index = jnp.where(guide.model.fitted, jnp.argmax(apart), 0)
-    there = jax.tree.map(lambda leaf: leaf[index], (guide.env, guide.obs, actions))
-    return guide.replace(env=there[0], obs=there[1]), there[2]
+    there = jax.tree.map(lambda leaf: leaf[index], (guide.env, guide.obs, actions, first))
+    return guide.replace(env=there[0], obs=there[1]), there[2], there[3]
 
 
 def record(
@@ -196,12 +212,11 @@ def ask(
     if guidance.form is None:
         raise ValueError(f"guidance {guidance.name!r} asks nothing")
     keys = question_keys(lane_key, position)
-    actions = question(guidance, env, scalars, base, guide, keys, bound)
-    there, action = chosen(guidance, env, guide, actions)
+    proposals = proposed(base, guide, keys)
+    actions = _asked_of(guidance, env, scalars, guide, proposals, keys, bound)
+    there, action, first = chosen(guidance, env, guide, actions, proposals)
     answer, answered = guidance.form.answer(keys.answer, env, teacher, there.env, there.obs, action, scalars)
-    # Compiled with the question, which computes the same, this costs nothing.
-    first = proposed(base, guide, keys) if guidance.onward else None
-    told = record(there, position, action, answer, answered, first)
+    told = record(there, position, action, answer, answered, first if guidance.onward else None)
     return proceed(env, told.replace(env=guide.env, obs=guide.obs), actions, keys)
 
 

@@ -72,6 +72,7 @@ IN_ROOMS: dict[str, dict[str, Mapping[str, Any]]] = {
         "members": {**SURE, **MEMBERS},
         "active-memory": {**SURE, **ACTIVE, **MEMORY},
         "memory": {**SURE, **MEMORY},
+        "contrary": {**SURE, **MEMBERS, **MEMORY, "scalars.mistake_probability": 0.5},  # do labels matter at all?
         "doubting": {**SURE, **MEMBERS, **MEMORY, "scalars.aim_doubt": 2.0},
         "small": {**SURE, **MEMBERS, **MEMORY, "sizes.aim_layers": (32, 32)},
         "close": {**SURE, **MEMBERS, **MEMORY, "sizes.question_every": 1},

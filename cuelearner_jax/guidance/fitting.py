@@ -8,6 +8,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from flax import struct
 from jaxtyping import Array, Bool, Float, Key, PRNGKeyArray
@@ -110,9 +111,9 @@ def fit_model(
     return fitted_members(sizes.ensemble, fit, key, init)
 
 
-def held_out(count: int) -> Bool[Array, " count"]:
+def held_out(count: int) -> Bool[np.ndarray, " count"]:
     """Which of so many labels validate a fit and are not trained on."""
-    return (jnp.arange(count) % VALIDATION_STRIDE) == VALIDATION_STRIDE - 1
+    return np.arange(count) % VALIDATION_STRIDE == VALIDATION_STRIDE - 1
 
 
 def _fit_network(

@@ -16,8 +16,9 @@ import numpy as np
 from jaxtyping import PRNGKeyArray
 
 from cuelearner_jax.agent.learning import all_finite
+from cuelearner_jax.guidance.fitting import held_out
 from cuelearner_jax.labelling.plan import Plan
-from cuelearner_jax.labelling.programs import Agreement, Programs, agreement, held_out
+from cuelearner_jax.labelling.programs import Agreement, Programs, agreement
 from cuelearner_jax.types import GuidanceModel, GuideState, Label
 
 # A fit computes in its own thread alone, which makes way for whoever answers.

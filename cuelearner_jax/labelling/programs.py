@@ -16,7 +16,6 @@ from cuelearner_jax import asking
 from cuelearner_jax.config import Scalars
 from cuelearner_jax.environment import Environment, actions_of
 from cuelearner_jax.guidance.bundle import AnswerForm, Guidance
-from cuelearner_jax.guidance.fitting import VALIDATION_STRIDE
 from cuelearner_jax.types import EnvState, GuideState, Label, Teacher
 
 
@@ -103,8 +102,3 @@ def agreement(form: AnswerForm, env: Environment, one: np.ndarray, other: np.nda
         apart = np.asarray(actions_of(env).distance(jnp.asarray(one), jnp.asarray(other)))
         return Agreement(float(np.degrees(apart).mean()) if len(one) else 0.0, len(one), "deg")
     return Agreement(float((one == other).all(-1).mean()) if len(one) else 0.0, len(one), "%")
-
-
-def held_out(count: int) -> np.ndarray:
-    """Which of so many labels no fit is trained on, (count,)."""
-    return np.arange(count) % VALIDATION_STRIDE == VALIDATION_STRIDE - 1
