@@ -65,6 +65,7 @@ FAULTS: dict[str, Options] = {
     "indifferent": {"scalars.indifference-deg": 5.0},
     "biased": {"scalars.teacher-bias-deg": 2.5},
 }
+LEAD = 0.5  # a shot: guided episodes that earn that much more than own ones have their whole share
 NEAREST: Options = {"scalars.aim-share": 0.8, "scalars.aim-doubt": 1_000.0}
 WAYS: dict[str, Options] = {
     "nearest": {"scalars.answer": "nearest"},
@@ -111,11 +112,14 @@ def variations(world: str, options: Options, minutes: int) -> list[Piece]:
     pieces.append(
         Piece(world, "scored", "scalar", ("scalar",), (500, 1_000), 8, scored, minutes, "what is called good")
     )
-    paced = {**options, "sizes.pace": True}
+    paced: Options = {**options, "sizes.pace": True, "scalars.pace-lead": LEAD}
     random = {**paced, **FAULTS["random"]}
+    any_lead: Options = {**paced, "scalars.pace-lead": 0.0}
     serves = "guidance never costs"
     pieces += [
+        Piece(world, "paced-any-lead", "heuristic", ("heuristic",), (), 8, any_lead, minutes // 2, serves),
         Piece(world, "paced", "heuristic", ("heuristic",), (), 8, paced, minutes // 2, serves),
+        Piece(world, "paced", "intent", ("intent",), (500,), 8, paced, minutes // 2, serves),
         Piece(world, "paced", "relative", ("relative",), (500,), 8, paced, minutes // 2, serves),
         Piece(world, "paced-random", "relative", ("relative",), (500,), 8, random, minutes // 2, serves),
     ]
@@ -124,7 +128,14 @@ def variations(world: str, options: Options, minutes: int) -> list[Piece]:
 
 def longer(world: str, options: Options, minutes: int) -> list[Piece]:
     """Guided to the end, in as many episodes as it pays, by the rule of `intent` that earns most by itself."""
-    options = {**options, **FRAME, "sizes.pace": True, "schedule.guidance-until": 1_000_000, **NEAREST}
+    options = {
+        **options,
+        **FRAME,
+        "sizes.pace": True,
+        "scalars.pace-lead": 0.0,
+        "schedule.guidance-until": 1_000_000,
+        **NEAREST,
+    }
     serves = "a better guide for longer"
     return [Piece(world, "longer", "intent", ("intent",), (500, 1_000), 16, options, minutes, serves)]
 

@@ -33,6 +33,7 @@ HALLS: Options = {
 }
 RAW: Options = {"sizes.frame": "raw", "sizes.pace": False}  # said whatever the presets say
 FRAME: Options = {"sizes.frame": "action", "sizes.pace": False}
+LEAD = 10.0  # a return: guided episodes that earn that much more than own ones have their whole share
 FAULTS: dict[str, Options] = {
     "flipped-05": {"scalars.mistake-probability": 0.05},
     "flipped-10": {"scalars.mistake-probability": 0.1},
@@ -81,7 +82,7 @@ def variations(minutes: int) -> list[Piece]:
         Piece("clutter", name, "relative", relative, (100, 500), SEEDS, {**options, **way}, minutes, "what is asked")
         for name, way in WAYS.items()
     ]
-    paced = {**options, "sizes.pace": True}
+    paced: Options = {**options, "sizes.pace": True, "scalars.pace-lead": LEAD}
     given: Options = {**options, "labels-from": PAGE}
     pieces.append(
         Piece(

@@ -202,6 +202,9 @@ class Scalars(TeacherFaults, GuideScalars, AgentScalars):
     """With sizes.pace: episodes, own and guided together, within which what they earned fades to 1/e."""
     pace_floor: float = 0.02
     """With sizes.pace: least share of guided episodes, and of own ones, so that both go on being seen."""
+    pace_lead: float = 0.0
+    """With sizes.pace: what guided episodes must earn more than own ones to have their whole share; below it the share
+    is proportional (0: any lead will do)."""
 
 
 @dataclass(frozen=True)

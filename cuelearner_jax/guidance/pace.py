@@ -6,6 +6,11 @@ bandit problems", 2011), so that an arm that is seldom seen becomes uncertain ag
 probability that guidance is the better arm (Thompson sampling of the difference of two means, taken as normal), doubled
 and cut: a draw means the unpaced share.
 
+An episode that earns a little more does not teach more: a weak guide costs an agent most of what it would have learned
+from episodes of its own (docs/results/bootstrapping.md). With `pace_lead` the share is proportional as well to what own
+episodes are behind, up to that lead (regret matching: Hart and Mas-Colell, "A simple adaptive procedure leading to
+correlated equilibrium", 2000), so that a draw means the floor.
+
 What an episode earned is a pair (gain, size), an arm's score the ratio of their sums:
 
 - At discount 0 each step is a problem of its own, and agents maximise the reward a step: gain is the episode's reward,
@@ -102,6 +107,8 @@ def probability(pace: Pace, scalars: Scalars) -> Float[Array, ""]:
     error = jnp.sqrt((jnp.maximum(variance, pooled) / jnp.maximum(sums.episodes, TINY)).sum())
     error = error + RESOLUTION * (jnp.abs(own) + jnp.abs(guided)) + TINY
     better = jax.scipy.stats.norm.cdf((guided - own) / error)
+    lead = jnp.clip((guided - own) / jnp.maximum(scalars.pace_lead, TINY), 0, 1)
+    worth = jnp.where(scalars.pace_lead > 0, lead, 1)
     most = scalars.guided_probability
-    paced = jnp.clip(most * jnp.minimum(2 * better, 1), scalars.pace_floor, 1 - scalars.pace_floor)
+    paced = jnp.clip(most * jnp.minimum(2 * better, 1) * worth, scalars.pace_floor, 1 - scalars.pace_floor)
     return jnp.where((sums.episodes >= ENOUGH).all(), jnp.minimum(paced, most), most)

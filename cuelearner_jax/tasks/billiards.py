@@ -42,6 +42,7 @@ SEEN_FROM_THE_STRIKE = Sizes(
     replay_capacity=1_000_000,
     pace=True,
 )
+LEAD = 0.5  # a guide that earns half a shot more than the agent has its whole share, a weaker one less
 
 
 def teacher_folder(config: BilliardsConfig) -> Path | None:
@@ -173,7 +174,7 @@ BILLIARDS = Task(
             RunConfig(
                 BilliardsConfig("regulation", teacher="learned", aim_error_deg=0.25),
                 dataclasses.replace(SEEN_FROM_THE_STRIKE, replay_capacity=2_000_000),
-                Scalars(),
+                Scalars(pace_lead=LEAD),
                 Schedule(
                     total_steps=2_000_000,
                     guidance_until=500_000,  # as measured to help
@@ -191,7 +192,7 @@ BILLIARDS = Task(
             RunConfig(
                 BilliardsConfig("easy", teacher="learned"),
                 SEEN_FROM_THE_STRIKE,
-                Scalars(),
+                Scalars(pace_lead=LEAD),
                 Schedule(total_steps=1_000_000, guidance_until=500_000, checkpoint_every=100_000, guide_eval_every=50),
             ),
             guidance=("none", "intent", "relative", "heuristic"),

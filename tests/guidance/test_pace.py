@@ -126,6 +126,24 @@ def test_the_share_is_twice_the_chance_that_guidance_is_better():
     assert float(pace.probability(record, Scalars())) == pytest.approx(0.5 * 2 * chance, rel=1e-4)
 
 
+@pytest.mark.parametrize(
+    ("own", "guided", "expected"),
+    [
+        ((1000, 0), (1000, 500), 0.5),  # the whole lead
+        ((1000, 0), (1000, 800), 0.5),  # and more
+        ((1000, 300), (1000, 500), 0.2),  # 0.2 of 0.5
+        ((1000, 0), (1000, 100), 0.1),  # a weak guide of agents that know nothing
+        ((1000, 500), (1000, 505), 0.02),  # a draw
+        ((1000, 500), (1000, 100), 0.02),
+        ((1000, 0), (1, 0), 0.5),  # hardly seen
+    ],
+)
+def test_with_a_lead_the_share_is_what_own_episodes_are_behind(own, guided, expected):
+    record = pace.start(1).replace(sums=sums(own, guided))
+    found = pace.probability(record, Scalars(pace_lead=0.5))
+    assert float(found) == pytest.approx(expected, abs=1e-5)
+
+
 def test_few_episodes_that_went_alike_are_not_believed_for_certain():
     # Three guided failures against own luck of 0.3: by their own variance (0) guidance were worse for certain.
     record = pace.start(1).replace(sums=sums((200, 60), (3, 0)))
