@@ -317,6 +317,7 @@ def run(study: Study, about: str, arguments: Sequence[str] | None = None) -> int
     parser.add_argument("--pieces", nargs="+", default=[], metavar="NAME", help="these alone, or all below a folder")
     parser.add_argument("--out", type=Path, default=Path("runs/adaptation"), help="folder")
     parser.add_argument("--labels", nargs="+", type=int, default=[], help="these of the pieces' budgets alone")
+    parser.add_argument("--envs", type=int, help="environments of an evaluation, one episode each in navigation")
     parser.add_argument("--resume", action="store_true", help="leave finished pieces, begin interrupted ones anew")
     parser.add_argument("--list", action="store_true", help="list the pieces and stop")
     asked = parser.parse_args(arguments)
@@ -333,6 +334,8 @@ def run(study: Study, about: str, arguments: Sequence[str] | None = None) -> int
     if asked.labels:
         known = scale.labels or {budget: budget for piece in pieces for budget in piece.labels}
         scale = scale._replace(labels={budget: known[budget] for budget in asked.labels if budget in known})
+    if asked.envs:
+        scale = scale._replace(envs=asked.envs)
     out = asked.out if asked.scale == "paper" else asked.out / asked.scale
     bases = asked.bases
     if bases is None and not scale.train:
