@@ -87,6 +87,7 @@ IN_ROOMS: dict[str, dict[str, Mapping[str, Any]]] = {
     },
 }
 BEST_IN_ROOMS = IN_ROOMS["intent"]["members-memory"]
+SIDED_INTENT = IN_ROOMS["intent"]["members"]
 SWEPT_RATES, SWEPT_NOISES_DEG = (0.0001, 0.001, 0.01), (0.0, 5.0, 20.0)
 
 
@@ -171,7 +172,11 @@ def sides() -> list[Piece]:
             Piece(world, "teacher", minutes=4, **asked),
             Piece(world, "relative", labels=(100, 250, 500), ways=True, minutes=12, **asked),
         ]
-    return [*pieces, *compared("corridor_left", SIDE_BOUND_DEG, "passed_left", {"relative": RELATIVE})]
+        asked |= {"variant": "members", "settings": SIDED_INTENT}
+        pieces.append(Piece(world, "intent", labels=(100, 250, 500), minutes=12, **asked))
+    tried = {"relative": RELATIVE, "intent": {name: IN_ROOMS["intent"][name] for name in ("members", "eps-40")}}
+    wide = compared("corridor_left", 180.0, "passed_left", {"intent": {"members-180": SIDED_INTENT}})
+    return [*pieces, *compared("corridor_left", SIDE_BOUND_DEG, "passed_left", tried), *wide]
 
 
 def quadruped() -> list[Piece]:

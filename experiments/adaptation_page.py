@@ -10,6 +10,7 @@ are written beside the data.
 from __future__ import annotations
 
 import argparse
+import json
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -21,6 +22,7 @@ from _trajectories import FILE, draw
 from adaptation_billiards import BOUNDS_DEG, LEAST
 from bootstrapping_page import rendered
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
 
 from cuelearner_jax.report.figures import colour_of, save_figure
 
@@ -131,10 +133,13 @@ def figure(curves: dict[str, Points], stem: Path, ylabel: str, level: tuple[floa
             axes.fill_between(x, low, high, color=colour, alpha=0.15, linewidth=0)
         if level:
             axes.axhline(level[0], color="#999999", linestyle="--", linewidth=1, label=level[1])
-        axes.set(xscale="log", title=world, xlabel="labels, or steps of fine-tuning")
+        axes.set(xscale="log", title=world.replace("_", " "), xlabel="labels, or steps of fine-tuning")
+        axes.xaxis.set_major_formatter(lambda value, _: f"{value / 1_000:g}k" if value >= 1_000 else f"{value:g}")
+        axes.xaxis.set_minor_formatter(NullFormatter())
     drawn.axes[0].set_ylabel(ylabel)
     handles, names = drawn.axes[0].get_legend_handles_labels()
-    drawn.legend(handles, names, loc="outside lower center", ncols=min(5, len(names)), frameon=False)
+    columns = min(len(names), 5) if len(curves) > 1 else 1
+    drawn.legend(handles, names, loc="outside lower center", ncols=columns, frameon=False)
     save_figure(drawn, stem)
 
 
@@ -170,8 +175,19 @@ def lidar(rows: Sequence[Row], folder: Path, seen: str) -> str:
 
 
 def rooms(rows: Sequence[Row], folder: Path, seen: str) -> str:
-    """The rooms; nothing has been lost that could come back."""
-    return outcomes(rows, "rooms", None)
+    """The rooms, where nothing has been lost that could come back; and how well they can be walked at all."""
+    text, file = outcomes(rows, "rooms", None), folder / "rooms" / "ceilings.json"
+    if not text or not file.exists():
+        return text
+    known = json.loads(file.read_text(encoding="utf-8"))
+    last = max(row["actions"] for row in known)
+    cells = []
+    for variant in dict.fromkeys(row["variant"] for row in known):
+        own = [row for row in known if row["variant"] == variant and row["actions"] in (0, last)]
+        told = (percent(np.array([row[name] for row in own])) for name in ("success", "collision", "timeout"))
+        cells.append([variant, f"{own[0]['actions']:,}", str(len(own)), *told])
+    header = ["cloned from the road map", "actions", "seeds", "success [%]", "collisions [%]", "time-outs [%]"]
+    return f"{text}\n\nCeilings:\n\n{table(header, cells)}"
 
 
 def sides(rows: Sequence[Row], folder: Path, seen: str) -> str:
