@@ -313,22 +313,30 @@ def _scan(builder: Builder, equation: Any, given: list[Known]) -> list[Known]:
     named = equation.params
     if named["length"] > MOST_UNROLLED:
         raise NotImplementedError(f"a scan of {named['length']} passes")
-    consts, carry = given[: named["num_consts"]], given[named["num_consts"] :][: named["num_carry"]]
-    over = given[named["num_consts"] + named["num_carry"] :]
+    fixed, carried = _parts(named)
+    consts, carry, over = given[:fixed], given[fixed:][:carried], given[fixed + carried :]
     rows: list[list[Known]] = []
     order = range(named["length"])
     for number in reversed(order) if named["reverse"] else order:
         now = [_row(builder, value, number) for value in over]
         found = builder.inlined(named["jaxpr"].jaxpr, named["jaxpr"].consts, [*consts, *carry, *now])
-        carry = found[: named["num_carry"]]
-        rows.append(found[named["num_carry"] :])
+        carry = found[:carried]
+        rows.append(found[carried:])
     rows = rows[::-1] if named["reverse"] else rows
     stacked = []
     for place, each in enumerate(zip(*rows, strict=True)):
-        shape, kind = _out(equation, place + named["num_carry"])
+        shape, kind = _out(equation, place + carried)
         parts = [builder.reshaped(value, (1, *value.shape)) for value in each]
         stacked.append(parts[0] if len(parts) == 1 else builder.add("concatenate", parts, shape, kind, axis=0))
     return [*carry, *stacked]
+
+
+def _parts(named: Any) -> tuple[int, int]:
+    """How many operands of a scan are constants, and how many are carried."""
+    if "ft_in" in named:  # since JAX 0.11
+        consts, carry, _ = named["ft_in"].unpack()
+        return len(consts), len(carry)
+    return named["num_consts"], named["num_carry"]
 
 
 def _row(builder: Builder, value: Known, number: int) -> Known:
