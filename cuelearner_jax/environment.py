@@ -194,11 +194,20 @@ def spaces_of(env: Any, sees: int | None = None) -> Spaces:
     spaces = Spaces(env.obs_size if sees is None else sees, actions_of(env))
     obs, action = jnp.zeros(spaces.obs_size), jnp.zeros(spaces.actions.size)
     if offers(env, "features"):
-        seen = jax.eval_shape(lambda env: env.features(obs, action), env)
+        seen = jax.eval_shape(_features, env, obs, action)
         spaces = spaces._replace(features=(seen.own.shape[-1], seen.turned.shape[-1]))
     if offers(env, "aims"):
-        spaces = spaces._replace(aims=jax.eval_shape(lambda env: env.aims(obs), env).features.shape[-1])
+        spaces = spaces._replace(aims=jax.eval_shape(_aims, env, obs).features.shape[-1])
     return spaces
+
+
+# By names of their own, by which JAX remembers what it has traced.
+def _features(env: Any, obs: Float[Array, " obs"], action: Float[Array, " action"]) -> Features:
+    return env.features(obs, action)
+
+
+def _aims(env: Any, obs: Float[Array, " obs"]) -> Aims:
+    return env.aims(obs)
 
 
 def symmetries_of(env: Any) -> int:

@@ -12,7 +12,7 @@ Function = TypeVar("Function", bound=Callable)
 PACKAGES = ["cuelearner_envs", "cuelearner_jax"]  # whose functions and methods are checked
 # Folders and files of tests in which an operand of a lower rank is filled up by NumPy's rule,
 # which brax and MuJoCo's MJX rely on; elsewhere it is an error.
-LOOSE_RANKS = ["brax_bridge", "cli/test_anymal.py", "envs/anymal", "examples"]
+LOOSE_RANKS = ("brax_bridge", "cli/test_anymal.py", "envs/anymal", "examples")
 
 _conf = BeartypeConf(is_pep484_tower=True)  # an int is a float, as pyright has it
 

@@ -1,7 +1,9 @@
 """Settings of every test: the CPU, compiled programs kept between runs, shapes in signatures checked."""
 
+import gc
 import os
 import signal
+from functools import cache
 from pathlib import Path
 
 import jaxlib.version
@@ -30,9 +32,21 @@ signal.signal(signal.SIGTERM, signal.SIG_DFL)
 install_import_hook(PACKAGES, "checked.checked")  # before anything of them is imported
 
 
+@cache
 def lies_in(path, places):
     """Is a file one of these files, or in one of these folders of tests?"""
     return any(TESTS / place in (path, *path.parents) for place in places)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection():
+    """What is imported stays: the garbage collector does not look through it, neither here nor during the tests."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.freeze()
+        gc.enable()
 
 
 @pytest.hookimpl(tryfirst=True)

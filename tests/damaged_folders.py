@@ -120,7 +120,7 @@ def _evaluate(folder: Path, work: Path) -> Outcome:
 
 
 def _render(folder: Path, work: Path) -> Outcome:
-    status, told, error = _called(["render", str(folder), "--steps", "2", "--out", str(work / "pictures")])
+    status, told, error = _called(["render", str(folder), "--steps", "1", "--out", str(work / "pictures")])
     return Outcome(status, error, told.split(";")[0], "")
 
 

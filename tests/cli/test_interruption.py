@@ -11,7 +11,7 @@ from cuelearner_jax.cli import main
 from cuelearner_jax.records import results
 
 ENTRY = [str(Path(sys.executable).with_name("cuelearner"))]
-STEPS = 2000
+STEPS = 1200
 LONG = [*SMALL, "--schedule.total-steps", str(STEPS), "--guidance", "none", "--seeds", "2"]
 COMMAND = ["sweep", "billiards", "--preset", "quickstart", *LONG]
 

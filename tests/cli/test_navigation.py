@@ -39,8 +39,8 @@ def test_every_evaluation_accounts_for_all_its_episodes(walked):
 @pytest.mark.parametrize("policy", ["corrected", "teacher"])
 def test_policies_are_evaluated_in_worlds_of_another_style(walked, tmp_path, policy):
     out = tmp_path / "measured.json"
-    command = ["evaluate", str(walked), "--policy", policy, "--task.style", "rooms", "--task.max-steps", "200"]
-    assert main([*command, "--envs", "8", "--steps", "1600", "--out", str(out)]) == 0
+    command = ["evaluate", str(walked), "--policy", policy, "--task.style", "rooms", "--task.max-steps", "120"]
+    assert main([*command, "--envs", "8", "--steps", "960", "--out", str(out)]) == 0
     measured = json.loads(out.read_text())
     assert measured["world"]["style"] == "rooms"
     for row in measured["rows"]:

@@ -7,9 +7,10 @@ import json
 import re
 import shlex
 import sys
+from importlib.abc import Loader, MetaPathFinder
+from importlib.util import spec_from_loader
 from pathlib import Path
 
-import jax
 import numpy as np
 import pytest
 from PIL import Image
@@ -37,22 +38,47 @@ SMALL = {
 }
 
 
+class Again(MetaPathFinder, Loader):
+    """Whoever imports a module of the examples once more gets the one of before, whose programs are compiled."""
+
+    def __init__(self):
+        self.modules = {}
+
+    def find_spec(self, fullname, path=None, target=None):
+        return spec_from_loader(fullname, self) if fullname in self.modules else None
+
+    def create_module(self, spec):
+        return self.modules[spec.name]
+
+    def exec_module(self, module):
+        pass
+
+
+AGAIN = Again()
+
+
+def forget_modules():
+    """Those of the examples, as they were imported."""
+    modules = {name: sys.modules.pop(name) for name in list(sys.modules) if name.split(".")[0] == "examples"}
+    AGAIN.modules.update(modules)
+    return modules
+
+
 @contextlib.contextmanager
 def stranger():
     """A process that knows no task, kind or module of the examples, and forgets them again."""
-    kinds, known = dict(guidances._KINDS), dict(tasks._registered)
-    modules = {name: sys.modules.pop(name) for name in list(sys.modules) if name.split(".")[0] == "examples"}
+    kinds, known, modules = dict(guidances._KINDS), dict(tasks._registered), forget_modules()
     guidances._KINDS.pop("clone", None)
     tasks._registered.clear()
-    jax.clear_caches()  # what was traced with classes of modules that are imported anew
+    sys.meta_path.insert(0, AGAIN)
     try:
         yield
     finally:
+        sys.meta_path.remove(AGAIN)
         for table, before in ((guidances._KINDS, kinds), (tasks._registered, known)):
             table.clear()
             table.update(before)
-        for name in [name for name in sys.modules if name.split(".")[0] == "examples"]:
-            del sys.modules[name]
+        forget_modules()
         sys.modules.update(modules)
 
 

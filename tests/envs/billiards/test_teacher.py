@@ -243,7 +243,7 @@ def test_the_shipped_teachers_play_well(table, least):
     env = make_environment(config)
     teacher = make_teacher(config, env)
     coarse = coarsely(teacher)
-    measured = jax.jit(lambda teacher: rollout(Taught(teacher), env, episodes("tuning"), 30, 300))(coarse)
+    measured = jax.jit(lambda teacher: rollout(Taught(teacher), env, episodes("tuning"), 30, 150))(coarse)
     assert float(measured["reward"]) > least  # over 10,000 steps with their 3,600 directions: see teacher.json
 
 

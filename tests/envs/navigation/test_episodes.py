@@ -1,7 +1,7 @@
 """Navigation over whole episodes: how they end and begin, what replay makes of them, and their mirror images."""
 
 import math
-from functools import partial
+from functools import cache, partial
 
 import chex
 import jax
@@ -31,14 +31,17 @@ recall = jax.jit(lambda env, memory: jax.vmap(env.recall)(memory))
 recall_next = jax.jit(lambda env, *parts: jax.vmap(env.recall_next)(*parts))
 step_many = jax.jit(lambda env, *parts: jax.vmap(env.step)(jax.random.split(KEY, 200), *parts))
 
-# Short episodes and wide goals, so that a few dozen steps see every kind of end.
-EIGHT = generate_many(jax.random.key(1), 8)  # as many as other tests have compiled
-WORLDS = Navigation(
-    worlds=jax.tree.map(lambda leaf: leaf[:3], EIGHT),
-    lidar=FAULTLESS,
-    max_steps=jnp.int32(25),
-    goal_radius=jnp.float32(4.5),
-)
+
+@cache
+def worlds():
+    """Short episodes and wide goals, so that a few dozen steps see every kind of end."""
+    eight = generate_many(jax.random.key(1), 8)  # as many as other tests have compiled
+    return Navigation(
+        worlds=jax.tree.map(lambda leaf: leaf[:3], eight),
+        lidar=FAULTLESS,
+        max_steps=jnp.int32(25),
+        goal_radius=jnp.float32(4.5),
+    )
 
 
 # --- episodes --------------------------------------------------------------------------------------------------------
@@ -55,8 +58,8 @@ def assert_begun(env, states):
 
 
 def test_episodes_begin_at_rest_at_the_start_of_every_route_turned_any_way():
-    states, _ = reset_many(WORLDS, jax.random.split(KEY, 600))
-    assert_begun(WORLDS, states)
+    states, _ = reset_many(worlds(), jax.random.split(KEY, 600))
+    assert_begun(worlds(), states)
     routes = np.asarray(states.world * 16 + states.route)
     counts = np.bincount(routes, minlength=48)
     assert counts.min() >= 2  # 12.5 each, standard deviation 3.5
@@ -68,7 +71,7 @@ def test_episodes_begin_at_rest_at_the_start_of_every_route_turned_any_way():
 
 def test_starts_and_goals_are_free_whichever_way_the_body_is_turned_and_5_to_15_m_apart():
     touches = jax.jit(jax.vmap(jax.vmap(jax.vmap(collides, (None, None, 0)), (None, None, 0)), (None, 0, 0)))
-    for places in (WORLDS.worlds.starts, WORLDS.worlds.goals):
+    for places in (worlds().worlds.starts, worlds().worlds.goals):
         yaws = jnp.linspace(0, math.pi, 9)
         poses = jnp.concatenate(
             [
@@ -77,8 +80,8 @@ def test_starts_and_goals_are_free_whichever_way_the_body_is_turned_and_5_to_15_
             ],
             -1,
         )
-        assert not touches(WORLDS.robot, WORLDS.worlds, poses).any()
-    apart = np.linalg.norm(WORLDS.worlds.goals - WORLDS.worlds.starts, axis=-1)
+        assert not touches(worlds().robot, worlds().worlds, poses).any()
+    apart = np.linalg.norm(worlds().worlds.goals - worlds().worlds.starts, axis=-1)
     assert apart.min() >= 5
     assert apart.max() <= 15
 
@@ -108,7 +111,7 @@ KINDS = {"plain": FAULTLESS, "faulty": FAULTS}
 
 @pytest.fixture(scope="module")
 def plays():
-    return {name: (env := WORLDS.replace(lidar=lidar), played(env, KEY)) for name, lidar in KINDS.items()}
+    return {name: (env := worlds().replace(lidar=lidar), played(env, KEY)) for name, lidar in KINDS.items()}
 
 
 def test_an_end_is_followed_by_a_new_episode_of_any_world_and_nothing_else_is(plays):
@@ -167,7 +170,7 @@ def test_a_faulty_reading_is_made_again_and_not_drawn_again(plays):
 
 
 def test_a_stored_transition_takes_80_bytes():
-    for env in (WORLDS, WORLDS.replace(lidar=FAULTS, mirrors=True)):
+    for env in (worlds(), worlds().replace(lidar=FAULTS, mirrors=True)):
         rows = learner(probes.SIZES, True, env).buffer.empty(10)
         assert rows.nbytes / 10 <= 80
 
@@ -258,7 +261,7 @@ def assert_mostly_close(found, expected):
 def test_mirroring_twice_or_under_the_identity_changes_nothing(plays):
     _, played_steps = plays["plain"]
     obs, action = flat(played_steps)[1][:50], flat(played_steps)[3][:50]
-    image = jax.vmap(WORLDS.mirror, (None, 0, 0))
+    image = jax.vmap(worlds().mirror, (None, 0, 0))
     chex.assert_trees_all_equal(image(0, obs, action), (obs, action))
     chex.assert_trees_all_equal(image(1, *image(1, obs, action)), (obs, action))
     np.testing.assert_array_equal(image(1, obs, action)[1], action * SIGNS[None, :2])
@@ -278,8 +281,8 @@ def test_the_robot_walks_as_before_with_a_faulty_sensor(plays):
 def test_changed_worlds_compile_nothing_new():
     chex.clear_trace_counter()  # it counts by hash, which a function of an earlier test may have had
     counted = jax.jit(chex.assert_max_traces(lambda env, state, action: env.step(KEY, state, action), n=1))
-    env = WORLDS.replace(
-        robot=jax.tree.map(jnp.float32, WORLDS.robot),
+    env = worlds().replace(
+        robot=jax.tree.map(jnp.float32, worlds().robot),
     )
     lidars = [
         env.lidar.replace(**{name: jnp.float32(value)})
