@@ -165,7 +165,8 @@ def test_the_page_holds_tables_where_there_are_rows(modules, recorded):
     written = (recorded / "page.md").read_text(encoding="utf-8")
     assert "| relative labels | 200 labels | 0.405 [0.360, 0.450] | 90.0 [90.0, 90.0] | 100% |" in written
     assert "| RL fine-tuning | 3,400 [3,400, 3,400] steps | 2,800 [2,800, 2,800] steps |" not in written
-    assert "<!-- lidar -->\n<!-- end of lidar -->" in written
+    of_lidar = text[text.index("<!-- lidar -->") : text.index("<!-- end of lidar -->")]
+    assert of_lidar in written  # of which there are no rows
     assert (recorded / "billiards" / "shares.png").exists()
     assert page.main(asked) == 0
     assert (recorded / "page.md").read_text(encoding="utf-8") == written
@@ -180,6 +181,22 @@ def test_the_preferred_side_is_counted_among_those_who_passed_anything(modules, 
     rows = modules["_adaptation_tables"].read(tmp_path / "navigation")
     text = modules["adaptation_page"].sides(rows, tmp_path, "data")
     assert "| left | not adapted |  | 80.0 [80.0, 80.0] | 75.0 [75.0, 75.0] | 12.5 [12.5, 12.5] |" in text
+
+
+def test_ceilings_are_those_after_the_most_actions(modules, tmp_path):
+    row = {"base": np.arange(2), "success": 0.5, "collision": 0.3, "timeout": 0.2}
+    world = {"task": "navigation", "world": "rooms", "method": "none"}
+    wrote(modules, tmp_path / "rooms" / "none", [row], **world)
+    rows, page = modules["_adaptation_tables"].read(tmp_path), modules["adaptation_page"]
+    assert "Ceilings" not in page.rooms(rows, tmp_path, "data")
+    measured = [("road map", 0, 0, 0.9), ("ways", 10, 0, 0.1), ("ways", 20, 0, 0.4), ("ways", 20, 1, 0.4)]
+    names = ("variant", "actions", "seed", "success")
+    found = [dict(zip(names, each, strict=True), collision=0.0, timeout=0.1) for each in measured]
+    (tmp_path / "rooms" / "ceilings.json").write_text(json.dumps(found))
+    text = page.rooms(rows, tmp_path, "data")
+    assert "| road map | 0 | 1 | 90.0 | 0.0 | 10.0 |" in text
+    assert "| ways | 20 | 2 | 40.0 [40.0, 40.0] | 0.0 [0.0, 0.0] | 10.0 [10.0, 10.0] |" in text
+    assert "10.0 |\n| ways | 10" not in text
 
 
 def test_a_piece_is_finished_resumed_and_refused(modules, tmp_path, capsys, monkeypatch):
