@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import jax
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from cuelearner_jax.config import RunConfig
+from cuelearner_jax.config import GuideSizes, RunConfig, Scalars
 from cuelearner_jax.environment import Environment
 from cuelearner_jax.errors import UserError, closest
 from cuelearner_jax.types import EnvState, Reel, Sketch, Teacher
@@ -72,6 +72,11 @@ class Scenario:
     changes: dict[str, Any]  # fields of the task's configuration
     bound_deg: float | None = None  # suggested bound of an adapted policy's corrections [deg]
     eps_deg: float | None = None  # suggested strength of a label in it [deg]
+    # How `cuelearner adapt` corrects a policy there, unless told otherwise:
+    guidance: str | None = None  # kind of guidance
+    judge_by: str | None = None  # metric by which a model must be worth using
+    sizes: dict[str, Any] = field(default_factory=dict)  # fields of `GuideSizes`
+    scalars: dict[str, Any] = field(default_factory=dict)  # fields of `Scalars`
 
     def applied(self, config: Any) -> Any:
         """The configuration with the changes in it."""
@@ -114,17 +119,24 @@ class Task:
             if not isinstance(preset.config.task, self.config):
                 kind = type(preset.config.task).__name__
                 raise ValueError(f"task {self.name}: preset {name!r} configures {kind}, not {self.config.__name__}")
-        for name, scenario in self.scenarios.items():
-            unknown = sorted(set(scenario.changes) - fields)
-            if unknown:
+        for name in self.scenarios:
+            self._check_scenario(name, fields)
+
+    def _check_scenario(self, name: str, fields: set[str]) -> None:
+        scenario, config = self.scenarios[name], self.config.__name__
+        if unknown := sorted(set(scenario.changes) - fields):
+            raise ValueError(f"task {self.name}: scenario {name!r} changes {unknown[0]!r}, no field of {config}")
+        for group, given in ((GuideSizes, scenario.sizes), (Scalars, scenario.scalars)):
+            if unknown := sorted(set(given) - {entry.name for entry in dataclasses.fields(group)}):
+                group_name = group.__name__
                 raise ValueError(
-                    f"task {self.name}: scenario {name!r} changes {unknown[0]!r}, no field of {self.config.__name__}"
+                    f"task {self.name}: scenario {name!r} suggests {unknown[0]!r}, no field of {group_name}"
                 )
-            try:
-                for base in [preset.config.task for preset in self.presets.values()] or [self.config()]:
-                    scenario.applied(base)
-            except Exception as error:
-                raise ValueError(f"task {self.name}: scenario {name!r} makes no configuration ({error})") from error
+        try:
+            for base in [preset.config.task for preset in self.presets.values()] or [self.config()]:
+                scenario.applied(base)
+        except Exception as error:
+            raise ValueError(f"task {self.name}: scenario {name!r} makes no configuration ({error})") from error
 
     def environment(self, config: Any, split: str = "training") -> Environment:
         """The world of a configuration with the first body in it, for the episodes of a split."""

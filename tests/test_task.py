@@ -54,6 +54,11 @@ CANNOT_BE = [
     ({"presets": {"x": Preset("", RunConfig(Picky()))}}, "preset 'x' configures Picky, not WindowConfig"),
     ({"scenarios": {"x": Scenario("", {"half_with_deg": 1.0})}}, "scenario 'x' changes 'half_with_deg', no field of"),
     (
+        {"scenarios": {"x": Scenario("", {}, sizes={"members": 5})}},
+        "scenario 'x' suggests 'members', no field of GuideS",
+    ),
+    ({"scenarios": {"x": Scenario("", {}, scalars={"eps": 5.0})}}, "scenario 'x' suggests 'eps', no field of Scalars"),
+    (
         {"config": Picky, "presets": {}, "scenarios": {"x": Scenario("", {"width": -1.0})}},
         "scenario 'x' makes no configuration (width is negative)",
     ),

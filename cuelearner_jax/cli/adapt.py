@@ -19,6 +19,7 @@ from cuelearner_jax.records import label_files
 from cuelearner_jax.runs import adaptation
 from cuelearner_jax.runs.adaptation import Base, Order
 from cuelearner_jax.runs.trained import PolicySource
+from cuelearner_jax.task import Scenario
 from cuelearner_jax.terminal import console, progress_bars
 
 
@@ -70,8 +71,11 @@ def run(arguments: list[str]) -> None:
     source, code, named, rest = _source(arguments)
     kind = Adapt[source.task.config]  # pyright: ignore[reportInvalidTypeArguments]
     world = world_of(source, rest)
-    scenario, _ = taken(rest, "--scenario", ", ".join(source.task.scenarios) or "none")
-    eps = source.task.scenario(scenario).eps_deg if scenario else None
+    named_world, _ = taken(rest, "--scenario", ", ".join(source.task.scenarios) or "none")
+    changed = source.task.scenario(named_world) if named_world else Scenario("the world as it is", {})
+    if taken(rest, "--guidance", "a kind of guidance")[0] not in (None, changed.guidance):
+        changed = replace(changed, guidance=None, sizes={}, scalars={})  # which are for the suggested kind
+    eps = changed.eps_deg
     labels, given = Adapt.labels, taken(rest, "--labels-from", "a labels.parquet")[0]
     if given:  # what the file holds is the default
         file = label_files.read(Path(given))
@@ -82,8 +86,10 @@ def run(arguments: list[str]) -> None:
         out=Path("policies") / source.folder.name,
         labels=labels,
         base=Base(policy=source.default_policy),
-        sizes=replace(adapting.SIZES, frame=source.config.sizes.frame),
-        scalars=adapting.settling(source.config.scalars, eps),
+        guidance=changed.guidance or Adapt.guidance,
+        judge_by=changed.judge_by or Adapt.judge_by,
+        sizes=replace(adapting.SIZES, frame=source.config.sizes.frame, **changed.sizes),
+        scalars=replace(adapting.settling(source.config.scalars, eps), **changed.scalars),
     )
     asked = parse(kind, rest, f"adapt {source.folder}", default, about(Adapt, source.task, policies=True))
     order = _order(source, code, named, asked)

@@ -2,6 +2,7 @@
 
 import importlib
 import json
+import re
 import shutil
 import sys
 from pathlib import Path
@@ -40,7 +41,13 @@ CONFIG = dataclasses.replace(probes.CONFIG, task=Config())
 TASK = Task(
     "turned", "a bandit", Config, (Body("point", "", environment),), teacher=lambda config, env: probes.Expert(env),
     presets={"small": Preset("seconds", CONFIG, labels=(10,))},
-    scenarios={"aslant": Scenario("the best direction is turned", {"offset_deg": -20.0}, bound_deg=45.0, eps_deg=5.0)},
+    scenarios={
+        "aslant": Scenario("the best direction is turned", {"offset_deg": -20.0}, bound_deg=45.0, eps_deg=5.0),
+        "told": Scenario(
+            "how is said too", {"offset_deg": 20.0}, guidance="residual", judge_by="labels",
+            sizes={"labels_per_round": 40}, scalars={"k_max": 7},
+        ),
+    },
 )
 
 def straight(obs):
@@ -138,6 +145,23 @@ def test_labels_lie_beside_and_lead_to_the_same_policy(adapted, tmp_path):
     assert len(models) == 2
     chex.assert_trees_all_equal(*models)
     assert (tmp_path / "again" / "labels.parquet").exists()
+
+
+def defaults_of(capsys, *options):
+    """What `adapt` would take, by the options of its help."""
+    with pytest.raises(SystemExit) as status:
+        main(["adapt", "own_turned:straight", *TASK, *options, "--help"])
+    assert status.value.code == 0
+    shown = re.sub(r"[│\s]+", " ", capsys.readouterr().out)
+    wanted = ("--guidance", "--judge-by", "--sizes.labels-per-round", "--scalars.k-max")
+    return [re.search(rf"{name} .*?\(default: (\S+)\)", shown)[1] for name in wanted]  # pyright: ignore
+
+
+def test_a_scenario_says_how_unless_another_kind_is_asked_for(home, capsys):
+    assert defaults_of(capsys, "--scenario", "told") == ["residual", "labels", "40", "7"]
+    kind, by, a_round, passes = defaults_of(capsys)
+    assert (kind, by, a_round, passes) == ("relative", "reward", "10", "50")
+    assert defaults_of(capsys, "--scenario", "told", "--guidance", "dcoach") == [kind, "labels", a_round, passes]
 
 
 def test_what_is_adapted_saved_and_loaded_acts_bitwise_alike(home, tmp_path):
