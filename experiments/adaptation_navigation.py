@@ -162,19 +162,19 @@ def rooms() -> list[Piece]:
 
 
 def sides() -> list[Piece]:
-    """The preferred side in the corridor."""
+    """The preferred side in the corridor: the paper's labels within 60 degrees, and read as intent within any."""
     pieces = []
     for side in ("left", "right"):
         world, judge_by, serves = f"corridor_{side}", f"passed_{side}", "the preferred side"
         asked = {"bound_deg": SIDE_BOUND_DEG, "settings": SIDED, "judge_by": judge_by, "serves": serves}
+        wide = {**asked, "variant": "180", "bound_deg": 180.0, "settings": SIDED_INTENT}
         pieces += [
             Piece(world, "none", minutes=2, serves=serves),
             Piece(world, "teacher", minutes=4, **asked),
             Piece(world, "relative", labels=(100, 250, 500), ways=True, minutes=12, **asked),
+            Piece(world, "intent", labels=(100, 250, 500), ways=True, minutes=12, **wide),
         ]
-        asked |= {"variant": "members", "settings": SIDED_INTENT}
-        pieces.append(Piece(world, "intent", labels=(100, 250, 500), minutes=12, **asked))
-    tried = {"relative": RELATIVE, "intent": {name: IN_ROOMS["intent"][name] for name in ("members", "eps-40")}}
+    tried = {"relative": RELATIVE, "intent": {"members": SIDED_INTENT}}
     wide = compared("corridor_left", 180.0, "passed_left", {"intent": {"members-180": SIDED_INTENT}})
     return [*pieces, *compared("corridor_left", SIDE_BOUND_DEG, "passed_left", tried), *wide]
 
