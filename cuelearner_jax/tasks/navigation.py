@@ -123,7 +123,7 @@ SCENARIOS = {
         f"corridor_{side}": Scenario(
             f"the corridor, and a wish: pass every obstacle on the {side}",
             {"style": "corridor", "preferred_side": side},
-            bound_deg=60.0,
+            bound_deg=180.0,
             judge_by=f"passed_{side}",
             **BY_WAYS,
         )

@@ -71,7 +71,7 @@ def test_the_papers_changed_worlds():
     bounds = {scenario: one.bound_deg for own in worlds.values() for scenario, one in own.items()}
     assert bounds == {
         **{"turned_strike": 1.0, "shifted_balls": 0.3, "tilted_table": 0.3},
-        **{"turned_lidar": 60.0, "rooms": 180.0, "corridor": 60.0, "corridor_left": 60.0, "corridor_right": 60.0},
+        **{"turned_lidar": 60.0, "rooms": 180.0, "corridor": 60.0, "corridor_left": 180.0, "corridor_right": 180.0},
     }
     eps = {scenario: one.eps_deg for own in worlds.values() for scenario, one in own.items() if one.eps_deg}
     assert eps == {"turned_strike": 0.1, "shifted_balls": 0.1, "tilted_table": 0.1, "turned_lidar": 2.0}
