@@ -28,6 +28,7 @@ from cuelearner_jax.report.figures import colour_of, save_figure
 
 CURVES = ("relative", "residual", "dcoach", "finetuning")
 SIDES = ("left", "right")
+WALKED = {"relative": NAMES["relative"], "intent-180": NAMES["intent"]}  # pieces whose ways are drawn
 COLOURS = {"residual": "#E69F00", "finetuning": "#4d4d4d"}
 
 
@@ -201,9 +202,10 @@ def sides(rows: Sequence[Row], folder: Path, seen: str) -> str:
             cells.append(
                 [side, line.name, after(line), percent(line.columns["success"]), percent(wanted), percent(mixed)]
             )
-        kept = folder / f"corridor_{side}" / CURVES[0] / FILE
-        if kept.exists():
-            drawn[f"adapted to pass on the {side}"] = kept
+        for piece, name in WALKED.items():
+            kept = folder / f"corridor_{side}" / piece / FILE
+            if kept.exists():
+                drawn[f"adapted to pass on the {side}: {name}"] = kept
     if not cells:
         return ""
     text = table(["wanted", "", "after", "success [%]", "all on the wanted side [%]", "on both sides [%]"], cells)
