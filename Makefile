@@ -8,7 +8,7 @@ UV_VERSION := $(shell sed -n 's/^uv==\([0-9.]*\).*/\1/p' constraints.txt)
 .PHONY: help setup quickstart smoke test test-quick fuzz lint format docs bench constraints clean
 help:
 	@echo "make quickstart   train, report and film the small billiards example (two to three minutes)"
-	@echo "make test         run the tests (about 20 minutes on 2 idle cores)"
+	@echo "make test         run the tests (about 12 minutes on 2 idle cores)"
 	@echo "make test-quick   those of them that compile next to nothing (under 3 minutes)"
 	@echo "make smoke        one tiny sweep of every form of feedback and of every adaptation on both tasks (minutes on 2 cores)"
 	@echo "make fuzz         damaged run folders by chance, CASES=2000 SEED=0 (hours on 2 cores)"
