@@ -334,7 +334,9 @@ def run(study: Study, about: str, arguments: Sequence[str] | None = None) -> int
     if asked.labels:
         known = scale.labels or {budget: budget for piece in pieces for budget in piece.labels}
         scale = scale._replace(labels={budget: known[budget] for budget in asked.labels if budget in known})
-    if asked.envs:
+    if asked.envs is not None:
+        if asked.envs < 1:
+            parser.error(f"--envs is {asked.envs}: give at least 1")
         scale = scale._replace(envs=asked.envs)
     out = asked.out if asked.scale == "paper" else asked.out / asked.scale
     bases = asked.bases
