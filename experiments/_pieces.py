@@ -25,6 +25,7 @@ class Piece(NamedTuple):
     options: Options
     minutes: int  # of an H100 or H200; estimated from 0.45 ms a step of 32 lanes, not measured
     serves: str  # which figure
+    first_seed: int = FIRST_SEED
 
     @property
     def path(self) -> str:
@@ -80,7 +81,7 @@ def option(name: str, value: object) -> list[str]:
 def sweep_command(task: str, piece: Piece, out: Path, resume: bool) -> list[str]:
     """The command line of a piece."""
     given: dict[str, object] = {**piece.options, "guidance": piece.kinds, "seeds": piece.seeds}
-    given |= {"first-seed": FIRST_SEED, **({"labels": piece.labels} if piece.labels else {})}
+    given |= {"first-seed": piece.first_seed, **({"labels": piece.labels} if piece.labels else {})}
     words = ["sweep", task]
     for name, value in given.items():
         words += option(name, value)

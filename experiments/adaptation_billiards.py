@@ -42,7 +42,7 @@ BEST: dict[tuple[str, str], Mapping[str, Any]] = {
     **{(world, "relative"): {**TURN, **SLOW} for world in BOUNDS_DEG},
     ("tilted_table", "relative"): {**TURN, **SLOW, **SHARE_60},
     ("tilted_table", "teacher"): SHARE_60,
-    ("turned_strike", "residual"): TURN,
+    **{(world, "residual"): TURN for world in BOUNDS_DEG},
 }
 
 # Settings that are compared on tuning episodes, by method.

@@ -14,10 +14,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from _pieces import Experiment, Options, Piece, Scale, run
+from _pieces import FIRST_SEED, Experiment, Options, Piece, Scale, run
 
 FIRST, MORE = (25, 100, 500, 1_000), (50, 350, 2_000, 5_000)
-CURVE = (10_000, 20_000, 50_000, 100_000)  # simulated: from which number on do labels pay?
+COMPARED = (100, 1_000)  # of the forms that only the regulation table has with all budgets
+CURVE = (10_000, 100_000)  # simulated: from which number on do labels pay?
 ASKING = ("relative", "intent", "demonstration", "scalar", "dcoach")
 
 REGULATION: Options = {
@@ -49,12 +50,14 @@ FULL: Options = {
 }
 RAW: Options = {"sizes.frame": "raw", "sizes.pace": False}  # said whatever the presets say
 FRAME: Options = {"sizes.frame": "action", "sizes.pace": False}
-# Fits are as long for a label as those of small budgets are, and rounds as few as keep them within minutes.
+# To the step to which areas under the curve are taken, a little past the end of guidance.
+GUIDED: Options = {"schedule.total-steps": 550_000, "schedule.checkpoint-every": 275_000}
+# Rounds as few as keep fits of so many labels within minutes.
 LARGE_ROUNDS: Options = {
-    "sizes.labels-per-round": 2_500,
+    "sizes.labels-per-round": 5_000,
     "sizes.fit-steps": 20_000,
     "sizes.fit-batch-size": 500,
-    "schedule.guide-eval-every": 2_500,
+    "schedule.guide-eval-every": 5_000,
 }
 FAULTS: dict[str, Options] = {
     "flipped-05": {"scalars.mistake-probability": 0.05},
@@ -79,10 +82,16 @@ def budgets(world: str, options: Options, minutes: int) -> list[Piece]:
     """Every form of feedback with every budget seen from the action, beside agents that nobody guides."""
     options = {**options, **FRAME}
     alone = {**options, **(ALONE if world == "regulation" else {})}
+    shared, first = (options, FIRST) if world == "regulation" else ({**options, **GUIDED}, COMPARED)
+    own = dict.fromkeys(("relative", "intent"), (options, FIRST))
     return [
         Piece(world, "frame", "none", ("none",), (), 16, alone, minutes // 2, "unguided agents, of every figure"),
-        Piece(world, "frame", "heuristic", ("heuristic",), (), 8, options, minutes // 3, "against the obvious shot"),
-        *(Piece(world, "frame", kind, (kind,), FIRST, 8, options, minutes, f"labels of {kind}") for kind in ASKING),
+        Piece(world, "frame", "heuristic", ("heuristic",), (), 8, shared, minutes // 3, "against the obvious shot"),
+        *(
+            Piece(world, "frame", kind, (kind,), labels, 8, settings, minutes, f"labels of {kind}")
+            for kind in ASKING
+            for settings, labels in (own.get(kind, (shared, first)),)
+        ),
         *(
             Piece(world, "frame", f"{kind}-more", (kind,), MORE, 8, options, minutes + 14, f"labels of {kind}")
             for kind in ASKING
@@ -90,9 +99,29 @@ def budgets(world: str, options: Options, minutes: int) -> list[Piece]:
     ]
 
 
+def again(world: str, options: Options, minutes: int) -> list[Piece]:
+    """More seeds of what comes nearest to two thirds of the steps."""
+    options = {**options, **FRAME}
+    return [
+        Piece(
+            world,
+            "frame",
+            f"intent-{labels}",
+            ("intent",),
+            (labels,),
+            16,
+            options,
+            minutes,
+            "two thirds",
+            FIRST_SEED + 8,
+        )
+        for labels in (500, 1_000)
+    ]
+
+
 def curves(world: str, options: Options, minutes: int) -> list[Piece]:
     """The same with more labels than anybody gives."""
-    options = {**options, **FRAME, **LARGE_ROUNDS}
+    options = {**options, **FRAME, **LARGE_ROUNDS, **GUIDED}
     serves = "the number from which labels pay"
     return [Piece(world, "frame", f"{kind}-curve", (kind,), CURVE, 8, options, minutes + 8, serves) for kind in ASKING]
 
@@ -160,6 +189,7 @@ def full_length(minutes: int) -> list[Piece]:
 
 PIECES = (
     *budgets("regulation", REGULATION, 16),
+    *again("regulation", REGULATION, 8),
     *curves("regulation", REGULATION, 16),
     *variations("regulation", REGULATION, 16),
     *longer("regulation", REGULATION, 10),

@@ -19,7 +19,7 @@ from _pieces import Experiment, Options, Piece, Scale, run
 
 FEW, MANY = (25, 50, 100), (350, 500, 1_000)
 ASKING = ("relative", "demonstration", "scalar", "dcoach")
-SEEDS = 16
+SEEDS, VARIED_SEEDS = 16, 8
 
 HALLS: Options = {
     "preset": "paper",
@@ -31,6 +31,8 @@ HALLS: Options = {
     "schedule.eval-steps": 40_000,
     "schedule.checkpoint-every": 50_000,
 }
+# As far as faults and ways to ask are compared.
+HALF: Options = {"schedule.total-steps": 50_000, "schedule.guidance-until": 50_000}
 RAW: Options = {"sizes.frame": "raw", "sizes.pace": False}  # said whatever the presets say
 FRAME: Options = {"sizes.frame": "action", "sizes.pace": False}
 LEAD = 10.0  # a return: guided episodes that earn that much more than own ones have their whole share
@@ -54,47 +56,73 @@ WAYS: dict[str, Options] = {
 
 def budgets(name: str, options: Options, minutes: int) -> list[Piece]:
     """Every form of feedback with every budget, beside agents that nobody guides."""
-    options = {**HALLS, **options}
+    whole = {**HALLS, **options}
+    half = {**whole, **HALF}
+    alone = whole if name == "frame" else half
     pieces = [
-        Piece("clutter", name, "none", ("none",), (), SEEDS, options, minutes // 2, "unguided agents, of every figure"),
-        Piece(
-            "clutter", name, "heuristic", ("heuristic",), (), SEEDS, options, minutes // 2, "against walking straight"
-        ),
+        Piece("clutter", name, "none", ("none",), (), SEEDS, alone, minutes // 2, "unguided agents, of every figure"),
+        Piece("clutter", name, "heuristic", ("heuristic",), (), SEEDS, half, minutes // 4, "against walking straight"),
     ]
     for kind in ASKING:
-        serves = f"labels of {kind}"
-        pieces.append(Piece("clutter", name, f"{kind}-few", (kind,), FEW, SEEDS, options, minutes, serves))
-        pieces.append(Piece("clutter", name, f"{kind}-many", (kind,), MANY, SEEDS, options, minutes + 3, serves))
+        serves, many = f"labels of {kind}", whole if name == "raw" else half
+        pieces.append(Piece("clutter", name, f"{kind}-few", (kind,), FEW, SEEDS, whole, minutes, serves))
+        pieces.append(Piece("clutter", name, f"{kind}-many", (kind,), MANY, SEEDS, many, minutes + 3, serves))
     return pieces
 
 
 def variations(minutes: int) -> list[Piece]:
     """Five hundred labels of a faulty teacher, and other ways to ask; then paced."""
-    options = {**HALLS, **FRAME}
+    options = {**HALLS, **FRAME, **HALF}
     relative = ("relative",)
     pieces = [
         Piece(
-            "clutter", name, "relative", relative, (500,), SEEDS, {**options, **fault}, minutes // 2, "faulty teachers"
+            "clutter",
+            name,
+            "relative",
+            relative,
+            (500,),
+            VARIED_SEEDS,
+            {**options, **fault},
+            minutes // 2,
+            "faulty teachers",
         )
         for name, fault in FAULTS.items()
     ]
     pieces += [
-        Piece("clutter", name, "relative", relative, (100, 500), SEEDS, {**options, **way}, minutes, "what is asked")
+        Piece(
+            "clutter",
+            name,
+            "relative",
+            relative,
+            (100, 500),
+            VARIED_SEEDS,
+            {**options, **way},
+            minutes,
+            "what is asked",
+        )
         for name, way in WAYS.items()
     ]
     paced: Options = {**options, "sizes.pace": True, "scalars.pace-lead": LEAD}
     given: Options = {**options, "labels-from": PAGE}
     pieces.append(
         Piece(
-            "clutter", "page", "relative", relative, (450, 500), SEEDS, given, minutes // 2, "labels given on the page"
+            "clutter",
+            "page",
+            "relative",
+            relative,
+            (450, 500),
+            VARIED_SEEDS,
+            given,
+            minutes // 2,
+            "labels given on the page",
         )
     )
     random = {**paced, **FAULTS["random"]}
     serves = "guidance never costs"
     pieces += [
-        Piece("clutter", "paced", "heuristic", ("heuristic",), (), SEEDS, paced, minutes // 2, serves),
-        Piece("clutter", "paced", "relative", relative, (500,), SEEDS, paced, minutes // 2, serves),
-        Piece("clutter", "paced-random", "relative", relative, (500,), SEEDS, random, minutes // 2, serves),
+        Piece("clutter", "paced", "heuristic", ("heuristic",), (), VARIED_SEEDS, paced, minutes // 2, serves),
+        Piece("clutter", "paced", "relative", relative, (500,), VARIED_SEEDS, paced, minutes // 2, serves),
+        Piece("clutter", "paced-random", "relative", relative, (500,), VARIED_SEEDS, random, minutes // 2, serves),
     ]
     return pieces
 
