@@ -124,7 +124,8 @@ def lidar() -> list[Piece]:
         *(Piece(world, method, minutes=15, **asked) for method in ("relative", "dcoach")),
         Piece(world, "residual", minutes=15, **{**asked, "settings": TURN}),
         Piece(world, "finetuning", minutes=25, serves=serves, **learns),
-        *compared(world, bound, "success", {"relative": RELATIVE, **OTHERS}),
+        *compared(world, bound, "success", {"relative": RELATIVE, **OTHERS, "intent": {"members": SIDED_INTENT}}),
+        *compared(world, 180.0, "success", {"intent": {"members-180": SIDED_INTENT}}),
         Piece(
             world,
             "finetuning",

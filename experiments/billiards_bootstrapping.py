@@ -51,7 +51,7 @@ FULL: Options = {
 RAW: Options = {"sizes.frame": "raw", "sizes.pace": False}  # said whatever the presets say
 FRAME: Options = {"sizes.frame": "action", "sizes.pace": False}
 # To the step to which areas under the curve are taken, a little past the end of guidance.
-GUIDED: Options = {"schedule.total-steps": 550_000, "schedule.checkpoint-every": 275_000}
+GUIDED: Options = {"schedule.total-steps": 550_000, "schedule.checkpoint-every": 550_000}
 # Rounds as few as keep fits of so many labels within minutes.
 LARGE_ROUNDS: Options = {
     "sizes.labels-per-round": 5_000,
