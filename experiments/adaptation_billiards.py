@@ -33,16 +33,20 @@ ASKED: Mapping[str, Any] = {
 }
 TURN: Mapping[str, Any] = {"sizes.sees_turn": True}
 LEARNING: Mapping[str, Any] = {"task.teacher": "local_search", "sizes.num_envs": 10, "sizes.replay_capacity": 100_000}
-# A tenth of the step size of training; tuning/WORLD/finetuning sweeps it.
-RATES, NOISES_DEG, STEPS, EVERY = (0.01,), (0.3,), 60_000, 10_000
+STEPS, EVERY = 60_000, 10_000
 # As chosen on tuning episodes, see docs/results/adaptation.md.
 SLOW: Mapping[str, Any] = {"scalars.feedback_learning_rate": 3e-4}
+FAST: Mapping[str, Any] = {"scalars.feedback_learning_rate": 3e-3}
 SHARE_60: Mapping[str, Any] = {"scalars.nearest_share": 0.6}
+# Step size and noise [deg] of fine-tuning: swept in one world, a tenth of the step size of training in the others.
+LEARNED: dict[str, tuple[float, float]] = {"turned_strike": (0.05, 0.6)}
+LEARNED_ELSEWHERE = (0.01, 0.3)
 BEST: dict[tuple[str, str], Mapping[str, Any]] = {
     **{(world, "relative"): {**TURN, **SLOW} for world in BOUNDS_DEG},
     ("tilted_table", "relative"): {**TURN, **SLOW, **SHARE_60},
     ("tilted_table", "teacher"): SHARE_60,
     **{(world, "residual"): TURN for world in BOUNDS_DEG},
+    **{(world, "dcoach"): FAST for world in BOUNDS_DEG},
 }
 
 # Settings that are compared on tuning episodes, by method.
@@ -74,7 +78,7 @@ COMPARED: dict[str, dict[str, Mapping[str, Any]]] = {
     },
     "dcoach": {
         "default": {},
-        "fast": {"scalars.feedback_learning_rate": 3e-3},
+        "fast": FAST,
         "slow": {"scalars.feedback_learning_rate": 1e-4},
     },
     "teacher": {
@@ -115,7 +119,8 @@ def reported(world: str, bound: float) -> list[Piece]:
     serves = "reward as a share of the original"
     asked = {"bound_deg": bound, "serves": serves}
     best = {method: {**ASKED, **BEST.get((world, method), {})} for method in ("teacher", *BY_LABELS)}
-    learns = {"rates": RATES, "noises_deg": NOISES_DEG, "steps": STEPS, "every": EVERY}
+    rate, noise = LEARNED.get(world, LEARNED_ELSEWHERE)
+    learns = {"rates": (rate,), "noises_deg": (noise,), "steps": STEPS, "every": EVERY}
     return [
         Piece(world, "none", minutes=1, serves=serves),
         Piece(world, "teacher", minutes=2, settings=best["teacher"], **asked),

@@ -28,8 +28,8 @@ TURN: Mapping[str, Any] = {**FRAME, "sizes.sees_turn": True}
 ROOMY: Mapping[str, Any] = {**FRAME, "scalars.eps_deg": 20.0}  # in rooms small turns lead nowhere
 SIDED: Mapping[str, Any] = {**TURN, "scalars.eps_deg": 20.0}
 LEARNING: Mapping[str, Any] = {"sizes.num_envs": 10, "sizes.replay_capacity": 50_000}
-# The step size of training; tuning/turned_lidar/finetuning sweeps it.
-RATES, NOISES_DEG, STEPS, EVERY = (0.001,), (5.0,), 20_000, 5_000
+# As chosen by tuning/turned_lidar/finetuning: a tenth of the step size of training.
+RATES, NOISES_DEG, STEPS, EVERY = (0.0001,), (0.0,), 20_000, 5_000
 
 # Settings that are compared on tuning episodes, by world and method.
 RELATIVE: dict[str, Mapping[str, Any]] = {
@@ -121,7 +121,8 @@ def lidar() -> list[Piece]:
     return [
         Piece(world, "none", minutes=2, serves=serves),
         Piece(world, "teacher", bound_deg=bound, minutes=4, serves=serves),
-        *(Piece(world, method, minutes=15, **asked) for method in ("relative", "dcoach")),
+        Piece(world, "relative", minutes=15, **asked),
+        Piece(world, "dcoach", minutes=15, **{**asked, "settings": OTHERS["dcoach"]["slow"]}),
         Piece(world, "residual", minutes=15, **{**asked, "settings": TURN}),
         Piece(world, "finetuning", minutes=25, serves=serves, **learns),
         *compared(world, bound, "success", {"relative": RELATIVE, **OTHERS, "intent": {"members": SIDED_INTENT}}),
@@ -173,10 +174,11 @@ def sides() -> list[Piece]:
             Piece(world, "none", minutes=2, serves=serves),
             Piece(world, "teacher", minutes=4, **asked),
             Piece(world, "relative", labels=(100, 250, 500), ways=True, minutes=12, **asked),
-            Piece(world, "intent", labels=(100, 250, 500), ways=True, minutes=12, **wide),
+            Piece(world, "intent", labels=(100, 250, 500, 1_000), ways=True, minutes=12, **wide),
         ]
     tried = {"relative": RELATIVE, "intent": {"members": SIDED_INTENT}}
-    wide = compared("corridor_left", 180.0, "passed_left", {"intent": {"members-180": SIDED_INTENT}})
+    freely = {"members-180": SIDED_INTENT, "active-180": {**SIDED_INTENT, **ACTIVE}}
+    wide = compared("corridor_left", 180.0, "passed_left", {"intent": freely})
     return [*pieces, *compared("corridor_left", SIDE_BOUND_DEG, "passed_left", tried), *wide]
 
 
