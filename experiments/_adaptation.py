@@ -77,6 +77,7 @@ class Piece(NamedTuple):
     split: str = "validation"  # of the episodes; settings are chosen on "tuning"
     bases: int | None = None  # at most so many
     judge_by: str = "reward"  # a model that is worse by this on tuning episodes is not used
+    judge_bounds: tuple[float, ...] = ()  # shares of the bound within which the model is tried too
     robot: str | None = None  # what acts there, where that is changed
     ways: bool = False  # keep some ways that are walked before and after, for a picture?
     minutes: int = 10  # of an H100 or H200, a guess
@@ -189,11 +190,16 @@ def by_labels(kind: Any, bench: Bench) -> Iterator[Row]:
     guidance = guidances.made_for(kind, sizes, spaces_of(env))
     lanes = program.product(len(bench.seeds), (SEED,), piece.labels, (piece.bound_deg,))
     envs = min(bench.envs, JUDGED)
-    judge = adapting.Judging(bench.env("tuning"), envs, envs * bench.steps, piece.judge_by)
+    judge = adapting.Judging(bench.env("tuning"), envs, envs * bench.steps, piece.judge_by, bounds=piece.judge_bounds)
     asked = adapting.Adaptation(guidance, sizes, scalars, env, bench.agents, lanes, judge)
     found = adapting.adapt(asked, bench.task.make_teacher(bench.world, env))
     told = {"used": found.judged.used.astype(float), "failed": np.asarray(found.block.failed).astype(float)}
-    told |= {"judged_before": found.judged.before, "judged_after": found.judged.after, "eps_deg": scalars.eps_deg}
+    told |= {
+        "within_deg": found.judged.within_deg,
+        "judged_before": found.judged.before,
+        "judged_after": found.judged.after,
+        "eps_deg": scalars.eps_deg,
+    }
     shown = bench.env(piece.split)
     metrics = bench.measured(found.policy(shown))
     if piece.ways:

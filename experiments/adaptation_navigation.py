@@ -27,6 +27,7 @@ FRAME: Mapping[str, Any] = {"sizes.frame": "action"}
 TURN: Mapping[str, Any] = {**FRAME, "sizes.sees_turn": True}
 ROOMY: Mapping[str, Any] = {**FRAME, "scalars.eps_deg": 20.0}  # in rooms small turns lead nowhere
 SIDED: Mapping[str, Any] = {**TURN, "scalars.eps_deg": 20.0}
+NARROWER = (0.5, 0.25)  # shares of a bound that are tried on tuning episodes
 LEARNING: Mapping[str, Any] = {"sizes.num_envs": 10, "sizes.replay_capacity": 50_000}
 # As chosen by tuning/turned_lidar/finetuning: a tenth of the step size of training.
 RATES, NOISES_DEG, STEPS, EVERY = (0.0001,), (0.0,), 20_000, 5_000
@@ -122,6 +123,7 @@ def lidar() -> list[Piece]:
         Piece(world, "none", minutes=2, serves=serves),
         Piece(world, "teacher", bound_deg=bound, minutes=4, serves=serves),
         Piece(world, "relative", minutes=15, **asked),
+        Piece(world, "relative", "narrowed", minutes=18, judge_bounds=NARROWER, **asked),
         Piece(world, "dcoach", minutes=15, **{**asked, "settings": OTHERS["dcoach"]["slow"]}),
         Piece(world, "residual", minutes=15, **{**asked, "settings": TURN}),
         Piece(world, "finetuning", minutes=25, serves=serves, **learns),

@@ -43,6 +43,7 @@ class Judging:
     by: str = "reward"  # a metric, or "labels"
     every: int = 0  # labels between two measurements on the way (0: at the end alone)
     split: str = "tuning"
+    bounds: tuple[float, ...] = ()  # shares of a lane's bound within which its policy is tried as well
 
 
 @dataclass(frozen=True)
@@ -178,7 +179,7 @@ def adapt(
                 program.ask_round(work.guidance, work.sizes, env, asks, work.scalars, bases, block, mesh)
             )
         tell(number, number)
-    judged = measure.judged(block)
+    judged, block = measure.judged(block)
     curve = [{name: values[:count] for name, values in row.items()} for row in measure.curve]
     block = jax.tree.map(lambda leaf: leaf[:count], judging.kept(block, judged.used))
     cut = Judged(judged.by, *(column[:count] for column in judged[1:]))
@@ -198,26 +199,41 @@ class _Measuring:
         if every and asked % every == 0:
             self._add(block)
 
-    def judged(self, block: Adapting) -> Judged:
-        """What is used of the finished lanes."""
+    def judged(self, block: Adapting) -> tuple[Judged, Adapting]:
+        """What is used of the finished lanes, and these within the bounds that are used."""
         work, how = self.work, self.work.judging
         if how.by == judging.LABELS:
             found = judging.judged_by_labels(work.guidance, work.sizes, work.env, work.scalars, block)
         if how.env is not None:
             after = self._add(block)
         if how.by == judging.LABELS:
-            return found
+            return found, block
+        judging.check_metric(how.by, after)
         bases = self._measured(work.bases, "the policy as it was")
+        block, after = self._narrowed(block, after)
         usable = ~np.asarray(block.failed) & np.asarray(block.guide.model.fitted)
-        return judging.judged(how.by, work.lanes, bases, after, usable)
+        return judging.judged(how.by, work.lanes, bases, after, usable, judging.within_deg(block)), block
+
+    def _narrowed(self, block: Adapting, after: judging.Metrics) -> tuple[Adapting, judging.Metrics]:
+        """Lanes within the share of their bounds with which they are worth most, and what they are worth so."""
+        how, bound = self.work.judging, block.bound
+        for share in how.bounds:
+            tried = block.replace(bound=share * block.bound)
+            found = self._measured(self._policy(tried), f"the adapted policy within {share:g} of its bound")
+            better = found[how.by] > after[how.by]
+            after = {name: np.where(better, found[name], values) for name, values in after.items()}
+            bound = jnp.where(jnp.asarray(better), tried.bound, bound)
+        return block.replace(bound=bound), after
 
     def _add(self, block: Adapting) -> judging.Metrics:
-        work, env = self.work, self.work.judging.env
-        assert env is not None
-        policy = program.adapted(work.guidance, work.sizes, env, work.scalars, work.bases, block)
-        found = self._measured(policy, "the adapted policy")
+        found = self._measured(self._policy(block), "the adapted policy")
         self.curve.append({"asked": np.asarray(block.guide.asked), "failed": np.asarray(block.failed), **found})
         return found
+
+    def _policy(self, block: Adapting) -> Guided:
+        work, env = self.work, self.work.judging.env
+        assert env is not None
+        return program.adapted(work.guidance, work.sizes, env, work.scalars, work.bases, block)
 
     def _measured(self, policy: Policy, what: str) -> judging.Metrics:
         how = self.work.judging

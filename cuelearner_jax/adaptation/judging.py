@@ -39,6 +39,7 @@ class Judged(NamedTuple):
     before: np.ndarray  # (lanes,)
     after: np.ndarray  # (lanes,)
     used: np.ndarray  # (lanes,) bool: is the model used? Not if it is worth less than nothing, or not finite
+    within_deg: np.ndarray  # (lanes,) how far corrections then lead from the base's actions [deg]
 
 
 def metrics_of(env: Environment) -> tuple[str, ...]:
@@ -78,7 +79,9 @@ def measured(
     return watched_lanes(env, policy, key, num_envs, steps, tell)
 
 
-def judged(by: str, lanes: Lanes, bases: Metrics, policies: Metrics, usable: np.ndarray) -> Judged:
+def judged(
+    by: str, lanes: Lanes, bases: Metrics, policies: Metrics, usable: np.ndarray, within_deg: np.ndarray
+) -> Judged:
     """Compares metrics of base policies (bases,) or (1,) and of lanes (lanes,) on the same episodes.
 
     Args:
@@ -86,16 +89,14 @@ def judged(by: str, lanes: Lanes, bases: Metrics, policies: Metrics, usable: np.
         lanes: which base is whose.
         bases, policies: from `measured`.
         usable: (lanes,) bool: False where nothing could be fitted, or not to finite numbers.
-
-    Raises:
-        UserError: there is no such metric.
+        within_deg: (lanes,) the bounds of the policies.
     """
-    if by not in policies:
-        raise UserError(f"there is no metric {by!r} to judge by{closest(by, [*policies, LABELS])}")
     before = np.asarray(bases[by])
     before = np.broadcast_to(before, lanes.number) if len(before) == 1 else before[lanes.base]
     after = np.asarray(policies[by])
-    return Judged(by, before, after, np.asarray(usable) & (after >= before))  # NaN is worth less than anything
+    return Judged(
+        by, before, after, np.asarray(usable) & (after >= before), within_deg
+    )  # NaN is worth less than anything
 
 
 @partial(jax.jit, static_argnames=("guidance",))
@@ -140,7 +141,27 @@ def judged_by_labels(
     if int(np.asarray(block.guide.labels.valid).sum(-1).min()) < HELD_OUT:
         raise UserError(f"fewer than {HELD_OUT} labels cannot be judged by: give more, or --judge-by a metric")
     zero, right = jax.device_get(_predicted(guidance, env, scalars, block))
-    return Judged(LABELS, zero, right, ~np.asarray(block.failed) & (right >= zero))
+    return Judged(LABELS, zero, right, ~np.asarray(block.failed) & (right >= zero), within_deg(block))
+
+
+def within_deg(block: Adapting) -> np.ndarray:
+    """The bounds (lanes,) of a block [deg]."""
+    return np.degrees(np.asarray(block.bound))
+
+
+def check_bounds(shares: tuple[float, ...], by: str, named: str) -> None:
+    """Raises UserError for shares of a bound that cannot be tried; `named` is what the user calls them."""
+    if not all(0 < share < 1 for share in shares) or len(set(shares)) < len(shares):
+        given = " ".join(f"{share:g}" for share in shares)
+        raise UserError(f"{named} is {given}: give shares of the bound above 0 and below 1, each once")
+    if shares and by == LABELS:
+        raise UserError(f"{named} needs episodes to try them on: judge by a metric of the task")
+
+
+def check_metric(by: str, policies: Metrics) -> None:
+    """Raises UserError if there is no such metric."""
+    if by not in policies:
+        raise UserError(f"there is no metric {by!r} to judge by{closest(by, [*policies, LABELS])}")
 
 
 def kept(block: Adapting, used: np.ndarray) -> Adapting:

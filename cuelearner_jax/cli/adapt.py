@@ -56,6 +56,9 @@ class Adapt(Generic[TaskT]):
     """Tuning episodes that policies are judged on; where the task counts steps, each is 100 of them."""
     judge_every: int = 0
     """Also measure the policy after every so many labels on the way, kept in guide.parquet (0: at the end alone)."""
+    judge_bounds: tuple[float, ...] = ()
+    """Also try the model within these shares of its bound (0.5 0.25), and use it within what is worth most on the
+    tuning episodes."""
     overwrite: Flag[bool] = False
     """Delete the policy folder that is there."""
     base: Base = field(default_factory=Base)
@@ -146,6 +149,7 @@ def _order(source: PolicySource, code: Any, named: str | None, asked: Adapt[Any]
         judge_by=asked.judge_by,
         judge_episodes=asked.judge_episodes,
         judge_every=asked.judge_every,
+        judge_bounds=asked.judge_bounds,
         overwrite=asked.overwrite,
         base=asked.base,
         sizes=asked.sizes,

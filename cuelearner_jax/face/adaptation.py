@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import os
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -82,6 +83,7 @@ def adapt(
     seed: int = 0,
     judge_by: str = "reward",
     judge_episodes: int = 100,
+    judge_bounds: Sequence[float] = (),
 ) -> AdaptedPolicy:
     """Corrects a finished policy by labels about what it does in a (changed) world.
 
@@ -103,6 +105,8 @@ def adapt(
         seed: of everything random.
         judge_by: the metric by which it is judged, or "labels": by the prediction of held-out ones.
         judge_episodes: that many tuning episodes, each of 100 steps where the task does not count episodes.
+        judge_bounds: shares of the bound, such as (0.5, 0.25), within which the model is tried on these episodes too;
+            it is used within what is worth most.
 
     Raises:
         UserError: settings that make no sense, or with which the fit diverges.
@@ -135,7 +139,7 @@ def adapt(
     bound_deg = adapting.BOUND_DEG if bound_deg is None else bound_deg
     if note := adapting.check_angles([bound_deg], scalars):
         warnings.warn(note, stacklevel=2)
-    how = place.judging(judge_by, judge_episodes)
+    how = place.judging(judge_by, judge_episodes, tuple(judge_bounds))
     lanes = program.product(1, (seed,), (budget,), (bound_deg,))
     slots = program.rounds(lanes, sizes) * sizes.labels_per_round
     padded = None if rows is None else jax.tree.map(lambda leaf: _padded(leaf, slots)[None], rows)
@@ -166,14 +170,15 @@ class _Place(NamedTuple):
         steps = longest(world.config) if longest else judging.STEPS
         return cls(world.env, world.environment("tuning"), steps, world)
 
-    def judging(self, by: str, episodes: int) -> Judging:
+    def judging(self, by: str, episodes: int, bounds: tuple[float, ...]) -> Judging:
         """How policies are judged there. Raises UserError for what makes no sense."""
         if episodes < 1:
             raise UserError(f"judge_episodes is {episodes}: give at least 1")
         known = [*judging.metrics_of(self.env), judging.LABELS]
         if by not in known:
             raise UserError(f"judge_by is {by!r}, no metric of this world{closest(by, known)}")
-        return Judging(None if by == judging.LABELS else self.tuned, episodes, episodes * self.steps, by)
+        judging.check_bounds(bounds, by, "judge_bounds")
+        return Judging(None if by == judging.LABELS else self.tuned, episodes, episodes * self.steps, by, bounds=bounds)
 
 
 def _of_file(file: label_files.LabelFile, bundle: Guidance) -> Label:

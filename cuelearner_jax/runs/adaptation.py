@@ -67,6 +67,7 @@ class Order:
     judge_by: str
     judge_episodes: int
     judge_every: int
+    judge_bounds: tuple[float, ...]
     overwrite: bool
     base: Base
     sizes: GuideSizes
@@ -173,13 +174,14 @@ def _judging(order: Order, env: Any) -> Judging:
     unit = order.sizes.labels_per_round
     if order.judge_every < 0 or order.judge_every % unit:
         raise UserError(f"--judge-every is {order.judge_every}: give a multiple of sizes.labels_per_round ({unit})")
+    judging.check_bounds(order.judge_bounds, by, "--judge-bounds")
     metrics = judging.metrics_of(env)
     if by not in (*metrics, judging.LABELS):
         raise UserError(f"--judge-by is {by!r}, no metric of {task.name}{closest(by, [*metrics, judging.LABELS])}")
     steps = task.longest(order.world) if task.longest else judging.STEPS
     plays = by != judging.LABELS or order.judge_every
     tuned = task.environment(order.world, "tuning") if plays else None
-    return Judging(tuned, envs, envs * steps, by, order.judge_every)
+    return Judging(tuned, envs, envs * steps, by, order.judge_every, bounds=order.judge_bounds)
 
 
 def told(found: Adapted) -> list[str]:
@@ -193,6 +195,8 @@ def told(found: Adapted) -> list[str]:
         else:
             worth, worse = f"{judged.by} on tuning episodes {before} before, {after} after", "worse than before"
         lines.append(f"{budget} labels within {bound:g} degrees: {worth}")
+        if narrowed := sorted({*judged.within_deg[own & judged.used].round(3).tolist()} - {round(bound, 3)}):
+            lines[-1] += f", used within {' or '.join(f'{angle:g}' for angle in narrowed)} degrees"
         left = lanes.seed[own & ~judged.used]
         if len(left):
             which = f"seed {left[0]}" if len(left) == 1 else f"{len(left)} of {int(own.sum())} seeds"

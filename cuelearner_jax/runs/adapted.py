@@ -152,6 +152,7 @@ def write(
             "split": of.judging.split,
             "before": _plain(judged.before),
             "after": _plain(judged.after),
+            "within_deg": [float(f"{bound:g}") for bound in judged.within_deg],
         },
         **{name: value for name, value in (used or {}).items() if value},
         "observation": [quantity._asdict() for quantity in env.observation],

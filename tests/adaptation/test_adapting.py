@@ -180,6 +180,21 @@ def test_without_a_simulator_held_out_answers_decide():
         judging.judged_by_labels(RELATIVE, SIZES, ENV, SCALARS, few)
 
 
+def test_a_bound_is_narrowed_where_that_is_worth_more():
+    """Wrong answers about a policy that is right already: within half of the window it stays right."""
+    lanes = program.product(1, (0,), (40,), (60.0,))
+    base = Common(Shifted(jnp.array(0.0)))
+    wide, narrow = (
+        adapting.adapt(asked(base, lanes, dataclasses.replace(JUDGING, bounds=shares)), labels=own_labels(0.0, 40))
+        for shares in ((), (0.5, 0.05))
+    )
+    assert (wide.judged.before[0], wide.judged.after[0], wide.judged.used[0]) == (1.0, 0.0, False)
+    assert wide.judged.within_deg.tolist() == pytest.approx([60.0])
+    assert (narrow.judged.after[0], narrow.judged.used[0]) == (1.0, True)
+    assert narrow.judged.within_deg.tolist() == pytest.approx([3.0])
+    assert errors(narrow.policy(ENV), 0) == pytest.approx(3.0, abs=0.01)
+
+
 def quarter(obs):
     """A quarter turn, exact in any arithmetic."""
     return (jnp if isinstance(obs, jax.Array) else np).stack([-obs[:, 1], obs[:, 0]], -1)

@@ -231,6 +231,8 @@ def test_what_cannot_be_is_refused(adapted, refused, tmp_path):
     refused([*plain, "--judge-by", "hits"], "no metric of turned, did you mean 'hit'", tmp_path)
     refused([*plain, "--judge-episodes", "0"], "--judge-episodes is 0", tmp_path)
     refused([*plain, "--judge-every", "7"], "--judge-every is 7: give a multiple", tmp_path)
+    refused([*plain, "--judge-bounds", "0.5", "1.5"], "--judge-bounds is 0.5 1.5: give shares", tmp_path)
+    refused([*plain, "--judge-bounds", "0.5", "--judge-by", "labels"], "--judge-bounds needs episodes", tmp_path)
     refused([*plain, "--base.seeds", "3"], "own_turned:straight is none: leave it out", tmp_path)
     refused([*plain, "--labels-from", tmp_path / "no.parquet"], "no label file at", tmp_path)
     refused(["adapt", "own_turned:narrow", *TASK, *new], "returned actions of shape (1, 1)", tmp_path)
