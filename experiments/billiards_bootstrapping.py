@@ -79,42 +79,31 @@ WAYS: dict[str, Options] = {
 
 
 def budgets(world: str, options: Options, minutes: int) -> list[Piece]:
-    """Every form of feedback with every budget seen from the action, beside agents that nobody guides."""
+    """Every form of feedback with every budget seen from the action, beside agents that nobody guides.
+
+    What relative feedback is compared with is run whole on the regulation table, and to the end of guidance elsewhere.
+    """
     options = {**options, **FRAME}
-    alone = {**options, **(ALONE if world == "regulation" else {})}
-    shared, first = (options, FIRST) if world == "regulation" else ({**options, **GUIDED}, COMPARED)
-    own = dict.fromkeys(("relative", "intent"), (options, FIRST))
-    return [
+    whole = world == "regulation"
+    alone = {**options, **ALONE} if whole else options
+    compared = options if whole else {**options, **GUIDED}
+    pieces = [
         Piece(world, "frame", "none", ("none",), (), 16, alone, minutes // 2, "unguided agents, of every figure"),
-        Piece(world, "frame", "heuristic", ("heuristic",), (), 8, shared, minutes // 3, "against the obvious shot"),
-        *(
-            Piece(world, "frame", kind, (kind,), labels, 8, settings, minutes, f"labels of {kind}")
-            for kind in ASKING
-            for settings, labels in (own.get(kind, (shared, first)),)
-        ),
-        *(
-            Piece(world, "frame", f"{kind}-more", (kind,), MORE, 8, options, minutes + 14, f"labels of {kind}")
-            for kind in ASKING
-        ),
+        Piece(world, "frame", "heuristic", ("heuristic",), (), 8, compared, minutes // 3, "against the obvious shot"),
     ]
+    for kind in ASKING:
+        ours, serves = kind in ("relative", "intent"), f"labels of {kind}"
+        settings, labels = (options if ours else compared), (FIRST if whole or ours else COMPARED)
+        pieces.append(Piece(world, "frame", kind, (kind,), labels, 8, settings, minutes, serves))
+        pieces.append(Piece(world, "frame", f"{kind}-more", (kind,), MORE, 8, options, minutes + 14, serves))
+    return pieces
 
 
 def again(world: str, options: Options, minutes: int) -> list[Piece]:
     """More seeds of what comes nearest to two thirds of the steps."""
-    options = {**options, **FRAME}
+    options, serves, first = {**options, **FRAME}, "two thirds of the steps", FIRST_SEED + 8
     return [
-        Piece(
-            world,
-            "frame",
-            f"intent-{labels}",
-            ("intent",),
-            (labels,),
-            16,
-            options,
-            minutes,
-            "two thirds",
-            FIRST_SEED + 8,
-        )
+        Piece(world, "frame", f"intent-{labels}", ("intent",), (labels,), 16, options, minutes, serves, first)
         for labels in (500, 1_000)
     ]
 

@@ -55,7 +55,7 @@ WAYS: dict[str, Options] = {
 
 
 def budgets(name: str, options: Options, minutes: int) -> list[Piece]:
-    """Every form of feedback with every budget, beside agents that nobody guides."""
+    """Every form of feedback with every budget, beside agents that nobody guides; some half as long."""
     whole = {**HALLS, **options}
     half = {**whole, **HALF}
     alone = whole if name == "frame" else half
