@@ -75,6 +75,7 @@ class Scenario:
     # How `cuelearner adapt` corrects a policy there, unless told otherwise:
     guidance: str | None = None  # kind of guidance
     judge_by: str | None = None  # metric by which a model must be worth using
+    judge_bounds: tuple[float, ...] = ()  # shares of the bound within which it is tried as well
     sizes: dict[str, Any] = field(default_factory=dict)  # fields of `GuideSizes`
     scalars: dict[str, Any] = field(default_factory=dict)  # fields of `Scalars`
 

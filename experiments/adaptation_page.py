@@ -240,6 +240,9 @@ def sections(data: Path, page: Path) -> dict[str, str]:
         for name, part in parts.items():
             found[name] = part(rows, folder, seen)
         found[f"{task}-settings"] = settings(rows, "reward" if task == "billiards" else "success")
+    coarse = data / "cpu" / "navigation"  # of the scale of that name, its base agents among them
+    rows = read(coarse) if coarse.exists() else []
+    found["lidar-cpu"] = outcomes(rows, "turned_lidar", whole_of(rows, 0.0))
     return {name: text for name, text in found.items() if text}
 
 

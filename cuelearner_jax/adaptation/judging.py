@@ -94,9 +94,8 @@ def judged(
     before = np.asarray(bases[by])
     before = np.broadcast_to(before, lanes.number) if len(before) == 1 else before[lanes.base]
     after = np.asarray(policies[by])
-    return Judged(
-        by, before, after, np.asarray(usable) & (after >= before), within_deg
-    )  # NaN is worth less than anything
+    used = np.asarray(usable) & (after >= before)  # NaN is worth less than anything
+    return Judged(by, before, after, used, within_deg)
 
 
 @partial(jax.jit, static_argnames=("guidance",))

@@ -8,7 +8,7 @@ from typing import Any, Generic
 
 import numpy as np
 
-from cuelearner_jax.adaptation import adapting
+from cuelearner_jax.adaptation import adapting, judging
 from cuelearner_jax.cli.parsing import about, code_of, out, parse, source_of, taken, world_of
 from cuelearner_jax.cli.shared_options import Flag, TaskT, seeds_of
 from cuelearner_jax.config import GuideSizes, Scalars
@@ -78,6 +78,8 @@ def run(arguments: list[str]) -> None:
     changed = source.task.scenario(named_world) if named_world else Scenario("the world as it is", {})
     if taken(rest, "--guidance", "a kind of guidance")[0] not in (None, changed.guidance):
         changed = replace(changed, guidance=None, sizes={}, scalars={})  # which are for the suggested kind
+    if taken(rest, "--judge-by", "what it is judged by")[0] == judging.LABELS:
+        changed = replace(changed, judge_bounds=())  # which are tried on episodes
     eps = changed.eps_deg
     labels, given = Adapt.labels, taken(rest, "--labels-from", "a labels.parquet")[0]
     if given:  # what the file holds is the default
@@ -91,7 +93,8 @@ def run(arguments: list[str]) -> None:
         base=Base(policy=source.default_policy),
         guidance=changed.guidance or Adapt.guidance,
         judge_by=changed.judge_by or Adapt.judge_by,
-        sizes=replace(adapting.SIZES, frame=source.config.sizes.frame, **changed.sizes),
+        judge_bounds=changed.judge_bounds,
+        sizes=replace(adapting.SIZES, **{"frame": source.config.sizes.frame, **changed.sizes}),
         scalars=replace(adapting.settling(source.config.scalars, eps), **changed.scalars),
     )
     asked = parse(kind, rest, f"adapt {source.folder}", default, about(Adapt, source.task, policies=True))

@@ -45,8 +45,9 @@ TASK = Task(
         "aslant": Scenario("the best direction is turned", {"offset_deg": -20.0}, bound_deg=45.0, eps_deg=5.0),
         "told": Scenario(
             "how is said too", {"offset_deg": 20.0}, guidance="residual", judge_by="labels",
-            sizes={"labels_per_round": 40}, scalars={"k_max": 7},
+            sizes={"labels_per_round": 40, "frame": "raw"}, scalars={"k_max": 7},
         ),
+        "tried": Scenario("bounds are tried", {"offset_deg": 20.0}, judge_bounds=(0.5, 0.25)),
     },
 )
 
@@ -162,6 +163,14 @@ def test_a_scenario_says_how_unless_another_kind_is_asked_for(home, capsys):
     kind, by, a_round, passes = defaults_of(capsys)
     assert (kind, by, a_round, passes) == ("relative", "reward", "10", "50")
     assert defaults_of(capsys, "--scenario", "told", "--guidance", "dcoach") == [kind, "labels", a_round, passes]
+
+
+def test_a_scenario_says_which_bounds_are_tried_unless_labels_decide(home, capsys):
+    for options, shown in (([], "(default: 0.5 0.25)"), (["--judge-by", "labels"], "(default: )")):
+        with pytest.raises(SystemExit):
+            main(["adapt", "own_turned:straight", *TASK, "--scenario", "tried", *options, "--help"])
+        told = re.sub(r"[│\s]+", " ", capsys.readouterr().out)
+        assert shown in told[told.index("--judge-bounds") : told.index("--overwrite")]
 
 
 def test_what_is_adapted_saved_and_loaded_acts_bitwise_alike(home, tmp_path):
