@@ -17,7 +17,6 @@ from collections.abc import Sequence
 from _pieces import FIRST_SEED, Experiment, Options, Piece, Scale, run
 
 FIRST, MORE = (25, 100, 500, 1_000), (50, 350, 2_000, 5_000)
-COMPARED = (100, 1_000)  # of the forms that only the regulation table has with all budgets
 CURVE = (10_000, 100_000)  # simulated: from which number on do labels pay?
 ASKING = ("relative", "intent", "demonstration", "scalar", "dcoach")
 
@@ -92,9 +91,8 @@ def budgets(world: str, options: Options, minutes: int) -> list[Piece]:
         Piece(world, "frame", "heuristic", ("heuristic",), (), 8, compared, minutes // 3, "against the obvious shot"),
     ]
     for kind in ASKING:
-        ours, serves = kind in ("relative", "intent"), f"labels of {kind}"
-        settings, labels = (options if ours else compared), (FIRST if whole or ours else COMPARED)
-        pieces.append(Piece(world, "frame", kind, (kind,), labels, 8, settings, minutes, serves))
+        settings, serves = options if kind in ("relative", "intent") else compared, f"labels of {kind}"
+        pieces.append(Piece(world, "frame", kind, (kind,), FIRST, 8, settings, minutes, serves))
         pieces.append(Piece(world, "frame", f"{kind}-more", (kind,), MORE, 8, options, minutes + 14, serves))
     return pieces
 

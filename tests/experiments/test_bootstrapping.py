@@ -46,13 +46,14 @@ def test_pieces_are_bounded_and_no_lane_is_trained_twice(experiment):
         assert 0 < piece.minutes <= 30, piece.path
         if all(map(known_kind, piece.kinds)):
             assert bool(piece.labels) == any(registry.find(kind).asks for kind in piece.kinds), piece.path
-    variants = [
-        (piece.world, piece.run, kind, budget)
+    lanes = [
+        (piece.world, piece.run, kind, budget, piece.first_seed + seed)
         for piece in experiment.pieces
         for kind in piece.kinds
         for budget in piece.labels or (0,)
+        for seed in range(piece.seeds)
     ]
-    assert len(set(variants)) == len(variants)
+    assert len(set(lanes)) == len(lanes)
     first = {piece.world: piece for piece in reversed(experiment.pieces)}
     assert {piece.kinds for piece in first.values()} == {("none",)}  # whom all runs of a world are compared with
 
