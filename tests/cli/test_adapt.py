@@ -228,6 +228,23 @@ def test_a_model_that_makes_it_worse_is_not_used_and_said_to_be(home):
     np.testing.assert_allclose(kept(SEEN), SEEN, atol=1e-6)
 
 
+def test_a_bound_is_learned_and_kept(home, tmp_path):
+    """The same labels, followed by no more than a fiftieth of the bound."""
+    world = cl.World(registry.resolve("own_turned:TASK"), importlib.import_module("own_turned").Config(offset_deg=5.0))
+    code, labels = importlib.import_module("own_turned").straight, cl.Labels(SEEN, SEEN, np.ones(len(SEEN)))
+    settings = {"labels": labels, "bound_deg": 180.0, "eps_deg": 5.0, "judge_episodes": 20}
+    near = cl.adapt(code, world, judge_bounds=(0.02,), **settings)
+    assert near.used
+    assert near.judged == ("reward", 1.0, 1.0)
+    moved = np.degrees(np.arccos(np.clip((near(SEEN) * SEEN).sum(-1), -1, 1)))
+    np.testing.assert_allclose(moved, 3.6, atol=0.1)
+    near.save(tmp_path / "near")
+    again = cl.load_policy(tmp_path / "near", task="own_turned:TASK", base=code)
+    np.testing.assert_array_equal(again(SEEN), near(SEEN))
+    with pytest.raises(cl.UserError, match="judge_bounds is 2: give shares"):
+        cl.adapt(code, world, judge_bounds=(2.0,), **settings)
+
+
 def test_what_cannot_be_is_refused(adapted, refused, tmp_path):
     new = ["--out", tmp_path / "new"]
     refused(["adapt", "own_turned:straight", *new], "is to act in some task: name it, as --task", tmp_path)
