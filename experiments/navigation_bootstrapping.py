@@ -31,7 +31,7 @@ HALLS: Options = {
     "schedule.eval-steps": 40_000,
     "schedule.checkpoint-every": 50_000,
 }
-# As far as faults and ways to ask are compared.
+# Long enough for what is compared over the first 40,000 steps alone.
 HALF: Options = {"schedule.total-steps": 50_000, "schedule.guidance-until": 50_000}
 RAW: Options = {"sizes.frame": "raw", "sizes.pace": False}  # said whatever the presets say
 FRAME: Options = {"sizes.frame": "action", "sizes.pace": False}
@@ -58,7 +58,7 @@ def budgets(name: str, options: Options, minutes: int) -> list[Piece]:
     """Every form of feedback with every budget, beside agents that nobody guides; some half as long."""
     whole = {**HALLS, **options}
     half = {**whole, **HALF}
-    alone = whole if name == "frame" else half
+    alone = whole if name == "frame" else half  # those seen from the action are whom all others are compared with
     pieces = [
         Piece("clutter", name, "none", ("none",), (), SEEDS, alone, minutes // 2, "unguided agents, of every figure"),
         Piece("clutter", name, "heuristic", ("heuristic",), (), SEEDS, half, minutes // 4, "against walking straight"),
@@ -73,56 +73,25 @@ def budgets(name: str, options: Options, minutes: int) -> list[Piece]:
 def variations(minutes: int) -> list[Piece]:
     """Five hundred labels of a faulty teacher, and other ways to ask; then paced."""
     options = {**HALLS, **FRAME, **HALF}
-    relative = ("relative",)
+    relative, seeds, brief = ("relative",), VARIED_SEEDS, minutes // 2
     pieces = [
-        Piece(
-            "clutter",
-            name,
-            "relative",
-            relative,
-            (500,),
-            VARIED_SEEDS,
-            {**options, **fault},
-            minutes // 2,
-            "faulty teachers",
-        )
+        Piece("clutter", name, "relative", relative, (500,), seeds, {**options, **fault}, brief, "faulty teachers")
         for name, fault in FAULTS.items()
     ]
     pieces += [
-        Piece(
-            "clutter",
-            name,
-            "relative",
-            relative,
-            (100, 500),
-            VARIED_SEEDS,
-            {**options, **way},
-            minutes,
-            "what is asked",
-        )
+        Piece("clutter", name, "relative", relative, (100, 500), seeds, {**options, **way}, minutes, "what is asked")
         for name, way in WAYS.items()
     ]
     paced: Options = {**options, "sizes.pace": True, "scalars.pace-lead": LEAD}
     given: Options = {**options, "labels-from": PAGE}
-    pieces.append(
-        Piece(
-            "clutter",
-            "page",
-            "relative",
-            relative,
-            (450, 500),
-            VARIED_SEEDS,
-            given,
-            minutes // 2,
-            "labels given on the page",
-        )
-    )
+    serves = "labels given on the page"
+    pieces.append(Piece("clutter", "page", "relative", relative, (450, 500), seeds, given, brief, serves))
     random = {**paced, **FAULTS["random"]}
     serves = "guidance never costs"
     pieces += [
-        Piece("clutter", "paced", "heuristic", ("heuristic",), (), VARIED_SEEDS, paced, minutes // 2, serves),
-        Piece("clutter", "paced", "relative", relative, (500,), VARIED_SEEDS, paced, minutes // 2, serves),
-        Piece("clutter", "paced-random", "relative", relative, (500,), VARIED_SEEDS, random, minutes // 2, serves),
+        Piece("clutter", "paced", "heuristic", ("heuristic",), (), seeds, paced, brief, serves),
+        Piece("clutter", "paced", "relative", relative, (500,), seeds, paced, brief, serves),
+        Piece("clutter", "paced-random", "relative", relative, (500,), seeds, random, brief, serves),
     ]
     return pieces
 

@@ -20,6 +20,7 @@ from cuelearner_jax.cli import main
 from cuelearner_jax.policies import Guided
 from cuelearner_jax.records import guides, label_files, policy_folders
 from cuelearner_jax.records.checkpoint import checkpoints
+from cuelearner_jax.runs.adaptation import told
 from cuelearner_jax.tasks import registry
 
 OWN = '''
@@ -236,6 +237,8 @@ def test_a_bound_is_learned_and_kept(home, tmp_path):
     near = cl.adapt(code, world, judge_bounds=(0.02,), **settings)
     assert near.used
     assert near.judged == ("reward", 1.0, 1.0)
+    (line,) = told(near.found)
+    assert line.endswith("1 before, 1 after, used within 3.6 degrees")
     moved = np.degrees(np.arccos(np.clip((near(SEEN) * SEEN).sum(-1), -1, 1)))
     np.testing.assert_allclose(moved, 3.6, atol=0.1)
     near.save(tmp_path / "near")
