@@ -68,12 +68,14 @@ def start(
     k_model: PRNGKeyArray,
     k_env: PRNGKeyArray,
     candidates: int = 1,
+    ask_all: bool = False,
 ) -> GuideState:
     """A guide that has asked nothing yet, at the start of an episode; of as many as there are candidates, if several.
 
-    Raises ValueError if its questions are to be chosen and there is nothing to choose them by.
+    `ask_all`: is every candidate asked about? Raises ValueError if questions are to be chosen and there is nothing to
+    choose them by.
     """
-    if candidates > 1 and guidance.disagreement is None:
+    if candidates > 1 and guidance.disagreement is None and not ask_all:
         raise ValueError(f"guidance {guidance.name!r} has no members whose disagreement could choose its questions")
     state, obs = env.reset(k_env) if candidates == 1 else jax.vmap(env.reset)(jax.random.split(k_env, candidates))
     return GuideState(
@@ -220,6 +222,36 @@ def ask(
     return proceed(env, told.replace(env=guide.env, obs=guide.obs), actions, keys)
 
 
+def ask_all(
+    guidance: Guidance,
+    env: Environment,
+    teacher: Teacher,
+    scalars: Scalars,
+    base: Policy,
+    guide: GuideState,
+    lane_key: PRNGKeyArray,
+    position: Int[Array, ""],
+    bound: Float[Array, ""] | None = None,
+) -> GuideState:
+    """Like `ask`, of every candidate: as many questions as there are, the first of them number `position`."""
+    assert guidance.form is not None
+    keys, count = question_keys(lane_key, position), len(guide.obs)
+    proposals = proposed(base, guide, keys)
+    actions = _asked_of(guidance, env, scalars, guide, proposals, keys, bound)
+
+    def one(key: PRNGKeyArray, state: Any, obs: Array, action: Array) -> tuple[Array, Array]:
+        assert guidance.form is not None
+        return guidance.form.answer(key, env, teacher, state, obs, action, scalars)
+
+    answers, answered = jax.vmap(one)(jax.random.split(keys.answer, count), guide.env, guide.obs, actions)
+    counted = answered & (position + jnp.arange(count) < guide.budget)
+    rows = Label(guide.obs, actions, answers, counted, proposals if guidance.onward else None)
+    put = lambda all_rows, new: jax.lax.dynamic_update_slice_in_dim(all_rows, new, position, 0)  # noqa: E731
+    labels = jax.tree.map(put, guide.labels, rows)
+    told = guide.replace(labels=labels, asked=jnp.minimum(position + count, guide.budget))
+    return proceed(env, told, actions, keys)
+
+
 def walked(
     guidance: Guidance,
     env: Environment,
@@ -258,16 +290,17 @@ def label_round(
         bound: see `question`.
     """
     first, until = guide.asked, guide.budget if until is None else until
+    asking, at_once = (ask_all, sizes.candidates) if sizes.ask_all else (ask, 1)
 
     def one(guide: GuideState, offset: Int[Array, ""]) -> tuple[GuideState, None]:
-        asked = ask(guidance, env, teacher, scalars, base, guide, lane_key, first + offset, bound)
+        asked = asking(guidance, env, teacher, scalars, base, guide, lane_key, first + offset, bound)
         if sizes.question_every == 1:
             return asked, None
         key = jax.random.fold_in(jax.random.fold_in(lane_key, Stream.WALK), first + offset)
         keys = jax.random.split(key, sizes.question_every - 1)
         return walked(guidance, env, scalars, base, asked, keys, bound), None
 
-    asked, _ = jax.lax.scan(one, guide, jnp.arange(sizes.labels_per_round))
+    asked, _ = jax.lax.scan(one, guide, jnp.arange(0, sizes.labels_per_round, at_once))
     fitted = fit(guidance, env, scalars, asked, lane_key, first // sizes.labels_per_round)
     return jax.tree.map(lambda new, old: jnp.where(first < until, new, old), fitted, guide)
 

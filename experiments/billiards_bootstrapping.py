@@ -51,12 +51,13 @@ RAW: Options = {"sizes.frame": "raw", "sizes.pace": False}  # said whatever the 
 FRAME: Options = {"sizes.frame": "action", "sizes.pace": False}
 # To the step to which areas under the curve are taken, a little past the end of guidance.
 GUIDED: Options = {"schedule.total-steps": 550_000, "schedule.checkpoint-every": 550_000}
-# Rounds as few as keep fits of so many labels within minutes.
-LARGE_ROUNDS: Options = {
-    "sizes.labels-per-round": 5_000,
-    "sizes.fit-steps": 20_000,
+# A tenth of the labels a round, asked in as many situations at once as keep that within minutes.
+MANY: Options = {
+    "sizes.candidates": 100,
+    "sizes.ask-all": True,
+    "sizes.fit-steps": 10_000,
     "sizes.fit-batch-size": 500,
-    "schedule.guide-eval-every": 5_000,
+    "sizes.validate-every": 100,
 }
 FAULTS: dict[str, Options] = {
     "flipped-05": {"scalars.mistake-probability": 0.05},
@@ -108,9 +109,17 @@ def again(world: str, options: Options, minutes: int) -> list[Piece]:
 
 def curves(world: str, options: Options, minutes: int) -> list[Piece]:
     """The same with more labels than anybody gives."""
-    options = {**options, **FRAME, **LARGE_ROUNDS, **GUIDED}
+    options = {**options, **FRAME, **MANY, **GUIDED}
     serves = "the number from which labels pay"
-    return [Piece(world, "frame", f"{kind}-curve", (kind,), CURVE, 8, options, minutes + 8, serves) for kind in ASKING]
+    pieces = []
+    for labels in CURVE:
+        rounds: Options = {"sizes.labels-per-round": labels // 10, "schedule.guide-eval-every": labels // 10}
+        settings = {**options, **rounds}
+        pieces += [
+            Piece(world, "frame", f"{kind}-{labels}", (kind,), (labels,), 8, settings, minutes, serves)
+            for kind in ASKING
+        ]
+    return pieces
 
 
 def variations(world: str, options: Options, minutes: int) -> list[Piece]:
@@ -204,6 +213,7 @@ SCALES = {
             "sizes.labels-per-round": 5,
             "sizes.fit-steps": 20,
             "sizes.fit-batch-size": 10,
+            "sizes.validate-every": 20,
             "sizes.lanes-per-block": 1,
             "schedule.total-steps": 200,
             "schedule.random-steps": 50,
@@ -214,7 +224,7 @@ SCALES = {
             "schedule.eval-envs": 10,
             "schedule.checkpoint-every": 200,
         },
-        instead={"schedule.ask-at": (0, 100)},
+        instead={"schedule.ask-at": (0, 100), "sizes.candidates": 5, "schedule.guide-eval-every": 5},
     ),
     "quick": Scale(
         "minutes a piece on an accelerator, to see where it goes",

@@ -107,7 +107,7 @@ def rounds(lanes: Lanes, sizes: GuideSizes) -> int:
 def _begin(guidance: Guidance, sizes: GuideSizes, slots: int, env: Any, columns: Any) -> Adapting:
     def one(base: Array, seed: Array, budget: Array, bound: Array) -> Adapting:
         k_model, k_env, k_lane = jax.random.split(jax.random.key(seed), 3)
-        guide = asking.start(guidance, env, slots, budget, k_model, k_env, sizes.candidates)
+        guide = asking.start(guidance, env, slots, budget, k_model, k_env, sizes.candidates, sizes.ask_all)
         return Adapting(guide, base, bound, k_lane, jnp.array(False))
 
     return each_lane(one)(*columns)

@@ -126,10 +126,14 @@ def check_guide(sizes: GuideSizes, scalars: GuideScalars) -> None:
         "question_every",
     )
     _check_positive(sizes, (*positive, "guide_directions", "replay_steps"))
-    if sizes.candidates > 1 and sizes.ensemble == 1:
+    if sizes.ask_all:
+        _check_multiple(sizes.labels_per_round, sizes.candidates, "sizes.labels_per_round", "sizes.candidates")
+    if sizes.ask_all and sizes.candidates == 1:
+        raise UserError("sizes.ask_all asks about every candidate: give sizes.candidates above 1 too, or leave it out")
+    if sizes.candidates > 1 and sizes.ensemble == 1 and not sizes.ask_all:
         raise UserError(
             f"sizes.candidates is {sizes.candidates}: questions are chosen by the disagreement of members, so give a "
-            "sizes.ensemble above 1 too"
+            "sizes.ensemble above 1 too, or sizes.ask_all to ask about every one"
         )
     if sizes.labels_per_round > LARGEST_ROUND:
         raise UserError(f"sizes.labels_per_round is {sizes.labels_per_round}: give at most {LARGEST_ROUND}")

@@ -89,6 +89,9 @@ class GuideSizes(_Seeing):
     on what the base policy did, so this is for adaptation."""
     candidates: int = 1
     """Situations among which each question is chosen: where the members disagree most (1: as they come)."""
+    ask_all: bool = False
+    """Is every candidate asked about, in place of one that is chosen? Simulated labels by the thousand are then soon
+    asked for: a round takes its number of questions divided by `candidates` in steps."""
     question_every: int = 1
     """Steps from one question of a simulated teacher to the next (1: every situation is asked about): questions farther
     apart are of more different situations."""

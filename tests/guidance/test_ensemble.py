@@ -137,3 +137,29 @@ def test_kinds_of_one_model_are_refused_where_members_are_wanted(monkeypatch):
         registry.make("single", CHOOSING, ENV)
     assert "\n" not in str(refusal.value)
     assert registry.make("none", CHOOSING, ENV).name == "none"  # which asks nothing
+
+
+def test_every_candidate_is_asked_about_at_once_within_the_budget():
+    sizes = dataclasses.replace(ONE, candidates=6, ask_all=True, labels_per_round=12)
+    single = registry.make("relative", sizes, ENV)._replace(question=about_base)
+    assert single.disagreement is None
+    slots, key, expert = asking.label_slots(21, sizes), jax.random.key(7), probes.Expert(ENV)
+    assert slots == 24
+    guide = asking.start(single, ENV, slots, 21, jax.random.key(1), jax.random.key(2), 6, ask_all=True)
+    keys = asking.question_keys(key, 12)
+    proposed = Uniform().act(keys.base, guide.env, guide.obs)
+    after = asking.ask_all(single, ENV, expert, probes.SCALARS, Uniform(), guide, key, jnp.asarray(12))
+    np.testing.assert_array_equal(after.labels.obs[12:18], guide.obs)
+    np.testing.assert_array_equal(after.labels.action[12:18], proposed)
+    errors = jax.vmap(actions.difference)(proposed, jax.vmap(ENV.best)(guide.obs))
+    h = np.where(np.abs(errors) <= np.deg2rad(10), 0.0, np.sign(errors))
+    assert set(h) >= {-1.0, 1.0}
+    np.testing.assert_array_equal(after.labels.answer[12:18, 0], h)
+    assert np.flatnonzero(after.labels.valid).tolist() == list(range(12, 18))
+    states, steps = jax.vmap(ENV.step)(jax.random.split(keys.env, 6), guide.env, proposed)
+    chex.assert_trees_all_equal((after.env, after.obs), (states, steps.obs))
+    one = jax.jit(lambda guide: asking.label_round(single, sizes, ENV, expert, probes.SCALARS, Uniform(), guide, key))
+    guide = one(one(guide))
+    assert np.asarray(guide.labels.valid).tolist() == [True] * 21 + [False] * 3
+    assert (int(guide.asked), bool(guide.model.fitted)) == (21, True)
+    assert len(np.unique(np.asarray(guide.labels.action)[:21], axis=0)) == 21
