@@ -6,18 +6,23 @@ adaptation gives another base policy than uniform actions.
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray
 
+from cuelearner_jax import choosing
 from cuelearner_jax.config import GuideScalars, GuideSizes, Scalars
 from cuelearner_jax.environment import Environment, actions_of
+from cuelearner_jax.guidance.answers import of_strength
 from cuelearner_jax.guidance.bounding import within
 from cuelearner_jax.guidance.bundle import Guidance
 from cuelearner_jax.policies import Policy
 from cuelearner_jax.types import GuideState, Label, Stream, Teacher
+
+ONE_BY_ONE = GuideSizes()  # questions as they come, of one strength: as a page asks them
 
 
 class QuestionKeys(NamedTuple):
@@ -49,15 +54,55 @@ def share(budget: int, instalment: int, instalments: int, sizes: GuideSizes) -> 
     return min(-(-rounds * (instalment + 1) // instalments) * sizes.labels_per_round, budget)
 
 
-def empty_labels(slots: int, obs_size: int, action_size: int, answer_width: int, with_base: bool = False) -> Label:
-    """`slots` rows of padding. `with_base`: is kept what was proposed before any correction?"""
+def strength(
+    scalars: GuideScalars, position: Int[Array, "*positions"] | int, budget: Int[Array, ""] | int
+) -> Float[Array, "*positions"]:
+    """How strong label number `position` (from 0) of a budget is where labels fall [deg].
+
+    From `scalars.eps_deg` for the first to `scalars.eps_last_deg` for the last, by the same factor from one to the
+    next; the only one of a budget is as strong as a first.
+    """
+    through = jnp.clip(position / jnp.maximum(budget - 1, 1), 0.0, 1.0)
+    falling = scalars.eps_deg * (scalars.eps_last_deg / scalars.eps_deg) ** through
+    return jnp.where(through < 1, falling, scalars.eps_last_deg)
+
+
+def empty_labels(
+    slots: int,
+    obs_size: int,
+    action_size: int,
+    answer_width: int,
+    with_base: bool = False,
+    with_eps: bool = False,
+) -> Label:
+    """`slots` rows of padding.
+
+    Args:
+        slots: their number.
+        obs_size, action_size, answer_width: entries of a row.
+        with_base: is kept what was proposed before any correction?
+        with_eps: is kept how strong each answer is?
+    """
     return Label(
         obs=jnp.zeros((slots, obs_size)),
         action=jnp.zeros((slots, action_size)),
         answer=jnp.zeros((slots, answer_width)),
         valid=jnp.zeros((slots,), bool),
         base=jnp.zeros((slots, action_size)) if with_base else None,
+        eps_deg=jnp.zeros((slots,)) if with_eps else None,
     )
+
+
+def as_kept(labels: Label, guide: GuideState, scalars: GuideScalars) -> Label:
+    """Labels (slots, ...) that were given elsewhere, with strengths if the guide keeps those.
+
+    Raises ValueError for labels with strengths of their own, of which the guide keeps none.
+    """
+    if guide.labels.eps_deg is None and labels.eps_deg is not None:
+        raise ValueError("these labels have strengths of their own: make the guide with sizes.eps_falls")
+    if guide.labels.eps_deg is None or labels.eps_deg is not None:
+        return labels
+    return labels.replace(eps_deg=jnp.full(labels.valid.shape, scalars.eps_deg, jnp.float32))
 
 
 def start(
@@ -67,21 +112,26 @@ def start(
     budget: Int[Array, ""] | int,
     k_model: PRNGKeyArray,
     k_env: PRNGKeyArray,
-    candidates: int = 1,
-    ask_all: bool = False,
+    sizes: GuideSizes = ONE_BY_ONE,
 ) -> GuideState:
     """A guide that has asked nothing yet, at the start of an episode; of as many as there are candidates, if several.
 
-    `ask_all`: is every candidate asked about? Raises ValueError if questions are to be chosen and there is nothing to
-    choose them by.
+    Raises ValueError if its questions are to be chosen and there is nothing to choose them by.
     """
-    if candidates > 1 and guidance.disagreement is None and not ask_all:
+    candidates = sizes.candidates
+    by_members = candidates > 1 and sizes.chosen_by == "members" and not sizes.ask_all
+    if by_members and guidance.asks and guidance.disagreement is None:
         raise ValueError(f"guidance {guidance.name!r} has no members whose disagreement could choose its questions")
     state, obs = env.reset(k_env) if candidates == 1 else jax.vmap(env.reset)(jax.random.split(k_env, candidates))
     return GuideState(
         model=guidance.init(k_model),
         labels=empty_labels(
-            slots, env.obs_size, actions_of(env).size, guidance.answer_width, guidance.onward is not None
+            slots,
+            env.obs_size,
+            actions_of(env).size,
+            guidance.answer_width,
+            with_base=guidance.onward is not None,
+            with_eps=guidance.asks and sizes.eps_falls,
         ),
         budget=jnp.asarray(budget, jnp.int32),
         asked=jnp.zeros((), jnp.int32),
@@ -136,26 +186,6 @@ def _asked_of(
     return one(keys.question, guide.obs, first)
 
 
-def chosen(
-    guidance: Guidance,
-    env: Environment,
-    guide: GuideState,
-    actions: Float[Array, "*candidates action"],
-    first: Float[Array, "*candidates action"],
-) -> tuple[GuideState, Float[Array, " action"], Float[Array, " action"]]:
-    """The guide in the one situation to ask in, the action to ask about there, and what was proposed there at first.
-
-    Of several candidates it is the one on which the members of the guide's model disagree most (query by committee:
-    Seung, Opper, Sompolinsky, 1992); before the first fit, when they know nothing, the first.
-    """
-    if guidance.disagreement is None or guide.obs.ndim == 1:
-        return guide, actions, first
-    apart = guidance.disagreement(guide.model, env, guide.obs, actions)
-    index = jnp.where(guide.model.fitted, jnp.argmax(apart), 0)
-    there = jax.tree.map(lambda leaf: leaf[index], (guide.env, guide.obs, actions, first))
-    return guide.replace(env=there[0], obs=there[1]), there[2], there[3]
-
-
 def record(
     guide: GuideState,
     position: Int[Array, ""] | int,
@@ -163,12 +193,13 @@ def record(
     answer: Float[Array, " answer"],
     answered: Bool[Array, ""] | bool,
     base: Float[Array, " action"] | None = None,
+    eps_deg: Float[Array, ""] | None = None,
 ) -> GuideState:
     """The guide with an answer in the row `position` of its labels; it counts within the budget alone.
 
-    `base`: what was proposed in place of the action, if labels keep that.
+    `base`: what was proposed in place of the action, `eps_deg`: how strong the answer is [deg], if labels keep that.
     """
-    label = Label(guide.obs, action, answer, jnp.asarray(answered) & (position < guide.budget), base)
+    label = Label(guide.obs, action, answer, jnp.asarray(answered) & (position < guide.budget), base, eps_deg)
     put = lambda rows, row: jax.lax.dynamic_update_index_in_dim(rows, row, position, 0)  # noqa: E731
     asked = jnp.minimum(position + 1, guide.budget)
     return guide.replace(labels=jax.tree.map(put, guide.labels, label), asked=asked)
@@ -209,16 +240,33 @@ def ask(
     lane_key: PRNGKeyArray,
     position: Int[Array, ""],
     bound: Float[Array, ""] | None = None,
+    sizes: GuideSizes = ONE_BY_ONE,
 ) -> GuideState:
-    """Question number `position`, answered by a simulated teacher, recorded and acted on; `bound`: see `question`."""
+    """Question number `position`, answered by a simulated teacher, recorded and acted on.
+
+    Args:
+        guidance, env, teacher, scalars, base: who asks whom about what.
+        guide: of `start` with the same `sizes`.
+        lane_key: of all questions.
+        position: of this one, from 0.
+        bound: see `question`.
+        sizes: who chooses among candidates.
+
+    Raises:
+        ValueError: the guidance asks nothing.
+    """
     if guidance.form is None:
         raise ValueError(f"guidance {guidance.name!r} asks nothing")
     keys = question_keys(lane_key, position)
     proposals = proposed(base, guide, keys)
     actions = _asked_of(guidance, env, scalars, guide, proposals, keys, bound)
-    there, action, first = chosen(guidance, env, guide, actions, proposals)
-    answer, answered = guidance.form.answer(keys.answer, env, teacher, there.env, there.obs, action, scalars)
-    told = record(there, position, action, answer, answered, first if guidance.onward else None)
+    watches = sizes.candidates > 1 and sizes.chosen_by == "teacher"
+    away = choosing.parting(env, teacher, scalars, guide, actions) if watches else None
+    there, action, first = choosing.chosen(guidance, env, guide, actions, proposals, away)
+    eps_deg = None if guide.labels.eps_deg is None else strength(scalars, position, guide.budget)
+    strong = of_strength(scalars, eps_deg)
+    answer, answered = guidance.form.answer(keys.answer, env, teacher, there.env, there.obs, action, strong)
+    told = record(there, position, action, answer, answered, first if guidance.onward else None, eps_deg)
     return proceed(env, told.replace(env=guide.env, obs=guide.obs), actions, keys)
 
 
@@ -234,21 +282,25 @@ def ask_all(
     bound: Float[Array, ""] | None = None,
 ) -> GuideState:
     """Like `ask`, of every candidate: as many questions as there are, the first of them number `position`."""
-    assert guidance.form is not None
+    form = guidance.form
+    if form is None:
+        raise ValueError(f"guidance {guidance.name!r} asks nothing")
     keys, count = question_keys(lane_key, position), len(guide.obs)
     proposals = proposed(base, guide, keys)
     actions = _asked_of(guidance, env, scalars, guide, proposals, keys, bound)
+    positions = position + jnp.arange(count)
+    eps_deg = None if guide.labels.eps_deg is None else strength(scalars, positions, guide.budget)
 
-    def one(key: PRNGKeyArray, state: Any, obs: Array, action: Array) -> tuple[Array, Array]:
-        assert guidance.form is not None
-        return guidance.form.answer(key, env, teacher, state, obs, action, scalars)
+    def one(key: PRNGKeyArray, state: Any, obs: Array, action: Array, eps_deg: Array | None) -> tuple[Array, Array]:
+        return form.answer(key, env, teacher, state, obs, action, of_strength(scalars, eps_deg))
 
-    answers, answered = jax.vmap(one)(jax.random.split(keys.answer, count), guide.env, guide.obs, actions)
-    counted = answered & (position + jnp.arange(count) < guide.budget)
-    rows = Label(guide.obs, actions, answers, counted, proposals if guidance.onward else None)
-    put = lambda all_rows, new: jax.lax.dynamic_update_slice_in_dim(all_rows, new, position, 0)  # noqa: E731
-    labels = jax.tree.map(put, guide.labels, rows)
-    told = guide.replace(labels=labels, asked=jnp.minimum(position + count, guide.budget))
+    answer_keys = jax.random.split(keys.answer, count)
+    answers, answered = jax.vmap(one)(answer_keys, guide.env, guide.obs, actions, eps_deg)
+    first = proposals if guidance.onward else None
+    rows = Label(guide.obs, actions, answers, answered & (positions < guide.budget), first, eps_deg)
+    put = lambda known, new: jax.lax.dynamic_update_slice_in_dim(known, new, position, 0)  # noqa: E731
+    asked = jnp.minimum(position + count, guide.budget)
+    told = guide.replace(labels=jax.tree.map(put, guide.labels, rows), asked=asked)
     return proceed(env, told, actions, keys)
 
 
@@ -290,7 +342,8 @@ def label_round(
         bound: see `question`.
     """
     first, until = guide.asked, guide.budget if until is None else until
-    asking, at_once = (ask_all, sizes.candidates) if sizes.ask_all else (ask, 1)
+    one_by_one = partial(ask, sizes=sizes)
+    asking, at_once = (ask_all, sizes.candidates) if sizes.ask_all else (one_by_one, 1)
 
     def one(guide: GuideState, offset: Int[Array, ""]) -> tuple[GuideState, None]:
         asked = asking(guidance, env, teacher, scalars, base, guide, lane_key, first + offset, bound)
@@ -308,5 +361,9 @@ def label_round(
 def take_labels(
     guidance: Guidance, env: Environment, scalars: GuideScalars, labels: Label, guide: GuideState, lane_key: Any
 ) -> GuideState:
-    """The guide with labels (slots, ...) that were given elsewhere, and a model fitted to them once."""
+    """The guide with labels (slots, ...) that were given elsewhere, and a model fitted to them once.
+
+    Raises ValueError if they have strengths of their own and the guide keeps none.
+    """
+    labels = as_kept(labels, guide, scalars)
     return fit(guidance, env, scalars, guide.replace(labels=labels, asked=guide.budget), lane_key)

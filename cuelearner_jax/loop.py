@@ -175,7 +175,7 @@ class Lane(NamedTuple):
             agent = agent.replace(params=params, target_params=follows)
         return TrainState(
             agent=agent,
-            guide=asking.start(self.guidance, env, slots, budget, k_guidance, k_ask, self.sizes.candidates, self.sizes.ask_all),
+            guide=asking.start(self.guidance, env, slots, budget, k_guidance, k_ask, self.sizes),
             key=key,
             failed=jnp.array(False),
             pace=pace.start(self.sizes.num_envs) if self.sizes.pace else None,

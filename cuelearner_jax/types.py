@@ -96,6 +96,7 @@ class Label(struct.PyTreeNode):
     answer: Float[Array, " answer"]  # in its form's words; relative: h in {-1, 0, +1}, see `guidance.answers`
     valid: Bool[Array, ""]  # False: padding, past this lane's budget, or no answer
     base: Float[Array, " action"] | None = None  # what was proposed before any correction; None: no model looks at it
+    eps_deg: Float[Array, ""] | None = None  # strength of the answer [deg]; None: that of the scalars (`eps_deg`)
 
 
 class GuidanceModel(struct.PyTreeNode):

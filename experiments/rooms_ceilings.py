@@ -11,8 +11,8 @@ too. Success on validation episodes goes to FOLDER/ceilings.json. On an H100 by 
 
 The third ceiling, agents trained in rooms under guidance, is an ordinary sweep:
 
-    cuelearner sweep navigation --preset paper --task.style rooms --sizes.frame action --guidance relative --labels 500 \
-        --seeds 8 --out runs/rooms
+    cuelearner sweep navigation --preset paper --task.style rooms --sizes.frame action --guidance relative \
+        --labels 500 --seeds 8 --out runs/rooms
 """
 
 from __future__ import annotations

@@ -187,6 +187,71 @@ def test_labels_given_elsewhere_are_fitted_once():
     assert bool(taken.model.fitted)
 
 
+# Strengths that fall.
+
+FALLING = dataclasses.replace(probes.SIZES, eps_falls=True)
+FROM_40_TO_10 = dataclasses.replace(probes.SCALARS, eps_deg=40.0, eps_last_deg=10.0)
+
+
+def begun_falling(budget):
+    slots = asking.label_slots(budget, FALLING)
+    return asking.start(RELATIVE, ENV, slots, budget, jax.random.key(1), jax.random.key(2), FALLING)
+
+
+@pytest.mark.parametrize(
+    ("budget", "strengths"),
+    [
+        (3, [40.0, 20.0, 10.0]),
+        (5, [40.0, 28.284271, 20.0, 14.142136, 10.0]),
+        (2, [40.0, 10.0, 10.0]),  # what is past the budget is as strong as its last
+        (1, [40.0]),
+    ],
+)
+def test_strengths_fall_by_the_same_factor_from_the_first_label_of_a_budget_to_the_last(budget, strengths):
+    found = [asking.strength(FROM_40_TO_10, position, budget) for position in range(len(strengths))]
+    np.testing.assert_allclose(found, strengths, rtol=1e-6)
+    assert (found[0], found[budget - 1]) == (40.0, 10.0 if budget > 1 else 40.0)  # to the last bit
+    same = dataclasses.replace(FROM_40_TO_10, eps_last_deg=40.0)
+    assert {float(asking.strength(same, position, 7)) for position in range(7)} == {40.0}
+
+
+def test_a_teacher_answers_by_the_strength_of_each_label_which_the_label_keeps():
+    """8 degrees off: right for a label of more than 16 degrees, a turn for one of less, as from number 13 of 20 on."""
+    base, near = Heuristic(ENV), probes.Expert(probes.Window(offset=-1.0 - np.deg2rad(8.0)))
+    scalars = dataclasses.replace(FROM_40_TO_10, refined_fraction=0.0)
+    guide = begun_falling(20)
+    for _ in range(2):
+        guide = asking.label_round(RELATIVE, FALLING, ENV, near, scalars, base, guide, LANE_KEY)
+    np.testing.assert_allclose(guide.labels.eps_deg, 40.0 * 0.25 ** (np.arange(20) / 19), rtol=1e-5)
+    assert np.asarray(guide.labels.answer)[:, 0].tolist() == [0.0] * 13 + [-1.0] * 7
+    assert guide.labels.valid.all()
+
+
+def test_a_lanes_own_budget_says_how_strengths_fall_and_instalments_do_not():
+    ask = jax.jit(partial(asking.label_round, RELATIVE, FALLING))
+    several = [begun_falling(budget) for budget in (15, 2 * ROUND)]
+    for number in range(2):
+        several = [ask(ENV, EXPERT, FROM_40_TO_10, Uniform(), guide, LANE_KEY) for guide in several]
+        if number == 0:
+            assert int(several[0].labels.valid.sum()) == ROUND
+    for guide, budget in zip(several, (15, 2 * ROUND), strict=True):
+        strengths = np.asarray(guide.labels.eps_deg)[:budget]
+        np.testing.assert_allclose(strengths, np.geomspace(40.0, 10.0, budget), rtol=1e-5)
+    waited = begun_falling(2 * ROUND)
+    for until in (ROUND, ROUND, 2 * ROUND):
+        waited = ask(ENV, EXPERT, FROM_40_TO_10, Uniform(), waited, LANE_KEY, jnp.asarray(until))
+    chex.assert_trees_all_equal(waited, several[1])
+
+
+def test_labels_of_one_strength_are_taken_where_strengths_fall_and_not_the_other_way_round():
+    labels = label_round(ENV, EXPERT, probes.SCALARS, Uniform(), begun(), LANE_KEY).labels
+    taken = asking.as_kept(labels, begun_falling(2 * ROUND), probes.SCALARS)
+    assert taken.eps_deg.tolist() == [20.0] * 2 * ROUND
+    assert asking.as_kept(labels, begun(), probes.SCALARS) is labels
+    with pytest.raises(ValueError, match=r"make the guide with sizes\.eps_falls"):
+        asking.as_kept(taken, begun(), probes.SCALARS)
+
+
 # Instalments.
 
 

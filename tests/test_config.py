@@ -72,8 +72,18 @@ from cuelearner_jax.errors import UserError
         ("sizes", {"ensemble": 0}, "sizes.ensemble is 0"),
         ("sizes", {"candidates": 0}, "sizes.candidates is 0"),
         ("sizes", {"ask_all": True}, "sizes.ask_all asks about every candidate: give sizes.candidates above 1 too"),
-        ("sizes", {"ask_all": True, "candidates": 4}, "sizes.labels_per_round is 10: give a multiple of sizes.candidates"),
+        (
+            "sizes",
+            {"ask_all": True, "candidates": 4},
+            "sizes.labels_per_round is 10: give a multiple of sizes.candidates",
+        ),
         ("sizes", {"candidates": 8}, "sizes.candidates is 8: questions are chosen by the disagreement of members"),
+        ("sizes", {"candidates": 8}, "give a sizes.ensemble above 1 too, or sizes.chosen_by teacher"),
+        ("sizes", {"chosen_by": "teacher"}, "sizes.chosen_by is teacher and sizes.candidates is 1: give more"),
+        ("sizes", {"chosen_by": "coach", "candidates": 8}, "sizes.chosen_by is 'coach': give members or teacher"),
+        ("sizes", {"eps_falls": True}, "scalars.eps_last_deg is 0.0, to which sizes.eps_falls leads: give an angle"),
+        ("scalars", {"eps_last_deg": 5.0}, "scalars.eps_last_deg is 5.0, to which labels fall with sizes.eps_falls"),
+        ("scalars", {"eps_last_deg": -5.0}, "scalars.eps_last_deg is -5.0: give a number that is not negative"),
         ("scalars", {"ask_bound_deg": 20.0}, "ask_bound_deg is 20.0, which bounds later instalments, and there is but"),
         ("scalars", {"ask_bound_deg": 0.0}, "scalars.ask_bound_deg is 0.0: give an angle"),
         ("schedule", {"ask_at": ()}, "schedule.ask_at is empty: give steps in ascending order, the first of them 0"),
@@ -95,6 +105,13 @@ def test_values_that_cannot_work_are_refused(group, values, message):
         config.check(probes.config(**{group: values}))
     assert message in str(error.value)
     assert "\n" not in str(error.value)
+
+
+def test_strengths_do_not_rise():
+    falling = probes.config(sizes={"eps_falls": True}, scalars={"eps_deg": 20.0, "eps_last_deg": 20.0})
+    config.check(falling)
+    with pytest.raises(UserError, match=r"above 0 and up to scalars\.eps_deg \(19\.0\)"):
+        config.check(dataclasses.replace(falling, scalars=dataclasses.replace(falling.scalars, eps_deg=19.0)))
 
 
 def test_defaults_and_probes_can_work():

@@ -20,6 +20,7 @@ ROWS = [
     ["agent"],
     ["guidance"],
     ["policies"],
+    ["choosing"],
     ["asking", "evaluate"],
     ["export"],
     ["loop"],

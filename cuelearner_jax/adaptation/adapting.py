@@ -138,6 +138,13 @@ def settling(scalars: Scalars, eps_deg: float | None) -> Scalars:
     return replace(scalars, eps_deg=eps, tau_deg=min(scalars.tau_deg, eps / PASSES))
 
 
+def falling(sizes: GuideSizes, scalars: Scalars, strengths: Any) -> tuple[GuideSizes, Scalars]:
+    """Sizes and scalars of lanes that take labels of these strengths (labels,) [deg]; None: of one, as they are."""
+    if strengths is None:
+        return sizes, scalars
+    return replace(sizes, eps_falls=True), replace(scalars, eps_last_deg=float(np.min(strengths)))
+
+
 def adapt(
     asked: Adaptation,
     teacher: Teacher | None = None,

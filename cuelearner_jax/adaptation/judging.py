@@ -22,6 +22,7 @@ from cuelearner_jax.devices import each_lane
 from cuelearner_jax.environment import Environment, actions_of
 from cuelearner_jax.errors import UserError, closest
 from cuelearner_jax.evaluate import Tell, episodes, evaluate_lanes, untold, watched, watched_lanes
+from cuelearner_jax.guidance.answers import of_strength
 from cuelearner_jax.guidance.bundle import Guidance
 from cuelearner_jax.policies import Common, Policy
 from cuelearner_jax.types import Label
@@ -114,7 +115,8 @@ def _predicted(guidance: Guidance, env: Any, scalars: Any, block: Adapting) -> t
         return jnp.sum(zero, where=held) / count, jnp.where(held.any(), jnp.sum(right, where=held) / count, jnp.nan)
 
     def _right(labels: Label, moved: Float[Array, "n action"]) -> tuple[Array, Array]:
-        turn = space.sense(labels.action, moved) * space.distance(labels.action, moved) / scalars.radians("eps")
+        eps = of_strength(scalars, labels.eps_deg).radians("eps")  # of all labels, or of each
+        turn = space.sense(labels.action, moved) * space.distance(labels.action, moved) / eps
         return jnp.round(jnp.clip(turn, -1, 1)) == labels.answer[:, 0], labels.answer[:, 0] == 0
 
     return each_lane(one)(block)

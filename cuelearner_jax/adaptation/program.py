@@ -107,7 +107,7 @@ def rounds(lanes: Lanes, sizes: GuideSizes) -> int:
 def _begin(guidance: Guidance, sizes: GuideSizes, slots: int, env: Any, columns: Any) -> Adapting:
     def one(base: Array, seed: Array, budget: Array, bound: Array) -> Adapting:
         k_model, k_env, k_lane = jax.random.split(jax.random.key(seed), 3)
-        guide = asking.start(guidance, env, slots, budget, k_model, k_env, sizes.candidates, sizes.ask_all)
+        guide = asking.start(guidance, env, slots, budget, k_model, k_env, sizes)
         return Adapting(guide, base, bound, k_lane, jnp.array(False))
 
     return each_lane(one)(*columns)
@@ -188,6 +188,7 @@ def _take(
         def one(labels: Label, lane: Adapting) -> Adapting:
             if guidance.onward:  # files do not keep what the base policy does: it tells again
                 labels = labels.replace(base=one_lane(bases, lane.base).act(lane.key, None, labels.obs))
+            labels = asking.as_kept(labels, lane.guide, scalars)
             guide = lane.guide.replace(labels=labels, asked=lane.guide.budget)
             last = (lane.guide.budget - 1) // sizes.labels_per_round  # the fit that follows the last round
             return _kept_finite(lane, asking.fit(guidance, env, scalars, guide, lane.key, last))

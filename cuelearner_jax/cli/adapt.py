@@ -80,12 +80,16 @@ def run(arguments: list[str]) -> None:
         changed = replace(changed, guidance=None, sizes={}, scalars={})  # which are for the suggested kind
     if taken(rest, "--judge-by", "what it is judged by")[0] == judging.LABELS:
         changed = replace(changed, judge_bounds=())  # which are tried on episodes
-    eps = changed.eps_deg
+    eps, strengths = changed.eps_deg, None
     labels, given = Adapt.labels, taken(rest, "--labels-from", "a labels.parquet")[0]
     if given:  # what the file holds is the default
         file = label_files.read(Path(given))
-        eps = file.eps_deg if file.eps_deg else eps
+        eps, strengths = file.eps_deg if file.eps_deg else eps, file.labels.eps_deg
         labels = (int(np.unique(file.seeds, return_counts=True)[1].min()),)
+    sizes = replace(adapting.SIZES, **{"frame": source.config.sizes.frame, **changed.sizes})
+    of_run = replace(source.config.scalars, eps_last_deg=Scalars.eps_last_deg)  # of its own labels
+    scalars = replace(adapting.settling(of_run, eps), **changed.scalars)
+    sizes, scalars = adapting.falling(sizes, scalars, strengths)
     default = kind(
         world,
         out=Path("policies") / source.folder.name,
@@ -94,8 +98,8 @@ def run(arguments: list[str]) -> None:
         guidance=changed.guidance or Adapt.guidance,
         judge_by=changed.judge_by or Adapt.judge_by,
         judge_bounds=changed.judge_bounds,
-        sizes=replace(adapting.SIZES, **{"frame": source.config.sizes.frame, **changed.sizes}),
-        scalars=replace(adapting.settling(source.config.scalars, eps), **changed.scalars),
+        sizes=sizes,
+        scalars=scalars,
     )
     asked = parse(kind, rest, f"adapt {source.folder}", default, about(Adapt, source.task, policies=True))
     order = _order(source, code, named, asked)

@@ -156,6 +156,8 @@ def planned(
         raise UserError(f"--bound-deg is {asked.bound_deg:g}: give an angle above 0 and up to 180")
     if not asked.who.strip():
         raise UserError("--who is empty: give a name, or leave it out")
+    if merged.sizes.eps_falls:
+        raise UserError("--sizes.eps-falls is for simulated teachers, a page asks with one strength: leave it out")
     if merged.sizes.candidates > 1:
         raise UserError("--sizes.candidates is above 1, but a page asks in situations as they come: leave it out")
     robot, task = _robot(task, asked.robot), task.on(asked.robot)

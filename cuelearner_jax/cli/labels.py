@@ -95,6 +95,8 @@ def _told(path: Path, file: LabelFile, teacher: bool) -> dict[str, str]:
     """What is known of a file, by name."""
     world = ", ".join(f"{name} {value}" for name, value in file.task.items() if name not in ("name", "from"))
     strength = "" if file.eps_deg is None else f", by {file.eps_deg:g} degrees"
+    if file.labels.eps_deg is not None:
+        strength = f", by {np.max(file.labels.eps_deg):g} to {np.min(file.labels.eps_deg):g} degrees"
     facts = {"task": f"{file.task.get('name')} ({world})", "answers": f"{file.answers}{strength}"}
     facts["labels"] = f"{len(file.seeds)}" + (
         f" of {len(np.unique(file.seeds))} seeds" if len(np.unique(file.seeds)) > 1 else ""
@@ -191,7 +193,7 @@ def _flat(file: LabelFile) -> dict[str, list[Any]]:
     columns: dict[str, list[Any]] = {"seed": file.seeds.tolist()}
     if file.people is not None:
         columns |= {name: getattr(file.people, name).tolist() for name in file.people._fields}
-    columns["eps_deg"] = [file.eps_deg] * len(file.seeds)
+    columns["eps_deg"] = [None] * len(file.seeds) if file.strengths is None else file.strengths.tolist()
     layout = (file.session or {}).get("observation") or []
     names = [f"{part['name']}[{i}]" for part in layout for i in range(part["size"])]
     width = file.labels.obs.shape[1]

@@ -126,15 +126,8 @@ def check_guide(sizes: GuideSizes, scalars: GuideScalars) -> None:
         "question_every",
     )
     _check_positive(sizes, (*positive, "guide_directions", "replay_steps"))
-    if sizes.ask_all:
-        _check_multiple(sizes.labels_per_round, sizes.candidates, "sizes.labels_per_round", "sizes.candidates")
-    if sizes.ask_all and sizes.candidates == 1:
-        raise UserError("sizes.ask_all asks about every candidate: give sizes.candidates above 1 too, or leave it out")
-    if sizes.candidates > 1 and sizes.ensemble == 1 and not sizes.ask_all:
-        raise UserError(
-            f"sizes.candidates is {sizes.candidates}: questions are chosen by the disagreement of members, so give a "
-            "sizes.ensemble above 1 too, or sizes.ask_all to ask about every one"
-        )
+    _check_words(sizes, "sizes")
+    _check_choice(sizes)
     if sizes.labels_per_round > LARGEST_ROUND:
         raise UserError(f"sizes.labels_per_round is {sizes.labels_per_round}: give at most {LARGEST_ROUND}")
     _check_layers(sizes.feedback_layers, "sizes.feedback_layers")
@@ -145,10 +138,37 @@ def check_guide(sizes: GuideSizes, scalars: GuideScalars) -> None:
         raise UserError(
             f"scalars.eps_deg is {scalars.eps_deg}: a relative label is a turn of more than 0 and up to 180"
         )
+    if sizes.eps_falls and not 0 < scalars.eps_last_deg <= scalars.eps_deg:
+        raise UserError(
+            f"scalars.eps_last_deg is {scalars.eps_last_deg}, to which sizes.eps_falls leads: give an angle above 0 "
+            f"and up to scalars.eps_deg ({scalars.eps_deg})"
+        )
+    if scalars.eps_last_deg and not sizes.eps_falls:
+        raise UserError(
+            f"scalars.eps_last_deg is {scalars.eps_last_deg}, to which labels fall with sizes.eps_falls alone: add "
+            "that, or leave it out"
+        )
     if scalars.correction_replay < 1:
         raise UserError(f"scalars.correction_replay is {scalars.correction_replay}: give a positive number")
     if scalars.max_grad_norm <= 0:  # a zero gradient would be scaled by 0 / 0
         raise UserError(f"scalars.max_grad_norm is {scalars.max_grad_norm}: give a positive number")
+
+
+def _check_choice(sizes: GuideSizes) -> None:
+    """Of the situations to ask in."""
+    if sizes.ask_all and sizes.candidates == 1:
+        raise UserError("sizes.ask_all asks about every candidate: give sizes.candidates above 1 too, or leave it out")
+    if sizes.ask_all and sizes.chosen_by == "teacher":
+        raise UserError("sizes.ask_all leaves nothing to choose: leave out sizes.chosen_by")
+    if sizes.ask_all:
+        _check_multiple(sizes.labels_per_round, sizes.candidates, "sizes.labels_per_round", "sizes.candidates")
+    elif sizes.candidates > 1 and sizes.ensemble == 1 and sizes.chosen_by == "members":
+        raise UserError(
+            f"sizes.candidates is {sizes.candidates}: questions are chosen by the disagreement of members, so give a "
+            "sizes.ensemble above 1 too, or sizes.chosen_by teacher, or sizes.ask_all"
+        )
+    if sizes.candidates == 1 and sizes.chosen_by == "teacher":
+        raise UserError("sizes.chosen_by is teacher and sizes.candidates is 1: give more situations to choose among")
 
 
 def _check_positive(sizes: Any, names: tuple[str, ...]) -> None:
@@ -162,12 +182,17 @@ def _check_layers(layers: tuple[int, ...], name: str) -> None:
         raise UserError(f"{name}: give at least one layer of positive width")
 
 
+def _check_words(group: Any, prefix: str) -> None:
+    for name, kind in get_type_hints(type(group)).items():
+        value = getattr(group, name)
+        if get_origin(kind) is Literal and not fits(value, kind):
+            raise UserError(f"{prefix}.{name} is {value!r}: give {' or '.join(get_args(kind))}")
+
+
 def _check_numbers(scalars: Any) -> None:
-    types = get_type_hints(type(scalars))
+    _check_words(scalars, "scalars")
     for name, value in dataclasses.asdict(scalars).items():
-        if get_origin(types[name]) is Literal:
-            if not fits(value, types[name]):
-                raise UserError(f"scalars.{name} is {value!r}: give {' or '.join(get_args(types[name]))}")
+        if isinstance(value, str):
             continue
         if name.endswith(("probability", "fraction", "share", "polyak", "weight")) and not 0 <= value <= 1:
             raise UserError(f"scalars.{name} is {value}: give a number from 0 to 1")

@@ -88,13 +88,19 @@ class GuideSizes(_Seeing):
     """Does a guide that corrects actions see how far each has been turned already, in units of eps? What is right hangs
     on what the base policy did, so this is for adaptation."""
     candidates: int = 1
-    """Situations among which each question is chosen: where the members disagree most (1: as they come)."""
+    """Situations among which each question is chosen (1: as they come)."""
+    chosen_by: Literal["members", "teacher"] = "members"
+    """Who chooses: the members of an ensemble, where they disagree most; or a simulated teacher that watches, where the
+    action asked about is farthest from what it would do."""
     ask_all: bool = False
     """Is every candidate asked about, in place of one that is chosen? Simulated labels by the thousand are then soon
     asked for: a round takes its number of questions divided by `candidates` in steps."""
     question_every: int = 1
     """Steps from one question of a simulated teacher to the next (1: every situation is asked about): questions farther
     apart are of more different situations."""
+    eps_falls: bool = False
+    """Does the strength of relative labels fall from question to question of a budget, from scalars.eps_deg to
+    scalars.eps_last_deg? Larger turns first, smaller ones after."""
 
 
 @dataclass(frozen=True)
@@ -148,6 +154,8 @@ class GuideScalars(_Degrees, _Clipping):
     """Adam's step size of the guidance model."""
     eps_deg: float = 5.0
     """Strength of one relative label: by how much the teacher turns an action [deg]."""
+    eps_last_deg: float = 0.0
+    """With sizes.eps_falls: strength of the last label of a budget, to which it falls geometrically [deg]."""
     tau_deg: float = 0.1
     """Refinement stops once a pass turns the action by less [deg]."""
     tau_max_deg: float = 180.0

@@ -114,6 +114,8 @@ def adapt(
     place, base = _Place.of(world), Common(as_policy(policy))
     file = label_files.read(Path(labels)) if isinstance(labels, str | os.PathLike) else None
     eps_deg = file.eps_deg if file is not None and eps_deg is None else eps_deg
+    if file is not None:
+        sizes, scalars = adapting.falling(sizes or adapting.SIZES, scalars or Scalars(), file.labels.eps_deg)
     sizes, scalars = settings(sizes, scalars, eps_deg)
     kind = registry.find(guidance)
     if not kind.asks:

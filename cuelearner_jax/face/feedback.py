@@ -68,7 +68,7 @@ def fit_feedback(
 
     Args:
         labels: arrays, or a label file (its first seed's).
-        eps_deg: strength of an answer [deg]; of arrays 5 if not given, of a file the file's.
+        eps_deg: strength of an answer [deg]; of arrays 5 if not given, of a file the file's, or of each label its own.
         sizes: of the network and its fitting (default: small ones, the paper's are `config.GuideSizes()`).
         scalars: of the fitting and of refinement.
         seed: of the network.
@@ -76,6 +76,7 @@ def fit_feedback(
     Raises:
         UserError: labels or settings that make no sense, or with which the fit diverges.
     """
+    own_eps = None
     if not isinstance(labels, Labels):
         file = label_files.read(Path(labels))
         if file.answers != RELATIVE.name:
@@ -85,12 +86,13 @@ def fit_feedback(
         own = file.seeds == file.seeds[0]
         eps_deg = file.eps_deg
         rows = jax.tree.map(lambda leaf: np.asarray(leaf)[own], file.labels)
-        labels = Labels(rows.obs, rows.action, rows.answer[:, 0])
-    labels = _checked(labels)
+        labels, own_eps = Labels(rows.obs, rows.action, rows.answer[:, 0]), rows.eps_deg
+    labels = _checked(labels, own_eps)
     sizes, scalars = settings(sizes, scalars, eps_deg)
     guidance = _relative(sizes, Spaces(labels.obs.shape[1], DIRECTIONS))
     valid = np.ones(len(labels.obs), bool)
     rows = Label(*(jnp.asarray(part) for part in (labels.obs, labels.action, labels.answer[:, None], valid)))
+    rows = rows.replace(eps_deg=None if own_eps is None else jnp.asarray(own_eps))
     k_init, k_fit = jax.random.split(jax.random.key(seed))
     fit = jax.jit(lambda key, rows, former, scalars: guidance.fit(key, None, rows, former, scalars))
     return FeedbackModel(guidance, _finite(fit(k_fit, rows, guidance.init(k_init), scalars)), scalars, labels, sizes)
@@ -187,7 +189,7 @@ def settings(sizes: GuideSizes | None, scalars: Scalars | None, eps_deg: float |
     return sizes, scalars
 
 
-def _checked(labels: Labels) -> Labels:
+def _checked(labels: Labels, own_eps: Any) -> Labels:
     """Labels of floats, in the shapes that are needed. Raises UserError for what makes no sense."""
     obs, action, answer = (np.asarray(part, np.float32) for part in labels)
     answer = answer[:, 0] if answer.ndim == 2 and answer.shape[1] == 1 else answer
@@ -198,7 +200,8 @@ def _checked(labels: Labels) -> Labels:
         )
     if len(obs) < 2:
         raise UserError(f"{len(obs)} labels teach nothing: give more")
-    rows = Label(obs, action, answer[:, None], np.ones(len(obs), bool))  # pyright: ignore[reportArgumentType]
+    valid = np.ones(len(obs), bool)
+    rows = Label(obs, action, answer[:, None], valid, None, own_eps)  # pyright: ignore[reportArgumentType]
     given.check(rows, Spaces(obs.shape[1], DIRECTIONS), RELATIVE)
     return Labels(obs, action, answer)
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+import dataclasses
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -10,10 +11,12 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from cuelearner_jax import actions as geometry
 from cuelearner_jax.actions import DIRECTIONS
-from cuelearner_jax.config import Scalars, TeacherFaults
+from cuelearner_jax.config import GuideScalars, Scalars, TeacherFaults
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guidance.bundle import AnswerForm
 from cuelearner_jax.types import EnvState, Teacher, ValuesDirections
+
+GuideScalarsT = TypeVar("GuideScalarsT", bound=GuideScalars)
 
 
 def check_teacher(teacher: Any, faults: TeacherFaults) -> None:
@@ -39,6 +42,11 @@ def in_mind(
     seen = geometry.rotate(action, -scalars.radians("teacher_bias"))
     spread = scalars.radians("nearest_aim")
     return teacher.nearest_good(state, obs, seen, spread, scalars.nearest_share)
+
+
+def of_strength(scalars: GuideScalarsT, eps_deg: Float[Array, "*labels"] | None) -> GuideScalarsT:
+    """Scalars under which answers of that strength [deg] were given; None: of the scalars' own."""
+    return scalars if eps_deg is None else dataclasses.replace(scalars, eps_deg=eps_deg)
 
 
 def relative_feedback(

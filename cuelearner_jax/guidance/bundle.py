@@ -72,7 +72,7 @@ class QuestionFunction(Protocol):
 
 @runtime_checkable
 class TargetFunction(Protocol):
-    """What the model is to predict of one label."""
+    """What the model is to predict of one label; `scalars` are with the label's own strength (`fitting.lessons`)."""
 
     def __call__(self, label: Label, scalars: GuideScalars) -> Float[Array, " outputs"]:
         """The target."""

@@ -14,6 +14,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Key, PRNGKeyArray
 
 from cuelearner_jax.config import GuideScalars, GuideSizes
+from cuelearner_jax.guidance.answers import of_strength
 from cuelearner_jax.guidance.bundle import TargetFunction
 from cuelearner_jax.guidance.ensemble import fitted_members
 from cuelearner_jax.types import GuidanceModel, Label, Params
@@ -31,8 +32,8 @@ class Lesson(struct.PyTreeNode):
 
 
 def lessons(labels: Label, target: TargetFunction, scalars: GuideScalars) -> Lesson:
-    """Labels (slots, ...) with what their answers mean to a network."""
-    targets = jax.vmap(lambda label: target(label, scalars))(labels)
+    """Labels (slots, ...) with what their answers, each of its own strength, mean to a network."""
+    targets = jax.vmap(lambda label: target(label, of_strength(scalars, label.eps_deg)))(labels)
     # Rounded here, whatever is computed of them next: fused with that, their last bits would hang on the compiler.
     return Lesson(labels.obs, labels.action, jax.lax.optimization_barrier(targets), labels.valid)
 

@@ -23,7 +23,8 @@ def check(labels: Label, spaces: Spaces, form: AnswerForm, named: str = "the lab
         named: what a message calls them.
 
     Raises:
-        UserError: a shape is another, a number is not finite, an action is none, an answer is none of the form.
+        UserError: a shape is another, a number is not finite, an action is none, an answer is none of the form, a
+            strength is no angle.
     """
     rows = {"observations": labels.obs, "actions": labels.action, "answers": labels.answer}
     widths = {"observations": spaces.obs_size, "actions": spaces.actions.size, "answers": form.width}
@@ -32,6 +33,9 @@ def check(labels: Label, spaces: Spaces, form: AnswerForm, named: str = "the lab
             raise UserError(f"{named}: {name} have the shape {values.shape}, (labels, {widths[name]}) is needed")
         if not np.isfinite(values).all():
             raise UserError(f"{named}: {name} hold numbers that are not finite: leave these labels out")
+    own = np.asarray(1.0 if labels.eps_deg is None else labels.eps_deg)
+    if not ((own > 0) & (own <= 180)).all():
+        raise UserError(f"{named}: strengths are no angles above 0 and up to 180: leave these labels out")
     for name in ("actions", "answers") if form.is_action else ("actions",):
         action = np.asarray(rows[name])
         # The one action space there is has unit vectors; retract leaves an action of any as it is.

@@ -24,7 +24,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 from cuelearner_jax.actions import Actions
 from cuelearner_jax.config import GuideScalars, GuideSizes
 from cuelearner_jax.environment import Aims, Spaces
-from cuelearner_jax.guidance.answers import RELATIVE
+from cuelearner_jax.guidance.answers import RELATIVE, of_strength
 from cuelearner_jax.guidance.bundle import Guidance
 from cuelearner_jax.guidance.ensemble import ensemble
 from cuelearner_jax.guidance.fitting import fit_model
@@ -84,9 +84,10 @@ def likelihood(
     return jnp.where(h > 0, above, jnp.where(h < 0, below, 1.0 - above - below))
 
 
-def evidence_of(env: Any, space: Actions, label: Label, eps: Float[Array, ""]) -> Evidence:
-    """What a label says of the aims of its situation."""
+def evidence_of(env: Any, space: Actions, label: Label, scalars: GuideScalars) -> Evidence:
+    """What a label says of the aims of its situation, by its own strength if it has one."""
     aims: Aims = env.aims(label.obs)
+    eps = of_strength(scalars, label.eps_deg).radians("eps")
     of_aims = likelihood(space, label.action, aims.actions, label.answer[0], eps)
     of_none = likelihood(space, label.action, space.spread(ELSEWHERE), label.answer[0], eps).mean(keepdims=True)
     return Evidence(aims.features, aims.possible, jnp.concatenate([of_aims, of_none]), label.valid)
@@ -136,7 +137,7 @@ def make(sizes: GuideSizes, spaces: Spaces) -> Guidance:
         return -jnp.log((1.0 - SLIPS) * (share * rows.likelihood).sum(-1) + SLIPS / WORDS)
 
     def fit(key: PRNGKeyArray, env: Any, labels: Label, former: GuidanceModel, scalars: GuideScalars) -> GuidanceModel:
-        rows = jax.vmap(lambda label: evidence_of(env, space, label, scalars.radians("eps")))(labels)
+        rows = jax.vmap(lambda label: evidence_of(env, space, label, scalars))(labels)
         return fit_model(key, rows, scalars, init=weighing.init, losses=surprise, sizes=sizes)
 
     def act(

@@ -86,6 +86,11 @@ def made_for(kind: Kind, sizes: GuideSizes, spaces: Spaces) -> Guidance:
         raise ValueError(f"guidance {kind.name!r} was made with another name or form of answers than its kind has")
     if sizes.sees_turn and made.onward is None:
         raise UserError(f"guidance {kind.name!r} does not see how far actions were turned: leave out --sizes.sees-turn")
+    if sizes.eps_falls and made.form is not None and not made.form.by_eps:
+        raise UserError(
+            f"guidance {kind.name!r} asks for {made.form.name} answers, which have no strength that could fall: leave "
+            "out --sizes.eps-falls"
+        )
     if made.asks and made.disagreement is None and sizes.ensemble > 1:
         raise UserError(
             f"guidance {kind.name!r} has one model, no ensemble of them: leave out --sizes.ensemble and "

@@ -20,7 +20,6 @@ from cuelearner_jax.labelling.programs import Agreement, agreement, as_teacher
 from cuelearner_jax.records import label_files
 from cuelearner_jax.records.label_files import LabelFile
 from cuelearner_jax.task import Task
-from cuelearner_jax.types import Label
 
 
 def form_of(file: LabelFile) -> AnswerForm | None:
@@ -86,15 +85,15 @@ def _with_eps(scalars: Scalars, eps_deg: float) -> Scalars:
 
 
 def between(one: LabelFile, other: LabelFile, env: Any) -> Agreement:
-    """How well two files agree on the questions that both answered: the same observation and the same action.
+    """How well two files agree on the questions that both answered: the same observation, action and strength.
 
     Raises UserError if their answers are of two forms or strengths.
     """
     form = form_of(one)
     if form is None or (one.answers, one.eps_deg) != (other.answers, other.eps_deg):
         raise UserError(f"the files hold {_called(one)} and {_called(other)} answers: give two of one form")
-    theirs = _by_question(other.labels)
-    mine = _by_question(one.labels)
+    theirs = _by_question(other)
+    mine = _by_question(one)
     both = [question for question in mine if question in theirs]
     width = form.width
     pairs = np.array([(mine[question], theirs[question]) for question in both], np.float32).reshape(-1, 2, width)
@@ -105,9 +104,11 @@ def _called(file: LabelFile) -> str:
     return file.answers if file.eps_deg is None else f"{file.answers} ({file.eps_deg:g} degrees)"
 
 
-def _by_question(labels: Label) -> dict[bytes, np.ndarray]:
-    rows = zip(np.asarray(labels.obs), np.asarray(labels.action), np.asarray(labels.answer), strict=True)
-    return {obs.tobytes() + action.tobytes(): answer for obs, action, answer in rows}
+def _by_question(file: LabelFile) -> dict[bytes, np.ndarray]:
+    strengths = np.zeros(len(file.seeds)) if file.strengths is None else file.strengths
+    columns = (file.labels.obs, file.labels.action, strengths.astype(np.float32), file.labels.answer)
+    rows = zip(*(np.asarray(column) for column in columns), strict=True)
+    return {b"".join(part.tobytes() for part in asked): answer for *asked, answer in rows}
 
 
 def merged(files: Iterable[LabelFile]) -> LabelFile:
@@ -127,7 +128,9 @@ def merged(files: Iterable[LabelFile]) -> LabelFile:
                 )
     if len({(file.labels.obs.shape[1], file.labels.action.shape[1]) for file in files}) > 1:
         raise UserError("the files' observations differ in size: merge files of one world")
-    labels = jax.tree.map(lambda *leaves: np.concatenate(leaves), *(file.labels for file in files))
+    differ = any(file.labels.eps_deg is not None for file in files)
+    sets = [file.labels.replace(eps_deg=np.float32(file.strengths)) if differ else file.labels for file in files]
+    labels = jax.tree.map(lambda *leaves: np.concatenate(leaves), *sets)
     told = [file.people for file in files if file.people is not None]
     people = None
     if len(told) == len(files):

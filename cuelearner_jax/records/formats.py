@@ -27,7 +27,7 @@ from cuelearner_jax.errors import UserError
 from cuelearner_jax.records.whole import replacing, unreadable
 
 DIGEST = "digest"  # the name under which a JSON file holds the digest of its other values
-FORMATS = {"config": 2, "labels": 2, "teacher": 3, "policy": 2}
+FORMATS = {"config": 2, "labels": 3, "teacher": 3, "policy": 2}
 SEALED_SINCE = 2  # the format from which on a JSON file must carry a digest
 REMEDIES = {  # what a message says of a damaged file, after its path
     "config": "is damaged or of another program: restore it, or start anew with --overwrite",
@@ -149,6 +149,7 @@ STEPS: dict[tuple[str, int], Callable[[Values], Values]] = {
     ("config", 1): _pieces_with_seeds,
     ("labels", 0): _answers_of_targets,
     ("labels", 1): _only_numbered,  # since then a later row may take one back
+    ("labels", 2): _only_numbered,  # since then labels may be of several strengths
     ("teacher", 0): _only_numbered,
     ("teacher", 1): _only_numbered,
     ("teacher", 2): _seen_in_another_order,

@@ -12,13 +12,13 @@ of a run. `write` writes a whole file; `LabelWriter` one row at a time, each of 
 | answer  | list of floats | what the teacher said; the file names the form of it; absent where nothing was said  |
 | item    | int            | people: number of the question, from 0                                               |
 | said    | string         | people: one of `SAID`; of several rows of one item the last one holds                |
-| eps_deg | float          | people: strength of the answer [deg], as the file's own                              |
+| eps_deg | float          | strength of the answer [deg]: of people as the file's own; else where it falls       |
 | seconds | float          | people: from the question on the screen to the answer [s]                            |
 | who     | string         | people: a name                                                                       |
 | when    | string         | people: time of the answer, ISO 8601 in UTC                                          |
 
-Rows of simulated teachers have the first four columns. A row is never changed: what is taken back stays, and a later
-row of the same item says so. Readers give the labels that stand.
+Rows of simulated teachers have the first four columns, and strengths where these differ. A row is never changed: what
+is taken back stays, and a later row of the same item says so. Readers give the labels that stand.
 """
 
 from __future__ import annotations
@@ -55,10 +55,11 @@ CONVENTIONS = {
     "obs": "the task's observation at the question",
     "action": "unit vector asked about",
     "answer": "what the teacher said of the action, in the form that `answers` names",
-    "eps_deg": "strength of an answer [deg], null where the form has none",
+    "eps_deg": "strength of an answer [deg], null where the form has none; a row that tells its own has that",
     "angles": "radians, counterclockwise positive",
 }
 TOLD = ("format", "task", "answers", "eps_deg", "session")  # what must be the same for labels to share a file
+CONTINUED = (2,)  # earlier formats whose files are gone on with: a page's rows were then what they are now
 
 
 class People(NamedTuple):
@@ -75,12 +76,20 @@ class LabelFile(NamedTuple):
 
     task: dict[str, Any]  # {"name": ..., configuration of the task}
     answers: str  # name of the form of the answers, see `guidance.answers`
-    eps_deg: float | None  # strength of an answer [deg]; None where the form has none
+    eps_deg: float | None  # strength of an answer [deg], where it falls of the first; None where the form has none
     seeds: np.ndarray  # (labels,)
     labels: Label  # rows (labels, ...), in the order they were given; those that stand
     people: People | None = None  # None: a simulated teacher's, or of several people's merged with such
     session: dict[str, Any] | None = None  # how a page asked, see `labelling.session`
     said: dict[str, int] | None = None  # rows of each kind (`SAID`), those that no longer stand included
+
+    @property
+    def strengths(self) -> np.ndarray | None:
+        """Of each label [deg], (labels,); None where the form has none."""
+        own = self.labels.eps_deg
+        if own is None and self.eps_deg is not None:
+            return np.full(len(self.seeds), self.eps_deg)
+        return None if own is None else np.asarray(own)
 
 
 class LabelWriter(tables.TableWriter):
@@ -196,7 +205,7 @@ def write(
         path: where to.
         task: {"name": ..., configuration of the task}.
         answers: form of the answers.
-        eps_deg: strength of an answer [deg]; None where the form has none.
+        eps_deg: strength of an answer [deg], where it falls of the first; None where the form has none.
         seeds: of the lanes, (lanes,).
         labels: (lanes, slots, ...).
         meaning: of an answer's numbers, written into the file.
@@ -207,6 +216,8 @@ def write(
     columns = {"seed": pa.array(seed.astype(np.int64))}
     for name in ROW:
         columns[name] = pa.array(list(getattr(rows, name)), SCHEMA.type(name))
+    if rows.eps_deg is not None:
+        columns["eps_deg"] = pa.array(rows.eps_deg.astype(np.float64))
     tables.write(path, pa.table(columns), SCHEMA, about=_about(task, answers, eps_deg, meaning))
 
 
@@ -218,8 +229,8 @@ def write_file(path: Path, file: LabelFile, **told: Any) -> None:
     if file.people is not None:
         person = {**file.people._asdict(), "said": [ANSWERED] * len(file.seeds)}
         columns |= {name: pa.array(list(person[name]), SCHEMA.type(name)) for name in PEOPLE}
-        if file.eps_deg is not None:
-            columns["eps_deg"] = pa.array([file.eps_deg] * len(file.seeds), pa.float64())
+    if file.strengths is not None and (file.people is not None or file.labels.eps_deg is not None):
+        columns["eps_deg"] = pa.array(file.strengths.astype(np.float64))
     about = _about(file.task, file.answers, file.eps_deg, "")
     session = {} if file.session is None else {"session": file.session}
     tables.write(path, pa.table(columns), SCHEMA, about={**about, **session, **told})
@@ -245,9 +256,11 @@ def read(path: Path) -> LabelFile:
         values = formats.upgrade("labels", {**(told or {}), "columns": columns}, path)
         columns, eps = values["columns"], values["eps_deg"]
         rows = {name: columns[name] for name in ROW}
+        own = _differing(columns.get("eps_deg"), eps)
         if any(array.ndim != 2 for array in rows.values()) or not isinstance(values["answers"], str):
             raise ValueError("every column holds one list a label, and the form of the answers is a name")
-        labels = Label(**rows, valid=np.ones(table.num_rows, bool))  # pyright: ignore[reportArgumentType]
+        valid = np.ones(table.num_rows, bool)
+        labels = Label(**rows, valid=valid, eps_deg=own)  # pyright: ignore[reportArgumentType]
         named = dict(values["task"]), values["answers"], None if eps is None else float(eps), columns["seed"], labels
         people = None
         if "item" in columns and not (columns["item"] < 0).any():
@@ -255,6 +268,14 @@ def read(path: Path) -> LabelFile:
         return LabelFile(*named, people, values.get("session"), said)
     except (KeyError, TypeError, ValueError) as error:
         raise formats.damaged("labels", path) from error
+
+
+def _differing(told: np.ndarray | None, eps_deg: float | None) -> np.ndarray | None:
+    """Strengths (labels,) [deg] that rows tell, NaN for the file's own; None: all are of that, or the form has none."""
+    if told is None or eps_deg is None:
+        return None
+    own = np.where(np.isnan(told), np.float32(eps_deg), told)
+    return None if (own == np.float32(eps_deg)).all() else own
 
 
 def _standing(table: pa.Table) -> pa.Table:
@@ -331,6 +352,8 @@ def _about(task: dict[str, Any], answers: str, eps_deg: float | None, meaning: s
 
 def _check_same(path: Path, before: dict[str, Any], now: dict[str, Any]) -> None:
     """Raises UserError, with the first difference in words, unless labels may share a file."""
+    if before.get("format") in CONTINUED:
+        before = {**before, "format": now["format"]}
     parts = [("", name, before.get(name), now.get(name)) for name in TOLD]
     for group in ("task", "session"):
         old, new = before.get(group) or {}, now.get(group) or {}

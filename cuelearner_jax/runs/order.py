@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from cuelearner_jax import config as configuration
 from cuelearner_jax.asking import label_slots
 from cuelearner_jax.config import RunConfig
@@ -131,6 +133,12 @@ def read_labels(order: Order) -> label_files.LabelFile:
         raise UserError(
             f"{path} holds labels of {file.eps_deg:g} degrees, the run's are of {config.scalars.eps_deg:g}: "
             f"give --scalars.eps-deg {file.eps_deg:g}, or other labels"
+        )
+    if file.labels.eps_deg is not None and not config.sizes.eps_falls:
+        last = float(np.min(file.labels.eps_deg))
+        raise UserError(
+            f"{path} holds labels of strengths down to {last:g} degrees: give --sizes.eps-falls --scalars.eps-last-deg "
+            f"{last:g}, or other labels"
         )
     for guidance in asking:
         seeds, budgets = grid.lanes(guidance)

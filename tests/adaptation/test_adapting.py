@@ -21,6 +21,7 @@ from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import one_lane
 from cuelearner_jax.guidance import registry as guidances
 from cuelearner_jax.policies import BY_LANE, Common, Opaque, policy_of
+from cuelearner_jax.records import label_files
 from cuelearner_jax.types import Label
 
 HALF = 6.0  # half the width of the winning window [deg]
@@ -253,3 +254,49 @@ def test_defaults_go_together():
         adapting.check_angles([45.0], scalars)
     assert "scalars.k_max 1800 would" in adapting.check_angles([180.0], adapting.settling(SCALARS, 0.1))
     assert judging.metrics_of(ENV) == ("reward", "hit")
+
+
+# Labels of several strengths.
+
+FALLING = dataclasses.replace(SCALARS, eps_deg=20.0, eps_last_deg=4.0)
+
+
+@pytest.mark.parametrize(
+    ("kind", "more"),
+    [("relative", {}), ("relative", {"sees_turn": True}), ("intent", {"aim_layers": (8,)})],
+    ids=["relative", "turn", "intent"],
+)
+def test_a_file_of_falling_strengths_leads_where_asking_did(tmp_path, kind, more):
+    env = probes.Aimed(half_width=jnp.deg2rad(jnp.array(HALF)))
+    sizes = dataclasses.replace(SIZES, eps_falls=True, fit_steps=60, **more)
+    bundle = guidances.make(kind, sizes, env)
+    lanes = program.one_each((3, 4), (25,), (60.0,))
+    how = dataclasses.replace(JUDGING, env=None, by="labels")
+    of = Adaptation(bundle, sizes, FALLING, env, BASES, lanes, how)
+    first = adapting.adapt(of, probes.Expert(env), mesh=MESH)
+    np.testing.assert_allclose(first.labels.eps_deg[:, :25], np.tile(np.geomspace(20, 4, 25), (2, 1)), rtol=1e-5)
+    path = tmp_path / "labels.parquet"
+    label_files.write(path, {"name": "window"}, "relative", 20.0, lanes.seed, first.labels)
+    slots = program.rounds(lanes, sizes) * sizes.labels_per_round
+    rows = label_files.for_lanes(label_files.read(path), lanes.seed, lanes.budget, slots)
+    given = adapting.adapt(of, labels=rows, mesh=MESH)
+    chex.assert_trees_all_equal(given.block.guide.model, first.block.guide.model)
+    np.testing.assert_array_equal(given.judged.after, first.judged.after)
+    alike = adapting.adapt(of, labels=rows.replace(eps_deg=None), mesh=MESH)  # all of 20 degrees: another model
+    with pytest.raises(AssertionError):
+        chex.assert_trees_all_equal(alike.block.guide.model, first.block.guide.model)
+
+
+def test_a_finer_label_is_predicted_by_a_finer_turn():
+    """A quarter of eps told everywhere: the model turns by that, which is the whole of what such a label asks for."""
+    how, sizes = dataclasses.replace(JUDGING, env=None, by="labels"), dataclasses.replace(SIZES, eps_falls=True)
+    bundle = guidances.make("relative", sizes, ENV)
+    base, lanes = Common(Shifted(jnp.array(-25.0))), program.product(1, (0,), (40,), (30.0,))
+    scalars = dataclasses.replace(FALLING, eps_last_deg=5.0)
+    of = Adaptation(bundle, sizes, scalars, ENV, base, lanes, how)
+    rows = own_labels(-25.0, 40)
+    fine = adapting.adapt(of, labels=rows.replace(eps_deg=np.full((1, 40), 5.0, np.float32)), mesh=MESH)
+    assert (fine.judged.after[0], fine.judged.used[0]) == (1.0, True)
+    once = dataclasses.replace(scalars, k_max=1)
+    policy = program.adapted(bundle, sizes, ENV, once, base, fine.block)
+    assert errors(policy, 0).mean() == pytest.approx(20.0, abs=1.5)

@@ -9,7 +9,7 @@ import numpy as np
 import probes
 import pytest
 
-from cuelearner_jax import actions, asking
+from cuelearner_jax import actions, asking, choosing
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guidance import registry
 from cuelearner_jax.guidance.ensemble import ensemble
@@ -64,7 +64,7 @@ def test_members_that_are_the_same_do_what_one_does_and_do_not_disagree(kind):
 
 def begun(guidance, sizes, budget=20):
     slots = asking.label_slots(budget, sizes)
-    return asking.start(guidance, ENV, slots, budget, jax.random.key(1), jax.random.key(2), sizes.candidates)
+    return asking.start(guidance, ENV, slots, budget, jax.random.key(1), jax.random.key(2), sizes)
 
 
 def test_the_candidate_is_asked_about_on_which_members_disagree_most_and_all_walk_on():
@@ -145,7 +145,7 @@ def test_every_candidate_is_asked_about_at_once_within_the_budget():
     assert single.disagreement is None
     slots, key, expert = asking.label_slots(21, sizes), jax.random.key(7), probes.Expert(ENV)
     assert slots == 24
-    guide = asking.start(single, ENV, slots, 21, jax.random.key(1), jax.random.key(2), 6, ask_all=True)
+    guide = asking.start(single, ENV, slots, 21, jax.random.key(1), jax.random.key(2), sizes)
     keys = asking.question_keys(key, 12)
     proposed = Uniform().act(keys.base, guide.env, guide.obs)
     after = asking.ask_all(single, ENV, expert, probes.SCALARS, Uniform(), guide, key, jnp.asarray(12))
@@ -163,3 +163,77 @@ def test_every_candidate_is_asked_about_at_once_within_the_budget():
     assert np.asarray(guide.labels.valid).tolist() == [True] * 21 + [False] * 3
     assert (int(guide.asked), bool(guide.model.fitted)) == (21, True)
     assert len(np.unique(np.asarray(guide.labels.action)[:21], axis=0)) == 21
+
+
+# Where the policy and the teacher part.
+
+WATCHED = dataclasses.replace(ONE, candidates=4, chosen_by="teacher")
+
+
+@pytest.mark.parametrize(
+    ("off", "bias", "index"),
+    [
+        ([10.0, -50.0, 30.0, 49.0], 0.0, 1),
+        ([10.0, -50.0, 170.0, -179.0], 0.0, 3),
+        ([10.0, -50.0, 30.0, 49.0], 20.0, 1),  # 70 from what it takes for best, and 29
+        ([10.0, -50.0, 30.0, 49.0], -20.0, 3),  # 69, and 30
+        ([0.0, 0.0, 0.0, 0.0], 0.0, 0),
+    ],
+)
+def test_a_coach_speaks_where_the_action_is_farthest_from_its_own(off, bias, index):
+    bundle, expert = registry.make("relative", WATCHED, ENV), probes.Expert(ENV)
+    guide = begun(bundle, WATCHED)
+    obs = actions.evenly_spaced(4)
+    guide = guide.replace(env=obs, obs=obs)
+    asked = actions.rotate(jax.vmap(ENV.best)(obs), jnp.deg2rad(jnp.array(off)))
+    scalars = dataclasses.replace(probes.SCALARS, teacher_bias_deg=bias)
+    away = choosing.parting(ENV, expert, scalars, guide, asked)
+    apart = np.abs(np.array(off) - bias)
+    np.testing.assert_allclose(np.degrees(away), np.minimum(apart, 360 - apart), atol=1e-3)
+    first = actions.rotate(asked, 0.1)
+    for fitted in (False, True):  # it needs no model
+        known = guide.replace(model=guide.model.replace(fitted=jnp.array(fitted)))
+        there, action, proposed = choosing.chosen(bundle, ENV, known, asked, first, away)
+        np.testing.assert_array_equal(there.obs, obs[index])
+        np.testing.assert_array_equal(action, asked[index])
+        np.testing.assert_array_equal(proposed, first[index])
+
+
+def test_of_actions_as_far_from_its_own_the_first_is_asked_about():
+    bundle = registry.make("relative", WATCHED, ENV)
+    guide, asked = begun(bundle, WATCHED), actions.evenly_spaced(4)
+    there, _, _ = choosing.chosen(bundle, ENV, guide, asked, asked, jnp.array([0.1, 0.7, 0.7, 0.2]))
+    np.testing.assert_array_equal(there.obs, guide.obs[1])
+
+
+@pytest.mark.parametrize(("members", "fitted"), [(1, False), (1, True), (3, True)])
+def test_questions_that_a_coach_chooses_are_asked_from_the_first_on_and_all_candidates_walk_on(members, fitted):
+    sizes = dataclasses.replace(WATCHED, ensemble=members)
+    bundle, expert = registry.make("relative", sizes, ENV)._replace(question=about_base), probes.Expert(ENV)
+    guide, key = begun(bundle, sizes), jax.random.key(7)
+    guide = guide.replace(model=guide.model.replace(fitted=jnp.array(fitted)))
+    keys = asking.question_keys(key, 0)
+    proposed = Uniform().act(keys.base, guide.env, guide.obs)
+    off = np.abs(actions.difference(proposed, jax.vmap(ENV.best)(guide.obs)))
+    index = int(np.argmax(off))
+    assert index != 0
+    after = asking.ask(bundle, ENV, expert, probes.SCALARS, Uniform(), guide, key, jnp.asarray(0), sizes=sizes)
+    np.testing.assert_array_equal(after.labels.obs[0], guide.obs[index])
+    np.testing.assert_array_equal(after.labels.action[0], proposed[index])
+    assert abs(float(after.labels.answer[0, 0])) == 1.0
+    states, steps = jax.vmap(ENV.step)(jax.random.split(keys.env, 4), guide.env, proposed)
+    chex.assert_trees_all_equal((after.env, after.obs), (states, steps.obs))
+
+
+def test_rounds_of_a_coachs_questions_fill_the_budget_and_the_unguided_have_candidates_too():
+    bundle, expert, key = registry.make("relative", WATCHED, ENV), probes.Expert(ENV), jax.random.key(3)
+    guide = begun(bundle, WATCHED, budget=15)
+    one = jax.jit(lambda guide: asking.label_round(bundle, WATCHED, ENV, expert, probes.SCALARS, Uniform(), guide, key))
+    for _ in range(2):
+        guide = one(guide)
+    assert np.asarray(guide.labels.valid).tolist() == [True] * 15 + [False] * 5
+    off = np.abs(actions.difference(guide.labels.action, jax.vmap(ENV.best)(guide.labels.obs)))
+    assert off[:10].mean() > np.pi * 0.65  # of four uniform actions the farthest: 4/5 of pi on average
+    assert begun(registry.make("none", CHOOSING, ENV), CHOOSING).obs.shape == (6, 2)
+    with pytest.raises(ValueError, match="has no members whose disagreement"):
+        begun(bundle, dataclasses.replace(WATCHED, chosen_by="members"))

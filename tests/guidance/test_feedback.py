@@ -104,6 +104,18 @@ def test_lessons_are_labels_with_their_targets_in_place_of_the_answers():
         np.testing.assert_array_equal(getattr(rows, name), getattr(labels, name))
 
 
+@pytest.mark.parametrize("kind", ["relative", "dcoach"])
+def test_a_label_of_its_own_strength_asks_for_a_turn_by_that(kind):
+    """The network's units stay eps: of the target of a label half as strong it is to predict half."""
+    strengths, h = np.array([40.0, 20.0, 5.0, 10.0]), np.array([1.0, -1.0, -1.0, 0.0])
+    action = actions.from_angle(jnp.array([0.0, 1.0, 2.0, 3.0]))
+    labels = Label(action, action, jnp.array(h)[:, None], jnp.ones(4, bool), None, jnp.array(strengths))
+    target = guidances.make(kind, SIZES, probes.Window()).target
+    found = lessons(labels, target, Scalars(eps_deg=40.0, eps_last_deg=5.0)).target
+    turned = found if kind == "dcoach" else action + found
+    np.testing.assert_allclose(actions.difference(action, turned) / DEG, strengths * h, atol=1e-4)
+
+
 @jax.jit
 def answers(scalars, best_deg):
     keys = jax.random.split(jax.random.key(0), 2000)

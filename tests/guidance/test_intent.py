@@ -158,3 +158,29 @@ def test_members_weigh_aims_each_by_itself_and_their_mean_leads():
     assert apart[0] > 10 * bundle.disagreement(model, ENV, OBS, BASE)[0]
     np.testing.assert_allclose(apart[0], shares.var(0).sum(), rtol=1e-4)
     np.testing.assert_array_equal(apart, bundle.disagreement(outvoted, ENV, OBS, OBS))  # whatever the action
+
+
+def test_what_an_answer_says_of_aims_hangs_on_its_own_strength():
+    """The second aim lies 10 degrees to the left: on the edge of what is right for a label of 20 degrees."""
+    obs, scalars = OBS[0], dataclasses.replace(probes.SCALARS, eps_deg=40.0)
+    asked = actions.rotate(ENV.best(obs), -jnp.deg2rad(10.0))
+    label = Label(obs, asked, jnp.array([1.0]), jnp.array(True), None, jnp.array(20.0))
+    of = lambda label: intent.evidence_of(ENV, actions.DIRECTIONS, label, scalars).likelihood  # noqa: E731
+    # Logistic, of one degree: half at the edge of 10; e^-10 within that of 20; all but e^-8 beyond that of 2.
+    for strength, said in ((jnp.array(20.0), 0.5), (None, math.exp(-10)), (jnp.array(4.0), 1 - math.exp(-8))):
+        assert float(of(label.replace(eps_deg=strength))[1]) == pytest.approx(said, abs=2e-4 * (said > 0.1) + 1e-6)
+    everywhere = of(label.replace(eps_deg=jnp.array(20.0)))[-1], of(label.replace(eps_deg=jnp.array(40.0)))[-1]
+    np.testing.assert_allclose(everywhere, [170 / 360, 160 / 360], atol=2e-3)  # degrees that are more to the left
+
+
+def test_a_model_is_fitted_to_what_answers_of_their_own_strengths_say():
+    """ "Already right", nine degrees off the aim: a coarse label means the aim, a fine one none of them."""
+    bundle, scalars = registry.make("intent", SIZES, ENV), dataclasses.replace(probes.SCALARS, eps_deg=4.0)
+    obs = jax.vmap(lambda key: ENV.reset(key)[1])(jax.random.split(jax.random.key(3), 40))
+    asked = actions.rotate(ENV.best(obs), -jnp.deg2rad(9.0))
+    fine = Label(obs, asked, jnp.zeros((40, 1)), jnp.ones(40, bool))
+    former, aims = bundle.init(jax.random.key(0)), ENV.aims(OBS[0])
+    for labels, low, high in ((fine.replace(eps_deg=jnp.full(40, 40.0)), 0.9, 1.0), (fine, 0.0, 0.1)):
+        model = bundle.fit(jax.random.key(1), ENV, labels, former, scalars)
+        weights = intent.Weights(SIZES.aim_layers).apply(model.params, aims.features, aims.possible)
+        assert low <= float(jax.nn.softmax(jnp.asarray(weights))[1]) <= high

@@ -11,6 +11,7 @@ import probes
 import pytest
 
 from cuelearner_jax import actions, asking
+from cuelearner_jax.errors import UserError
 from cuelearner_jax.guidance import registry
 from cuelearner_jax.policies import Uniform
 from cuelearner_jax.types import Label
@@ -159,3 +160,13 @@ def test_a_coached_policy_comes_nearer_to_what_its_coach_has_in_mind():
     asked = np.degrees(actions.distance(jax.vmap(ENV.best)(guide.labels.obs), guide.labels.action))
     assert np.median(asked[:20]) > 60
     assert np.median(asked[-20:]) < 15
+
+
+@pytest.mark.parametrize("kind", ["demonstration", "scalar", "cuelearner_jax.adaptation.residual:KIND"])
+def test_answers_that_mean_no_turn_have_no_strength_that_could_fall(kind):
+    falling = dataclasses.replace(SIZES, eps_falls=True)
+    with pytest.raises(UserError, match=r"answers, which have no strength .* leave out --sizes\.eps-falls") as refusal:
+        registry.make(kind, falling, ENV)
+    assert "\n" not in str(refusal.value)
+    for other in ("none", "relative", "dcoach"):
+        assert registry.make(other, falling, ENV).name == other

@@ -104,3 +104,19 @@ def test_training_and_kinds_that_do_not_correct_refuse_it():
         check(RunConfig(None, Sizes(sees_turn=True)))
     with pytest.raises(UserError, match=r"leave out --sizes.sees-turn"):
         registry.make("demonstration", SIZES, ENV)
+
+
+def test_the_part_of_the_turn_learns_by_how_much_each_label_turns():
+    obs = actions.evenly_spaced(20)
+    base = missing(obs)
+    asked = actions.rotate(base, jnp.deg2rad(jnp.linspace(-20.0, 20.0, 20)))
+    labels = Label(obs, asked, jnp.ones((20, 1)), jnp.ones(20, bool), base)
+    former, fit = BUNDLE.init(jax.random.key(0)), jax.jit(BUNDLE.fit)
+    found = [
+        fit(jax.random.key(1), ENV, labels.replace(eps_deg=strengths), former, SCALARS).params.part
+        for strengths in (None, jnp.full(20, 5.0), jnp.full(20, 2.5))
+    ]
+    assert float(found[0].heights.max()) > 0.5  # in units of eps, which is 5 degrees
+    np.testing.assert_allclose(found[1].heights, found[0].heights, atol=1e-5)
+    np.testing.assert_allclose(found[2].heights, found[0].heights / 2, atol=1e-5)
+    np.testing.assert_array_equal(found[2].reach, found[0].reach)

@@ -77,7 +77,7 @@ def test_targets_become_the_answers_that_they_came_from():
         assert (answer.shape, answer.dtype) == ((8, 1), np.float32)
         assert answer[:, 0].tolist() == answers
         assert not np.signbit(answer[answer == 0]).any()
-        assert (values["answers"], values["eps_deg"], values["format"]) == ("relative", eps_deg, 2)
+        assert (values["answers"], values["eps_deg"], values["format"]) == ("relative", eps_deg, 3)
         assert {"guidance", "target"}.isdisjoint([*values, *values["columns"]])
 
 

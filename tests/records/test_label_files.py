@@ -9,6 +9,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from cuelearner_jax.errors import UserError
+from cuelearner_jax.records import formats
 from cuelearner_jax.records import label_files as files
 from cuelearner_jax.records.table import META
 
@@ -66,7 +67,7 @@ def test_only_labels_that_count_are_written(path):
 def test_what_the_numbers_mean_is_written_in_the_file(path):
     written(path)
     meta = json.loads(pq.read_schema(path).metadata[META])
-    assert meta["format"] == 2
+    assert meta["format"] == 3
     assert meta["conventions"]["angles"] == "radians, counterclockwise positive"
     assert set(meta["conventions"]) >= set(NAMES)
 
@@ -141,7 +142,7 @@ def test_older_files_of_another_guidance_and_newer_files_are_refused(path):
     older(path, guidance="demonstration")
     with pytest.raises(UserError, match="not a label file"):
         files.read(path)
-    older(path, format=3)
+    older(path, format=4)
     with pytest.raises(UserError, match="written by a newer cuelearner"):
         files.read(path)
 
@@ -332,3 +333,46 @@ def test_a_damaged_line_of_a_person_s_work_is_named(tmp_path):
     path.write_text("\n".join([*lines[:2], lines[2][:-9], *lines[3:]]) + "\n")
     with pytest.raises(UserError, match=r"damaged: .*\(line 3: it, or a line before it"):
         files.read(path)
+
+
+# Strengths of their own.
+
+
+def falling(lanes=1):
+    labels = label_sets(lanes=lanes)
+    return labels.replace(eps_deg=np.geomspace(EPS, 3.3, lanes * 20, dtype=np.float32).reshape(lanes, 20))
+
+
+def test_strengths_come_back_to_the_last_bit_and_lanes_get_them_padded(path):
+    labels = falling(2)
+    labels = labels.replace(valid=np.arange(20) % 4 + np.zeros((2, 1)) < 3)
+    files.write(path, TASK, "relative", EPS, np.array([4, 9]), labels)
+    file = files.read(path)
+    assert file.eps_deg == EPS
+    assert file.labels.eps_deg.dtype == np.float32
+    np.testing.assert_array_equal(file.labels.eps_deg, labels.eps_deg[labels.valid])
+    np.testing.assert_array_equal(file.strengths, labels.eps_deg[labels.valid])
+    rows = files.for_lanes(file, np.array([9]), np.array([7]), 10)
+    np.testing.assert_array_equal(rows.eps_deg[0, :7], labels.eps_deg[1][labels.valid[1]][:7])
+    np.testing.assert_array_equal(rows.eps_deg[0, 7:], 0)
+    files.write_file(path.with_name("again.parquet"), file)
+    np.testing.assert_array_equal(files.read(path.with_name("again.parquet")).labels.eps_deg, file.labels.eps_deg)
+
+
+def test_labels_that_are_all_of_the_files_strength_have_none_of_their_own(path):
+    labels = falling().replace(eps_deg=np.full((1, 20), EPS, np.float32))
+    files.write(path, TASK, "relative", EPS, np.array([4]), labels)
+    file = files.read(path)
+    assert file.labels.eps_deg is None
+    assert file.strengths.tolist() == [EPS] * 20
+    written(path, answers="demonstration", eps_deg=None, width=2)
+    assert files.read(path).strengths is None
+
+
+def test_a_file_of_the_format_before_is_read_and_gone_on_with(tmp_path, monkeypatch):
+    monkeypatch.setitem(formats.FORMATS, "labels", 2)
+    labels = said(tmp_path, range(3))
+    monkeypatch.undo()
+    assert_holds(files.read(tmp_path), labels, 3)
+    said(tmp_path, range(3, 5))
+    assert_holds(files.read(tmp_path), labels, 5)

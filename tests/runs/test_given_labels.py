@@ -21,7 +21,7 @@ def path(tmp_path):
     return tmp_path / "labels.parquet"
 
 
-def written(path, task=None, answers="relative", eps_deg=EPS, obs_size=2, spoil=None):
+def written(path, task=None, answers="relative", eps_deg=EPS, obs_size=2, spoil=None, own=None):
     rng = np.random.default_rng(0)
     draw = lambda size: rng.normal(size=(2, 20, size)).astype(np.float32)  # noqa: E731
     action = draw(2)
@@ -30,14 +30,15 @@ def written(path, task=None, answers="relative", eps_deg=EPS, obs_size=2, spoil=
     if spoil:
         rows[spoil[0]][1, 7] = spoil[1]
     labels = probes.label_set(rows["obs"], rows["action"], rows["answer"], np.ones((2, 20), bool))
+    labels = labels.replace(eps_deg=None if own is None else np.tile(np.float32(own), (2, 1)))
     label_files.write(path, task or TASK, answers, eps_deg, np.array([4, 9]), labels)
 
 
 GRID = Grid(("none", "relative"), seeds=(4, 9), labels=(10, 15))
 
 
-def read_for(path, grid=GRID, task=None):
-    return read_labels(Order(task or probes.make_task(), probes.CONFIG, grid, path.parent / "run", labels_from=path))
+def read_for(path, grid=GRID, task=None, config=probes.CONFIG):
+    return read_labels(Order(task or probes.make_task(), config, grid, path.parent / "run", labels_from=path))
 
 
 def test_labels_that_fit_a_run(path):
@@ -111,6 +112,23 @@ def test_labels_of_another_world_are_refused_but_for_what_they_do_not_depend_on(
         read_for(path)
 
 
+def test_labels_of_several_strengths_are_taken_where_strengths_fall(path):
+    written(path, own=np.linspace(EPS, EPS / 4, 20))
+    with pytest.raises(
+        UserError, match=r"down to 5 degrees: give --sizes\.eps-falls --scalars\.eps-last-deg 5, or"
+    ) as no:
+        read_for(path)
+    assert "\n" not in str(no.value)
+    falls = probes.config(sizes={"eps_falls": True}, scalars={"eps_last_deg": EPS / 4})
+    assert read_for(path, config=falls).labels.eps_deg.min() == EPS / 4
+    written(path)
+    assert read_for(path, config=falls).labels.eps_deg is None
+    for wrong in (0.0, 200.0, np.inf):
+        written(path, own=[EPS] * 19 + [wrong])
+        with pytest.raises(UserError, match="strengths are no angles above 0 and up to 180"):
+            read_for(path, config=falls)
+
+
 SMALL = {"q_layers": (4,), "feedback_layers": (4,), "fit_steps": 20, "lanes_per_block": 1, "guide_directions": 6}
 RUN = probes.config(sizes=SMALL, schedule={"total_steps": 16, "guidance_until": 16})
 
@@ -127,6 +145,20 @@ def test_demonstrations_are_written_and_taken_again_by_their_own_kind_alone(tmp_
     for other in ("relative", "scalar", "dcoach"):
         with pytest.raises(UserError, match=f"holds demonstration answers, guidance {other} needs"):
             read_for(path, Grid((other,), (4,), (10,)))
+
+
+def test_a_run_with_falling_strengths_and_a_coach_leaves_a_file_that_is_taken_again(tmp_path):
+    sizes = {**SMALL, "eps_falls": True, "candidates": 3, "chosen_by": "teacher"}
+    config = dataclasses.replace(probes.config(sizes=sizes, scalars={"eps_last_deg": EPS / 4}), schedule=RUN.schedule)
+    grid, task = Grid(("none", "relative"), (4, 5), (15,)), probes.make_task()
+    sweep.run(Order(task, config, grid, tmp_path / "asked"))
+    path = tmp_path / "asked" / "relative" / "labels.parquet"
+    file = label_files.read(path)
+    np.testing.assert_allclose(file.labels.eps_deg, np.tile(np.geomspace(EPS, EPS / 4, 15), 2), rtol=1e-5)
+    sweep.run(Order(task, config, grid, tmp_path / "given", labels_from=path))
+    again = label_files.read(tmp_path / "given" / "relative" / "labels.parquet")
+    np.testing.assert_array_equal(again.labels.eps_deg, file.labels.eps_deg)
+    np.testing.assert_array_equal(again.labels.answer, file.labels.answer)
 
 
 def test_demonstrations_that_are_no_actions_are_refused(path):

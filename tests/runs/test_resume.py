@@ -1,5 +1,6 @@
 """Runs that were stopped or killed and resumed: bitwise the run that was left alone."""
 
+import dataclasses
 import json
 import shutil
 from contextlib import contextmanager
@@ -295,6 +296,26 @@ def test_a_block_filled_up_with_repeats_has_a_row_for_each_seed(whole, tmp_path)
     assert [row["seed"] for row in table if row["step"] == 96] == [3, 5, 7]
     expected = [row for row in rows(whole) if row["guidance"] == "none"]
     assert [row for row in table if row["seed"] != 7] == expected
+
+
+def test_a_run_whose_labels_fall_and_whose_questions_a_coach_chooses_goes_on_as_one(tmp_path):
+    own = {**SMALL, "eps_falls": True, "candidates": 3, "chosen_by": "teacher"}
+    config = probes.config(
+        sizes=own,
+        scalars={"eps_last_deg": 5.0},
+        schedule={"total_steps": 32, "checkpoint_every": 32, "ask_at": (0, 16)},
+    )
+    orders = [Order(TASK, config, Grid(("relative",), (3, 5), (35,)), tmp_path / name / "run") for name in "ab"]
+    sweep.run(orders[0])
+    for stop in (3, 1):  # rounds, of which two are of the second instalment
+        with stopping_at(stop), pytest.raises(Interrupted):
+            sweep.run(dataclasses.replace(orders[1], resume=stop == 1))
+    sweep.run(dataclasses.replace(orders[1], resume=True))
+    mine, whole = (label_files.read(order.out / "relative" / "labels.parquet").labels for order in orders)
+    for name in ("obs", "action", "answer", "eps_deg"):
+        np.testing.assert_array_equal(getattr(mine, name), getattr(whole, name))
+    np.testing.assert_allclose(whole.eps_deg, np.tile(np.geomspace(20.0, 5.0, 35), 2), rtol=1e-5)
+    assert rows(orders[1].out) == rows(orders[0].out)
 
 
 # Labels from a file.
