@@ -67,6 +67,9 @@ SPACED, MEMORY = {"sizes.question_every": 10}, {"task.memory": True}
 # The likeliest way is always gone: in doubt the base would act, which walks into walls.
 SURE: Mapping[str, Any] = {**EACH, **SPACED, "scalars.aim_doubt": 1000.0, "sizes.aim_layers": (64, 64)}
 MEMBERS, ACTIVE = {"sizes.ensemble": 5}, {"sizes.ensemble": 5, "sizes.candidates": 16, "sizes.question_every": 1}
+# Larger turns first; and a coach who watches 16 robots, and speaks where one does what is farthest from the way.
+FALLING = {"sizes.eps_falls": True, "scalars.eps_deg": 40.0, "scalars.eps_last_deg": 10.0}
+PARTING = {"sizes.candidates": 16, "sizes.chosen_by": "teacher", "sizes.question_every": 1}
 IN_ROOMS: dict[str, dict[str, Mapping[str, Any]]] = {
     "intent": {
         "members-memory": {**SURE, **MEMBERS, **MEMORY},
@@ -79,12 +82,16 @@ IN_ROOMS: dict[str, dict[str, Mapping[str, Any]]] = {
         "close": {**SURE, **MEMBERS, **MEMORY, "sizes.question_every": 1},
         "eps-10": {**SURE, **MEMBERS, **MEMORY, "scalars.eps_deg": 10.0},
         "eps-40": {**SURE, **MEMBERS, **MEMORY, "scalars.eps_deg": 40.0},
+        "eps-falls": {**SURE, **MEMBERS, **MEMORY, **FALLING},
+        "parting": {**SURE, **MEMBERS, **MEMORY, **PARTING},
     },
     "relative": {
         "close": EACH,
         "spaced": {**EACH, **SPACED},
         "spaced-members": {**EACH, **SPACED, **MEMBERS},
         "spaced-memory": {**EACH, **SPACED, **MEMORY},
+        "spaced-eps-falls": {**EACH, **SPACED, **FALLING},
+        "parting": {**EACH, **PARTING},
     },
 }
 BEST_IN_ROOMS = IN_ROOMS["intent"]["members-memory"]
