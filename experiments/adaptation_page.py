@@ -191,24 +191,38 @@ def rooms(rows: Sequence[Row], folder: Path, seen: str) -> str:
     return f"{text}\n\nCeilings:\n\n{table(header, cells)}"
 
 
+SIDES_HEADER = ["wanted", "", "after", "success [%]", "all on the wanted side [%]", "on both sides [%]"]
+
+
+def side_cells(rows: Sequence[Row], world: str, side: str) -> list[list[str]]:
+    """A row for each way of adapting in a corridor with a wanted side."""
+    cells = []
+    for line in lines(rows, world):
+        each = {name: line.columns[f"passed_{name}"] for name in (*SIDES, "both")}
+        passed = np.maximum(sum(each.values()), 1e-9)
+        wanted, mixed = percent(each[side] / passed), percent(each["both"] / passed)
+        cells.append([side, line.name, after(line), percent(line.columns["success"]), wanted, mixed])
+    return cells
+
+
+def quadruped(rows: Sequence[Row]) -> str:
+    """The quadruped in the halls that its agents know, and in the corridor with a wanted side."""
+    halls, corridor = outcomes(rows, "anymal", None), side_cells(rows, "corridor_left_anymal", "left")
+    return "\n\n".join(part for part in (halls, table(SIDES_HEADER, corridor) if corridor else "") if part)
+
+
 def sides(rows: Sequence[Row], folder: Path, seen: str) -> str:
     """The preferred side: of episodes that passed an obstacle, how many passed all of theirs where it was wanted."""
     cells, drawn = [], {}
     for side in SIDES:
-        for line in lines(rows, f"corridor_{side}"):
-            each = {name: line.columns[f"passed_{name}"] for name in (*SIDES, "both")}
-            passed = np.maximum(sum(each.values()), 1e-9)
-            wanted, mixed = each[side] / passed, each["both"] / passed
-            cells.append(
-                [side, line.name, after(line), percent(line.columns["success"]), percent(wanted), percent(mixed)]
-            )
+        cells += side_cells(rows, f"corridor_{side}", side)
         for piece, name in WALKED.items():
             kept = folder / f"corridor_{side}" / piece / FILE
             if kept.exists():
                 drawn[f"adapted to pass on the {side}: {name}"] = kept
     if not cells:
         return ""
-    text = table(["wanted", "", "after", "success [%]", "all on the wanted side [%]", "on both sides [%]"], cells)
+    text = table(SIDES_HEADER, cells)
     if drawn:
         draw(drawn, folder / "trajectories")
         text += f"\n\n![ways in a corridor]({seen}/trajectories.png)"
@@ -243,6 +257,7 @@ def sections(data: Path, page: Path) -> dict[str, str]:
     coarse = data / "cpu" / "navigation"  # of the scale of that name, its base agents among them
     rows = read(coarse) if coarse.exists() else []
     found["lidar-cpu"] = outcomes(rows, "turned_lidar", whole_of(rows, 0.0))
+    found["quadruped-cpu"] = quadruped(rows)
     found["navigation-cpu-settings"] = settings(rows, "success")
     return {name: text for name, text in found.items() if text}
 
