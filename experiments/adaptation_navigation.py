@@ -64,6 +64,7 @@ OTHERS: dict[str, dict[str, Mapping[str, Any]]] = {
 # In rooms: what helps, each by itself and together. A round is 50 questions, so that a thousand are 20 fits.
 EACH: Mapping[str, Any] = {**FRAME, "scalars.eps_deg": 20.0, "sizes.labels_per_round": 50}
 SPACED, MEMORY = {"sizes.question_every": 10}, {"task.memory": True}
+LOOK_AHEAD = {"task.look_ahead": True}
 # The likeliest way is always gone: in doubt the base would act, which walks into walls.
 SURE: Mapping[str, Any] = {**EACH, **SPACED, "scalars.aim_doubt": 1000.0, "sizes.aim_layers": (64, 64)}
 MEMBERS, ACTIVE = {"sizes.ensemble": 5}, {"sizes.ensemble": 5, "sizes.candidates": 16, "sizes.question_every": 1}
@@ -76,6 +77,8 @@ IN_ROOMS: dict[str, dict[str, Mapping[str, Any]]] = {
         "members": {**SURE, **MEMBERS},
         "active-memory": {**SURE, **ACTIVE, **MEMORY},
         "memory": {**SURE, **MEMORY},
+        "look-ahead": {**SURE, **MEMBERS, **MEMORY, **LOOK_AHEAD},
+        "look-ahead-only": {**SURE, **MEMBERS, **LOOK_AHEAD},
         "contrary": {**SURE, **MEMBERS, **MEMORY, "scalars.mistake_probability": 0.5},  # do labels matter at all?
         "doubting": {**SURE, **MEMBERS, **MEMORY, "scalars.aim_doubt": 2.0},
         "small": {**SURE, **MEMBERS, **MEMORY, "sizes.aim_layers": (32, 32)},

@@ -48,6 +48,16 @@ class AdaptedLanes:
         """The kind of guidance that was fitted last."""
         return self.values["policy"]["guidance"]
 
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """The kinds of guidance that the policy is under, the last first."""
+        layer, found = self.values["policy"], []
+        while layer is not None:
+            if layer["policy"] == "guided":
+                found.append(layer["guidance"])
+            layer = layer.get("base")
+        return tuple(found)
+
     def policy(self, env: Any) -> Guided:
         """A block of the lanes' policies. Raises UserError if it cannot be had."""
         values, arrays = self.values["policy"], self._arrays(env)

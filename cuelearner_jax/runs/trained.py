@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from cuelearner_jax.config import RunConfig
-from cuelearner_jax.environment import actions_of, offers
+from cuelearner_jax.environment import actions_of, offers, spaces_of
 from cuelearner_jax.errors import UserError, closest
 from cuelearner_jax.evaluate import one_lane
 from cuelearner_jax.guidance import registry as guidances
@@ -144,8 +144,8 @@ class PolicySource:
     def check(self, policy: str, changed: Any, **lanes: Any) -> None:
         """Raises UserError unless the policy can be had and acts in the changed world.
 
-        What was trained sees the observations that it was trained on; other policies act in any world. An agent also
-        acts where a world says that it adds to them at their end (`plain_size`).
+        What was trained sees the observations that it was trained on, and aims as they were told then; other policies
+        act in any world. An agent also acts where a world says that it adds to them at their end (`plain_size`).
         `lanes`: options that choose among a run's lanes, by name; one that is given must choose something.
         """
         if policy not in POLICIES:
@@ -174,6 +174,19 @@ class PolicySource:
             raise UserError(
                 f"the {what}'s observations have {size} entries, this world's {after.obs_size}: keep its structure"
             )
+        if policy in SEE_THEIR_OWN:
+            return
+        chosen = next((value for name, value in lanes.items() if name.endswith("guidance") and value), None)
+        if not self._weighs_aims((chosen,) if isinstance(chosen, str) else chosen):
+            return
+        if (width := spaces_of(known).aims) != (now := spaces_of(after).aims):
+            raise UserError(f"the {what} weighs aims of {width} features, this world's have {now}: keep its structure")
+
+    def _weighs_aims(self, chosen: tuple[str, ...] | None) -> bool:
+        """Is a policy under a guidance that looks at the task's aims? `chosen`: of these kinds of a run alone."""
+        kinds = self.adapted.kinds if self.adapted else chosen or (self.grid.guidance if self.grid else ())
+        found = (guidances.registered(kind) for kind in kinds)
+        return any(kind is not None and "aims" in kind.needs for kind in found)
 
     def load(self, kinds: tuple[str, ...] = ()) -> list[Lanes]:
         """The lanes of a run's kinds of guidance (none named: all), those at different steps apart.

@@ -171,5 +171,6 @@ def make_environment(
         goal_radius=plain.goal_radius,
         mirrors=plain.mirrors,
         sides=plain.sides,
+        look_ahead=plain.look_ahead,
         walking=walking_policy.load() if walking is None else walking,
     )

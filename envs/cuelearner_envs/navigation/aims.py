@@ -13,7 +13,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from cuelearner_envs.navigation import memory
+from cuelearner_envs.navigation.geometry import free_path
 from cuelearner_envs.navigation.lidar import BEAM_ANGLES, BEAMS, MAX_RANGE
+from cuelearner_envs.navigation.look_ahead import EVERY, look_ahead
 from cuelearner_envs.navigation.world import FAR_AWAY
 from cuelearner_envs.navigation.worlds import FARTHEST
 from cuelearner_jax.actions import from_angle, rotate, to_angle
@@ -29,8 +31,14 @@ SCALE = 5.0  # of lengths among the features [m]
 UNSEEN = -1.0  # nearness where the lidar does not look
 
 
-def aims_of(obs: Float[Array, " obs"]) -> Aims:
-    """The ways of a situation; see `Navigation.aims`."""
+def aims_of(obs: Float[Array, " obs"], ahead: bool = False) -> Aims:
+    """The ways of a situation; see `Navigation.aims`.
+
+    Args:
+        obs: the observation; one with a memory tells ways by that too.
+        ahead: tell also, as the last three features, where two legs lead (`look_ahead.look_ahead`); it takes about as
+            long again.
+    """
     goal, away = obs[BEAMS : BEAMS + 2], obs[BEAMS + 2] * FARTHEST
     ways = rotate(jnp.broadcast_to(goal, (WAYS, 2)), jnp.arange(WAYS) * (2 * jnp.pi / WAYS))
     free = free_ways(obs, ways)
@@ -44,6 +52,9 @@ def aims_of(obs: Float[Array, " obs"]) -> Aims:
         tried = memory.turned(obs[BEAMS + 9 :], ways).reshape(WAYS, -1, memory.SECTORS)
         middle = memory.SECTORS // 2
         rows += [tried[:, :, middle + step : middle + step + 2].mean(-1).T for step in (-1, -5, 3)]
+    if ahead:
+        left, detour, leg = look_ahead(points_of(obs)[::EVERY], ways, free[1], away * goal, RADII[1])
+        rows += [left / SCALE, jnp.clip(detour / SCALE, 0.0, 3.0), leg / SCALE]
     features = jnp.concatenate([row.reshape(-1, WAYS) for row in [*beside, *rows]]).T
     room = (free[0] > ROOM[0]) & (free[1] > ROOM[1]) & seen
     return Aims(ways, features, jnp.ones(WAYS, bool), room)
@@ -51,18 +62,17 @@ def aims_of(obs: Float[Array, " obs"]) -> Aims:
 
 def free_ways(obs: Float[Array, " obs"], ways: Float[Array, "n 2"]) -> Float[Array, "radii n"]:
     """How far a disc of each radius could walk in directions before it touches what the lidar sees [m], to 10 m."""
-    ranges = -jnp.log(jnp.maximum(obs[:BEAMS], math.exp(-MAX_RANGE)))
-    hit = ranges < MAX_RANGE - 0.01
-    points = jnp.where(hit[:, None], ranges[:, None] * from_angle(jnp.asarray(BEAM_ANGLES)), FAR_AWAY)
+    points = points_of(obs)
     along = ways[:, :1] * points[None, :, 0] + ways[:, 1:] * points[None, :, 1]
     across = ways[:, :1] * points[None, :, 1] - ways[:, 1:] * points[None, :, 0]
+    return jnp.stack([free_path(along, across, radius, MAX_RANGE) for radius in RADII])
 
-    def of_disc(radius: float) -> Float[Array, " n"]:
-        chord = radius**2 - jnp.square(across)
-        stop = along - jnp.sqrt(jnp.maximum(chord, 0.0))
-        return jnp.clip(jnp.where((chord > 0) & (along > 0), stop, MAX_RANGE).min(-1), 0.0, MAX_RANGE)
 
-    return jnp.stack([of_disc(radius) for radius in RADII])
+def points_of(obs: Float[Array, " obs"]) -> Float[Array, "271 2"]:
+    """What each beam hits, in the body's frame [m]; `FAR_AWAY` where it hits nothing."""
+    ranges = -jnp.log(jnp.maximum(obs[:BEAMS], math.exp(-MAX_RANGE)))
+    hit = ranges < MAX_RANGE - 0.01
+    return jnp.where(hit[:, None], ranges[:, None] * from_angle(jnp.asarray(BEAM_ANGLES)), FAR_AWAY)
 
 
 def _lengths(

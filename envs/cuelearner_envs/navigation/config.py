@@ -52,6 +52,8 @@ class NavigationConfig:
     memory: bool = False
     """Does the robot remember where it has been? 72 numbers of it then end the observation; policies that were trained
     without them see the rest."""
+    look_ahead: bool = False
+    """Do ways, as guidance intent weighs them, tell where a second leg would lead? Observations stay as they are."""
     preferred_side: Literal["none", "left", "right"] = "none"
     """Changed wish, in a corridor: the teacher passes every obstacle on this side."""
 
@@ -91,4 +93,5 @@ def make_environment(config: NavigationConfig, split: str = "training") -> Navig
         mirrors=config.mirrors,
         sides=config.style == "corridor",
         memory=config.memory,
+        look_ahead=config.look_ahead,
     )

@@ -50,7 +50,7 @@ AnyWalker = Any  # a `Walker`, or what another body has in its place: pose, goal
 
 
 class Navigation(Described, struct.PyTreeNode):
-    """The environment (`cuelearner_jax.environment.Environment`). Everything but the last three fields is traced."""
+    """The environment (`cuelearner_jax.environment.Environment`). Everything but the last four fields is traced."""
 
     worlds: World  # leading axis: worlds
     robot: Robot = Robot()
@@ -61,6 +61,7 @@ class Navigation(Described, struct.PyTreeNode):
     mirrors: bool = struct.field(pytree_node=False, default=False)  # offer the mirror image as data?
     sides: bool = struct.field(pytree_node=False, default=False)  # say on which side obstacles were passed?
     memory: bool = struct.field(pytree_node=False, default=False)  # does the robot remember where it has been?
+    look_ahead: bool = struct.field(pytree_node=False, default=False)  # do aims tell where a second leg leads?
 
     perceived = (
         Quantity("lidar", BEAMS, "1", "exp(-distance / 1 m) of each beam, from -135 to +135 degrees, counterclockwise"),
@@ -243,9 +244,11 @@ class Navigation(Described, struct.PyTreeNode):
 
         Any may be meant; open are those where the lidar looks and the body would not soon touch what it sees. One
         network weighs each from its own side: ways of three widths there and beside it, detours, goal and previous
-        actions, and, of an observation with a memory, how much of the way so far lies there.
+        actions, and, of an observation with a memory, how much of the way so far lies there. With `look_ahead` also
+        what is left to the goal after two legs of which the first goes there, what a detour they are, and the first
+        leg's length (`look_ahead.look_ahead`).
         """
-        return aims_of(obs)
+        return aims_of(obs, self.look_ahead)
 
     def mirror(
         self, which: Int[Array, ""] | int, obs: Float[Array, " obs"], vector: Float[Array, "2"]

@@ -1,4 +1,7 @@
-"""Distances from points and straight lines to the solids of a world, seen from above. Closed form, one at a time."""
+"""Distances from points and straight lines to the solids of a world, seen from above. Closed form, one at a time.
+
+And how far a disc walks among points, of whose solids nothing is known.
+"""
 
 from __future__ import annotations
 
@@ -34,6 +37,22 @@ def line_clearance(world: World, start: Float[Array, "2"], end: Float[Array, "2"
     sizes = world.boxes[:, 3:]
     to_boxes = jax.vmap(_box_to_line)(sizes, in_frame(world.boxes, start), in_frame(world.boxes, end))
     return jnp.minimum(to_circles.min(), to_boxes.min())
+
+
+def free_path(
+    along: Float[Array, "*n points"], across: Float[Array, "*n points"], radius: float, most: float
+) -> Float[Array, "*n"]:
+    """How far a disc can walk straight on before it touches one of the points [m], from 0 to `most`.
+
+    Args:
+        along: how far ahead of its middle the points lie, in the direction that it walks [m].
+        across: and how far aside [m].
+        radius: of the disc [m].
+        most: what is said where nothing stops it [m].
+    """
+    chord = radius**2 - jnp.square(across)
+    stop = along - jnp.sqrt(jnp.maximum(chord, 0.0))
+    return jnp.clip(jnp.where((chord > 0) & (along > 0), stop, most).min(-1), 0.0, most)
 
 
 def _point_to_line(point: Float[Array, "2"], start: Float[Array, "2"], end: Float[Array, "2"]) -> Float[Array, ""]:

@@ -1,0 +1,221 @@
+"""Where two legs lead: scenes whose best second leg is known by hand, and laws of geometry."""
+
+import math
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from cuelearner_envs.navigation.aims import RADII, SCALE, WAYS, aims_of
+from cuelearner_envs.navigation.config import NavigationConfig
+from cuelearner_envs.navigation.lidar import BEAMS, scan
+from cuelearner_envs.navigation.look_ahead import LEAST, SHORT
+from cuelearner_envs.navigation.world import World
+from cuelearner_envs.navigation.worlds import FARTHEST
+from cuelearner_jax.actions import from_angle
+from cuelearner_jax.adaptation import stored
+from cuelearner_jax.adaptation.program import Lanes
+from cuelearner_jax.cli import main
+from cuelearner_jax.config import GuideSizes, RunConfig, to_json
+from cuelearner_jax.environment import spaces_of
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.runs.adapted import AdaptedLanes
+from cuelearner_jax.runs.trained import PolicySource
+from cuelearner_jax.task import shape_of
+from cuelearner_jax.tasks import registry
+
+PLAINLY = 45  # features of a way without a memory and without look-ahead
+POSE = jnp.zeros(3)
+RADIUS = RADII[1]
+
+told = jax.jit(lambda obs: aims_of(obs, True))
+told_less = jax.jit(aims_of)
+
+
+def seen(ranges, goal):
+    """An observation: what beams read [m], and where the goal lies in the body's frame [m]."""
+    goal = np.asarray(goal, float)
+    away = np.hypot(*goal)
+    return jnp.concatenate([jnp.exp(-ranges), jnp.array([*(goal / away), away / FARTHEST]), jnp.zeros(6)])
+
+
+def among(boxes, goal, pose=POSE):
+    """What is seen among boxes (x, y, yaw, half-length, half-width) from a pose, of a goal in the body's frame."""
+    boxes = jnp.array(boxes, jnp.float32)
+    world = World(
+        boxes=boxes,
+        box_heights=jnp.full(len(boxes), 1.5),
+        circles=jnp.array([[1000.0, 1000.0, 0.01]]),
+        circle_heights=jnp.ones(1),
+        extent=jnp.array([20.0, 20.0]),
+        starts=jnp.zeros((1, 2)),
+        goals=jnp.ones((1, 2)),
+    )
+    return seen(scan(world, pose), goal)
+
+
+def ahead(obs):
+    """By direction, counted from the goal's in steps of 5 degrees: what is left, detour, first leg [m]."""
+    features = np.asarray(told(obs).features)
+    assert features.shape == (WAYS, PLAINLY + 3)
+    return features[:, PLAINLY:].T * SCALE
+
+
+def test_in_an_empty_hall_every_way_leads_on_to_the_goal():
+    """From every station of every way the goal is in free sight, so nothing is left and the nearest is no detour."""
+    left, detour, leg = ahead(seen(jnp.full(BEAMS, 10.0), (4.0, 0.0)))
+    np.testing.assert_allclose(left, 0.0, atol=1e-3)
+    # The goal's way: a station at the goal or on the way there. To the side: a quarter of 9.9 m, and back from there.
+    np.testing.assert_allclose(detour[0], 0.0, atol=1e-3)
+    first = (10.0 - SHORT) / 4
+    angle = math.radians(30.0)  # the foot of the goal is 3.46 m along: the quarter comes before it
+    np.testing.assert_allclose(leg[6], first, atol=1e-3)
+    beyond = math.hypot(4.0 - first * math.cos(angle), first * math.sin(angle))
+    np.testing.assert_allclose(detour[6], first + beyond - 4.0, atol=1e-3)
+    # Straight back there is no station nearer than LEAST: so far and back again.
+    np.testing.assert_allclose([leg[36], detour[36]], [LEAST, 2 * LEAST], atol=1e-3)
+
+
+def test_a_goal_nearer_than_every_station_is_no_reason_to_go_past_it():
+    left, detour, leg = ahead(seen(jnp.full(BEAMS, 10.0), (0.0, 1.0)))
+    np.testing.assert_allclose([left[0], detour[0]], 0.0, atol=1e-3)
+    np.testing.assert_allclose(leg[0], 1.0, atol=1e-3)
+
+
+# 3 m ahead a wall with a doorway from y = 1.5 to 3; the goal lies 6 m straight ahead.
+DOORWAY = [[3.0, -4.25, 0, 0.1, 5.75], [3.0, 8.5, 0, 0.1, 5.5]]
+
+
+def test_the_way_to_a_doorway_leads_on_and_the_wall_does_not():
+    left, detour, leg = ahead(among(DOORWAY, (6.0, 0.0)))
+    to_gap = round(math.degrees(math.atan2(2.25, 3.0)) / 5)  # 37 degrees
+    assert left[to_gap] < 0.1
+    assert leg[to_gap] > 3.4  # past the wall
+    # At the least round the near edge, a radius off it; through the middle it is 3.75 + 3.75 - 6 m.
+    assert 2 * math.hypot(3.0, 1.5 + RADIUS) - 6.0 < detour[to_gap] < 1.5 + 0.1
+    # Straight at the wall the second leg is at best 60 degrees aside along it: what is left is beyond.
+    assert left[0] > 2.0
+    assert left[-to_gap] > 2.0
+    inner = np.r_[0 : to_gap - 3, -to_gap:0]
+    assert left[inner].min() > left[to_gap] + 1.0
+
+
+# A passage ahead, 1.5 m wide, that turns left at its end 5 m away; the goal lies round the corner.
+PASSAGE = [[2.0, 0.85, 0, 2.0, 0.1], [3.0, -0.85, 0, 4.0, 0.1], [5.6, 1.5, 0, 0.1, 2.25], [3.9, 3.0, 0, 0.1, 2.0]]
+
+
+def test_an_l_shaped_passage_is_walked_in_two_legs():
+    goal = (4.75, 3.0)
+    obs = among(PASSAGE, goal)
+    left, detour, leg = ahead(obs)
+    along = -round(math.degrees(math.atan2(goal[1], goal[0])) / 5)  # ahead, counted from the goal
+    near = left[[along - 1, along, along + 1]]
+    assert near.min() < 0.1
+    best = along - 1 + int(near.argmin())
+    np.testing.assert_allclose(leg[best], goal[0], atol=0.7)
+    # Two sides of a right angle less the third: 4.75 + 3 - 5.6 m.
+    np.testing.assert_allclose(detour[best], sum(goal) - math.hypot(*goal), atol=0.4)
+    assert left[0] > 2.0  # straight at the goal: the passage's wall
+
+
+def test_where_the_first_leg_is_blocked_nothing_follows():
+    """A wall touches the disc: whatever lies behind it cannot be had that way."""
+    left, detour, leg = ahead(among([[RADIUS + 0.15, 0, 0, 0.1, 3.0]], (6.0, 0.0)))
+    np.testing.assert_allclose([left[0], detour[0], leg[0]], [6.0, 3.0 * SCALE, 0.0], atol=1e-3)
+    assert left[18] < 0.1  # along the wall and round its end, 3 m away
+
+
+def test_what_is_seen_of_a_wall_stops_a_second_leg_and_what_is_not_seen_does_not():
+    """Behind a screen the free-space assumption holds: the hidden wall counts only for who sees it."""
+    goal, screen, hidden = (6.5, 0.0), [3.0, 0.0, 0, 0.1, 1.0], [5.0, 0.0, 0, 0.1, 1.6]
+    one, other, seen_too = (ahead(among(boxes, goal)) for boxes in ([screen], [screen, hidden], [hidden]))
+    np.testing.assert_array_equal(one, other)
+    beside = [-6, 6]  # 30 degrees either way, past the screen
+    np.testing.assert_allclose(one[0][beside], 0.0, atol=1e-3)
+    assert one[1][beside].max() < seen_too[1][beside].min()
+
+
+@pytest.mark.parametrize("beams", [2, 10, -24])
+def test_a_turned_scene_has_the_same_features(beams):
+    """Turned by as many degrees as beams: every second beam is then seen by another that is looked at too."""
+    angle, ranges = math.radians(beams), np.full(BEAMS, 10.0)
+    ranges[60:180] = np.linspace(2.0, 4.0, 120)  # nothing at the ends, which would be turned out of sight
+    goal = 7.0 * from_angle(jnp.array(0.3))
+    turned = 7.0 * from_angle(jnp.array(0.3 + angle))
+    here, there = ahead(seen(ranges, goal)), ahead(seen(np.roll(ranges, beams), turned))
+    np.testing.assert_allclose(here, there, atol=2e-3)
+    assert np.ptp(here, 1).min() > 0.5  # of several metres, not all alike
+
+
+def test_a_mirrored_scene_has_mirrored_features():
+    rng = np.random.default_rng(1)
+    ranges = rng.uniform(1.0, 7.0, BEAMS)
+    one, other = ahead(seen(ranges, (4.0, 2.0))), ahead(seen(ranges[::-1].copy(), (4.0, -2.0)))
+    np.testing.assert_allclose(one, np.roll(other[:, ::-1], 1, axis=1), atol=2e-3)
+
+
+def test_unless_it_is_asked_for_aims_are_what_they_were():
+    rng = np.random.default_rng(2)
+    obs = seen(rng.uniform(0.5, 9.0, BEAMS), (3.0, 1.0))
+    plain, more = told_less(obs), told(obs)
+    assert plain.features.shape == (WAYS, PLAINLY)
+    np.testing.assert_array_equal(plain.features, more.features[:, :PLAINLY])
+    np.testing.assert_array_equal(plain.open, more.open)
+    np.testing.assert_array_equal(plain.actions, more.actions)
+
+
+def world(**changes):
+    return NavigationConfig(worlds=1, **changes)
+
+
+def test_the_option_widens_aims_and_leaves_observations_alone():
+    task = registry.find("navigation")
+    plain, more = (spaces_of(shape_of(task, world(look_ahead=on))) for on in (False, True))
+    assert (plain.aims, more.aims) == (PLAINLY, PLAINLY + 3)
+    assert plain._replace(aims=None) == more._replace(aims=None)
+    both = spaces_of(shape_of(task, world(look_ahead=True, memory=True))).aims
+    remembering = spaces_of(shape_of(task, world(memory=True))).aims
+    assert both and remembering and both - remembering == 3
+    assert not NavigationConfig().look_ahead
+
+
+def test_the_option_is_on_the_command_line(capsys):
+    with pytest.raises(SystemExit):
+        main(["adapt", "--task", "navigation", "--help"])
+    assert "--task.look-ahead, --task.no-look-ahead" in capsys.readouterr().out
+
+
+def kept(guidance, look_ahead):
+    """A policy folder, as it is known without its arrays."""
+    sizes = to_json(GuideSizes(aim_layers=(8,)))
+    layer = {"policy": "guided", "guidance": guidance, "sizes": sizes, "bounded": True, "base": {"policy": "uniform"}}
+    adapted = AdaptedLanes(Path(), {"policy": layer}, Lanes(*(np.zeros(1),) * 4), np.ones(1, bool), None, None)
+    config = RunConfig(world(look_ahead=look_ahead))
+    return PolicySource(registry.find("navigation"), config, None, Path(), adapted=adapted)
+
+
+def test_weights_of_ways_are_kept_with_their_width():
+    source = kept("intent", True)
+    assert source.adapted is not None
+    shapes = stored.shapes_of(source.adapted.values["policy"], shape_of(source.task, source.config.task))
+    kernels = [leaf.shape for leaf in jax.tree.leaves(shapes["model"]) if leaf.shape[-1:] == (8,) and leaf.ndim > 1]
+    assert kernels == [(PLAINLY + 3, 8)]
+
+
+@pytest.mark.parametrize("policy", ["adapted", "base"])
+def test_who_weighs_ways_is_refused_where_they_tell_something_else(policy):
+    for before in (False, True):
+        source = kept("intent", before)
+        source.check(policy, world(look_ahead=before))
+        with pytest.raises(UserError, match=f"weighs aims of {PLAINLY + 3 * before} features"):
+            source.check(policy, world(look_ahead=not before))
+    kept("relative", False).check(policy, world(look_ahead=True))  # who asks nothing of ways does not mind
+
+
+def test_agents_do_not_mind_what_ways_tell():
+    folder = Path(__file__).parents[3] / "docs" / "data" / "navigation_agent"
+    source = PolicySource.of_run(folder, registry.find)
+    for policy in ("agent", "corrected"):
+        source.check(policy, world(look_ahead=True))
