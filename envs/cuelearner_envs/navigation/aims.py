@@ -53,7 +53,7 @@ def aims_of(obs: Float[Array, " obs"], ahead: bool = False) -> Aims:
         middle = memory.SECTORS // 2
         rows += [tried[:, :, middle + step : middle + step + 2].mean(-1).T for step in (-1, -5, 3)]
     if ahead:
-        left, detour, leg = look_ahead(points_of(obs)[::EVERY], ways, free[1], away * goal, RADII[1])
+        left, detour, leg = look_ahead(points_of(obs)[::EVERY], ways, free[2], away * goal, RADII[2])
         rows += [left / SCALE, jnp.clip(detour / SCALE, 0.0, 3.0), leg / SCALE]
     features = jnp.concatenate([row.reshape(-1, WAYS) for row in [*beside, *rows]]).T
     room = (free[0] > ROOM[0]) & (free[1] > ROOM[1]) & seen
