@@ -97,7 +97,7 @@ IN_ROOMS: dict[str, dict[str, Mapping[str, Any]]] = {
         "parting": {**EACH, **PARTING},
     },
 }
-BEST_IN_ROOMS = IN_ROOMS["intent"]["members-memory"]
+BEST_IN_ROOMS, FARTHER_IN_ROOMS = IN_ROOMS["intent"]["members-memory"], IN_ROOMS["intent"]["look-ahead"]
 SIDED_INTENT = IN_ROOMS["intent"]["members"]
 SWEPT_RATES, SWEPT_NOISES_DEG = (0.0001, 0.001, 0.01), (0.0, 5.0, 20.0)
 
@@ -166,10 +166,9 @@ def rooms() -> list[Piece]:
         pieces.append(
             Piece(ROOMS, "relative", labels=(250, 500, 1_000), settings=ROOMY, judge_by="success", minutes=20, **asked)
         )
-        asked["variant"], settings = f"{bound:g}-memory", BEST_IN_ROOMS
-        pieces.append(
-            Piece(ROOMS, "intent", labels=(250, 500, 1_000), settings=settings, judge_by="success", minutes=15, **asked)
-        )
+        for name, settings in (("memory", BEST_IN_ROOMS), ("look-ahead", FARTHER_IN_ROOMS)):
+            asked |= {"variant": f"{bound:g}-{name}", "settings": settings, "judge_by": "success"}
+            pieces.append(Piece(ROOMS, "intent", labels=(250, 500, 1_000), minutes=15, **asked))
     tried = compared(ROOMS, 180.0, "success", {"relative": RELATIVE})
     ablation = compared(ROOMS, 180.0, "success", IN_ROOMS)
     return [*pieces, *tried, *(piece._replace(labels=(250, 1_000)) for piece in ablation)]
