@@ -26,6 +26,11 @@ DRAWS = 2_000
 Row = dict[str, Any]
 
 
+def named(method: str, variant: str) -> str:
+    """A method as tables and figures show it."""
+    return NAMES[method] + (f" ({variant})" if variant else "")
+
+
 class Line(NamedTuple):
     """A method after some labels or steps."""
 
@@ -38,7 +43,7 @@ class Line(NamedTuple):
     @property
     def name(self) -> str:
         """As tables show it."""
-        return NAMES[self.method] + (f" ({self.variant})" if self.variant else "")
+        return named(self.method, self.variant)
 
 
 def read(folder: Path) -> list[Row]:

@@ -17,7 +17,21 @@ from pathlib import Path
 
 import numpy as np
 from _adaptation import UNCHANGED
-from _adaptation_tables import GAIN, NAMES, Line, Row, lines, matched, percent, reached, read, share, spread, table
+from _adaptation_tables import (
+    GAIN,
+    NAMES,
+    Line,
+    Row,
+    lines,
+    matched,
+    named,
+    percent,
+    reached,
+    read,
+    share,
+    spread,
+    table,
+)
 from _trajectories import FILE, draw
 from adaptation_billiards import BOUNDS_DEG, LEAST
 from bootstrapping_page import rendered
@@ -81,7 +95,8 @@ def _used(line: Line) -> str:
     return f"{100 * line.columns['used'].mean():.0f}%" if "used" in line.columns else ""
 
 
-Points = dict[str, tuple[list[int], np.ndarray]]  # method -> labels or steps, values (bases, points)
+# method and variant -> labels or steps, values (bases, points)
+Points = dict[tuple[str, str], tuple[list[int], np.ndarray]]
 
 
 def curve_points(known: Sequence[Line], metric: str, whole: Line | None = None) -> Points:
@@ -90,8 +105,9 @@ def curve_points(known: Sequence[Line], metric: str, whole: Line | None = None) 
     if not start:
         return {}
     found: Points = {}
-    for method in CURVES:
-        own = [line for line in known if line.method == method]
+    made = dict.fromkeys((line.method, line.variant) for line in known if line.method in CURVES)
+    for kind in sorted(made, key=lambda kind: CURVES.index(kind[0])):
+        own = [line for line in known if (line.method, line.variant) == kind]
         own = own if any(line.after == 0 for line in own) else [*start, *own]
         if len(own) < 2:
             continue
@@ -101,23 +117,23 @@ def curve_points(known: Sequence[Line], metric: str, whole: Line | None = None) 
             for line in sorted(own, key=lambda line: line.after)
         ]
         if len({len(column) for column in columns}) == 1:
-            found[method] = sorted(line.after for line in own), np.stack(columns, axis=1)
+            found[kind] = sorted(line.after for line in own), np.stack(columns, axis=1)
     return found
 
 
 def _gains(points: Points) -> str:
     """When each method has made its own gain, and that of relative labels."""
-    if CURVES[0] not in points:
+    if (CURVES[0], "") not in points:
         return ""
-    reference = points[CURVES[0]][1][:, [0, -1]]
+    reference = points[CURVES[0], ""][1][:, [0, -1]]
     rows = []
-    for method, (labels, values) in points.items():
+    for (method, variant), (labels, values) in points.items():
         if len(values) != len(reference):
             continue
         mine, theirs = (reached(values, labels, reference, own) for own in (True, False))
         unit = "steps" if method == "finetuning" else "labels"
         told = ["never gained" if not np.isfinite(mine.estimate) else f"{mine.told(labels[-1])} {unit}"]
-        rows.append([NAMES[method], *told, f"{theirs.told(labels[-1])} {unit}"])
+        rows.append([named(method, variant), *told, f"{theirs.told(labels[-1])} {unit}"])
     header = ["", f"{GAIN:.0%} of its own gain", f"{GAIN:.0%} of the gain of relative labels"]
     return table(header, rows)
 
@@ -126,11 +142,12 @@ def figure(curves: dict[str, Points], stem: Path, ylabel: str, level: tuple[floa
     """Curves over labels and steps on one logarithmic axis, a panel a world."""
     drawn = Figure(figsize=(3.2 * len(curves) + 0.6, 3.2), layout="constrained")
     for axes, (world, points) in zip(drawn.subplots(1, len(curves), squeeze=False)[0], curves.items(), strict=True):
-        for method, (labels, values) in points.items():
+        for (method, variant), (labels, values) in points.items():
             low, middle, high = np.quantile(values, [0.25, 0.5, 0.75], axis=0)
             colour = COLOURS.get(method) or colour_of(method)
             x = np.maximum(labels, 10)  # the first point, of no labels, at the left end
-            axes.plot(x, middle, color=colour, marker="o", markersize=3, label=NAMES[method])
+            style = {"color": colour, "linestyle": "--" if variant else "-", "marker": "o", "markersize": 3}
+            axes.plot(x, middle, label=named(method, variant), **style)
             axes.fill_between(x, low, high, color=colour, alpha=0.15, linewidth=0)
         if level:
             axes.axhline(level[0], color="#999999", linestyle="--", linewidth=1, label=level[1])

@@ -36,6 +36,7 @@ STYLE: dict[Any, Any] = {
     "text.parse_math": False,  # a name with dollar signs is a name
 }
 DWARFED = 5.0  # times the span of all other evaluations that the first may have for it to set the scale
+APART = 0.09  # of an axis over label budgets: nearer ticks than that cannot both have their names
 
 
 def draw_curves(variants: Sequence[Variant], title: str, metric: str) -> Figure:
@@ -102,10 +103,20 @@ def draw_budgets(axes: Axes, variants: Sequence[Variant], intervals: Sequence[In
             axes.errorbar(labels, estimate, bars, color=colour, label=name, marker="o", capsize=3 + 2 * place)
     budgets = sorted({variant.labels for variant in variants if variant.labels})
     axes.set_xscale("log")
-    axes.set_xticks(budgets, [f"{budget:,}" for budget in budgets])
+    axes.set_xticks(budgets, names_of(budgets))
     axes.minorticks_off()
     axes.set_xlabel("labels")
     axes.set_title(panel, fontsize=10)
+
+
+def names_of(budgets: Sequence[int]) -> list[str]:
+    """Budgets as ticks of a logarithmic axis show them; of those too near a larger one for both to be read, nothing."""
+    names: list[str] = []
+    last, least = np.inf, APART * np.log(max(budgets) / min(budgets)) if budgets else 0.0
+    for budget in reversed(budgets):
+        names.append(f"{budget:,}" if last - np.log(budget) >= least else "")
+        last = np.log(budget) if names[-1] else last
+    return names[::-1]
 
 
 def save_figure(figure: Figure, stem: Path) -> None:

@@ -144,13 +144,13 @@ def test_a_gain_is_made_where_lines_between_points_say(modules, recorded):
     rows = found.read(recorded / "billiards")
     known = found.lines(rows, "tilted_table", least=0.4)
     points = page.curve_points(known, "reward", found.lines(rows, "unchanged", least=0.4)[0])
-    labels, values = points["relative"]
+    labels, values = points["relative", ""]
     assert labels == [0, 100, 200]
     reference = values[:, [0, -1]]
     made = found.reached(values, labels, reference, own=True)
     assert made.estimate == pytest.approx(100 + 100 * 0.28 / 0.3)
     assert (made.lower, made.upper) == pytest.approx((made.estimate, made.estimate))  # all agents are alike
-    steps, values = points["finetuning"]
+    steps, values = points["finetuning", ""]
     assert found.reached(values, steps, reference, own=False).estimate == pytest.approx(2_000 + 2_000 * 0.08 / 0.2)
     never = found.reached(values * 0.5, steps, reference, own=False)
     assert never.told(4_000) == "above 4,000 [above 4,000, above 4,000]"

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-from cuelearner_jax.report.figures import draw_curves, draw_label_efficiency
+from cuelearner_jax.report.figures import draw_curves, draw_label_efficiency, names_of
 from cuelearner_jax.report.statistics import Interval, curve
 from cuelearner_jax.report.variants import Variant
 
@@ -98,3 +98,9 @@ def test_a_name_with_dollars_or_beyond_all_length_is_drawn():
     ((_, text),) = names(figure, figure.axes[0])
     assert text.startswith("$\\broken{$xxx")
     assert len(text) <= 40
+
+
+def test_of_budgets_too_near_each_other_the_larger_has_its_name():
+    assert names_of([25, 100, 500, 1_000]) == ["25", "100", "500", "1,000"]
+    assert names_of([25, 100, 500, 1_000, 10_000, 100_000]) == ["25", "100", "", "1,000", "10,000", "100,000"]
+    assert (names_of([500]), names_of([])) == (["500"], [])
