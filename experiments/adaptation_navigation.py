@@ -62,7 +62,12 @@ OTHERS: dict[str, dict[str, Mapping[str, Any]]] = {
     },
 }
 # In rooms: what helps, each by itself and together. A round is 50 questions, so that a thousand are 20 fits.
-EACH: Mapping[str, Any] = {**FRAME, "scalars.eps_deg": 20.0, "sizes.labels_per_round": 50}
+EACH: Mapping[str, Any] = {
+    **FRAME,
+    "scalars.eps_deg": 20.0,
+    "sizes.labels_per_round": 50,
+    "task.look_ahead": False,  # the scenario looks ahead
+}
 SPACED, MEMORY = {"sizes.question_every": 10}, {"task.memory": True}
 LOOK_AHEAD = {"task.look_ahead": True}
 # The likeliest way is always gone: in doubt the base would act, which walks into walls.

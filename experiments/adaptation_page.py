@@ -274,6 +274,7 @@ def sections(data: Path, page: Path) -> dict[str, str]:
     coarse = data / "cpu" / "navigation"  # of the scale of that name, its base agents among them
     rows = read(coarse) if coarse.exists() else []
     found["lidar-cpu"] = outcomes(rows, "turned_lidar", whole_of(rows, 0.0))
+    found["rooms-cpu"] = outcomes(rows, "rooms", None)
     found["quadruped-cpu"] = quadruped(rows)
     found["navigation-cpu-settings"] = settings(rows, "success")
     return {name: text for name, text in found.items() if text}
