@@ -193,7 +193,11 @@ def sides() -> list[Piece]:
             Piece(world, "intent", labels=(100, 250, 500, 1_000), ways=True, minutes=12, **wide),
         ]
     tried = {"relative": RELATIVE, "intent": {"members": SIDED_INTENT}}
-    freely = {"members-180": SIDED_INTENT, "active-180": {**SIDED_INTENT, **ACTIVE}}
+    freely = {
+        "members-180": SIDED_INTENT,
+        "active-180": {**SIDED_INTENT, **ACTIVE},
+        "look-ahead-180": {**SIDED_INTENT, **LOOK_AHEAD},
+    }
     wide = compared("corridor_left", 180.0, "passed_left", {"intent": freely})
     return [*pieces, *compared("corridor_left", SIDE_BOUND_DEG, "passed_left", tried), *wide]
 
