@@ -281,7 +281,10 @@ def ask_all(
     position: Int[Array, ""],
     bound: Float[Array, ""] | None = None,
 ) -> GuideState:
-    """Like `ask`, of every candidate: as many questions as there are, the first of them number `position`."""
+    """Like `ask`, of every candidate: as many questions as there are, the first of them number `position`.
+
+    `guide` stands in several situations. Raises ValueError if the guidance asks nothing.
+    """
     form = guidance.form
     if form is None:
         raise ValueError(f"guidance {guidance.name!r} asks nothing")

@@ -162,7 +162,7 @@ def rooms() -> list[Piece]:
     """The table of the rooms: unadapted, and learned and by the road map within either bound.
 
     The paper's labels, refined in the action frame; then read as intent among the ways that the lidar sees, asked in
-    situations farther apart, with and without a memory of the way tried.
+    situations farther apart, with a memory of the way tried, and with look-ahead too.
     """
     pieces = [Piece(ROOMS, "none", minutes=2, serves="success in rooms")]
     for bound in ROOMS_BOUNDS_DEG:

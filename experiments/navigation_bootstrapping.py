@@ -64,10 +64,9 @@ def budgets(name: str, options: Options, minutes: int) -> list[Piece]:
         Piece("clutter", name, "heuristic", ("heuristic",), (), SEEDS, half, minutes // 4, "against walking straight"),
     ]
     for kind in ASKING:
-        serves = f"labels of {kind}"
-        many, seeds = (whole, SEEDS) if name == "raw" else (half, VARIED_SEEDS)
+        serves, many = f"labels of {kind}", whole if name == "raw" else half
         pieces.append(Piece("clutter", name, f"{kind}-few", (kind,), FEW, SEEDS, whole, minutes, serves))
-        pieces.append(Piece("clutter", name, f"{kind}-many", (kind,), MANY, seeds, many, minutes + 3, serves))
+        pieces.append(Piece("clutter", name, f"{kind}-many", (kind,), MANY, SEEDS, many, minutes + 3, serves))
     return pieces
 
 

@@ -36,8 +36,7 @@ def aims_of(obs: Float[Array, " obs"], ahead: bool = False) -> Aims:
 
     Args:
         obs: the observation; one with a memory tells ways by that too.
-        ahead: tell also, as the last three features, where two legs lead (`look_ahead.look_ahead`); it takes about as
-            long again.
+        ahead: tell also, as the last three features, where two legs lead (`look_ahead.look_ahead`).
     """
     goal, away = obs[BEAMS : BEAMS + 2], obs[BEAMS + 2] * FARTHEST
     ways = rotate(jnp.broadcast_to(goal, (WAYS, 2)), jnp.arange(WAYS) * (2 * jnp.pi / WAYS))

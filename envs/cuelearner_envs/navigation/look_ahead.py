@@ -6,7 +6,7 @@ of robots in unknown terrain (Koenig, Smirnov, "Sensor-based planning with the f
 geometry of one scan, in the body's frame, and nothing is remembered of former ones.
 
 Cost: 7 stations on each of 72 ways, 5 second legs from each, every second of 271 points: 340,000 tests of a disc
-against a point for an observation, where the ways themselves take 60,000; on a CPU aims take twice the time with it.
+against a point for an observation, where the ways themselves take 60,000.
 """
 
 from __future__ import annotations
