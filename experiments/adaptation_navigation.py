@@ -180,17 +180,22 @@ def rooms() -> list[Piece]:
 
 
 def sides() -> list[Piece]:
-    """The preferred side in the corridor: the paper's labels within 60 degrees, and read as intent within any."""
+    """The preferred side in the corridor: the paper's labels within 60 degrees, and read as intent within any.
+
+    Of the latter also among ways that tell where a second leg would lead.
+    """
     pieces = []
     for side in ("left", "right"):
         world, judge_by, serves = f"corridor_{side}", f"passed_{side}", "the preferred side"
         asked = {"bound_deg": SIDE_BOUND_DEG, "settings": SIDED, "judge_by": judge_by, "serves": serves}
         wide = {**asked, "variant": "180", "bound_deg": 180.0, "settings": SIDED_INTENT}
+        farther = {**wide, "variant": "180-look-ahead", "settings": {**SIDED_INTENT, **LOOK_AHEAD}}
         pieces += [
             Piece(world, "none", minutes=2, serves=serves),
             Piece(world, "teacher", minutes=4, **asked),
             Piece(world, "relative", labels=(100, 250, 500), ways=True, minutes=12, **asked),
             Piece(world, "intent", labels=(100, 250, 500, 1_000), ways=True, minutes=12, **wide),
+            Piece(world, "intent", labels=(250, 500, 1_000), minutes=15, **farther),
         ]
     tried = {"relative": RELATIVE, "intent": {"members": SIDED_INTENT}}
     freely = {

@@ -95,6 +95,8 @@ def budgets(world: str, options: Options, minutes: int) -> list[Piece]:
         settings, serves = options if kind in ("relative", "intent") else compared, f"labels of {kind}"
         pieces.append(Piece(world, "frame", kind, (kind,), FIRST, 8, settings, minutes, serves))
         pieces.append(Piece(world, "frame", f"{kind}-more", (kind,), MORE, 8, options, minutes + 14, serves))
+    perfect, until = (f"perfect_guide:{world.upper()}",), {**options, **GUIDED}
+    pieces.append(Piece(world, "frame", "perfect", perfect, (), 8, until, minutes // 2, "how far guidance goes at all"))
     return pieces
 
 
