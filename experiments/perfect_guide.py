@@ -3,7 +3,8 @@
     python experiments/billiards_bootstrapping.py --pieces regulation/frame/perfect
 
 The kinds are named as `perfect_guide:REGULATION` and `perfect_guide:EASY` wherever a kind of guidance is asked for, in
-the folder that holds this file or by a script in it. What such a guide earns by itself is measured beside the agents.
+the folder that holds this file or by a script in it; reports of a script that imports this file know their names. What
+such a guide earns by itself is measured beside the agents.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from cuelearner_jax.actions import DIRECTIONS
 from cuelearner_jax.agent.choice import greedy_actions
 from cuelearner_jax.config import GuideScalars, GuideSizes, Sizes
 from cuelearner_jax.environment import Spaces
+from cuelearner_jax.guidance import registry
 from cuelearner_jax.guidance.bundle import Guidance
 from cuelearner_jax.guidance.kind import Kind
 from cuelearner_jax.guidance.refining import Refined
@@ -28,6 +30,7 @@ from cuelearner_jax.tasks.billiards import SHIPPED_TEACHERS
 from cuelearner_jax.teachers import stored
 from cuelearner_jax.teachers.learned import LearnedTeacher
 from cuelearner_jax.types import GuidanceModel
+
 
 @lru_cache
 def teacher(table: str) -> LearnedTeacher:
@@ -46,7 +49,7 @@ def act(
     active: Bool[Array, " n"],
     scalars: GuideScalars,
 ) -> Refined:
-    """The teacher's best action in active rows; searched near the peaks, as agents search theirs, for it is asked often."""
+    """The teacher's best action in active rows; searched near the peaks, as agents search theirs: it is asked often."""
     told = teacher(table)
     sizes = Sizes(
         frame="action",
@@ -66,7 +69,7 @@ def make(table: str, sizes: GuideSizes, spaces: Spaces) -> Guidance:
 
 
 def _kind(table: str) -> Kind:
-    return Kind(f"perfect-{table}", "the teacher's best shot", partial(make, table), title="perfect", colour="#000000")
+    return Kind(f"perfect-{table}", "the teacher's best shot", partial(make, table), title="perfect", colour="#6A3D9A")
 
 
-REGULATION, EASY = _kind("regulation"), _kind("easy")
+REGULATION, EASY = (registry.register(_kind(table)) for table in ("regulation", "easy"))

@@ -8,18 +8,24 @@ import sys
 from itertools import chain
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
+import numpy as np
 import pytest
 
+from cuelearner_envs.billiards.config import BilliardsConfig, make_environment
+from cuelearner_jax.actions import DIRECTIONS, evenly_spaced
 from cuelearner_jax.cli import main
 from cuelearner_jax.cli.parsing import parse
 from cuelearner_jax.cli.report import Report
-from cuelearner_jax.config import Scalars, Schedule, Sizes
+from cuelearner_jax.config import GuideScalars, GuideSizes, Scalars, Schedule, Sizes
 from cuelearner_jax.guidance import registry
 from cuelearner_jax.report.efficiency import Question, efficiency_of
 from cuelearner_jax.report.efficiency_document import efficiency_lines
 from cuelearner_jax.report.variants import read_groups, variants_of
 from cuelearner_jax.runs import sweep
 from cuelearner_jax.runs.order import planned
+from cuelearner_jax.tasks.billiards import make_teacher
 
 FOLDER = Path(__file__).parents[2] / "experiments"
 BUDGETS = [25, 50, 100, 350, 500, 1_000, 2_000, 5_000]
@@ -29,9 +35,12 @@ BUDGETS = [25, 50, 100, 350, 500, 1_000, 2_000, 5_000]
 def modules():
     """Those of the experiments, as Python finds them when it runs one of the files."""
     sys.path.insert(0, str(FOLDER))
-    names = ("_pieces", "billiards_bootstrapping", "navigation_bootstrapping", "bootstrapping_page")
+    names = ("_pieces", "billiards_bootstrapping", "navigation_bootstrapping", "bootstrapping_page", "perfect_guide")
+    kinds = dict(registry._KINDS)  # without those that an experiment brings along
     yield {name: importlib.import_module(name) for name in names}
     sys.path.remove(str(FOLDER))
+    registry._KINDS.clear()
+    registry._KINDS.update(kinds)
 
 
 @pytest.fixture(params=["billiards", "navigation"])
@@ -72,7 +81,7 @@ def test_every_form_of_feedback_has_every_budget(modules):
 
 
 def known_kind(name):
-    return registry.registered(name) is not None
+    return ":" in name or registry.registered(name) is not None
 
 
 def options_known(piece):
@@ -98,7 +107,7 @@ def test_every_piece_is_a_sweep_that_would_begin(experiment, scale, modules, mon
     for piece in different.values():
         assert main(pieces.sweep_command(experiment.task, piece, tmp_path, resume=False)) == 0, piece.path
         order = orders[-1]
-        assert order.grid.guidance == piece.kinds
+        assert order.grid.guidance == tuple(registry.find(kind).name for kind in piece.kinds)
         assert order.grid.labels == piece.labels or not piece.labels
         assert order.grid.seeds == tuple(range(4000, 4000 + piece.seeds))
         assert order.out == tmp_path / piece.path
@@ -107,6 +116,22 @@ def test_every_piece_is_a_sweep_that_would_begin(experiment, scale, modules, mon
         sizes = {piece.run: order.config.sizes for piece, order in zip(different.values(), orders, strict=True)}
         assert [sizes[run].frame for run in ("frame", "raw", "paced")] == ["action", "raw", "action"]
         assert [sizes[run].pace for run in ("frame", "raw", "paced")] == [False, False, True]
+
+
+@pytest.mark.parametrize("table", ["regulation", "easy"])
+def test_a_perfect_guide_does_what_the_tables_teacher_holds_for_best(modules, table):
+    perfect = modules["perfect_guide"]
+    kind, env = getattr(perfect, table.upper()), make_environment(BilliardsConfig(table))
+    guidance = registry.make(kind.name, GuideSizes(), env)
+    _, obs = jax.vmap(env.reset)(jax.random.split(jax.random.key(3), 12))
+    base = DIRECTIONS.uniform(jax.random.key(4), (12,))
+    active = jnp.arange(12) < 10
+    found = guidance.act(guidance.init(jax.random.key(0)), env, obs, base, active, GuideScalars()).actions
+    np.testing.assert_array_equal(found[10:], base[10:])
+    teacher = make_teacher(BilliardsConfig(table, teacher="learned"), env).teacher
+    for seen, action in zip(obs[:10], found[:10], strict=True):
+        best = teacher.values(seen, evenly_spaced(3600)).max()  # of all that it knows, searched one by one
+        assert teacher.values(seen, action[None])[0] >= best - 0.02
 
 
 def test_scales_keep_what_they_say(modules):
