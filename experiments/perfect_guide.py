@@ -10,7 +10,7 @@ such a guide earns by itself is measured beside the agents.
 from __future__ import annotations
 
 from functools import lru_cache, partial
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -31,9 +31,11 @@ from cuelearner_jax.teachers import stored
 from cuelearner_jax.teachers.learned import LearnedTeacher
 from cuelearner_jax.types import GuidanceModel
 
+Table = Literal["regulation", "easy"]
+
 
 @lru_cache
-def teacher(table: str) -> LearnedTeacher:
+def teacher(table: Table) -> LearnedTeacher:
     """The table's shipped network, which aims without error. Its arrays are NumPy's: constants of any program."""
     with jax.ensure_compile_time_eval():
         found = stored.load(SHIPPED_TEACHERS / table, make_environment(BilliardsConfig(table)), 0.0, 0.0)
@@ -41,7 +43,7 @@ def teacher(table: str) -> LearnedTeacher:
 
 
 def act(
-    table: str,
+    table: Table,
     model: GuidanceModel,
     env: Any,
     obs: Float[Array, "n obs"],
@@ -63,13 +65,13 @@ def act(
     return Refined(jnp.where(active[:, None], best, actions), active.astype(jnp.int32))
 
 
-def make(table: str, sizes: GuideSizes, spaces: Spaces) -> Guidance:
+def make(table: Table, sizes: GuideSizes, spaces: Spaces) -> Guidance:
     """The bundle."""
     return unlabelled(f"perfect-{table}", partial(act, table))
 
 
-def _kind(table: str) -> Kind:
+def _kind(table: Table) -> Kind:
     return Kind(f"perfect-{table}", "the teacher's best shot", partial(make, table), title="perfect", colour="#6A3D9A")
 
 
-REGULATION, EASY = (registry.register(_kind(table)) for table in ("regulation", "easy"))
+REGULATION, EASY = registry.register(_kind("regulation")), registry.register(_kind("easy"))

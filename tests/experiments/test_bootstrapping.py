@@ -7,6 +7,7 @@ import json
 import sys
 from itertools import chain
 from pathlib import Path
+from typing import cast
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +15,7 @@ import numpy as np
 import pytest
 
 from cuelearner_envs.billiards.config import BilliardsConfig, make_environment
+from cuelearner_envs.billiards.teacher import Transferred
 from cuelearner_jax.actions import DIRECTIONS, evenly_spaced
 from cuelearner_jax.cli import main
 from cuelearner_jax.cli.parsing import parse
@@ -128,7 +130,7 @@ def test_a_perfect_guide_does_what_the_tables_teacher_holds_for_best(modules, ta
     active = jnp.arange(12) < 10
     found = guidance.act(guidance.init(jax.random.key(0)), env, obs, base, active, GuideScalars()).actions
     np.testing.assert_array_equal(found[10:], base[10:])
-    teacher = make_teacher(BilliardsConfig(table, teacher="learned"), env).teacher
+    teacher = cast(Transferred, make_teacher(BilliardsConfig(table, teacher="learned"), env)).teacher
     for seen, action in zip(obs[:10], found[:10], strict=True):
         best = teacher.values(seen, evenly_spaced(3600)).max()  # of all that it knows, searched one by one
         assert teacher.values(seen, action[None])[0] >= best - 0.02
