@@ -47,7 +47,7 @@ class Line(NamedTuple):
 
 
 def read(folder: Path) -> list[Row]:
-    """The rows of all finished pieces of a task."""
+    """The rows of all finished pieces of a task; none where there is no such folder."""
     rows = []
     for file in sorted(folder.rglob(SCHEMA.parquet)):
         rows += tables.read(file, SCHEMA).to_pylist()

@@ -266,19 +266,18 @@ def sections(data: Path, page: Path) -> dict[str, str]:
     tasks = {"billiards": {"billiards": billiards}, "navigation": {"lidar": lidar, "rooms": rooms, "sides": sides}}
     for task, parts in tasks.items():
         folder = data / task
-        rows = read(folder) if folder.exists() else []
+        rows = read(folder)
         seen = Path(os.path.relpath(folder, page.parent)).as_posix()
         for name, part in parts.items():
             found[name] = part(rows, folder, seen)
         found[f"{task}-settings"] = settings(rows, "reward" if task == "billiards" else "success")
-    # At the scale `cpu`, its base agents among them; and of other agents that were trained in the same way.
-    coarse, again = ((data / name / "navigation") for name in ("cpu", "retrained"))
-    rows = read(coarse) if coarse.exists() else []
+    rows = read(data / "cpu" / "navigation")  # of the scale of that name, its base agents among them
     found["lidar-cpu"] = outcomes(rows, "turned_lidar", whole_of(rows, 0.0))
     found["rooms-cpu"] = outcomes(rows, "rooms", None)
     found["quadruped-cpu"] = quadruped(rows)
     found["navigation-cpu-settings"] = settings(rows, "success")
-    rows = read(again) if again.exists() else []
+    again = data / "retrained" / "navigation"  # at that scale too, of agents trained once more
+    rows = read(again)
     found["rooms-retrained"] = outcomes(rows, "rooms", None)
     found["sides-retrained"] = sides(rows, again, Path(os.path.relpath(again, page.parent)).as_posix())
     return {name: text for name, text in found.items() if text}

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import perfect_guide
 from _pieces import FIRST_SEED, Experiment, Options, Piece, Scale, run
 
 FIRST, MORE = (25, 100, 500, 1_000), (50, 350, 2_000, 5_000)
@@ -96,10 +95,8 @@ def budgets(world: str, options: Options, minutes: int) -> list[Piece]:
         settings, serves = options if kind in ("relative", "intent") else compared, f"labels of {kind}"
         pieces.append(Piece(world, "frame", kind, (kind,), FIRST, 8, settings, minutes, serves))
         pieces.append(Piece(world, "frame", f"{kind}-more", (kind,), MORE, 8, options, minutes + 14, serves))
-    perfect, serves = f"{perfect_guide.__name__}:{world.upper()}", "how far guidance goes at all"
-    pieces.append(
-        Piece(world, "frame", "perfect", (perfect,), (), 8, {**options, **GUIDED}, minutes // 2, serves),
-    )
+    perfect, until, serves = f"_perfect_guide:{world.upper()}", {**options, **GUIDED}, "how far guidance goes at all"
+    pieces.append(Piece(world, "frame", "perfect", (perfect,), (), 8, until, minutes // 2, serves))
     return pieces
 
 

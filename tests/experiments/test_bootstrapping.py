@@ -37,7 +37,7 @@ BUDGETS = [25, 50, 100, 350, 500, 1_000, 2_000, 5_000]
 def modules():
     """Those of the experiments, as Python finds them when it runs one of the files."""
     sys.path.insert(0, str(FOLDER))
-    names = ("_pieces", "billiards_bootstrapping", "navigation_bootstrapping", "bootstrapping_page", "perfect_guide")
+    names = ("_pieces", "billiards_bootstrapping", "navigation_bootstrapping", "bootstrapping_page")
     kinds = dict(registry._KINDS)  # without those that an experiment brings along
     yield {name: importlib.import_module(name) for name in names}
     sys.path.remove(str(FOLDER))
@@ -122,8 +122,7 @@ def test_every_piece_is_a_sweep_that_would_begin(experiment, scale, modules, mon
 
 @pytest.mark.parametrize("table", ["regulation", "easy"])
 def test_a_perfect_guide_does_what_the_tables_teacher_holds_for_best(modules, table):
-    perfect = modules["perfect_guide"]
-    kind, env = getattr(perfect, table.upper()), make_environment(BilliardsConfig(table))
+    kind, env = registry.find(f"_perfect_guide:{table.upper()}"), make_environment(BilliardsConfig(table))
     guidance = registry.make(kind.name, GuideSizes(), env)
     _, obs = jax.vmap(env.reset)(jax.random.split(jax.random.key(3), 12))
     base = DIRECTIONS.uniform(jax.random.key(4), (12,))

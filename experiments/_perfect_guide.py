@@ -1,14 +1,14 @@
-"""A guide that needs no labels, as good as the billiards tables' shipped teachers: how far can guidance go at all?
+"""A guide that needs no labels: the billiards tables' shipped teachers strike for it. How far can guidance go at all?
 
     python experiments/billiards_bootstrapping.py --pieces regulation/frame/perfect
 
-The kinds are named as `perfect_guide:REGULATION` and `perfect_guide:EASY` wherever a kind of guidance is asked for, in
-the folder that holds this file or by a script in it; reports of a script that imports this file know their names. What
-such a guide earns by itself is measured beside the agents.
+The kinds are named as `_perfect_guide:REGULATION` and `_perfect_guide:EASY` wherever a kind of guidance is asked for,
+in the folder that holds this file or by a script in it. What such a guide earns by itself is measured beside the agents.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import lru_cache, partial
 from typing import Any, Literal
 
@@ -19,14 +19,13 @@ from jaxtyping import Array, Bool, Float
 from cuelearner_envs.billiards.config import BilliardsConfig, make_environment
 from cuelearner_jax.actions import DIRECTIONS
 from cuelearner_jax.agent.choice import greedy_actions
-from cuelearner_jax.config import GuideScalars, GuideSizes, Sizes
+from cuelearner_jax.config import GuideScalars, GuideSizes
 from cuelearner_jax.environment import Spaces
-from cuelearner_jax.guidance import registry
 from cuelearner_jax.guidance.bundle import Guidance
 from cuelearner_jax.guidance.kind import Kind
 from cuelearner_jax.guidance.refining import Refined
 from cuelearner_jax.guidance.unlabelled import unlabelled
-from cuelearner_jax.tasks.billiards import SHIPPED_TEACHERS
+from cuelearner_jax.tasks.billiards import SEEN_FROM_THE_STRIKE, SHIPPED_TEACHERS
 from cuelearner_jax.teachers import stored
 from cuelearner_jax.teachers.learned import LearnedTeacher
 from cuelearner_jax.types import GuidanceModel
@@ -53,14 +52,7 @@ def act(
 ) -> Refined:
     """The teacher's best action in active rows; searched near the peaks, as agents search theirs: it is asked often."""
     told = teacher(table)
-    sizes = Sizes(
-        frame="action",
-        q_layers=told.layers,
-        directions=told.directions,
-        coarse_directions=360,
-        coarse_dtype="bfloat16",
-        peaks=4,
-    )
+    sizes = replace(SEEN_FROM_THE_STRIKE, q_layers=told.layers, directions=told.directions)
     best = greedy_actions(sizes, DIRECTIONS, env, told.params, obs)
     return Refined(jnp.where(active[:, None], best, actions), active.astype(jnp.int32))
 
@@ -74,4 +66,4 @@ def _kind(table: Table) -> Kind:
     return Kind(f"perfect-{table}", "the teacher's best shot", partial(make, table), title="perfect", colour="#6A3D9A")
 
 
-REGULATION, EASY = registry.register(_kind("regulation")), registry.register(_kind("easy"))
+REGULATION, EASY = _kind("regulation"), _kind("easy")
