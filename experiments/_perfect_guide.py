@@ -3,7 +3,7 @@
     python experiments/billiards_bootstrapping.py --pieces regulation/frame/perfect
 
 The kinds are named as `_perfect_guide:REGULATION` and `_perfect_guide:EASY` wherever a kind of guidance is asked for,
-in the folder that holds this file or by a script in it. What such a guide earns by itself is measured beside the agents.
+in the folder that holds this file or by a script in it. What such a guide earns alone is measured beside the agents.
 """
 
 from __future__ import annotations
