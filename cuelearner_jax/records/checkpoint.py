@@ -17,6 +17,7 @@ import re
 import shutil
 import sys
 import time
+import warnings
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -133,7 +134,9 @@ def _quiet() -> Iterator[None]:
     silenced = log.disabled
     log.disabled, sys.unraisablehook, sys.excepthook = True, lambda _: None, lambda *_: None
     try:
-        yield
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "coroutine .* was never awaited", RuntimeWarning)
+            yield
     finally:
         log.disabled, sys.unraisablehook, sys.excepthook = silenced, unraisable, uncaught
 

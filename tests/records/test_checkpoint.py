@@ -1,5 +1,6 @@
 """Checkpoints: what was saved comes back bit by bit, and what cannot be read is said in one line."""
 
+import errno
 import gc
 import hashlib
 import shutil
@@ -229,6 +230,23 @@ def test_what_a_refused_checkpoint_leaves_behind_is_silent(tmp_path, caplog, mon
     gc.collect()
     assert complaints == []
     assert caplog.records == []
+
+
+def test_what_a_refused_write_leaves_behind_is_silent(tmp_path, monkeypatch, recwarn):
+    async def fragment():
+        pass
+
+    def full(*_, **__):
+        left = [fragment()]
+        left.append(left)  # as TensorStore's are: found by the garbage collector alone
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with checkpoints(tmp_path) as saved:
+        monkeypatch.setattr(saved._manager, "save", full)
+        with pytest.raises(OSError, match="MB are needed"):
+            saved.save(5, {"policy": state()})
+    gc.collect()
+    assert list(recwarn) == []
 
 
 def test_an_item_that_was_never_saved_is_refused(tmp_path):
