@@ -47,6 +47,7 @@ class Scale(NamedTuple):
     labels: Mapping[int, int] | None = None  # budgets that are kept, and what they become
     options: Mapping[str, object] = {}
     instead: Mapping[str, object] = {}  # of options that a piece has
+    reported: bool = False  # is its report asked the questions of the experiment's page?
 
 
 class Experiment(NamedTuple):
@@ -55,7 +56,7 @@ class Experiment(NamedTuple):
     task: str
     pieces: tuple[Piece, ...]
     scales: Mapping[str, Scale]
-    report: Mapping[str, Sequence[str]]  # options of `cuelearner report` at the scale `paper`, by world
+    report: Mapping[str, Sequence[str]]  # options of `cuelearner report` at scales that are reported, by world
     metric: Sequence[str] = ()  # options of it at every scale
 
 
@@ -102,7 +103,7 @@ def report_command(experiment: Experiment, world: str, out: Path, scale: str) ->
     begun = [str(out / world / run) for run in runs if list((out / world / run).glob("*/config.json"))]
     if not begun:
         return None
-    asked = experiment.report.get(world, ()) if scale == "paper" else ()
+    asked = experiment.report.get(world, ()) if experiment.scales[scale].reported else ()
     unguided = any((out / p.path / "config.json").exists() for p in own if p.kinds == ("none",))
     efficiency = ["--efficiency", *asked] if unguided else []
     words = ["report", *begun, "--by-run", *experiment.metric, *efficiency]

@@ -241,7 +241,7 @@ SCALES = {
         },
         instead={"schedule.ask-at": (0, 20_000, 40_000)},
     ),
-    "paper": Scale("what is reported"),
+    "paper": Scale("what is reported", reported=True),
 }
 
 EXPERIMENT = Experiment(

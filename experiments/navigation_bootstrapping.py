@@ -6,8 +6,8 @@
 
 The sweeps are data below: every piece fits half an hour of one accelerator, has a folder of its own and is resumed.
 After the pieces, or alone with --report, there is a report (FOLDER/clutter/report). Several processes may share FOLDER,
-each with pieces of its own. At the scale `quick` a piece takes minutes, at `smoke` seconds on a CPU; both have folders
-of their own in FOLDER.
+each with pieces of its own. At the scale `quick` a piece takes minutes, at `cpu` ten minutes on one core, at `smoke`
+seconds on a CPU; all have folders of their own in FOLDER.
 """
 
 from __future__ import annotations
@@ -128,6 +128,31 @@ SCALES = {
         },
         instead={"schedule.ask-at": (0, 100)},
     ),
+    "cpu": Scale(
+        "ten minutes a piece on one core: the networks of the preset quickstart, 12,000 steps",
+        seeds=8,
+        labels={100: 100, 500: 500},
+        options={
+            "sizes.q-layers": (128, 128),
+            "sizes.feedback-layers": (128, 128),
+            "sizes.directions": 36,
+            "sizes.target-directions": 12,
+            "sizes.target-dtype": "float32",
+            "sizes.batch-size": 64,
+            "sizes.replay-capacity": 50_000,
+            "sizes.fit-steps": 400,
+            "sizes.fit-batch-size": 64,
+            "scalars.learning-rate": 0.003,
+            "schedule.total-steps": 12_000,
+            "schedule.guidance-until": 12_000,
+            "schedule.eval-every": 2_000,
+            "schedule.eval-envs": 30,
+            "schedule.eval-steps": 6_000,
+            "schedule.checkpoint-every": 12_000,
+        },
+        instead={"schedule.ask-at": (0, 4_000, 8_000)},
+        reported=True,
+    ),
     "quick": Scale(
         "minutes a piece on an accelerator, to see where it goes",
         seeds=4,
@@ -140,7 +165,7 @@ SCALES = {
         },
         instead={"schedule.ask-at": (0, 5_000, 10_000)},
     ),
-    "paper": Scale("what is reported"),
+    "paper": Scale("what is reported", reported=True),
 }
 
 EXPERIMENT = Experiment(
