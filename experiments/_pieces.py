@@ -91,6 +91,11 @@ def sweep_command(task: str, piece: Piece, out: Path, resume: bool) -> list[str]
     return [*words, "--out", str(folder), *(["--resume"] if resume and (folder / "config.json").exists() else [])]
 
 
+def folder_at(out: Path, scale: str) -> Path:
+    """Where the worlds of a scale are: those of `paper` in the folder itself, others below it."""
+    return out if scale == "paper" else out / scale
+
+
 def report_command(experiment: Experiment, world: str, out: Path, scale: str) -> list[str] | None:
     """The command line of the report of all runs of a world that have been begun, or None where none has.
 
@@ -130,7 +135,8 @@ def listed(pieces: Sequence[Any]) -> str:
     width = max(len(piece.path) for piece in pieces)
     rows = [f"{piece.path:<{width}} {piece.lanes:4} lanes  {piece.minutes:3} min  {piece.serves}" for piece in pieces]
     hours = sum(piece.minutes for piece in pieces) / 60
-    return "\n".join([*rows, f"{len(pieces)} pieces, {hours:.1f} hours of one accelerator (estimates, not measured)"])
+    total = f"{len(pieces)} pieces, {hours:.1f} hours of one accelerator at the scale paper (estimates, not measured)"
+    return "\n".join([*rows, total])
 
 
 def run(experiment: Experiment, about: str, arguments: Sequence[str] | None = None) -> int:
@@ -153,7 +159,7 @@ def run(experiment: Experiment, about: str, arguments: Sequence[str] | None = No
     if asked.list:
         print(listed(pieces))
         return 0
-    out = asked.out if asked.scale == "paper" else asked.out / asked.scale
+    out = folder_at(asked.out, asked.scale)
     commands = []
     if not asked.report:
         at_scale = [scaled(piece, experiment.scales[asked.scale]) for piece in pieces]

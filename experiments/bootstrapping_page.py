@@ -4,7 +4,8 @@
 
 For every table or hall of which there are runs in the data (WORLD/RUN/PIECE, as the two experiments of that name leave
 them) the command `cuelearner report --efficiency` writes WORLD/report, and its section on label efficiency goes between
-the lines `<!-- WORLD -->` and `<!-- end of WORLD -->` of the page, in place of what was there.
+the lines `<!-- WORLD -->` and `<!-- end of WORLD -->` of the page, in place of what was there. Runs at the scale `cpu`
+(cpu/WORLD/RUN/PIECE) have places of their own, `<!-- WORLD-cpu -->`.
 """
 
 from __future__ import annotations
@@ -12,17 +13,48 @@ from __future__ import annotations
 import argparse
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import NamedTuple
 
 import billiards_bootstrapping
 import navigation_bootstrapping
-from _pieces import report_command
+from _pieces import Experiment, folder_at, report_command
 
 from cuelearner_jax.cli import main as cuelearner
 
 EXPERIMENTS = (billiards_bootstrapping.EXPERIMENT, navigation_bootstrapping.EXPERIMENT)
 FIRST, LAST = "## Label efficiency\n", "## Where the numbers come from"
+
+
+class Place(NamedTuple):
+    """One world at one scale: what its section of the page comes from."""
+
+    experiment: Experiment
+    world: str
+    scale: str
+
+    @property
+    def mark(self) -> str:
+        """The name between the marks of the page."""
+        return self.world if self.scale == "paper" else f"{self.world}-{self.scale}"
+
+    def command(self, data: Path) -> list[str] | None:
+        """That writes its report, or None where there are no runs of it, or no unguided ones to compare with."""
+        command = report_command(self.experiment, self.world, folder_at(data, self.scale), self.scale)
+        return command if command and "--efficiency" in command else None
+
+    def report(self, data: Path) -> Path:
+        """The folder of its report."""
+        return folder_at(data, self.scale) / self.world / "report"
+
+
+def places() -> Iterator[Place]:
+    """Every world at every scale that is reported, in the order of the experiments."""
+    for experiment in EXPERIMENTS:
+        for scale in (name for name, scale in experiment.scales.items() if scale.reported):
+            for world in dict.fromkeys(piece.world for piece in experiment.pieces):
+                yield Place(experiment, world, scale)
 
 
 def section(report: str, folder: str) -> str:
@@ -59,17 +91,16 @@ def main() -> int:
     parser.add_argument("--page", type=Path, default=Path("docs/results/bootstrapping.md"))
     asked = parser.parse_args()
     sections = {}
-    for experiment in EXPERIMENTS:
-        for world in dict.fromkeys(piece.world for piece in experiment.pieces):
-            command = report_command(experiment, world, asked.data, "paper")
-            if command is None or "--efficiency" not in command:
-                print(f"{world}: no runs in {asked.data}, or no unguided ones")
-                continue
-            if status := cuelearner(command):
-                return status
-            folder = asked.data / world / "report"
-            seen = Path(os.path.relpath(folder, asked.page.parent)).as_posix()
-            sections[world] = section((folder / "report.md").read_text(encoding="utf-8"), seen)
+    for place in places():
+        command = place.command(asked.data)
+        if command is None:
+            print(f"{place.mark}: no runs in {asked.data}, or no unguided ones")
+            continue
+        if status := cuelearner(command):
+            return status
+        folder = place.report(asked.data)
+        seen = Path(os.path.relpath(folder, asked.page.parent)).as_posix()
+        sections[place.mark] = section((folder / "report.md").read_text(encoding="utf-8"), seen)
     asked.page.write_text(rendered(asked.page.read_text(encoding="utf-8"), sections), encoding="utf-8")
     print(f"wrote {asked.page}: {', '.join(sections) or 'nothing new'}")
     return 0

@@ -94,9 +94,11 @@ def options_known(piece):
     return own <= known and all(map(known_kind, piece.kinds))
 
 
-@pytest.mark.parametrize("scale", ["smoke", "paper"])
+@pytest.mark.parametrize("scale", ["smoke", "cpu", "paper"])
 def test_every_piece_is_a_sweep_that_would_begin(experiment, scale, modules, monkeypatch, tmp_path):
     """The command line itself plans each: options exist, values are legal, counts divide each other."""
+    if scale not in experiment.scales:
+        pytest.skip(f"{experiment.task} has no scale {scale}")
     orders = []
     monkeypatch.setattr(sweep, "run", lambda order: orders.append(planned(order).order))
     pieces = modules["_pieces"]
@@ -172,8 +174,9 @@ def test_a_page_shows_sections_between_their_marks_and_nothing_else_changes(modu
     with pytest.raises(ValueError, match="no place for full"):
         page.rendered(text, {"full": shown})
     real = (FOLDER.parent / "docs" / "results" / "bootstrapping.md").read_text()
-    worlds = [p.world for name in ("billiards", "navigation") for p in modules[f"{name}_bootstrapping"].PIECES]
-    page.rendered(real, dict.fromkeys(worlds, "x"))  # every world has its place
+    marks = [place.mark for place in page.places()]
+    assert marks == ["regulation", "easy", "full", "clutter-cpu", "clutter"]
+    page.rendered(real, dict.fromkeys(marks, "x"))  # every world has its place
 
 
 def test_a_smoke_of_the_easy_table_runs_resumes_and_reports(modules, tmp_path, capsys):
@@ -195,26 +198,27 @@ def test_a_smoke_of_the_easy_table_runs_resumes_and_reports(modules, tmp_path, c
     assert data.main(asked) == 2  # begun already, and --resume was not given
 
 
-def said_of(world, modules):
+def said_of(mark, modules):
     """What the page says of a world, and what the recorded runs of it give, as far as it is computed from them."""
-    pieces, page = modules["_pieces"], modules["bootstrapping_page"]
+    page = modules["bootstrapping_page"]
     text = (FOLDER.parent / "docs" / "results" / "bootstrapping.md").read_text(encoding="utf-8")
-    shown = text.split(f"<!-- {world} -->\n")[1].split(f"<!-- end of {world} -->")[0].strip()
-    (experiment,) = (e for e in page.EXPERIMENTS if any(piece.world == world for piece in e.pieces))
+    shown = text.split(f"<!-- {mark} -->\n")[1].split(f"<!-- end of {mark} -->")[0].strip()
+    (place,) = (place for place in page.places() if place.mark == mark)
     data = FOLDER.parent / "docs" / "data" / "bootstrapping"
-    command = pieces.report_command(experiment, world, data, "paper") or []
-    if "--efficiency" not in command:
+    command = place.command(data)
+    if command is None:
         return shown, ""
     asked = parse(Report, command[1:], "report")
     groups = read_groups(asked.folders, None, asked.metric, asked.split, by_run=True)
     question = Question(**asked.question)
     lines = efficiency_lines(efficiency_of(variants_of(groups, asked.metric), question, asked.lower_is_better))
-    return shown, page.section("\n".join([*lines, page.LAST]), f"../data/bootstrapping/{world}/report")
+    seen = Path("../data/bootstrapping") / place.report(data).relative_to(data)
+    return shown, page.section("\n".join([*lines, page.LAST]), seen.as_posix())
 
 
-@pytest.mark.parametrize("world", ["regulation", "easy", "full", "clutter"])
-def test_the_page_says_what_the_recorded_runs_give_and_nothing_where_there_are_none(world, modules):
-    shown, given = said_of(world, modules)
+@pytest.mark.parametrize("mark", ["regulation", "easy", "full", "clutter", "clutter-cpu"])
+def test_the_page_says_what_the_recorded_runs_give_and_nothing_where_there_are_none(mark, modules):
+    shown, given = said_of(mark, modules)
     assert shown.split("\n\nMissing:")[0] == given
 
 
