@@ -99,7 +99,8 @@ def folder_at(out: Path, scale: str) -> Path:
 def report_command(experiment: Experiment, world: str, out: Path, scale: str) -> list[str] | None:
     """The command line of the report of all runs of a world that have been begun, or None where none has.
 
-    How far labels carry is said as soon as there are unguided agents to compare with.
+    How far labels carry is said as soon as there are unguided agents to compare with; how many labels of the reference
+    they are worth, as soon as that has been begun.
     """
     own = [piece for piece in experiment.pieces if piece.world == world]
     for kind in {kind for piece in own for kind in piece.kinds if ":" in kind}:
@@ -108,9 +109,11 @@ def report_command(experiment: Experiment, world: str, out: Path, scale: str) ->
     begun = [str(out / world / run) for run in runs if list((out / world / run).glob("*/config.json"))]
     if not begun:
         return None
-    asked = experiment.report.get(world, ()) if experiment.scales[scale].reported else ()
-    unguided = any((out / p.path / "config.json").exists() for p in own if p.kinds == ("none",))
-    efficiency = ["--efficiency", *asked] if unguided else []
+    kinds = {kind for piece in own if (out / piece.path / "config.json").exists() for kind in piece.kinds}
+    asked = list(experiment.report.get(world, ())) if experiment.scales[scale].reported else []
+    if "--reference" in asked and asked[(at := asked.index("--reference")) + 1] not in kinds:
+        del asked[at : at + 2]
+    efficiency = ["--efficiency", *asked] if "none" in kinds else []
     words = ["report", *begun, "--by-run", *experiment.metric, *efficiency]
     return [*words, "--out", str(out / world / "report"), "--overwrite"]
 

@@ -30,6 +30,7 @@ from cuelearner_jax.runs.order import planned
 from cuelearner_jax.tasks.billiards import make_teacher
 
 FOLDER = Path(__file__).parents[2] / "experiments"
+KINDS = {"heuristic": [], "none": ["--efficiency"], "relative": ["--efficiency", "--reference"]}  # what each adds
 BUDGETS = [25, 50, 100, 350, 500, 1_000, 2_000, 5_000]
 
 
@@ -159,6 +160,20 @@ def test_names_choose_pieces_and_folders_of_them(modules, capsys):
     assert "no piece 'regulation/fra': see --list" in capsys.readouterr().err
     assert data.main(["--list", "--pieces", "full"]) == 0
     assert "full/raw/relative" in capsys.readouterr().out
+
+
+def test_what_is_asked_of_a_report_is_what_its_runs_can_answer(experiment, modules, tmp_path):
+    world = experiment.pieces[0].world
+    asked = modules["_pieces"].report_command
+    assert asked(experiment, world, tmp_path, "paper") is None
+    begun = {kind: next(p for p in experiment.pieces if p.world == world and p.kinds == (kind,)) for kind in KINDS}
+    for kind, options in KINDS.items():
+        config = tmp_path / begun[kind].path / "config.json"
+        config.parent.mkdir(parents=True)
+        config.touch()
+        command = asked(experiment, world, tmp_path, "paper")
+        assert [name for name in ("--efficiency", "--reference") if name in command] == options
+    assert "--reference" not in asked(experiment, world, tmp_path, "smoke")
 
 
 def test_a_page_shows_sections_between_their_marks_and_nothing_else_changes(modules):
