@@ -6,8 +6,8 @@
 
 The sweeps are data below: every piece fits half an hour of one accelerator, has a folder of its own and is resumed.
 After the pieces, or alone with --report, there is a report (FOLDER/clutter/report). Several processes may share FOLDER,
-each with pieces of its own. At the scale `quick` a piece takes minutes, at `cpu` ten minutes on one core, at `smoke`
-seconds on a CPU; all have folders of their own in FOLDER.
+each with pieces of its own. At the scale `quick` a piece takes minutes, at `cpu` ten minutes on one core (45 for five
+models), at `smoke` seconds on a CPU; all have folders of their own in FOLDER.
 """
 
 from __future__ import annotations
@@ -129,7 +129,7 @@ SCALES = {
         instead={"schedule.ask-at": (0, 100)},
     ),
     "cpu": Scale(
-        "ten minutes a piece on one core: the networks of the preset quickstart, 12,000 steps",
+        "ten minutes a piece on one core, 45 for five models: the networks of the preset quickstart, 12,000 steps",
         seeds=8,
         labels={100: 100, 500: 500},
         options={
