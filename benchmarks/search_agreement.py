@@ -1,11 +1,12 @@
-"""Whether the quick argmax (a rough first look, then closely near its peaks) chooses what a full one would.
+"""How much the rough argmax (a first look at some directions, then closely near its peaks) loses against the full one.
 
-    python benchmarks/search_agreement.py runs/billiards-paper --out agreement.json
+    python benchmarks/search_agreement.py runs/regulation --out agreement.json    # the agents of a finished run
+    python benchmarks/search_agreement.py shipped --out agreement.json            # the shipped teacher's network
 
-For the agents of a run, on observations that they meet themselves, against all directions in full float32: how often
-the choice is the same or close, how much value it gives up as a share of the values' spread, and the reward a step of
-agents that choose one way or the other on the same validation episodes. "all, as computed by default" is the full
-search at the device's own float32, which on a GPU rounds the factors of its products to 10 bits.
+Against the full search in full float32: how often the choice is the same or close, how much value the rough choice
+gives up as a share of the values' spread, and the reward a step on the same validation episodes. The lost reward is
+paired by agent (of a single network by episode), with a 95% bootstrap interval of the mean. "all, as computed by
+default" is the full search at the device's own float32, which on a GPU rounds the factors of its products to 10 bits.
 """
 
 from __future__ import annotations
@@ -13,57 +14,110 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+import scipy.stats
+from flax import struct
 
+import cuelearner_jax as cl
 from cuelearner_jax import actions as geometry
 from cuelearner_jax.actions import DIRECTIONS
 from cuelearner_jax.agent.choice import greedy_actions, values
-from cuelearner_jax.config import Sizes
+from cuelearner_jax.config import AgentSizes
 from cuelearner_jax.evaluate import episodes, rollout
 from cuelearner_jax.guidance import registry as guidance
-from cuelearner_jax.policies import Agent
 from cuelearner_jax.records.provenance import provenance
 from cuelearner_jax.runs import grid as runs
 from cuelearner_jax.runs.grid import Grid
 from cuelearner_jax.runs.kept import restore_policies
 from cuelearner_jax.runs.lanes import LaneGroup
 from cuelearner_jax.tasks import registry
+from cuelearner_jax.tasks.billiards import SHIPPED_TEACHERS
+from cuelearner_jax.teachers import stored
 
 STATES = 256  # of an agent
+ENVS = 100  # that share an evaluation's steps
 NAMES = ("same", "neighbouring", "within_half_a_degree", "value_given_up", "reward")
+SHIPPED = "shipped"
+TABLE = "regulation"  # of the shipped network
 
 
-def met(env: Any, sizes: Sizes, params: Any) -> jax.Array:
+class Searching(struct.PyTreeNode):
+    """An agent that searches as its sizes say, roughly or fully; a finished `policies.Agent` always searches fully."""
+
+    params: Any
+    sizes: AgentSizes = struct.field(pytree_node=False)
+    env: Any
+
+    def act(self, key: jax.Array, states: Any, obs: jax.Array) -> jax.Array:
+        """The action with the largest value that the search finds."""
+        return greedy_actions(self.sizes, DIRECTIONS, self.env, self.params, obs)
+
+
+class Agents(NamedTuple):
+    """The agents of one source."""
+
+    env: Any  # of the validation episodes
+    sizes: AgentSizes
+    params: Any  # leading axis: agents
+    told: dict[str, Any]  # about them, for the record
+
+
+def shipped() -> Agents:
+    """The shipped teacher's network, which expects a reward of every direction, as one agent."""
+    world = cl.make("billiards", table=TABLE)
+    network = stored.load(SHIPPED_TEACHERS / TABLE, world.env, 0.0, 0.0)
+    params = jax.tree.map(lambda leaf: leaf[None], network.params)
+    sizes = AgentSizes(frame="action", q_layers=network.layers)
+    return Agents(world.environment("validation"), sizes, params, {"network": TABLE})
+
+
+def of_run(folder: Path) -> Agents:
+    """The agents of a run's first kind of guidance, as its newest checkpoint has them."""
+    task, config, grid = runs.load(folder, registry.find)
+    env = task.environment(config.task, "validation")
+    kind = guidance.make(grid.guidance[0], config.sizes, env)
+    group = LaneGroup(config, env, kind, Grid((kind.name,), grid.seeds, grid.labels))
+    policies, step = restore_policies(group, folder / kind.name)
+    return Agents(env, config.sizes, policies["params"], {"step": step, "seeds": list(grid.seeds)})
+
+
+def met(agent: Searching) -> jax.Array:
     """Observations (STATES, obs) that an agent meets after a few steps of its own play."""
+    env = agent.env
     state, obs = jax.vmap(env.reset)(jax.random.split(episodes("tuning"), STATES))
 
     def step(carry: tuple, key: jax.Array) -> tuple[tuple, None]:
         state, obs = carry
-        after, made = jax.vmap(env.step)(
-            jax.random.split(key, STATES), state, greedy_actions(sizes, DIRECTIONS, env, params, obs)
-        )
+        after, made = jax.vmap(env.step)(jax.random.split(key, STATES), state, agent.act(key, state, obs))
         return (after, made.obs), None
 
     return jax.lax.scan(step, (state, obs), jax.random.split(jax.random.key(1), 5))[0][1]
 
 
-def compare(env: Any, agents: Any, own: Sizes, way: Sizes, steps: int, precise: bool) -> dict[str, float]:
-    """Means over agents (leading axis of `agents`) of one way to search against the full one."""
-    options = geometry.evenly_spaced(way.directions)
+def compare(agents: Agents, way: AgentSizes, steps: int, precise: bool) -> dict[str, np.ndarray]:
+    """One way to search against the full one: NAMES, each (agents,), and "rewards" (agents, parts of the episodes)."""
+    env, options = agents.env, geometry.evenly_spaced(way.directions)
+    full = dataclasses.replace(way, coarse_directions=0)
     q = values(way, env)
 
     def one(params: Any) -> dict[str, jax.Array]:
-        obs = met(env, own, params)
+        obs = met(Searching(params, full, env))
         with jax.default_matmul_precision("highest"):
             found = jax.lax.map(lambda seen: q(params, seen, options)[:, 0], obs, batch_size=16)
         with jax.default_matmul_precision("highest" if precise else "default"):
-            chosen = greedy_actions(way, DIRECTIONS, env, params, obs)
-            reward = rollout(Agent(params, way), env, episodes(), 100, steps)["reward"]
+            agent = Searching(params, way, env)
+            chosen = agent.act(jax.random.key(0), None, obs)
+            keys = jax.random.split(episodes(), ENVS)
+            rewards = jax.lax.map(
+                lambda key: rollout(agent, env, key, 10, steps // ENVS)["reward"], keys, batch_size=10
+            )
         best, number = found.max(-1), found.argmax(-1)
         off = jnp.abs(geometry.difference(options[number], chosen))
         tenth = jnp.deg2rad(360.0 / way.directions)
@@ -74,43 +128,61 @@ def compare(env: Any, agents: Any, own: Sizes, way: Sizes, steps: int, precise: 
             "neighbouring": jnp.mean(off < 1.5 * tenth),
             "within_half_a_degree": jnp.mean(off < jnp.deg2rad(0.5) + 0.5 * tenth),
             "value_given_up": lost.mean(),
-            "reward": reward,
+            "reward": rewards.mean(),
+            "rewards": rewards,
         }
 
-    found = jax.jit(partial(jax.lax.map, one))(agents)
-    return {name: float(found[name].mean()) for name in NAMES}
+    return jax.device_get(jax.jit(partial(jax.lax.map, one))(agents.params))
+
+
+def ways(
+    sizes: AgentSizes, coarse: list[int], peaks: list[int], dtypes: list[Any]
+) -> Iterator[tuple[str, AgentSizes, bool]]:
+    """(what the search is called, sizes, in full float32?), the full search first."""
+    full = dataclasses.replace(sizes, coarse_directions=0)
+    yield "all, in full float32", full, True
+    yield "all, as computed by default", full, False
+    for first in coarse:
+        for dtype in dtypes:
+            for count in peaks:
+                way = dataclasses.replace(full, coarse_directions=first, coarse_dtype=dtype, peaks=count)
+                yield f"{first} in {dtype}, {count} peaks", way, False
+
+
+def lost(best: np.ndarray, rewards: np.ndarray) -> list[float]:
+    """Reward lost against the full search: [mean, lower, upper], paired by agent, of one agent by parts of episodes."""
+    pairs = (best - rewards).mean(-1) if len(best) > 1 else (best - rewards)[0]
+    if not pairs.any():
+        return [0.0, 0.0, 0.0]
+    bounds = scipy.stats.bootstrap((pairs,), np.mean, rng=np.random.default_rng(0)).confidence_interval
+    return [float(pairs.mean()), float(bounds.low), float(bounds.high)]
 
 
 def main() -> None:
     """Compares and prints a table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("run", type=Path, help="a finished run's folder with its checkpoint")
-    parser.add_argument("--coarse", type=int, nargs="+", default=[180, 360, 720])
-    parser.add_argument("--peaks", type=int, default=4)
-    parser.add_argument("--steps", type=int, default=10_000)
+    parser.add_argument("of", help=f"a finished run's folder with its checkpoint, or {SHIPPED}")
+    parser.add_argument("--coarse", type=int, nargs="+", default=[360, 720, 1200])
+    parser.add_argument("--peaks", type=int, nargs="+", default=[4, 8, 16])
+    parser.add_argument("--dtypes", nargs="+", default=["float32", "bfloat16"], choices=["float32", "bfloat16"])
+    parser.add_argument("--steps", type=int, default=10_000, help="environment steps of an agent, a multiple of 1000")
     parser.add_argument("--out", type=Path, help="write the figures to this JSON file")
     asked = parser.parse_args()
-    task, config, grid = runs.load(asked.run, registry.find)
-    env = task.environment(config.task, "validation")
-    kind = guidance.make(grid.guidance[0], config.sizes, env)
-    group = LaneGroup(config, env, kind, Grid((kind.name,), grid.seeds, grid.labels))
-    policies, step = restore_policies(group, asked.run / kind.name)
-    all_ = dataclasses.replace(config.sizes, coarse_directions=0)
-    ways = {"all, in full float32": (all_, True), "all, as computed by default": (all_, False)}
-    for coarse in asked.coarse:
-        for dtype in ("float32", "bfloat16"):
-            sizes = dataclasses.replace(all_, coarse_directions=coarse, coarse_dtype=dtype, peaks=asked.peaks)
-            ways[f"{coarse} in {dtype}, {asked.peaks} peaks"] = (sizes, False)
-    rows = [
-        {"search": name, **compare(env, policies["params"], config.sizes, way, asked.steps, precise)}
-        for name, (way, precise) in ways.items()
-    ]
-    print(f"{'search':32s}  " + "  ".join(f"{name:>20}" for name in NAMES))
-    for row in rows:
-        print(f"{row['search']:32s}  " + "  ".join(f"{row[name]:>20.5f}" for name in NAMES))
-    if asked.out:
-        told = {**provenance(), "step": step, "seeds": list(grid.seeds), "rows": rows}
-        asked.out.write_text(json.dumps(told, indent=1) + "\n")
+    agents = shipped() if asked.of == SHIPPED else of_run(Path(asked.of))
+    rows, best = [], None
+    print(f"{'search':28s}  " + "  ".join(f"{name:>20}" for name in NAMES) + "  reward lost [95%]")
+    for name, way, precise in ways(agents.sizes, asked.coarse, asked.peaks, asked.dtypes):
+        found = compare(agents, way, asked.steps, precise)
+        best = found["rewards"] if best is None else best
+        row = {"search": name, **{part: float(found[part].mean()) for part in NAMES}}
+        row |= {"reward_by_agent": found["reward"].tolist(), "reward_lost": lost(best, found["rewards"])}
+        rows.append(row)
+        mean, low, high = row["reward_lost"]
+        told = "  ".join(f"{row[part]:>20.5f}" for part in NAMES)
+        print(f"{name:28s}  {told}  {mean:.4f} [{low:.4f}, {high:.4f}]", flush=True)
+        if asked.out:
+            record = {**provenance(), **agents.told, "steps": asked.steps, "rows": rows}
+            asked.out.write_text(json.dumps(record, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -11,6 +11,7 @@ import probes
 import pytest
 
 from cuelearner_jax import actions
+from cuelearner_jax.agent import choice
 from cuelearner_jax.agent.networks import applied, q_network, residual_network
 from cuelearner_jax.devices import lane_mesh
 from cuelearner_jax.errors import UserError
@@ -53,6 +54,12 @@ def test_the_agent_takes_the_direction_of_the_largest_value():
     np.testing.assert_array_equal(act(AGENT), expected)
     assert len(np.unique(expected, axis=0)) > 2
     np.testing.assert_array_equal(act(AGENT, jax.random.key(6)), expected)  # whatever the key
+
+
+def test_an_agent_that_learned_with_a_rough_first_look_acts_by_all_of_the_set(monkeypatch):
+    rough = dataclasses.replace(probes.SIZES, coarse_directions=4, peaks=1)
+    monkeypatch.setattr(choice, "_near_peaks", lambda *_: pytest.fail("a finished agent looked roughly"))
+    np.testing.assert_array_equal(act(AGENT.replace(sizes=rough)), act(AGENT))
 
 
 def test_uniform_actions_are_drawn_anew_with_each_key():

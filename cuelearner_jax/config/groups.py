@@ -38,8 +38,8 @@ class AgentSizes(_Seeing):
     directions: int = 3600
     """Directions over which the agent takes its argmax (3600: every 0.1 deg)."""
     coarse_directions: int = 0
-    """Directions of a first look, evenly spaced; the argmax over the set is then taken near its peaks (0: over all
-    of the set)."""
+    """Directions of a first look while learning, evenly spaced; the argmax over the set is then taken near its peaks
+    (0: over all of the set, as every finished policy takes it)."""
     coarse_dtype: Literal["float32", "bfloat16"] = "float32"
     """Arithmetic of the first look (bfloat16 is twice as fast on an accelerator); the choice is made in float32."""
     peaks: int = 8

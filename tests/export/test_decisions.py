@@ -51,7 +51,7 @@ def turned(params, obs, actions):
 
 
 POLICIES = {
-    "agent near peaks": lambda: agent(coarse_directions=18, coarse_dtype="bfloat16", peaks=3),
+    "agent": lambda: agent(),
     "heuristic": lambda: Heuristic(ENV),
     "refined within a bound": lambda: guided("relative", bound_deg=7.0, base=agent(frame="action"), frame="action"),
     "an ensemble": lambda: guided("demonstration", ensemble=3),
