@@ -18,11 +18,13 @@ from cuelearner_jax.config import Scalars
 from cuelearner_jax.errors import UserError, closest
 from cuelearner_jax.labelling import comparing
 from cuelearner_jax.records import label_files
-from cuelearner_jax.records.label_files import UNDONE, UNSURE, LabelFile
+from cuelearner_jax.records.label_checks import UNDONE, UNSURE
+from cuelearner_jax.records.label_files import LabelFile
 from cuelearner_jax.records.whole import replacing
+from cuelearner_jax.report.escaping import cell
 from cuelearner_jax.task import Task, shape_of
 from cuelearner_jax.tasks import registry
-from cuelearner_jax.terminal import console
+from cuelearner_jax.terminal import console, one_line
 
 Files = Annotated[tuple[Path, ...], tyro.conf.Positional]
 
@@ -81,11 +83,11 @@ def run(arguments: list[str]) -> None:
 
 
 def _inspect(asked: Inspect) -> None:
-    files = [label_files.read(path) for path in asked.files]
-    table = Table("", *(str(path) for path in asked.files))
+    files = [comparing.checked(path) for path in asked.files]
+    table = Table("", *(one_line(str(path)) for path in asked.files))
     told = [_told(path, file, asked.teacher) for path, file in zip(asked.files, files, strict=True)]
     for name in dict.fromkeys(name for one in told for name in one):
-        table.add_row(name, *(one.get(name, "") for one in told))
+        table.add_row(name, *(one_line(one.get(name, "")) for one in told))
     if len(files) == 2:
         table.add_row("agree with each other", str(comparing.between(files[0], files[1], _shape(files[0]))))
     out.print(table)
@@ -154,20 +156,14 @@ def _with_teacher(path: Path, file: LabelFile) -> comparing.Agreement:
 # --- merge and export ------------------------------------------------------------------------------------------------
 
 
-def _free(place: Path) -> Path:
-    if place.exists():
-        raise UserError(f"{place} exists: give another --out")
-    place.parent.mkdir(parents=True, exist_ok=True)
-    return place
-
-
 def _merge(asked: Merge) -> None:
     if asked.out is None or asked.out.suffix != ".parquet":
         raise UserError("give --out a name that ends in .parquet")
-    file = comparing.merged([label_files.read(path) for path in asked.files])
+    file, left_out = comparing.merged([comparing.checked(path) for path in asked.files])
     sources = [f"{path.name} {label_files.digest(path)}" for path in asked.files]
-    label_files.write_file(_free(asked.out), file, merged_from=sources)
-    out.print(f"wrote {len(file.seeds)} labels of {len(asked.files)} files to {asked.out}")
+    label_files.write_file(asked.out, file, merged_from=sources)
+    twice = f"; {left_out} that an earlier file holds already were left out" if left_out else ""
+    out.print(f"wrote {len(file.seeds)} labels of {len(asked.files)} files to {asked.out}{twice}")
 
 
 def _export(asked: Export) -> None:
@@ -176,15 +172,15 @@ def _export(asked: Export) -> None:
     place = asked.out
     if place is None or place.suffix not in (".csv", ".parquet"):
         raise UserError("give --out a name that ends in .csv or .parquet")
-    file = label_files.read(asked.files[0])
+    file = comparing.checked(asked.files[0])
     if place.suffix == ".parquet":
-        label_files.write_file(_free(place), file)
+        label_files.write_file(place, file)
     else:
         rows = _flat(file)
-        with replacing(_free(place)) as target:
+        with replacing(place, fresh=True) as target:
             writer = csv.writer(target)
-            writer.writerow(rows)
-            writer.writerows(zip(*rows.values(), strict=True))
+            writer.writerow(map(cell, rows))
+            writer.writerows(map(cell, row) for row in zip(*rows.values(), strict=True))
     out.print(f"wrote {len(file.seeds)} labels to {place}")
 
 

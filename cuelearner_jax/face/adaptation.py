@@ -188,6 +188,7 @@ def _of_file(file: label_files.LabelFile, bundle: Guidance) -> Label:
     assert bundle.form is not None  # it asks
     if file.answers != bundle.form.name:
         raise UserError(f"the file holds {file.answers} answers: {bundle.name} guidance needs {bundle.form.name} ones")
+    given.check_file(file, None, bundle.form, "the file")
     own = file.seeds == file.seeds[0]
     return jax.tree.map(lambda leaf: np.asarray(leaf)[own], file.labels)
 

@@ -81,6 +81,7 @@ def fit_feedback(
         file = label_files.read(Path(labels))
         if file.answers != RELATIVE.name:
             raise UserError(f"{labels} holds {file.answers} answers: give a file of {RELATIVE.name} ones")
+        given.check_file(file, None, RELATIVE, str(labels))
         if eps_deg is not None and not math.isclose(eps_deg, file.eps_deg or 0.0, rel_tol=1e-6):
             raise UserError(f"{labels} holds answers of {file.eps_deg:g} degrees: leave out eps_deg")
         own = file.seeds == file.seeds[0]

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -13,6 +14,7 @@ from cuelearner_jax import config as configuration
 from cuelearner_jax.config import Scalars
 from cuelearner_jax.environment import Environment
 from cuelearner_jax.errors import UserError
+from cuelearner_jax.guidance import given
 from cuelearner_jax.guidance import registry as guidances
 from cuelearner_jax.guidance.bundle import AnswerForm
 from cuelearner_jax.labelling.living import keys_of, lived
@@ -26,6 +28,13 @@ def form_of(file: LabelFile) -> AnswerForm | None:
     """The form of a file's answers; None: of a kind of guidance that is not known here."""
     forms = {kind.form.name: kind.form for kind in guidances.known() if kind.form is not None}
     return forms.get(file.answers)
+
+
+def checked(path: Path) -> LabelFile:
+    """The labels of a file, as training would take them. Raises UserError if there are none, or one makes no sense."""
+    file = label_files.read(path)
+    given.check_file(file, None, form_of(file), str(path))
+    return file
 
 
 def world_of(task: Task, file: LabelFile) -> Any:
@@ -105,14 +114,22 @@ def _called(file: LabelFile) -> str:
 
 
 def _by_question(file: LabelFile) -> dict[bytes, np.ndarray]:
+    return dict(_questions(file))
+
+
+def _questions(file: LabelFile) -> Iterator[tuple[bytes, np.ndarray]]:
+    """What was asked, observation, action and strength, and what was said, label after label."""
     strengths = np.zeros(len(file.seeds)) if file.strengths is None else file.strengths
     columns = (file.labels.obs, file.labels.action, strengths.astype(np.float32), file.labels.answer)
-    rows = zip(*(np.asarray(column) for column in columns), strict=True)
-    return {b"".join(part.tobytes() for part in asked): answer for *asked, answer in rows}
+    for *asked, answer in zip(*(np.asarray(column) for column in columns), strict=True):
+        yield b"".join(part.tobytes() for part in asked), answer
 
 
-def merged(files: Iterable[LabelFile]) -> LabelFile:
-    """One set of labels of several files' sets, one after the other.
+def merged(files: Iterable[LabelFile]) -> tuple[LabelFile, int]:
+    """One set of labels of several files' sets, one after the other, and how many were left out as they were there.
+
+    A label is there already if one of an earlier file has its observation, action, answer and strength, and the person
+    and the time where both tell them.
 
     Raises UserError if they differ in task, world or form, or a file holds several sets.
     """
@@ -128,6 +145,8 @@ def merged(files: Iterable[LabelFile]) -> LabelFile:
                 )
     if len({(file.labels.obs.shape[1], file.labels.action.shape[1]) for file in files}) > 1:
         raise UserError("the files' observations differ in size: merge files of one world")
+    new = _new(files)
+    files = [_rows(file, kept) for file, kept in zip(files, new, strict=True)]
     differ = any(file.labels.eps_deg is not None for file in files)
     sets = [file.labels.replace(eps_deg=np.float32(file.strengths)) if differ else file.labels for file in files]
     labels = jax.tree.map(lambda *leaves: np.concatenate(leaves), *sets)
@@ -137,4 +156,30 @@ def merged(files: Iterable[LabelFile]) -> LabelFile:
         parts = [np.concatenate(columns) for columns in zip(*told, strict=True)]
         people = label_files.People(np.arange(len(parts[0])), *parts[1:])
     seeds = np.zeros(len(labels.valid), np.int64)
-    return LabelFile(first.task, first.answers, first.eps_deg, seeds, labels, people)
+    left_out = sum(int((~kept).sum()) for kept in new)
+    return LabelFile(first.task, first.answers, first.eps_deg, seeds, labels, people), left_out
+
+
+def _new(files: list[LabelFile]) -> list[np.ndarray]:
+    """Of each file, which of its labels no file before it has, (labels,)."""
+    there: dict[bytes, set[Any]] = {}
+    found = []
+    for file in files:
+        keys = [question + answer.tobytes() for question, answer in _questions(file)]
+        people = file.people
+        by = [None] * len(keys) if people is None else list(zip(people.who.tolist(), people.when.tolist(), strict=True))
+        kept = []
+        for key, who in zip(keys, by, strict=True):
+            before = there.get(key, set())
+            kept.append(not (before and (who is None or who in before or None in before)))
+        for key, who in zip(keys, by, strict=True):
+            there.setdefault(key, set()).add(who)
+        found.append(np.array(kept, bool))
+    return found
+
+
+def _rows(file: LabelFile, kept: np.ndarray) -> LabelFile:
+    """Some of a file's labels."""
+    people = None if file.people is None else label_files.People(*(column[kept] for column in file.people))
+    labels = jax.tree.map(lambda leaf: np.asarray(leaf)[kept], file.labels)
+    return file._replace(seeds=file.seeds[kept], labels=labels, people=people)

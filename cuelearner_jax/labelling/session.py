@@ -26,7 +26,7 @@ from cuelearner_jax.labelling.living import advance, keys_of, lived
 from cuelearner_jax.labelling.plan import Plan
 from cuelearner_jax.labelling.programs import programs
 from cuelearner_jax.records import label_files
-from cuelearner_jax.records.label_files import ANSWERED, UNDONE, UNSURE
+from cuelearner_jax.records.label_checks import ANSWERED, UNDONE, UNSURE
 from cuelearner_jax.records.provenance import provenance
 from cuelearner_jax.task import shape_of
 from cuelearner_jax.types import GuideState, Label, Reel, Sketch
@@ -47,7 +47,7 @@ class Item(NamedTuple):
 class Said(NamedTuple):
     """What was said of an item."""
 
-    said: str  # one of `label_files.SAID`
+    said: str  # one of `label_checks.SAID`
     obs: np.ndarray
     action: np.ndarray
     answer: np.ndarray | None

@@ -1,14 +1,15 @@
 """Format numbers of the files that outlive the program that wrote them, and the one way in which older ones are read.
 
-| kind      | file                   | values                                                                  |
-|-----------|------------------------|-------------------------------------------------------------------------|
-| `config`  | `config.json` of a run | its contents                                                            |
-| `labels`  | a label file           | what it says of itself, and its columns under `columns` as NumPy arrays |
-| `teacher` | `teacher.json`         | its contents                                                            |
-| `policy`  | `policy.json`          | its contents                                                            |
+| kind      | file                   | values                 |
+|-----------|------------------------|------------------------|
+| `config`  | `config.json` of a run | its contents           |
+| `labels`  | a label file           | what it says of itself |
+| `teacher` | `teacher.json`         | its contents           |
+| `policy`  | `policy.json`          | its contents           |
 
 A file tells its number under `format`; one without a number is of format 0. A change of what is written raises the
-number here and adds a step that leads there from the number before; readers know the current format only.
+number here and adds a step that leads there from the number before; readers know the current format only. A format
+without a step is refused.
 
 A JSON file carries a digest of its values, and is not read if they are others: a changed bit is no configuration.
 """
@@ -19,8 +20,6 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from cuelearner_jax import config as configuration
 from cuelearner_jax.errors import UserError
@@ -39,9 +38,10 @@ REMEDIES = {  # what a message says of a damaged file, after its path
 Values = dict[str, Any]
 
 
-def damaged(kind: str, path: Path) -> UserError:
-    """What is raised for a file that makes no sense."""
-    return UserError(f"{path} {REMEDIES[kind]}")
+def damaged(kind: str, path: Path, reason: object = "") -> UserError:
+    """What is raised for a file that makes no sense; `reason`: why, where that is known."""
+    why = (str(reason).splitlines() or [""])[0][:200]
+    return UserError(f"{path} {REMEDIES[kind]}{f' ({why})' if why else ''}")
 
 
 def read(kind: str, path: Path) -> Values:
@@ -91,6 +91,8 @@ def upgrade(kind: str, values: Any, path: Path) -> Values:
             f"(its format is {number}, this program knows up to {FORMATS[kind]})"
         )
     for before in range(number, FORMATS[kind]):
+        if (kind, before) not in STEPS:
+            raise UserError(f"{path} is of format {number}, which had no checksums and is not read: write it anew")
         try:
             values = {**STEPS[kind, before](values), "format": before + 1}
         except UserError as error:
@@ -126,29 +128,9 @@ def _never_written(values: Values) -> Values:
     raise ValueError("no program wrote this format")
 
 
-def _answers_of_targets(values: Values) -> Values:
-    """Labels held what the model of relative feedback was to predict, rotate(action, h * eps) - action; now h."""
-    kept = {name: value for name, value in values.items() if name not in ("guidance", "columns")}
-    columns = dict(values["columns"])
-    if values["guidance"] != "relative":
-        raise ValueError("labels of format 0 are relative ones")
-    action = np.asarray(columns["action"], np.float64)
-    turned = action + columns.pop("target")
-    angle = np.arctan2(
-        action[:, 0] * turned[:, 1] - action[:, 1] * turned[:, 0], (action * turned).sum(axis=-1)
-    )  # [rad], counterclockwise
-    h = np.round(angle / np.deg2rad(values["eps_deg"])) + 0.0  # no negative zero
-    if not (np.abs(h) <= 1).all():
-        raise ValueError("a label turns an action by more than eps")
-    columns["answer"] = h[:, None].astype(np.float32)
-    return {**kept, "answers": "relative", "columns": columns}
-
-
 STEPS: dict[tuple[str, int], Callable[[Values], Values]] = {
     ("config", 0): _only_numbered,
     ("config", 1): _pieces_with_seeds,
-    ("labels", 0): _answers_of_targets,
-    ("labels", 1): _only_numbered,  # since then a later row may take one back
     ("labels", 2): _only_numbered,  # since then labels may be of several strengths
     ("teacher", 0): _only_numbered,
     ("teacher", 1): _only_numbered,

@@ -35,6 +35,7 @@ import pyarrow as pa
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.records import formats
 from cuelearner_jax.records import table as tables
+from cuelearner_jax.records.label_checks import ANSWERED, PEOPLE, ROW, SAID, check_head, check_rows
 from cuelearner_jax.types import Label
 
 SCHEMA = tables.Schema(
@@ -43,13 +44,10 @@ SCHEMA = tables.Schema(
     required=("seed", "obs", "action"),
     strings=("said", "who", "when"),
     integers=("seed", "item"),
-    lists=("obs", "action", "answer", "target"),  # target: of files of format 0, in place of the answer
+    lists=ROW,
     remedy=formats.REMEDIES["labels"],
 )
 JSONL, PARQUET = SCHEMA.jsonl, SCHEMA.parquet
-ROW = ("obs", "action", "answer")  # columns of lists
-PEOPLE = ("item", "said", "seconds", "who", "when")  # columns of rows that a person gave
-ANSWERED, UNSURE, UNDONE = SAID = ("answer", "unsure", "undone")  # an answer, "don't know", taken back
 LISTED = 20  # seeds that a message names
 CONVENTIONS = {
     "obs": "the task's observation at the question",
@@ -59,7 +57,6 @@ CONVENTIONS = {
     "angles": "radians, counterclockwise positive",
 }
 TOLD = ("format", "task", "answers", "eps_deg", "session")  # what must be the same for labels to share a file
-CONTINUED = (2,)  # earlier formats whose files are gone on with: a page's rows were then what they are now
 
 
 class People(NamedTuple):
@@ -129,8 +126,6 @@ class LabelWriter(tables.TableWriter):
         self._eps = about["eps_deg"]
         if there is not None:
             table, before = _told(there)
-            if before is None and table.num_rows:
-                raise formats.damaged("labels", there)
             if before is not None:
                 _check_same(there, before, about)
             for name in set(ROW) & set(table.column_names):
@@ -222,7 +217,10 @@ def write(
 
 
 def write_file(path: Path, file: LabelFile, **told: Any) -> None:
-    """Writes labels as Parquet, in one step, with what a person's have beside them; `told`: see `LabelWriter`."""
+    """Writes labels as a new Parquet file, with what a person's have beside them; `told`: see `LabelWriter`.
+
+    Raises UserError if the file exists.
+    """
     columns = {"seed": pa.array(np.asarray(file.seeds, np.int64))}
     for name in ROW:
         columns[name] = pa.array(list(np.asarray(getattr(file.labels, name), np.float32)), SCHEMA.type(name))
@@ -233,11 +231,11 @@ def write_file(path: Path, file: LabelFile, **told: Any) -> None:
         columns["eps_deg"] = pa.array(file.strengths.astype(np.float64))
     about = _about(file.task, file.answers, file.eps_deg, "")
     session = {} if file.session is None else {"session": file.session}
-    tables.write(path, pa.table(columns), SCHEMA, about={**about, **session, **told})
+    tables.write(path, pa.table(columns), SCHEMA, about={**about, **session, **told}, fresh=True)
 
 
 def read(path: Path) -> LabelFile:
-    """The labels that stand in a Parquet or JSONL file, or a folder with one, of the current format or an older one.
+    """The labels that stand in a Parquet or JSONL file, or a folder with one.
 
     Raises:
         UserError: the file is missing, damaged, of a newer program, or holds no labels.
@@ -246,28 +244,22 @@ def read(path: Path) -> LabelFile:
     if found is None or not found.is_file():
         raise UserError(f"no label file at {path}: give the path of a labels.parquet that a run or a person wrote")
     path = found
-    table, told = _told(path)
-    try:
-        said = dict(Counter(table["said"].to_pylist())) if "said" in table.column_names else None
-        table = _standing(table)
-        if not table.num_rows and told is not None:
-            raise UserError(f"{path} holds no labels: collect some first")
-        columns = {name: _array(table[name], name) for name in table.column_names}
-        values = formats.upgrade("labels", {**(told or {}), "columns": columns}, path)
-        columns, eps = values["columns"], values["eps_deg"]
-        rows = {name: columns[name] for name in ROW}
-        own = _differing(columns.get("eps_deg"), eps)
-        if any(array.ndim != 2 for array in rows.values()) or not isinstance(values["answers"], str):
-            raise ValueError("every column holds one list a label, and the form of the answers is a name")
-        valid = np.ones(table.num_rows, bool)
-        labels = Label(**rows, valid=valid, eps_deg=own)  # pyright: ignore[reportArgumentType]
-        named = dict(values["task"]), values["answers"], None if eps is None else float(eps), columns["seed"], labels
-        people = None
-        if "item" in columns and not (columns["item"] < 0).any():
-            people = People(*(columns[name] for name in People._fields))
-        return LabelFile(*named, people, values.get("session"), said)
-    except (KeyError, TypeError, ValueError) as error:
-        raise formats.damaged("labels", path) from error
+    table, head = _told(path)
+    if head is None:
+        raise UserError(f"{path} holds no labels: collect some first")
+    said = dict(Counter(table["said"].to_pylist())) if "said" in table.column_names else None
+    table = _standing(table)
+    if not table.num_rows:
+        raise UserError(f"{path} holds no labels: collect some first")
+    columns, eps = {name: _array(table[name], name) for name in table.column_names}, head["eps_deg"]
+    own = _differing(columns.get("eps_deg"), eps)
+    rows = {name: columns[name] for name in ROW}
+    labels = Label(**rows, valid=np.ones(table.num_rows, bool), eps_deg=own)  # pyright: ignore[reportArgumentType]
+    named = dict(head["task"]), head["answers"], None if eps is None else float(eps), columns["seed"], labels
+    people = None
+    if "item" in columns and not (columns["item"] < 0).any():
+        people = People(*(columns[name] for name in People._fields))
+    return LabelFile(*named, people, head.get("session"), said)
 
 
 def _differing(told: np.ndarray | None, eps_deg: float | None) -> np.ndarray | None:
@@ -352,8 +344,6 @@ def _about(task: dict[str, Any], answers: str, eps_deg: float | None, meaning: s
 
 def _check_same(path: Path, before: dict[str, Any], now: dict[str, Any]) -> None:
     """Raises UserError, with the first difference in words, unless labels may share a file."""
-    if before.get("format") in CONTINUED:
-        before = {**before, "format": now["format"]}
     parts = [("", name, before.get(name), now.get(name)) for name in TOLD]
     for group in ("task", "session"):
         old, new = before.get(group) or {}, now.get(group) or {}
@@ -375,16 +365,23 @@ def _short(value: Any) -> str:
 
 
 def _told(path: Path) -> tuple[pa.Table, dict[str, Any] | None]:
-    """A file's table and what it says of itself, in whatever format; None: nothing."""
+    """A file's table and head in the current format, both checked; None: the file has just begun."""
     table = tables.read(path, SCHEMA)
     try:
-        return table, tables.about_of(table)
-    except ValueError as error:
-        raise formats.damaged("labels", path) from error
+        head = tables.about_of(table)
+        if head is None and table.num_rows:
+            raise ValueError("it does not say what it holds")
+        if head is not None:
+            head = formats.upgrade("labels", head, path)
+            check_head(head)
+            check_rows(table, head)
+        return table, head
+    except (ValueError, RecursionError) as error:
+        raise formats.damaged("labels", path, error) from error
 
 
 def _array(column: pa.ChunkedArray, name: str) -> np.ndarray:
-    """A column as an array; ValueError if its lists are of several lengths. An item that has no number is -1."""
+    """A column as an array. An item that has no number is -1."""
     if name in SCHEMA.strings:
         return np.array([value or "" for value in column.to_pylist()])
     if name in SCHEMA.integers:

@@ -6,11 +6,8 @@ Each line of the JSONL file is an object, of one of three kinds:
     {"constants": {...}}     columns that stay the same: they hold for all lines after it, until the next such line
     {"step": 10, ...}        a row
 
-A line is on the disk when the call that writes it returns. A kill can tear the last line only, which readers leave out
-and whoever continues the table drops. Whatever replaces a file does so in one step.
-
-A reader gives what was written or nothing: every line ends in a checksum of itself and of the lines before it, so that
-none can be changed or taken out of the middle; Parquet holds a digest of its contents. Files of before had neither.
+A line is on the disk when the call that writes it returns; `records.lines` says how lines are sealed. Whatever replaces
+a file does so in one step. Parquet holds a digest of its contents. A file without these is refused.
 """
 
 from __future__ import annotations
@@ -19,9 +16,7 @@ import hashlib
 import json
 import math
 import os
-import re
-import zlib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -31,15 +26,18 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from cuelearner_jax.errors import UserError
+from cuelearner_jax.records import lines
+from cuelearner_jax.records.footer import declared
+from cuelearner_jax.records.lines import Row
+from cuelearner_jax.records.room import check_room
 from cuelearner_jax.records.whole import replacing, unreadable
 
 META = b"cuelearner"  # the key under which Parquet holds what the table is
 DIGEST = b"cuelearner.sha256"  # and the one of the digest of its contents
-CHECKSUM = re.compile(rb', "crc": "([0-9a-f]{8})"}$')  # the end of a line
 TAIL = 1 << 16  # more than the longest row of most tables [bytes]
+VALUE = 64  # of memory, that a value takes while it is read: as Arrow's, as Python's, as NumPy's [bytes]
 
 PathLike = str | os.PathLike[str]
-Row = dict[str, Any]
 Writer = TypeVar("Writer", bound="TableWriter")
 
 
@@ -101,15 +99,14 @@ class TableWriter:
         self._schema, self._columns = schema, set(constants or ())
         self.path.parent.mkdir(parents=True, exist_ok=True)
         _reopen(self.path, schema)
-        there, last, self._checksum = None, None, 0
-        if self.path.exists():
-            there, last, self._checksum = _rewrite(self.path, schema, keep=lambda row: True)
+        rows = _rows(self.path, schema) if self.path.exists() else []
         header = None if constants is None else {name: _plain(value) for name, value in constants.items()}
-        self._file = self.path.open("a", encoding="utf-8")
-        if about is not None and there is None:
-            self._write([{"about": about}])
+        if about is not None and not any("about" in row for row in rows):
+            rows.append({"about": about})
+        last = next((row["constants"] for row in reversed(rows) if "constants" in row), None)
         if header is not None and header != last:
-            self._write([{"constants": header}])
+            rows.append({"constants": header})
+        self._lines = lines.Writer(self.path, rows)
 
     def append(self, **columns: Any) -> None:
         """Appends rows.
@@ -131,14 +128,14 @@ class TableWriter:
             raise ValueError(f"columns of one append must have one length, got {sorted(lengths)}")
         # tolist() turns NumPy and JAX values into plain Python ones, in one transfer for each column.
         values = {name: array.tolist() for name, array in arrays.items()}
-        self._write(
+        self._lines.append(
             {name: _plain(value if own[name] else value[row]) for name, value in values.items()}
             for row in range(lengths.pop() if lengths else 1)
         )
 
     def close(self) -> None:
         """Closes the file; the table stays JSONL until `finish`."""
-        self._file.close()
+        self._lines.close()
 
     def __enter__(self: Writer) -> Writer:
         return self
@@ -146,30 +143,14 @@ class TableWriter:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _write(self, lines: Iterable[Row]) -> None:
-        for line in lines:
-            text, self._checksum = _sealed(line, self._checksum)
-            self._file.write(text)
-        self._file.flush()
-        os.fsync(self._file.fileno())
-
 
 def last_row(path: PathLike, schema: Schema) -> Row | None:
     """The newest complete row of a table that is still being written, without looking at the others."""
     try:
-        with schema.growing(path).open("rb") as file:
-            file.seek(max(0, file.seek(0, os.SEEK_END) - TAIL))
-            lines = file.read().split(b"\n")[:-1]
+        found = lines.newest(schema.growing(path), TAIL)
     except FileNotFoundError:
         return None
-    try:
-        found = json.loads(lines[-1]) if lines else {}
-    except ValueError:  # whoever reads the whole table says so
-        return None
-    if not isinstance(found, dict) or schema.mark not in found:
-        return None
-    found.pop("crc", None)
-    return found
+    return found if found is not None and schema.mark in found else None
 
 
 def truncate(path: PathLike, schema: Schema, keep: Callable[[Row], bool]) -> None:
@@ -183,7 +164,8 @@ def truncate(path: PathLike, schema: Schema, keep: Callable[[Row], bool]) -> Non
     path = schema.growing(path)
     _reopen(path, schema)
     if path.exists():
-        _rewrite(path, schema, keep)
+        kept = [row for row in _rows(path, schema) if schema.mark not in row or keep(row)]
+        lines.Writer(path, kept).close()
 
 
 def finish(path: PathLike, schema: Schema) -> Path:
@@ -209,13 +191,21 @@ def finish(path: PathLike, schema: Schema) -> Path:
     return target
 
 
-def write(path: Path, table: pa.Table, schema: Schema, about: Row | None = None) -> None:
-    """Writes a whole table as Parquet, replacing `path` in one step; `about` is what the table is."""
+def write(path: Path, table: pa.Table, schema: Schema, about: Row | None = None, fresh: bool = False) -> None:
+    """Writes a whole table as Parquet, in one step.
+
+    Args:
+        path: the file.
+        table: its rows.
+        schema: what they are.
+        about: what the table is.
+        fresh: make folders as needed, and raise UserError rather than replace a file.
+    """
     told = about_of(table) if about is None else about
     table = _typed(table, schema)
     told = {} if told is None else {META: json.dumps(told).encode()}
     table = table.replace_schema_metadata({**told, DIGEST: digest(table, told.get(META, b"")).encode()})
-    with replacing(path, "wb") as file:
+    with replacing(path, "wb", fresh) as file:
         pq.write_table(table, file, compression="zstd", write_page_checksum=True)
 
 
@@ -251,7 +241,7 @@ def read(path: Path, schema: Schema) -> pa.Table:
         if error.errno is None:  # Arrow's own
             raise _damaged(path, schema, error) from error
         raise unreadable(path, error) from error
-    except (TypeError, ValueError, MemoryError, OverflowError, pa.ArrowException) as error:
+    except (KeyError, TypeError, ValueError, MemoryError, OverflowError, pa.ArrowException) as error:
         raise _damaged(path, schema, error) from error
     missing = [name for name in schema.required if name not in table.column_names]
     if missing and table.num_rows:
@@ -282,12 +272,26 @@ def _typed(table: pa.Table, schema: Schema) -> pa.Table:
 
 def _finished(path: Path, schema: Schema) -> pa.Table:
     """The table of a Parquet file. Raises ValueError if it is not what was written."""
-    table = _typed(pq.read_table(path, page_checksum_verification=True), schema)
+    held = declared(path)
+    what, remedy = f"{path} declares {held.rows:,} rows with {held.values:,} values", f"it {schema.remedy}"
+    check_room(what, VALUE * held.values + held.page_bytes, remedy)
+    # Equal strings stand once in the file and need not do so in memory.
+    table = pq.read_table(path, page_checksum_verification=True, read_dictionary=list(held.strings))
+    chunks = [chunk for name in held.strings for chunk in table[name].chunks]
+    check_room(what, VALUE * held.values + 2 * sum(map(_letters, chunks)), remedy)
+    table = _typed(table, schema)
     metadata = table.schema.metadata or {}
-    told = metadata.get(DIGEST)
-    if told is not None and told.decode() != digest(table, metadata.get(META, b"")):
+    if DIGEST not in metadata:
+        raise ValueError("it has no digest of its contents, so this program did not write it")
+    if metadata[DIGEST].decode() != digest(table, metadata.get(META, b"")):
         raise ValueError("its contents are not those that were written")
     return table.replace_schema_metadata({META: metadata[META]} if META in metadata else None)
+
+
+def _letters(texts: pa.DictionaryArray) -> int:
+    """Length of all strings of a column together, where equal ones stand once [bytes]."""
+    used = np.bincount(np.asarray(texts.indices.drop_null()), minlength=len(texts.dictionary))
+    return sum(int(count) * len(text or "") for count, text in zip(used, texts.dictionary.to_pylist(), strict=True))
 
 
 def _is_parquet(path: Path) -> bool:
@@ -306,57 +310,17 @@ def _plain(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _sealed(line: Row, before: int) -> tuple[str, int]:
-    """A line as it is written, its checksum at its end, and that checksum; `before`: that of the line before."""
-    text = json.dumps(line, allow_nan=False)
-    checksum = zlib.crc32(text.encode(), before)
-    return f'{text[:-1]}, "crc": "{checksum:08x}"}}\n', checksum
-
-
-def _lines(path: Path, schema: Schema) -> Iterator[Row]:
-    """The lines of a JSONL file, parsed, without a torn last one. Raises UserError for one that is damaged."""
+def _rows(path: Path, schema: Schema) -> list[Row]:
+    """The lines of a JSONL file, parsed. Raises UserError for one that is damaged."""
     try:
-        lines = path.read_bytes().split(b"\n")
-    except OSError as error:
-        raise unreadable(path, error) from error
-    sealed, checksum = any(map(CHECKSUM.search, lines)), 0  # lines of before have no checksums
-    for number, line in enumerate(lines, start=1):
-        try:
-            text, checksum = _opened(line, checksum) if sealed else (line, 0)
-            parsed = json.loads(text)
-            if not isinstance(parsed, dict) or not parsed.keys() & {"about", "constants", schema.mark}:
-                raise ValueError(f"it is not a row of {schema.stem}")
-        except (ValueError, RecursionError) as error:
-            if number == len(lines):  # what has no end was torn by a crash
-                return
-            raise _damaged(path, schema, f"line {number}: {error}") from error
-        yield parsed
-
-
-def _opened(line: bytes, before: int) -> tuple[bytes, int]:
-    """A line without its checksum, and that; the inverse of `_sealed`. Raises ValueError if it was changed."""
-    found = CHECKSUM.search(line)
-    text = line[: found.start()] + b"}" if found else b""
-    checksum = zlib.crc32(text, before)
-    if not found or int(found[1], 16) != checksum:
-        raise ValueError("it, or a line before it, is not what was written")
-    return text, checksum
-
-
-def _rewrite(path: Path, schema: Schema, keep: Callable[[Row], bool]) -> tuple[Row | None, Row | None, int]:
-    """Rewrites a JSONL file with the rows to keep.
-
-    Returns:
-        What it is, the constants that hold at its end, and the checksum of its last line.
-    """
-    told, constants, checksum = None, None, 0
-    with replacing(path) as file:
-        for line in _lines(path, schema):
-            told, constants = line.get("about", told), line.get("constants", constants)
-            if "about" in line or "constants" in line or keep(line):
-                text, checksum = _sealed(line, checksum)
-                file.write(text)
-    return told, constants, checksum
+        rows = lines.read(path).rows
+    except lines.Damaged as error:
+        raise _damaged(path, schema, error) from error
+    for number, row in enumerate(rows, start=1):
+        kinds = row.keys() & {"about", "constants", schema.mark}
+        if not kinds or not all(isinstance(row[name], dict) for name in kinds - {schema.mark}):
+            raise _damaged(path, schema, f"line {number}: it is not a row of {schema.stem}")
+    return rows
 
 
 def _reopen(path: Path, schema: Schema) -> None:
@@ -367,13 +331,9 @@ def _reopen(path: Path, schema: Schema) -> None:
     if not path.exists():
         table = read(whole, schema)
         told = about_of(table)
-        lines = [] if told is None else [{"about": told}]
-        lines += [{name: value for name, value in row.items() if value is not None} for row in table.to_pylist()]
-        checksum = 0
-        with replacing(path) as file:
-            for line in lines:
-                text, checksum = _sealed(line, checksum)
-                file.write(text)
+        rows = [] if told is None else [{"about": told}]
+        rows += [{name: value for name, value in row.items() if value is not None} for row in table.to_pylist()]
+        lines.Writer(path, rows).close()
     whole.unlink()
 
 
@@ -382,8 +342,9 @@ def _grown(path: Path, schema: Schema) -> pa.Table:
     told: Row | None = None
     constants: Row = {}
     columns: dict[str, list[Any]] = {}
-    count = 0
-    for line in _lines(path, schema):
+    count, rows = 0, _rows(path, schema)
+    check_room(f"{path} holds {len(rows):,} lines", _extent(rows), f"it {schema.remedy}")
+    for line in rows:
         if "about" in line or "constants" in line:
             told, constants = line.get("about", told), line.get("constants", constants)
             continue
@@ -392,8 +353,28 @@ def _grown(path: Path, schema: Schema) -> pa.Table:
             column.extend([None] * (count - len(column)))  # a column that earlier rows lacked
             column.append(value)
         count += 1
-    table = pa.table(
-        {name: pa.array(column + [None] * (count - len(column)), schema.type(name)) for name, column in columns.items()}
-    )
+    # Whole numbers are cast, since Arrow would cut a broken one off.
+    types = {name: None if name in schema.integers else schema.type(name) for name in columns}
+    padded = {name: column + [None] * (count - len(column)) for name, column in columns.items()}
+    table = pa.table({name: pa.array(column, types[name]) for name, column in padded.items()})
     table = _typed(table, schema)
     return table if told is None else table.replace_schema_metadata({META: json.dumps(told).encode()})
+
+
+def _extent(rows: Iterable[Row]) -> int:
+    """Memory that the table of these lines takes [bytes]: constants hold for each row, a column for all."""
+    names: set[str] = set()
+    count, found, shared = 0, 0, 0
+    for row in rows:
+        if "about" in row:
+            continue
+        values = row.get("constants", row)
+        names.update(values)
+        lists = sum(len(value) for value in values.values() if isinstance(value, list))
+        texts = sum(len(value) for value in values.values() if isinstance(value, str))
+        size = VALUE * lists + 2 * texts
+        if "constants" in row:
+            shared = size
+        else:
+            count, found = count + 1, found + shared + size
+    return found + VALUE * count * len(names)

@@ -10,6 +10,8 @@ import html
 import re
 from typing import TypeVar
 
+from cuelearner_jax.terminal import one_line
+
 ValueT = TypeVar("ValueT")
 
 # What makes text more than text in Markdown with GitHub's tables, wherever it stands; underscores inside words do not.
@@ -17,14 +19,6 @@ _ACTIVE = re.compile(r"[\\`*\[\]|~]|(?<![^\W_])_|_(?![^\W_])")
 _BLOCK = re.compile(r"^(\d*)([#+\-=.)])")  # at the beginning of a line: heading, list or rule
 # What a spreadsheet takes for the beginning of a formula (OWASP, "CSV injection"), also after blanks and in full width.
 _FORMULA = re.compile(r"\s*[=+\-@＝＋－＠]")
-
-
-def one_line(text: str) -> str:
-    """The text with every character that is not printable as its escape, for instance a newline as `\\n`."""
-    return "".join(
-        character if character.isprintable() else character.encode("unicode_escape").decode("ascii")
-        for character in text
-    )
 
 
 def markdown(text: object) -> str:

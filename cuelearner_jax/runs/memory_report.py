@@ -12,7 +12,7 @@ from cuelearner_jax.asking import label_slots
 from cuelearner_jax.devices import portions
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guidance.registry import registered
-from cuelearner_jax.runs.free_memory import free_bytes
+from cuelearner_jax.records.room import free_bytes
 from cuelearner_jax.runs.lanes import LaneGroup
 from cuelearner_jax.types import TrainState
 

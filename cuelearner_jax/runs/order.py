@@ -128,7 +128,7 @@ def read_labels(order: Order) -> label_files.LabelFile:
                 f"{path} holds {file.answers} answers, guidance {guidance.name} needs {guidance.form.name} ones: "
                 "give fitting labels"
             )
-        given.check(file.labels, spaces_of(env), guidance.form, str(path))
+        given.check_file(file, spaces_of(env), guidance.form, str(path))
     if file.eps_deg is not None and not math.isclose(file.eps_deg, config.scalars.eps_deg, rel_tol=1e-6):
         raise UserError(
             f"{path} holds labels of {file.eps_deg:g} degrees, the run's are of {config.scalars.eps_deg:g}: "

@@ -28,7 +28,7 @@ from cuelearner_jax.records.label_files import JSONL
 
 
 def lines(folder):
-    return (folder / JSONL).read_bytes().count(b"\n") - 1  # without the head
+    return (folder / JSONL).read_bytes().count(b"\n") - 2  # without the head and the closing line
 
 
 def test_an_answer_is_on_the_disk_before_the_next_question_and_said_twice_counts_once(opened, tmp_path):
@@ -168,7 +168,7 @@ def test_a_kill_at_any_byte_loses_no_line_that_was_whole(opened, tmp_path):
     cuts = [*rng.integers(ends[0], len(whole), 3).tolist(), ends[3], len(whole) - 1]
     for cut in cuts:
         (folder / JSONL).write_bytes(whole[:cut])
-        kept = sum(end - 1 <= cut for end in ends) - 1  # a line without its end is whole too
+        kept = sum(end - 1 <= cut for end in ends[:-1]) - 1  # a line without its end is whole too
         assert len(label_files.history(folder / JSONL)) == kept
     opened("cut")
     assert lines(folder) == 6
@@ -246,8 +246,12 @@ def test_a_second_opinion_is_about_the_same_questions(opened, tmp_path):
     same = sum(bool(expert(item)[0] == (1 - abs(expert(item)[0]))) for item in items[6:])
     assert (found.count, found.value) == (8, (6 + same) / 8)
     assert theirs.people.who.tolist() == ["other"] * 8
-    merged = comparing.merged([file, theirs])
-    assert merged.people.item.tolist() == list(range(16))
+    merged, left_out = comparing.merged([file, theirs])
+    assert (merged.people.item.tolist(), left_out) == (list(range(16)), 0)
+    again, left_out = comparing.merged([file, file, merged])
+    assert (len(again.seeds), left_out) == (16, 16)
+    nobodys = [one._replace(people=None) for one in (file, merged)]
+    assert [comparing.merged([one, file])[1] for one in nobodys] == [8, 8]
 
 
 def test_labels_are_compared_with_the_teacher_in_the_situations_they_were_given_in(opened, tmp_path):

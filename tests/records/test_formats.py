@@ -3,7 +3,6 @@
 import json
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from cuelearner_jax.errors import UserError
@@ -11,21 +10,6 @@ from cuelearner_jax.records import formats
 
 PATH = Path("somewhere") / "file"
 ROOT = Path(__file__).resolve().parents[2]
-EPS = 20.0
-
-
-def directions(*degrees):
-    angles = np.deg2rad(np.array(degrees))
-    return np.stack([np.cos(angles), np.sin(angles)], -1).astype(np.float32)
-
-
-def relative(*answers, eps_deg=EPS, **others):
-    """Labels of format 0: actions all around, each with the target of its answer."""
-    at = np.linspace(-170, 180, len(answers))
-    action = directions(*at)
-    columns = {"seed": np.arange(len(answers)), "obs": action, "action": action}
-    columns["target"] = directions(*(at + eps_deg * np.array(answers))) - action
-    return {"task": {"name": "window"}, "guidance": "relative", "eps_deg": eps_deg, "columns": columns, **others}
 
 
 def refused(kind, values, message):
@@ -36,7 +20,9 @@ def refused(kind, values, message):
 
 
 def test_every_format_leads_to_the_current_one():
-    assert set(formats.STEPS) == {(kind, n) for kind, current in formats.FORMATS.items() for n in range(current)}
+    first = {"labels": 2}  # of those before files had no checksums
+    every = {(kind, n) for kind, last in formats.FORMATS.items() for n in range(first.get(kind, 0), last)}
+    assert set(formats.STEPS) == every
     assert set(formats.REMEDIES) == set(formats.FORMATS)
 
 
@@ -69,37 +55,9 @@ def test_nonsense_is_refused_as_damaged(kind, values):
     refused(kind, values, "damaged")
 
 
-def test_targets_become_the_answers_that_they_came_from():
-    answers = [1, 0, -1, -1, 1, 0, 1, -1]
-    for eps_deg in (0.1, EPS, 120.0):
-        values = formats.upgrade("labels", relative(*answers, eps_deg=eps_deg), PATH)
-        answer = values["columns"]["answer"]
-        assert (answer.shape, answer.dtype) == ((8, 1), np.float32)
-        assert answer[:, 0].tolist() == answers
-        assert not np.signbit(answer[answer == 0]).any()
-        assert (values["answers"], values["eps_deg"], values["format"]) == ("relative", eps_deg, 3)
-        assert {"guidance", "target"}.isdisjoint([*values, *values["columns"]])
-
-
-def test_an_upgrade_leaves_what_it_was_given():
-    old = relative(1, -1)
-    formats.upgrade("labels", old, PATH)
-    assert set(old["columns"]) == {"seed", "obs", "action", "target"}
-
-
-@pytest.mark.parametrize("missing", ["guidance", "eps_deg", "columns"])
-def test_older_labels_that_do_not_say_what_they_are_are_refused(missing):
-    values = relative(1, -1)
-    del values[missing]
-    refused("labels", values, "not a label file")
-
-
-def test_older_labels_that_make_no_sense_are_refused():
-    refused("labels", relative(1, -1, guidance="scalar"), "not a label file")
-    refused("labels", relative(2, -1), "not a label file")
-    refused("labels", {**relative(1), "eps_deg": "five"}, "not a label file")
-    refused("labels", {**relative(1), "eps_deg": float("nan")}, "not a label file")
-    refused("labels", {**relative(1), "columns": {"action": directions(0)}}, "not a label file")
+@pytest.mark.parametrize("number", [0, 1])
+def test_labels_of_before_files_had_checksums_are_refused(number):
+    refused("labels", {"format": number, "task": {"name": "window"}}, f"is of format {number}, which had no checksums")
 
 
 def test_files_are_read_in_the_current_format(tmp_path):

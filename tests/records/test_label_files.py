@@ -9,8 +9,9 @@ import pyarrow.parquet as pq
 import pytest
 
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.records import formats
+from cuelearner_jax.records import formats, lines
 from cuelearner_jax.records import label_files as files
+from cuelearner_jax.records import table as tables
 from cuelearner_jax.records.table import META
 
 TASK = {"name": "window", "half_width_deg": 28.0}
@@ -110,43 +111,6 @@ def test_a_digest_tells_contents_apart(path):
     assert files.digest(path) != first
 
 
-# Older files.
-
-
-def older(path, **meta):
-    """A file as it was written before formats had numbers: targets of the relative answers 1, 0 and -1."""
-    at = np.deg2rad([10.0, 100.0, 175.0])
-    turned = at + np.deg2rad(EPS) * np.array([1, 0, -1])
-    action, end = (np.stack([np.cos(a), np.sin(a)], -1).astype(np.float32) for a in (at, turned))
-    columns = {"seed": pa.array([4, 4, 9])}
-    for name, values in (("obs", action), ("action", action), ("target", end - action)):
-        columns[name] = pa.array(list(values), pa.list_(pa.float32()))
-    told = {"task": TASK, "guidance": "relative", "eps_deg": EPS, "conventions": {}, **meta}
-    table = pa.table(columns).replace_schema_metadata({META: json.dumps(told).encode()})
-    pq.write_table(table, path, write_page_checksum=True)
-    return action
-
-
-def test_older_files_are_read_as_the_answers_that_they_held(path):
-    action = older(path)
-    content = path.read_bytes()
-    file = files.read(path)
-    assert (file.task, file.answers, file.eps_deg) == (TASK, "relative", EPS)
-    assert file.seeds.tolist() == [4, 4, 9]
-    assert file.labels.answer.tolist() == [[1.0], [0.0], [-1.0]]
-    np.testing.assert_array_equal(file.labels.action, action)
-    assert path.read_bytes() == content
-
-
-def test_older_files_of_another_guidance_and_newer_files_are_refused(path):
-    older(path, guidance="demonstration")
-    with pytest.raises(UserError, match="not a label file"):
-        files.read(path)
-    older(path, format=4)
-    with pytest.raises(UserError, match="written by a newer cuelearner"):
-        files.read(path)
-
-
 # Files that cannot be read.
 
 
@@ -196,32 +160,10 @@ def test_text_and_foreign_tables_are_refused(path):
     with pytest.raises(UserError, match="not a label file"):
         files.read(path)
     pq.write_table(pa.table({"seed": [1]}), path)
+    with pytest.raises(UserError, match="has no digest of its contents"):
+        files.read(path)
+    tables.write(path, pa.table({"seed": [1]}), files.SCHEMA)
     with pytest.raises(UserError, match="lacks the columns obs, action"):
-        files.read(path)
-    foreign = pa.table({"seed": [1], "obs": [[1.0]], "action": [[1.0]], "answer": [[1.0]]})
-    for told in (None, b"{}", b"{", b"[]", b"3"):
-        pq.write_table(foreign.replace_schema_metadata({META: told} if told else None), path)
-        with pytest.raises(UserError, match="not a label file"):
-            files.read(path)
-
-
-def test_lists_of_several_lengths_are_refused(path):
-    written(path)
-    about = pq.read_schema(path).metadata
-    ragged = pa.table({"seed": [1, 2], "obs": [[1.0], [1.0, 2.0]], "action": [[1.0]] * 2, "answer": [[1.0]] * 2})
-    pq.write_table(ragged.replace_schema_metadata(about), path)
-    with pytest.raises(UserError, match="not a label file"):
-        files.read(path)
-
-
-@pytest.mark.parametrize("missing", ["format", "task", "answers", "eps_deg"])
-def test_a_file_that_does_not_say_what_it_holds_is_refused(path, missing):
-    written(path)
-    table = pq.read_table(path)
-    meta = json.loads(table.schema.metadata[META])
-    del meta[missing]
-    pq.write_table(table.replace_schema_metadata({META: json.dumps(meta).encode()}), path)
-    with pytest.raises(UserError, match="not a label file"):
         files.read(path)
 
 
@@ -265,9 +207,10 @@ def test_a_killed_session_goes_on_where_it_was(tmp_path, torn):
     assert_holds(files.read(tmp_path / files.JSONL), labels, 8)
 
 
-def test_a_file_torn_in_its_first_line_starts_anew(tmp_path):
+def test_a_file_cut_in_its_first_line_starts_anew_and_says_so(tmp_path, capsys):
     (tmp_path / files.JSONL).write_text('{"about": {"form')
     labels = said(tmp_path, range(2))
+    assert "labels.jsonl lacks its closing line: it was cut" in capsys.readouterr().err
     assert_holds(files.read(tmp_path / files.JSONL), labels, 2)
 
 
@@ -302,14 +245,12 @@ def test_labels_of_another_kind_are_not_mixed_in(tmp_path, other, named, done):
     assert probes.files_of(tmp_path) == before
 
 
-def test_older_and_foreign_files_are_not_continued(tmp_path):
-    older(tmp_path / files.PARQUET)
-    with pytest.raises(UserError, match="holds labels of another "):
+def test_foreign_files_are_not_continued(tmp_path):
+    lines.Writer(tmp_path / files.JSONL, [{"seed": 1, "obs": [1.0], "action": [1.0], "answer": [1.0]}]).close()
+    before = probes.files_of(tmp_path)
+    with pytest.raises(UserError, match=r"not a label file.*\(it does not say what it holds\)"):
         said(tmp_path, [3])
-    (tmp_path / files.PARQUET).unlink()
-    (tmp_path / files.JSONL).write_text('{"seed": 1, "obs": [1.0], "action": [1.0], "answer": [1.0]}\n')
-    with pytest.raises(UserError, match="not a label file"):
-        said(tmp_path, [3])
+    assert probes.files_of(tmp_path) == before
 
 
 def test_a_label_that_could_not_be_read_is_not_written(tmp_path):
@@ -329,9 +270,9 @@ def test_a_label_that_could_not_be_read_is_not_written(tmp_path):
 def test_a_damaged_line_of_a_person_s_work_is_named(tmp_path):
     said(tmp_path, range(4))
     path = tmp_path / files.JSONL
-    lines = path.read_text().splitlines()
-    path.write_text("\n".join([*lines[:2], lines[2][:-9], *lines[3:]]) + "\n")
-    with pytest.raises(UserError, match=r"damaged: .*\(line 3: it, or a line before it"):
+    written = path.read_text().splitlines()
+    path.write_text("\n".join([*written[:2], written[2][:-9], *written[3:]]) + "\n")
+    with pytest.raises(UserError, match=r"damaged: .*\(line 3: it has no checksum, so it, or a line before it"):
         files.read(path)
 
 

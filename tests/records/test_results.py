@@ -1,14 +1,12 @@
 """The results table: what is appended is there, what is torn is dropped, what is wrong is said in one line."""
 
-import json
-
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.records import results
+from cuelearner_jax.records import lines, results
 
 CONSTANTS = {"run": "a", "task": "one_ball", "guidance": "relative", "config_hash": "0f", "hardware": "1 x cpu"}
 SEEDS, LABELS = np.array([3, 4]), np.array([100, 500])
@@ -183,7 +181,7 @@ def test_errors_are_one_clear_line(tmp_path):
     (tmp_path / "c" / results.PARQUET).write_bytes(b"PAR1 and then rubbish")
     assert "is damaged" in message(tmp_path / "c")
     (tmp_path / "d").mkdir()
-    (tmp_path / "d" / results.JSONL).write_text(json.dumps({"step": 1, "reward": 2.0}) + "\n")
+    lines.Writer(tmp_path / "d" / results.JSONL, [{"step": 1, "reward": 2.0}]).close()
     assert "lacks the columns" in message(tmp_path / "d")
-    (tmp_path / "d" / results.JSONL).write_text(json.dumps({"step": "three"}) + "\n")
+    lines.Writer(tmp_path / "d" / results.JSONL, [{"step": "three"}]).close()
     assert "is damaged" in message(tmp_path / "d")

@@ -1,4 +1,4 @@
-"""How much memory is free to train in: a device's, a machine's, or what a container or a batch job may have of it."""
+"""Free memory: a device's, a machine's, or what a container or a batch job may have of it; and what files declare."""
 
 from __future__ import annotations
 
@@ -6,6 +6,31 @@ from collections.abc import Iterable
 from pathlib import Path
 
 import jax
+
+from cuelearner_jax.errors import UserError
+
+GROWTH = 16  # bytes in memory, of a byte of JSON
+
+
+def check_size(path: Path) -> None:
+    """Raises UserError if a file of JSON is more than memory holds, and OSError if it cannot be looked at."""
+    size = path.stat().st_size
+    check_room(f"{path} has {size:,} bytes", GROWTH * size, "it is damaged, or no file of this program")
+
+
+def check_room(declared: str, needed: int, remedy: str) -> None:
+    """Raises UserError if something needs more memory than is free; before any of it is taken.
+
+    Args:
+        declared: who declares how much of what, the beginning of the message.
+        needed: for that [bytes].
+        remedy: what to do, the end of the message.
+    """
+    free = _least([_host_bytes(), group_bytes()])
+    if free is not None and needed > free:
+        raise UserError(
+            f"{declared}, which needs {needed / 1e9:,.1f} GB of memory, {free / 1e9:.1f} GB are free: {remedy}"
+        )
 
 
 def free_bytes() -> int | None:

@@ -1,6 +1,6 @@
 """Free memory as containers and batch jobs grant it: control groups' files written by hand."""
 
-from cuelearner_jax.runs.free_memory import group_bytes
+from cuelearner_jax.records.room import group_bytes
 
 
 def test_a_batch_job_has_the_memory_that_its_narrowest_group_grants(tmp_path):
