@@ -1,7 +1,6 @@
 """Runs that were stopped or killed and resumed: bitwise the run that was left alone."""
 
 import dataclasses
-import json
 import shutil
 from contextlib import contextmanager
 from functools import cache
@@ -18,7 +17,8 @@ from cuelearner_jax.asking import label_slots
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guidance import registry as guidances
 from cuelearner_jax.loop import make_program, start_clock
-from cuelearner_jax.records import formats, label_files, results
+from cuelearner_jax.records import formats, label_files, lines, results
+from cuelearner_jax.records import table as tables
 from cuelearner_jax.records.checkpoint import checkpoints
 from cuelearner_jax.records.folders import prepare_folder
 from cuelearner_jax.runs import kept, lanes, runner, sweep, training
@@ -382,10 +382,9 @@ def test_a_damaged_checkpoint_is_refused_and_the_one_before_serves(stopped, whol
 
 
 def without_rows(table, drop):
-    """Rewrites a growing table without some rows, as somebody would who knows nothing of checksums."""
-    lines = [json.loads(line) for line in table.read_text().splitlines()]
-    kept = [{name: value for name, value in line.items() if name != "crc"} for line in lines if not drop(line)]
-    table.write_text("".join(json.dumps(line) + "\n" for line in kept))
+    """Rewrites a growing table without some rows, checksums included."""
+    kept = [line for line in lines.read(table).rows if not drop(line)]
+    lines.Writer(table, kept).close()
 
 
 def refused(out, message):
@@ -425,7 +424,7 @@ def test_a_finished_kind_is_looked_at_before_it_is_called_finished(whole, tmp_pa
     content = file.read_bytes()
     file.write_bytes(content[: len(content) // 2])
     refused(out, "is damaged: restore it")
-    pq.write_table(pq.read_table(whole / "relative" / results.PARQUET).replace_schema_metadata(None).slice(1), file)
+    tables.write(file, pq.read_table(whole / "relative" / results.PARQUET).slice(1), results.SCHEMA)
     refused(out, "lacks rows: 1,")
     file.write_bytes(content)
     labels = out / "relative" / label_files.PARQUET
