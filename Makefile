@@ -28,7 +28,7 @@ $(BIN)/uv: constraints.txt
 	@touch $@
 
 $(VENV)/.installed: $(BIN)/uv pyproject.toml constraints.txt
-	$(UV) pip install --python $(BIN)/python --constraints constraints.txt --editable .
+	$(UV) pip install --python $(BIN)/python --constraints constraints.txt --editable '.[label]'
 	@touch $@
 
 $(VENV)/.tested: $(VENV)/.installed

@@ -43,10 +43,10 @@ class Scene:
         tip = _points(next(one for one in groups["arrow asked"] if _named(one) == "polygon"))[0]
         self.asked = _angle(tip)
         marks = [one for one in still if "--goal" in one.get("style", "") and one.get("r")]
-        if len(marks) == 2:  # the goal, and how near one must come
+        mark = next((one.get("transform", "") for one in still if _named(one) == "g"), None)
+        if mark is None:  # it lies in the sketch: the goal, and how near one must come
             self.goal, self.shown = np.array([float(marks[0].get(name, "")) for name in ("cx", "cy")]), True
             return
-        mark = next(one.get("transform", "") for one in still if _named(one) == "g")
         words = next(one.text or "" for one in still if _named(one) == "text")
         at = np.array([float(value) for value in re.findall(r"-?[\d.]+", mark)[:2]])
         (away,) = re.findall(r"[\d.]+", words)

@@ -18,7 +18,7 @@ from flax import struct
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from cuelearner_jax import types
-from cuelearner_jax.actions import DIRECTIONS, Actions
+from cuelearner_jax.actions import DIRECTIONS, Actions, rotate
 from cuelearner_jax.agent.choice import greedy_actions
 from cuelearner_jax.config import AgentSizes, GuideScalars, GuideSizes
 from cuelearner_jax.devices import portions
@@ -82,6 +82,30 @@ class Uniform(struct.PyTreeNode):
     def axes(self) -> Uniform:
         """It has nothing."""
         return self
+
+
+class NearAims(struct.PyTreeNode):
+    """Actions near one of a situation's aims, each aim as likely; uniform ones where there is none."""
+
+    env: Any  # offers aims
+    reach: Float[Array, ""] | float  # how far from the aim at most [rad]
+
+    def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
+        """Drawn anew each time."""
+        return jax.vmap(self._one)(jax.random.split(key, len(obs)), obs)
+
+    def _one(self, key: PRNGKeyArray, obs: Float[Array, " obs"]) -> Float[Array, " action"]:
+        k_aim, k_turn, k_elsewhere = jax.random.split(key, 3)
+        aims = self.env.aims(obs)
+        index = jax.random.categorical(k_aim, jnp.where(aims.possible, 0.0, -jnp.inf))
+        turn = jax.random.uniform(k_turn, (), minval=-self.reach, maxval=self.reach)
+        elsewhere = actions_of(self.env).uniform(k_elsewhere, ())
+        return jnp.where(aims.possible.any(), rotate(aims.actions[index], turn), elsewhere)
+
+    @property
+    def axes(self) -> NearAims:
+        """It is one for all lanes."""
+        return self.replace(env=SHARED, reach=SHARED)
 
 
 class Taught(struct.PyTreeNode):

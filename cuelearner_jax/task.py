@@ -48,6 +48,10 @@ class Pictures(NamedTuple):
     sketch: Callable[[Any, EnvState], Sketch] | None = None
     # (environment, state, action (action,)): what the action leads to, to be seen in the sketch of the state
     reel: Callable[[Any, EnvState, Float[Array, " action"]], Reel] | None = None
+    # (environment, state, actions (n, action)): SVG elements of where each of the actions leads, to be seen in the
+    # sketch of the state; they take their colour from the group around them
+    trails: Callable[[Any, EnvState, Float[Array, "n action"]], list[str]] | None = None
+    legend: str = ""  # what the trails mean, for a person
 
 
 @dataclass(frozen=True)
@@ -97,6 +101,8 @@ class Task:
     files: Callable[[Any], dict[str, str]] = lambda config: {}
     # configuration -> steps of its longest episode, where episodes count (`Step.outcome`); None: steps count
     longest: Callable[[Any], int] | None = None
+    wants: Callable[[Any], str] = lambda config: ""  # configuration -> what is wanted there: a sentence for a person
+    near_aims: bool = False  # are people asked near the aims of a situation? Elsewhere no answer would mean much
     presets: dict[str, Preset] = field(default_factory=dict)
     scenarios: dict[str, Scenario] = field(default_factory=dict)
     labels_hold: tuple[str, ...] = ()  # fields of the configuration that labels of another world may differ in

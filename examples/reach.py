@@ -310,6 +310,7 @@ def _pictures() -> Pictures:
 TASK = Task(
     name="reach",
     about="reach a buoy in a cross wind",
+    wants=lambda config: "The boat goes where the arrow points, the wind pushes it; it wants to get to the green buoy.",
     config=ReachConfig,
     bodies=(Body("boat", "goes where it is sent, and with the wind", make_environment, pictures=_pictures),),
     teacher=lambda config, env: Skipper(env),

@@ -14,6 +14,7 @@ from cuelearner_jax import actions
 from cuelearner_jax.agent import choice
 from cuelearner_jax.agent.networks import applied, q_network, residual_network
 from cuelearner_jax.devices import lane_mesh
+from cuelearner_jax.environment import Aims
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import evaluate_lanes, evaluate_policy, one_lane, rollout
 from cuelearner_jax.guidance import registry as guidances
@@ -23,6 +24,7 @@ from cuelearner_jax.policies import (
     Corrected,
     Guided,
     Heuristic,
+    NearAims,
     Opaque,
     Residual,
     Taught,
@@ -47,6 +49,23 @@ def act(policy, key=KEY, obs=OBS):
 
 
 # What each does.
+
+
+class Aiming:
+    """Two aims, a quarter turn to each side of what is seen; none where that points down."""
+
+    def aims(self, obs):
+        both = jnp.stack([actions.rotate(obs, turn) for turn in (jnp.pi / 2, -jnp.pi / 2)])
+        return Aims(both, jnp.zeros((2, 1)), jnp.full(2, obs[1] >= 0))
+
+
+def test_actions_near_aims_are_near_each_of_them_and_anywhere_where_there_is_none():
+    turns = np.degrees(actions.difference(OBS, act(NearAims(Aiming(), 0.1))))
+    here = np.asarray(OBS[:, 1] >= 0)
+    beside = np.abs(np.abs(turns[here]) - 90.0)
+    assert 1.0 < beside.max() <= np.degrees(0.1) + 1e-3
+    assert {*np.sign(turns[here])} == {-1.0, 1.0}
+    assert np.abs(np.abs(turns[~here]) - 90.0).max() > 30.0
 
 
 def test_the_agent_takes_the_direction_of_the_largest_value():

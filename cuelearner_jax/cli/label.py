@@ -5,24 +5,28 @@ from __future__ import annotations
 import dataclasses
 import webbrowser
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
-from typing import Any, Generic
+from typing import Any, Generic, Literal
 
 import jax
 import numpy as np
 
 from cuelearner_jax import config as configuration
 from cuelearner_jax.adaptation import adapting
-from cuelearner_jax.cli.parsing import about, code_of, out, parse, preset_of, taken, task_of
+from cuelearner_jax.cli import label_commands
+from cuelearner_jax.cli.parsing import PAPER, about, code_of, out, parse, preset_of, taken, task_of
 from cuelearner_jax.cli.shared_options import Flag, TaskT, asking_kind, preset_kinds
 from cuelearner_jax.config import GuideScalars, GuideSizes, RunConfig
+from cuelearner_jax.environment import offers
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.face.acting import load_policy
 from cuelearner_jax.face.worlds import World
 from cuelearner_jax.guidance import registry as guidances
+from cuelearner_jax.labelling import controls
 from cuelearner_jax.labelling.plan import Base, Plan
 from cuelearner_jax.plugins import REFERENCE
-from cuelearner_jax.policies import uniform_in
+from cuelearner_jax.policies import NearAims, uniform_in
 from cuelearner_jax.records import label_files
 from cuelearner_jax.records.folders import claimed
 from cuelearner_jax.runs import adaptation
@@ -32,7 +36,10 @@ from cuelearner_jax.task import Task, shape_of
 from cuelearner_jax.tasks import registry
 from cuelearner_jax.terminal import Interrupted, console, interruptible
 
-UNIFORM = "uniform"
+UNIFORM, NEAR_AIMS = "uniform", "near_aims"
+REACH = 1.5  # of questions near an aim: from the aim, in turns by eps
+PRESET = "quickstart"  # where none is given and chance is asked about: what is labelled trains in minutes
+PRACTICE = len(controls.PRACTICE)  # questions
 MOST_LABELS = 100_000
 
 
@@ -65,7 +72,7 @@ class Label(Generic[TaskT]):
     out: Path
     """Folder of the labels; one that holds some already goes on where it stopped."""
     labels: int = 500
-    """Answers that are wanted; to go on later, give more."""
+    """Answers that are wanted; to go on later, give more (default without a policy: the most that the preset uses)."""
     guidance: str = ""
     """Kind of guidance that is fitted while you label; it decides what you are asked for."""
     who: str = "anonymous"
@@ -82,6 +89,10 @@ class Label(Generic[TaskT]):
     robot: str | None = None
     """Another robot, see above (default: the task's own); with a folder, as anymal:FOLDER, one with your own walking
     policy."""
+    questions: Literal["uniform", "near_aims"] = UNIFORM
+    """Without a policy: actions of any direction, or near what a player may aim at (where the task has aims)."""
+    practice: Flag[bool] = True
+    """Begin a new file with three questions for practice, which are not saved."""
     port: int = 0
     """Port on 127.0.0.1 (0: any that is free)."""
     open: Flag[bool] = False
@@ -96,13 +107,14 @@ def run(arguments: list[str]) -> None:
     """Runs the command.
 
     Raises:
-        UserError: bad input, a folder in use or with labels of something else.
+        UserError: bad input, a port or a folder in use, or a folder with labels of something else.
         Interrupted: Ctrl-C or SIGTERM; every answer is saved.
     """
-    serve = _serving()
+    server, typed = _server(), list(arguments)
     task, rest = task_of(arguments, "label", Label)
     named, rest = (rest[0], rest[1:]) if rest and not rest[0].startswith("-") else (None, rest)
-    _, preset, rest = preset_of(task, rest)
+    usual = PAPER if named is not None else PRESET
+    chosen, preset, rest = preset_of(task, rest, usual)
     kind = Label[task.config]  # pyright: ignore[reportInvalidTypeArguments]
     scenario, _ = taken(rest, "--scenario", ", ".join(task.scenarios) or "none")
     changed = task.scenario(scenario) if scenario else None
@@ -122,15 +134,21 @@ def run(arguments: list[str]) -> None:
         Path("labels") / task.name,
         guidance=asking_kind(preset_kinds(task, preset)) if named is None else adaptation.DEFAULT_KIND,
         bound_deg=bound,
+        labels=max(preset.labels) if named is None else Label.labels,
+        questions=NEAR_AIMS if named is None and task.near_aims else UNIFORM,
     )
-    asked = parse(kind, rest, f"label {task.name}", default, about(Label, task))
+    asked = parse(kind, rest, f"label {task.name}", default, about(Label, task, preset=usual))
     plan = planned(task, preset.config, asked, named, source)
-    with claimed(asked.out), interruptible("the answer of the moment") as stopping:
-        finished = serve(plan, asked, stopping)
-        if finished:
-            out.print(f"done: {label_files.finish(asked.out)}")
-            return
+    config = preset.config if source is None else dataclasses.replace(preset.config, task=world)
+    commands = server.Commands(
+        label_commands.again(typed), partial(label_commands.following, task, chosen, config, asked, named)
+    )
+    # The port first: where it is refused, nothing has been made.
+    with server.bound(asked.port) as port, claimed(asked.out), interruptible("the answer of the moment") as stopping:
+        finished = _served(server, plan, asked, port, stopping, commands)
+    if finished is None:
         raise Interrupted(f"stopped; every answer is in {asked.out}: the same command goes on")
+    out.print(f"done: {finished.line}\nnext: {finished.following}")
 
 
 def planned(
@@ -221,10 +239,19 @@ def _source(task: Task, named: str | None) -> PolicySource | None:
 def _base(task: Task, asked: Label[Any], named: str | None, source: PolicySource | None, env: Any) -> Base:
     """The policy that is asked about. Raises UserError if it cannot be had, or sees something else."""
     lane = asked.base
+    if named is not None and asked.questions != UNIFORM:
+        raise UserError(f"--questions is {asked.questions}, but {named} is what is asked about: leave out one of them")
     if source is None:
         if lane != Lane():
             raise UserError("--base.… chooses in a folder, and none is given: leave it out")
-        return Base(uniform_in(env), UNIFORM) if named is None else Base(code_of(named), named)
+        if named is not None:
+            return Base(code_of(named), named)
+        if asked.questions == UNIFORM:
+            return Base(uniform_in(env), UNIFORM)
+        if not offers(env, "aims"):
+            raise UserError(f"--questions is {NEAR_AIMS}, but {task.name} has no aims in this world: give {UNIFORM}")
+        reach = float(np.deg2rad(REACH * asked.scalars.eps_deg))
+        return Base(NearAims(task.environment(asked.task), reach), NEAR_AIMS)
     found = load_policy(source.folder, task=task, world=World(task, asked.task), **dataclasses.asdict(lane))
     if found.observation and tuple(found.observation) != tuple(env.observation):
         raise UserError(f"{source.folder} acts on other observations than this world has: give a policy of this world")
@@ -236,33 +263,31 @@ def _part(kind: type, values: Any) -> Any:
     return kind(**{field.name: getattr(values, field.name) for field in dataclasses.fields(kind)})
 
 
-def _serving() -> Any:
-    """What serves a plan. Raises UserError if the packages that it needs are not installed."""
+def _server() -> Any:
+    """The module that serves a page. Raises UserError if the packages that it needs are not installed."""
     try:
         from cuelearner_jax.labelling import server
     except ImportError as error:
         raise UserError(
-            f"the page needs packages that are not installed ({error.name}): pip install 'cuelearner-jax[label]'"
+            f"the page needs packages that are not installed ({error.name}): run `make setup`, or "
+            "pip install -c constraints.txt -e '.[label]' in the project's folder"
         ) from error
-    from cuelearner_jax.labelling.session import Session
-
     # Before JAX starts: what a thread asks for is computed by that thread, at its own priority (`learner`).
     jax.config.update("jax_cpu_enable_async_dispatch", False)
+    return server
 
-    def tell(address: str) -> None:
+
+def _served(server: Any, plan: Plan, asked: Label[Any], port: Any, stopping: Any, commands: Any) -> Any:
+    """Serves a session until it is finished (returns how, an `Ending`) or stopped (None)."""
+    from cuelearner_jax.labelling.session import Session
+
+    def open_page(address: str) -> None:
         out.print(f"open {address}")
+        if asked.open:
+            webbrowser.open(address)
 
-    def serve(plan: Plan, asked: Label[Any], stopping: Any) -> bool:
-        with (
-            server.bound(asked.port) as port,
-            Session(plan, asked.out, lambda words: console.print(f"{words} ...")) as session,
-        ):
+    def tell(words: str) -> None:
+        console.print(f"{words} ...")
 
-            def open_page(address: str) -> None:
-                tell(address)
-                if asked.open:
-                    webbrowser.open(address)
-
-            return server.serve(session, port, stopping, open_page)
-
-    return serve
+    with Session(plan, asked.out, tell, practice=PRACTICE if asked.practice else 0) as session:
+        return server.serve(session, port, stopping, open_page, commands)

@@ -27,6 +27,7 @@ from cuelearner_jax.tasks import registry
 from cuelearner_jax.terminal import PLAIN
 
 HELP = ("-h", "--help")
+PAPER = "paper"  # the preset that holds where none is given
 
 
 class _Output(Console):
@@ -145,20 +146,23 @@ def task_of(arguments: list[str], command: str, kind: type) -> tuple[Task, list[
     return registry.resolve(given), rest
 
 
-def preset_of(task: Task, arguments: list[str]) -> tuple[str, Preset, list[str]]:
-    """The preset, by default `paper` or else the first, and the other arguments. Raises UserError if there is none."""
+def preset_of(task: Task, arguments: list[str], default: str = PAPER) -> tuple[str, Preset, list[str]]:
+    """The preset (if none is given, `default` or the first) and other arguments. Raises UserError for a wrong one."""
     if not task.presets:
         raise UserError(f"{task.name} has no preset to start from: give its Task one")
     name, rest = taken(arguments, "--preset", ", ".join(task.presets))
-    name = _default_preset(task) if name is None else name
+    name = _default_preset(task, default) if name is None else name
     if name not in task.presets:
         raise UserError(f"unknown preset {name!r}{closest(name, task.presets)}")
     return name, task.presets[name], rest
 
 
-def _default_preset(task: Task) -> str:
-    """The same for every command, so that what is evaluated without a run is the world that is trained in."""
-    return "paper" if "paper" in task.presets else next(iter(task.presets))
+def _default_preset(task: Task, default: str = PAPER) -> str:
+    """The same for all commands but one, so that what is evaluated without a run is the world that is trained in.
+
+    A person who labels waits for nothing longer than minutes (`cli.label`).
+    """
+    return default if default in task.presets else next(iter(task.presets))
 
 
 def source_of(arguments: list[str], command: str, kind: type) -> tuple[PolicySource, list[str]]:
@@ -205,8 +209,15 @@ def world_of(source: PolicySource, arguments: list[str]) -> Any:
     return source.config.task if name is None else source.task.scenario(name).applied(source.config.task)
 
 
-def about(kind: type, task: Task, policies: bool = False) -> str:
-    """The text above a command's options: what it does, and what there is to choose from."""
+def about(kind: type, task: Task, policies: bool = False, preset: str = PAPER) -> str:
+    """The text above a command's options: what it does, and what there is to choose from.
+
+    Args:
+        kind: the command's options.
+        task: with its presets, changed worlds and robots.
+        policies: does one choose among policies?
+        preset: that holds where none is given.
+    """
     groups = {"guidance (--guidance; your own as package.module:NAME)": {k.name: k.about for k in guidances.known()}}
     if policies:
         trained = {name: named.about for name, named in POLICIES.items() if named.trained}
@@ -214,7 +225,7 @@ def about(kind: type, task: Task, policies: bool = False) -> str:
         untrained = {name: named.about for name, named in POLICIES.items() if not named.kept}
         groups |= {"policies of a run (--policy)": trained, "policies of a policy folder": adapted}
         groups |= {"policies of any folder or a task alone": untrained}
-    told = [summary(kind), _choices(task), *(f"{title}:\n{_rows(rows)}" for title, rows in groups.items())]
+    told = [summary(kind), _choices(task, preset), *(f"{title}:\n{_rows(rows)}" for title, rows in groups.items())]
     return "\n\n".join(told)
 
 
@@ -249,14 +260,12 @@ def _tasks() -> str:
     return "\n".join([*told, "a task of your own: package.module:NAME, also as --task package.module:NAME"])
 
 
-def _choices(task: Task) -> str:
-    """A task's presets, changed worlds and other bodies, a line each."""
+def _choices(task: Task, preset: str = PAPER) -> str:
+    """A task's presets, changed worlds and other bodies, a line each; `preset`: which holds where none is given."""
     scenarios = {name: f"{one.about} ({_as_options(one.changes)})" for name, one in task.scenarios.items()}
     bodies = {body.name: body.about for body in task.bodies} if len(task.bodies) > 1 else {}
-    presets = {
-        name: f"{preset.about}{f' ({preset.takes})' if preset.takes else ''}" for name, preset in task.presets.items()
-    }
-    default = f"; {_default_preset(task)} where none is given" if presets else ""
+    presets = {name: f"{one.about}{f' ({one.takes})' if one.takes else ''}" for name, one in task.presets.items()}
+    default = f"; {_default_preset(task, preset)} where none is given" if presets else ""
     groups = {
         f"presets (--preset{default})": presets,
         "changed worlds (--scenario of adapt, evaluate and render)": scenarios,

@@ -64,7 +64,7 @@ class Gate:
                 continue
         if self.cookie in jar and self._right(jar[self.cookie].value):
             return None, False
-        return "the token is missing or wrong: open the address that the command printed", False
+        return "the token is missing or wrong: open the address that the command printed when it started last", False
 
     def _right(self, token: str) -> bool:
         return secrets.compare_digest(token.encode(), self.token.encode())

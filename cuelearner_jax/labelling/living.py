@@ -33,6 +33,12 @@ def keys_of(seed: int) -> Keys:
 
 
 @jax.jit
+def begin(env: Environment, key: PRNGKeyArray) -> tuple[EnvState, jax.Array]:
+    """The first situation of an episode: (state, observation)."""
+    return env.reset(key)
+
+
+@jax.jit
 def advance(env: Environment, key: PRNGKeyArray, state: EnvState, action: jax.Array) -> tuple[EnvState, jax.Array]:
     """The situation that an action leads to: (state, observation)."""
     after, step = env.step(key, state, action)
@@ -46,7 +52,7 @@ def lived(
 
     Ends early, before the first item that was seen otherwise: by a program of another version.
     """
-    state, obs = jax.jit(env.reset)(keys.start)
+    state, obs = begin(env, keys.start)
     for number, (seen, action) in enumerate(rows):
         if seen.shape != obs.shape or not np.allclose(np.asarray(obs), seen, atol=SAME):
             return

@@ -1,21 +1,44 @@
 // Keys, buttons and pointing; each answer names the item that is on the screen. Films move what can move.
+//
+// What is pressed before a question can be answered is dropped, counted and told, never kept for later: a key that
+// waited would answer a question that nobody has seen. So what was pressed is what was saved plus what was told.
 "use strict";
+const SOON = 100;  // after a question came nobody can have seen it and answered [ms]
+const TWICE = 400;  // within this the second click of a double click may follow the first [ms]
 const cue = {
-  keys: {}, shown: performance.now(), sent: null, playing: 0,
+  keys: {}, again: "", item: undefined, shown: Infinity, sent: false, dropped: 0, playing: 0,
   scene() { return document.querySelector("svg.scene"); },
-  seconds() { return (performance.now() - cue.shown) / 1000; },
-  send(name, angle) {
-    const scene = cue.scene();
-    if (name === "help") { emitEvent("cue", {name}); return; }
-    if (!scene && name !== "undo") return;
-    const item = scene ? +scene.dataset.item : null;
-    const film = name.startsWith("film");
-    const now = performance.now();
-    // One answer for what is on the screen; if the server stays silent, it may be said again: it keeps one alone.
-    if (!film && cue.sent && cue.sent.scene === scene && now - cue.sent.at < 1000) return;
-    if (!film) cue.sent = {scene, at: now};
-    emitEvent("cue", {name, item, angle: angle === undefined ? null : angle, seconds: cue.seconds()});
+  at() { const scene = cue.scene(); return scene ? +scene.dataset.item : null; },
+  window() { return document.querySelector(".q-dialog"); },
+  seconds() { return Math.max(performance.now() - cue.shown, 0) / 1000; },
+  why(clicks) {  // nothing can be answered now; empty: something can
+    const since = performance.now() - cue.shown;
+    if (cue.window()) return "a window lies over the question: close it first";
+    if (cue.sent || cue.item !== cue.at()) return "the next question was not there yet";
+    if (!(since >= SOON)) return "the question had only just come";
+    if (clicks > 1 && since < TWICE) return "it was the second click of a double click";
+    return "";
   },
+  ready() { return !cue.why(1); },
+  send(name, told = {}) {
+    if (name === "help") { emitEvent("cue", {name}); return; }
+    if (name.startsWith("film")) { if (cue.scene()) emitEvent("cue", {name, item: cue.at()}); return; }
+    const why = cue.why(told.clicks || 1);
+    if (why) { cue.drop(why); return; }
+    if (!cue.scene() && name !== "undo") return;
+    cue.sent = true;
+    cue.tell("");
+    emitEvent("cue", {name, item: cue.at(), angle: told.angle === undefined ? null : told.angle, seconds: cue.seconds()});
+  },
+  tell(why) {
+    const line = document.querySelector(".dropped");
+    if (!line) return;
+    const count = cue.dropped === 1 ? "1 press was not taken" : `${cue.dropped} presses were not taken`;
+    line.textContent = why ? `Not taken: ${why}. So far ${count}.` : cue.dropped ? `So far ${count}.` : "";
+    line.classList.toggle("now", !!why);
+  },
+  drop(why) { cue.dropped += 1; cue.tell(why); },
+  refused(why) { cue.sent = false; cue.drop(why); },  // by the server
   angle(event) {
     const scene = cue.scene();
     const at = new DOMPoint(event.clientX, event.clientY).matrixTransform(scene.getScreenCTM().inverse());
@@ -50,27 +73,40 @@ const cue = {
     };
     requestAnimationFrame(tick);
   },
+  gone() {  // what NiceGUI shows when nothing answers any more
+    const popup = document.getElementById("popup");
+    if (!popup) return;
+    const line = (kind, text) => popup.append(Object.assign(document.createElement(kind), {textContent: text}));
+    popup.replaceChildren();
+    line("span", "The command behind this page has stopped.");
+    line("div", "Every answer that the page counted is saved. To go on, type in the terminal");
+    line("code", cue.again);
+    line("div", "and open the address that it prints: this tab does not know it.");
+  },
 };
 window.cue = cue;
 new MutationObserver(() => {
-  if (cue.scene() === cue.last) return;
-  cue.last = cue.scene();
-  cue.sent = null;
+  if (cue.at() === cue.item) return;  // the same question, with what a newer model makes of it
+  cue.item = cue.at();
+  cue.sent = false;
+  cue.shown = Infinity;
   const words = document.querySelector(".film-words");
   if (words) words.textContent = "";
   requestAnimationFrame(() => { cue.shown = performance.now(); });
 }).observe(document, {childList: true, subtree: true});
+document.addEventListener("DOMContentLoaded", () => cue.gone());
 document.addEventListener("keydown", event => {
   if (event.ctrlKey || event.altKey || event.metaKey) return;
   const name = cue.keys[event.key];
   if (!name) return;
+  if (cue.window() && (event.key === " " || name === "undo")) return;  // they are the window's own
   event.preventDefault();
   if (!event.repeat) cue.send(name);
 });
 document.addEventListener("click", event => {
   if (document.activeElement && document.activeElement.blur) document.activeElement.blur();
   const scene = event.target.closest && event.target.closest("svg.scene");
-  if (scene && +scene.dataset.points) cue.send("point", cue.angle(event));
+  if (scene && +scene.dataset.points) cue.send("point", {angle: cue.angle(event), clicks: event.detail});
 });
 document.addEventListener("pointermove", event => {
   if (cue.scene() && +cue.scene().dataset.points) cue.point(event);

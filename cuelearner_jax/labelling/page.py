@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import Any
 
@@ -18,23 +19,26 @@ from cuelearner_jax.labelling.session import Session, Status
 HERE = Path(__file__).parent
 SWATCHES = (
     ("asked", "the action in question"),
-    ("left", "turned counterclockwise"),
-    ("right", "turned clockwise"),
+    ("left", "more to the left"),
+    ("right", "more to the right"),
     ("refined", "what the model makes of it"),
 )
-KEYS = {" ": "space", "ArrowLeft": "←", "ArrowRight": "→", "ArrowUp": "↑", "ArrowDown": "↓"}  # for people
+LATE = "another question had come by then"  # to the server
+
+Finish = Callable[[], Awaitable[None]]  # ends the work; raises UserError if that cannot be
 
 
 class Page:
     """What one browser shows of a session; several may show the same one."""
 
-    def __init__(self, session: Session, pages: set[Page], finish: Any = None) -> None:
+    def __init__(self, session: Session, pages: set[Page], finish: Finish | None = None, again: str = "") -> None:
         """Builds the page in NiceGUI's current client.
 
         Args:
             session: whose question it shows.
             pages: all pages of the session, which it joins while it is open.
             finish: is called by the button that ends the work; None: there is none.
+            again: the command that opens the session once more.
         """
         self.session, self._pages, self._finish = session, pages, finish
         self.controls = controls.controls(session.plan.form)
@@ -42,17 +46,20 @@ class Page:
         self._client = ui.context.client
         ui.add_css((HERE / "page.css").read_text())
         keys = {key: name for name, control in self.controls.items() for key in control.keys}
-        script = (HERE / "page.js").read_text() + f"cue.keys = {json.dumps(keys)};"
+        script = (HERE / "page.js").read_text() + f"cue.keys = {json.dumps(keys)}; cue.again = {json.dumps(again)};"
+        script = script.replace("</", "<\\/")  # which would end it
         ui.add_head_html(f"<script>{script}</script>")
         with ui.element("main").classes("label-page"):
             with ui.column().classes("w-full gap-2"):
+                self._practice()
+                ui.label(session.plan.task.wants(session.plan.config.task)).classes("note")
                 self._asked = ui.label(controls.question(session.plan.form)).classes("big")
                 self._note = ui.label().classes("note")
                 self._scene = ui.html("", sanitize=False).classes("stage")
                 self._answers()
             with ui.element("aside").classes("side"):
                 self._side()
-        self._help = self._overlay()
+        self._help, self._early = self._overlay(), self._ask_early()
         ui.on("cue", self._heard)
         pages.add(self)
         stop = session.listen(self._model_changed)
@@ -63,20 +70,26 @@ class Page:
 
     def _button(self, control: Control, **look: str) -> ui.button:
         """A button that says the item on the screen with what it does."""
-        with ui.button(color=look.get("color", "primary")).props(look.get("props", "")) as button:
+        with ui.button(color=None).props(look.get("props", "")) as button:
             ui.html(f"{control.words}<span class=key>{control.shown}</span>", sanitize=False)
         button.classes(control.colour).mark(control.name)
         button.on(
             "click",
             lambda event, name=control.name: self._heard(event, name),
-            js_handler=f"() => cue.send({json.dumps(control.name)})",
+            js_handler=f"event => cue.send({json.dumps(control.name)}, {{clicks: event.detail}})",
         )
         return button
+
+    def _practice(self) -> None:
+        with ui.element("div").classes("practice") as self._practising:
+            self._practice_words = ui.label()
+            ui.button("skip practice", on_click=self._skip, color=None).props("flat dense").mark("skip")
 
     def _answers(self) -> None:
         with ui.element("div").classes("answers"):
             self._pressable = [self._button(control) for control in controls.answers(self.session.plan.form)]
-            self._pressable.append(self._button(controls.UNSURE, color="grey-7").classes("wide"))
+            self._pressable.append(self._button(controls.UNSURE).classes("wide"))
+        ui.label("").classes("dropped").props("aria-live=polite")
         ui.label("").classes("film-words")
 
     def _side(self) -> None:
@@ -92,27 +105,32 @@ class Page:
         with ui.element("div").classes("hide-small"):
             for name, about in SWATCHES if self.session.plan.form.by_eps else (SWATCHES[0], SWATCHES[3]):
                 ui.html(f'<span class=swatch style="background:var(--{name})"></span>{about}', sanitize=False)
+            ui.label(self.session.legend).classes("text-caption")
         with ui.element("div").classes("tools"):
             for control in (controls.UNDO, controls.FILM, controls.HELP):
-                self._button(control, props="flat dense", color="")
+                self._button(control, props="flat dense")
             dark = ui.dark_mode(None)
-            ui.button("light or dark", on_click=lambda: dark.set_value(not dark.value), color="").props("flat dense")
+            ui.button("light or dark", on_click=lambda: dark.set_value(not dark.value), color=None).props("flat dense")
         self._saved = ui.label().classes("text-caption")
         self._trouble = ui.label().classes("trouble")
         if self._finish is not None:
-            ui.button("finish", on_click=self._finish, color="grey-7").mark("finish")
+            ui.button("finish", on_click=self._ask_finish, color="grey-7").mark("finish")
 
     def _overlay(self) -> ui.dialog:
-        with ui.dialog() as dialog, ui.card():
-            ui.label("Keys").classes("big")
-            for control in self.controls.values():
-                keys = ", ".join(dict.fromkeys(map(_key, control.keys)))
-                ui.label(f"{control.words}: {keys}")
-            ui.label(
-                "Each answer is saved before the next question shows. An answer can be taken back. Where you cannot "
-                "tell, say so: it costs nothing. The film shows what the arrow leads to."
-            )
+        with ui.dialog() as dialog, ui.card().classes("gap-1"):
+            ui.label("Help").classes("big")
+            for line in controls.help_lines(self.session.plan.form):
+                ui.label(line)
             ui.button("close", on_click=dialog.close)
+        return dialog
+
+    def _ask_early(self) -> ui.dialog:
+        with ui.dialog() as dialog, ui.card():
+            ui.label("Finish early?").classes("big")
+            self._early_words = ui.label()
+            with ui.row():
+                ui.button("go on labelling", on_click=dialog.close).mark("go-on")
+                ui.button("finish now", on_click=self._end, color="grey-7").mark("finish-now")
         return dialog
 
     # --- what happens ------------------------------------------------------------------------------------------------
@@ -133,16 +151,50 @@ class Page:
         pressed, angle = self.controls.get(name), told.get("angle")
         if pressed is None and not (name == "point" and self.session.plan.form.is_action and angle is not None):
             return
-        try:
-            if name == "undo":
-                await run.io_bound(self.session.undo, number)
-            else:
-                answer = controls.given(self.session.plan.form, pressed, angle)
-                await run.io_bound(self.session.answer, number, answer, told.get("seconds"))
-        except UserError:
-            pass  # the status tells
+        taken, why = False, LATE
+        if self._help.value or self._early.value:  # a browser may not know yet that it opened
+            why = "a window lies over the question: close it first"
+        else:
+            try:
+                if name == "undo":
+                    taken = await run.io_bound(self.session.undo, number)
+                else:
+                    answer = controls.given(self.session.plan.form, pressed, angle)
+                    taken = await run.io_bound(self.session.answer, number, answer, told.get("seconds"))
+            except UserError as error:
+                why = str(error)
+        if not taken:
+            why = "there is nothing to take back" if name == "undo" and number == self.session.number else why
+            with self._client:
+                ui.run_javascript(f"cue.refused({json.dumps(why)})")
         for page in list(self._pages):
             page.refresh()
+
+    async def _skip(self) -> None:
+        await run.io_bound(self.session.skip_practice)
+        for page in list(self._pages):
+            page.refresh()
+
+    async def _ask_finish(self) -> None:
+        """Finishes what is complete; asks before the rest."""
+        status = self.session.status()
+        if self.session.done:
+            await self._end()
+            return
+        self._early_words.text = (
+            f"{status.answered} of {status.labels} labels are given, and saved. Those can be used as they are, and the "
+            "same command goes on later."
+        )
+        self._early.open()
+
+    async def _end(self) -> None:
+        assert self._finish is not None
+        self._early.close()
+        try:
+            await self._finish()
+        except UserError as error:
+            with self._client:
+                ui.notify(str(error), type="negative", timeout=0, close_button="close")
 
     async def _show_film(self, name: str, number: int) -> None:
         item = self.session.item
@@ -150,10 +202,15 @@ class Page:
             return
         eps = self.session.plan.config.scalars.eps_deg
         way = {"film-left": eps, "film-right": -eps}.get(name, 0.0)
-        reel = await run.io_bound(self.session.film, number, view.turned(item.action, way))
+        reel = await run.io_bound(self.session.film, number, controls.turned(item.action, way))
         if reel is not None:
             with self._client:
                 ui.run_javascript(f"cue.play({view.film(item, reel)})")
+
+    def goto(self, address: str) -> None:
+        """Has the browser open another page of this server."""
+        with self._client:
+            ui.run_javascript(f"location.replace({json.dumps(address)})")
 
     def _model_changed(self) -> None:
         """From any thread."""
@@ -165,13 +222,18 @@ class Page:
         plan = self.session.plan
         self._scene.content = "" if item is None else view.picture(item, plan.form, plan.config.scalars.eps_deg)
         self._note.text = "" if item is None else view.note(item, plan.form, plan.config.scalars.eps_deg)
+        self._practising.set_visibility(item is not None and item.number < 0)
         if item is None:
-            self._asked.text = "All labels are given. Thank you."
+            self._asked.text = "All labels are given. Thank you. Press finish, or undo to change the last one."
         else:
             self._asked.text = controls.question(plan.form)
             self._words.text = item.sketch.words if item.sketch else ""
+        if item is not None and item.number < 0:
+            number, count = self.session.practice + item.number, self.session.practice
+            hint = controls.PRACTICE[min(number, len(controls.PRACTICE) - 1)]
+            self._practice_words.text = f"Practice {number + 1} of {count}, nothing is saved. {hint}"
         for button in self._pressable:
-            button.set_enabled(item is not None and not status.trouble)
+            button.set_enabled(item is not None)
         self._tell(status)
 
     def _tell(self, status: Status) -> None:
@@ -199,7 +261,3 @@ def _left(minutes: float | None) -> str:
     if minutes < 1.5:
         return "about a minute left" if minutes > 0.5 else "nearly done"
     return f"{minutes:.0f} minutes left"
-
-
-def _key(key: str) -> str:
-    return KEYS.get(key, key.upper() if len(key) == 1 else key)

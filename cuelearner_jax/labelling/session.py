@@ -21,8 +21,9 @@ import numpy as np
 
 from cuelearner_jax import asking
 from cuelearner_jax.errors import UserError
+from cuelearner_jax.labelling import controls
 from cuelearner_jax.labelling.learner import Fitted, Learner
-from cuelearner_jax.labelling.living import advance, keys_of, lived
+from cuelearner_jax.labelling.living import advance, begin, keys_of, lived
 from cuelearner_jax.labelling.plan import Plan
 from cuelearner_jax.labelling.programs import programs
 from cuelearner_jax.records import label_files
@@ -32,16 +33,18 @@ from cuelearner_jax.task import shape_of
 from cuelearner_jax.types import GuideState, Label, Reel, Sketch
 
 RECENT = 50  # answers by which the pace is told
+NUMBERS = 2**31  # of questions: those of practice count down to 0, and their random numbers are the last ones
 
 
 class Item(NamedTuple):
     """A question: a situation and an action in it."""
 
-    number: int
+    number: int  # from 0; below 0: it is for practice
     guide: GuideState  # in that situation
     action: np.ndarray  # (action,)
     sketch: Sketch | None = None  # None: nobody is about to see it
     refined: np.ndarray | None = None  # what the newest model makes of the action; None: there is none yet
+    trails: dict[str, str] | None = None  # where `controls.outcomes` lead, as `Pictures.trails`; None: not made
 
 
 class Said(NamedTuple):
@@ -64,19 +67,22 @@ class Status(NamedTuple):
     minutes_left: float | None
     fitting: bool
     newest: Fitted
-    trouble: str  # why nothing can be saved any more; empty: all is well
+    trouble: str  # why the last answer is not saved; empty: all is well
 
 
 class Session:
     """Asks, keeps, fits. Its methods may be called from any thread."""
 
-    def __init__(self, plan: Plan, folder: Path, tell: Callable[[str], None] = lambda words: None) -> None:
+    def __init__(
+        self, plan: Plan, folder: Path, tell: Callable[[str], None] = lambda words: None, practice: int = 0
+    ) -> None:
         """Opens the file and prepares everything: afterwards nothing is compiled.
 
         Args:
             plan: what it is about.
             folder: where `labels.jsonl` lies, or is to lie. Keep it claimed (`records.folders.claimed`).
             tell: is told what is being prepared.
+            practice: questions that come before the first one and are not saved, unless the file holds some already.
 
         Raises:
             UserError: the folder holds labels of something else, or nothing draws the task.
@@ -104,7 +110,10 @@ class Session:
         self._rows: dict[int, Said] = {}
         self._items: dict[int, Item] = {}
         self._trouble = ""
+        self._finished: Path | None = None
         self._lived(start, tell)
+        self.practice = 0 if self._rows else practice
+        self._prepare_practice(start)
         tell("preparing questions")
         self._ensure(self.number)
         self._ensure(self.number + 1)
@@ -129,7 +138,7 @@ class Session:
         found = list(lived(self.env, self._keys, [(row.obs, row.action) for row in told]))
         if len(found) <= count:
             tell("the earlier situations come out otherwise with this program: a new episode begins")
-            found = [(None, None)] * count + [self.env.reset(jax.random.fold_in(self._keys.start, count))]
+            found = [(None, None)] * count + [begin(self.env, jax.random.fold_in(self._keys.start, count))]
         for number, (state, obs) in enumerate(found[:count]):
             if obs is not None:
                 self._items[number] = Item(number, start.replace(env=state, obs=obs), told[number].action)
@@ -139,6 +148,13 @@ class Session:
         state, obs = found[count]
         self._items[count] = self._asked(count, start.replace(env=state, obs=obs))
 
+    def _prepare_practice(self, start: GuideState) -> None:
+        """Makes the questions of practice, each in an episode of its own, and goes to the first of them."""
+        for number in range(-self.practice, 0):
+            state, obs = begin(self.env, jax.random.fold_in(self._keys.start, number % NUMBERS))
+            self._items[number] = self._asked(number, start.replace(env=state, obs=obs))
+            self.number = min(self.number, number)
+
     # --- questions ---------------------------------------------------------------------------------------------------
 
     def _followed(self, item: Item) -> GuideState:
@@ -147,9 +163,9 @@ class Session:
         return item.guide.replace(env=state, obs=obs)
 
     def _asked(self, number: int, guide: GuideState) -> Item:
-        if number < len(self.plan.again):
+        if 0 <= number < len(self.plan.again):
             return Item(number, guide, self.plan.again[number])
-        keys = asking.question_keys(self._keys.session, number)
+        keys = asking.question_keys(self._keys.session, number % NUMBERS)
         guide = guide.replace(model=self._learner.newest.model)
         scalars, base = self.plan.config.scalars, self.plan.base.policy
         action = self._programs.question(self.env, scalars, base, guide, keys, self._bound)
@@ -167,7 +183,16 @@ class Session:
         item = self._items.get(number) or self._asked(number, self._followed(self._items[number - 1]))
         if item.sketch is None:
             item = item._replace(sketch=self._pictures.sketch(self.env, item.guide.env))
+        if item.trails is None:
+            item = item._replace(trails=self._trails(item))
         self._items[number] = self._refined(item)
+
+    def _trails(self, item: Item) -> dict[str, str]:
+        if self._pictures.trails is None:
+            return {}
+        outcomes = controls.outcomes(self.plan.form, item.action, self.plan.config.scalars.eps_deg)
+        drawn = self._pictures.trails(self.env, item.guide.env, jnp.asarray(np.stack([*outcomes.values()])))
+        return dict(zip(outcomes, drawn, strict=True))
 
     def _renew(self) -> None:
         """By the newest model: what is prepared but was never seen is asked anew, what is seen is refined anew."""
@@ -187,20 +212,28 @@ class Session:
         return self._writer.path
 
     @property
+    def legend(self) -> str:
+        """What the picture's trails mean; empty: there are none."""
+        return self._pictures.legend
+
+    @property
     def item(self) -> Item | None:
-        """The question of the moment; None: all are answered."""
+        """The question of the moment; None: all are answered, or the work is finished."""
         with self._lock:
             return None if self.done else self._items[self.number]
 
     @property
     def done(self) -> bool:
-        """Are as many answered as were wanted?"""
-        return self._counted(ANSWERED) >= self.plan.labels or 0 < len(self.plan.again) <= self.number
+        """Are as many answered as were wanted, or is the work finished before?"""
+        enough = self._counted(ANSWERED) >= self.plan.labels or 0 < len(self.plan.again) <= self.number
+        return enough or self._finished is not None
 
     # --- answers -----------------------------------------------------------------------------------------------------
 
     def answer(self, number: int, answer: np.ndarray | None, seconds: float | None = None) -> bool:
         """Keeps an answer and moves on; False if the question is another by now: it was answered, or taken back.
+
+        What is said of a question of practice is not kept.
 
         Args:
             number: of the item that was on the screen.
@@ -208,7 +241,7 @@ class Session:
             seconds: from the question on the screen to the answer (default: since it became the question).
 
         Raises:
-            UserError: nothing can be saved any more.
+            UserError: the answer cannot be saved. It may be given again.
         """
         with self._acting:
             with self._lock:
@@ -232,11 +265,11 @@ class Session:
     def undo(self, number: int) -> bool:
         """Takes the answer before this question back and asks it again; False if there is none, or not this question.
 
-        Raises UserError if nothing can be saved any more.
+        Nothing leads from the first question back to those of practice. Raises UserError if it cannot be saved.
         """
         with self._acting:
             with self._lock:
-                before = self._items.get(number - 1)
+                before = None if number == 0 or self._finished else self._items.get(number - 1)
                 if number != self.number or before is None:
                     return False
                 self._keep(before, UNDONE, None, time.monotonic() - self._since)
@@ -244,17 +277,42 @@ class Session:
             self._show(number - 1)
             return True
 
+    def skip_practice(self) -> None:
+        """Goes to the first question that counts; nothing happens where practice is over."""
+        with self._acting:
+            self._next.result()
+            if self.number < 0:
+                self._ahead.submit(self._ensure, 0).result()
+                self._show(0)
+
+    def finish(self) -> Path:
+        """Ends the work: turns the answers into Parquet and returns that file; whatever is said later is not taken.
+
+        Raises UserError if there is no answer yet, or the disk takes no more; the work then goes on.
+        """
+        with self._acting:
+            if self._finished is None:
+                if not self._counted(ANSWERED):
+                    raise UserError("there is no answer to save yet: answer a question, or stop with Ctrl-C")
+                try:
+                    self._finished = label_files.finish(self.place.parent)
+                except OSError as error:
+                    reason = error.strerror or error
+                    raise UserError(f"not finished ({reason}): make room, then finish again") from error
+            return self._finished
+
     def _keep(self, item: Item, said: str, answer: np.ndarray | None, seconds: float) -> None:
-        if self._trouble:
-            raise UserError(self._trouble)
+        if item.number < 0:
+            return
         now = datetime.now(UTC).isoformat(timespec="milliseconds")
         person = {"item": item.number, "said": said, "seconds": round(seconds, 3), "who": self.plan.who, "when": now}
         obs = np.asarray(item.guide.obs)
         try:
             self._writer.append(seed=self.plan.seed, obs=obs, action=item.action, answer=answer, **person)
         except OSError as error:
-            self._trouble = f"nothing can be saved ({error.strerror or error}): make room, then start this page again"
+            self._trouble = f"this answer is not saved ({error.strerror or error}): make room, then answer again"
             raise UserError(self._trouble) from error
+        self._trouble = ""
         self._rows[item.number] = Said(said, obs, item.action, answer, seconds)
 
     # --- the model ---------------------------------------------------------------------------------------------------

@@ -6,9 +6,8 @@ import html
 import json
 import math
 
-import numpy as np
-
 from cuelearner_jax.guidance.bundle import AnswerForm
+from cuelearner_jax.labelling.controls import LEFT, RIGHT, angle_of
 from cuelearner_jax.labelling.session import Item
 from cuelearner_jax.types import Reel, Sketch
 
@@ -20,18 +19,8 @@ HALO = ' class="halo"', 3.8  # so that arrows stand out on any ground
 TIPS = 8.0  # turns are drawn larger than they are where tips would be nearer than this [hairs],
 STEEPEST = 30.0  # but eps no larger than this [deg],
 WIDEST = 60.0  # and a refined action no farther away, unless it is [deg]
+BADGE = 7.0  # radius of the key at a turned arrow's tip [hairs]
 LEAST_TURN = 1.0  # of the refined action from the one in question as they are drawn, to be shown [deg]
-
-
-def angle_of(action: np.ndarray) -> float:
-    """Of a direction, counterclockwise [deg]."""
-    return math.degrees(math.atan2(float(action[1]), float(action[0])))
-
-
-def turned(action: np.ndarray, by_deg: float) -> np.ndarray:
-    """A direction turned counterclockwise."""
-    angle = math.radians(angle_of(action) + by_deg)
-    return np.array([math.cos(angle), math.sin(angle)], np.float32)
 
 
 def magnified(item: Item, eps_deg: float) -> int:
@@ -46,7 +35,10 @@ def magnified(item: Item, eps_deg: float) -> int:
 def note(item: Item, form: AnswerForm, eps_deg: float) -> str:
     """What a person has to know about the picture; empty: nothing."""
     times = magnified(item, eps_deg) if form.by_eps else 1
-    return f"turns are drawn {times} times as large: {eps_deg:g}° as {times * eps_deg:g}°" if times > 1 else ""
+    if times == 1:
+        return ""
+    true = "; the thin lines are true" if item.trails else ""
+    return f"turns are drawn {times} times as large: {eps_deg:g}° as {times * eps_deg:g}°{true}"
 
 
 def picture(item: Item, form: AnswerForm, eps_deg: float) -> str:
@@ -54,6 +46,8 @@ def picture(item: Item, form: AnswerForm, eps_deg: float) -> str:
     assert item.sketch is not None
     sketch, angle = item.sketch, angle_of(item.action)
     parts = [f'<g class="still">{sketch.still}</g>']
+    for name, drawn in reversed((item.trails or {}).items()):
+        parts += [f'<g class="trail halo">{drawn}</g>', f'<g class="trail {name}">{drawn}</g>']
     for name, body in sketch.movers.items():
         place = f'class="mover" data-mover="{html.escape(name)}" transform="{_moved(sketch, name)}"'
         parts.append(f"<g {place}>{body}</g>")
@@ -61,8 +55,9 @@ def picture(item: Item, form: AnswerForm, eps_deg: float) -> str:
     if form.by_eps:
         drawn = times * eps_deg
         longer = min(max(APART / drawn, TURNED_REACH[0]), TURNED_REACH[1])
-        parts += [_arrow(sketch, angle + way * drawn, name, longer) for way, name in ((1, "left"), (-1, "right"))]
-    parts.append(_line(sketch, angle))
+        turns = ((1, LEFT), (-1, RIGHT))
+        parts += [_arrow(sketch, angle + way * drawn, one.colour, longer, one.shown) for way, one in turns]
+    parts.append("" if item.trails else _line(sketch, angle))
     parts.append(_arrow(sketch, angle, "asked"))
     if item.refined is not None:
         turn = (angle_of(item.refined) - angle + 180) % 360 - 180
@@ -112,17 +107,20 @@ def _room(sketch: Sketch, angle: float) -> float:
     return min(across, down)
 
 
-def _ends(sketch: Sketch, angle: float, longer: float = 1.0) -> tuple[float, float]:
-    """Where an arrow begins and ends, from the foot: within what is shown, but never too short for its head [m]."""
+def _ends(sketch: Sketch, angle: float, longer: float = 1.0, beyond: float = 0.0) -> tuple[float, float]:
+    """Where an arrow begins and ends, from the foot: within what is shown, but never too short for its head [m].
+
+    `beyond`: what else is to be shown beyond its tip [m].
+    """
     hair, (first, last) = sketch.box[2] * HAIR, sketch.reach
     last = first + (last - first) * longer
-    return first, max(min(last, _room(sketch, angle) - 2 * hair), first + HEAD * hair)
+    return first, max(min(last, _room(sketch, angle) - 2 * hair - beyond), first + HEAD * hair)
 
 
-def _arrow(sketch: Sketch, angle: float, name: str, longer: float = 1.0) -> str:
+def _arrow(sketch: Sketch, angle: float, name: str, longer: float = 1.0, key: str = "") -> str:
     hair = sketch.box[2] * HAIR
-    head, half = HEAD * hair, 2.8 * hair
-    first, last = _ends(sketch, angle, longer)
+    head, half, badge = HEAD * hair, 2.8 * hair, BADGE * hair
+    first, last = _ends(sketch, angle, longer, 2 * badge if key else 0.0)
     shaft = [_point(sketch, angle, first), _point(sketch, angle, last - 0.6 * head)]
     tip = [_point(sketch, angle, last), *(_point(sketch, angle, last - head, side) for side in (half, -half))]
     (x1, y1), (x2, y2) = shaft
@@ -130,7 +128,12 @@ def _arrow(sketch: Sketch, angle: float, name: str, longer: float = 1.0) -> str:
     place = f'x1="{x1:.4f}" y1="{y1:.4f}" x2="{x2:.4f}" y2="{y2:.4f}"'
     halo, line = (f'<line{kind} {place} stroke-width="{width * hair:.5f}"/>' for kind, width in (HALO, ("", 2.2)))
     head_drawn = f'<polygon points="{corners}" stroke-width="{1.6 * hair:.5f}"/>'
-    return f'<g class="arrow {name}">{halo}{line}{head_drawn}</g>'
+    shown = ""
+    if key:  # which says this, at its tip: left and right on the screen are others where the arrow points down
+        x, y = _point(sketch, angle, last + badge)
+        disc = f'<circle cx="{x:.4f}" cy="{y:.4f}" r="{badge:.5f}" stroke-width="{0.8 * hair:.5f}"/>'
+        shown = f'<g class="at-key">{disc}<text x="{x:.4f}" y="{y:.4f}" font-size="{1.6 * badge:.5f}">{key}</text></g>'
+    return f'<g class="arrow {name}">{halo}{line}{head_drawn}{shown}</g>'
 
 
 def _line(sketch: Sketch, angle: float) -> str:

@@ -147,7 +147,7 @@ class LabelWriter(tables.TableWriter):
 
         Raises:
             ValueError: a number is not finite, or a width is not that of the labels before.
-            OSError: the disk takes no more; the file must be opened again before anything is appended.
+            OSError: the disk takes no more. The row is not in the file, now or later; the call may be repeated.
         """
         values = {name: value for name, value in zip(ROW, (obs, action, answer), strict=True) if value is not None}
         columns = {name: np.asarray(value, np.float32) for name, value in values.items()}

@@ -117,6 +117,7 @@ class TableWriter:
 
         Raises:
             ValueError: if a required column is missing or the lengths differ.
+            OSError: the disk takes no more. None of the rows is in the table, now or later; the call may be repeated.
         """
         missing = [name for name in self._schema.required if name not in columns and name not in self._columns]
         if missing:

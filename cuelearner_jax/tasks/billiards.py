@@ -97,7 +97,7 @@ def _files(config: BilliardsConfig) -> dict[str, str]:
 def _pictures() -> Pictures:
     from cuelearner_envs.billiards import drawing  # takes seconds to load
     from cuelearner_envs.billiards.recording import record
-    from cuelearner_envs.billiards.sketch import reel, sketch
+    from cuelearner_envs.billiards.sketch import reel, sketch, trails
 
     return Pictures(
         record=record,
@@ -108,6 +108,9 @@ def _pictures() -> Pictures:
         ),
         sketch=sketch,
         reel=reel,
+        trails=trails,
+        legend="Thin lines: the ways of the white ball (solid) and of the ball that it hits (dashed), within three "
+        "seconds. A disc: a ball is pocketed. A cross: the white one is, a foul.",
     )
 
 
@@ -150,6 +153,10 @@ SCENARIOS = {
 BILLIARDS = Task(
     name="billiards",
     about="pocket the target balls with one shot a step",
+    wants=lambda config: (
+        "The white ball is struck along the arrow. A coloured ball is to fall into a pocket, the white one never."
+    ),
+    near_aims=True,
     config=BilliardsConfig,
     bodies=(PLAYER, POOLTOOL),
     teacher=make_teacher,

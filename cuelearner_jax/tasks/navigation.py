@@ -40,6 +40,11 @@ def make_teacher(config: NavigationConfig, env: Any) -> Teacher:
     return make_sided_teacher(env, jnp.float32(side)) if side else make_road_map(env)
 
 
+def _wants(config: NavigationConfig) -> str:
+    side = "" if config.preferred_side == "none" else f", passing each obstacle on the {config.preferred_side}"
+    return f"The robot walks along the arrow and wants to get to the green goal without touching anything grey{side}."
+
+
 def _pictures() -> Pictures:
     from cuelearner_envs.navigation import drawing  # takes seconds to load
     from cuelearner_envs.navigation.recording import record, situation
@@ -145,6 +150,7 @@ SCENARIOS = {
 NAVIGATION = Task(
     name="navigation",
     about="reach a goal without a map, by a lidar",
+    wants=_wants,
     config=NavigationConfig,
     bodies=(SIMPLE, ANYMAL),
     teacher=make_teacher,

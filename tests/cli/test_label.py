@@ -2,9 +2,12 @@
 
 import csv
 import dataclasses
+import shlex
 import signal
+import socket
 import urllib.error
 import urllib.request
+from pathlib import Path
 
 import numpy as np
 import probes
@@ -12,6 +15,7 @@ import pytest
 from sessions import OWN, expert, plan, served
 
 from cuelearner_jax.cli import label, main
+from cuelearner_jax.labelling import ending
 from cuelearner_jax.labelling.plan import Base
 from cuelearner_jax.labelling.session import Session
 from cuelearner_jax.policies import Uniform
@@ -19,6 +23,9 @@ from cuelearner_jax.records import label_files
 from cuelearner_jax.records.folders import claimed
 from cuelearner_jax.task import shape_of
 from cuelearner_jax.tasks import registry as tasks
+
+ROOT = Path(__file__).resolve().parents[2]
+POLICY = [str(ROOT / "docs" / "data" / "navigation_agent")]
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +55,7 @@ def test_the_page_is_served_to_who_knows_its_address_until_ctrl_c(tmp_path, refu
         assert place.startswith("http://127.0.0.1:")
         status, headers, text = status_of(address)
         assert status == 200
-        assert "Which way should the arrow turn?" in text
+        assert "Which way should the middle arrow turn?" in text
         assert status_of(place, Cookie=headers["set-cookie"].partition(";")[0])[0] == 200
         for told in ({}, {"Cookie": "x=1"}, {"Host": "evil.example"}, {"Origin": "http://evil.example"}):
             assert status_of(address if told.keys() & {"Host", "Origin"} else place, **told)[0] == 403
@@ -75,12 +82,74 @@ def test_the_page_is_served_to_who_knows_its_address_until_ctrl_c(tmp_path, refu
         (["--who", " "], "--who is empty"),
         (["--robot", "anymal"], "has no robots to choose from"),
         (["--again", "nothing"], "no label file at nothing"),
+        (["--questions", "near_aims"], "--questions is near_aims, but wandering has no aims in this world"),
         (["--scalars.eps-deg", "-1"], "eps_deg"),
     ],
 )
 def test_what_makes_no_sense_is_refused(more, says, refused, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     refused(["label", OWN, "--out", "labels", *more], says, tmp_path)
+
+
+def test_a_port_in_use_is_refused_before_anything_is_made(refused, tmp_path):
+    pytest.importorskip("nicegui")
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        command = ["label", OWN, "--out", tmp_path / "labels", "--port", str(port)]
+        refused(command, f"port {port} of 127.0.0.1 cannot be had", tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+def asked_for(monkeypatch, *arguments):
+    """The options, plan and commands of a page that is not opened."""
+    found = []
+
+    def served(server, plan, asked, port, stopping, commands):
+        found.extend([asked, plan, commands])
+        return ending.Ending(asked.out, 40, 0, 50, commands.following(40), commands.again)
+
+    monkeypatch.setattr(label, "_served", served)
+    assert main(["label", *arguments]) == 0
+    return found
+
+
+def test_what_is_labelled_by_default_trains_in_minutes(monkeypatch, tmp_path, capsys):
+    pytest.importorskip("nicegui")
+    place = tmp_path / "my labels"
+    asked, plan, commands = asked_for(monkeypatch, "billiards", "--out", str(place), "--who", "Ada B")
+    preset = tasks.find("billiards").presets["quickstart"]
+    assert (asked.task, asked.labels, plan.eps_deg) == (preset.config.task, 100, preset.config.scalars.eps_deg)
+    assert (plan.base.name, asked.practice) == ("near_aims", True)
+    assert commands.again == f"cuelearner label billiards --out '{place}' --who 'Ada B'"
+    following = "cuelearner train billiards --preset quickstart --guidance relative --labels-from"
+    assert commands.following(40) == f"{following} '{place}' --labels 40 --out 'runs/my labels'"
+    told = capsys.readouterr().out
+    assert "done: 40 of 50 labels are saved" in told
+    assert f"next: {following}" in told
+
+
+def test_the_next_command_has_the_options_that_labels_depend_on(monkeypatch, tmp_path):
+    pytest.importorskip("nicegui")
+    monkeypatch.setattr(label, "planned", lambda *told: None)  # worlds take long to make
+    options = ["--scenario", "corridor_left", "--sizes.frame", "action", "--scalars.eps-deg", "10"]
+    _, _, commands = asked_for(monkeypatch, "navigation", "--out", str(tmp_path), *options)
+    words = shlex.split(commands.following(7))
+    assert words[:3] == ["cuelearner", "train", "navigation"]
+    for pair in (["--task.style", "corridor"], ["--task.preferred-side", "left"], ["--scalars.eps-deg", "10.0"]):
+        assert words[words.index(pair[0]) + 1] == pair[1]
+    policy = [*POLICY, "--scenario", "turned_lidar", "--out", str(tmp_path)]
+    asked, _, commands = asked_for(monkeypatch, "navigation", *policy)
+    words = shlex.split(commands.following(7))
+    assert words[:5] == ["cuelearner", "adapt", *POLICY, "--scenario", "turned_lidar"]
+    assert "--task.lidar-rotation-deg" not in words
+    assert asked.labels == 500
+
+
+def test_set_up_installs_what_the_page_needs():
+    rule = (ROOT / "Makefile").read_text().partition("$(VENV)/.installed:")[2].partition("\n\n")[0]
+    assert "--editable '.[label]'" in rule
 
 
 def test_policies_that_cannot_be_had_are_refused(refused, tmp_path, monkeypatch):

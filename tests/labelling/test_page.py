@@ -1,35 +1,53 @@
 """The page without a browser: what it shows and what its buttons do, for each form of feedback."""
 
 import asyncio
+import contextlib
 import html
 import json
 import math
 import re
+import threading
 
+import httpx
 import numpy as np
 import pytest
 from sessions import expert
 
 pytest.importorskip("nicegui")
+from fastapi import FastAPI
+from nicegui import ui
 from nicegui.testing.user_simulation import user_simulation
 
+from cuelearner_jax.errors import UserError
 from cuelearner_jax.guidance.answers import DEMONSTRATION, RELATIVE, SCALAR
 from cuelearner_jax.guidance.bundle import AnswerForm
-from cuelearner_jax.labelling import controls, view
+from cuelearner_jax.labelling import controls, ending, server, view
+from cuelearner_jax.labelling.ending import Commands
 from cuelearner_jax.labelling.page import Page
 from cuelearner_jax.records import label_files
 
 
-def shown(session, acts):
+def shown(session, acts, finish=None):
     """Opens the page of a session in a browser that is none, and has `acts` use it."""
 
     async def used():
         pages = set()
-        async with user_simulation(root=lambda: Page(session, pages) and None) as user:
+        async with user_simulation(root=lambda: Page(session, pages, finish, "cuelearner label") and None) as user:
             await user.open("/")
             await acts(user, pages)
 
     asyncio.run(used())
+
+
+@contextlib.contextmanager
+def told_browser(user):
+    """What the browser is told to run meanwhile."""
+    sent, run = [], ui.run_javascript
+    ui.run_javascript = lambda code, **how: sent.append(code)
+    try:
+        yield sent
+    finally:
+        ui.run_javascript = run
 
 
 async def press(user, name, moved):
@@ -49,7 +67,7 @@ def test_buttons_answer_what_is_on_the_page_and_it_tells_how_far_it_is(opened, t
 
     async def acts(user, pages):
         await user.should_see("0 of 20")
-        await user.should_see("Which way should the arrow turn?")
+        await user.should_see("Which way should the middle arrow turn?")
         for number in range(10):
             right = expert(session.item)
             told.append(float(right[0]))
@@ -61,7 +79,12 @@ def test_buttons_answer_what_is_on_the_page_and_it_tells_how_far_it_is(opened, t
         await user.should_see("model 1, of 10 labels", retries=600)
         await user.should_see("labels kept apart")
         user.find(marker="help").click()
-        await user.should_see("counterclockwise: ←, A")
+        await user.should_see("more to the left: ←, A")
+        (page,) = pages
+        page._help.open()
+        with told_browser(user) as told_it:
+            await page._act("+1", 10, {"name": "+1", "item": 10})  # the question lies under the help
+        assert (session.number, told_it) == (10, ['cue.refused("a window lies over the question: close it first")'])
 
     shown(session, acts)
     file = label_files.read(tmp_path / "labels")
@@ -75,9 +98,12 @@ def test_an_answer_names_its_item_and_pages_show_the_same(opened):
     async def acts(user, pages):
         (page,) = pages
         told = {"name": "+1", "item": 0, "angle": None, "seconds": 0.0}
-        await page._act("+1", 0, told)
-        await page._act("+1", 0, told)  # the key again, before the next question came
+        with told_browser(user) as told_it:
+            await page._act("+1", 0, told)
+            await page._act("+1", 0, told)  # the key again, before the next question came
+            await page._act("undo", 0, {"name": "undo", "item": 0})
         assert session.number == 1
+        assert told_it == ['cue.refused("another question had come by then")'] * 2  # each is told as not taken
         await page._act("nonsense", 1, {"name": "nonsense", "item": 1})
         await page._act("point", 1, {"name": "point", "item": 1, "angle": 30.0})  # not of this form
         assert session.number == 1
@@ -130,8 +156,67 @@ def test_keys_are_told_apart_and_every_answer_is_one_of_the_form():
         assert len(keys) == len(set(keys)) >= 5
         answers = [control.answer for control in controls.answers(form)]
         assert sorted(answers) == sorted((value,) for value in form.values or ())
-    assert controls.COUNTERCLOCKWISE.answer == (1.0,)
+    assert controls.LEFT.answer == (1.0,)
     assert controls.given(RELATIVE, controls.UNSURE, None) is None
+
+
+def test_practice_is_marked_and_can_be_skipped(opened, tmp_path):
+    session = opened(practice=3)
+
+    async def acts(user, pages):
+        await user.should_see("Practice 1 of 3, nothing is saved. Compare the three arrows")
+        await press(user, "+1", lambda: session.number == -2)
+        await user.should_see("Practice 2 of 3, nothing is saved. Where you cannot tell, press ↓")
+        await press(user, "skip", lambda: session.number == 0)
+        await user.should_not_see("Practice")
+        await press(user, "+1", lambda: session.number == 1)
+
+    shown(session, acts)
+    assert label_files.read(tmp_path / "labels").people.item.tolist() == [0]
+
+
+def test_finishing_early_is_asked_about_and_every_page_ends_where_it_says_what_was_saved(opened, tmp_path):
+    session, stopping = opened(), threading.Event()
+    commands = Commands("cuelearner label mine", lambda labels: f"cuelearner train <{labels}>")
+    pages = set()
+    last = server._Last(session, pages, stopping, commands)
+    app = FastAPI()
+    last.routes(app)
+
+    async def seen(kind, address):
+        async with httpx.AsyncClient(transport=httpx.ASGITransport(app), base_url="http://page") as client:
+            return await client.request(kind, address)
+
+    async def acts(user, its_pages):
+        pages.update(its_pages)
+        (page,) = its_pages
+        user.find(marker="finish").click()
+        await user.should_see("0 of 20 labels are given, and saved")
+        with pytest.raises(UserError, match="no answer to save yet"):
+            await last.finish()
+        user.find(marker="go-on").click()
+        await asyncio.sleep(0.1)
+        for number in range(2):
+            await press(user, "+1", lambda number=number: session.number == number + 1)
+        assert (await seen("GET", ending.ADDRESS)).status_code == 404
+        user.find(marker="finish").click()
+        await user.should_see("2 of 20 labels are given, and saved")
+        with told_browser(user) as told_it:
+            await page._end()
+        assert told_it == [f'location.replace("{ending.ADDRESS}")']
+        text = (await seen("GET", ending.ADDRESS)).text
+        place = str(tmp_path / "labels" / label_files.PARQUET)
+        for words in (f"2 of 20 labels are saved, in {place}", "cuelearner train &lt;2&gt;", "cuelearner label mine"):
+            assert words in text
+        assert not stopping.is_set()  # until a browser has shown it
+        await seen("POST", ending.SEEN)
+        assert stopping.is_set()
+
+    shown(session, acts, last.finish)
+    assert last.told.labels == len(label_files.read(tmp_path / "labels").people.item) == 2
+
+
+WAYS = ("left", "right")
 
 
 def tip(svg, name):
@@ -159,8 +244,13 @@ def test_arrows_point_where_actions_do(opened):
     x, y = tip(view.picture(edge, RELATIVE, 20.0), "asked")
     assert (x, 1.5 < y < 1.55) == (pytest.approx(1.0, abs=1e-3), True)
     assert json.loads(html.unescape(re.search('data-places="([^"]*)"', svg)[1])).keys() == {"dot"}
+    down = view.picture(item._replace(action=np.float32([0.0, -1.0])), RELATIVE, 20.0)
+    keys = {name: float(re.search(rf'class="arrow {name}">.*?<text x="([^"]*)"[^>]*>(.)', down)[1]) for name in WAYS}
+    assert keys["left"] > 0.3  # of an arrow that points down the left key moves the tip to the right of the screen
+    assert keys["right"] < -0.3
+    assert [re.search(rf'class="arrow {name}">.*?<text [^>]*>(.)', down)[1] for name in WAYS] == ["←", "→"]
     assert "refined" not in view.picture(item._replace(refined=item.action), RELATIVE, 20.0)
-    np.testing.assert_allclose(view.turned(item.action, 90.0), [-0.8, 0.6], atol=1e-6)
+    np.testing.assert_allclose(controls.turned(item.action, 90.0), [-0.8, 0.6], atol=1e-6)
 
 
 def test_small_turns_are_drawn_larger_and_the_page_says_so(opened):
@@ -187,7 +277,7 @@ def test_small_turns_are_drawn_larger_and_the_page_says_so(opened):
     near = asked._replace(sketch=asked.sketch._replace(box=(-0.1, -0.3, 2.0, 2.0)))  # the picture ends close by
     assert view.magnified(near, 0.1) > times
     for refined, seen in ((0.3, 0.3 * times), (20.0, 60.0), (100.0, 100.0)):  # never past what it is, or 60
-        item = asked._replace(refined=view.turned(asked.action, refined))
+        item = asked._replace(refined=controls.turned(asked.action, refined))
         assert drawn("refined", 0.1, item)[0] == pytest.approx(seen, abs=0.1)
 
 
@@ -195,6 +285,6 @@ def test_a_film_shows_what_the_action_leads_to(opened):
     session = opened()
     best = np.asarray(session.env.best(session.item.guide.obs))
     assert session.film(0, best).words == "True"
-    assert session.film(0, view.turned(best, 90.0)).words == "False"
+    assert session.film(0, controls.turned(best, 90.0)).words == "False"
     film = json.loads(view.film(session.item, session.film(0, best)))
     assert (film["item"], film["frames"][-1]) == (0, {"dot": None})

@@ -2,6 +2,7 @@
 
 import errno
 import math
+import os
 from functools import partial
 from itertools import pairwise
 
@@ -24,7 +25,7 @@ from cuelearner_jax.labelling.programs import programs
 from cuelearner_jax.labelling.session import Session
 from cuelearner_jax.policies import Opaque, Uniform
 from cuelearner_jax.records import label_files
-from cuelearner_jax.records.label_files import JSONL
+from cuelearner_jax.records.label_files import JSONL, PARQUET
 
 
 def lines(folder):
@@ -175,19 +176,61 @@ def test_a_kill_at_any_byte_loses_no_line_that_was_whole(opened, tmp_path):
     assert label_files.read(folder).people.item.tolist() == [0, 1, 2, 3, 4, 5]
 
 
-def test_where_the_disk_takes_no_more_nothing_moves_on(opened, monkeypatch):
+def test_where_the_disk_takes_no_more_nothing_moves_on_and_nothing_is_saved_later(opened, monkeypatch, tmp_path):
     session = opened()
     give(session, 1)
+    write = os.pwrite
 
-    def full(**row):
+    def full(descriptor, data, at):
+        if data.startswith(b"{"):  # of a row its beginning alone; whole what puts the file right again
+            return write(descriptor, data if data.startswith(b'{"end"') else data[:10], at)
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(session._writer, "append", full)
-    for _ in range(2):
-        with pytest.raises(UserError, match=r"nothing can be saved \(No space left on device\): make room, then start"):
-            session.answer(1, np.zeros(1))
+    with monkeypatch.context() as patched:
+        patched.setattr("cuelearner_jax.records.lines.os.pwrite", full)
+        for _ in range(2):
+            with pytest.raises(UserError, match=r"not saved \(No space left on device\): make room, then answer again"):
+                session.answer(1, np.zeros(1))
     assert (session.number, session.status().answered) == (1, 1)
-    assert "nothing can be saved" in session.status().trouble
+    assert "this answer is not saved" in session.status().trouble
+    assert session.answer(1, np.ones(1))
+    assert session.status().trouble == ""
+    rows = label_files.history(tmp_path / "labels" / JSONL)
+    assert [(row["item"], row["answer"]) for row in rows][1:] == [(1, [1.0])]
+
+
+def test_practice_comes_first_is_not_saved_and_changes_nothing(opened, tmp_path):
+    plain = opened("plain")
+    session = opened(practice=3)
+    assert (session.number, session.practice) == (-3, 3)
+    assert session.answer(-3, np.ones(1))
+    assert session.answer(-2, None)
+    assert session.undo(-1)
+    seen = [session.item, plain.item]
+    assert seen[0].number == -2
+    assert np.abs(seen[0].action - seen[1].action).max() > 1e-3  # no question that counts is given away
+    session.skip_practice()
+    session.skip_practice()
+    assert session.number == 0
+    assert not session.undo(0)
+    assert (lines(tmp_path / "labels"), session.status().answered, session.status().per_minute) == (0, 0, None)
+    for mine, theirs in zip(give(session, 3), give(plain, 3), strict=True):
+        np.testing.assert_array_equal(mine.guide.obs, theirs.guide.obs)
+        np.testing.assert_array_equal(mine.action, theirs.action)
+    session.close()
+    assert opened(practice=3).number == 3  # who labels already needs none
+
+
+def test_a_session_is_finished_once_and_takes_nothing_afterwards(opened, tmp_path):
+    session = opened()
+    with pytest.raises(UserError, match="no answer to save yet"):
+        session.finish()
+    give(session, 2)
+    file = session.finish()
+    assert (file, session.finish(), session.done, session.item) == (tmp_path / "labels" / PARQUET, file, True, None)
+    assert not session.answer(2, np.ones(1))
+    assert not session.undo(2)
+    assert label_files.read(file).people.item.tolist() == [0, 1]
 
 
 def test_files_of_something_else_are_refused(opened, tmp_path):

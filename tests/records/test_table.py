@@ -1,6 +1,7 @@
 """The append-only table: columns of every type, what a table says of itself, and what a crash leaves."""
 
 import os
+import resource
 from pathlib import Path
 
 import numpy as np
@@ -123,6 +124,23 @@ def test_a_line_is_on_the_disk_before_append_returns(tmp_path, monkeypatch):
         monkeypatch.setattr(os, "fsync", fsync)
         writer.append(fish="pike", weights=[1.0])
     assert synced == [3]  # what the table is, the row and the closing line
+
+
+def test_a_full_disk_leaves_no_row_behind_and_takes_the_next_one(tmp_path):
+    with tables.TableWriter(tmp_path, SCHEMA, about=ABOUT) as writer:
+        writer.append(fish="pike", weights=[1.0])
+        before = (tmp_path / SCHEMA.jsonl).read_bytes()
+        limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (len(before) + 10, limits[1]))  # room for a part of a line
+        try:
+            for _ in range(2):
+                with pytest.raises(OSError, match="too large"):
+                    writer.append(fish="eel", weights=[2.0])
+                assert (tmp_path / SCHEMA.jsonl).read_bytes() == before
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        writer.append(fish="carp", weights=[3.0])
+    assert read(tmp_path)["fish"].to_pylist() == ["pike", "carp"]
 
 
 def test_the_newest_row(tmp_path):

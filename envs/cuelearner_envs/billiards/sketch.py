@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
 import jax
 import jax.numpy as jnp
@@ -19,6 +20,10 @@ from cuelearner_jax.types import Reel, Sketch
 
 FRAMES = 90  # of a film
 LONGEST = 3.0  # a film [s]: longer shots are shown faster
+TRAIL = 181  # moments of a trail
+BEND = 0.03  # sine of the least angle of a trail's bend
+TOLD = 3.0  # so much of a shot a trail tells at most [s]
+MOVED = 1e-4  # what a ball moves by that was hit, at least [m]
 
 
 def sketch(env: Billiards, state: Balls) -> Sketch:
@@ -34,8 +39,9 @@ def sketch(env: Billiards, state: Balls) -> Sketch:
     places = {f"ball-{number}": (float(x), -float(y), 0.0) for number, (x, y) in enumerate(spots)}
     x, y = positions[0]
     above = max(4.3 * radius - rail, 0.0)  # room for pocketed balls, which stand above the table
+    edge = 0.01 * width  # a frame that ends where the picture does looks cut off
     return Sketch(
-        box=(left, top - above, width + 2 * rail, height + 2 * rail + above),
+        box=(left - edge, top - above - edge, width + 2 * (rail + edge), height + 2 * (rail + edge) + above),
         still=_table(table),
         movers=movers,
         places=places,
@@ -69,6 +75,64 @@ def reel(env: Billiards, state: Balls, action: Float[Array, "2"]) -> Reel:
     scored = int((end & ~np.asarray(state.pocketed))[1:].sum())
     words = "foul: the cue ball is pocketed" if end[0] else f"{scored} pocketed" if scored else "nothing pocketed"
     return Reel(min(float(seconds), LONGEST) / FRAMES, frames, words)
+
+
+@jax.jit
+def _rolled(env: Billiards, state: Balls, actions: jax.Array) -> tuple[Array, Array]:
+    def one(action: jax.Array) -> tuple[Array, Array]:
+        path = trace(env.table, state.positions, state.pocketed, to_angle(action) + env.action_turn)
+        return positions_at(env.table, path, jnp.linspace(0.0, TOLD, TRAIL))
+
+    return jax.vmap(one)(actions)
+
+
+def trails(env: Billiards, state: Balls, actions: Float[Array, "n 2"]) -> list[str]:
+    """For each action, the ways of the cue ball and of the ball that it hits first, in the first `TOLD` seconds.
+
+    The cue ball's is a line, the other's is dashed; a ring is where a ball is then, a disc a target that fell, a cross
+    the cue ball that did.
+    """
+    shots = zip(*jax.device_get(_rolled(env, state, jnp.asarray(actions))), strict=True)
+    return [_trail(float(env.table.ball_radius), positions, pocketed) for positions, pocketed in shots]
+
+
+def _trail(radius: float, positions: np.ndarray, pocketed: np.ndarray) -> str:
+    moved = np.linalg.norm(positions - positions[:1], axis=-1) > MOVED
+    moved[:, 0] = False
+    hit = int(moved.any(axis=1).argmax())  # the first moment at which a target has moved
+    shown = [0, int(moved[hit].argmax())] if moved.any() else [0]
+    return "".join(_way(radius, number, positions[:, number], pocketed[:, number]) for number in shown)
+
+
+def _way(radius: float, number: int, places: np.ndarray, gone: np.ndarray) -> str:
+    """One ball's; it ends where the ball falls."""
+    places = places[: max(int(gone.argmax()), 1)] if gone.any() else places
+    rows = _corners(np.asarray(places, float) * [1.0, -1.0])
+    dashes = f";stroke-dasharray:{svg.number(0.7 * radius)} {svg.number(0.5 * radius)}" if number else ""
+    line = svg.element("polyline", points=svg.points(rows), style=_stroke(0.2 * radius) + dashes)
+    x, y = rows[-1]
+    if not gone.any():
+        return line + svg.circle((x, y), radius, _stroke(0.2 * radius))
+    if number:
+        return line + svg.circle((x, y), 0.7 * radius, "fill:currentColor;" + _stroke(0.1 * radius, ""))
+    ends = [[(x - 0.8 * radius, y - way * 0.8 * radius), (x + 0.8 * radius, y + way * 0.8 * radius)] for way in (1, -1)]
+    return line + "".join(svg.element("polyline", points=svg.points(one), style=_stroke(0.5 * radius)) for one in ends)
+
+
+def _stroke(width: float, fill: str = "fill:none;") -> str:
+    """Of a line [m], which a page may draw wider underneath, so that the line stands out."""
+    return f"{fill}stroke-width:calc({width:.5f}px*var(--wider,1));stroke-linejoin:round"
+
+
+def _corners(rows: np.ndarray) -> np.ndarray:
+    """The places of a way (n, 2) at which it bends, its first and its last."""
+    kept = [rows[0]]
+    for place, following in pairwise(rows[1:]):
+        way, onward = place - kept[-1], following - place
+        bent = abs(way[0] * onward[1] - way[1] * onward[0]) > BEND * np.hypot(*way) * np.hypot(*onward)
+        if np.hypot(*way) > MOVED and (bent or way @ onward < 0):
+            kept.append(place)
+    return np.array([*kept, rows[-1]])
 
 
 def _ball(number: int, radius: float) -> str:

@@ -21,7 +21,8 @@ from cuelearner_envs.navigation.world import FAR_AWAY
 from cuelearner_jax.actions import rotate
 from cuelearner_jax.types import Reel, Sketch
 
-AHEAD, BEHIND, ASIDE = 9.0, 4.0, 6.5  # that is shown [m]
+AHEAD, BEHIND, ASIDE = 9.0, 4.0, 6.5  # that is shown at least [m]
+AROUND = 2 * (AHEAD + BEHIND)  # that is drawn: a page wider or higher than the sketch shows more of it [m]
 INSET = 0.5  # of a goal that lies farther away, from the edge [m]
 STEPS = 15  # of a film
 DOT = 0.05  # radius of a beam's end [m]
@@ -31,8 +32,7 @@ WORDS = {"success": "the goal is reached", "collision": "collision", "fall": "it
 def sketch(env: Navigation, state: Any) -> Sketch:
     """What lies round the robot, from above."""
     world, goal, pose, ranges = jax.device_get(_seen(env, state))
-    around = 2 * (AHEAD + BEHIND)  # a page may be wider than the sketch
-    parts = [svg.rectangle(-around, -around, 2 * around, 2 * around, "fill:var(--floor)")]
+    parts = [svg.rectangle(-AROUND, -AROUND, 2 * AROUND, 2 * AROUND, "fill:var(--floor)")]
     boxes = zip(world.boxes, world.box_heights.tolist(), strict=True)
     discs = zip(world.circles, world.circle_heights.tolist(), strict=True)
     solids = [(height, _box(row, height, pose)) for row, height in boxes]
@@ -104,9 +104,9 @@ def _placed(points: np.ndarray, pose: np.ndarray) -> np.ndarray:
 
 
 def _shown(points: np.ndarray, beyond: float = 0.0) -> bool:
-    """May something of what lies between these points be seen?"""
+    """May something of what lies between these points be seen, on a page of any width?"""
     low, high = points.min(axis=0) - beyond, points.max(axis=0) + beyond
-    return bool(low[0] < ASIDE and high[0] > -ASIDE and low[1] < BEHIND and high[1] > -AHEAD)
+    return bool((low < AROUND).all() and (high > -AROUND).all())
 
 
 def _fill(height: float) -> str:
@@ -133,8 +133,9 @@ def _disc(row: np.ndarray, height: float, pose: np.ndarray) -> str:
 def _goal(at: np.ndarray, radius: float, away: float) -> str:
     low, high = np.array([-ASIDE, -AHEAD]) + INSET, np.array([ASIDE, BEHIND]) - INSET
     ring = svg.circle(tuple(at), radius, "fill:var(--goal);fill-opacity:0.25;stroke:var(--goal);stroke-width:0.06")
+    mark = ring + svg.circle(tuple(at), 0.16, "fill:var(--goal)")
     if (at >= low).all() and (at <= high).all():
-        return ring + svg.circle(tuple(at), 0.16, "fill:var(--goal)")
+        return mark
     # Farther away: where the way there leaves the sketch, as an arrow's head.
     bounds = np.where(at > 0, high, -low) / np.maximum(np.abs(at), 1e-9)
     edge = at * bounds.min()
@@ -143,14 +144,14 @@ def _goal(at: np.ndarray, radius: float, away: float) -> str:
     head = svg.polygon([(0.4, 0.0), (-0.3, -0.35), (-0.3, 0.35)], "fill:var(--goal)")
     inside = edge * (1 - 1.6 / max(float(np.linalg.norm(edge)), 1.6))
     words = svg.text(tuple(inside), 0.4, f"goal {away:.0f} m", "fill:var(--goal);font-weight:bold")
-    return svg.element("g", head, transform=place) + words
+    return mark + svg.element("g", head, transform=place) + words
 
 
 def _robot(robot: Robot) -> str:
     radius, offset = float(robot.disc_radius), float(robot.disc_offset)
     bend = np.linspace(-math.pi / 2, math.pi / 2, 13)
     front = np.stack([np.cos(bend), np.sin(bend)], axis=-1) * radius + [offset, 0.0]
-    hull = svg.polygon(np.concatenate([front, -front]), "fill:var(--body);stroke:white;stroke-width:0.03")
+    hull = svg.polygon(np.concatenate([front, -front]), "fill:var(--body);stroke:#222222;stroke-width:0.04")
     tip = offset + 0.6 * radius
     back = tip - 1.1 * radius
-    return hull + svg.polygon([(tip, 0.0), (back, 0.6 * radius), (back, -0.6 * radius)], "fill:white")
+    return hull + svg.polygon([(tip, 0.0), (back, 0.6 * radius), (back, -0.6 * radius)], "fill:#222222")
