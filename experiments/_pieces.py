@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from cuelearner_jax.cli import main as cuelearner
-from cuelearner_jax.guidance.registry import find
+from cuelearner_jax.guidance.registry import resolve
 
 FIRST_SEED = 4000  # of reported runs; settings are chosen on seeds from 0 on, with --tuning
 Options = Mapping[str, object]  # of `cuelearner sweep`: a value, several in a tuple, or whether a flag is on
@@ -104,7 +104,7 @@ def report_command(experiment: Experiment, world: str, out: Path, scale: str) ->
     """
     own = [piece for piece in experiment.pieces if piece.world == world]
     for kind in {kind for piece in own for kind in piece.kinds if ":" in kind}:
-        find(kind)  # the report then knows its title and colour
+        resolve(kind)  # the report then knows its title and colour
     runs = dict.fromkeys(piece.run for piece in own)
     begun = [str(out / world / run) for run in runs if list((out / world / run).glob("*/config.json"))]
     if not begun:

@@ -180,7 +180,7 @@ def planned(
         raise UserError("--sizes.candidates is above 1, but a page asks in situations as they come: leave it out")
     robot, task = _robot(task, asked.robot), task.on(asked.robot)
     env = shape_of(task, asked.task)
-    guidance = guidances.make(asked.guidance, merged.sizes, env)
+    guidance = guidances.make(guidances.named(asked.guidance), merged.sizes, env)
     if guidance.form is None:
         asking = [kind.name for kind in guidances.known() if kind.asks]
         raise UserError(f"guidance {guidance.name!r} asks for no labels: give --guidance {' or '.join(asking)}")

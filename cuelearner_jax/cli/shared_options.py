@@ -66,7 +66,7 @@ def preset_kinds(task: Task, preset: Preset) -> tuple[str, ...]:
 
 def asking_kind(kinds: tuple[str, ...]) -> str:
     """The first of the kinds that asks a teacher, or else the first."""
-    asking = [kind for kind in kinds if guidances.find(kind).asks]
+    asking = [kind for kind in kinds if guidances.resolve(kind).asks]
     return (asking or list(kinds))[0]
 
 

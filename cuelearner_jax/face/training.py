@@ -98,7 +98,7 @@ def train(
     configuration.check(run_config)
     world.task.check_evaluations(run_config)
     asked = guidance or registry.possible(world.env, taught=teacher is not None)
-    names = tuple(registry.find(kind).name for kind in asked)
+    names = tuple(registry.resolve(kind).name for kind in asked)
     if isinstance(seeds, int) and not 0 < seeds <= LARGEST_SEED:
         raise UserError(f"seeds is {seeds}: give a number from 1 to {LARGEST_SEED}")
     grid = Grid(names, tuple(range(seeds)) if isinstance(seeds, int) else tuple(seeds), tuple(labels))

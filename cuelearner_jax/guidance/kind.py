@@ -10,6 +10,8 @@ from cuelearner_jax.config import GuideSizes
 from cuelearner_jax.environment import Spaces
 from cuelearner_jax.guidance.bundle import AnswerForm, Guidance
 
+NAME = re.compile(r"[a-z][a-z0-9_-]*")  # of kinds, also in files: neither a path nor a reference to code
+
 
 @dataclass(frozen=True)
 class Kind:
@@ -24,7 +26,7 @@ class Kind:
     colour: str | None = None  # in figures
 
     def __post_init__(self) -> None:
-        if not re.fullmatch(r"[a-z][a-z0-9_-]*", self.name):
+        if not NAME.fullmatch(self.name):
             raise ValueError(f"a guidance is called {self.name!r}: give lower-case letters, digits, - and _")
 
     @property

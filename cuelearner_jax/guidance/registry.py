@@ -44,19 +44,26 @@ def registered(name: str) -> Kind | None:
 
 
 def find(name: str) -> Kind:
-    """The kind of that name, or that `package.module:NAME` leads to.
-
-    Raises:
-        UserError: there is none.
-    """
-    if ":" in name:
-        return register(load(name, Kind, "a kind of guidance"))
+    """The kind of that name; no code is loaded that the name leads to. Raises UserError if there is none."""
     _register_installed()
     if name not in _KINDS:
         raise UserError(
             f"unknown guidance {name!r}{closest(name, _KINDS)} (one of your own is named as package.module:NAME)"
         )
     return _KINDS[name]
+
+
+def resolve(text: str) -> Kind:
+    """The kind that a user or caller names: by its name, or as `package.module:NAME`, whose code is loaded.
+
+    Never call it with what a file says. Raises UserError if there is no such kind.
+    """
+    return register(load(text, Kind, "a kind of guidance")) if ":" in text else find(text)
+
+
+def named(text: str) -> str:
+    """Name of the kind that a user or caller names, as `resolve`; a name alone need not be known here."""
+    return resolve(text).name if ":" in text else text
 
 
 def possible(env: Any, taught: bool) -> tuple[str, ...]:

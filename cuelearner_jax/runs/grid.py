@@ -15,6 +15,7 @@ from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import SPLITS
 from cuelearner_jax.guidance import registry as guidances
 from cuelearner_jax.guidance.bundle import Guidance
+from cuelearner_jax.guidance.kind import NAME
 from cuelearner_jax.plugins import REFERENCE
 from cuelearner_jax.records import formats, label_files
 from cuelearner_jax.records.folders import CONFIG
@@ -113,12 +114,9 @@ def load(folder: Path, find: Callable[[str], Task]) -> tuple[Task, RunConfig, Gr
         raise UserError(f"{folder} is no run folder (it has no config.json): give the --out of a train or sweep")
     values = formats.read("config", path)
     try:
-        name, origin = values["task"].pop("name"), values["task"].pop("from", None)
-        if origin is not None and not REFERENCE.fullmatch(origin):
-            raise ValueError(f"{origin!r} names no code")
-        task = known_task(find, name, origin, path)
+        task, world = world_of(values["task"], find, path)
         config = RunConfig(
-            configuration.from_json(task.config, values["task"]),
+            world,
             configuration.from_json(Sizes, values["sizes"]),
             configuration.from_json(Scalars, values["scalars"]),
             configuration.from_json(Schedule, values["schedule"]),
@@ -139,8 +137,10 @@ def _grid(values: dict[str, Any]) -> Grid:
     if not all(isinstance(values[name], list) for name in ("guidance", "seeds", "labels")):
         raise TypeError("a grid is made of lists")
     kinds, seeds, labels = (tuple(values[name]) for name in ("guidance", "seeds", "labels"))
-    if not kinds or not all(isinstance(kind, str) for kind in kinds) or len(set(kinds)) < len(kinds):
-        raise ValueError(f"{kinds} are no kinds of guidance")
+    if not kinds or not all(isinstance(kind, str) and NAME.fullmatch(kind) for kind in kinds):
+        raise ValueError(f"{kinds} are no names of kinds of guidance")
+    if len(set(kinds)) < len(kinds):
+        raise ValueError(f"{kinds} name a kind twice")
     for name, numbers, end in (("seeds", seeds, LARGEST_SEED), ("budgets", labels, LARGEST_BUDGET)):
         if not all(type(number) is int and 0 <= number < end for number in numbers) or len(set(numbers)) < len(numbers):
             raise ValueError(f"{numbers} are no {name}")
@@ -149,8 +149,22 @@ def _grid(values: dict[str, Any]) -> Grid:
     return Grid(kinds, seeds, labels)
 
 
-def known_task(find: Callable[[str], Task], name: str, origin: str | None, path: Path) -> Task:
-    """The task of a run. Raises UserError if it is not known, saying how one from outside becomes so."""
+def world_of(told: dict[str, Any], find: Callable[[str], Task], path: Path) -> tuple[Task, Any]:
+    """The task of a folder and the world in it (a configuration), of what its file says of them.
+
+    Raises:
+        UserError: the task is not known; the message says how one from outside becomes so.
+        ValueError, KeyError, TypeError, AttributeError: it makes no sense.
+    """
+    name, origin = told["name"], told.get("from")
+    if origin is not None and not REFERENCE.fullmatch(origin):
+        raise ValueError(f"{origin!r} names no code")
+    task = _known_task(find, name, origin, path)
+    fields = {field: value for field, value in told.items() if field not in ("name", "from")}
+    return task, configuration.from_json(task.config, fields)
+
+
+def _known_task(find: Callable[[str], Task], name: str, origin: str | None, path: Path) -> Task:
     try:
         return find(name)
     except UserError as error:

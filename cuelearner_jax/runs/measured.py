@@ -12,6 +12,7 @@ import numpy as np
 
 from cuelearner_jax.config import to_json
 from cuelearner_jax.evaluate import Tell, episodes, part_of, untold, watched, watched_lanes
+from cuelearner_jax.guidance import registry as guidances
 from cuelearner_jax.policies import Common
 from cuelearner_jax.records.provenance import provenance
 from cuelearner_jax.records.whole import replacing
@@ -64,7 +65,7 @@ def evaluate(
         metrics = {metric: np.asarray(value)[None] for metric, value in found.items()}
         return [Measured("-", 0, 0, np.zeros(1, int), metrics)]
     rows = []
-    for block in blocks_of(source, named, env, teacher, kinds):
+    for block in blocks_of(source, named, env, teacher, tuple(map(guidances.named, kinds))):
         tell, policy, count = watch(block.guidance), block.policy, len(block.seeds)
         if engine:
             each = []

@@ -67,7 +67,7 @@ def planned(order: Order) -> Plan:
     """What `run` does with an order. Raises UserError for what it would refuse, but for too little memory."""
     configuration.check(order.config)
     tracking.check(order.track)
-    names = tuple(guidances.find(kind).name for kind in order.grid.guidance)  # one of one's own is named by its module
+    names = tuple(guidances.resolve(kind).name for kind in order.grid.guidance)  # code is loaded here
     order = dataclasses.replace(order, grid=dataclasses.replace(order.grid, guidance=names))
     check_grid(order.grid)
     piece, sweep = None, order.out

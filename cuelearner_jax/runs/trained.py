@@ -195,10 +195,9 @@ class PolicySource:
         """
         assert self.grid is not None  # `check` has seen to it
         loaded = []
-        for kind in kinds or self.grid.guidance:
-            name = guidances.find(kind).name if ":" in kind else kind
+        for name in kinds or self.grid.guidance:
             if name not in self.grid.guidance:
-                raise UserError(f"{self.folder} has no guidance {kind!r}: choose among {', '.join(self.grid.guidance)}")
+                raise UserError(f"{self.folder} has no guidance {name!r}: choose among {', '.join(self.grid.guidance)}")
             if guidances.registered(name) is None:
                 raise UserError(
                     f"{self.folder} has lanes of a guidance from outside, {name!r}: name its code by "
@@ -235,11 +234,10 @@ def blocks_of(
     kinds: tuple[str, ...],
     failed_too: bool = False,
 ) -> list[Block]:
-    """A policy of a folder's lanes. Raises UserError if it cannot be had."""
+    """A policy of a folder's lanes under `kinds` of guidance, by name. Raises UserError if it cannot be had."""
     if source.adapted is not None:
         kept = source.adapted
-        known = [guidances.find(kind).name for kind in kinds]  # one from outside is known from here on
-        if known and kept.guidance not in known:
+        if kinds and kept.guidance not in kinds:
             raise UserError(f"{source.folder} is under {kept.guidance} guidance: leave out --guidance")
         columns = (kept.lanes.seed, kept.lanes.budget, kept.lanes.bound_deg)
         policy = named.make(Parts(source.config, env, teacher, None, kept))
@@ -300,7 +298,7 @@ def several(
     teacher = source.task.make_teacher(world, env) if named.taught else None
     if not named.kept:
         return [named.make(Parts(source.config, env, teacher, None))], (0,)
-    kinds = (kind,) if kind else (source.grid.guidance[-1],) if source.grid else ()
+    kinds = (guidances.named(kind),) if kind else (source.grid.guidance[-1],) if source.grid else ()
     blocks = blocks_of(source, named, env, teacher, kinds, failed_too=True)
     known = {
         part: np.concatenate([getattr(block, part) for block in blocks]) for part in ("seeds", "budgets", "bounds")

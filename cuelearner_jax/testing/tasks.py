@@ -47,7 +47,7 @@ def check_task(
             check_grid(Grid(preset.guidance or ("none",), (preset.first_seed,), preset.labels))
         env = _shapes(laws, task, preset.config.task, f"preset {name!r}")
         possible = registry.possible(env, taught=task.teacher is not None)
-        odd = [kind for kind in preset.guidance if registry.find(kind).name not in possible]
+        odd = [kind for kind in preset.guidance if registry.resolve(kind).name not in possible]
         laws.hold(not odd, f"preset {name!r} compares guidance {odd[:1]}, which it cannot have: of {list(possible)}")
         _check_splits(laws, task, preset.config.task, name)
         _check_scenarios(laws, task, preset.config.task, env.obs_size)
