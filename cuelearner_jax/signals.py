@@ -14,6 +14,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from types import FrameType
 
 NUMBERS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # Ctrl-C, a scheduler, a terminal that was closed
@@ -22,6 +23,7 @@ SHOW_CURSOR = b"\r\x1b[K\x1b[?25h"  # where a progress bar stood, which hides it
 _listening = threading.Event()  # set in a process of the command's own
 _leaving = threading.Lock()
 _saves = threading.RLock()
+_litter: set[Path] = set()  # files that are not to outlive this process
 
 
 class Interrupted(Exception):
@@ -101,6 +103,17 @@ def saving() -> Iterator[None]:
         raise KeyboardInterrupt
 
 
+@contextmanager
+def removed(file: Path) -> Iterator[None]:
+    """Removes a file at the end, also at that of a process that a signal ends at once."""
+    _litter.add(file)
+    try:
+        yield
+    finally:
+        _litter.discard(file)
+        file.unlink(missing_ok=True)
+
+
 def listen() -> None:
     """Makes a signal end this process at once, in one line, with status 128 and its number, but where `interruptible`.
 
@@ -148,6 +161,9 @@ def _stop_at_once(number: int) -> None:
 def _leave(number: int) -> None:
     if not _leaving.acquire(blocking=False):
         return
+    for file in tuple(_litter):
+        with contextlib.suppress(OSError):
+            file.unlink()
     with contextlib.suppress(OSError):  # past Python's streams: whoever computes or writes may hold them
         shown = SHOW_CURSOR if os.isatty(2) else b""
         os.write(2, shown + b"stopped at once; what was saved before is safe\n")

@@ -24,14 +24,18 @@ import jax.numpy as jnp
 from cuelearner_jax import config as configuration
 from cuelearner_jax.agent import view
 from cuelearner_jax.agent.networks import q_network
-from cuelearner_jax.config import AgentSizes, GuideSizes, Scalars
+from cuelearner_jax.config import AgentSizes, GuideSizes, Scalars, check_agent, check_guide
 from cuelearner_jax.environment import actions_of, offers, spaces_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guidance import registry as guidances
+from cuelearner_jax.guidance.kind import NAME
 from cuelearner_jax.policies import Agent, Common, Corrected, Guided, Heuristic, Taught, uniform_in
 from cuelearner_jax.policies import Uniform as UniformPolicy
 
 Told = dict[str, Any]
+KINDS = ("agent", "uniform", "heuristic", "guided", "code")
+PARTS = ((GuideSizes, "sizes"), (Scalars, "scalars"))  # of a guided policy's values
+MOST_LAYERS = 16  # of a policy that was adapted again and again
 
 
 def told(policy: Any, named: str | None = None) -> Told:
@@ -76,6 +80,35 @@ def _part(kind: type, values: Any) -> Told:
     )
 
 
+def check(values: Told, outermost: bool = True, depth: int = MOST_LAYERS) -> None:
+    """Whether plain values from a file say what a policy is made of.
+
+    Args:
+        values: as `told` gives them.
+        outermost: is it the policy itself, not one that it refines?
+        depth: layers that it may have.
+
+    Raises:
+        UserError: a size or scalar that cannot work.
+        ValueError, TypeError, KeyError, AttributeError: anything else that `told` would not have written.
+    """
+    kind = values["policy"]
+    if kind not in (("guided",) if outermost else KINDS) or not depth:
+        raise ValueError(f"{kind!r} is no policy here")
+    if kind == "agent":
+        check_agent(configuration.from_json(AgentSizes, values["sizes"]))
+        if (sees := values.get("sees")) is not None and (type(sees) is not int or sees < 1):
+            raise ValueError(f"an agent sees {sees!r} entries")
+    if kind == "code" and not isinstance(values["named"], str):
+        raise TypeError(f"code is named {values['named']!r}")
+    if kind == "guided":
+        sizes, scalars = (configuration.from_json(of, values[part]) for of, part in PARTS)
+        check_guide(sizes, scalars)
+        if not NAME.fullmatch(values["guidance"]) or type(values["bounded"]) is not bool:
+            raise ValueError(f"a guidance is called {values['guidance']!r}, and bounded {values['bounded']!r}")
+        check(values["base"], outermost=False, depth=depth - 1)
+
+
 def arrays_of(policy: Any) -> Any:
     """The arrays of a policy, or of a block of them."""
     if isinstance(policy, Common):
@@ -95,13 +128,19 @@ def shapes_of(values: Told, env: Any, rows: int | None = None) -> Any:
         values: from `told`.
         env: of the policy's task, shapes in place of arrays will do.
         rows: of a block of so many policies; None: of one.
+
+    Raises:
+        UserError, ValueError: the environment is none that the policy can act in.
     """
     spaces = spaces_of(env)
 
     def one(values: Told) -> Any:
         if values["policy"] == "agent":
             sizes = configuration.from_json(AgentSizes, values["sizes"])
-            own = spaces if values.get("sees") is None else spaces_of(env, values["sees"])
+            sees = values.get("sees")
+            if sees is not None and sees > env.obs_size:
+                raise ValueError(f"an agent sees {sees} of {env.obs_size} entries")
+            own = spaces if sees is None else spaces_of(env, sees)
             seen = [jnp.zeros(width) for width in view.widths(sizes.frame, own)]
             return {"params": q_network(sizes.q_layers).init(jax.random.key(0), *seen)}
         if values["policy"] == "guided":
@@ -139,9 +178,7 @@ def made(values: Told, arrays: Any, env: Any, code: Any = None) -> Any:
         return Heuristic(env)
     if kind == "guided":
         base = made(values["base"], arrays["base"], env, code)
-        sizes, scalars = (
-            configuration.from_json(of, values[part]) for of, part in ((GuideSizes, "sizes"), (Scalars, "scalars"))
-        )
+        sizes, scalars = (configuration.from_json(of, values[part]) for of, part in PARTS)
         return Guided(base, arrays["model"], env, scalars, _guidance(values, env), arrays.get("bound"), sizes)
     if kind == "code":
         if code is None:

@@ -1,6 +1,14 @@
 """Configuration of the method: its groups of values, what of them can work, and how they are kept."""
 
-from cuelearner_jax.config.checks import LARGEST, LARGEST_FLOAT, LARGEST_ROUND, check, check_guide, check_whole
+from cuelearner_jax.config.checks import (
+    LARGEST,
+    LARGEST_FLOAT,
+    LARGEST_ROUND,
+    check,
+    check_agent,
+    check_guide,
+    check_whole,
+)
 from cuelearner_jax.config.groups import (
     AgentScalars,
     AgentSizes,
@@ -30,6 +38,7 @@ __all__ = [
     "Sizes",
     "TeacherFaults",
     "check",
+    "check_agent",
     "check_guide",
     "check_whole",
     "defaults",

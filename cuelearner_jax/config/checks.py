@@ -7,7 +7,7 @@ import itertools
 import math
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
-from cuelearner_jax.config.groups import GuideScalars, GuideSizes, RunConfig, Sizes
+from cuelearner_jax.config.groups import AgentSizes, GuideScalars, GuideSizes, RunConfig
 from cuelearner_jax.config.plain import fits
 from cuelearner_jax.errors import UserError
 
@@ -20,7 +20,11 @@ def check(config: RunConfig) -> None:
     """Raises UserError with one line for the first value that cannot work."""
     sizes, schedule = config.sizes, config.schedule
     check_whole(schedule, "schedule")
-    _check_sizes(sizes)
+    check_agent(sizes)
+    if sizes.lanes_per_block < 0:
+        raise UserError(
+            f"sizes.lanes_per_block is {sizes.lanes_per_block}: give a positive number, or 0 to leave it open"
+        )
     check_guide(sizes, config.scalars)
     if sizes.sees_turn:
         raise UserError("sizes.sees_turn is for adaptation, whose base policy is no random one: leave it out")
@@ -89,7 +93,8 @@ def check_whole(group: Any, prefix: str) -> None:
                 )
 
 
-def _check_sizes(sizes: Sizes) -> None:
+def check_agent(sizes: AgentSizes) -> None:
+    """Raises UserError with one line for the first value of an agent's that cannot work."""
     check_whole(sizes, "sizes")
     positive = ("directions", "peaks", "target_directions", "num_envs", "batch_size", "replay_capacity")
     _check_positive(sizes, (*positive, "updates_per_step", "n_step"))
@@ -100,10 +105,6 @@ def _check_sizes(sizes: Sizes) -> None:
         )
     if sizes.coarse_directions and sizes.peaks > sizes.coarse_directions:
         raise UserError(f"sizes.peaks is {sizes.peaks}: give at most sizes.coarse_directions")
-    if sizes.lanes_per_block < 0:
-        raise UserError(
-            f"sizes.lanes_per_block is {sizes.lanes_per_block}: give a positive number, or 0 to leave it open"
-        )
     _check_layers(sizes.q_layers, "sizes.q_layers")
     if sizes.n_step * sizes.num_envs > sizes.replay_capacity:
         raise UserError(

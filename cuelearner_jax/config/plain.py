@@ -48,7 +48,7 @@ def fits(value: Any, kind: Any) -> bool:
         parts = parts[:1] * len(value) if isinstance(value, tuple) and parts[1:] == (...,) else parts
         return isinstance(value, tuple) and len(value) == len(parts) and all(map(fits, value, parts))
     if kind in (int, float):
-        return type(value) is int or (kind is float and type(value) is float)
+        return (type(value) is int and abs(value) < 1 << 63) or (kind is float and type(value) is float)
     return isinstance(value, kind) if isinstance(kind, type) else True
 
 

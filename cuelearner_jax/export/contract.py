@@ -12,8 +12,6 @@ import hashlib
 import io
 import itertools
 import json
-import os
-import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -29,9 +27,8 @@ from cuelearner_jax.export import runner
 from cuelearner_jax.export.decisions import TOLERANCE, clip_radius_deg, described, golden_cases
 from cuelearner_jax.export.formats import FORMATS, traced
 from cuelearner_jax.policies import Policy
-from cuelearner_jax.records.folders import in_use
 from cuelearner_jax.records.provenance import provenance
-from cuelearner_jax.records.whole import replacing
+from cuelearner_jax.records.whole import Place, is_used, place_of, replacing
 
 ANGLE = "atan2(action[1], action[0]) [rad]: 0 along x, positive counterclockwise (from x to y)"
 
@@ -40,7 +37,11 @@ def check_request(format: str, out: Path) -> None:
     """Raises UserError unless a decision of that format can be written to a folder."""
     if format not in FORMATS:
         raise UserError(f"unknown format {format!r}{closest(format, FORMATS)}")
-    if in_use(out):
+    _check_free(out)
+
+
+def _check_free(out: Path) -> None:
+    if is_used(out):
         raise UserError(f"{out} is not empty: give another --out")
 
 
@@ -71,6 +72,20 @@ def write(
         UserError: no such format; the folder is in use; the policy cannot be exported.
     """
     check_request(format, out)
+    with place_of(out, _check_free) as place:
+        return _made(policy, observation, action, drawn, format, place, source)
+
+
+def _made(
+    policy: Policy,
+    observation: Sequence[Quantity],
+    action: Quantity,
+    drawn: Callable[[], Float[np.ndarray, "n obs"]],
+    format: str,
+    place: Place,
+    source: dict[str, Any],
+) -> dict[str, Any]:
+    """`write` at a place that is kept for it."""
     policy = jax.tree.map(jnp.asarray, jax.device_get(policy))  # what was trained may lie on several devices
     size = sum(quantity.size for quantity in observation)
     found = traced(policy, size)
@@ -108,7 +123,7 @@ def write(
         "files": {name: hashlib.sha256(contents).hexdigest() for name, contents in files.items()},
         **provenance(),
     }
-    return {**contract, "difference": _written(out, files, contract)}
+    return {**contract, "difference": _written(place, files, contract)}
 
 
 def _slices(observation: Sequence[Quantity]) -> list[dict[str, Any]]:
@@ -119,23 +134,16 @@ def _slices(observation: Sequence[Quantity]) -> list[dict[str, Any]]:
     ]
 
 
-def _written(out: Path, files: dict[str, bytes], contract: dict[str, Any]) -> float:
+def _written(place: Place, files: dict[str, bytes], contract: dict[str, Any]) -> float:
     """Writes everything beside the place, tries it there, and moves it."""
-    out.parent.mkdir(parents=True, exist_ok=True)
-    beside = out.with_name(f".{out.name}.{os.getpid()}")
-    beside.mkdir()
-    try:
+    with place.writing() as folder:
         for name, contents in files.items():
-            with replacing(beside / name, "wb") as file:
+            with replacing(folder / name, "wb") as file:
                 file.write(contents)
         contract = json.loads(json.dumps(contract))
-        with replacing(beside / runner.CONTRACT) as file:
+        with replacing(folder / runner.CONTRACT) as file:
             file.write(json.dumps({**contract, runner.DIGEST: runner.digest(contract)}, indent=1) + "\n")
-        difference = checked(beside)
-        beside.replace(out)
-    finally:
-        shutil.rmtree(beside, ignore_errors=True)
-    return difference
+        return checked(folder)
 
 
 def checked(folder: Path) -> float:
@@ -145,5 +153,13 @@ def checked(folder: Path) -> float:
     """
     try:
         return runner.Decision(folder).check()
+    except runner.ContractError as error:
+        raise UserError(str(error)) from error
+
+
+def unlisted(folder: Path) -> list[str]:
+    """Names of what lies in a folder and is not in its contract. Raises UserError for a folder that is damaged."""
+    try:
+        return runner.Decision(folder).unlisted
     except runner.ContractError as error:
         raise UserError(str(error)) from error

@@ -24,7 +24,7 @@ from cuelearner_jax.guidance import given, registry
 from cuelearner_jax.guidance.answers import check_teacher
 from cuelearner_jax.guidance.bundle import Guidance
 from cuelearner_jax.policies import Common, Opaque
-from cuelearner_jax.records import label_files
+from cuelearner_jax.records import label_files, policy_folders
 from cuelearner_jax.runs import adapted as folders
 from cuelearner_jax.runs.adaptation import DEFAULT_KIND, told
 from cuelearner_jax.runs.adapted import alone
@@ -66,7 +66,8 @@ class AdaptedPolicy(CallablePolicy):
                 "a policy folder says in which world its policy acts: adapt in a world, as cl.make gives it"
             )
         origin = {"code": self.named}
-        folders.write(Path(folder), self.found, self.world.task, self.world.config, origin, overwrite=overwrite)
+        with policy_folders.place_of(Path(folder), overwrite) as place:
+            folders.write(place, self.found, self.world.task, self.world.config, origin)
 
 
 def adapt(
@@ -117,7 +118,7 @@ def adapt(
     if file is not None:
         sizes, scalars = adapting.falling(sizes or adapting.SIZES, scalars or Scalars(), file.labels.eps_deg)
     sizes, scalars = settings(sizes, scalars, eps_deg)
-    kind = registry.find(guidance)
+    kind = registry.resolve(guidance)
     if not kind.asks:
         raise UserError(f"guidance {guidance!r} asks nothing that could be learned from: choose another")
     bundle = registry.make(kind.name, sizes, place.env)

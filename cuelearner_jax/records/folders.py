@@ -12,17 +12,15 @@ Folder of a run:
 
 from __future__ import annotations
 
-import fcntl
-import os
 import shutil
-import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.records import formats
+from cuelearner_jax.records import formats, locks
+from cuelearner_jax.records.locks import held
 from cuelearner_jax.records.whole import TEMPORARY
 
 CONFIG = "config.json"
@@ -92,38 +90,18 @@ def differences(
 def claimed(out: Path) -> Iterator[None]:
     """Makes a run's folder and keeps it for this process alone; it is free again however the process ends.
 
-    The lock is on a file, not on the folder: that is what NFS passes on between machines. Whatever was found in the
-    folder before may have changed until it is kept: look again.
+    Whatever was found in the folder before may have changed until it is kept: look again.
 
     Raises UserError if another process has it.
     """
     out.mkdir(parents=True, exist_ok=True)
-    descriptor = os.open(out / LOCK, os.O_RDWR | os.O_CREAT, 0o666)
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        os.close(descriptor)
-        by = f" ({found})" if (found := holder(out)) else ""
-        raise UserError(f"{out} is being written by another process{by}: wait for it, or give another --out") from None
-    try:
-        os.ftruncate(descriptor, 0)
-        os.write(descriptor, f"process {os.getpid()} on {socket.gethostname()}".encode())
+    with held(out / LOCK, out, stays=True):
         yield
-    finally:
-        os.ftruncate(descriptor, 0)
-        os.close(descriptor)
 
 
 def holder(out: Path) -> str | None:
     """Who keeps a folder, as "process N on MACHINE"; None: nobody, or nobody knows."""
-    try:
-        with (out / LOCK).open("rb") as file:
-            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return (out / LOCK).read_text(encoding="utf-8", errors="replace") or None
-    except OSError:
-        pass
-    return None
+    return locks.holder(out / LOCK)
 
 
 def prepare_folder(out: Path, described: dict[str, Any], clean: bool) -> None:

@@ -52,15 +52,15 @@ def read(kind: str, path: Path) -> Values:
     """
     try:
         values = json.loads(path.read_text(encoding="utf-8"))
+        if isinstance(values, dict):
+            number, told = values.get("format", 0), values.pop(DIGEST, None)
+            sealed = isinstance(number, int) and number >= SEALED_SINCE
+            if (sealed or told is not None) and told != configuration.digest(values):
+                raise damaged(kind, path)
     except OSError as error:
         raise unreadable(path, error) from error
     except (ValueError, RecursionError) as error:
         raise damaged(kind, path) from error
-    if isinstance(values, dict):
-        number, told = values.get("format", 0), values.pop(DIGEST, None)
-        sealed = isinstance(number, int) and number >= SEALED_SINCE
-        if (sealed or told is not None) and told != configuration.digest(values):
-            raise damaged(kind, path)
     return upgrade(kind, values, path)
 
 

@@ -5,22 +5,19 @@
     labels.parquet    what was answered; labels-60deg.parquet and so on where lanes differ in their bounds
     guide.parquet     what the policy was worth after so many labels
 
-The folder appears in one step, once all of it is on the disk. Code is named in it, never kept.
+The folder appears in one step, once all of it is written (`whole.Place`). Code is named in it, never kept.
 """
 
 from __future__ import annotations
 
-import os
-import shutil
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.records import formats
+from cuelearner_jax.records import formats, whole
 from cuelearner_jax.records.checkpoint import checkpoints, digest
-from cuelearner_jax.records.whole import TEMPORARY
+from cuelearner_jax.records.whole import Place, is_used
 
 POLICY, ARRAYS = "policy.json", "arrays"
 
@@ -32,7 +29,7 @@ def is_one(folder: Path) -> bool:
 
 def check_free(folder: Path, overwrite: bool) -> None:
     """Raises UserError unless a policy folder may be written there: nothing is, or one that may be overwritten."""
-    if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
+    if not is_used(folder):
         return
     if not overwrite:
         raise UserError(f"{folder} is not empty: give --overwrite to delete it, or another --out")
@@ -40,23 +37,9 @@ def check_free(folder: Path, overwrite: bool) -> None:
         raise UserError(f"{folder} is not a policy folder, so --overwrite will not delete it: give another --out")
 
 
-@contextmanager
-def writing(folder: Path, overwrite: bool) -> Iterator[Path]:
-    """A folder to write in that takes the place of `folder` once all is done; of what fails before nothing is left.
-
-    Raises UserError as `check_free`.
-    """
-    check_free(folder, overwrite)
-    folder = folder.resolve()  # what a link leads to, not the link
-    temporary = folder.with_name(f"{folder.name}.{os.getpid()}{TEMPORARY}")
-    temporary.mkdir(parents=True)
-    try:
-        yield temporary
-        if folder.exists():
-            shutil.rmtree(folder)
-        os.replace(temporary, folder)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+def place_of(folder: Path, overwrite: bool) -> AbstractContextManager[Place]:
+    """Keeps the place of a policy folder for this process (`whole.place_of`). Raises UserError as `check_free`."""
+    return whole.place_of(folder, lambda there: check_free(there, overwrite), overwrite)
 
 
 def write(folder: Path, described: dict[str, Any], arrays: Any) -> None:

@@ -75,14 +75,23 @@ class Order:
 
 
 def run(order: Order, watch: Callable[[str], Tell] = lambda what: untold) -> Adapted:
-    """Adapts and writes the policy folder.
+    """Adapts and writes the policy folder, whose place is kept for this process from now on.
 
     Raises UserError for what cannot be adapted; nothing has then been written.
     """
+    with policy_folders.place_of(order.out, order.overwrite) as place:
+        found, origin = _adapted(order, watch)
+        path = order.labels_from
+        used = {"labels_from": f"{path.name} {label_files.digest(path)}" if path else None, "robot": order.robot}
+        adapted.write(place, found, order.source.task, order.world, origin, used)
+    return found
+
+
+def _adapted(order: Order, watch: Callable[[str], Tell]) -> tuple[Adapted, dict[str, Any]]:
+    """What adaptation leads to, and what was adapted in plain values. Raises UserError for what cannot be adapted."""
     task, sizes, scalars = order.source.task, order.sizes, order.scalars
-    policy_folders.check_free(order.out, order.overwrite)
     check_guide(sizes, scalars)
-    kind = guidances.find(order.kind)
+    kind = guidances.resolve(order.kind)
     if not kind.asks:
         raise UserError(f"guidance {kind.name!r} asks nothing that could be learned from: choose another --guidance")
     env = task.environment(order.world)
@@ -109,11 +118,7 @@ def run(order: Order, watch: Callable[[str], Tell] = lambda what: untold) -> Ada
     if file:
         slots = program.rounds(lanes, sizes) * sizes.labels_per_round
         labels = label_files.for_lanes(file, lanes.seed, lanes.budget, slots)
-    found = adapting.adapt(asked, teacher, labels, watch=watch)
-    path = order.labels_from
-    used = {"labels_from": f"{path.name} {label_files.digest(path)}" if path else None, "robot": order.robot}
-    adapted.write(order.out, found, task, order.world, origin, used, order.overwrite)
-    return found
+    return adapting.adapt(asked, teacher, labels, watch=watch), origin
 
 
 def _bases(order: Order, env: Any) -> tuple[Any, tuple[int, ...], dict[str, Any]]:

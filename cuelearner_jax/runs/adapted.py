@@ -17,14 +17,15 @@ from cuelearner_jax.adaptation.program import Lanes
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import one_lane
 from cuelearner_jax.guidance.bundle import AnswerForm
-from cuelearner_jax.plugins import REFERENCE
 from cuelearner_jax.policies import Common, Guided
 from cuelearner_jax.records import formats, guides, label_files, policy_folders
 from cuelearner_jax.records.provenance import provenance
-from cuelearner_jax.runs.grid import known_task
+from cuelearner_jax.records.whole import Place
+from cuelearner_jax.runs.grid import LARGEST_BUDGET, LARGEST_SEED, world_of
 from cuelearner_jax.task import Task, shape_of
 from cuelearner_jax.types import Label
 
+COLUMNS = ("base", "seeds", "labels", "bounds_deg", "used")  # of the lanes
 CONVENTIONS = {
     "action": "unit vector: the base policy's, refined by the model until a pass turns it by less than tau, within the "
     "bound",
@@ -100,42 +101,58 @@ def open_folder(folder: Path, find: Callable[[str], Task], code: Any = None) -> 
     path = folder / policy_folders.POLICY
     values = policy_folders.read(folder)
     try:
-        name, origin = values["task"].pop("name"), values["task"].pop("from", None)
-        if origin is not None and not REFERENCE.fullmatch(origin):
-            raise ValueError(f"{origin!r} names no code")
-        task = known_task(find, name, origin, path)
-        world = configuration.from_json(task.config, values["task"])
-        told = values["lanes"]
-        columns = [np.array(told[column]) for column in ("base", "seeds", "labels", "bounds_deg")]
-        lanes, used = Lanes(*columns), np.array(told["used"], bool)
-        if len({len(column) for column in (*lanes, used)}) != 1 or values["policy"]["policy"] != "guided":
-            raise ValueError("the columns of its lanes are of several lengths")
+        task, world = world_of(values["task"], find, path)
+        stored.check(values["policy"])
+        lanes, used = _lanes(values["lanes"], values["rows"])
+    except UserError as error:
+        raise error if str(path) in str(error) else UserError(f"{path}: {error}") from error
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise formats.damaged("policy", path) from error
     return task, world, AdaptedLanes(folder, values, lanes, used, values["rows"], code)
 
 
+def _lanes(told: dict[str, Any], rows: int | None) -> tuple[Lanes, np.ndarray]:
+    """The lanes that a file tells of, and which models are used (lanes,). Raises ValueError or KeyError for nonsense.
+
+    `rows`: base policies; None: the lanes share one.
+    """
+    columns = [told[column] for column in COLUMNS]
+    sound = all(isinstance(column, list) and len(column) == len(columns[0]) > 0 for column in columns)
+    if sound:
+        kinds = zip(columns, (int, int, int, float, bool), strict=True)
+        sound = all(type(value) is kind for column, kind in kinds for value in column)
+    if not sound:
+        raise ValueError("its lanes' columns are of several lengths, or hold something else than they should")
+    base, seeds, labels, bounds, used = columns
+    if rows is not None and (type(rows) is not int or not 1 <= rows <= len(seeds)):
+        raise ValueError(f"{len(seeds)} lanes have {rows!r} base policies")
+    ends = ((base, rows or 1), (seeds, LARGEST_SEED), (labels, LARGEST_BUDGET))
+    if not all(0 <= value < end for column, end in ends for value in column) or not all(0 < b <= 180 for b in bounds):
+        raise ValueError("some lane's base, seed, labels or bound is none")
+    if len(set(zip(base, seeds, labels, bounds, strict=True))) < len(seeds):
+        raise ValueError("a lane is there twice")
+    return Lanes(*(np.array(column) for column in columns[:-1])), np.array(used)
+
+
 def write(
-    folder: Path,
+    place: Place,
     adapted: Adapted,
     task: Task,
     world: Any,
     origin: dict[str, Any],
     used: dict[str, str | None] | None = None,
-    overwrite: bool = False,
 ) -> None:
     """Writes a policy folder.
 
     Args:
-        folder: where to; it appears once it is whole.
+        place: where to; the folder appears once it is whole.
         adapted: the lanes.
         task, world: in which they were adapted.
         origin: what was adapted, in plain values: "folder" and which lanes of it, or "code".
         used: what else led to it, by name: the label file, another robot.
-        overwrite: may it take the place of another policy folder?
 
     Raises:
-        UserError: the folder is in use, or the policy cannot be kept.
+        UserError: something came to the place meanwhile, or the policy cannot be kept.
     """
     of, judged = adapted.asked, adapted.judged
     env = shape_of(task, world)
@@ -170,10 +187,10 @@ def write(
         **provenance(),
     }
     arrays = {**stored.arrays_of(replace(block, base=Common(of.bases))), "base": stored.arrays_of(bases)}
-    with policy_folders.writing(folder, overwrite) as place:
-        policy_folders.write(place, described, arrays)
-        _write_labels(place, adapted, task, world)
-        _write_curve(place, folder.name, adapted, task)
+    with place.writing() as folder:
+        policy_folders.write(folder, described, arrays)
+        _write_labels(folder, adapted, task, world)
+        _write_curve(folder, place.folder.name, adapted, task)
 
 
 def _rows(bases: Any) -> int:
@@ -194,7 +211,7 @@ def labels_name(lanes: Lanes, bound_deg: float) -> str:
     return f"labels-{bound_deg:g}deg.parquet" if several else label_files.PARQUET
 
 
-def _write_labels(place: Path, adapted: Adapted, task: Task, world: Any) -> None:
+def _write_labels(folder: Path, adapted: Adapted, task: Task, world: Any) -> None:
     """One file a bound, with a set a seed: that of the largest budget, of which smaller ones have the first labels."""
     of = adapted.asked
     form: AnswerForm | None = of.guidance.form
@@ -206,11 +223,11 @@ def _write_labels(place: Path, adapted: Adapted, task: Task, world: Any) -> None
         own = np.flatnonzero(largest & (of.lanes.bound_deg == bound))
         eps = of.scalars.eps_deg if form.by_eps else None
         sets = jax.tree.map(lambda leaf, own=own: leaf[own], rows)
-        file = place / labels_name(of.lanes, float(bound))
+        file = folder / labels_name(of.lanes, float(bound))
         label_files.write(file, told, form.name, eps, of.lanes.seed[own], sets, form.meaning)
 
 
-def _write_curve(place: Path, name: str, adapted: Adapted, task: Task) -> None:
+def _write_curve(folder: Path, name: str, adapted: Adapted, task: Task) -> None:
     """What the policies were worth after so many labels, as runs keep it of their guides."""
     of = adapted.asked
     if not adapted.curve:
@@ -224,7 +241,7 @@ def _write_curve(place: Path, name: str, adapted: Adapted, task: Task) -> None:
         **provenance(),
     }
     lanes = {"seed": of.lanes.seed, "labels": of.lanes.budget, "bound_deg": of.lanes.bound_deg}
-    with guides.GuideWriter(place, **constants) as writer:
+    with guides.GuideWriter(folder, **constants) as writer:
         done = np.full(of.lanes.number, -1)
         for row in adapted.curve:
             new = row["asked"] > done  # a lane that has its budget does not change any more
@@ -235,4 +252,4 @@ def _write_curve(place: Path, name: str, adapted: Adapted, task: Task) -> None:
             chosen = {column: np.asarray(values)[new] for column, values in columns.items()}
             if new.any():
                 writer.append(round=number, step=0, wall_s=0.0, **chosen)
-    guides.finish(place)
+    guides.finish(folder)

@@ -1,0 +1,50 @@
+"""A policy folder of the bandit, as `adapt` writes it, of an agent and a guide that learned nothing."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import probes
+
+from cuelearner_jax.adaptation import program
+from cuelearner_jax.adaptation.adapting import Adaptation, Adapted, Judging
+from cuelearner_jax.adaptation.judging import Judged
+from cuelearner_jax.agent import view
+from cuelearner_jax.agent.networks import q_network
+from cuelearner_jax.config import GuideSizes
+from cuelearner_jax.environment import spaces_of
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.guidance import registry as guidances
+from cuelearner_jax.policies import Agent, Common
+from cuelearner_jax.records import policy_folders
+from cuelearner_jax.runs import adapted
+
+TASK = probes.make_task()
+ENV = TASK.environment(probes.CONFIG.task)
+SIZES = GuideSizes(**{field.name: getattr(probes.SIZES, field.name) for field in dataclasses.fields(GuideSizes)})
+LANES = program.Lanes(*(np.array(column) for column in ([0, 0], [0, 1], [10, 10], [45.0, 45.0])))
+
+
+def find(name):
+    """The one task that is known here."""
+    if name != TASK.name:
+        raise UserError(f"unknown task {name!r}")
+    return TASK
+
+
+def agent():
+    """An untrained agent."""
+    widths = view.widths(probes.SIZES.frame, spaces_of(ENV))
+    params = q_network(probes.SIZES.q_layers).init(jax.random.key(4), *map(jnp.zeros, widths))
+    return Agent(params, probes.SIZES, env=ENV)
+
+
+def write(folder, overwrite=False, origin="run"):
+    """Writes the folder; `origin`: what policy.json says was adapted."""
+    guidance = guidances.make("relative", SIZES, ENV)
+    asked = Adaptation(guidance, SIZES, probes.SCALARS, ENV, Common(agent()), LANES, Judging(None))
+    judged = Judged("reward", np.zeros(2), np.ones(2), np.ones(2, bool), np.full(2, 45.0))
+    found = Adapted(asked, program.begin(guidance, SIZES, ENV, LANES), judged, [])
+    with policy_folders.place_of(folder, overwrite) as place:
+        adapted.write(place, found, TASK, probes.CONFIG.task, {"folder": origin})
