@@ -90,4 +90,6 @@ def run(arguments: list[str]) -> None:
 
 def _check(folder: Path) -> None:
     difference = contract.checked(folder)
+    if others := contract.unlisted(folder):
+        out.print(f"{folder} also holds what its contract does not list: {', '.join(others)}")
     out.print(f"{folder} is as it was exported; golden cases replayed, largest difference {difference:.1e}")

@@ -24,6 +24,9 @@ import numpy as np
 CONTRACT, GOLDEN = "contract.json", "golden.npz"
 VERSION = 1  # of contracts and graphs
 DIGEST = "digest"  # the name under which a contract holds the digest of its other values
+VECTORS = ("observation", "action")
+MOST = 1 << 20  # entries of an observation or an action, and golden cases
+LOOSEST = 1e-2  # tolerance that still says that two actions are one
 
 Values = dict[str, np.ndarray]
 Run = Callable[[Values], None]
@@ -43,7 +46,13 @@ class Decision:
         """Reads a folder. Raises ContractError if a file is missing, damaged or changed, or cannot be run here."""
         self.folder = Path(folder)
         self.contract = read_contract(self.folder)
-        self._decide = RUNNERS[self.contract["artefact"]["format"]](self.folder, self.contract)
+        self._decide = self._sound(lambda: RUNNERS[self.contract["artefact"]["format"]](self.folder, self.contract))
+
+    @property
+    def unlisted(self) -> list[str]:
+        """Names of what lies in the folder and is not in the contract: nobody vouches for that."""
+        known = (CONTRACT, "__pycache__", *self.contract["files"])
+        return sorted(path.name for path in self.folder.iterdir() if path.name not in known)
 
     def __call__(self, obs: Any) -> np.ndarray:
         """The action for an observation (obs,), or for each of a batch (n, obs): unit vectors (2,) or (n, 2).
@@ -58,8 +67,23 @@ class Decision:
             raise ContractError("an observation holds numbers that are not finite")
         if not len(batch):
             return np.zeros((0, self.contract["action"]["size"]), np.float32)
-        actions = self._decide(np.ascontiguousarray(batch))
+        actions = self._sound(lambda: self._decide(np.ascontiguousarray(batch)))
+        wanted = (len(batch), self.contract["action"]["size"])
+        if actions.shape != wanted or actions.dtype.kind != "f" or not np.isfinite(actions).all():
+            raise ContractError(f"{self.folder} decides on no finite numbers of shape {wanted}: export the policy anew")
         return actions[0] if rows.ndim == 1 else actions
+
+    def _sound(self, work: Callable[[], Any]) -> Any:
+        """What some work on the artefact gives; of one that makes no sense whatever is raised is told in one line."""
+        try:
+            return work()
+        except ContractError:
+            raise
+        except Exception as error:
+            told = f"{type(error).__name__}: {' '.join(str(error).split())}"[:160]
+            raise ContractError(
+                f"{self.folder} holds a decision that makes no sense here ({told}): export the policy anew"
+            ) from None
 
     def angle(self, obs: Any) -> np.ndarray:
         """The same as angles [rad], counterclockwise positive, 0 along x: () or (n,)."""
@@ -71,8 +95,7 @@ class Decision:
 
         Raises ContractError if that is more than the contract allows.
         """
-        with np.load(self.folder / GOLDEN, allow_pickle=False) as golden:
-            obs, actions = golden["obs"], golden["actions"]
+        obs, actions = self._sound(self._golden)
         difference = float(np.abs(self(obs) - actions).max())
         allowed = self.contract["golden"]["tolerance"]
         if not difference <= allowed:
@@ -81,6 +104,17 @@ class Decision:
                 f"{difference:.2g}, more than {allowed:g}; export it anew"
             )
         return difference
+
+    def _golden(self) -> tuple[np.ndarray, np.ndarray]:
+        """Observations (cases, obs) and actions (cases, action). Raises ValueError unless they are as many as told."""
+        with np.load(self.folder / GOLDEN, allow_pickle=False) as golden:
+            obs, actions = golden["obs"], golden["actions"]
+        cases, sizes = self.contract["golden"]["cases"], (self.contract[part]["size"] for part in VECTORS)
+        if [array.shape for array in (obs, actions)] != [(cases, size) for size in sizes]:
+            raise ValueError(f"the shapes of the golden cases are {obs.shape} and {actions.shape}")
+        if not all(array.dtype.kind == "f" and np.isfinite(array).all() for array in (obs, actions)):
+            raise ValueError("golden cases are not finite")
+        return obs, actions
 
 
 def digest(values: dict[str, Any]) -> str:
@@ -104,8 +138,14 @@ def read_contract(folder: Path) -> dict[str, Any]:
         sound, contract = False, {}
     if not sound:
         raise ContractError(f"{path} is damaged or was changed: export the policy anew")
-    if contract["version"] > VERSION:
+    version = contract.get("version")
+    if type(version) is int and version > VERSION:
         raise ContractError(f"{path} was written by a newer cuelearner: use the decide.py beside it, or update")
+    try:
+        _check(contract)
+    except (ValueError, KeyError, AttributeError, TypeError) as error:
+        told = f"no {error}" if isinstance(error, KeyError) else f"{error}"
+        raise ContractError(f"{path} makes no sense ({told[:160]}): export the policy anew") from None
     for name, recorded in contract["files"].items():
         try:
             found = hashlib.sha256((folder / name).read_bytes()).hexdigest()
@@ -114,6 +154,29 @@ def read_contract(folder: Path) -> dict[str, Any]:
         if found != recorded:
             raise ContractError(f"{folder / name} is not the file that was exported: export the policy anew")
     return contract
+
+
+def _check(contract: dict[str, Any]) -> None:
+    """Raises ValueError, KeyError, TypeError or AttributeError for a contract that no export writes."""
+    files, artefact, golden = contract["files"], contract["artefact"], contract["golden"]
+    _hold("version", type(contract["version"]) is int and contract["version"] > 0)
+    for name in (*files, artefact["file"]):
+        _hold("files", name in files and name not in (".", "..", CONTRACT) and not set(name) & set("/\\\0"))
+    _hold("golden", GOLDEN in files and type(golden["tolerance"]) is float and 0 < golden["tolerance"] <= LOOSEST)
+    _hold("artefact", artefact["format"] in RUNNERS and type(artefact.get("jax", "")) is str)
+    sizes = golden["cases"], *(contract[part]["size"] for part in VECTORS)
+    _hold("size", all(type(size) is int and 1 <= size <= MOST for size in sizes))
+    end = 0
+    for part in contract["observation"]["slices"]:
+        _hold("slices", type(part["name"]) is type(part["unit"]) is str and type(part["size"]) is int)
+        _hold("slices", part["size"] > 0 and (part["from"], part["to"]) == (end, end + part["size"]))
+        end = part["to"]
+    _hold("slices", end == contract["observation"]["size"])
+
+
+def _hold(what: str, sound: bool) -> None:
+    if not sound:
+        raise ValueError(f"its {what}")
 
 
 Batch = Callable[[np.ndarray], np.ndarray]  # observations (n, obs) -> actions (n, action)
@@ -164,8 +227,13 @@ def _of_stablehlo(folder: Path, contract: dict[str, Any]) -> Batch:
         raise ContractError("a decision in StableHLO needs JAX: pip install jax flatbuffers, or export NumPy") from None
     stored = (folder / contract["artefact"]["file"]).read_bytes()
     try:
-        call = jax.jit(export.deserialize(bytearray(stored)).call)
+        exported = export.deserialize(bytearray(stored))
+        if b"callback" in exported.mlir_module_serialized:  # no export has one: it leads out of the program
+            raise ContractError(f"{folder} holds a decision that calls Python functions: export the policy anew")
+        call = jax.jit(exported.call)
         call(np.zeros((1, contract["observation"]["size"]), np.float32)).block_until_ready()
+    except ContractError:
+        raise
     except Exception:
         made = contract["artefact"]["jax"]
         raise ContractError(

@@ -1,6 +1,7 @@
 """Exported decisions: the policies' own in every format, the contract that lies beside them, and what is refused."""
 
 import dataclasses
+import functools
 import hashlib
 import json
 import os
@@ -175,6 +176,132 @@ def test_a_folder_that_is_damaged_or_changed_is_refused(folder, tmp_path):
         contract.checked(there)
     with pytest.raises(UserError, match="cannot be read"):
         contract.checked(tmp_path / "nowhere")
+
+
+JUNK = [None, -1, 1e30, True, "/etc/passwd", [], {"a": 1}, float("nan")]
+NEEDED = {"version", "artefact", "files"} | {"observation", "action", "golden"}
+
+
+def leaves(values, way=()):
+    """The ways to every value of nested JSON values, the lists and objects themselves included."""
+    for name, value in values.items() if isinstance(values, dict) else enumerate(values):
+        yield (*way, name)
+        if isinstance(value, dict | list):
+            yield from leaves(value, (*way, name))
+
+
+def test_nonsense_in_a_contract_is_refused_in_one_line_wherever_it_stands(tmp_path):
+    """Whoever writes it signs it too; what is not refused decides as before."""
+    there = tmp_path / "small"
+    write(Heuristic(ENV), "numpy", there)
+    whole = json.loads((there / runner.CONTRACT).read_text())
+    whole.pop(runner.DIGEST)
+    wanted, refused, taken = runner.Decision(there)(DRAWN[:3]), 0, set()
+    for way in [way for way in leaves(whole) if way[0] in NEEDED]:
+        for junk in (*JUNK, "gone"):
+            told = json.loads(json.dumps(whole))
+            place = functools.reduce(lambda part, name: part[name], way[:-1], told)
+            if place[way[-1]] == junk:
+                continue
+            if junk == "gone":
+                del place[way[-1]]
+            else:
+                place[way[-1]] = junk
+            (there / runner.CONTRACT).write_text(json.dumps({**told, runner.DIGEST: runner.digest(told)}))
+            try:
+                decide = runner.Decision(there)
+                if way not in taken:
+                    np.testing.assert_array_equal(decide(DRAWN[:3]), wanted)
+                    assert decide.check() <= 1e-5
+                taken.add(way)
+            except runner.ContractError as error:
+                refused += 1
+                assert "\n" not in str(error)
+    words = {"about", "name", "unit", "dtype", "angle", "clip_radius_deg", "drawn", "steady", "needs", "tolerance"}
+    assert {way for way in taken if way[-1] not in words} <= {("files", "decide.py")}
+    assert refused > 150
+
+
+@pytest.mark.parametrize("name", ["../decision.npz", "/tmp/decision.npz", "sub/decision.npz", "other.npz"])
+def test_an_artefact_is_a_file_that_the_contract_lists(folder, tmp_path, name):
+    there = copied(folder / "numpy", tmp_path)
+    for place in (tmp_path, there):
+        for other in ("decision.npz", "other.npz"):
+            if not (place / other).exists():
+                shutil.copy(folder / "numpy" / "decision.npz", place / other)
+    sealed(there, lambda told: told["artefact"].update(file=name))
+    with pytest.raises(UserError, match="makes no sense"):
+        contract.checked(there)
+
+
+def test_golden_cases_and_graphs_that_make_no_sense_are_refused_in_one_line(folder, tmp_path):
+    there = copied(folder / "numpy", tmp_path)
+    with np.load(there / runner.GOLDEN) as golden:
+        obs, actions = golden["obs"], golden["actions"]
+    for spoiled in (
+        {"obs": obs},
+        {"obs": obs[:0], "actions": actions[:0]},
+        {"obs": obs, "actions": actions[:3]},
+        {"obs": obs, "actions": actions * np.nan},
+        {"obs": obs.astype(str), "actions": actions},
+        {"obs": obs.astype(object), "actions": actions},
+    ):
+        np.savez(there / runner.GOLDEN, **spoiled)
+        sealed(there, lambda told: None)
+        with pytest.raises(UserError, match="makes no sense"):
+            contract.checked(there)
+    np.savez(there / runner.GOLDEN, obs=obs, actions=actions)
+    with np.load(there / "decision.npz") as stored:
+        arrays = dict(stored)
+    graph = json.loads(arrays["graph"].tobytes())
+    for change in (
+        lambda: graph.update(ops=3),
+        lambda: graph.update(ops=[["add", ["no"], ["thing"], {}]]),
+        lambda: graph.update(ops=[], outputs=graph["inputs"]),
+        lambda: graph.pop("inputs"),
+    ):
+        change()
+        np.savez(there / "decision.npz", **{**arrays, "graph": np.frombuffer(json.dumps(graph).encode(), np.uint8)})
+        sealed(there, lambda told: None)
+        with pytest.raises(UserError, match=r"makes no sense|golden cases differ|no finite numbers"):
+            contract.checked(there)
+
+
+def test_what_the_contract_does_not_list_is_told(folder, tmp_path):
+    there = copied(folder / "numpy", tmp_path)
+    assert contract.unlisted(there) == []
+    (there / "helper.py").write_text("print()")
+    assert contract.unlisted(there) == ["helper.py"]
+
+
+def test_a_compiled_decision_that_calls_back_into_python_is_refused(folder, tmp_path):
+    there = copied(folder / "stablehlo", tmp_path)
+    exported = jax.export.deserialize(bytearray((there / "decision.stablehlo").read_bytes()))
+    called = (
+        exported.mlir_module_serialized + b"xla_ffi_python_cpu_callback"
+    )  # as a name of what is called stands there
+    changed = dataclasses.replace(exported, mlir_module_serialized=called)
+    (there / "decision.stablehlo").write_bytes(changed.serialize())
+    sealed(there, lambda told: None)
+    with pytest.raises(UserError, match="calls Python functions"):
+        contract.checked(there)
+
+
+def test_of_two_exports_at_once_the_second_is_refused(folder, tmp_path):
+    out = tmp_path / "new"
+    second = []
+
+    def meanwhile():
+        with pytest.raises(UserError, match="is being written by another process") as refused:
+            write(Heuristic(ENV), "numpy", out)
+        second.append(str(refused.value))
+        return DRAWN
+
+    contract.write(Heuristic(ENV), ENV.observation, action_of(ENV), meanwhile, "numpy", out, {})
+    assert len(second) == 1
+    assert "\n" not in second[0]
+    assert contract.checked(out) <= 1e-5
+    assert [path.name for path in tmp_path.iterdir()] == ["new"]
 
 
 def test_a_decision_that_is_another_one_is_found_by_its_golden_cases(folder, tmp_path):
