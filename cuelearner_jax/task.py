@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,7 +15,10 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from cuelearner_jax.config import GuideSizes, RunConfig, Scalars
 from cuelearner_jax.environment import Environment
 from cuelearner_jax.errors import UserError, closest
+from cuelearner_jax.records.room import check_room
 from cuelearner_jax.types import EnvState, Reel, Sketch, Teacher
+
+COPIES = 3  # of a world while it is made
 
 # (policy, environment, key, environments, steps, tell) -> metrics by name, as `evaluate.rollout`; now and then it calls
 # `tell` with how far it is, and of how much
@@ -146,7 +150,15 @@ class Task:
             raise ValueError(f"task {self.name}: scenario {name!r} makes no configuration ({error})") from error
 
     def environment(self, config: Any, split: str = "training") -> Environment:
-        """The world of a configuration with the first body in it, for the episodes of a split."""
+        """The world of a configuration with the first body in it, for the episodes of a split.
+
+        Raises UserError if it is more than memory holds, before any of it is made.
+        """
+        leaves = jax.tree.leaves(shape_of(self, config))
+        needed = COPIES * sum(math.prod(leaf.shape) * leaf.dtype.itemsize for leaf in leaves)
+        check_room(
+            f"the world of {self.name} has large numbers", needed, "lower those of --task, or of the file's task"
+        )
         return self.bodies[0].environment(config, split)
 
     def make_teacher(self, config: Any, env: Environment) -> Teacher:
@@ -221,4 +233,4 @@ class Task:
 
 def shape_of(task: Task, config: Any) -> Any:
     """The environment of a configuration with shapes in place of arrays: costs next to nothing."""
-    return jax.eval_shape(lambda: task.environment(config))
+    return jax.eval_shape(lambda: task.bodies[0].environment(config, "training"))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +20,7 @@ from cuelearner_jax.guidance.kind import NAME
 from cuelearner_jax.plugins import REFERENCE
 from cuelearner_jax.records import formats, label_files
 from cuelearner_jax.records.folders import CONFIG
+from cuelearner_jax.records.room import check_room
 from cuelearner_jax.runs.shards import Shard
 from cuelearner_jax.task import Task
 
@@ -127,9 +129,19 @@ def load(folder: Path, find: Callable[[str], Task]) -> tuple[Task, RunConfig, Gr
         if values["split"] not in SPLITS or values["total_steps"] != config.schedule.total_steps:
             raise ValueError("what it says of its evaluations makes no sense")
         configuration.check(config)
+        _check_room(path, config.sizes, grid)
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise formats.damaged("config", path) from error
     return task, config, grid
+
+
+def _check_room(path: Path, sizes: Sizes, grid: Grid) -> None:
+    """Raises UserError if the networks of a run, or a search of their actions, are more than memory holds."""
+    layers, remedy = sizes.q_layers, "restore the file"
+    lanes, weights = len(grid.seeds) * max(1, len(grid.labels)), sum(layers) + math.prod(layers[:2])
+    check_room(f"{path} has {lanes:,} lanes of layers {layers}", 4 * weights * lanes, remedy)
+    told = f"{path} has {sizes.directions:,} sizes.directions"
+    check_room(told, 8 * max(layers) * sizes.directions, remedy)  # of a layer, before and after its activation
 
 
 def _grid(values: dict[str, Any]) -> Grid:

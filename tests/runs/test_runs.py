@@ -12,7 +12,7 @@ import pytest
 from cuelearner_jax import config as configuration
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guidance import registry as guidances
-from cuelearner_jax.records import formats, results
+from cuelearner_jax.records import formats, results, room
 from cuelearner_jax.records.folders import check_folder, prepare_folder
 from cuelearner_jax.runs import grid as runs
 from cuelearner_jax.runs import sweep
@@ -267,3 +267,19 @@ def test_a_missing_teacher_is_said_before_anything_is_deleted(out):
     with pytest.raises(UserError, match="no teacher"):
         sweep.run(Order(task, probes.CONFIG, GRID, out, overwrite=True, split="tuning"))
     assert probes.files_of(out.parent) == before
+
+
+@pytest.mark.parametrize(
+    ("group", "values", "says"),
+    [
+        ("grid", {"seeds": list(range(200_000))}, "has [0-9,]*00,000 lanes of layers"),
+        ("sizes", {"directions": 2**31 - 1}, "has 2,147,483,647 sizes.directions"),
+        ("sizes", {"q_layers": [2**30, 2**30]}, "lanes of layers .1073741824, 1073741824., which needs"),
+    ],
+)
+def test_a_run_that_would_eat_the_machine_is_refused_before_anything_is_made(out, group, values, says, monkeypatch):
+    monkeypatch.setattr(room, "_host_bytes", lambda: 10_000_000)
+    changed = described()
+    changed[group] = {**changed[group], **values}
+    formats.write("config", out / "config.json", changed)
+    not_loaded(out, says)
