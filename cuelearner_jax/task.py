@@ -156,9 +156,7 @@ class Task:
         """
         leaves = jax.tree.leaves(shape_of(self, config))
         needed = COPIES * sum(math.prod(leaf.shape) * leaf.dtype.itemsize for leaf in leaves)
-        check_room(
-            f"the world of {self.name} has large numbers", needed, "lower those of --task, or of the file's task"
-        )
+        check_room(f"the world of {self.name} is large", needed, "lower those of --task or of the file")
         return self.bodies[0].environment(config, split)
 
     def make_teacher(self, config: Any, env: Environment) -> Teacher:
