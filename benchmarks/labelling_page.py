@@ -1,6 +1,7 @@
 """The labelling page in a real browser, with real keys: nothing lost or doubled, how fast, and what it looks like.
 
     python benchmarks/labelling_page.py paced --task navigation --out paced.json        500 labels, 5 a second
+    python benchmarks/labelling_page.py blind --task billiards --preset quickstart --labels 200
     python benchmarks/labelling_page.py kills --task billiards --preset quickstart --out kills.json
     python benchmarks/labelling_page.py pictures --task navigation --preset quickstart
     python benchmarks/labelling_page.py pictures --task billiards --preset quickstart --more="--task.table regulation"
@@ -72,7 +73,7 @@ ITEM = "() => { const one = document.querySelector('svg.scene'); return one ? +o
 def served(asked: argparse.Namespace, task: str, folder: Path, *more: str) -> Iterator[tuple[subprocess.Popen, str]]:
     """The command, until it has told its address: the process and that."""
     command = [sys.executable, "-m", "cuelearner_jax.cli", "label", task, "--preset", asked.preset]
-    command += ["--out", str(folder), *shlex.split(asked.more), *more]
+    command += ["--no-practice", "--out", str(folder), *shlex.split(asked.more), *more]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env={**os.environ, "PYTHONUNBUFFERED": "1"})
     try:
         assert process.stdout is not None
@@ -96,12 +97,13 @@ def entered(browser: Browser, address: str, **look: Any) -> Page:
             break
         time.sleep(0.1)
     page.wait_for_selector("svg.scene")
+    page.wait_for_function("() => cue.ready()")
     return page
 
 
 def moved(page: Page, item: int, seconds: float = 30.0) -> None:
-    """Waits for another question than this one."""
-    page.wait_for_function(f"({ITEM})() !== {item}", timeout=seconds * 1000)
+    """Waits for another question than this one, until it takes an answer."""
+    page.wait_for_function(f"({ITEM})() !== {item} && cue.ready()", timeout=seconds * 1000)
 
 
 def chosen(page: Page, task: str, rng: random.Random) -> str:
@@ -168,6 +170,31 @@ def paced(asked: argparse.Namespace, browser: Browser, work: Path) -> dict[str, 
         **check(folder, pressed, len(pressed)),
         "exit_status": status,
         "page": side.splitlines()[:6],
+    }
+
+
+def blind(asked: argparse.Namespace, browser: Browser, work: Path) -> dict[str, Any]:
+    """Presses at a pace whatever the page shows: each is in the file once, or told as not taken."""
+    (task,) = asked.task
+    folder = asked.keep or work / "labels"
+    with served(asked, task, folder, "--labels", str(2 * asked.labels)) as (_, address):
+        page = entered(browser, address)
+        start = time.perf_counter()
+        for number in range(asked.labels):
+            time.sleep(max(0.0, start + number / asked.rate - time.perf_counter()))
+            page.keyboard.press(["ArrowLeft", "ArrowUp", "ArrowRight"][number % 3])
+        seconds = time.perf_counter() - start
+        page.wait_for_function("() => cue.ready()")
+        told = page.evaluate("cue.dropped")
+    found = label_files.found_in(folder)
+    assert found is not None
+    items = [row["item"] for row in label_files.history(found)]
+    saved = {"saved": len(items), "doubled": len(items) - len(set(items)), "told_as_not_taken": told}
+    return {
+        "presses": asked.labels,
+        "seconds": round(seconds, 1),
+        **saved,
+        "unexplained": asked.labels - len(items) - told,
     }
 
 
@@ -241,7 +268,7 @@ def pictures(asked: argparse.Namespace, browser: Browser, work: Path) -> dict[st
 def main() -> None:
     """Runs one of them."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("paced", "kills", "pictures"))
+    parser.add_argument("what", choices=("paced", "blind", "kills", "pictures"))
     parser.add_argument("--task", nargs="+", default=["navigation"])
     parser.add_argument("--preset", default="paper")
     parser.add_argument("--guidance", nargs="*", help="pictures: of these kinds instead of the task's own")
@@ -257,7 +284,9 @@ def main() -> None:
     asked = parser.parse_args()
     with tempfile.TemporaryDirectory() as work, sync_playwright() as driver:
         browser = driver.chromium.launch(executable_path=asked.browser, args=["--no-sandbox"])
-        found = {"paced": paced, "kills": kills, "pictures": pictures}[asked.what](asked, browser, Path(work))
+        found = {"paced": paced, "blind": blind, "kills": kills, "pictures": pictures}[asked.what](
+            asked, browser, Path(work)
+        )
         browser.close()
     print(json.dumps(found, indent=1))
     if asked.out:

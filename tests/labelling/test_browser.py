@@ -28,18 +28,19 @@ def entered(browser, address):
     page = browser.new_page(viewport={"width": 1000, "height": 800})
     page.goto(address)
     page.wait_for_selector("svg.scene")
+    page.wait_for_function("() => cue.ready()")
     return page
 
 
 def moved(page, item):
-    page.wait_for_function(f"({ITEM})() !== {item}")
+    page.wait_for_function(f"({ITEM})() !== {item} && cue.ready()")
 
 
 def test_every_key_is_in_the_file_once(browser, tmp_path):
     rng, folder = np.random.default_rng(0), tmp_path / "labels"
     values = {"ArrowLeft": 1.0, "ArrowUp": 0.0, "ArrowRight": -1.0, "ArrowDown": None, "a": 1.0, " ": 0.0, "D": -1.0}
     pressed = []
-    with served(folder) as (_, address):
+    with served(folder, "--no-practice") as (_, address):
         page = entered(browser, address)
         for number in range(12):
             assert page.evaluate(ITEM) == number
@@ -74,12 +75,48 @@ def test_every_key_is_in_the_file_once(browser, tmp_path):
 
 def test_pointing_shows_what_to_do_instead(browser, tmp_path):
     folder = tmp_path / "labels"
-    with served(folder, "--guidance", "demonstration") as (_, address):
+    with served(folder, "--no-practice", "--guidance", "demonstration") as (process, address):
         page = entered(browser, address)
         box = page.locator("svg.scene").bounding_box()
         x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
         page.mouse.move(x + 60, y - 104)
         page.mouse.click(x + 60, y - 104)
         moved(page, 0)
+        process.kill()
+        page.get_by_text("The command behind this page has stopped").wait_for()
+        assert f"--out {folder}" in page.locator("#popup code").inner_text()
     (row,) = label_files.history(folder / label_files.JSONL)
     np.testing.assert_allclose(row["answer"], [0.5, math.sqrt(0.75)], atol=0.02)
+
+
+def test_every_press_is_saved_or_told_and_the_end_outlives_the_command(browser, tmp_path):
+    folder = tmp_path / "labels"
+    dropped = "() => cue.dropped"
+    with served(folder) as (process, address):
+        page = entered(browser, address)
+        page.get_by_text("skip practice").click()
+        page.wait_for_function(f"({ITEM})() === 0 && cue.ready()")
+        for number in range(30):  # faster than anybody sees and answers, whatever the page shows
+            page.keyboard.press(["ArrowLeft", "ArrowDown"][number % 2])
+            page.wait_for_timeout(25)
+        page.wait_for_function("() => cue.ready()")
+        saved, told = page.evaluate(ITEM), page.evaluate(dropped)
+        assert (saved + told, told > 0) == (30, True)
+        assert f"So far {told} press" in page.locator(".dropped").inner_text()
+        page.keyboard.press("h")
+        page.locator(".q-dialog").wait_for()
+        page.keyboard.press("ArrowLeft")
+        assert (page.evaluate(ITEM), page.evaluate(dropped)) == (saved, told + 1)
+        page.keyboard.press("h")
+        page.wait_for_function("() => cue.ready()")
+        page.locator(".answers button").first.dblclick()
+        moved(page, saved)
+        assert (page.evaluate(ITEM), page.evaluate(dropped)) == (saved + 1, told + 2)
+        page.get_by_role("button", name="finish").click()
+        page.get_by_text("labels are given, and saved").wait_for()
+        page.get_by_role("button", name="finish now").click()
+        page.locator(".saved").wait_for()
+        assert process.wait(30) == 0
+        assert str(folder / label_files.PARQUET) in page.locator(".saved").inner_text()
+        assert "cuelearner train page_task:TASK" in page.locator("#next").inner_text()
+    assert len(label_files.history(folder / label_files.PARQUET)) == saved + 1
