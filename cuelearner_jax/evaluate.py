@@ -17,7 +17,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from cuelearner_jax.devices import BY_LANE, SHARED, over_lanes, portions
-from cuelearner_jax.environment import Environment
+from cuelearner_jax.environment import Environment, actions_of
 from cuelearner_jax.policies import Policy
 
 # Folded into the root key: episodes for reported figures only, and episodes for choosing settings.
@@ -41,8 +41,21 @@ def rollout(
         "reward" a step, every metric of the environment's, and, where it has outcomes, these (nan unless all first
         episodes have ended) and "finished", the share of first episodes that have.
     """
-    _, seen = _walked(policy, env, key, _begun(env, key, num_envs), jnp.arange(steps // num_envs))
-    return _summed(seen, num_envs)
+    return _rolled(policy, env, key, num_envs, steps).means
+
+
+class Rolled(NamedTuple):
+    """A roll-out: what it came to over all environments, and in each of them, whose values are independent."""
+
+    means: dict[str, Any]  # (*lanes,) over the environments, as `rollout` gives them
+    # (*lanes, envs) means over an environment's own steps; outcomes are of its first episode, nan until that has ended
+    each: dict[str, Any]
+    episode_steps: Any  # (*lanes, envs) int: of each environment's first episode, as far as it went
+
+
+def _rolled(policy: Policy, env: Environment, key: PRNGKeyArray, num_envs: int, steps: int) -> Rolled:
+    walk = _walked(policy, env, key, _begun(env, key, num_envs), jnp.arange(steps // num_envs))
+    return _summed(walk, steps // num_envs)
 
 
 class _Walk(NamedTuple):
@@ -51,47 +64,47 @@ class _Walk(NamedTuple):
     state: Any
     obs: Array
     first: Array  # is this still the first episode?
-
-
-Seen = tuple[dict[str, Array], dict[str, Array]]  # of each step: means, and sums over the first episodes that it ended
+    episode_steps: Array  # of the first episode so far
+    sums: dict[str, Array]  # of rewards and metrics, over the steps so far
+    outcomes: dict[str, Array]  # of the first episode, nan until it ends
 
 
 def _begun(env: Environment, key: PRNGKeyArray, num_envs: int) -> _Walk:
     k_reset, _ = jax.random.split(key)
-    state, obs = jax.vmap(env.reset)(jax.random.split(k_reset, num_envs))
-    return _Walk(state, obs, jnp.ones(num_envs, bool))
+    keys = jax.random.split(k_reset, num_envs)
+    state, obs = jax.vmap(env.reset)(keys)
+    _, step = jax.eval_shape(jax.vmap(env.step), keys, state, jnp.zeros((num_envs, actions_of(env).size)))
+    names: list[str] = ["reward", *step.metrics]
+    sums = dict.fromkeys(names, jnp.zeros(num_envs))
+    outcomes = dict.fromkeys(step.outcome, jnp.full(num_envs, jnp.nan))
+    return _Walk(state, obs, jnp.ones(num_envs, bool), jnp.zeros(num_envs, jnp.int32), sums, outcomes)
 
 
-def _walked(policy: Policy, env: Environment, key: PRNGKeyArray, walk: _Walk, indices: Array) -> tuple[_Walk, Seen]:
+def _walked(policy: Policy, env: Environment, key: PRNGKeyArray, walk: _Walk, indices: Array) -> _Walk:
     """The steps of these numbers."""
     _, k_run = jax.random.split(key)
     num_envs = walk.first.shape[0]
 
-    def one_step(walk: _Walk, index: jax.Array) -> tuple[_Walk, Seen]:
-        state, obs, first = walk
+    def one_step(walk: _Walk, index: jax.Array) -> tuple[_Walk, None]:
         k_act, k_env = jax.random.split(jax.random.fold_in(k_run, index))
-        action = policy.act(k_act, state, obs)
-        state, step = jax.vmap(env.step)(jax.random.split(k_env, num_envs), state, action)
+        action = policy.act(k_act, walk.state, walk.obs)
+        state, step = jax.vmap(env.step)(jax.random.split(k_env, num_envs), walk.state, action)
         done = step.terminated | step.truncated
-        means = {"reward": step.reward.mean(), **{name: value.mean() for name, value in step.metrics.items()}}
-        ends = {name: jnp.sum(value, where=first & done) for name, value in step.outcome.items()}
-        if ends:
-            ends["finished"] = jnp.sum(first & done)
-        return _Walk(state, step.obs, first & ~done), (means, ends)
+        values = {"reward": step.reward, **step.metrics}
+        sums = {name: total + values[name] for name, total in walk.sums.items()}
+        ends = walk.first & done
+        outcomes = {name: jnp.where(ends, step.outcome[name], before) for name, before in walk.outcomes.items()}
+        return _Walk(state, step.obs, walk.first & ~done, walk.episode_steps + walk.first, sums, outcomes), None
 
-    return jax.lax.scan(one_step, walk, indices)
+    return jax.lax.scan(one_step, walk, indices)[0]
 
 
-def _summed(seen: Seen, num_envs: int) -> dict[str, Float[Array, ""]]:
-    """The metrics of all steps."""
-    means, ends = seen
-    metrics = {name: value.mean() for name, value in means.items()}
-    if ends:
-        finished = ends["finished"].sum()
-        outcomes = {name: value.sum() / jnp.maximum(finished, 1) for name, value in ends.items() if name != "finished"}
-        metrics |= {name: jnp.where(finished == num_envs, value, jnp.nan) for name, value in outcomes.items()}
-        metrics["finished"] = finished / num_envs
-    return metrics
+def _summed(walk: _Walk, steps: int) -> Rolled:
+    """What a walk of so many steps an environment has come to."""
+    each = {name: total / steps for name, total in walk.sums.items()} | walk.outcomes
+    if walk.outcomes:
+        each["finished"] = 1.0 - walk.first
+    return Rolled({name: values.mean() for name, values in each.items()}, each, walk.episode_steps)
 
 
 class _Structure(NamedTuple):
@@ -147,6 +160,11 @@ def evaluate_lanes(
     Returns:
         Metrics by name.
     """
+    return roll_lanes(env, policy, key, mesh=mesh, num_envs=num_envs, steps=steps).means
+
+
+def roll_lanes(env: Environment, policy: Policy, key: PRNGKeyArray, *, mesh: Mesh, num_envs: int, steps: int) -> Rolled:
+    """Like `evaluate_lanes`, with the values of each environment."""
     structure = _structure(policy)
     each, shared = structure.take_apart(policy)
     return _evaluate(env, each, shared, key, structure=structure, mesh=mesh, num_envs=num_envs, steps=steps)
@@ -155,10 +173,10 @@ def evaluate_lanes(
 @partial(jax.jit, static_argnames=("structure", "mesh", "num_envs", "steps"))
 def _evaluate(
     env: Any, each: list[Array], shared: list[Array], key: PRNGKeyArray, *, structure, mesh, num_envs, steps
-) -> dict[str, Float[Array, " lanes"]]:
-    def share(env: Any, each: list[Array], shared: list[Array], key: PRNGKeyArray) -> dict[str, jax.Array]:
-        def one(lane: list[Array]) -> dict[str, jax.Array]:
-            return rollout(structure.put_together(lane, shared), env, key, num_envs, steps)
+) -> Rolled:
+    def share(env: Any, each: list[Array], shared: list[Array], key: PRNGKeyArray) -> Rolled:
+        def one(lane: list[Array]) -> Rolled:
+            return _rolled(structure.put_together(lane, shared), env, key, num_envs, steps)
 
         # As many lanes at once as the device takes well.
         return jax.lax.map(one, each, batch_size=min(each[0].shape[0], portions().agents))
@@ -172,6 +190,25 @@ def evaluate_policy(
 ) -> dict[str, Float[Array, ""]]:
     """`rollout` of one policy, compiled."""
     return rollout(policy, env, key, num_envs, steps)
+
+
+RESAMPLES = 2_000
+
+
+def mean_interval(
+    values: Float[np.ndarray, "*lanes n"], resamples: int = RESAMPLES, seed: int = 0
+) -> Float[np.ndarray, "3 *lanes"]:
+    """The mean of independent values, and the ends of its 95% percentile bootstrap interval (nan for one value alone).
+
+    The same values always give the same interval. For differences of two policies, pass those of each environment.
+    """
+    values = np.asarray(values, float)
+    count, mean = values.shape[-1], values.mean(-1)
+    if count == 1:
+        return np.stack([mean, np.full_like(mean, np.nan), np.full_like(mean, np.nan)])
+    random = np.random.default_rng(seed)
+    drawn = (values[..., random.integers(0, count, count)].mean(-1) for _ in range(resamples))
+    return np.stack([mean, *np.quantile(np.stack(list(drawn)), [0.025, 0.975], axis=0)])
 
 
 MOST_STRETCHES = 25  # of a roll-out that is watched
@@ -190,16 +227,16 @@ def part_of(tell: Tell, number: int, parts: int) -> Tell:
 
 def watched(
     env: Environment, policy: Policy, key: PRNGKeyArray, num_envs: int, steps: int, tell: Tell = untold
-) -> dict[str, np.ndarray]:
-    """`rollout` of one policy in stretches. Returns metrics ()."""
+) -> Rolled:
+    """Roll out one policy, as `rollout` does, in stretches. Returns NumPy arrays: means (), values (envs,)."""
     leaves, tree = jax.tree.flatten(policy)
     return _in_stretches(env, _Structure(tree, (False,) * len(leaves)), [], leaves, key, num_envs, steps, tell)
 
 
 def watched_lanes(
     env: Environment, policy: Policy, key: PRNGKeyArray, num_envs: int, steps: int, tell: Tell = untold
-) -> dict[str, np.ndarray]:
-    """`evaluate_lanes` on one device, in stretches: as many lanes at once as it takes well. Metrics (lanes,)."""
+) -> Rolled:
+    """Like `roll_lanes`, on one device in stretches: as many lanes at once as it takes well. Returns NumPy arrays."""
     structure = _structure(policy)
     each, shared = structure.take_apart(policy)
     lanes = jnp.asarray(each[0]).shape[0]
@@ -210,7 +247,7 @@ def watched_lanes(
         part = [jnp.asarray(leaf)[rows] for leaf in each]
         told = part_of(tell, number, len(firsts))
         found.append(_in_stretches(env, structure, part, shared, key, num_envs, steps, told))
-    return {name: np.concatenate([part[name] for part in found])[:lanes] for name in found[0]}
+    return jax.tree.map(lambda *parts: np.concatenate(parts)[:lanes], *found)
 
 
 def _in_stretches(
@@ -222,17 +259,15 @@ def _in_stretches(
     num_envs: int,
     steps: int,
     tell: Tell,
-) -> dict[str, np.ndarray]:
+) -> Rolled:
     """A roll-out of one policy, or of as many lanes as `each` has rows, side by side."""
     count = _stretches(steps // num_envs)
-    walk, seen = _begin(env, key, num_envs=num_envs, lanes=len(each[0]) if each else 0), []
-    for indices in np.arange(steps // num_envs).reshape(count, -1):
-        tell(len(seen), count)
-        walk, part = _walk(env, each, shared, key, walk, jnp.asarray(indices), structure=structure)
-        seen.append(jax.device_get(part))  # what waits until the stretch is done
+    walk = _begin(env, key, num_envs=num_envs, lanes=len(each[0]) if each else 0)
+    for number, indices in enumerate(np.arange(steps // num_envs).reshape(count, -1)):
+        tell(number, count)
+        walk = jax.block_until_ready(_walk(env, each, shared, key, walk, jnp.asarray(indices), structure=structure))
     tell(count, count)
-    whole = jax.tree.map(lambda *parts: np.concatenate(parts, axis=-1), *seen)
-    return jax.device_get(_sum_up(whole, num_envs=num_envs, lanes=bool(each)))
+    return jax.device_get(_sum_up(walk, steps=steps // num_envs, lanes=bool(each)))
 
 
 def _stretches(steps: int) -> int:
@@ -252,14 +287,14 @@ def _begin(env: Any, key: PRNGKeyArray, *, num_envs: int, lanes: int) -> _Walk:
 @partial(jax.jit, static_argnames=("structure",))
 def _walk(
     env: Any, each: list[Array], shared: list[Array], key: PRNGKeyArray, walk: _Walk, indices: Array, *, structure
-) -> tuple[_Walk, Seen]:
-    def one(lane: list[Array], walk: _Walk) -> tuple[_Walk, Seen]:
+) -> _Walk:
+    def one(lane: list[Array], walk: _Walk) -> _Walk:
         return _walked(structure.put_together(lane, shared), env, key, walk, indices)
 
     return jax.vmap(one)(each, walk) if each else one([], walk)
 
 
-@partial(jax.jit, static_argnames=("num_envs", "lanes"))
-def _sum_up(seen: Seen, *, num_envs: int, lanes: bool) -> dict[str, Array]:
-    summed = partial(_summed, num_envs=num_envs)
-    return jax.vmap(summed)(seen) if lanes else summed(seen)
+@partial(jax.jit, static_argnames=("steps", "lanes"))
+def _sum_up(walk: _Walk, *, steps: int, lanes: bool) -> Rolled:
+    summed = partial(_summed, steps=steps)
+    return jax.vmap(summed)(walk) if lanes else summed(walk)

@@ -20,8 +20,8 @@ from cuelearner_jax.types import EnvState, Reel, Sketch, Teacher
 
 COPIES = 3  # of a world while it is made
 
-# (policy, environment, key, environments, steps, tell) -> metrics by name, as `evaluate.rollout`; now and then it calls
-# `tell` with how far it is, and of how much
+# (policy, environment, key, environments, steps, tell) -> values (environments,) by name, as `evaluate.Rolled.each`;
+# now and then it calls `tell` with how far it is, and of how much
 Rollout = Callable[[Any, Any, PRNGKeyArray, int, int, Callable[[int, int], None]], dict[str, Any]]
 
 

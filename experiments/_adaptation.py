@@ -150,7 +150,7 @@ class Bench(NamedTuple):
     def measured(self, policy: Any, split: str | None = None) -> Row:
         """Metrics (lanes,) of a block of policies on the episodes of a split (default: the piece's)."""
         split = split or self.piece.split
-        return watched_lanes(self.env(split), policy, episodes(split), self.envs, self.envs * self.steps)
+        return watched_lanes(self.env(split), policy, episodes(split), self.envs, self.envs * self.steps).means
 
     def set(self, group: str, values: Any) -> Any:
         """A group of a configuration with the piece's settings of that name; tuples for lists."""

@@ -111,7 +111,7 @@ def main() -> int:
         known = {(row["style"], row["robot"], row["episodes"]) for row in rows}
         if (asked.only and name not in asked.only) or (style, name, count) in known:
             return
-        found = {metric: float(np.asarray(value)) for metric, value in measure().items()}
+        found = {metric: float(np.mean(value)) for metric, value in measure().items()}
         rows.append({"style": style, "robot": name, "episodes": count, **found})
         told = "".join(f"{found.get(metric, 0.0):10.3f}" for metric in SHOWN)
         print(f"{style:10}{name:36}{count:6d}{told}", flush=True)

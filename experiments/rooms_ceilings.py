@@ -195,7 +195,7 @@ def cloned(variant: str, scale: Scale) -> list[dict[str, Any]]:
         block = go_on(env, teacher, jnp.asarray(done), block)
         if (count := done + scale.each) in scale.counts:
             policy = clone.replace(params=block.params, env=shown)
-            found = watched_lanes(shown, policy, episodes(), scale.episodes, steps)
+            found = watched_lanes(shown, policy, episodes(), scale.episodes, steps).means
             rows += [_row(variant, count, seed, found, seed) for seed in range(scale.seeds)]
             print(f"{variant}: {count} actions, success {found['success'].mean():.3f}", flush=True)
     return rows

@@ -53,14 +53,24 @@ def test_means_over_first_episodes_are_of_all_of_them_or_of_none():
     assert np.isfinite([cut["reward"], cut["hit"]]).all()
 
 
+def test_each_environment_tells_its_own_steps_and_its_first_episode():
+    found = evaluate.watched(ENV, Uniform(), KEY, 400, 400 * (LONGEST - 1))
+    ended = found.each["finished"] == 1
+    np.testing.assert_array_equal(np.isnan(found.each["success"]), ~ended)
+    np.testing.assert_array_equal(found.each["duration"][ended], found.episode_steps[ended])
+    assert set(found.episode_steps[~ended]) == {LONGEST - 1}
+    assert found.each["reward"].mean() == pytest.approx(float(found.means["reward"]))
+    assert len(set(found.each["reward"])) > 1
+
+
 @pytest.mark.parametrize("steps", [1, 2, 5, 6, 48])
 def test_a_roll_out_in_stretches_is_bitwise_that_in_one(steps):
     told = []
     watched = evaluate.watched(ENV, Uniform(), KEY, 20, 20 * steps, lambda *given: told.append(given))
     whole = rolled(20, steps)
-    assert watched.keys() == whole.keys()
+    assert watched.means.keys() == whole.keys()
     for name, value in whole.items():
-        np.testing.assert_array_equal(watched[name], value, strict=True)
+        np.testing.assert_array_equal(watched.means[name], value, strict=True)
     assert told == [(done, told[-1][1]) for done in range(told[-1][1] + 1)]
     assert told[-1][1] == {1: 1, 2: 1, 5: 1, 6: 3, 48: 24}[steps]  # none of a single step
 
@@ -76,8 +86,9 @@ def test_lanes_in_stretches_are_bitwise_those_in_one(monkeypatch, at_once):
     mesh = lane_mesh(jax.local_devices()[:1])
     whole = jax.device_get(evaluate.evaluate_lanes(ENV, agents, KEY, mesh=mesh, num_envs=10, steps=120))
     for name, value in whole.items():
-        np.testing.assert_array_equal(watched[name], value, strict=True)
-    assert len(set(watched["reward"])) > 1
+        np.testing.assert_array_equal(watched.means[name], value, strict=True)
+    assert len(set(watched.means["reward"])) > 1
+    assert watched.each["reward"].shape == (3, 10)
     batches = -(-3 // at_once)
     assert told[0] == (0, 6 * batches)
     assert told[-1] == (6 * batches, 6 * batches)

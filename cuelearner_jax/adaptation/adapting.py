@@ -21,7 +21,7 @@ from cuelearner_jax.config import GuideSizes, Scalars
 from cuelearner_jax.devices import BY_LANE, SHARED, lane_mesh, place
 from cuelearner_jax.environment import Environment
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.evaluate import Tell, untold
+from cuelearner_jax.evaluate import Rolled, Tell, untold
 from cuelearner_jax.guidance.bundle import Guidance
 from cuelearner_jax.policies import Guided, Policy
 from cuelearner_jax.types import Label, Teacher
@@ -217,24 +217,40 @@ class _Measuring:
             return found, block
         judging.check_metric(how.by, after)
         bases = self._measured(work.bases, "the policy as it was")
-        block, after = self._narrowed(block, after)
+        own = self._played(bases)
+        played = self._played(after) + (own if len(own) == 1 else own[work.lanes.base])
+        block, after, more = self._narrowed(block, after)
         usable = ~np.asarray(block.failed) & np.asarray(block.guide.model.fitted)
-        return judging.judged(how.by, work.lanes, bases, after, usable, judging.within_deg(block)), block
+        within = judging.within_deg(block)
+        return judging.judged(how.by, work.lanes, bases, after, usable, within, played + more), block
 
-    def _narrowed(self, block: Adapting, after: judging.Metrics) -> tuple[Adapting, judging.Metrics]:
-        """Lanes within the share of their bounds with which they are worth most, and what they are worth so."""
-        how, bound = self.work.judging, block.bound
+    def _played(self, rolled: Rolled) -> np.ndarray:
+        """The rewarded steps (lanes,) of a roll-out."""
+        how = self.work.judging
+        assert how.env is not None
+        return judging.steps_played(how.env, how.by, rolled, how.steps)
+
+    def _narrowed(self, block: Adapting, after: Rolled) -> tuple[Adapting, Rolled, np.ndarray]:
+        """Lanes within the share of their bounds with which they are worth most, what they are worth so, and the
+        rewarded steps (lanes,) that it took to know."""
+        how, bound, played = self.work.judging, block.bound, np.zeros(self.work.lanes.number, int)
         for share in how.bounds:
             tried = block.replace(bound=share * block.bound)
             found = self._measured(self._policy(tried), f"the adapted policy within {share:g} of its bound")
-            better = found[how.by] > after[how.by]
-            after = {name: np.where(better, found[name], values) for name, values in after.items()}
+            played = played + self._played(found)
+            better = np.asarray(found.means[how.by] > after.means[how.by])
+            after = jax.tree.map(
+                lambda new, old, better=better: np.where(better.reshape(-1, *[1] * (new.ndim - 1)), new, old),
+                found,
+                after,
+            )
             bound = jnp.where(jnp.asarray(better), tried.bound, bound)
-        return block.replace(bound=bound), after
+        return block.replace(bound=bound), after, played
 
-    def _add(self, block: Adapting) -> judging.Metrics:
+    def _add(self, block: Adapting) -> Rolled:
         found = self._measured(self._policy(block), "the adapted policy")
-        self.curve.append({"asked": np.asarray(block.guide.asked), "failed": np.asarray(block.failed), **found})
+        asked, failed = np.asarray(block.guide.asked), np.asarray(block.failed)
+        self.curve.append({"asked": asked, "failed": failed, **found.means})
         return found
 
     def _policy(self, block: Adapting) -> Guided:
@@ -242,7 +258,7 @@ class _Measuring:
         assert env is not None
         return program.adapted(work.guidance, work.sizes, env, work.scalars, work.bases, block)
 
-    def _measured(self, policy: Policy, what: str) -> judging.Metrics:
+    def _measured(self, policy: Policy, what: str) -> Rolled:
         how = self.work.judging
         assert how.env is not None
         mesh = self.mesh if not isinstance(policy, judging.Common) else None

@@ -8,7 +8,7 @@ settings over many bases is one compiled program: side by side on an accelerator
     tuning = FineTuning(config, env, agents, lanes)
     while tuning.step < 20_000:
         tuning.train(2_000)
-        found = evaluate.watched_lanes(world, tuning.policy(world), episodes(), 100, 10_000)
+        found = evaluate.watched_lanes(world, tuning.policy(world), episodes(), 100, 10_000).means
 """
 
 from __future__ import annotations

@@ -21,7 +21,7 @@ from cuelearner_jax.config import GuideSizes, Scalars
 from cuelearner_jax.devices import each_lane
 from cuelearner_jax.environment import Environment, actions_of
 from cuelearner_jax.errors import UserError, closest
-from cuelearner_jax.evaluate import Tell, episodes, evaluate_lanes, untold, watched, watched_lanes
+from cuelearner_jax.evaluate import Rolled, Tell, episodes, mean_interval, roll_lanes, untold, watched, watched_lanes
 from cuelearner_jax.guidance.answers import of_strength
 from cuelearner_jax.guidance.bundle import Guidance
 from cuelearner_jax.policies import Common, Policy
@@ -30,7 +30,6 @@ from cuelearner_jax.types import Label
 HELD_OUT = 5  # every fifth label
 LABELS = "labels"  # what is judged by, in place of a metric
 STEPS = 100  # of an environment, where a task counts steps
-Metrics = dict[str, np.ndarray]
 
 
 class Judged(NamedTuple):
@@ -41,14 +40,27 @@ class Judged(NamedTuple):
     after: np.ndarray  # (lanes,)
     used: np.ndarray  # (lanes,) bool: is the model used? Not if it is worth less than nothing, or not finite
     within_deg: np.ndarray  # (lanes,) how far corrections then lead from the base's actions [deg]
+    # (lanes, 3) after less before and the ends of its 95% interval over episodes, paired; nan by labels
+    difference: np.ndarray
+    rewarded_steps: np.ndarray  # (lanes,) int: environment steps whose rewards or outcomes decided; 0 by labels
 
 
 def metrics_of(env: Environment) -> tuple[str, ...]:
     """Names of what a roll-out measures in an environment."""
+    step = _step_of(env)
+    return ("reward", *step.metrics, *step.outcome)
+
+
+def _step_of(env: Environment) -> Any:
     key = jax.random.key(0)
     state, _ = jax.eval_shape(env.reset, key)
-    _, step = jax.eval_shape(env.step, key, state, jnp.zeros(actions_of(env).size))
-    return ("reward", *step.metrics, *step.outcome)
+    return jax.eval_shape(env.step, key, state, jnp.zeros(actions_of(env).size))[1]
+
+
+def steps_played(env: Environment, by: str, rolled: Rolled, steps: int) -> np.ndarray:
+    """Environment steps (lanes,) of a roll-out that a metric is about: of an outcome those of first episodes alone."""
+    first = np.asarray(rolled.episode_steps)
+    return first.sum(-1) if by in _step_of(env).outcome else np.full(len(first), steps)
 
 
 def measured(
@@ -59,8 +71,8 @@ def measured(
     split: str = "tuning",
     mesh: Mesh | None = None,
     tell: Tell = untold,
-) -> Metrics:
-    """Metrics (lanes,) of a block of policies, or (1,) of one that all share, on the episodes of a split.
+) -> Rolled:
+    """Roll out a block of policies, or one that all lanes share (as one lane), on the episodes of a split.
 
     Args:
         env: the changed world, of that split.
@@ -73,17 +85,22 @@ def measured(
     key = episodes(split)
     if isinstance(policy, Common):
         found = watched(env, policy.policy, key, num_envs, steps, tell)
-        return {name: np.asarray(value)[None] for name, value in found.items()}
+        return jax.tree.map(lambda leaf: np.asarray(leaf)[None], found)
     if mesh is not None and mesh.size > 1:
-        found = evaluate_lanes(env, policy, key, mesh=mesh, num_envs=num_envs, steps=steps)
-        return jax.device_get(found)
+        return jax.device_get(roll_lanes(env, policy, key, mesh=mesh, num_envs=num_envs, steps=steps))
     return watched_lanes(env, policy, key, num_envs, steps, tell)
 
 
 def judged(
-    by: str, lanes: Lanes, bases: Metrics, policies: Metrics, usable: np.ndarray, within_deg: np.ndarray
+    by: str,
+    lanes: Lanes,
+    bases: Rolled,
+    policies: Rolled,
+    usable: np.ndarray,
+    within_deg: np.ndarray,
+    rewarded_steps: np.ndarray,
 ) -> Judged:
-    """Compares metrics of base policies (bases,) or (1,) and of lanes (lanes,) on the same episodes.
+    """Compares base policies (bases or one) and lanes on the same episodes.
 
     Args:
         by: the metric.
@@ -91,12 +108,13 @@ def judged(
         bases, policies: from `measured`.
         usable: (lanes,) bool: False where nothing could be fitted, or not to finite numbers.
         within_deg: (lanes,) the bounds of the policies.
+        rewarded_steps: (lanes,) that it took.
     """
-    before = np.asarray(bases[by])
-    before = np.broadcast_to(before, lanes.number) if len(before) == 1 else before[lanes.base]
-    after = np.asarray(policies[by])
+    own = np.zeros(lanes.number, int) if len(bases.means[by]) == 1 else lanes.base
+    before, after = np.asarray(bases.means[by])[own], np.asarray(policies.means[by])
     used = np.asarray(usable) & (after >= before)  # NaN is worth less than anything
-    return Judged(by, before, after, used, within_deg)
+    difference = mean_interval(np.asarray(policies.each[by]) - np.asarray(bases.each[by])[own]).T
+    return Judged(by, before, after, used, within_deg, difference, rewarded_steps)
 
 
 @partial(jax.jit, static_argnames=("guidance",))
@@ -142,7 +160,9 @@ def judged_by_labels(
     if int(np.asarray(block.guide.labels.valid).sum(-1).min()) < HELD_OUT:
         raise UserError(f"fewer than {HELD_OUT} labels cannot be judged by: give more, or --judge-by a metric")
     zero, right = jax.device_get(_predicted(guidance, env, scalars, block))
-    return Judged(LABELS, zero, right, ~np.asarray(block.failed) & (right >= zero), within_deg(block))
+    used = ~np.asarray(block.failed) & (right >= zero)
+    unknown, none = np.full((len(used), 3), np.nan), np.zeros(len(used), int)
+    return Judged(LABELS, zero, right, used, within_deg(block), unknown, none)
 
 
 def within_deg(block: Adapting) -> np.ndarray:
@@ -159,10 +179,10 @@ def check_bounds(shares: tuple[float, ...], by: str, named: str) -> None:
         raise UserError(f"{named} needs episodes to try them on: judge by a metric of the task")
 
 
-def check_metric(by: str, policies: Metrics) -> None:
+def check_metric(by: str, policies: Rolled) -> None:
     """Raises UserError if there is no such metric."""
-    if by not in policies:
-        raise UserError(f"there is no metric {by!r} to judge by{closest(by, [*policies, LABELS])}")
+    if by not in policies.means:
+        raise UserError(f"there is no metric {by!r} to judge by{closest(by, [*policies.means, LABELS])}")
 
 
 def kept(block: Adapting, used: np.ndarray) -> Adapting:

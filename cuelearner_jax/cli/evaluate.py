@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Generic
+from typing import TYPE_CHECKING, Any, Generic
 
 import numpy as np
 from rich.table import Table
@@ -13,10 +13,16 @@ from cuelearner_jax.cli.parsing import about, out, parse, source_of, world_of
 from cuelearner_jax.cli.shared_options import TaskT
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import Tell
+from cuelearner_jax.records import policy_folders
 from cuelearner_jax.runs import measured
 from cuelearner_jax.runs.measured import Measured
+from cuelearner_jax.runs.trained import POLICIES, PolicySource
 from cuelearner_jax.task import Task
+from cuelearner_jax.tasks import registry
 from cuelearner_jax.terminal import console, progress_bars
+
+if TYPE_CHECKING:
+    from cuelearner_jax.report.measurements import Difference
 
 
 @dataclass(frozen=True)
@@ -42,6 +48,9 @@ class Evaluate(Generic[TaskT]):
     only."""
     scenario: str | None = None
     """The changed world of this name, see above; options of the task (--task.…) come on top of it."""
+    compare: str | None = None
+    """Another run folder, policy folder or policy, measured on the same episodes; its default policy where that is a
+    folder. The table then shows both and the difference."""
     out: Path | None = None
     """Also write the measurements to this JSON file. (Beside all these: --base package.module:NAME gives the code of a
     policy folder that has some.)"""
@@ -65,6 +74,7 @@ def run(arguments: list[str]) -> None:
     envs, steps = _work(source.task, asked)
     if asked.out and asked.out.exists():
         raise UserError(f"{asked.out} exists: give another --out")
+    other = _other(source, asked) if asked.compare is not None else None
     with progress_bars(shown=console.is_terminal) as bars:
 
         def watch(kind: str) -> Tell:
@@ -72,14 +82,26 @@ def run(arguments: list[str]) -> None:
             return lambda done, count: bars.update(bar, completed=done, total=count)
 
         found = measured.evaluate(source, asked.task, asked.policy, asked.guidance, envs, steps, engine, watch)
+        others = measured.evaluate(*other, (), envs, steps, engine, watch) if other else []
+    from cuelearner_jax.report import measurements  # loads SciPy
+
+    compared = measurements.differences(found, others) if other else None
     told = {"robot": asked.robot, "engine": asked.engine, "scenario": asked.scenario}
     told = {name: value for name, value in told.items() if value}
     robot = {"robot_digest": digest} if (digest := source.task.bodies[0].digest) else {}
     amount = f"{steps:,} steps a lane" if source.task.longest is None else f"{envs:,} episodes a lane"
+    title = ", ".join([asked.policy, *told.values(), amount])
     if asked.out:  # first: whoever reads the table may leave before its end
-        measured.write(asked.out, source, asked.task, asked.policy, envs, steps, found, {**told, **robot})
-    out.print(_measurements(found, ", ".join([asked.policy, *told.values(), amount])))
-    if any((row.metrics.get("finished", np.ones(1)) < 1).any() for row in found):
+        named = (str(asked.compare), compared) if compared is not None else None
+        described = {**told, **robot}
+        measurements.write(asked.out, source, asked.task, asked.policy, envs, steps, found, described, named)
+    shares = f"{envs:,} episodes" if source.task.longest else f"{envs:,} environments of {steps // envs:,} steps"
+    if compared is None:
+        out.print(_measurements(found, title, shares))
+    for difference in compared or ():
+        out.print(_comparison(difference, str(asked.compare), title, shares))
+        out.print(_verdict(difference))
+    if any((row.metrics.get("finished", np.ones(1)) < 1).any() for row in [*found, *others]):
         console.print("not every first episode has ended, so outcomes have no mean: give more --steps")
     if asked.out:
         out.print(f"wrote {asked.out}")
@@ -109,23 +131,106 @@ def _work(task: Task, asked: Evaluate[Any]) -> tuple[int, int]:
     return envs, steps
 
 
-def _measurements(found: list[Measured], title: str) -> Table:
-    """Interquartile means over seeds with their intervals, a row for each guidance and budget."""
-    from cuelearner_jax.report.statistics import interval
+def _other(source: PolicySource, asked: Evaluate[Any]) -> tuple[PolicySource, Any, str]:
+    """The source, world and name of the policy to compare with. Raises UserError if it cannot be had in that world."""
+    given = str(asked.compare)
+    folder = Path(given)
+    if given in POLICIES and not folder.exists():
+        other, policy = source, given
+    elif folder.exists():
+        code = source.adapted.code if source.adapted and policy_folders.is_one(folder) else None
+        other = PolicySource.of_folder(folder, registry.find, code)
+        if other.task.name != source.task.name:
+            raise UserError(f"{given} is of {other.task.name}, not of {source.task.name}: compare within one task")
+        other, policy = other.on(asked.robot), other.default_policy
+    else:
+        known = ", ".join(POLICIES)
+        raise UserError(f"--compare is {given!r}: give a run folder, a policy folder, or one of {known}")
+    if policy == asked.policy and other.folder.absolute() == source.folder.absolute():
+        raise UserError(f"--compare is {given!r}, the policy that is evaluated: give another one")
+    other.check(policy, asked.task)
+    return other, asked.task, policy
 
-    table = Table("guidance", "labels", "seeds", "steps", "metric", "mean", "95% interval", title=title)
+
+def _measurements(found: list[Measured], title: str, episodes: str) -> Table:
+    """Means with their intervals, a section for each guidance and budget.
+
+    Args:
+        found: the rows.
+        title: of the table.
+        episodes: what the interval of a single policy is over.
+    """
+    from cuelearner_jax.report import measurements
+
+    columns = {
+        "guidance": lambda row: row.guidance,
+        "labels": lambda row: str(row.labels),
+        "within": lambda row: "" if row.bound_deg is None else f"{row.bound_deg:g} deg",
+        "seeds": lambda row: str(len(row.seeds)),
+        "trained steps": lambda row: f"{row.step:,}",
+    }
+    if all(row.guidance == "-" for row in found):  # of no folder
+        columns = {}
+    elif not any(row.step for row in found):
+        del columns["trained steps"]
+    if all(row.bound_deg is None for row in found):
+        columns.pop("within", None)
+    table = Table(*columns, "metric", "mean", "95% interval", title=title, caption=_over(found, episodes))
     for column in table.columns:
         column.no_wrap = True
     for row in found:
-        own = [row.guidance, str(row.labels), str(len(row.seeds)), str(row.step)]
-        below = "" if row.bound_deg is None else f"≤ {row.bound_deg:g} deg"
+        own = [told(row) for told in columns.values()]
         for name, values in row.metrics.items():
-            if np.isfinite(values).all():
-                of = interval(values)
-                spread = f"{float(of.lower):.3f} to {float(of.upper):.3f}" if len(values) > 1 else ""
-                table.add_row(*own, name, f"{float(of.estimate):.3f}", spread)
+            of = measurements.spread(row, name)
+            if of is None:
+                told = f"of {len(values)}, {int(np.isfinite(values).sum())} have one"
+                table.add_row(*own, name, "none", told)
             else:
-                table.add_row(*own, name, "none", f"of {len(values)}, {int(np.isfinite(values).sum())} have one")
-            own, below = [below] + [""] * (len(own) - 1), ""
+                ends = "" if np.isnan(of.lower) else f"{of.lower:.3f} to {of.upper:.3f}"
+                table.add_row(*own, name, f"{of.estimate:.3f}", ends)
+            own = [""] * len(own)
         table.add_section()
     return table
+
+
+def _over(found: list[Measured], episodes: str) -> str:
+    """What means and intervals are over."""
+    from cuelearner_jax.report import measurements
+
+    kinds = {measurements.over(row) for row in found}
+    told = {
+        measurements.EPISODES: f"one policy: mean and bootstrap over {episodes}",
+        measurements.SEEDS: "several seeds: interquartile mean and bootstrap over seeds",
+    }
+    return "; ".join(text for kind, text in told.items() if kind in kinds)
+
+
+def _comparison(difference: Difference, other: str, title: str, episodes: str) -> Table:
+    """Two policies side by side, with their difference."""
+    from cuelearner_jax.report import measurements
+
+    mine, its = (measurements.variant(row) for row in (difference.row, difference.other))
+    over = f"{episodes}, paired" if difference.over == measurements.EPISODES else "seeds (interquartile means)"
+    table = Table(
+        "metric",
+        "policy" + (f" ({mine})" if mine else ""),
+        other + (f" ({its})" if its else ""),
+        "difference",
+        title=title,
+        caption=f"mean [95% bootstrap interval]; of the difference over {over}",
+        padding=0,
+    )
+    for column in table.columns:
+        column.no_wrap = True
+    for name, less in difference.metrics.items():
+        both = (measurements.spread(row, name) for row in (difference.row, difference.other))
+        table.add_row(name, *map(str, both), f"{less.estimate:+.3f} [{less.lower:+.3f}, {less.upper:+.3f}]")
+    return table
+
+
+def _verdict(difference: Difference) -> str:
+    """Whether the interval of the difference excludes 0, metric by metric."""
+    apart = [name for name, less in difference.metrics.items() if less.excludes_zero]
+    alike = [name for name in difference.metrics if name not in apart]
+    told = [f"excludes 0 for {', '.join(apart)}"] * bool(apart) + [f"includes 0 for {', '.join(alike)}"] * bool(alike)
+    return f"The 95% interval of the difference {'; '.join(told)}."

@@ -52,6 +52,17 @@ class AdaptedPolicy(CallablePolicy):
         return of.by, float(of.before[0]), float(of.after[0])
 
     @property
+    def difference(self) -> tuple[float, float, float]:
+        """After less before, and the ends of its 95% interval over the tuning episodes; nan where labels judge."""
+        estimate, lower, upper = (float(value) for value in self.found.judged.difference[0])
+        return estimate, lower, upper
+
+    @property
+    def rewarded_steps(self) -> int:
+        """Environment steps whose rewards or outcomes decided whether the model is used; 0 where labels judge."""
+        return int(self.found.judged.rewarded_steps[0])
+
+    @property
     def labels(self) -> Labels:
         """What was answered (of relative feedback)."""
         return labels_of(jax.tree.map(lambda leaf: leaf[0], self.found.block.guide.labels))

@@ -189,6 +189,20 @@ def _judging(order: Order, env: Any) -> Judging:
     return Judging(tuned, envs, envs * steps, by, order.judge_every, bounds=order.judge_bounds)
 
 
+def _difference(lanes: np.ndarray) -> str:
+    """Differences (lanes, 3) in words: one with its 95% interval, or how many of several exclude 0."""
+    if len(lanes) > 1:
+        return f"the difference's 95% interval lies above 0 in {int((lanes[:, 1] > 0).sum())} of {len(lanes)} lanes"
+    ((estimate, lower, upper),) = lanes
+    zero = ", which includes 0" if lower <= 0 <= upper else ""
+    return f"difference {estimate:+.3g} [{lower:+.3g}, {upper:+.3g}]{zero}"
+
+
+def _steps(lanes: np.ndarray) -> str:
+    """Rewarded steps (lanes,) in words."""
+    return f"{int(np.mean(lanes)):,} rewarded steps{'' if len(lanes) == 1 else ' a lane'}"
+
+
 def told(found: Adapted) -> list[str]:
     """What adaptation has led to, a line for each budget and bound."""
     lanes, judged, lines = found.asked.lanes, found.judged, []
@@ -199,6 +213,7 @@ def told(found: Adapted) -> list[str]:
             worth, worse = f"predicts {after} of held-out answers, always 'already right' {before}", "fewer than that"
         else:
             worth, worse = f"{judged.by} on tuning episodes {before} before, {after} after", "worse than before"
+            worth += f" ({_difference(judged.difference[own])}; {_steps(judged.rewarded_steps[own])})"
         lines.append(f"{budget} labels within {bound:g} degrees: {worth}")
         if narrowed := sorted({*judged.within_deg[own & judged.used].round(3).tolist()} - {round(bound, 3)}):
             lines[-1] += f", used within {' or '.join(f'{angle:g}' for angle in narrowed)} degrees"

@@ -180,6 +180,8 @@ def write(
             "before": _plain(judged.before),
             "after": _plain(judged.after),
             "within_deg": [float(f"{bound:g}") for bound in judged.within_deg],
+            "difference": [_plain(ends) for ends in judged.difference],
+            "rewarded_steps": judged.rewarded_steps.tolist(),
         },
         **{name: value for name, value in (used or {}).items() if value},
         "observation": [quantity._asdict() for quantity in env.observation],

@@ -1,21 +1,16 @@
-"""What named policies are worth: measured on validation episodes, and written with where the numbers come from."""
+"""Measure named policies on validation episodes."""
 
 from __future__ import annotations
 
-import json
-import math
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 
-from cuelearner_jax.config import to_json
-from cuelearner_jax.evaluate import Tell, episodes, part_of, untold, watched, watched_lanes
+from cuelearner_jax.evaluate import Rolled, Tell, episodes, part_of, untold, watched, watched_lanes
 from cuelearner_jax.guidance import registry as guidances
 from cuelearner_jax.policies import Common
-from cuelearner_jax.records.provenance import provenance
-from cuelearner_jax.records.whole import replacing
 from cuelearner_jax.runs.trained import POLICIES, Parts, PolicySource, blocks_of
 from cuelearner_jax.task import Rollout
 
@@ -25,10 +20,12 @@ class Measured(NamedTuple):
 
     guidance: str
     labels: int
-    step: int
+    step: int  # of its training; 0: nothing was trained
     seeds: np.ndarray  # (seeds,)
     metrics: dict[str, np.ndarray]  # each (seeds,)
+    each: dict[str, np.ndarray]  # the same of each environment (seeds, envs), nan where its first episode goes on
     bound_deg: float | None = None  # of a policy folder's lanes [deg]
+    is_shared: bool = False  # do all seeds have one policy?
 
 
 def evaluate(
@@ -59,70 +56,39 @@ def evaluate(
         policy = named.make(Parts(source.config, env, teacher, None))
         tell = watch(name)
         if engine:
-            found = engine(policy, env, key, num_envs, steps, tell)
+            means, each = _of_lanes([engine(policy, env, key, num_envs, steps, tell)])
         else:
-            found = watched(env, policy, key, num_envs, steps, tell)
-        metrics = {metric: np.asarray(value)[None] for metric, value in found.items()}
-        return [Measured("-", 0, 0, np.zeros(1, int), metrics)]
+            means, each = _repeated(watched(env, policy, key, num_envs, steps, tell), 1)
+        return [Measured("-", 0, 0, np.zeros(1, int), means, each)]
     rows = []
     for block in blocks_of(source, named, env, teacher, tuple(map(guidances.named, kinds))):
         tell, policy, count = watch(block.guidance), block.policy, len(block.seeds)
+        is_shared = isinstance(policy, Common)
         if engine:
-            each = []
-            for lane in range(count):
-                each.append(engine(block.alone(lane), env, key, num_envs, steps, part_of(tell, lane, count)))
-            found = {metric: np.stack([measured[metric] for measured in each]) for metric in each[0]}
-        elif isinstance(policy, Common):
-            shared = watched(env, policy.policy, key, num_envs, steps, tell)
-            found = {metric: np.repeat(np.asarray(value)[None], count) for metric, value in shared.items()}
+            tells = [part_of(tell, lane, count) for lane in range(count)]
+            means, each = _of_lanes(
+                [engine(block.alone(lane), env, key, num_envs, steps, tells[lane]) for lane in range(count)]
+            )
+        elif is_shared:
+            means, each = _repeated(watched(env, policy.policy, key, num_envs, steps, tell), count)
         else:
-            found = watched_lanes(env, policy, key, num_envs, steps, tell)
+            means, each, _ = watched_lanes(env, policy, key, num_envs, steps, tell)
         variants = sorted(set(zip(block.bounds.tolist(), block.budgets.tolist(), strict=True)))
         for bound, budget in variants:
             own = (block.budgets == budget) & (block.bounds == bound)
-            metrics = {metric: np.asarray(values)[own] for metric, values in found.items()}
+            mine, apart = ({name: np.asarray(of[name])[own] for name in of} for of in (means, each))
             bounded = None if source.adapted is None else bound
-            rows.append(Measured(block.guidance, budget, block.step, block.seeds[own], metrics, bounded))
+            rows.append(Measured(block.guidance, budget, block.step, block.seeds[own], mine, apart, bounded, is_shared))
     return rows
 
 
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None
+def _of_lanes(lanes: list[dict[str, Any]]) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """Means (lanes,) and values (lanes, envs) of what an engine gave for each lane."""
+    each = {name: np.stack([np.asarray(lane[name], float) for lane in lanes]) for name in lanes[0]}
+    return {name: values.mean(-1) for name, values in each.items()}, each
 
 
-def write(
-    path: Path,
-    source: PolicySource,
-    world: Any,
-    policy: str,
-    num_envs: int,
-    steps: int,
-    measured: list[Measured],
-    body: dict[str, str],
-) -> None:
-    """Measurements as JSON, with the world, the body if it is not the task's own, and where the numbers come from."""
-    rows = [
-        {
-            "guidance": row.guidance,
-            "labels": row.labels,
-            **({} if row.bound_deg is None else {"bound_deg": float(f"{row.bound_deg:g}")}),
-            "trained_steps": row.step,
-            "seeds": row.seeds.tolist(),
-            **{metric: [_finite(value) for value in values.tolist()] for metric, values in row.metrics.items()},
-        }
-        for row in measured
-    ]
-    contents = {
-        "subject": source.folder.name,
-        "world": {"name": source.task.name, **to_json(world)},
-        **({"files": files} if POLICIES[policy].taught and (files := source.task.files(world)) else {}),
-        "policy": policy,
-        **body,
-        "envs": num_envs,
-        "steps": steps,
-        **provenance(),
-        "rows": rows,
-    }
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(path) as file:
-        file.write(json.dumps(contents, indent=1) + "\n")
+def _repeated(rolled: Rolled, lanes: int) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """Means (lanes,) and values (lanes, envs) of a policy that all lanes share."""
+    means, each, _ = jax.tree.map(lambda leaf: np.repeat(np.asarray(leaf)[None], lanes, axis=0), rolled)
+    return means, each

@@ -87,7 +87,11 @@ def test_a_constant_shift_is_recovered_to_within_eps():
         assert errors(policy, lane).max() < SCALARS.eps_deg
     assert found().judged.used.all()
     np.testing.assert_array_equal(found().judged.before, 0.0)
-    assert found().judged.after[(LANES.budget == 80) & (LANES.bound_deg == 60)].min() == 1.0
+    judged = found().judged
+    assert judged.after[(LANES.budget == 80) & (LANES.bound_deg == 60)].min() == 1.0
+    np.testing.assert_allclose(judged.difference[:, 0], judged.after - judged.before, atol=1e-6)
+    assert (judged.difference[:, 1] <= judged.difference[:, 0]).all()
+    assert set(judged.rewarded_steps.tolist()) == {2 * JUDGING.steps}  # before and after
 
 
 def test_the_bound_is_never_exceeded():
@@ -172,6 +176,7 @@ def test_without_a_simulator_held_out_answers_decide():
     both = jax.tree.map(lambda *leaves: np.concatenate(leaves), one, noise)
     judged = adapting.adapt(asked(base, lanes, how), labels=both, mesh=MESH).judged
     assert judged.by == "labels"
+    assert judged.rewarded_steps.tolist() == [0, 0]
     assert (judged.before[0], judged.after[0], judged.used[0]) == (0.0, 1.0, True)
     held = chance[0, 3::5, 0]
     assert judged.before[1] == pytest.approx((held == 0).mean())
@@ -193,6 +198,7 @@ def test_a_bound_is_narrowed_where_that_is_worth_more():
     assert wide.judged.within_deg.tolist() == pytest.approx([60.0])
     assert (narrow.judged.after[0], narrow.judged.used[0]) == (1.0, True)
     assert narrow.judged.within_deg.tolist() == pytest.approx([3.0])
+    assert (narrow.judged.rewarded_steps[0], wide.judged.rewarded_steps[0]) == (4 * JUDGING.steps, 2 * JUDGING.steps)
     assert errors(narrow.policy(ENV), 0) == pytest.approx(3.0, abs=0.01)
 
 

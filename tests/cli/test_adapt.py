@@ -121,6 +121,7 @@ def test_a_function_is_adapted_and_its_folder_evaluated(adapted, tmp_path):
     values = json.loads((adapted / "policy.json").read_text())
     assert values["task"]["offset_deg"] == -20.0
     assert values["of"] == {"code": "own_turned:straight"}
+    assert values["judged"]["rewarded_steps"] == [2 * 20 * 100] * 4
     assert values["policy"]["base"] == {"policy": "code", "named": "own_turned:straight"}
     rows = measured(tmp_path, adapted, *own())
     assert [(row["labels"], row["bound_deg"]) for row in rows] == [(20, 3.0), (80, 3.0), (20, 45.0), (80, 45.0)]
@@ -216,6 +217,8 @@ def test_what_is_adapted_saved_and_loaded_acts_bitwise_alike(home, tmp_path):
     better = cl.adapt(code, world, cl.teacher_of(world), labels=80, **settings)
     assert better.used
     assert better.judged == ("reward", 0.0, 1.0)
+    assert (better.difference, better.rewarded_steps) == ((1.0, 1.0, 1.0), 2 * 20 * 100)
+    assert "difference +1 [+1, +1]; 4,000 rewarded steps)" in told(better.found)[0]
     assert len(better.labels.obs) == 80
     better.save(tmp_path / "better")
     with pytest.raises(cl.UserError, match="is not empty: give --overwrite"):

@@ -55,11 +55,32 @@ def test_every_policy_is_evaluated(run_folder, tmp_path, capsys, policy):
     out = tmp_path / "measured.json"
     command = ["evaluate", str(run_folder), "--policy", policy, "--steps", "20", "--envs", "10", "--out", str(out)]
     assert main(command) == 0
-    assert "reward" in capsys.readouterr().out
+    told = capsys.readouterr().out
+    assert "reward" in told
+    trained = policy in ("agent", "guide", "guided")
+    assert ("trained steps" in told) == ("interquartile mean and bootstrap over seeds" in told) == trained
+    assert ("mean and bootstrap over 10 environments of 2 steps" in told) == (not trained)
     rows = json.loads(out.read_text())["rows"]
     lanes = {("none", 0), ("relative", 10), ("relative", 20)}
-    trained = policy in ("agent", "guide", "guided")
+    assert {row["intervals"]["over"] for row in rows} == {"seeds" if trained else "episodes"}
+    assert all(row["intervals"]["reward"][1] <= row["intervals"]["reward"][2] for row in rows)
     assert {(row["guidance"], row["labels"]) for row in rows} == (lanes if trained else {("-", 0)})
+
+
+def test_two_policies_are_compared_on_the_same_episodes(run_folder, tmp_path, capsys):
+    few, out = ["--steps", "20", "--envs", "10"], tmp_path / "compared.json"
+    command = ["evaluate", str(run_folder), *few]
+    assert main([*command, "--policy", "heuristic", "--compare", "uniform", "--out", str(out)]) == 0
+    told = capsys.readouterr().out
+    assert "difference over 10 environments of 2 steps, paired" in told
+    assert "The 95% interval of the difference" in told
+    recorded = json.loads(out.read_text())
+    (found,) = recorded["compared"]["differences"]
+    assert (recorded["compared"]["with"], found["over"]) == ("uniform", "episodes")
+    less = recorded["rows"][0]["reward"][0] - found["less"]["reward"][0]
+    assert found["difference"]["reward"][0] == pytest.approx(less)
+    assert main([*command, "--compare", "heuristic"]) == 0
+    assert capsys.readouterr().out.count("difference over seeds") == 3  # a table for each kind and budget
 
 
 def test_labels_in_instalments_each_about_the_situation_that_members_disagree_on(tmp_path):

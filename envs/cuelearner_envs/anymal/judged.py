@@ -113,25 +113,22 @@ def rollout(
     `tell` is told how many steps of how many each robot has made.
 
     Returns:
-        Means over the episodes (nan unless all have ended within `steps` shared by all), and "finished", the share that
-        has.
+        Outcomes of each episode (num_envs,), nan where it has not ended within `steps` shared by all, and "finished".
     """
     k_reset, k_run = jax.random.split(key)
     course = Course(env, jax.random.split(k_reset, num_envs))
     choose = jax.jit(policy.act)
-    running, outcomes = np.ones(num_envs, bool), []
+    running = np.ones(num_envs, bool)
+    found = {name: np.full(num_envs, np.nan) for name in course.outcomes}
     for index in range(steps // num_envs):
         tell(index, steps // num_envs)
         k_act, _ = jax.random.split(jax.random.fold_in(k_run, index))
         outcome, terminated, truncated = course.step(choose(k_act, course.state, course.obs))
         ended = running & (terminated | truncated)
-        outcomes += [{name: value[number] for name, value in outcome.items()} for number in np.flatnonzero(ended)]
+        for name, values in found.items():
+            values[ended] = outcome[name][ended]
         running &= ~ended
         course.judge.retired |= ended
         if not running.any():
             break
-    if running.any():
-        means = dict.fromkeys(course.outcomes, np.asarray(np.nan))
-    else:
-        means = {name: np.asarray(np.mean([one[name] for one in outcomes])) for name in course.outcomes}
-    return {**means, "finished": np.asarray(1.0 - running.mean())}
+    return {**found, "finished": 1.0 - running}

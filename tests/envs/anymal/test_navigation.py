@@ -223,11 +223,11 @@ def test_the_sensor_has_noise_of_its_own(env):
 def test_in_c_mujoco_walking_toward_the_goal_reaches_it_or_meets_something():
     env = make_environment(NavigationConfig(worlds=8, max_steps=100))
     found = judged.rollout(Heuristic(env), env, jax.random.key(0), 6, 600)
-    assert float(found["finished"]) == 1
-    ends = [float(found[name]) for name in ("success", "collision", "fall", "timeout")]
-    assert sum(ends) == pytest.approx(1)
-    assert float(found["success"]) > 0
-    assert 2.0 < float(found["duration"]) <= 20.0
+    assert found["finished"].tolist() == [1.0] * 6
+    ends = sum(found[name] for name in ("success", "collision", "fall", "timeout"))
+    np.testing.assert_allclose(ends, np.ones(6))
+    assert found["success"].any()
+    assert 2.0 < found["duration"].mean() <= 20.0
 
 
 def test_in_c_mujoco_episodes_begin_where_those_in_mjx_do(env):

@@ -1,0 +1,194 @@
+"""Intervals of measured policies, differences between two of them, and the JSON file of a measurement."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from cuelearner_jax.config import to_json
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.evaluate import mean_interval
+from cuelearner_jax.records.provenance import provenance
+from cuelearner_jax.records.whole import replacing
+from cuelearner_jax.report.statistics import RESAMPLES, interquartile_mean, interval, resampled
+from cuelearner_jax.runs.measured import Measured
+from cuelearner_jax.runs.trained import POLICIES, PolicySource
+
+EPISODES = "episodes"  # what the interval of a single policy is over
+SEEDS = "seeds"
+
+
+class Spread(NamedTuple):
+    """An estimate with its 95% bootstrap interval; the bounds are nan where one value alone is known."""
+
+    estimate: float
+    lower: float
+    upper: float
+
+    @property
+    def excludes_zero(self) -> bool:
+        """Whether zero lies outside the interval."""
+        return self.lower > 0 or self.upper < 0
+
+    def __str__(self) -> str:
+        """As tables show it."""
+        if math.isnan(self.lower):
+            return f"{self.estimate:.3f}"
+        return f"{self.estimate:.3f} [{self.lower:.3f}, {self.upper:.3f}]"
+
+
+def is_single(row: Measured) -> bool:
+    """Whether a row measures one policy, whose interval is over episodes, not over seeds."""
+    return len(row.seeds) == 1 or row.is_shared
+
+
+def over(row: Measured) -> str:
+    """What the intervals of a row are over."""
+    return EPISODES if is_single(row) else SEEDS
+
+
+def spread(row: Measured, metric: str) -> Spread | None:
+    """One policy's mean over its episodes, or the interquartile mean over seeds; None where a value is not finite."""
+    if not np.isfinite(row.metrics[metric]).all():
+        return None
+    found = mean_interval(row.each[metric][0]) if is_single(row) else interval(row.metrics[metric])
+    return Spread(*map(float, found))
+
+
+class Difference(NamedTuple):
+    """A measured policy less another on the same episodes."""
+
+    row: Measured
+    other: Measured
+    over: str  # "episodes" or "seeds"
+    metrics: dict[str, Spread]
+
+
+def variant(row: Measured) -> str:
+    """The guidance, labels and bound of a row, as a phrase; empty for a policy without them."""
+    if row.guidance == "-":
+        return ""
+    bound = "" if row.bound_deg is None else f" within {row.bound_deg:g} deg"
+    return f"{row.guidance}, {row.labels} labels{bound}"
+
+
+def differences(rows: Sequence[Measured], others: Sequence[Measured]) -> list[Difference]:
+    """Each row less the other of its variant, or less the only other.
+
+    Two single policies are paired by episode; rows of the same seeds are paired by seed; one policy is taken off each
+    seed of several; rows of different seeds are drawn independently.
+
+    Raises:
+        UserError: a row has no counterpart.
+    """
+    return [_difference(row, _counterpart(row, others)) for row in rows]
+
+
+def _counterpart(row: Measured, others: Sequence[Measured]) -> Measured:
+    if len(others) == 1:
+        return others[0]
+    alike = [other for other in others if variant(other) == variant(row)]
+    if len(alike) == 1:
+        return alike[0]
+    known = "; ".join(variant(other) for other in others)
+    wanted = variant(row) or "without labels"
+    raise UserError(
+        f"--compare leads to {len(others)} variants ({known}), none of them {wanted}: give a policy of one variant"
+    )
+
+
+def _difference(row: Measured, other: Measured) -> Difference:
+    metrics = {}
+    for name in row.metrics.keys() & other.metrics.keys():
+        if np.isfinite(row.metrics[name]).all() and np.isfinite(other.metrics[name]).all():
+            metrics[name] = _less(row, other, name)
+    ordered = {name: metrics[name] for name in row.metrics if name in metrics}
+    return Difference(row, other, EPISODES if is_single(row) and is_single(other) else SEEDS, ordered)
+
+
+def _less(row: Measured, other: Measured, name: str) -> Spread:
+    if is_single(row) and is_single(other):
+        return Spread(*map(float, mean_interval(row.each[name][0] - other.each[name][0])))
+    mine, its = row.metrics[name], other.metrics[name]
+    if is_single(row) or is_single(other) or np.array_equal(row.seeds, other.seeds):
+        mine, its = (values[:1] if is_single(of) else values for of, values in ((row, mine), (other, its)))
+        return Spread(*map(float, interval(mine - its)))
+    drawn = resampled(mine, RESAMPLES, seed=0) - resampled(its, RESAMPLES, seed=1)
+    estimate = float(interquartile_mean(mine) - interquartile_mean(its))
+    return Spread(estimate, *map(float, np.quantile(drawn, [0.025, 0.975])))
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def _plain(found: Spread | None) -> list[float | None] | None:
+    """(estimate, lower, upper)"""
+    return None if found is None else [_finite(value) for value in found]
+
+
+def _row(row: Measured) -> dict[str, Any]:
+    return {
+        "guidance": row.guidance,
+        "labels": row.labels,
+        **({} if row.bound_deg is None else {"bound_deg": float(f"{row.bound_deg:g}")}),
+        "trained_steps": row.step,
+        "seeds": row.seeds.tolist(),
+        **{metric: [_finite(value) for value in values.tolist()] for metric, values in row.metrics.items()},
+        "intervals": {"over": over(row), **{metric: _plain(spread(row, metric)) for metric in row.metrics}},
+    }
+
+
+def write(
+    path: Path,
+    source: PolicySource,
+    world: Any,
+    policy: str,
+    num_envs: int,
+    steps: int,
+    rows: Sequence[Measured],
+    body: dict[str, str],
+    compared: tuple[str, Sequence[Difference]] | None = None,
+) -> None:
+    """Write measurements as JSON: the world, the rows with intervals, and where the numbers come from.
+
+    Args:
+        path: of the file.
+        source, world, policy, num_envs, steps: what was measured, as `measured.evaluate` has it.
+        rows: the measurements.
+        body: robot, engine and scenario, where they are not the task's own.
+        compared: the name of the other policy, and the differences.
+    """
+    contents = {
+        "subject": source.folder.name,
+        "world": {"name": source.task.name, **to_json(world)},
+        **({"files": files} if POLICIES[policy].taught and (files := source.task.files(world)) else {}),
+        "policy": policy,
+        **body,
+        "envs": num_envs,
+        "steps": steps,
+        **provenance(),
+        "rows": [_row(row) for row in rows],
+    }
+    if compared is not None:
+        name, found = compared
+        contents["compared"] = {
+            "with": name,
+            "differences": [
+                {
+                    "of": variant(one.row),
+                    "less": _row(one.other),
+                    "over": one.over,
+                    "difference": {metric: _plain(value) for metric, value in one.metrics.items()},
+                }
+                for one in found
+            ],
+        }
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(path) as file:
+        file.write(json.dumps(contents, indent=1) + "\n")

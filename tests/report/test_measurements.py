@@ -1,0 +1,74 @@
+"""Intervals of measured policies and of differences between two, over what they are said to be."""
+
+import numpy as np
+import pytest
+
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.evaluate import mean_interval
+from cuelearner_jax.report import measurements
+from cuelearner_jax.report.statistics import interval
+from cuelearner_jax.runs.measured import Measured
+
+RANDOM = np.random.default_rng(5)
+EPISODES = 200
+HARD = RANDOM.normal(size=EPISODES)  # what all policies find hard or easy, episode by episode
+
+
+def measured(seeds, gain=0.0, labels=0, **other):
+    """Rows of policies that share their episodes' luck and differ by `gain` and a little."""
+    each = HARD + gain + 0.1 * np.random.default_rng(seeds).normal(size=(len(seeds), EPISODES))
+    metrics = {"reward": each.mean(-1)}
+    return Measured("relative", labels, 100, np.array(seeds), metrics, {"reward": each}, **other)
+
+
+def test_an_interval_of_a_mean_covers_it_in_95_of_100():
+    samples = np.random.default_rng(2).normal(size=(400, 50))
+    mean, lower, upper = mean_interval(samples, resamples=400)
+    np.testing.assert_allclose(mean, samples.mean(-1))
+    assert 0.9 < ((lower <= 0) & (upper >= 0)).mean() < 0.97
+    assert np.isnan(mean_interval(np.array([0.5]))[1:]).all()
+
+
+def test_one_policy_has_an_interval_over_episodes_and_several_over_seeds():
+    one, many = measured([1]), measured([1, 2, 3, 4, 5])
+    assert (measurements.over(one), measurements.over(many)) == ("episodes", "seeds")
+    found = measurements.spread(one, "reward")
+    assert found.upper - found.lower == pytest.approx(4 * HARD.std() / np.sqrt(EPISODES), rel=0.15)
+    assert measurements.spread(many, "reward") == tuple(map(float, interval(many.metrics["reward"])))
+    alike = Measured("-", 0, 0, np.arange(3), {"reward": np.ones(3)}, {"reward": np.ones((3, 9))}, is_shared=True)
+    assert measurements.over(alike) == "episodes"  # three seeds of one policy are no spread over seeds
+    missing = one._replace(metrics={"success": np.array([np.nan])})
+    assert measurements.spread(missing, "success") is None
+
+
+def test_a_difference_of_two_policies_is_paired_by_episode():
+    (found,) = measurements.differences([measured([1], 0.1)], [measured([2])])
+    assert found.over == "episodes"
+    less = found.metrics["reward"]
+    assert less.excludes_zero
+    assert less.upper - less.lower < 0.05  # unpaired it would be 0.4
+    (same,) = measurements.differences([measured([1])], [measured([1])])
+    assert same.metrics["reward"] == (0.0, 0.0, 0.0)
+    assert not same.metrics["reward"].excludes_zero
+
+
+def test_differences_of_seeds_are_paired_where_seeds_are_the_same():
+    several = measured([1, 2, 3, 4], 0.1)
+    widths = []
+    for others in (measured([1, 2, 3, 4]), measured([7, 8, 9, 10]), measured([7])):
+        (found,) = measurements.differences([several], [others])
+        less = found.metrics["reward"]
+        assert found.over == "seeds"
+        assert less.lower <= less.estimate <= less.upper
+        assert less.estimate == pytest.approx(0.1, abs=0.02)
+        widths.append(less.upper - less.lower)
+    assert widths[0] == pytest.approx(0, abs=1e-6)  # the same luck, seed by seed
+    assert 0.001 < widths[2] < widths[1]  # a single policy adds no luck of other seeds
+
+
+def test_variants_are_compared_with_their_own_kind_or_refused():
+    rows = [measured([1], labels=100), measured([1], labels=500)]
+    found = measurements.differences(rows, rows[::-1])
+    assert [one.other.labels for one in found] == [100, 500]
+    with pytest.raises(UserError, match=r"leads to 2 variants .* none of them relative, 250 labels"):
+        measurements.differences([measured([1], labels=250)], rows)
