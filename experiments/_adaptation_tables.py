@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from _adaptation import SCHEMA, UNCHANGED
+from _adaptation import JUDGED, SCHEMA, UNCHANGED, Study
 
 from cuelearner_jax.records import table as tables
 from cuelearner_jax.report.statistics import interquartile_mean, interval
@@ -39,6 +40,8 @@ class Line(NamedTuple):
     after: int  # labels, or steps of fine-tuning
     bases: np.ndarray  # (bases,), ascending
     columns: dict[str, np.ndarray]  # metrics (bases,)
+    path: str  # of the piece, in its study
+    command: str  # that ran it
 
     @property
     def name(self) -> str:
@@ -72,7 +75,9 @@ def lines(rows: Sequence[Row], world: str, split: str = "validation", least: flo
         numbers = [name for name, value in own[0].items() if isinstance(value, float)]
         columns = {name: np.array([np.nan if row[name] is None else row[name] for row in own]) for name in numbers}
         told = ", ".join([variant] * bool(variant) + [f"{value:g}" for value in settings if value is not None])
-        result.append(Line(method, told, after, np.array([row["base"] for row in own]), columns))
+        path = f"{world}/{method}-{variant}" if variant else f"{world}/{method}"
+        bases, command = np.array([row["base"] for row in own]), own[0].get("command") or ""
+        result.append(Line(method, told, after, bases, columns, path, command))
     order = list(NAMES)
     return sorted(result, key=lambda line: (order.index(line.method), line.variant, line.after))
 
@@ -103,6 +108,60 @@ def matched(line: Line, other: Line, name: str) -> tuple[np.ndarray, np.ndarray]
     """A metric of two lines over the bases that both have."""
     _, mine, its = np.intersect1d(line.bases, other.bases, return_indices=True)
     return line.columns[name][mine], other.columns[name][its]
+
+
+def tuned(rows: Sequence[Row], world: str) -> set[int]:
+    """The base agents on which settings of a world were chosen."""
+    return {row["base"] for row in rows if row["split"] == "tuning" and row["world"] == world}
+
+
+def held_out(line: Line, name: str, bases: set[int]) -> str:
+    """A metric over the base agents that are not among those, in percent; nothing where all are."""
+    values = line.columns[name][~np.isin(line.bases, list(bases))]
+    return percent(values) if len(values) else ""
+
+
+PERIOD_S = 0.2  # of a step in navigation
+
+
+def rewarded_steps(line: Line, start: Line, study: Study) -> int | None:
+    """Environment steps an agent, rewards or outcomes of which a method used; None where that is not known.
+
+    Of fine-tuning those it learned from. Of a model of labels those by which its use was decided, on tuning episodes:
+    of the base and of the model within each bound that was tried. Where an outcome decided, an episode counts until its
+    end, which is taken from the validation episodes.
+    """
+    if line.method == "finetuning":
+        return line.after
+    if "used" not in line.columns or not line.command:
+        return None
+    words = [*line.command.split(), ""]
+    known = dict(itertools.pairwise(words))
+    scale = study.scales[known.get("--scale", "paper")]
+    episodes = min(int(known.get("--envs", scale.envs)), JUDGED)
+    tried = 1 + next(len(piece.judge_bounds) for piece in study.pieces if piece.path == line.path)
+    if "duration" not in line.columns:
+        return episodes * scale.steps * (1 + tried)
+    lengths = [float(np.mean(of.columns["duration"])) / PERIOD_S for of in (start, line)]
+    return round(int(episodes * (lengths[0] + tried * lengths[1])), -3)
+
+
+def recovered(now: np.ndarray, before: np.ndarray, whole: np.ndarray) -> str:
+    """The share of a loss that has come back, in percent: a ratio of interquartile means over the same agents.
+
+    Args:
+        now, before, whole: (bases,) after, not adapted, and what could come back.
+    """
+    draws = np.random.default_rng(0).integers(0, len(now), (DRAWS, len(now)))
+    draws = np.concatenate([np.arange(len(now))[None], draws])
+    after, start, most = (interquartile_mean(values[draws], axis=1) for values in (now, before, whole))
+    lost = most - start
+    if lost[0] <= 0:
+        return ""
+    shares = 100 * np.divide(after - start, lost, out=np.full(len(lost), np.inf), where=lost > 0)
+    ends = np.quantile(shares[1:], [0.025, 0.975], method="nearest")
+    middle, lower, upper = (str(round(value)) if np.isfinite(value) else "no bound" for value in (shares[0], *ends))
+    return f"{middle} [{lower}, {upper}]"
 
 
 def share(line: Line, whole: Line) -> np.ndarray:

@@ -15,25 +15,31 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
+import adaptation_billiards
 import numpy as np
-from _adaptation import UNCHANGED
+from _adaptation import UNCHANGED, Study
 from _adaptation_tables import (
     GAIN,
     NAMES,
     Line,
     Row,
+    held_out,
     lines,
     matched,
     named,
     percent,
     reached,
     read,
+    recovered,
+    rewarded_steps,
     share,
     spread,
     table,
+    tuned,
 )
 from _trajectories import FILE, draw
 from adaptation_billiards import BOUNDS_DEG, LEAST
+from adaptation_navigation import STUDY
 from bootstrapping_page import rendered
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
@@ -59,6 +65,16 @@ def after(line: Line) -> str:
     return f"{line.after:,} labels" if line.after else ""
 
 
+AMOUNTS = ["labels", "rewarded steps"]
+
+
+def amounts(line: Line, start: Line, study: Study) -> list[str]:
+    """Labels and rewarded steps, as cells."""
+    labels = f"{line.after:,}" if line.after and line.method != "finetuning" else ""
+    steps = rewarded_steps(line, start, study)
+    return [labels, "" if steps is None else f"{steps:,}"]
+
+
 def shown(known: Sequence[Line]) -> list[Line]:
     """What tables show: of fine-tuning a few of its measurements."""
     steps = [line.after for line in known if line.method == "finetuning" and line.after]
@@ -73,15 +89,20 @@ def billiards(rows: Sequence[Row], folder: Path, seen: str) -> str:
         return ""
     original = f"The base agents: {len(whole.bases)}, of a reward of {spread(whole.columns['reward'])} unchanged."
     parts, curves = [original], {}
+    study = adaptation_billiards.STUDY
     for world, bound in BOUNDS_DEG.items():
         known = lines(rows, world, least=LEAST)
         if not known:
             continue
-        cells = [
-            [line.name, after(line), spread(line.columns["reward"]), percent(share(line, whole)), _used(line)]
-            for line in shown(known)
-        ]
-        header = ["", "after", "reward", "of the original [%]", "models used"]
+        chosen_on, start = tuned(rows, world), next(line for line in known if line.method == "none")
+        cells = []
+        for line in shown(known):
+            shares = share(line, whole)
+            others = shares[~np.isin(np.intersect1d(line.bases, whole.bases), list(chosen_on))]
+            own = [spread(line.columns["reward"]), percent(shares), *([percent(others)] if chosen_on else [])]
+            cells.append([line.name, *amounts(line, start, study), *own, _used(line)])
+        held = ["of the original, held-out agents [%]"] if chosen_on else []
+        header = ["", *AMOUNTS, "reward", "of the original [%]", *held, "models used"]
         parts.append(f"**{world}**, bound {bound:g} degrees:\n\n{table(header, cells)}")
         curves[world] = curve_points(known, "reward", whole)
         parts.append(_gains(curves[world]))
@@ -162,23 +183,35 @@ def figure(curves: dict[str, Points], stem: Path, ylabel: str, level: tuple[floa
 
 
 def outcomes(rows: Sequence[Row], world: str, whole: Line | None) -> str:
-    """Success, collisions and time-outs in a world, and how much of what was lost has come back."""
+    """Success, collisions and time-outs in a world, and how much of what was lost has come back.
+
+    Args:
+        rows: of the study.
+        world: the changed world.
+        whole: the base agents in the unchanged world; None: the teacher itself is the most that there is to gain.
+    """
     known = lines(rows, world)
     start = next((line for line in known if line.method == "none"), None)
     if start is None:
         return ""
-    cells = []
+    teachers = [line for line in known if line.method == "teacher"]
+    most = whole or max(teachers, key=lambda line: float(np.mean(line.columns["success"])), default=None)
+    chosen_on, cells = tuned(rows, world), []
     for line in ([whole] if whole else []) + shown(known):
-        name = "unchanged world" if line is whole else line.name
-        back = ""
-        if whole is not None and line is not whole and line is not start:
+        name, back, used = "unchanged world" if line is whole else line.name, "", amounts(line, start, STUDY)
+        if most is not None and line is not start and line is not most:
             now, before = matched(line, start, "success")
-            lost = matched(whole, start, "success")[0].mean() - before.mean()
-            back = f"{100 * (now.mean() - before.mean()) / lost:.0f}%" if lost > 0 else ""
-        own = [percent(line.columns[metric]) for metric in ("success", "collision", "timeout")]
-        cells.append([name, after(line), *own, back, _used(line)])
-    header = ["", "after", "success [%]", "collisions [%]", "time-outs [%]", "of the loss", "models used"]
+            back = recovered(now, before, matched(most, start, "success")[0])
+        held = [held_out(line, "success", chosen_on)] if chosen_on else []
+        own = [percent(line.columns["success"]), *held, *(percent(line.columns[name]) for name in WAYS_TO_FAIL)]
+        cells.append([name, *used, *own, *([back] if most else []), _used(line)])
+    gained = ["of the loss [%]" if whole else "of the way to the teacher [%]"] if most else []
+    held = ["success, held-out agents [%]"] if chosen_on else []
+    header = ["", *AMOUNTS, "success [%]", *held, "collisions [%]", "time-outs [%]", *gained, "models used"]
     return table(header, cells)
+
+
+WAYS_TO_FAIL = ("collision", "timeout")
 
 
 def lidar(rows: Sequence[Row], folder: Path, seen: str) -> str:
@@ -208,17 +241,19 @@ def rooms(rows: Sequence[Row], folder: Path, seen: str) -> str:
     return f"{text}\n\nCeilings:\n\n{table(header, cells)}"
 
 
-SIDES_HEADER = ["wanted", "", "after", "success [%]", "all on the wanted side [%]", "on both sides [%]"]
+SIDES_HEADER = ["wanted", "", *AMOUNTS, "success [%]", "all on the wanted side [%]", "on both sides [%]"]
 
 
 def side_cells(rows: Sequence[Row], world: str, side: str) -> list[list[str]]:
     """A row for each way of adapting in a corridor with a wanted side."""
-    cells = []
-    for line in lines(rows, world):
+    cells, known = [], lines(rows, world)
+    start = next((line for line in known if line.method == "none"), None)
+    for line in known:
+        used = amounts(line, start, STUDY) if start else ["", ""]
         each = {name: line.columns[f"passed_{name}"] for name in (*SIDES, "both")}
         passed = np.maximum(sum(each.values()), 1e-9)
         wanted, mixed = percent(each[side] / passed), percent(each["both"] / passed)
-        cells.append([side, line.name, after(line), percent(line.columns["success"]), wanted, mixed])
+        cells.append([side, line.name, *used, percent(line.columns["success"]), wanted, mixed])
     return cells
 
 

@@ -115,7 +115,8 @@ def recorded(modules, tmp_path):
     wrote(modules, place / "none", [{"base": bases, "reward": whole / 2}], world=world, method="none")
     points = [(100, 0.6), (200, 0.9)]
     rows = [{"base": bases, "labels": after, "reward": part * whole, "used": 1.0} for after, part in points]
-    wrote(modules, place / "relative", rows, world=world, method="relative")
+    command = "experiments/adaptation_billiards.py --bases runs/billiards"
+    wrote(modules, place / "relative", rows, world=world, method="relative", command=command)
     points = [(0, 0.5), (1_000, 0.6), (2_000, 0.8), (4_000, 1.0)]
     rows = [{"base": bases, "steps": after, "reward": part * whole} for after, part in points]
     wrote(modules, place / "finetuning", rows, world=world, method="finetuning")
@@ -156,6 +157,46 @@ def test_a_gain_is_made_where_lines_between_points_say(modules, recorded):
     assert never.told(4_000) == "above 4,000 [above 4,000, above 4,000]"
 
 
+def test_rewarded_steps_are_those_that_the_use_of_a_model_was_decided_by(modules):
+    """Two policies of 200 x 50 shots; in navigation 500 episodes at most, each until its end, for every bound tried."""
+    found, line = modules["_adaptation_tables"], modules["_adaptation_tables"].Line
+    ten = {"used": np.ones(2), "duration": np.full(2, 10.0)}
+    start = line("none", "", 0, np.arange(2), {"duration": np.full(2, 20.0)}, "turned_lidar/none", "")
+    command = "experiments/adaptation_navigation.py --bases runs/navigation --envs 1000 --pieces turned_lidar"
+    steps = {}
+    for variant in ("", "narrowed"):
+        path = "turned_lidar/relative" + (f"-{variant}" if variant else "")
+        own = line("relative", variant, 250, np.arange(2), ten, path, command)
+        steps[variant] = found.rewarded_steps(own, start, modules["adaptation_navigation"].STUDY)
+    assert steps == {"": 500 * (100 + 50), "narrowed": 500 * (100 + 3 * 50)}
+    shots = line("relative", "", 250, np.arange(2), {"used": np.ones(2)}, "turned_strike/relative", "adaptation --x 1")
+    assert found.rewarded_steps(shots, start, modules["adaptation_billiards"].STUDY) == 2 * 200 * 50
+    tuned = line("finetuning", "", 5_000, np.arange(2), {}, "turned_lidar/finetuning", command)
+    assert found.rewarded_steps(tuned, start, modules["adaptation_navigation"].STUDY) == 5_000
+    assert found.rewarded_steps(start, start, modules["adaptation_navigation"].STUDY) is None
+
+
+def test_what_has_come_back_is_a_ratio_with_an_interval(modules):
+    found = modules["_adaptation_tables"]
+    before, whole = np.full(8, 0.8), np.full(8, 1.0)
+    assert found.recovered(np.full(8, 0.9), before, whole) == "50 [50, 50]"
+    middle, lower, upper = (
+        int(part.strip("[],")) for part in found.recovered(np.linspace(0.8, 1, 8), before, whole).split()
+    )
+    assert (middle, lower < 40, upper > 60) == (50, True, True)
+    assert found.recovered(before, whole, before) == ""  # nothing was lost
+
+
+def test_agents_that_settings_were_chosen_on_are_told_from_the_others(modules):
+    found = modules["_adaptation_tables"]
+    rows = [{"base": base, "split": "tuning", "world": "rooms"} for base in (1, 2)]
+    rows += [{"base": 3, "split": "validation", "world": "rooms"}, {"base": 4, "split": "tuning", "world": "lidar"}]
+    assert found.tuned(rows, "rooms") == {1, 2}
+    line = found.Line("intent", "", 250, np.array([1, 2, 3, 4]), {"success": np.array([0.1, 0.1, 0.6, 0.6])}, "", "")
+    assert found.held_out(line, "success", {1, 2}) == "60.0 [60.0, 60.0]"
+    assert found.held_out(line, "success", {1, 2, 3, 4}) == ""
+
+
 def test_the_page_holds_tables_where_there_are_rows(modules, recorded):
     page = modules["adaptation_page"]
     text = (FOLDER.parent / "docs" / "results" / "adaptation.md").read_text(encoding="utf-8")
@@ -163,7 +204,7 @@ def test_the_page_holds_tables_where_there_are_rows(modules, recorded):
     asked = ["--data", str(recorded), "--page", str(recorded / "page.md")]
     assert page.main(asked) == 0
     written = (recorded / "page.md").read_text(encoding="utf-8")
-    assert "| relative labels | 200 labels | 0.405 [0.360, 0.450] | 90.0 [90.0, 90.0] | 100% |" in written
+    assert "| relative labels | 200 | 20,000 | 0.405 [0.360, 0.450] | 90.0 [90.0, 90.0] | 100% |" in written
     assert "| RL fine-tuning | 3,400 [3,400, 3,400] steps | 2,800 [2,800, 2,800] steps |" not in written
     of_lidar = text[text.index("<!-- lidar -->") : text.index("<!-- end of lidar -->")]
     assert of_lidar in written  # of which there are no rows
@@ -180,7 +221,7 @@ def test_the_preferred_side_is_counted_among_those_who_passed_anything(modules, 
     wrote(modules, tmp_path / "navigation" / "none", [row], **world)
     rows = modules["_adaptation_tables"].read(tmp_path / "navigation")
     text = modules["adaptation_page"].sides(rows, tmp_path, "data")
-    assert "| left | not adapted |  | 80.0 [80.0, 80.0] | 75.0 [75.0, 75.0] | 12.5 [12.5, 12.5] |" in text
+    assert "| left | not adapted |  |  | 80.0 [80.0, 80.0] | 75.0 [75.0, 75.0] | 12.5 [12.5, 12.5] |" in text
 
 
 def test_ceilings_are_those_after_the_most_actions(modules, tmp_path):
