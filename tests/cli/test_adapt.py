@@ -276,7 +276,8 @@ def test_a_bound_is_learned_and_kept(home, tmp_path):
     assert near.used
     assert near.judged == ("reward", 1.0, 1.0)
     (line,) = told(near.found)
-    assert line.endswith("1 before, 1 after, used within 3.6 degrees")
+    zero = "difference +0 [+0, +0], which includes 0; 6,000 rewarded steps"
+    assert line.endswith(f"1 before, 1 after ({zero}), used within 3.6 degrees")
     moved = np.degrees(np.arccos(np.clip((near(SEEN) * SEEN).sum(-1), -1, 1)))
     np.testing.assert_allclose(moved, 3.6, atol=0.1)
     near.save(tmp_path / "near")
