@@ -211,12 +211,10 @@ def _comparison(difference: Difference, other: str, title: str, episodes: str) -
 
     mine, its = (measurements.variant(row) for row in (difference.row, difference.other))
     over = f"{episodes}, paired" if difference.over == measurements.EPISODES else "seeds (interquartile means)"
+    named = " against ".join(name + (f" ({told})" if told else "") for name, told in ((title, mine), (other, its)))
     table = Table(
-        "metric",
-        "policy" + (f" ({mine})" if mine else ""),
-        other + (f" ({its})" if its else ""),
-        "difference",
-        title=title,
+        *("metric", "policy", "against", "difference"),
+        title=named,
         caption=f"mean [95% bootstrap interval]; of the difference over {over}",
         padding=0,
     )

@@ -74,6 +74,7 @@ def test_two_policies_are_compared_on_the_same_episodes(run_folder, tmp_path, ca
     told = capsys.readouterr().out
     assert "difference over 10 environments of 2 steps, paired" in told
     assert "The 95% interval of the difference" in told
+    assert "…" not in told  # every number is whole on a narrow terminal
     recorded = json.loads(out.read_text())
     (found,) = recorded["compared"]["differences"]
     assert (recorded["compared"]["with"], found["over"]) == ("uniform", "episodes")
