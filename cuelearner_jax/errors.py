@@ -2,7 +2,9 @@
 
 import difflib
 import errno
+import reprlib
 from collections.abc import Iterable
+from typing import Any
 
 # Refusals of the file system that no check beforehand can rule out.
 FILE_SYSTEM = (
@@ -45,8 +47,36 @@ def blamed(error: BaseException) -> str | None:
     return None
 
 
+def shown(value: Any) -> str:
+    """A value for a message, on one short line: plain values as Python writes them, anything else by its type."""
+    if isinstance(value, type):
+        return f"the class {value.__name__}"
+    if shape := getattr(value, "shape", None):
+        return f"an array of shape {shape}"
+    if not isinstance(value, str | bytes | int | float | complex | list | tuple | dict | set | None):
+        return f"a {type(value).__name__}"
+    short = reprlib.Repr()
+    short.maxstring = short.maxother = 60
+    try:
+        text = short.repr(value)
+    except Exception:  # of what cannot be written: an entry's own `repr`, an integer of thousands of digits
+        return f"a {type(value).__name__}"
+    return text if text.isprintable() and len(text) <= 120 else f"a {type(value).__name__}"
+
+
+def raised_by(named: str, error: Exception) -> UserError:
+    """What is told of an exception of the user's own code: one line that says whose it is and what was raised.
+
+    Args:
+        named: what the code is, for instance "policy my_policy".
+        error: what it raised.
+    """
+    said = " ".join(str(error).split())[:200]
+    return UserError(f"{named} raised {type(error).__name__}{': ' if said else ''}{said}: mend it first")
+
+
 def closest(word: str, known: Iterable[str]) -> str:
     """The end of a message about an unknown word: the one that was probably meant, or all there are."""
     known = list(known)
-    found = difflib.get_close_matches(word, known, n=1)
+    found = difflib.get_close_matches(str(word)[:100], known, n=1)
     return f", did you mean {found[0]!r}?" if found else f": choose one of {', '.join(known)}"

@@ -23,7 +23,7 @@ from cuelearner_jax.agent.choice import greedy_actions
 from cuelearner_jax.config import AgentSizes, GuideScalars, GuideSizes
 from cuelearner_jax.devices import portions
 from cuelearner_jax.environment import actions_of
-from cuelearner_jax.errors import UserError
+from cuelearner_jax.errors import UserError, shown
 from cuelearner_jax.guidance.answers import in_mind, relative_feedback
 from cuelearner_jax.guidance.bounding import act_within
 from cuelearner_jax.guidance.bundle import Guidance
@@ -296,9 +296,9 @@ def policy_of(given: Any) -> Any:
         return given
     if isinstance(given, jax.stages.Wrapped):
         return Opaque(given)
-    if callable(given):
+    if callable(given) and not isinstance(given, type):
         return Opaque(given, on_host=True)
-    raise UserError(f"a {type(given).__name__} is no policy: give a function of observations (n, obs), or load one")
+    raise UserError(f"{shown(given)} is no policy: give a function of observations (n, obs), or load one")
 
 
 def _takes_nothing(given: Callable[..., Any]) -> bool:

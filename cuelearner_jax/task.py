@@ -12,9 +12,9 @@ from typing import Any, NamedTuple
 import jax
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from cuelearner_jax.config import GuideSizes, RunConfig, Scalars
+from cuelearner_jax.config import GuideSizes, RunConfig, Scalars, check_types
 from cuelearner_jax.environment import Environment
-from cuelearner_jax.errors import UserError, closest
+from cuelearner_jax.errors import UserError, closest, shown
 from cuelearner_jax.records.room import check_room
 from cuelearner_jax.types import EnvState, Reel, Sketch, Teacher
 
@@ -149,6 +149,17 @@ class Task:
         except Exception as error:
             raise ValueError(f"task {self.name}: scenario {name!r} makes no configuration ({error})") from error
 
+    def configured(self, scenario: str | None = None, **changes: Any) -> Any:
+        """The task's configuration in a changed world, with fields changed.
+
+        Raises UserError for no such scenario or field, or a value that its field cannot hold.
+        """
+        config = self.config()
+        if scenario is not None:
+            config = self.scenario(scenario).applied(config)
+        values = check_types(config, "task", **changes) if changes else {}
+        return dataclasses.replace(config, **values)
+
     def environment(self, config: Any, split: str = "training") -> Environment:
         """The world of a configuration with the first body in it, for the episodes of a split.
 
@@ -198,7 +209,7 @@ class Task:
         others, found = tuple(one for one in self.bodies if one.name != body), known[body]
         if folder:
             if found.made_of is None:
-                raise UserError(f"{body} takes no folder: leave out {folder!r}")
+                raise UserError(f"robot {body} takes no folder: leave out {folder!r}")
             found = found.made_of(Path(folder))
         return dataclasses.replace(self, bodies=(found, *others))
 
@@ -225,7 +236,7 @@ class Task:
         if not self.scenarios:
             raise UserError(f"{self.name} has no scenarios to choose from: leave out --scenario")
         if name not in self.scenarios:
-            raise UserError(f"unknown scenario {name!r}{closest(name, self.scenarios)}")
+            raise UserError(f"unknown scenario {shown(name)}{closest(name, self.scenarios)}")
         return self.scenarios[name]
 
 

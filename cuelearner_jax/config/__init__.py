@@ -7,6 +7,7 @@ from cuelearner_jax.config.checks import (
     check,
     check_agent,
     check_guide,
+    check_types,
     check_whole,
 )
 from cuelearner_jax.config.groups import (
@@ -40,6 +41,7 @@ __all__ = [
     "check",
     "check_agent",
     "check_guide",
+    "check_types",
     "check_whole",
     "defaults",
     "digest",

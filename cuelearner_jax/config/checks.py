@@ -7,9 +7,11 @@ import itertools
 import math
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
+import numpy as np
+
 from cuelearner_jax.config.groups import AgentSizes, GuideScalars, GuideSizes, RunConfig
 from cuelearner_jax.config.plain import fits
-from cuelearner_jax.errors import UserError
+from cuelearner_jax.errors import UserError, closest, shown
 
 LARGEST = 2**31 - 1  # counters and indices are 32-bit integers
 LARGEST_ROUND = 1 << 30  # so that budgets of as many labels, in whole rounds, are such an integer too
@@ -19,6 +21,7 @@ LARGEST_FLOAT = 3.4028234e38  # scalars are computed in single precision
 def check(config: RunConfig) -> None:
     """Raises UserError with one line for the first value that cannot work."""
     sizes, schedule = config.sizes, config.schedule
+    check_types(schedule, "schedule")
     check_whole(schedule, "schedule")
     check_agent(sizes)
     if sizes.lanes_per_block < 0:
@@ -82,6 +85,37 @@ def _check_asking(config: RunConfig) -> None:
     _check_multiple(schedule.guide_eval_every, unit, "schedule.guide_eval_every", "sizes.labels_per_round")
 
 
+def check_types(group: Any, prefix: str, **changes: Any) -> dict[str, Any]:
+    """Values that fields of a configuration are to get, as they are kept: NumPy's numbers as Python's, lists as tuples.
+
+    Args:
+        group: a configuration, or its class.
+        prefix: what messages call it.
+        changes: the values by field (default: those that the configuration holds).
+
+    Raises:
+        UserError: no such field, or a value of another type than its field's.
+    """
+    fields = [field.name for field in dataclasses.fields(group) if field.init]
+    kinds = get_type_hints(group if isinstance(group, type) else type(group))
+    values = changes or {name: getattr(group, name) for name in fields}
+    kept = {}
+    for name, given in values.items():
+        if name not in fields:
+            raise UserError(f"{prefix} has no field {shown(name)}{closest(name, fields)}")
+        value = given.item() if isinstance(given, np.generic) else tuple(given) if isinstance(given, list) else given
+        kind = kinds[name]
+        if not fits(value, kind):
+            words = " or ".join(map(str, get_args(kind))) if get_origin(kind) is Literal else ""
+            raise UserError(f"{prefix}.{name} is {shown(value)}: give {words or f'a value of type {_called(kind)}'}")
+        kept[name] = value
+    return kept
+
+
+def _called(kind: Any) -> str:
+    return kind.__name__ if isinstance(kind, type) and not get_args(kind) else str(kind)
+
+
 def check_whole(group: Any, prefix: str) -> None:
     """Raises UserError for a whole number that 32 bits do not hold."""
     for field in dataclasses.fields(group):
@@ -95,6 +129,7 @@ def check_whole(group: Any, prefix: str) -> None:
 
 def check_agent(sizes: AgentSizes) -> None:
     """Raises UserError with one line for the first value of an agent's that cannot work."""
+    check_types(sizes, "sizes")
     check_whole(sizes, "sizes")
     positive = ("directions", "peaks", "target_directions", "num_envs", "batch_size", "replay_capacity")
     _check_positive(sizes, (*positive, "updates_per_step", "n_step"))
@@ -115,8 +150,9 @@ def check_agent(sizes: AgentSizes) -> None:
 
 def check_guide(sizes: GuideSizes, scalars: GuideScalars) -> None:
     """Raises UserError with one line for the first value of a guide's that cannot work."""
-    check_whole(sizes, "sizes")
-    check_whole(scalars, "scalars")
+    for group, prefix in ((sizes, "sizes"), (scalars, "scalars")):
+        check_types(group, prefix)
+        check_whole(group, prefix)
     positive = (
         "labels_per_round",
         "fit_steps",
@@ -127,7 +163,6 @@ def check_guide(sizes: GuideSizes, scalars: GuideScalars) -> None:
         "question_every",
     )
     _check_positive(sizes, (*positive, "guide_directions", "replay_steps"))
-    _check_words(sizes, "sizes")
     _check_choice(sizes)
     if sizes.labels_per_round > LARGEST_ROUND:
         raise UserError(f"sizes.labels_per_round is {sizes.labels_per_round}: give at most {LARGEST_ROUND}")
@@ -183,15 +218,7 @@ def _check_layers(layers: tuple[int, ...], name: str) -> None:
         raise UserError(f"{name}: give at least one layer of positive width")
 
 
-def _check_words(group: Any, prefix: str) -> None:
-    for name, kind in get_type_hints(type(group)).items():
-        value = getattr(group, name)
-        if get_origin(kind) is Literal and not fits(value, kind):
-            raise UserError(f"{prefix}.{name} is {value!r}: give {' or '.join(get_args(kind))}")
-
-
 def _check_numbers(scalars: Any) -> None:
-    _check_words(scalars, "scalars")
     for name, value in dataclasses.asdict(scalars).items():
         if isinstance(value, str):
             continue

@@ -13,8 +13,9 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from cuelearner_jax.environment import Quantity
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.face.worlds import World
-from cuelearner_jax.policies import Policy, policy_of
+from cuelearner_jax.face import arguments
+from cuelearner_jax.face.worlds import World, a_world
+from cuelearner_jax.policies import Policy
 from cuelearner_jax.runs import trained
 from cuelearner_jax.task import Task, shape_of
 from cuelearner_jax.tasks import registry
@@ -37,6 +38,10 @@ class CallablePolicy:
     observation: tuple[Quantity, ...] = ()  # what it expects to see; empty: not known
     asks: bool = False  # does it ask a teacher, who looks at the true state?
 
+    def __post_init__(self) -> None:
+        """Raises UserError for a policy that is none."""
+        arguments.policy("policy", self.policy)
+
     def __call__(self, obs: Any, key: PRNGKeyArray | None = None) -> np.ndarray:
         """Actions for observations.
 
@@ -52,14 +57,10 @@ class CallablePolicy:
         """
         if self.asks:
             raise UserError("this policy asks a teacher, who looks at the true state: call its act(key, states, obs)")
-        rows = np.asarray(obs, np.float32)
+        rows = arguments.observations("obs", obs, sum(quantity.size for quantity in self.observation) or None)
         batch = rows[None] if rows.ndim == 1 else rows
-        wanted = sum(quantity.size for quantity in self.observation) or batch.shape[-1]
-        if batch.ndim != 2 or batch.shape[1] != wanted:
-            raise UserError(f"observations have shape {rows.shape}: give ({wanted},) or (n, {wanted})")
-        if not np.isfinite(batch).all():
-            raise UserError("an observation holds numbers that are not finite")
-        chosen = np.asarray(_act(self.policy, jax.random.key(0) if key is None else key, jnp.asarray(batch)))
+        key = jax.random.key(0) if key is None else arguments.key("key", key)
+        chosen = np.asarray(_act(self.policy, key, jnp.asarray(batch)))
         return chosen[0] if rows.ndim == 1 else chosen
 
     def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
@@ -67,12 +68,12 @@ class CallablePolicy:
         return self.policy.act(key, states, obs)
 
 
-def as_policy(given: Any) -> Policy:
+def as_policy(given: Any, name: str = "policy") -> Policy:
     """Anything that acts as a policy: a `CallablePolicy`, or what `policies.policy_of` takes.
 
-    Raises UserError for what is none of them.
+    Raises UserError, which says the argument's name, for what is none of them.
     """
-    return given.policy if isinstance(given, CallablePolicy) else policy_of(given)
+    return given.policy if isinstance(given, CallablePolicy) else arguments.policy(name, given)
 
 
 def load_policy(
@@ -104,10 +105,22 @@ def load_policy(
     Raises:
         UserError: no such folder, lane or policy.
     """
+    path = arguments.path("folder", folder)
+    for argument, value in (("policy", policy), ("guidance", guidance)):
+        if value is not None:
+            arguments.text(argument, value, trained.POLICIES if argument == "policy" else ())
+    labels = None if labels is None else arguments.budget("labels", labels, least=0)
+    bound_deg = None if bound_deg is None else arguments.angle("bound_deg", bound_deg)
+    seed = None if seed is None else arguments.seed("seed", seed)
+    code = None if base is None else as_policy(base, "base")
     if isinstance(task, str):
-        task = registry.resolve(task)
-    path = Path(folder)
-    code = None if base is None else as_policy(base)
+        task = registry.resolve(arguments.text("task", task))
+    elif task is not None:
+        arguments.instance("task", task, Task, "a task, or its name")
+    if world is not None:
+        a_world("world", world)
+    if not path.exists():
+        raise UserError(f"folder {path} does not exist: give the folder of a run, or of an adapted policy")
     find = lambda name: task if task and task.name == name else registry.find(name)  # noqa: E731
     source = trained.PolicySource.of_folder(path, find, code)
     known, name = source.task, policy or source.default_policy

@@ -17,8 +17,9 @@ from cuelearner_jax.adaptation.adapting import Adaptation, Adapted, Judging
 from cuelearner_jax.config import GuideSizes, Scalars
 from cuelearner_jax.environment import Environment, spaces_of
 from cuelearner_jax.errors import UserError, closest
+from cuelearner_jax.face import arguments
 from cuelearner_jax.face.acting import CallablePolicy, as_policy
-from cuelearner_jax.face.feedback import Labels, diverged, labels_of, settings
+from cuelearner_jax.face.feedback import Labels, diverged, given_settings, label_path, labels_of, rows_of, settings
 from cuelearner_jax.face.worlds import World
 from cuelearner_jax.guidance import given, registry
 from cuelearner_jax.guidance.answers import check_teacher
@@ -26,7 +27,7 @@ from cuelearner_jax.guidance.bundle import Guidance
 from cuelearner_jax.policies import Common, Opaque
 from cuelearner_jax.records import label_files, policy_folders
 from cuelearner_jax.runs import adapted as folders
-from cuelearner_jax.runs.adaptation import DEFAULT_KIND, told
+from cuelearner_jax.runs.adaptation import DEFAULT_KIND, MOST_ENVS, told
 from cuelearner_jax.runs.adapted import alone
 from cuelearner_jax.runs.order import check_world
 from cuelearner_jax.types import Label, Teacher
@@ -72,12 +73,16 @@ class AdaptedPolicy(CallablePolicy):
 
         Raises UserError if the folder is in use, or the policy was adapted in no world that can be named.
         """
+        folder = arguments.path("folder", folder)
+        arguments.flag("overwrite", overwrite)
+        if folder.exists() and not folder.is_dir():
+            raise UserError(f"folder {folder} is a file: give another")
         if self.world is None:
             raise UserError(
                 "a policy folder says in which world its policy acts: adapt in a world, as cl.make gives it"
             )
         origin = {"code": self.named}
-        with policy_folders.place_of(Path(folder), overwrite) as place:
+        with policy_folders.place_of(folder, overwrite) as place:
             folders.write(place, self.found, self.world.task, self.world.config, origin)
 
 
@@ -123,24 +128,27 @@ def adapt(
     Raises:
         UserError: settings that make no sense, or with which the fit diverges.
     """
-    place, base = _Place.of(world), Common(as_policy(policy))
-    file = label_files.read(Path(labels)) if isinstance(labels, str | os.PathLike) else None
-    eps_deg = file.eps_deg if file is not None and eps_deg is None else eps_deg
-    if file is not None:
-        sizes, scalars = adapting.falling(sizes or adapting.SIZES, scalars or Scalars(), file.labels.eps_deg)
-    sizes, scalars = settings(sizes, scalars, eps_deg)
-    kind = registry.resolve(guidance)
+    base, place, seed = Common(as_policy(policy)), _Place.of(world), arguments.seed("seed", seed)
+    sizes, scalars, eps_deg = given_settings(sizes, scalars, eps_deg)
+    bound_deg = None if bound_deg is None else arguments.angle("bound_deg", bound_deg)
+    how = place.judging(judge_by, judge_episodes, judge_bounds)
+    kind = registry.resolve(arguments.text("guidance", guidance))
     if not kind.asks:
         raise UserError(f"guidance {guidance!r} asks nothing that could be learned from: choose another")
+    if teacher is not None:
+        arguments.teacher("teacher", teacher)
+    file = label_files.read(label_path(labels)) if isinstance(labels, str | os.PathLike) else None
+    if file is not None:
+        eps_deg = file.eps_deg if eps_deg is None else eps_deg
+        sizes, scalars = adapting.falling(sizes or adapting.SIZES, scalars or Scalars(), file.labels.eps_deg)
+    sizes, scalars = settings(sizes, scalars, eps_deg)
     bundle = registry.make(kind.name, sizes, place.env)
     rows = None
-    if isinstance(labels, int):
-        if labels < 1:
-            raise UserError(f"labels is {labels}: give at least 1")
+    if file is None and not isinstance(labels, tuple):
+        budget = arguments.budget("labels", labels)
         if teacher is None:
             raise UserError("labels are asked of a teacher: give one, for instance teacher_of(world), or labels")
         check_teacher(teacher, scalars)
-        budget = labels
     else:
         if file is not None and place.world is not None:
             check_world(Path(str(labels)), file.task, place.world.task, place.world.config)
@@ -153,7 +161,6 @@ def adapt(
     bound_deg = adapting.BOUND_DEG if bound_deg is None else bound_deg
     if note := adapting.check_angles([bound_deg], scalars):
         warnings.warn(note, stacklevel=2)
-    how = place.judging(judge_by, judge_episodes, tuple(judge_bounds))
     lanes = program.product(1, (seed,), (budget,), (bound_deg,))
     slots = program.rounds(lanes, sizes) * sizes.labels_per_round
     padded = None if rows is None else jax.tree.map(lambda leaf: _padded(leaf, slots)[None], rows)
@@ -179,15 +186,19 @@ class _Place(NamedTuple):
     @classmethod
     def of(cls, world: World | Environment) -> _Place:
         if not isinstance(world, World):
+            if isinstance(world, type) or not all(callable(getattr(world, name, None)) for name in ("reset", "step")):
+                raise arguments.refused("world", world, "a world, as cl.make gives it, or an environment")
             return cls(world, world, judging.STEPS, None)
         longest = world.task.longest
         steps = longest(world.config) if longest else judging.STEPS
         return cls(world.env, world.environment("tuning"), steps, world)
 
-    def judging(self, by: str, episodes: int, bounds: tuple[float, ...]) -> Judging:
+    def judging(self, by: Any, episodes: Any, bounds: Any) -> Judging:
         """How policies are judged there. Raises UserError for what makes no sense."""
-        if episodes < 1:
-            raise UserError(f"judge_episodes is {episodes}: give at least 1")
+        episodes, shares = arguments.whole("judge_episodes", episodes, 1, MOST_ENVS), "shares of the bound below 1"
+        given = arguments.several("judge_bounds", bounds, shares)
+        bounds = tuple(arguments.number("judge_bounds", bound, 1.0, shares) for bound in given)
+        arguments.text("judge_by", by)
         known = [*judging.metrics_of(self.env), judging.LABELS]
         if by not in known:
             raise UserError(f"judge_by is {by!r}, no metric of this world{closest(by, known)}")
@@ -207,9 +218,7 @@ def _of_file(file: label_files.LabelFile, bundle: Guidance) -> Label:
 
 def _of_arrays(labels: Any) -> Label:
     """Arrays as rows. Raises UserError if they are not three of one length."""
-    if not isinstance(labels, tuple) or len(labels) != 3 or len({len(part) for part in labels}) != 1:
-        raise UserError("labels are a number, a file, or Labels(obs, action, answer) of one length: give one of these")
-    obs, action, answer = (np.asarray(part, np.float32) for part in labels)
+    obs, action, answer = rows_of(labels)
     answer = answer[:, None] if answer.ndim == 1 else answer
     return Label(obs, action, answer, np.ones(len(obs), bool))  # pyright: ignore[reportArgumentType]
 

@@ -11,8 +11,9 @@ from cuelearner_jax.config import to_json
 from cuelearner_jax.environment import Quantity, action_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.export import contract, decisions, runner
+from cuelearner_jax.face import arguments
 from cuelearner_jax.face.acting import CallablePolicy, as_policy
-from cuelearner_jax.face.worlds import World
+from cuelearner_jax.face.worlds import World, a_world
 
 
 def export_policy(policy: Any, out: str | Path, world: World, format: str = "stablehlo") -> dict[str, Any]:
@@ -30,14 +31,16 @@ def export_policy(policy: Any, out: str | Path, world: World, format: str = "sta
     Raises:
         UserError: the folder is in use; the policy acts at random, asks a teacher, holds Python code, or does not fit.
     """
-    contract.check_request(format, Path(out))
+    out, acting = arguments.path("out", out), as_policy(policy)
+    a_world("world", world)
+    contract.check_request(arguments.text("format", format), out)
     wanted, given = (sum(quantity.size for quantity in seen) for seen in (_seen(policy), world.observation))
     if wanted not in (0, given):
         raise UserError(f"the policy's observations have {wanted} entries, this world's {given}: keep its structure")
-    acting, env = as_policy(policy), world.env
+    env = world.env
     about = {"subject": type(policy).__name__, "world": {"name": world.task.name, **to_json(world.config)}}
     drawn = lambda: decisions.observations(env, acting)  # noqa: E731
-    return contract.write(acting, env.observation, action_of(env), drawn, format, Path(out), about)
+    return contract.write(acting, env.observation, action_of(env), drawn, format, out, about)
 
 
 def load_exported(folder: str | Path) -> runner.Decision:
@@ -47,7 +50,7 @@ def load_exported(folder: str | Path) -> runner.Decision:
         UserError: the folder is damaged, or cannot be run here.
     """
     try:
-        decide = runner.Decision(folder)
+        decide = runner.Decision(arguments.path("folder", folder))
         decide(np.zeros(decide.contract["observation"]["size"], np.float32))
     except runner.ContractError as error:
         raise UserError(str(error)) from error

@@ -25,8 +25,9 @@ from cuelearner_jax.agent.learning import all_finite
 from cuelearner_jax.config import GuideSizes, Scalars, check_guide
 from cuelearner_jax.environment import Spaces, spaces_of
 from cuelearner_jax.errors import UserError
+from cuelearner_jax.face import arguments
 from cuelearner_jax.face.acting import CallablePolicy, as_policy
-from cuelearner_jax.face.worlds import World
+from cuelearner_jax.face.worlds import World, a_world
 from cuelearner_jax.guidance import given, registry
 from cuelearner_jax.guidance.answers import RELATIVE, check_teacher
 from cuelearner_jax.guidance.bundle import Guidance
@@ -76,9 +77,11 @@ def fit_feedback(
     Raises:
         UserError: labels or settings that make no sense, or with which the fit diverges.
     """
-    own_eps = None
-    if not isinstance(labels, Labels):
-        file = label_files.read(Path(labels))
+    seed, own_eps = arguments.seed("seed", seed), None
+    sizes, scalars, eps_deg = given_settings(sizes, scalars, eps_deg)
+    if not isinstance(labels, tuple):
+        labels = label_path(labels)
+        file = label_files.read(labels)
         if file.answers != RELATIVE.name:
             raise UserError(f"{labels} holds {file.answers} answers: give a file of {RELATIVE.name} ones")
         given.check_file(file, None, RELATIVE, str(labels))
@@ -127,13 +130,14 @@ def ask(
     Raises:
         UserError: settings that make no sense, or with which the fit diverges.
     """
-    if labels < 1:
-        raise UserError(f"labels is {labels}: give at least 1")
-    sizes, scalars = settings(sizes, scalars, eps_deg)
-    check_teacher(teacher, scalars)
+    base, labels, seed = as_policy(policy), arguments.budget("labels", labels), arguments.seed("seed", seed)
+    a_world("world", world)
+    bound_deg = arguments.angle("bound_deg", bound_deg)
+    sizes, scalars = settings(*given_settings(sizes, scalars, eps_deg))
+    check_teacher(arguments.teacher("teacher", teacher), scalars)
     adapting.check_angles([bound_deg], scalars)
     env, guidance = world.env, _relative(sizes, spaces_of(world.env))
-    lanes, base = program.product(1, (seed,), (labels,), (bound_deg,)), Common(as_policy(policy))
+    lanes, base = program.product(1, (seed,), (labels,), (bound_deg,)), Common(base)
     block = program.begin(guidance, sizes, env, lanes)
     for _ in range(program.rounds(lanes, sizes)):
         block = program.ask_round(guidance, sizes, env, teacher, scalars, base, block)
@@ -163,9 +167,9 @@ def refine(policy: Any, model: FeedbackModel, bound_deg: float | None = None) ->
         UserError: a bound that is no positive angle.
     """
     base = as_policy(policy)
+    arguments.instance("model", model, FeedbackModel, "a model, as cl.ask and cl.fit_feedback give it")
+    bound_deg = None if bound_deg is None else arguments.angle("bound_deg", bound_deg)
     reach = max(adapting.reach(base, model.labels.obs, model.labels.action), model.scalars.eps_deg)
-    if bound_deg is not None and not 0 < bound_deg <= 180:
-        raise UserError(f"bound_deg is {bound_deg}: give an angle above 0 and up to 180")
     if bound_deg is not None and bound_deg > reach * 1.05 and bound_deg > model.scalars.eps_deg:
         warnings.warn(
             f"the labels lie within {reach:.1f} degrees of this policy's own actions, and refinement may lead up to "
@@ -183,6 +187,23 @@ def _relative(sizes: GuideSizes, spaces: Spaces) -> Guidance:
     return registry.made_for(KIND, sizes, spaces)
 
 
+def given_settings(sizes: Any, scalars: Any, eps_deg: Any) -> tuple[GuideSizes | None, Scalars | None, float | None]:
+    """These arguments as they are, each of them one of its kind or None. Raises UserError for the first that is not."""
+    return (
+        None if sizes is None else arguments.settings("sizes", sizes, GuideSizes),
+        None if scalars is None else arguments.settings("scalars", scalars, Scalars),
+        None if eps_deg is None else arguments.angle("eps_deg", eps_deg),
+    )
+
+
+def label_path(labels: Any) -> Path:
+    """The path of a label file. Raises UserError where nothing lies there."""
+    path = arguments.path("labels", labels)
+    if not path.exists():
+        raise UserError(f"labels: there is no label file at {path}: give one that a run or a person wrote, or arrays")
+    return path
+
+
 def settings(sizes: GuideSizes | None, scalars: Scalars | None, eps_deg: float | None) -> tuple[GuideSizes, Scalars]:
     """Sizes and scalars, by default those of `adapting`. Raises UserError for what cannot work."""
     sizes, scalars = sizes or adapting.SIZES, adapting.settling(scalars or Scalars(), eps_deg)
@@ -190,21 +211,31 @@ def settings(sizes: GuideSizes | None, scalars: Scalars | None, eps_deg: float |
     return sizes, scalars
 
 
-def _checked(labels: Labels, own_eps: Any) -> Labels:
-    """Labels of floats, in the shapes that are needed. Raises UserError for what makes no sense."""
-    obs, action, answer = (np.asarray(part, np.float32) for part in labels)
+def rows_of(labels: Any) -> Labels:
+    """Labels of finite floats. Raises UserError if they are not three arrays of one length."""
+    if not isinstance(labels, tuple) or len(labels) != 3:
+        raise arguments.refused("labels", labels, "a label file, or Labels(obs, action, answer)")
+    obs, action, answer = (
+        arguments.numbers(f"labels.{name}", part) for name, part in zip(Labels._fields, labels, strict=True)
+    )
     answer = answer[:, 0] if answer.ndim == 2 and answer.shape[1] == 1 else answer
-    if obs.ndim != 2 or action.shape != (len(obs), 2) or answer.shape != (len(obs),):
+    if obs.ndim != 2 or not obs.size or action.shape[:1] != (len(obs),) or answer.shape[:1] != (len(obs),):
         raise UserError(
             f"labels have shapes {obs.shape}, {action.shape}, {answer.shape}: give observations (n, obs), "
             "actions (n, 2) and answers (n,)"
         )
+    return Labels(obs, action, answer)
+
+
+def _checked(labels: Any, own_eps: Any) -> Labels:
+    """Labels that a model can be fitted to. Raises UserError for what makes no sense."""
+    obs, action, answer = labels = rows_of(labels)
     if len(obs) < 2:
         raise UserError(f"{len(obs)} labels teach nothing: give more")
-    valid = np.ones(len(obs), bool)
-    rows = Label(obs, action, answer[:, None], valid, None, own_eps)  # pyright: ignore[reportArgumentType]
+    answers = answer[:, None] if answer.ndim == 1 else answer
+    rows = Label(obs, action, answers, np.ones(len(obs), bool), None, own_eps)  # pyright: ignore[reportArgumentType]
     given.check(rows, Spaces(obs.shape[1], DIRECTIONS), RELATIVE)
-    return Labels(obs, action, answer)
+    return labels
 
 
 def _finite(model: GuidanceModel) -> GuidanceModel:

@@ -16,9 +16,10 @@ from cuelearner_jax.config import RunConfig
 from cuelearner_jax.devices import SHARED, lane_mesh, place
 from cuelearner_jax.environment import actions_of
 from cuelearner_jax.errors import UserError, closest
-from cuelearner_jax.evaluate import one_lane
+from cuelearner_jax.evaluate import SPLITS, one_lane
+from cuelearner_jax.face import arguments
 from cuelearner_jax.face.acting import CallablePolicy
-from cuelearner_jax.face.worlds import World
+from cuelearner_jax.face.worlds import World, a_world
 from cuelearner_jax.guidance import registry
 from cuelearner_jax.policies import Agent
 from cuelearner_jax.runs import failures, instalments
@@ -50,7 +51,9 @@ class Run:
         Raises:
             UserError: there is no such lane.
         """
-        name = guidance or list(self.trainings)[-1]
+        labels = None if labels is None else arguments.budget("labels", labels, least=0)
+        seed = None if seed is None else arguments.seed("seed", seed)
+        name = list(self.trainings)[-1] if guidance is None else arguments.text("guidance", guidance)
         if name not in self.trainings:
             raise UserError(f"no guidance {name!r} was trained{closest(name, self.trainings)}")
         training = self.trainings[name]
@@ -94,14 +97,19 @@ def train(
     Raises:
         UserError: settings that make no sense, no teacher where one is asked, or too little memory.
     """
+    a_world("world", world)
+    if teacher is not None:
+        arguments.teacher("teacher", teacher)
+    guidance = [arguments.text("guidance", kind) for kind in arguments.several("guidance", guidance, "kinds")]
+    budgets = tuple(arguments.budget("labels", one) for one in arguments.several("labels", labels, "label budgets"))
+    arguments.text("split", split, SPLITS)
+    arguments.flag("progress", progress)
     run_config = dataclasses.replace(_config(world, config), task=world.config)
     configuration.check(run_config)
     world.task.check_evaluations(run_config)
     asked = guidance or registry.possible(world.env, taught=teacher is not None)
     names = tuple(registry.resolve(kind).name for kind in asked)
-    if isinstance(seeds, int) and not 0 < seeds <= LARGEST_SEED:
-        raise UserError(f"seeds is {seeds}: give a number from 1 to {LARGEST_SEED}")
-    grid = Grid(names, tuple(range(seeds)) if isinstance(seeds, int) else tuple(seeds), tuple(labels))
+    grid = Grid(names, _seeds(seeds), budgets)
     check_grid(grid)
     instalments.check(run_config, grid)
     mesh = lane_mesh()
@@ -135,12 +143,21 @@ def train(
     return Run(world, run_config, table, trainings)
 
 
+def _seeds(seeds: int | Sequence[int]) -> tuple[int, ...]:
+    """Seeds by their number, or one by one."""
+    if isinstance(seeds, list | tuple | range | np.ndarray):
+        return tuple(arguments.seed("seeds", seed) for seed in arguments.several("seeds", seeds, "seeds"))
+    return tuple(range(arguments.whole("seeds", seeds, 1, LARGEST_SEED)))
+
+
 def _config(world: World, config: RunConfig | str) -> RunConfig:
     if isinstance(config, RunConfig):
         return config
     presets = world.task.presets
+    if not isinstance(config, str):
+        raise arguments.refused("config", config, "a RunConfig, or the name of a preset")
     if config not in presets:
-        raise UserError(f"unknown preset {config!r}{closest(config, presets)}")
+        raise UserError(f"config: unknown preset {config!r}{closest(config, presets)}")
     return presets[config].config
 
 

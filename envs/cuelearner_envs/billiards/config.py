@@ -9,8 +9,7 @@ import jax.numpy as jnp
 
 from cuelearner_envs.billiards.environment import Billiards
 from cuelearner_envs.billiards.table import Table
-from cuelearner_envs.bounds import check_number, check_vector
-from cuelearner_jax.errors import UserError, closest
+from cuelearner_envs.bounds import check_number, check_vector, check_word
 
 MOST_DIRECTIONS = 100_000  # a shot is simulated for each, in every state that the teacher looks at
 SHOTS = {"one_ball": 1, "easy": 10, "regulation": 10}  # of an episode
@@ -40,11 +39,14 @@ class BilliardsConfig:
     search_directions: int = 1440
     """Search teacher: directions that it tries in every state."""
 
+    def __post_init__(self) -> None:
+        """Raises UserError with one line for the first value that cannot work."""
+        check(self)
+
 
 def check(config: BilliardsConfig) -> None:
     """Raises UserError with one line for the first value that cannot work."""
-    if config.table not in SHOTS:
-        raise UserError(f"task.table is {config.table!r}{closest(str(config.table), SHOTS)}")
+    check_word("table", config.table, SHOTS)
     check_number("action_turn_deg", config.action_turn_deg, -360, 360, unit="degrees")
     check_vector("observation_bias", config.observation_bias, 2, -1, 1, "metres")
     check_vector("acceleration", config.acceleration, 2, -9.81, 9.81, "m/s^2")
@@ -54,8 +56,7 @@ def check(config: BilliardsConfig) -> None:
 
 
 def make_environment(config: BilliardsConfig) -> Billiards:
-    """The world that a configuration describes. Raises UserError if it can't be."""
-    check(config)
+    """The world that a configuration describes."""
     table: Table = getattr(Table, config.table)()
     return Billiards(
         table=table.replace(acceleration=jnp.array(config.acceleration, jnp.float32)),

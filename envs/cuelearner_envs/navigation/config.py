@@ -8,12 +8,12 @@ from typing import Literal
 import jax
 import jax.numpy as jnp
 
-from cuelearner_envs.bounds import MOST_SEED, MOST_STEPS, check_number
+from cuelearner_envs.bounds import MOST_SEED, MOST_STEPS, check_number, check_word
 from cuelearner_envs.navigation.environment import Navigation
 from cuelearner_envs.navigation.layouts import STYLES
 from cuelearner_envs.navigation.lidar import Lidar
 from cuelearner_envs.navigation.worlds import generate_many
-from cuelearner_jax.errors import UserError, closest
+from cuelearner_jax.errors import UserError
 
 Style = Literal["clutter", "rooms", "corridor"]
 
@@ -57,13 +57,15 @@ class NavigationConfig:
     preferred_side: Literal["none", "left", "right"] = "none"
     """Changed wish, in a corridor: the teacher passes every obstacle on this side."""
 
+    def __post_init__(self) -> None:
+        """Raises UserError with one line for the first value that cannot work."""
+        check(self)
+
 
 def check(config: NavigationConfig) -> None:
     """Raises UserError with one line for the first value that cannot work."""
-    if config.style not in STYLES:
-        raise UserError(f"task.style is {config.style!r}{closest(config.style, STYLES)}")
-    if config.preferred_side not in SIDES:
-        raise UserError(f"task.preferred_side is {config.preferred_side!r}{closest(config.preferred_side, SIDES)}")
+    check_word("style", config.style, STYLES)
+    check_word("preferred_side", config.preferred_side, SIDES)
     if config.preferred_side != "none" and config.style != "corridor":
         raise UserError(f"task.preferred_side is {config.preferred_side}: that needs --task.style corridor")
     check_number("worlds", config.worlds, 1, MOST_WORLDS, whole=True)
@@ -77,8 +79,7 @@ def check(config: NavigationConfig) -> None:
 
 
 def make_environment(config: NavigationConfig, split: str = "training") -> Navigation:
-    """The environment that a configuration describes, with the worlds of a split. Raises UserError if it can't be."""
-    check(config)
+    """The environment that a configuration describes, with the worlds of a split."""
     key = jax.random.fold_in(jax.random.key(config.world_seed), SPLITS[split])
     return Navigation(
         worlds=generate_many(key, config.worlds, config.style),

@@ -1,0 +1,174 @@
+"""Arguments of the face, checked at the door: each function returns its argument ready for use, or names it.
+
+Every function takes the argument's name and its value, and raises UserError with one line that says what was given and
+what is wanted. They look at values alone and compile nothing.
+"""
+
+from __future__ import annotations
+
+import operator
+import os
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Float, PRNGKeyArray
+
+from cuelearner_jax.actions import Actions
+from cuelearner_jax.config import LARGEST_FLOAT, check_types
+from cuelearner_jax.errors import UserError, closest, shown
+from cuelearner_jax.policies import Policy, policy_of
+from cuelearner_jax.runs.grid import LARGEST_BUDGET, LARGEST_SEED
+from cuelearner_jax.types import Teacher
+
+KindT = TypeVar("KindT")
+
+
+def refused(name: str, value: Any, wanted: str) -> UserError:
+    """What is raised of an argument."""
+    return UserError(f"{name} is {shown(value)}: give {wanted}")
+
+
+def instance(name: str, value: Any, kind: type[KindT], wanted: str) -> KindT:
+    """An object of a class; `wanted` says where one comes from."""
+    if not isinstance(value, kind):
+        raise refused(name, value, wanted)
+    return value
+
+
+def flag(name: str, value: Any) -> bool:
+    """True or False, and nothing that merely counts as such."""
+    return bool(instance(name, value, bool | np.bool_, "True or False"))  # pyright: ignore[reportArgumentType]
+
+
+def text(name: str, value: Any, known: Iterable[str] = ()) -> str:
+    """A word: one of those that are known, if any are named."""
+    if not isinstance(value, str) or not value or not value.isprintable():
+        raise refused(name, value, "a name, in printable characters")
+    if (known := list(known)) and value not in known:
+        raise UserError(f"{name} is {shown(value)}{closest(value, known)}")
+    return value
+
+
+def whole(name: str, value: Any, least: int, most: int) -> int:
+    """A whole number between two bounds, both of which it may be."""
+    try:
+        number = None if isinstance(value, bool) else operator.index(value)
+    except TypeError:
+        number = None
+    if number is None or not least <= number <= most:
+        raise refused(name, value, f"a whole number from {least} to {most:,}")
+    return number
+
+
+def seed(name: str, value: Any) -> int:
+    """A seed."""
+    return whole(name, value, 0, LARGEST_SEED - 1)
+
+
+def budget(name: str, value: Any, least: int = 1) -> int:
+    """A number of labels."""
+    return whole(name, value, least, LARGEST_BUDGET - 1)
+
+
+def angle(name: str, value: Any) -> float:
+    """An angle above 0 and up to 180 [deg]."""
+    return number(name, value, 180.0, "an angle above 0 and up to 180")
+
+
+def number(name: str, value: Any, most: float, wanted: str) -> float:
+    """A number above 0, up to a bound."""
+    plain = value.item() if isinstance(value, np.generic) else value
+    if isinstance(plain, bool) or not isinstance(plain, int | float) or not 0 < plain <= most:  # NaN is neither
+        raise refused(name, value, wanted)
+    return float(plain)
+
+
+def several(name: str, values: Any, of_what: str) -> list[Any]:
+    """Values in a list, tuple, range or array of one axis; no text, whose letters would be meant."""
+    if not isinstance(values, list | tuple | range) and getattr(values, "ndim", None) != 1:
+        raise refused(name, values, f"a list of {of_what}")
+    return list(values)
+
+
+def path(name: str, value: Any) -> Path:
+    """A path, of a file that need not be there."""
+    given = os.fspath(value) if isinstance(value, str | os.PathLike) else None
+    if not isinstance(given, str) or not given or "\0" in given:
+        raise refused(name, value, "a path, as text or pathlib.Path")
+    return Path(given)
+
+
+def key(name: str, value: Any) -> PRNGKeyArray:
+    """One key of random numbers, typed or as older code has it."""
+    if isinstance(value, jax.Array):  # traced ones too
+        typed = jnp.issubdtype(value.dtype, jax.dtypes.prng_key)
+        if value.shape == (() if typed else (2,)) and (typed or value.dtype == jnp.uint32):
+            return value
+    raise refused(name, value, "a key, as jax.random.key(0) gives it")
+
+
+def like(name: str, value: Any, shapes: Any) -> Any:
+    """A tree of arrays such as these shapes, without more axes."""
+    leaves, structure = jax.tree.flatten(value)
+    wanted, known = jax.tree.flatten(shapes)
+    if structure != known or any(np.shape(one) != other.shape for one, other in zip(leaves, wanted, strict=True)):
+        raise refused(name, value, "a state of this world, as its reset and step give them")
+    return value
+
+
+def numbers(name: str, value: Any) -> Float[np.ndarray, "..."]:
+    """Numbers that single precision holds, of any shape, all of them finite."""
+    try:
+        found = np.asarray(value)
+    except (TypeError, ValueError, OverflowError):  # rows of different lengths
+        found = np.empty(0, object)
+    if found.dtype.kind not in "fiu":
+        raise refused(name, value, "an array of real numbers")
+    if not (np.abs(found.astype(np.float64)) <= LARGEST_FLOAT).all():
+        raise UserError(f"{name} holds numbers that are not finite (in single precision): leave these rows out")
+    return found.astype(np.float32)
+
+
+def observations(name: str, value: Any, size: int | None) -> Float[np.ndarray, "*n obs"]:
+    """One observation (size,) or many (n, size); None: of any size above 0."""
+    rows = numbers(name, value)
+    width = "obs" if size is None else size
+    if rows.ndim not in (1, 2) or rows.shape[-1] != (rows.shape[-1] if size is None else size) or not rows.shape[-1]:
+        raise UserError(f"{name}: observations have shape {rows.shape}: give ({width},) or (n, {width})")
+    return rows
+
+
+def action(name: str, value: Any, space: Actions) -> Any:
+    """One action, which may be traced."""
+    if isinstance(value, Tracer):
+        return value
+    found = numbers(name, value)
+    if found.shape != (space.size,) or not found.any():
+        raise refused(name, value, f"an action of shape ({space.size},), for instance [1.0, 0.0]")
+    return found
+
+
+def policy(name: str, value: Any) -> Policy:
+    """Anything that acts as a policy, as a policy: see `policies.policy_of`."""
+    try:
+        return policy_of(value)
+    except UserError as error:
+        raise UserError(f"{name}: {error}") from error
+
+
+def teacher(name: str, value: Any) -> Teacher:
+    """Who answers."""
+    if isinstance(value, type) or not callable(getattr(value, "best_action", None)):
+        raise refused(name, value, "a teacher, for instance teacher_of(world)")
+    return value
+
+
+def settings(name: str, value: Any, kind: type[KindT]) -> KindT:
+    """A group of settings with values of its fields' types; their bounds are checked where they are used."""
+    check_types(instance(name, value, kind, f"a cuelearner_jax.config.{kind.__name__}"), name)
+    return value
