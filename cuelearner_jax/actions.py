@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
+SQUARABLE = 1e15  # an entry up to this, and down to its inverse, has a square in single precision
 ROUNDING = 1e-5  # of the largest of values that a Fourier transform averaged
 
 Direction = Float[Array, "... 2"]
@@ -61,10 +62,26 @@ def difference(start: DirectionLike, end: DirectionLike) -> Float[Array, "..."]:
 
 
 def retract(vector: DirectionLike) -> Direction:
-    """The direction nearest to a vector (the vector divided by its length). The zero vector gives the x axis."""
+    """The direction nearest to a vector (the vector divided by its length), however long or short the vector is.
+
+    The zero vector gives the x axis, which networks need; a vector that is not finite gives NaN, which shows.
+    """
+    largest = jnp.max(jnp.abs(vector), axis=-1, keepdims=True)
+    # By powers of two, and by 1.0 as a rule: no bit of a usual vector changes.
+    small = jnp.where(largest < 1 / SQUARABLE, 2.0**80, 1.0)
+    vector = vector * jnp.where(largest > SQUARABLE, 2.0**-80, small).astype(vector.dtype)
     length = jnp.linalg.norm(vector, axis=-1, keepdims=True)
-    safe = jnp.where(length > 0, length, 1.0)
-    return jnp.where(length > 0, vector / safe, jnp.array([1.0, 0.0], vector.dtype))
+    length = jnp.where(jnp.isfinite(length), length, jnp.nan)
+    return jnp.where(length == 0, jnp.array([1.0, 0.0], vector.dtype), vector / jnp.where(length == 0, 1.0, length))
+
+
+def only_actions(vector: DirectionLike) -> Direction:
+    """Vectors as they are, but NaN in place of each that is no action: one that is not finite, or zero.
+
+    What comes from a user's code passes through here, so that a fault of that code shows and does not act.
+    """
+    usable = jnp.isfinite(vector).all(-1, keepdims=True) & (vector != 0).any(-1, keepdims=True)
+    return jnp.where(usable, vector, jnp.nan)
 
 
 def clip_to_ball(action: DirectionLike, base: DirectionLike, radius: Angle) -> Direction:

@@ -13,13 +13,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray
 
-from cuelearner_jax import choosing
+from cuelearner_jax import choosing, user_code
+from cuelearner_jax.actions import only_actions
 from cuelearner_jax.config import GuideScalars, GuideSizes, Scalars
 from cuelearner_jax.environment import Environment, actions_of
 from cuelearner_jax.guidance.answers import of_strength
 from cuelearner_jax.guidance.bounding import within
 from cuelearner_jax.guidance.bundle import Guidance
-from cuelearner_jax.policies import Policy
+from cuelearner_jax.policies import Policy, acted, best_actions, named
 from cuelearner_jax.types import GuideState, Label, Stream, Teacher
 
 ONE_BY_ONE = GuideSizes()  # questions as they come, of one strength: as a page asks them
@@ -140,12 +141,14 @@ def start(
     )
 
 
-def proposed(base: Policy, guide: GuideState, keys: QuestionKeys) -> Float[Array, "*candidates action"]:
+def proposed(
+    env: Environment, base: Policy, guide: GuideState, keys: QuestionKeys
+) -> Float[Array, "*candidates action"]:
     """What the base policy does in the guide's situation, or in each of its candidates."""
     if guide.obs.ndim > 1:
-        return base.act(keys.base, guide.env, guide.obs)
+        return acted(base, keys.base, guide.env, guide.obs, actions_of(env))
     states = jax.tree.map(lambda leaf: leaf[None], guide.env)
-    return base.act(keys.base, states, guide.obs[None])[0]
+    return acted(base, keys.base, states, guide.obs[None], actions_of(env))[0]
 
 
 def question(
@@ -161,7 +164,7 @@ def question(
 
     `bound`: questions stay within it of what the base policy does [rad]; None: wherever the guidance leads.
     """
-    return _asked_of(guidance, env, scalars, guide, proposed(base, guide, keys), keys, bound)
+    return _asked_of(guidance, env, scalars, guide, proposed(env, base, guide, keys), keys, bound)
 
 
 def _asked_of(
@@ -258,7 +261,7 @@ def ask(
     if guidance.form is None:
         raise ValueError(f"guidance {guidance.name!r} asks nothing")
     keys = question_keys(lane_key, position)
-    proposals = proposed(base, guide, keys)
+    proposals = proposed(env, base, guide, keys)
     actions = _asked_of(guidance, env, scalars, guide, proposals, keys, bound)
     watches = sizes.candidates > 1 and sizes.chosen_by == "teacher"
     away = choosing.parting(env, teacher, scalars, guide, actions) if watches else None
@@ -289,7 +292,7 @@ def ask_all(
     if form is None:
         raise ValueError(f"guidance {guidance.name!r} asks nothing")
     keys, count = question_keys(lane_key, position), len(guide.obs)
-    proposals = proposed(base, guide, keys)
+    proposals = proposed(env, base, guide, keys)
     actions = _asked_of(guidance, env, scalars, guide, proposals, keys, bound)
     positions = position + jnp.arange(count)
     eps_deg = None if guide.labels.eps_deg is None else strength(scalars, positions, guide.budget)
@@ -305,6 +308,24 @@ def ask_all(
     asked = jnp.minimum(position + count, guide.budget)
     told = guide.replace(labels=jax.tree.map(put, guide.labels, rows), asked=asked)
     return proceed(env, told, actions, keys)
+
+
+def blame(
+    teacher: Teacher | None, guide: GuideState, base: Policy | None = None, key: PRNGKeyArray | None = None
+) -> None:
+    """Raises UserError if a teacher or a base policy gives something else than actions where a guide stands.
+
+    For a lane that failed while it asked: it stands where it did before, and its labels hold nothing of the fault.
+    """
+    states, obs = guide.env, guide.obs
+    if obs.ndim == 1:
+        states, obs = jax.tree.map(lambda leaf: leaf[None], (states, obs))
+    if base is not None:
+        assert key is not None
+        user_code.check_actions(only_actions(base.act(key, states, obs)), named(base))
+    if teacher is not None:
+        given = only_actions(best_actions(teacher, states, obs))
+        user_code.check_actions(given, f"teacher {type(teacher).__name__}")
 
 
 def walked(

@@ -16,9 +16,10 @@ from jax.sharding import Mesh
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from cuelearner_jax import user_code
 from cuelearner_jax.devices import BY_LANE, SHARED, over_lanes, portions
 from cuelearner_jax.environment import Environment, actions_of
-from cuelearner_jax.policies import Policy
+from cuelearner_jax.policies import Policy, acted, named
 
 # Folded into the root key: episodes for reported figures only, and episodes for choosing settings.
 SPLITS = {"validation": 1_000_003, "tuning": 1_000_001}
@@ -67,6 +68,7 @@ class _Walk(NamedTuple):
     episode_steps: Array  # of the first episode so far
     sums: dict[str, Array]  # of rewards and metrics, over the steps so far
     outcomes: dict[str, Array]  # of the first episode, nan until it ends
+    acts: Array  # have all actions been finite so far?
 
 
 def _begun(env: Environment, key: PRNGKeyArray, num_envs: int) -> _Walk:
@@ -77,7 +79,8 @@ def _begun(env: Environment, key: PRNGKeyArray, num_envs: int) -> _Walk:
     names: list[str] = ["reward", *step.metrics]
     sums = dict.fromkeys(names, jnp.zeros(num_envs))
     outcomes = dict.fromkeys(step.outcome, jnp.full(num_envs, jnp.nan))
-    return _Walk(state, obs, jnp.ones(num_envs, bool), jnp.zeros(num_envs, jnp.int32), sums, outcomes)
+    yes = jnp.ones(num_envs, bool)
+    return _Walk(state, obs, yes, jnp.zeros(num_envs, jnp.int32), sums, outcomes, yes)
 
 
 def _walked(policy: Policy, env: Environment, key: PRNGKeyArray, walk: _Walk, indices: Array) -> _Walk:
@@ -87,14 +90,15 @@ def _walked(policy: Policy, env: Environment, key: PRNGKeyArray, walk: _Walk, in
 
     def one_step(walk: _Walk, index: jax.Array) -> tuple[_Walk, None]:
         k_act, k_env = jax.random.split(jax.random.fold_in(k_run, index))
-        action = policy.act(k_act, walk.state, walk.obs)
+        action = acted(policy, k_act, walk.state, walk.obs, actions_of(env))
+        acts = walk.acts & jnp.isfinite(action).all(-1)
         state, step = jax.vmap(env.step)(jax.random.split(k_env, num_envs), walk.state, action)
         done = step.terminated | step.truncated
         values = {"reward": step.reward, **step.metrics}
         sums = {name: total + values[name] for name, total in walk.sums.items()}
         ends = walk.first & done
         outcomes = {name: jnp.where(ends, step.outcome[name], before) for name, before in walk.outcomes.items()}
-        return _Walk(state, step.obs, walk.first & ~done, walk.episode_steps + walk.first, sums, outcomes), None
+        return _Walk(state, step.obs, walk.first & ~done, walk.episode_steps + walk.first, sums, outcomes, acts), None
 
     return jax.lax.scan(one_step, walk, indices)[0]
 
@@ -102,6 +106,8 @@ def _walked(policy: Policy, env: Environment, key: PRNGKeyArray, walk: _Walk, in
 def _summed(walk: _Walk, steps: int) -> Rolled:
     """What a walk of so many steps an environment has come to."""
     each = {name: total / steps for name, total in walk.sums.items()} | walk.outcomes
+    # What follows from an action that is none means nothing.
+    each = {name: jnp.where(walk.acts, values, jnp.nan) for name, values in each.items()}
     if walk.outcomes:
         each["finished"] = 1.0 - walk.first
     return Rolled({name: values.mean() for name, values in each.items()}, each, walk.episode_steps)
@@ -228,9 +234,13 @@ def part_of(tell: Tell, number: int, parts: int) -> Tell:
 def watched(
     env: Environment, policy: Policy, key: PRNGKeyArray, num_envs: int, steps: int, tell: Tell = untold
 ) -> Rolled:
-    """Roll out one policy, as `rollout` does, in stretches. Returns NumPy arrays: means (), values (envs,)."""
+    """Roll out one policy, as `rollout` does, in stretches. Returns NumPy arrays: means (), values (envs,).
+
+    Raises UserError, which names the policy, once one of its actions is not finite.
+    """
     leaves, tree = jax.tree.flatten(policy)
-    return _in_stretches(env, _Structure(tree, (False,) * len(leaves)), [], leaves, key, num_envs, steps, tell)
+    shared = _Structure(tree, (False,) * len(leaves))
+    return _in_stretches(env, shared, [], leaves, key, num_envs, steps, tell, named(policy))
 
 
 def watched_lanes(
@@ -259,13 +269,15 @@ def _in_stretches(
     num_envs: int,
     steps: int,
     tell: Tell,
+    whose: str = "",
 ) -> Rolled:
-    """A roll-out of one policy, or of as many lanes as `each` has rows, side by side."""
+    """A roll-out of one policy, or of as many lanes as `each` has rows, side by side; a lane that fails is NaN."""
     count = _stretches(steps // num_envs)
     walk = _begin(env, key, num_envs=num_envs, lanes=len(each[0]) if each else 0)
     for number, indices in enumerate(np.arange(steps // num_envs).reshape(count, -1)):
         tell(number, count)
         walk = jax.block_until_ready(_walk(env, each, shared, key, walk, jnp.asarray(indices), structure=structure))
+        user_code.check_actions(True if each else walk.acts, whose)
     tell(count, count)
     return jax.device_get(_sum_up(walk, steps=steps // num_envs, lanes=bool(each)))
 

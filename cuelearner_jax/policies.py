@@ -17,13 +17,13 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from cuelearner_jax import types
-from cuelearner_jax.actions import DIRECTIONS, Actions, rotate
+from cuelearner_jax import types, user_code
+from cuelearner_jax.actions import DIRECTIONS, Actions, only_actions, rotate
 from cuelearner_jax.agent.choice import greedy_actions
 from cuelearner_jax.config import AgentSizes, GuideScalars, GuideSizes
 from cuelearner_jax.devices import portions
 from cuelearner_jax.environment import actions_of
-from cuelearner_jax.errors import UserError, shown
+from cuelearner_jax.errors import UserError, raised_by, shown
 from cuelearner_jax.guidance.answers import in_mind, relative_feedback
 from cuelearner_jax.guidance.bounding import act_within
 from cuelearner_jax.guidance.bundle import Guidance
@@ -246,33 +246,80 @@ class Opaque(struct.PyTreeNode):
     def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
         """What the function gives. Raises UserError if that has another shape."""
         if self.on_host:
-            # Asked once while tracing: a complaint from inside a compiled program would be pages long.
+            # Asked once while tracing: another shape is told before anything is compiled.
             with jax.ensure_compile_time_eval():  # the function may compute with JAX itself
                 self._called(np.zeros(obs.shape, obs.dtype))
             shape = jax.ShapeDtypeStruct((obs.shape[0], self.actions.size), jnp.float32)
-            chosen = jax.pure_callback(self._called, shape, obs, vmap_method="expand_dims")
+            chosen = jax.pure_callback(self._called_back, shape, obs, vmap_method="expand_dims")
         else:
-            chosen = jnp.asarray(self.function(obs))
-            self._check(chosen.shape, obs.shape[0])
-        return self.actions.retract(chosen)
+            chosen = self._checked(self.function(obs), obs.shape[0], jnp.asarray)
+        return self.actions.retract(only_actions(chosen))
 
-    def _called(self, obs: Any) -> np.ndarray:
-        """The function of a batch with any leading axes."""
-        rows = np.asarray(obs)
+    def _called_back(self, obs: Any) -> np.ndarray:
+        """The function's actions; NaN once it has failed, which `user_code` tells when the program is done."""
+        nothing = np.full((*obs.shape[:-1], self.actions.size), np.nan, np.float32)
+        if user_code.is_waiting():
+            return nothing
+        try:
+            chosen = self._called(np.asarray(obs))
+            usable = np.isfinite(chosen).all(-1) & (chosen != 0).any(-1)
+            if not usable.all():
+                count = f"{(~usable).sum()} of {usable.size}"
+                raise UserError(
+                    f"{named(self)} gave no direction but zero or not finite numbers, in {count} situations"
+                )
+            return chosen
+        except UserError as error:
+            user_code.leave(error)
+            return nothing
+
+    def _called(self, rows: np.ndarray) -> np.ndarray:
+        """The function of a batch with any leading axes. Raises UserError for whatever it raises."""
         flat = rows.reshape(-1, rows.shape[-1])
-        chosen = np.asarray(self.function(flat), np.float32)
-        self._check(chosen.shape, len(flat))
-        return chosen.reshape(*rows.shape[:-1], self.actions.size)
+        try:
+            chosen = self.function(flat)
+        except Exception as error:
+            raise raised_by(named(self), error) from error
+        return self._checked(chosen, len(flat), np.asarray).reshape(*rows.shape[:-1], self.actions.size)
 
-    def _check(self, shape: tuple[int, ...], rows: int) -> None:
-        if shape != (rows, self.actions.size):
-            wanted = (rows, self.actions.size)
-            raise UserError(f"a policy returned actions of shape {shape} for {rows} observations: return {wanted}")
+    def _checked(self, chosen: Any, rows: int, as_array: Callable[..., Any]) -> Any:
+        """What the function returned, as an array of real numbers."""
+        wanted = (rows, self.actions.size)
+        try:
+            found = as_array(chosen)
+        except (TypeError, ValueError) as error:
+            raise UserError(f"{named(self)} returned {shown(chosen)}: return an array of shape {wanted}") from error
+        if found.dtype.kind not in "fiu" and not jnp.issubdtype(found.dtype, jnp.floating):
+            raise UserError(f"{named(self)} returned {found.dtype} numbers: return real ones, of shape {wanted}")
+        if found.shape != wanted:
+            raise UserError(
+                f"{named(self)} returned actions of shape {found.shape} for {rows} observations: return {wanted}"
+            )
+        with np.errstate(over="ignore"):
+            return found.astype(np.float32)
 
     @property
     def axes(self) -> Opaque:
         """It has nothing that JAX knows of."""
         return self
+
+
+def acted(
+    policy: types.Policy, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"], actions: Actions
+) -> Float[Array, "n action"]:
+    """A policy's actions, NaN in place of each that is none. Raises UserError if they have another shape."""
+    chosen, wanted = jnp.asarray(policy.act(key, states, obs)), (obs.shape[0], actions.size)
+    if chosen.shape != wanted:
+        raise UserError(f"{named(policy)} returned actions of shape {chosen.shape}: return {wanted}")
+    return only_actions(chosen)
+
+
+def named(policy: Any) -> str:
+    """A policy for a message: by the user's function or class that acts, below whatever changes its actions."""
+    while (below := getattr(policy, "base", None) or getattr(policy, "policy", None)) is not None:
+        policy = below
+    inner = policy.function if isinstance(policy, Opaque) else type(policy)
+    return f"policy {getattr(inner, '__qualname__', type(inner).__qualname__).replace('<locals>.', '')}"
 
 
 def policy_of(given: Any) -> Any:
@@ -286,7 +333,10 @@ def policy_of(given: Any) -> Any:
         UserError: it is none of these, or a policy that is no pytree.
     """
     if callable(given) and not (hasattr(given, "act") and not isinstance(given, type)) and _takes_nothing(given):
-        given = given()
+        try:
+            given = given()
+        except Exception as error:
+            raise raised_by(f"policy {getattr(given, '__qualname__', given)}", error) from error
     if hasattr(given, "act"):
         if any(leaf is given for leaf in jax.tree.leaves(given)):
             kind = type(given).__name__

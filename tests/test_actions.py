@@ -60,6 +60,22 @@ def test_retract_divides_by_the_length():
     np.testing.assert_allclose(actions.retract(jnp.array([[-1e-6, 0.0], [0.0, 500.0]])), [[-1, 0], [0, 1]], atol=1e-6)
 
 
+@pytest.mark.parametrize("length", [2e-38, 1e-30, 1.0, 1e30, 3e38])
+def test_retract_takes_any_length(length):
+    np.testing.assert_allclose(actions.retract(jnp.array([0.0, -length])), [0.0, -1.0], atol=1e-6)
+
+
+@pytest.mark.parametrize("vector", [[np.nan, 0.0], [0.0, np.nan], [np.inf, 0.0], [np.nan, np.nan]])
+def test_what_is_not_finite_is_no_direction(vector):
+    assert np.isnan(actions.retract(jnp.array(vector))).all()
+    assert np.isnan(actions.only_actions(jnp.array(vector))).all()
+
+
+def test_no_action_is_zero_and_actions_stay_as_they_are():
+    given = np.float32([[0.0, 0.0], [0.6, -0.8], [1e30, 0.0]])
+    np.testing.assert_array_equal(actions.only_actions(given), [[np.nan, np.nan], *given[1:]])
+
+
 def test_retract_of_zero_is_the_x_axis():
     np.testing.assert_array_equal(actions.retract(jnp.zeros(2)), [1.0, 0.0])
 

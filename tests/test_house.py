@@ -12,6 +12,7 @@ METHOD, TASKS = "cuelearner_jax", "cuelearner_envs"
 # Bottom row first: a module imports from rows below its own and, within its row, from its own package.
 ROWS = [
     ["errors", "signals"],
+    ["user_code"],
     ["types", "actions", "plugins"],
     ["environment"],
     ["config", "devices", "terminal"],

@@ -206,7 +206,7 @@ def test_a_function_rolls_out_the_same_in_jax_and_on_the_host():
 )
 def test_a_wrong_shape_is_refused_in_one_line(on_host, function, shape):
     policy = Opaque(function, on_host=on_host)
-    says = rf"a policy returned actions of shape {shape} for 40 observations: return \(40, 2\)"
+    says = rf"policy <lambda> returned actions of shape {shape} for 40 observations: return \(40, 2\)"
     for call in (act, jax.jit(lambda policy: policy.act(KEY, OBS, OBS))):
         with pytest.raises(UserError, match=says) as refusal:
             call(policy)

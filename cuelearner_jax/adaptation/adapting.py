@@ -13,6 +13,7 @@ import numpy as np
 from jax.sharding import Mesh
 from jaxtyping import Array
 
+from cuelearner_jax import user_code
 from cuelearner_jax.actions import DIRECTIONS
 from cuelearner_jax.adaptation import judging, program
 from cuelearner_jax.adaptation.judging import Judged
@@ -23,7 +24,7 @@ from cuelearner_jax.environment import Environment
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import Rolled, Tell, untold
 from cuelearner_jax.guidance.bundle import Guidance
-from cuelearner_jax.policies import Guided, Policy
+from cuelearner_jax.policies import Guided, Policy, named
 from cuelearner_jax.types import Label, Teacher
 
 # Seconds a fit on a CPU. The paper's networks are `GuideSizes()`.
@@ -124,6 +125,7 @@ def reach(policy: Policy, obs: Any, action: Any) -> float:
         action: asked about (labels, action).
     """
     away = _distances(policy, jnp.asarray(obs), jnp.asarray(action))
+    user_code.check_actions(away, named(policy))
     return float(np.degrees(np.quantile(np.asarray(away), REACH_QUANTILE)))
 
 
@@ -185,6 +187,8 @@ def adapt(
             block = jax.block_until_ready(
                 program.ask_round(work.guidance, work.sizes, env, asks, work.scalars, bases, block, mesh)
             )
+            if block.failed.all():
+                program.blame(bases, asks, block)
         tell(number, number)
     judged, block = measure.judged(block)
     curve = [{name: values[:count] for name, values in row.items()} for row in measure.curve]

@@ -217,6 +217,12 @@ def take_labels(
     return _take(guidance, sizes, mesh, env, scalars, bases, labels, block)
 
 
+def blame(bases: Policy, teacher: Teacher | None, block: Adapting) -> None:
+    """Raises UserError if the first lane, which failed, did so for its policy or its teacher (see `asking.blame`)."""
+    lane = jax.tree.map(lambda leaf: leaf[0], block)
+    asking.blame(teacher, lane.guide, one_lane(bases, lane.base), lane.key)
+
+
 def adapted(
     guidance: Guidance, sizes: GuideSizes, env: Environment, scalars: Scalars, bases: Policy, block: Adapting
 ) -> Guided:

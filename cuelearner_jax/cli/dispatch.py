@@ -16,7 +16,7 @@ from types import ModuleType
 # Before JAX starts: warnings of its start-up are not the user's.
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
 
-from cuelearner_jax import __version__
+from cuelearner_jax import __version__, user_code
 from cuelearner_jax.cli.parsing import HELP, summary
 from cuelearner_jax.errors import NotFinite, UserError, blamed, closest
 from cuelearner_jax.runs.cluster import JobsFailed
@@ -35,7 +35,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = list(sys.argv[1:] if argv is None else argv)
     try:
         try:
-            return _dispatch(arguments)
+            return user_code.told(_dispatch)(arguments)
         finally:
             sys.stdout.flush()  # here, where it is heard if nobody reads
     except UserError as error:

@@ -10,9 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from cuelearner_jax import user_code
 from cuelearner_jax.environment import Environment
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.policies import Agent, Common, Guided, Policy, Residual
+from cuelearner_jax.policies import Agent, Common, Guided, Policy, Residual, named
 
 TOLERANCE = 1e-5  # by which an entry of an action may differ elsewhere
 NUDGE = 1e-6  # of an entry of an observation, as much as rounding may do
@@ -113,6 +114,7 @@ def golden_cases(policy: Policy, drawn: Float[np.ndarray, "n obs"], most: int = 
     drawn = np.asarray(drawn, np.float32)
     decide = jax.jit(row_by_row(policy))
     actions = np.asarray(decide(jnp.asarray(drawn)))
+    user_code.check_actions(actions, named(policy))
     random = np.random.default_rng(0)
     apart = np.zeros(len(drawn))
     for _ in range(NUDGES):

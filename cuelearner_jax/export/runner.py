@@ -57,20 +57,23 @@ class Decision:
     def __call__(self, obs: Any) -> np.ndarray:
         """The action for an observation (obs,), or for each of a batch (n, obs): unit vectors (2,) or (n, 2).
 
-        Raises ContractError for an observation of another size, or one that is not finite.
+        Raises ContractError for an observation of another size, or one that is not finite in single precision; for a
+        decision that is no direction.
         """
-        rows, size = np.asarray(obs, np.float32), self.contract["observation"]["size"]
+        rows, size = _numbers(obs), self.contract["observation"]["size"]
         batch = rows[None] if rows.ndim == 1 else rows
         if batch.ndim != 2 or batch.shape[1] != size:
             raise ContractError(f"observations have shape {rows.shape}: the contract says ({size},) or (n, {size})")
         if not np.isfinite(batch).all():
-            raise ContractError("an observation holds numbers that are not finite")
+            raise ContractError("an observation holds numbers that are not finite, or beyond single precision")
         if not len(batch):
             return np.zeros((0, self.contract["action"]["size"]), np.float32)
         actions = self._sound(lambda: self._decide(np.ascontiguousarray(batch)))
         wanted = (len(batch), self.contract["action"]["size"])
         if actions.shape != wanted or actions.dtype.kind != "f" or not np.isfinite(actions).all():
             raise ContractError(f"{self.folder} decides on no finite numbers of shape {wanted}: export the policy anew")
+        if not actions.any(axis=-1).all():
+            raise ContractError(f"{self.folder} decides on zero, which is no direction: export the policy anew")
         return actions[0] if rows.ndim == 1 else actions
 
     def _sound(self, work: Callable[[], Any]) -> Any:
@@ -115,6 +118,18 @@ class Decision:
         if not all(array.dtype.kind == "f" and np.isfinite(array).all() for array in (obs, actions)):
             raise ValueError("golden cases are not finite")
         return obs, actions
+
+
+def _numbers(obs: Any) -> np.ndarray:
+    """Observations in single precision, infinite where that does not hold them."""
+    try:
+        rows = np.asarray(obs)
+    except (TypeError, ValueError):  # rows of different lengths
+        rows = np.empty(0, object)
+    if rows.dtype.kind not in "fiu":
+        raise ContractError(f"observations are of type {rows.dtype}: give real numbers")
+    with np.errstate(over="ignore"):
+        return rows.astype(np.float32)
 
 
 def digest(values: dict[str, Any]) -> str:

@@ -11,11 +11,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from cuelearner_jax import user_code
+from cuelearner_jax.actions import DIRECTIONS
 from cuelearner_jax.environment import Quantity
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.face import arguments
 from cuelearner_jax.face.worlds import World, a_world
-from cuelearner_jax.policies import Policy
+from cuelearner_jax.policies import Policy, acted, named
 from cuelearner_jax.runs import trained
 from cuelearner_jax.task import Task, shape_of
 from cuelearner_jax.tasks import registry
@@ -24,7 +26,7 @@ from cuelearner_jax.types import EnvState
 
 @jax.jit
 def _act(policy: Policy, key: PRNGKeyArray, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
-    return policy.act(key, None, obs)
+    return acted(policy, key, None, obs, DIRECTIONS)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,6 +44,7 @@ class CallablePolicy:
         """Raises UserError for a policy that is none."""
         arguments.policy("policy", self.policy)
 
+    @user_code.told
     def __call__(self, obs: Any, key: PRNGKeyArray | None = None) -> np.ndarray:
         """Actions for observations.
 
@@ -61,6 +64,7 @@ class CallablePolicy:
         batch = rows[None] if rows.ndim == 1 else rows
         key = jax.random.key(0) if key is None else arguments.key("key", key)
         chosen = np.asarray(_act(self.policy, key, jnp.asarray(batch)))
+        user_code.check_actions(chosen, named(self.policy))
         return chosen[0] if rows.ndim == 1 else chosen
 
     def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
@@ -76,6 +80,7 @@ def as_policy(given: Any, name: str = "policy") -> Policy:
     return given.policy if isinstance(given, CallablePolicy) else arguments.policy(name, given)
 
 
+@user_code.told
 def load_policy(
     folder: str | Path,
     *,

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from cuelearner_jax import user_code
 from cuelearner_jax.adaptation import adapting, judging, program
 from cuelearner_jax.adaptation.adapting import Adaptation, Adapted, Judging
 from cuelearner_jax.config import GuideSizes, Scalars
@@ -68,6 +69,7 @@ class AdaptedPolicy(CallablePolicy):
         """What was answered (of relative feedback)."""
         return labels_of(jax.tree.map(lambda leaf: leaf[0], self.found.block.guide.labels))
 
+    @user_code.told
     def save(self, folder: str | Path, overwrite: bool = False) -> None:
         """Writes a policy folder, as `cuelearner adapt` does; `load_policy` and every command take it.
 
@@ -86,6 +88,7 @@ class AdaptedPolicy(CallablePolicy):
             folders.write(place, self.found, self.world.task, self.world.config, origin)
 
 
+@user_code.told
 def adapt(
     policy: Any,
     world: World | Environment,
@@ -167,6 +170,7 @@ def adapt(
     asked = Adaptation(bundle, sizes, scalars, place.env, base, lanes, how)
     found = adapting.adapt(asked, teacher, padded)
     if found.block.failed.any():
+        program.blame(base, teacher, found.block)
         raise diverged()
     if not found.judged.used.all():
         warnings.warn(told(found)[0], stacklevel=2)

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from cuelearner_jax import user_code
 from cuelearner_jax.config import to_json
 from cuelearner_jax.environment import Quantity, action_of
 from cuelearner_jax.errors import UserError
@@ -16,6 +17,7 @@ from cuelearner_jax.face.acting import CallablePolicy, as_policy
 from cuelearner_jax.face.worlds import World, a_world
 
 
+@user_code.told
 def export_policy(policy: Any, out: str | Path, world: World, format: str = "stablehlo") -> dict[str, Any]:
     """Writes a policy's whole decision as a file, with a contract of what goes in and what comes out.
 
@@ -51,7 +53,8 @@ def load_exported(folder: str | Path) -> runner.Decision:
     """
     try:
         decide = runner.Decision(arguments.path("folder", folder))
-        decide(np.zeros(decide.contract["observation"]["size"], np.float32))
+        with np.load(decide.folder / runner.GOLDEN, allow_pickle=False) as golden:
+            decide(golden["obs"][0])
     except runner.ContractError as error:
         raise UserError(str(error)) from error
     return decide

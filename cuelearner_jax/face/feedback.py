@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from cuelearner_jax import user_code
 from cuelearner_jax.actions import DIRECTIONS
 from cuelearner_jax.adaptation import adapting, program
 from cuelearner_jax.agent.learning import all_finite
@@ -57,6 +58,7 @@ class FeedbackModel:
     env: Any = None  # says how an observation looks from an action; nobody asks it in the raw frame
 
 
+@user_code.told
 def fit_feedback(
     labels: Labels | str | os.PathLike[str],
     *,
@@ -102,6 +104,7 @@ def fit_feedback(
     return FeedbackModel(guidance, _finite(fit(k_fit, rows, guidance.init(k_init), scalars)), scalars, labels, sizes)
 
 
+@user_code.told
 def ask(
     policy: Any,
     world: World,
@@ -142,6 +145,7 @@ def ask(
     for _ in range(program.rounds(lanes, sizes)):
         block = program.ask_round(guidance, sizes, env, teacher, scalars, base, block)
     if block.failed.any():
+        program.blame(base, teacher, block)
         raise diverged()
     guide = jax.tree.map(lambda leaf: leaf[0], block.guide)
     return FeedbackModel(guidance, guide.model, scalars, labels_of(guide.labels), sizes, env)
@@ -153,6 +157,7 @@ def labels_of(rows: Label) -> Labels:
     return Labels(*(np.asarray(part)[given.valid] for part in (given.obs, given.action, given.answer[:, 0])))
 
 
+@user_code.told
 def refine(policy: Any, model: FeedbackModel, bound_deg: float | None = None) -> CallablePolicy:
     """A policy's actions refined by a feedback model, within a bound (paper, Eqs. 2 to 5).
 

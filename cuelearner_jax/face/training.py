@@ -12,6 +12,7 @@ import numpy as np
 import pyarrow as pa
 
 from cuelearner_jax import config as configuration
+from cuelearner_jax import user_code
 from cuelearner_jax.config import RunConfig
 from cuelearner_jax.devices import SHARED, lane_mesh, place
 from cuelearner_jax.environment import actions_of
@@ -69,6 +70,7 @@ class Run:
         return CallablePolicy(one_lane(agents, int(found[0])), self.world.observation)
 
 
+@user_code.told
 def train(
     world: World,
     teacher: Teacher | None = None,

@@ -10,6 +10,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from cuelearner_jax import user_code
 from cuelearner_jax.actions import Actions
 from cuelearner_jax.config import check_types
 from cuelearner_jax.environment import Environment, Quantity, actions_of
@@ -53,6 +54,7 @@ class World:
         """The action space."""
         return actions_of(self.env)
 
+    @user_code.told
     def reset(self, key: PRNGKeyArray) -> tuple[EnvState, Float[Array, " obs"]]:
         """Starts an episode: (state, observation). Raises UserError for what is no key."""
         return jax.jit(self.env.reset)(arguments.key("key", key))
@@ -62,6 +64,7 @@ class World:
         """A state with shapes in place of arrays."""
         return jax.eval_shape(self.env.reset, jax.random.key(0))[0]
 
+    @user_code.told
     def step(
         self, key: PRNGKeyArray, state: EnvState, action: Float[Array, " action"] | Float[np.ndarray, " action"]
     ) -> tuple[EnvState, Step]:
@@ -74,6 +77,7 @@ class World:
         return jax.jit(self.env.step)(arguments.key("key", key), state, action)
 
 
+@user_code.told
 def make(name: str | Task, *, scenario: str | None = None, robot: str | None = None, **changes: Any) -> World:
     """A world of a task.
 
@@ -99,6 +103,7 @@ def a_world(name: str, value: Any) -> World:
     return arguments.instance(name, value, World, "a world, as cl.make gives it")
 
 
+@user_code.told
 def teacher_of(source: World | Policy) -> Teacher:
     """Who teaches: in a world its task's own teacher, of a policy (a finished agent, say) that policy.
 

@@ -36,12 +36,22 @@ def in_mind(
     The second is the paper's Eq. 2 to the letter, whose answers follow a local gradient.
     """
     if scalars.answer == "best":
-        return teacher.best_action(state, obs)
+        return _taught(teacher, teacher.best_action(state, obs), action)
     assert isinstance(teacher, ValuesDirections)  # see `check_teacher`
     # One with a bias takes everything for turned by it: what it looks for lies round the action turned back.
     seen = geometry.rotate(action, -scalars.radians("teacher_bias"))
     spread = scalars.radians("nearest_aim")
-    return teacher.nearest_good(state, obs, seen, spread, scalars.nearest_share)
+    return _taught(teacher, teacher.nearest_good(state, obs, seen, spread, scalars.nearest_share), action)
+
+
+def _taught(teacher: Any, given: Any, action: Float[Array, " action"]) -> Float[Array, " action"]:
+    """A teacher's action; NaN where it is none. Raises UserError if it has another shape than actions have."""
+    given = jnp.asarray(given)
+    if given.shape != action.shape:
+        raise UserError(
+            f"teacher {type(teacher).__name__} gave an action of shape {given.shape}: give one of shape {action.shape}"
+        )
+    return geometry.only_actions(given)
 
 
 def of_strength(scalars: GuideScalarsT, eps_deg: Float[Array, "*labels"] | None) -> GuideScalarsT:
@@ -128,7 +138,8 @@ def scalar_answer(
     good = geometry.distance(action, wanted) <= within
     if scalars.scalar_good == "scored":
         good |= env.step(jax.random.fold_in(key, 0), state, action)[1].reward > 0
-    return (good != mistaken).astype(jnp.float32)[None], answered
+    said = jnp.where(jnp.isfinite(wanted).all(), (good != mistaken).astype(jnp.float32), jnp.nan)
+    return said[None], answered
 
 
 def _slips(key: PRNGKeyArray, scalars: Scalars) -> tuple[Bool[Array, ""], Bool[Array, ""]]:

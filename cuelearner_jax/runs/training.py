@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from cuelearner_jax.asking import label_slots
+from cuelearner_jax.asking import blame, label_slots
 from cuelearner_jax.devices import SHARED, place
 from cuelearner_jax.environment import Environment, actions_of
 from cuelearner_jax.evaluate import episodes
@@ -86,6 +86,8 @@ class Training:
             started = time.perf_counter()
             self.clock, self.blocks = self.group.label_round(teacher, self.clock, self.blocks, instalment)
             self.wall += time.perf_counter() - started
+            if self.failed.all():
+                blame(teacher, jax.tree.map(lambda leaf: leaf[0], self.blocks[0].guide))
             yield self.round
 
     def take(self, file: label_files.LabelFile) -> None:

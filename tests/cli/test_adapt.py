@@ -283,7 +283,7 @@ def test_a_bound_is_learned_and_kept(home, tmp_path):
     near.save(tmp_path / "near")
     again = cl.load_policy(tmp_path / "near", task="own_turned:TASK", base=code)
     np.testing.assert_array_equal(again(SEEN), near(SEEN))
-    with pytest.raises(cl.UserError, match="judge_bounds is 2: give shares"):
+    with pytest.raises(cl.UserError, match=r"judge_bounds is 2\.0: give shares"):
         cl.adapt(code, world, judge_bounds=(2.0,), **settings)
 
 

@@ -8,6 +8,7 @@ import os
 import shutil
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 
 import jax
@@ -391,6 +392,36 @@ def test_every_operation_can_be_said_in_onnx():
 
 def test_the_runner_is_what_lies_beside_a_decision(folder):
     assert (folder / "onnx" / "decide.py").read_bytes() == Path(runner.__file__).read_bytes()
+
+
+ODD = (1e39, -1e39, np.inf, np.nan, 1j, "1.0", None, object())
+
+
+@pytest.mark.parametrize("format", formats.FORMATS)
+def test_observations_that_are_no_numbers_of_single_precision_are_refused(folder, format):
+    decide = runner.Decision(folder / format)
+    size = decide.contract["observation"]["size"]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for odd in ODD:
+            with pytest.raises(runner.ContractError, match="not finite, or beyond single precision|give real numbers"):
+                decide([odd] + [0.0] * (size - 1))
+    with pytest.raises(runner.ContractError, match="give real numbers"):
+        decide([[0.0], [0.0, 1.0]])
+
+
+@pytest.mark.parametrize("given", [(np.nan, 0.0), (0.0, 0.0), (np.inf, 1.0)])
+def test_a_decision_that_is_no_direction_is_refused(folder, monkeypatch, given):
+    decide = runner.Decision(folder / "numpy")
+    monkeypatch.setattr(decide, "_decide", lambda batch: np.tile(np.float32(given), (len(batch), 1)))
+    with pytest.raises(runner.ContractError, match="no direction|no finite numbers"):
+        decide(np.zeros(decide.contract["observation"]["size"]))
+
+
+def test_a_policy_that_gives_no_actions_is_not_exported():
+    nothing = Opaque(lambda obs: obs[:, :2] * jnp.nan)
+    with pytest.raises(UserError, match="policy .*lambda.* gave actions that are not finite"):
+        decisions.golden_cases(nothing, np.ones((3, 2), np.float32))
 
 
 def test_from_python(tmp_path):

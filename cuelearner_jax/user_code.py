@@ -1,0 +1,108 @@
+"""Policies, teachers and environments of the user's own: what their code raised, and gave in place of actions.
+
+Such code runs inside compiled programs, from which no exception finds its way out in one line. A function that is
+called back on the host leaves what it raised here and gives NaN; NaN spreads, and whoever looks at a program's results
+on the host asks here first. What raises while JAX traces is told apart by the frames of its traceback.
+"""
+
+from __future__ import annotations
+
+import functools
+import sysconfig
+from collections.abc import Callable
+from pathlib import Path
+from types import FrameType
+from typing import Any, ParamSpec, TypeVar
+
+import numpy as np
+
+from cuelearner_jax.errors import NotFinite, UserError, raised_by
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+# Who has a method of that name; of anything else no more is said than that it is code.
+METHODS = {"act": "policy", "best_action": "teacher", "nearest_good": "teacher"}
+METHODS |= dict.fromkeys(("reset", "step", "remember", "recall", "recall_next"), "environment")
+METHODS |= dict.fromkeys(("features", "aims", "heuristic", "mirror", "observation"), "environment")
+_PACKAGE = Path(__file__).parent
+_OURS = (_PACKAGE, *(_PACKAGE.parent / place / "cuelearner_envs" for place in ("", "envs")))
+_LIBRARIES = tuple(Path(sysconfig.get_path(name)) for name in ("stdlib", "purelib", "platlib"))
+
+_left: list[UserError] = []  # by functions on the host, which other threads call
+
+
+def leave(error: UserError) -> None:
+    """Keeps what a function on the host raised until `tell` is called; of several, the first."""
+    _left.append(error)
+
+
+def is_waiting() -> bool:
+    """Return whether a function on the host has failed since `tell` was last called."""
+    return bool(_left)
+
+
+def tell() -> None:
+    """Raises the UserError that a function on the host left, if there is one, and forgets all of them."""
+    if _left:
+        first = _left[0]
+        _left.clear()
+        raise first
+
+
+def told(function: Callable[P, T]) -> Callable[P, T]:
+    """A function that users call, with the faults of their own code told in one line, the original as `__cause__`."""
+
+    @functools.wraps(function)
+    def wrapped(*arguments: P.args, **named: P.kwargs) -> T:
+        _left.clear()
+        try:
+            found = function(*arguments, **named)
+        except Exception as error:
+            tell()
+            raise_in_one_line(error)
+            raise
+        tell()
+        return found
+
+    return wrapped
+
+
+def raise_in_one_line(error: Exception) -> None:
+    """Raises a UserError from an exception that the user's own code raised; does nothing about any other."""
+    if isinstance(error, UserError | NotFinite):
+        return
+    if code := _of_user(error):
+        name = getattr(code, "co_qualname", code.co_name)
+        role = METHODS.get(code.co_name, "code")
+        raise raised_by(f"{role} {name.replace('<locals>.', '')}", error) from error
+
+
+def _of_user(error: BaseException) -> Any:
+    """The code of the user's function that was called first on the way to an exception; None: there is none."""
+    step = error.__traceback__
+    while step is not None:
+        if _is_users(step.tb_frame):
+            return step.tb_frame.f_code
+        step = step.tb_next
+    return None
+
+
+def _is_users(frame: FrameType) -> bool:
+    file = frame.f_code.co_filename
+    if file.startswith("<frozen") or not frame.f_globals.get("__name__", ""):
+        return False
+    return not any(Path(file).is_relative_to(place) for place in (*_OURS, *_LIBRARIES))
+
+
+def check_actions(actions: Any, whose: str) -> None:
+    """Raises UserError unless all of a program's actions are finite.
+
+    Args:
+        actions: on the host, of any shape; or whether all of them are finite.
+        whose: for the message, for instance "policy my_policy".
+    """
+    tell()
+    found = np.asarray(actions)
+    if not (found if found.dtype == bool else np.isfinite(found)).all():
+        raise UserError(f"{whose} gave actions that are not finite, or zero: give a direction in every situation")
