@@ -53,7 +53,7 @@ def turned(params, obs, actions):
 
 
 POLICIES = {
-    "agent": lambda: agent(),
+    "agent": agent,
     "heuristic": lambda: Heuristic(ENV),
     "refined within a bound": lambda: guided("relative", bound_deg=7.0, base=agent(frame="action"), frame="action"),
     "an ensemble": lambda: guided("demonstration", ensemble=3),
@@ -404,7 +404,7 @@ def test_observations_that_are_no_numbers_of_single_precision_are_refused(folder
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         for odd in ODD:
-            with pytest.raises(runner.ContractError, match="not finite, or beyond single precision|give real numbers"):
+            with pytest.raises(runner.ContractError, match=r"not finite, or beyond single precision|give real numbers"):
                 decide([odd] + [0.0] * (size - 1))
     with pytest.raises(runner.ContractError, match="give real numbers"):
         decide([[0.0], [0.0, 1.0]])
@@ -420,7 +420,7 @@ def test_a_decision_that_is_no_direction_is_refused(folder, monkeypatch, given):
 
 def test_a_policy_that_gives_no_actions_is_not_exported():
     nothing = Opaque(lambda obs: obs[:, :2] * jnp.nan)
-    with pytest.raises(UserError, match="policy .*lambda.* gave actions that are not finite"):
+    with pytest.raises(UserError, match=r"policy .*lambda.* gave actions that are not finite"):
         decisions.golden_cases(nothing, np.ones((3, 2), np.float32))
 
 
