@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 
 from cuelearner_jax import user_code
 from cuelearner_jax.config import to_json
@@ -46,15 +45,14 @@ def export_policy(policy: Any, out: str | Path, world: World, format: str = "sta
 
 
 def load_exported(folder: str | Path) -> runner.Decision:
-    """An exported decision, verified and called once: `decide(obs)` as a policy, `decide.contract`, `decide.check()`.
+    """An exported decision, its golden cases replayed: `decide(obs)` as a policy, `decide.contract`, `decide.check()`.
 
     Raises:
         UserError: the folder is damaged, or cannot be run here.
     """
     try:
         decide = runner.Decision(arguments.path("folder", folder))
-        with np.load(decide.folder / runner.GOLDEN, allow_pickle=False) as golden:
-            decide(golden["obs"][0])
+        decide.check()
     except runner.ContractError as error:
         raise UserError(str(error)) from error
     return decide

@@ -414,7 +414,7 @@ def test_observations_that_are_no_numbers_of_single_precision_are_refused(folder
 def test_a_decision_that_is_no_direction_is_refused(folder, monkeypatch, given):
     decide = runner.Decision(folder / "numpy")
     monkeypatch.setattr(decide, "_decide", lambda batch: np.tile(np.float32(given), (len(batch), 1)))
-    with pytest.raises(runner.ContractError, match="no direction|no finite numbers"):
+    with pytest.raises(runner.ContractError, match=r"no direction|no finite numbers"):
         decide(np.zeros(decide.contract["observation"]["size"]))
 
 
