@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-
 from cuelearner_jax import user_code
 from cuelearner_jax.config import to_json
 from cuelearner_jax.environment import Quantity, action_of
