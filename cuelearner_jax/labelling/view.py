@@ -14,6 +14,7 @@ from cuelearner_jax.types import Reel, Sketch
 HAIR = 1 / 400  # of the sketch's width: a thin line
 TURNED_REACH = 1.25, 3.5  # how much farther arrows reach that are turned: the more the less they are,
 APART = 10.0  # by this over eps [deg], so that they can be told apart
+BESIDE_TRAILS = 1.8  # no turned arrow reaches farther where trails tell them apart: what it points at stays in view
 HEAD = 7.0  # length of an arrow's head [hairs]
 HALO = ' class="halo"', 3.8  # so that arrows stand out on any ground
 TIPS = 8.0  # turns are drawn larger than they are where tips would be nearer than this [hairs],
@@ -27,9 +28,14 @@ def magnified(item: Item, eps_deg: float) -> int:
     """How many times larger than they are turns of an item's action are drawn: so that one by eps can be seen."""
     assert item.sketch is not None
     sketch, hair = item.sketch, item.sketch.box[2] * HAIR
-    far = _ends(sketch, angle_of(item.action), TURNED_REACH[1])[1]
+    far = _ends(sketch, angle_of(item.action), _farthest(item))[1]
     seen = min(math.degrees(math.asin(min(TIPS * hair / far, 1.0))), STEEPEST)
     return math.ceil(seen / eps_deg) if eps_deg < 0.75 * seen else 1
+
+
+def _farthest(item: Item) -> float:
+    """How much farther turned arrows may reach."""
+    return BESIDE_TRAILS if item.trails else TURNED_REACH[1]
 
 
 def note(item: Item, form: AnswerForm, eps_deg: float) -> str:
@@ -54,7 +60,7 @@ def picture(item: Item, form: AnswerForm, eps_deg: float) -> str:
     times = magnified(item, eps_deg) if form.by_eps else 1
     if form.by_eps:
         drawn = times * eps_deg
-        longer = min(max(APART / drawn, TURNED_REACH[0]), TURNED_REACH[1])
+        longer = min(max(APART / drawn, TURNED_REACH[0]), _farthest(item))
         turns = ((1, LEFT), (-1, RIGHT))
         parts += [_arrow(sketch, angle + way * drawn, one.colour, longer, one.shown) for way, one in turns]
     parts.append("" if item.trails else _line(sketch, angle))

@@ -249,6 +249,15 @@ def test_arrows_point_where_actions_do(opened):
     assert keys["left"] > 0.3  # of an arrow that points down the left key moves the tip to the right of the screen
     assert keys["right"] < -0.3
     assert [re.search(rf'class="arrow {name}">.*?<text [^>]*>(.)', down)[1] for name in WAYS] == ["←", "→"]
+    session._pictures = session._pictures._replace(
+        trails=lambda env, state, actions: [f"<{a[0]:.2f}>" for a in actions]
+    )
+    trails = session._trails(item)
+    assert [*trails] == ["asked", *WAYS]
+    assert trails["left"] == f"<{controls.turned(item.action, 20.0)[0]:.2f}>"
+    shown = view.picture(item._replace(trails=trails), RELATIVE, 20.0)
+    assert all(f'<g class="trail {name}">{drawn}</g>' in shown for name, drawn in trails.items())
+    assert 'class="aim"' not in shown
     assert "refined" not in view.picture(item._replace(refined=item.action), RELATIVE, 20.0)
     np.testing.assert_allclose(controls.turned(item.action, 90.0), [-0.8, 0.6], atol=1e-6)
 
