@@ -1,8 +1,8 @@
 """Checkpoints: the only file that knows Orbax.
 
 A run's checkpoint holds four items: `policy` (what acting needs, so that evaluation never reads a replay buffer),
-`rest`, `failed` (which lanes have; older checkpoints lack it) and `clock`; and the `digests` of their arrays: Orbax
-would read many a changed bit without a word. Older ones have none. Orbax writes to a temporary folder and renames it,
+`rest`, `failed` (which lanes have) and `clock`; and the `digests` of their arrays, without which nothing is read: Orbax
+would read many a changed bit without a word. Orbax writes to a temporary folder and renames it,
 so a kill leaves the last complete checkpoint in place.
 """
 
@@ -18,7 +18,7 @@ import shutil
 import sys
 import time
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
@@ -138,13 +138,28 @@ def _quiet() -> Iterator[None]:
             warnings.filterwarnings("ignore", "coroutine .* was never awaited", RuntimeWarning)
             yield
     finally:
-        log.disabled, sys.unraisablehook, sys.excepthook = silenced, unraisable, uncaught
+        log.disabled, sys.excepthook = silenced, uncaught
+        sys.unraisablehook = unraisable if isinstance(unraisable, _Late) else _Late(unraisable)
 
 
 def _settle() -> None:
     """Waits for the other reads or writes of one that failed, and collects them."""
     time.sleep(SETTLING_S)
     gc.collect()
+
+
+class _Late:
+    """A hook of the interpreter that passes over what the other reads or writes of one that failed complain of later.
+
+    On a slow disk they outlast `_settle`, and find the event loop closed in which Orbax ran them all.
+    """
+
+    def __init__(self, before: Callable[[Any], Any]) -> None:
+        self._before = before
+
+    def __call__(self, unraisable: Any) -> None:
+        if str(unraisable.exc_value) != "Event loop is closed":
+            self._before(unraisable)
 
 
 class Checkpoints:
@@ -165,11 +180,6 @@ class Checkpoints:
     def latest(self) -> int | None:
         """Number of the newest complete checkpoint."""
         return self._manager.latest_step()
-
-    def holds(self, name: str) -> bool:
-        """Has the newest complete checkpoint an item of that name, or at least should it have? Older ones lack some."""
-        folder = self._manager.directory / str(self.latest())
-        return (folder / name).exists() or (folder / DIGESTS).exists()
 
     def save(self, number: int, items: dict[str, Any]) -> None:
         """Writes a checkpoint; returns once it is complete on disk. Raises OSError where there is no room for it."""
@@ -215,12 +225,12 @@ class Checkpoints:
         }
         with self._reading() as folder:
             _compare_items(folder, wanted)
+            if not (folder / DIGESTS).exists():
+                raise ValueError("the digests of its arrays are missing")
             args: dict[str, Any] = {name: ocp.args.StandardRestore(item) for name, item in wanted.items()}
-            if (folder / DIGESTS).exists():
-                args[DIGESTS] = ocp.args.JsonRestore()
+            args[DIGESTS] = ocp.args.JsonRestore()
             restored = self._manager.restore(int(folder.name), args=ocp.args.Composite(**args))
-            if DIGESTS in args:
-                self._verify({name: restored[name] for name in like}, restored[DIGESTS])
+            self._verify({name: restored[name] for name in like}, restored[DIGESTS])
             return {name: _unflat(restored[name], like[name]) for name in like}
 
     @contextmanager
@@ -229,15 +239,15 @@ class Checkpoints:
         number = self.latest()
         if number is None:
             raise UserError(f"no checkpoint in {self._folder}: the run was stopped before its first one")
-        try:
-            yield self._manager.directory / str(number)
-            return
-        except Exception as error:  # Orbax and TensorStore raise many kinds for one cause: the files do not fit
-            # Orbax means to print TensorStore's details and prints the method that has them.
-            told = re.sub(r"\.? See full TensorStore details.*", "", str(error), flags=re.DOTALL).strip()
-            reason = told.splitlines()[0][:160] if told else type(error).__name__
-            remedy = OTHERS if isinstance(error, _OfAnother) else FORBIDDEN if _forbidden(error) else self._damaged
         with _quiet():
+            try:
+                yield self._manager.directory / str(number)
+                return
+            except Exception as error:  # Orbax and TensorStore raise many kinds for one cause: the files do not fit
+                # Orbax means to print TensorStore's details and prints the method that has them.
+                told = re.sub(r"\.? See full TensorStore details.*", "", str(error), flags=re.DOTALL).strip()
+                reason = told.splitlines()[0][:160] if told else type(error).__name__
+                remedy = OTHERS if isinstance(error, _OfAnother) else FORBIDDEN if _forbidden(error) else self._damaged
             _settle()
         raise UserError(f"checkpoint {number} in {self._folder} cannot be read ({reason}): {remedy}")
 

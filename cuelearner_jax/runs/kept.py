@@ -38,8 +38,6 @@ def items(blocks: list[TrainState], clock: Clock, wall: float) -> dict[str, Any]
 def restore(group: LaneGroup, saved: Checkpoints, *names: str, whole: bool = False) -> dict[str, Any]:
     """Items of the newest checkpoint by name, "failed" and "clock". Blocks are cut as they were when it was written.
 
-    A checkpoint that does not say which lanes have failed is of a program that did not look: it counts as of none.
-
     Args:
         group: the lanes.
         saved: their checkpoints.
@@ -57,9 +55,8 @@ def restore(group: LaneGroup, saved: Checkpoints, *names: str, whole: bool = Fal
     shapes = items(group.shapes_of(cut), jax.eval_shape(start_clock), 0.0)
     if whole:
         saved.compare({name: shapes[name] for name in ("policy", "rest")})
-    asked = (*names, "failed") if saved.holds("failed") else names
-    found = saved.restore({name: shapes[name] for name in asked})
-    return {"failed": [jnp.zeros(size, bool)] * count, **found, "clock": clock}
+    found = saved.restore({name: shapes[name] for name in (*names, "failed")})
+    return {**found, "clock": clock}
 
 
 def restore_blocks(group: LaneGroup, saved: Checkpoints) -> tuple[list[TrainState], Clock, float]:

@@ -5,6 +5,7 @@ import gc
 import hashlib
 import shutil
 import sys
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -165,8 +166,9 @@ def test_numbers_that_others_put_in_place_are_refused(tmp_path):
     shutil.copytree(tmp_path / "theirs" / "6" / "policy", tmp_path / "mine" / "5" / "policy")
     with pytest.raises(UserError, match=r"policy\['block'\].* is not what was written.*it is damaged"):
         restore(tmp_path / "mine")
-    shutil.rmtree(tmp_path / "mine" / "5" / "digests")  # older checkpoints had none
-    assert_bitwise(restore(tmp_path / "mine"), {"policy": state(6)})
+    shutil.rmtree(tmp_path / "mine" / "5" / "digests")
+    with pytest.raises(UserError, match="the digests of its arrays are missing"):
+        restore(tmp_path / "mine")
 
 
 def test_a_checkpoint_that_may_not_be_read_is_not_called_damaged(tmp_path, monkeypatch):
@@ -230,6 +232,17 @@ def test_what_a_refused_checkpoint_leaves_behind_is_silent(tmp_path, caplog, mon
     gc.collect()
     assert complaints == []
     assert caplog.records == []
+
+
+def test_what_complains_later_still_of_a_closed_event_loop_is_silent(tmp_path, monkeypatch):
+    complaints = []
+    monkeypatch.setattr(sys, "unraisablehook", complaints.append)
+    save(tmp_path, 5)
+    with pytest.raises(UserError):
+        restore(tmp_path, other(lambda item: item.pop("weights")))
+    for error in (RuntimeError("Event loop is closed"), RuntimeError("out of ink")):
+        sys.unraisablehook(SimpleNamespace(exc_value=error))
+    assert [str(complaint.exc_value) for complaint in complaints] == ["out of ink"]
 
 
 def test_what_a_refused_write_leaves_behind_is_silent(tmp_path, monkeypatch, recwarn):
