@@ -9,7 +9,7 @@ from typing import Any
 # Refusals of the file system that no check beforehand can rule out.
 FILE_SYSTEM = (
     *(errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOTDIR, errno.EISDIR, errno.ENAMETOOLONG, errno.ELOOP),
-    *(errno.EIO, errno.ESTALE, errno.EMFILE, errno.ENFILE),
+    *(errno.EIO, errno.ESTALE, errno.EMFILE, errno.ENFILE, errno.EBUSY),
 )
 
 
@@ -38,10 +38,14 @@ def no_space(error: BaseException | None) -> bool:
     return told or any(text in str(error) for text in words) or no_space(error.__cause__ or error.__context__)
 
 
-def blamed(error: BaseException) -> str | None:
-    """What to tell of an exception that the file system is to blame for, in one line; None for any other."""
+def blamed(error: BaseException, resumes: bool) -> str | None:
+    """What to tell of an exception that the file system is to blame for, in one line; None for any other.
+
+    `resumes`: can the command go on with what it saved?
+    """
     if no_space(error):
-        return "the disk is full: free some, then go on with the same command and --resume"
+        again = "go on with the same command and --resume" if resumes else "give the same command again"
+        return f"the disk is full: free some, then {again}"
     if isinstance(error, OSError) and error.filename is not None and error.errno in FILE_SYSTEM:
         return f"{error.filename}: {error.strerror}; what was saved before is safe"
     return None

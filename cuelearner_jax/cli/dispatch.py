@@ -48,7 +48,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         abandon(sys.stdout)
         return 141
     except Exception as error:
-        told = blamed(error)
+        told = blamed(error, _resumes(arguments))
         if told is None:
             raise
         console.print(f"error: {told}")
@@ -73,6 +73,13 @@ def _dispatch(arguments: list[str]) -> int:
         raise UserError(f"unknown command {command!r}{closest(command, COMMANDS)}; see cuelearner --help")
     _file(command).run(arguments[1:])
     return 0
+
+
+def _resumes(arguments: list[str]) -> bool:
+    """Has the command that was given an option --resume?"""
+    options = _file(arguments[0]).OPTIONS if arguments and arguments[0] in COMMANDS else {}
+    asked = [kind for name, kind in options.items() if name.split() == arguments[: len(name.split())]]
+    return any(hasattr(kind, "resume") for kind in asked)
 
 
 def _file(command: str) -> ModuleType:

@@ -1,3 +1,5 @@
+import errno
+import importlib
 import shutil
 
 import probes
@@ -110,6 +112,27 @@ def test_an_out_that_cannot_be_is_refused_before_any_work(refused, tmp_path, com
     refused([*command, "--out="], "--out is empty", tmp_path)
     refused([*command, "--out", tmp_path / "\udcff"], "not encoded as UTF-8", tmp_path)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "link"]
+
+
+@pytest.mark.parametrize(
+    ("command", "advice"),
+    [
+        ("sweep billiards", "go on with the same command and --resume"),
+        ("teacher train", "go on with the same command and --resume"),
+        ("adapt runs/a", "give the same command again"),
+        ("export runs/a", "give the same command again"),
+        ("labels export a.parquet", "give the same command again"),
+        ("locomotion train", "give the same command again"),
+    ],
+)
+def test_a_full_disk_advises_what_the_command_can_do(command, advice, capsys, monkeypatch):
+    def full(_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    name = command.split()[0]
+    monkeypatch.setattr(importlib.import_module(f"cuelearner_jax.cli.{name}"), "run", full)
+    assert main(command.split()) == 1
+    assert capsys.readouterr().err.splitlines() == [f"error: the disk is full: free some, then {advice}"]
 
 
 def test_a_folder_in_use_is_left_alone(refused, run_folder, tmp_path):
