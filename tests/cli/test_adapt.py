@@ -372,3 +372,9 @@ def test_help_names_what_there_is_to_choose_from(capsys):
     assert "aslant" in told
     assert "--bound-deg" in told
     assert jax.default_backend() == "cpu"
+
+
+def test_of_two_adaptations_at_once_the_second_is_refused_before_it_works(home, refused, tmp_path):
+    with policy_folders.place_of(tmp_path / "new", overwrite=False):
+        refused([*CODE, "--out", tmp_path / "new"], "is being written by another process", tmp_path)
+    assert list(tmp_path.iterdir()) == []
