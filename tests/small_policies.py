@@ -44,7 +44,8 @@ def write(folder, overwrite=False, origin="run"):
     """Writes the folder; `origin`: what policy.json says was adapted."""
     guidance = guidances.make("relative", SIZES, ENV)
     asked = Adaptation(guidance, SIZES, probes.SCALARS, ENV, Common(agent()), LANES, Judging(None))
-    judged = Judged("reward", np.zeros(2), np.ones(2), np.ones(2, bool), np.full(2, 45.0))
+    worth = np.zeros(2), np.ones(2), np.ones(2, bool), np.full(2, 45.0)
+    judged = Judged("reward", *worth, difference=np.ones((2, 3)), rewarded_steps=np.zeros(2, int))
     found = Adapted(asked, program.begin(guidance, SIZES, ENV, LANES), judged, [])
     with policy_folders.place_of(folder, overwrite) as place:
         adapted.write(place, found, TASK, probes.CONFIG.task, {"folder": origin})
