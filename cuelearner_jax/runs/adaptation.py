@@ -146,7 +146,8 @@ def _bases(order: Order, env: Any) -> tuple[Any, tuple[int, ...], dict[str, Any]
 def _try(policy: Any, env: Any, named: str | None) -> None:
     """Raises UserError if a policy from outside cannot act on the environment's observations."""
     try:
-        policy.act(jax.random.key(0), None, jnp.zeros((1, env.obs_size)))
+        # Shapes alone: of zeros a sound policy may make no direction.
+        jax.eval_shape(lambda obs: policy.act(jax.random.key(0), None, obs), jnp.zeros((1, env.obs_size)))
     except UserError:
         raise
     except Exception as error:  # whatever the user's own code raises
