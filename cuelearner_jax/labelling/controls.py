@@ -34,7 +34,7 @@ RIGHT = Control("-1", "more to the right", ("ArrowRight", "d", "D"), "→", (-1.
 AS_IT_IS = Control("0", "already right", ("ArrowUp", "w", "W", " "), "↑", (0.0,), "asked")
 KEYS = {" ": "space", "ArrowLeft": "←", "ArrowRight": "→", "ArrowUp": "↑", "ArrowDown": "↓"}  # for people
 PRACTICE = (  # what a person is to try, one a question of practice
-    "Compare the three arrows and press the key of the best one.",
+    "Compare the arrows with what is wanted, then answer by key, button or click.",
     "Where you cannot tell, press ↓: it costs nothing. F shows a film of where the arrow leads.",
     "An answer can be taken back with ⌫. After this one it counts.",
 )

@@ -164,7 +164,7 @@ def test_practice_is_marked_and_can_be_skipped(opened, tmp_path):
     session = opened(practice=3)
 
     async def acts(user, pages):
-        await user.should_see("Practice 1 of 3, nothing is saved. Compare the three arrows")
+        await user.should_see("Practice 1 of 3, nothing is saved. Compare the arrows")
         await press(user, "+1", lambda: session.number == -2)
         await user.should_see("Practice 2 of 3, nothing is saved. Where you cannot tell, press ↓")
         await press(user, "skip", lambda: session.number == 0)
