@@ -70,7 +70,7 @@ def shipped() -> Agent:
     """The shipped teacher's network as an agent: every direction's expected reward, and the largest is taken."""
     own = cl.make("billiards", table=TABLE).env
     network = stored.load(SHIPPED_TEACHERS / TABLE, own, 0.0, 0.0)
-    sizes = AgentSizes(frame="action", q_layers=network.layers, coarse_directions=360, peaks=4)
+    sizes = AgentSizes(frame="action", q_layers=network.layers)
     return Agent(network.params, sizes, env=own)
 
 

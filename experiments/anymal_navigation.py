@@ -77,7 +77,6 @@ def main() -> int:
     parser.add_argument("--episodes", type=int, default=500)
     parser.add_argument("--judged", type=int, default=50, help="of them also in C MuJoCo")
     parser.add_argument("--only", nargs="+", help="these rows alone, by name")
-    parser.add_argument("--coarse", type=int, default=0, help="first look at so many of its directions (0: all)")
     parser.add_argument("--write", type=Path, nargs="?", const=RESULTS, help="file (default: %(const)s)")
     parser.add_argument("--resume", action="store_true", help="keep the rows that the file of --write has")
     asked = parser.parse_args()
@@ -87,9 +86,8 @@ def main() -> int:
     except UserError as error:
         parser.error(str(error))
     params = jax.tree.map(lambda leaf: leaf[0], lanes.policies["params"])
-    sizes = replace(config.sizes, coarse_directions=asked.coarse)
     fitted = {name: json.loads(FIT.read_text())["fitted"][name] for name in FITTED}
-    about = {"run": asked.run.name, "fitted": fitted, "coarse": asked.coarse}
+    about = {"run": asked.run.name, "fitted": fitted}
     came = provenance()  # before the first row changes a file of the repository
     rows: list[dict[str, Any]] = []
     if asked.resume:
@@ -102,10 +100,10 @@ def main() -> int:
 
     @partial(jax.jit, static_argnames="count")
     def in_jax(env: Any, params: Any, count: int) -> Any:
-        return rollout(Agent(params, sizes), env, episodes(), count, count * 200)
+        return rollout(Agent(params, config.sizes), env, episodes(), count, count * 200)
 
     def in_c(env: Any, count: int) -> Any:
-        return judged(Agent(params, sizes), env, episodes(), count, count * 200)
+        return judged(Agent(params, config.sizes), env, episodes(), count, count * 200)
 
     def tell(style: str, name: str, count: int, measure: Callable[[], dict[str, Any]]) -> None:
         known = {(row["style"], row["robot"], row["episodes"]) for row in rows}

@@ -1,22 +1,26 @@
 """Whether an agent learns less when its argmax looks roughly first: the same seeds under three searches.
 
-    python experiments/search_width.py --out FOLDER [--steps 1000000] [--late 2000000] [--seeds 8]
+    python experiments/search_width.py --out FOLDER [--steps 1000000] [--seeds 8]
 
 The preset `regulation`, unguided, whose networks see from the strike. While learning, agents look at 360 directions and
-then near four peaks; at 720 and near eight; or at all 3,600. Every evaluation looks at all. Prints the reward after
-`--steps`, and the difference from the full search, paired by seed. The roughest search goes on to `--late` steps, for
-`benchmarks/search_agreement.py` to measure late agents. The sweeps run side by side on one accelerator, each with its
-share of the memory, and may be resumed by the same command: half an hour on one H200. Options that are not listed here
-are given to every sweep.
+then near four peaks; at 720 and near eight; or at all 3,600. Every evaluation looks at all. Prints, at each quarter of
+`--steps` that all searches have reached, the reward and the difference from the full search, paired by seed, and writes
+them to FOLDER/search_width.json. `benchmarks/search_agreement.py` then measures the late agents in FOLDER.
+
+The sweeps run side by side on one accelerator, each with its share of the memory: 25 minutes on one H200, of which the
+full search takes longest. The same command goes on after an interruption; `--table` only reads what is there. Options
+that are not listed here are given to every sweep.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -28,7 +32,7 @@ SEARCHES = {
     "720, 8 peaks": {"coarse-directions": 720, "peaks": 8},
     "360, 4 peaks": {"coarse-directions": 360, "peaks": 4},
 }
-FULL, ROUGHEST = "all 3,600", "360, 4 peaks"
+FULL = "all 3,600"
 
 
 def folder(out: Path, search: str) -> Path:
@@ -49,10 +53,31 @@ def begin(out: Path, search: str, steps: int, seeds: int, rest: list[str]) -> su
         return subprocess.Popen(command, stdout=log, stderr=log, env=environment)
 
 
-def rewards(run: Path, step: int) -> np.ndarray:
-    """Validation reward a shot (seeds,) at a step, by seed."""
-    rows = [row for row in results.read(run).to_pylist() if row["step"] == step]
-    return np.array([row["reward"] for row in sorted(rows, key=lambda row: row["seed"])])
+def curves(run: Path) -> dict[int, np.ndarray]:
+    """Validation reward a shot (seeds,), by seed, at each step that all seeds have reached."""
+    rows = sorted(results.read(run).to_pylist(), key=lambda row: row["seed"])
+    seeds = len({row["seed"] for row in rows})
+    found = {step: [row["reward"] for row in rows if row["step"] == step] for step in {row["step"] for row in rows}}
+    return {step: np.array(values) for step, values in sorted(found.items()) if len(values) == seeds}
+
+
+def table(out: Path, steps: int) -> list[dict[str, Any]]:
+    """Rewards at each quarter of the steps, of the searches that have got there."""
+    found = {search: curves(folder(out, search)) for search in SEARCHES}
+    rows = []
+    for step in (steps * quarter // 4 for quarter in (1, 2, 3, 4)):
+        for search, reached in found.items():
+            if step in reached:
+                full = found[FULL].get(step)
+                against = "" if full is None else told(full - reached[step])
+                rows.append({"step": step, "search": search, "reward": told(reached[step]), "lost": against})
+    return rows
+
+
+def origin(out: Path) -> dict[str, str]:
+    """Commit, versions and hardware of the sweeps, as the first one's rows say."""
+    row = results.read(folder(out, FULL)).slice(0, 1).to_pylist()[0]
+    return {name: row[name] for name in ("commit", "versions", "hardware")}
 
 
 def told(values: np.ndarray) -> str:
@@ -67,21 +92,20 @@ def main() -> int:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
     )
     parser.add_argument("--out", type=Path, default=Path("runs/search"), help="folder (default: %(default)s)")
-    parser.add_argument("--steps", type=int, default=1_000_000, help="at which agents are compared")
-    parser.add_argument("--late", type=int, default=2_000_000, help="to which the roughest search goes on")
+    parser.add_argument("--steps", type=int, default=1_000_000, help="of each seed")
     parser.add_argument("--seeds", type=int, default=8)
+    parser.add_argument("--table", action="store_true", help="run nothing")
     asked, rest = parser.parse_known_args()
-    begun = {
-        search: begin(asked.out, search, asked.late if search == ROUGHEST else asked.steps, asked.seeds, rest)
-        for search in SEARCHES
-    }
+    searches = () if asked.table else SEARCHES
+    begun = {search: begin(asked.out, search, asked.steps, asked.seeds, rest) for search in searches}
     if failed := [search for search, process in begun.items() if process.wait()]:
         print(f"failed: {', '.join(failed)}; see the .log files in {asked.out}", file=sys.stderr)
         return 1
-    found = {search: rewards(folder(asked.out, search), asked.steps) for search in SEARCHES}
-    print(f"{'search while learning':24}  reward at {asked.steps:,} steps    lost against {FULL}")
-    for search, values in found.items():
-        print(f"{search:24}  {told(values)}    {told(found[FULL] - values)}")
+    rows = table(asked.out, asked.steps)
+    print(f"{'steps':>9}  {'search while learning':22}  {'reward':22}  lost against the full search")
+    for row in rows:
+        print(f"{row['step']:9,}  {row['search']:22}  {row['reward']:22}  {row['lost']}")
+    (asked.out / "search_width.json").write_text(json.dumps({**origin(asked.out), "rows": rows}, indent=1) + "\n")
     return 0
 
 
