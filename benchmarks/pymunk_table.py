@@ -47,7 +47,7 @@ class PymunkTable:
         return shape
 
     def _place(self, positions: np.ndarray, angle: float) -> None:
-        for (body, shape), place in zip(self.balls, positions, strict=True):
+        for (body, shape), place in zip(self.balls[: len(positions)], positions, strict=True):
             body.position, body.velocity, body.angle, body.angular_velocity = tuple(map(float, place)), (0, 0), 0, 0
             self.space.add(body, shape)
         self.balls[0][0].velocity = (self.strike_speed * math.cos(angle), self.strike_speed * math.sin(angle))
@@ -55,11 +55,13 @@ class PymunkTable:
     def play(self, positions: np.ndarray, angle: float, limit_s: float = 60.0) -> tuple[np.ndarray, np.ndarray, float]:
         """Strike ball 0 at `angle` [rad]. Final positions (balls, 2) [m], pocketed (balls,) and duration [s].
 
-        Every ball starts on the table; the place of a pocketed ball is where it fell.
+        Every ball of `positions`, the first of the table's, starts on the table; the place of a pocketed ball is where
+        it fell.
         """
         self._place(positions, angle)
         out_x, out_y, stop2 = self.out_x, self.out_y, self.stop_speed**2
-        playing, steps = list(self.balls), 0
+        balls = self.balls[: len(positions)]
+        playing, steps = list(balls), 0
         while playing and steps * self.step < limit_s:
             self.space.step(self.step)
             steps += 1
@@ -76,8 +78,8 @@ class PymunkTable:
                 break
         for ball in playing:
             self.space.remove(*ball)
-        pocketed = np.array([ball not in playing for ball in self.balls])
-        return np.array([body.position for body, _ in self.balls]), pocketed, steps * self.step
+        pocketed = np.array([ball not in playing for ball in balls])
+        return np.array([body.position for body, _ in balls]), pocketed, steps * self.step
 
     def step_only(self, positions: np.ndarray, angle: float, duration: float) -> None:
         """The engine's share of a shot of known duration [s]: no pockets, no test for the end."""

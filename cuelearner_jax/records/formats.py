@@ -6,6 +6,7 @@
 | `labels`  | a label file           | what it says of itself |
 | `teacher` | `teacher.json`         | its contents           |
 | `policy`  | `policy.json`          | its contents           |
+| `due`     | `due.json` of a run    | its contents           |
 
 A file tells its number under `format`; one without a number is of format 0. A change of what is written raises the
 number here and adds a step that leads there from the number before; readers know the current format only. A format
@@ -26,13 +27,14 @@ from cuelearner_jax.errors import UserError
 from cuelearner_jax.records.whole import replacing, unreadable
 
 DIGEST = "digest"  # the name under which a JSON file holds the digest of its other values
-FORMATS = {"config": 2, "labels": 3, "teacher": 3, "policy": 2}
+FORMATS = {"config": 2, "labels": 3, "teacher": 3, "policy": 2, "due": 2}
 SEALED_SINCE = 2  # the format from which on a JSON file must carry a digest
 REMEDIES = {  # what a message says of a damaged file, after its path
     "config": "is damaged or of another program: restore it, or start anew with --overwrite",
     "labels": "is not a label file of cuelearner, or it is damaged: restore it, or write it anew",
     "teacher": "is damaged: restore it, or train the teacher anew",
     "policy": "is damaged: restore it, or adapt the policy anew",
+    "due": "is damaged: restore it, or delete the folder that it is in and give --resume",
 }
 
 Values = dict[str, Any]

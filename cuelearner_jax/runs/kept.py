@@ -11,11 +11,13 @@ import numpy as np
 
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.loop import start_clock
-from cuelearner_jax.records import guides, label_files, results
+from cuelearner_jax.records import formats, guides, label_files, results
 from cuelearner_jax.records import table as tables
 from cuelearner_jax.records.checkpoint import Checkpoints, checkpoints
 from cuelearner_jax.runs.lanes import LaneGroup
 from cuelearner_jax.types import Clock, TrainState
+
+DUE = "due.json"  # beside a checkpoint whose evaluation was ended: the columns that its row will have beside that
 
 
 def items(blocks: list[TrainState], clock: Clock, wall: float) -> dict[str, Any]:
@@ -76,6 +78,27 @@ def restore_blocks(group: LaneGroup, saved: Checkpoints) -> tuple[list[TrainStat
     return group.recut(blocks), found["clock"]["clock"], float(found["clock"]["wall_s"])
 
 
+def write_due(folder: Path, step: int, columns: dict[str, np.ndarray]) -> None:
+    """Keeps the columns (lanes,) of a stretch up to `step` whose evaluation was ended, beside a checkpoint there."""
+    formats.write("due", folder / DUE, {"step": step, "columns": {name: c.tolist() for name, c in columns.items()}})
+
+
+def read_due(folder: Path, step: int, lanes: int) -> dict[str, np.ndarray] | None:
+    """The columns (lanes,) of a stretch up to `step` that waits for its evaluation; None: no stretch does.
+
+    Raises UserError if the file cannot be read or is damaged.
+    """
+    path = folder / DUE
+    if not path.exists():
+        return None
+    told = formats.read("due", path)
+    try:
+        columns = {name: np.array(values, np.float32).reshape(lanes) for name, values in told["columns"].items()}
+        return columns if told["step"] == step else None
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise formats.damaged("due", path) from error
+
+
 def check_standing(group: LaneGroup, folder: Path, given: bool = False) -> None:
     """Whether a group can go on from what its folder holds: nothing lost, nothing changed.
 
@@ -93,13 +116,16 @@ def check_standing(group: LaneGroup, folder: Path, given: bool = False) -> None:
     """
     schedule, finished = group.config.schedule, (folder / results.PARQUET).exists()
     step, rounds = (schedule.total_steps, group.rounds) if finished else (0, 0)
+    waits = False  # for the evaluation of its newest stretch
     if not finished and (folder / "checkpoints").is_dir():
         with checkpoints(folder / "checkpoints", read_only=True) as saved:
             if saved.latest() is not None:
                 clock = restore(group, saved, whole=True)["clock"]["clock"]
                 step, rounds = int(clock.step), int(clock.round)
+                waits = read_due(folder, step, len(group.seeds)) is not None
     if step:
-        results.check_complete(folder, group.seeds, group.budgets, range(0, step + 1, schedule.eval_every))
+        evaluated = range(0, step if waits else step + 1, schedule.eval_every)
+        results.check_complete(folder, group.seeds, group.budgets, evaluated)
     elif (folder / results.JSONL).exists():
         tables.read(folder / results.JSONL, results.SCHEMA)
     if _has_guides(folder) or (rounds and not finished):  # finished runs of before have no such table

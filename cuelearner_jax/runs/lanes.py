@@ -16,7 +16,7 @@ from jaxtyping import PRNGKeyArray
 from cuelearner_jax.config import RunConfig
 from cuelearner_jax.devices import BY_LANE, lane_mesh, place
 from cuelearner_jax.environment import Environment
-from cuelearner_jax.evaluate import evaluate_lanes
+from cuelearner_jax.evaluate import Tell, evaluate_lanes, untold, watched_lanes
 from cuelearner_jax.guidance.bundle import Guidance
 from cuelearner_jax.loop import Program, make_program
 from cuelearner_jax.policies import Policy
@@ -167,16 +167,19 @@ class LaneGroup:
         num_envs: int,
         steps: int,
         blocks: list[TrainState],
+        tell: Tell = untold,
     ) -> dict[str, np.ndarray]:
-        """Metrics (lanes,) of a policy of each block on the same episodes."""
-        return self.columns(
-            self.each(
-                lambda block: evaluate_lanes(
-                    env, policy_of(block), key, mesh=self.mesh, num_envs=num_envs, steps=steps
-                ),
-                blocks,
-            )
-        )
+        """Metrics (lanes,) of a policy of each block on the same episodes.
+
+        One device tells between stretches how far each block is; several devices evaluate in one stretch.
+        """
+
+        def measured(block: TrainState) -> dict[str, Any]:
+            if self.mesh.size > 1:
+                return evaluate_lanes(env, policy_of(block), key, mesh=self.mesh, num_envs=num_envs, steps=steps)
+            return watched_lanes(env, policy_of(block), key, num_envs, steps, tell).means
+
+        return self.columns(self.each(measured, blocks))
 
     def columns(self, blocks: list[Any]) -> dict[str, np.ndarray]:
         """Columns of one row a lane from per-block dictionaries of (lanes,) arrays."""

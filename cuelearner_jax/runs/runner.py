@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Iterator
 from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
@@ -17,7 +18,7 @@ from cuelearner_jax.records.checkpoint import Checkpoints, checkpoints
 from cuelearner_jax.records.guides import GuideWriter
 from cuelearner_jax.runs.failures import LISTED, variant_name
 from cuelearner_jax.runs.grid import config_hash
-from cuelearner_jax.runs.kept import items, restore_blocks
+from cuelearner_jax.runs.kept import items, read_due, restore_blocks, write_due
 from cuelearner_jax.runs.lanes import LaneGroup
 from cuelearner_jax.runs.order import Order
 from cuelearner_jax.runs.training import Training, mean_of_finite
@@ -40,7 +41,7 @@ class Runner:
         bars: Progress,
     ) -> None:
         """Nothing is done yet; `described` is what config.json says, `stopping` is set by Ctrl-C."""
-        self.training = Training(group, examined, order.split)
+        self.training = Training(group, examined, order.split, self._end_if_asked)
         self.group, self.order, self.described = group, order, described
         self.stopping, self.bars = stopping, bars
         self.folder = order.out / group.guidance.name
@@ -93,15 +94,26 @@ class Runner:
             results.truncate_after(self.folder, -1)
             guide_records.truncate_after(self.folder, -1)
             return
-        self.training.go_on(*restore_blocks(self.group, saved))
+        blocks, clock, wall = restore_blocks(self.group, saved)
+        due = read_due(self.folder, int(clock.step), len(self.group.seeds))
+        self.training.go_on(blocks, clock, wall, due)
         self.failed = self.training.failed
-        # A checkpoint of the labels alone comes before the rows of step 0.
-        results.truncate_after(self.folder, self.training.step or -1)
+        # A checkpoint of the labels alone comes before the rows of step 0, one without its evaluation before its rows.
+        before = self.training.step == 0 or due is not None
+        results.truncate_after(self.folder, self.training.step - before)
         guide_records.truncate_after(self.folder, self.training.round)
 
     def _save(self, saved: Checkpoints) -> None:
         now = self.training
         saved.save(now.round + now.step, items(now.blocks, now.clock, now.wall))
+
+    def _end_if_asked(self, done: int, count: int) -> None:
+        """Ends an evaluation if that was asked for: an `evaluate.Tell`, called by several threads."""
+        if self.stopping.wait(0):
+            raise Interrupted(
+                f"stopped in an evaluation at step {self.training.step} of {self.group.guidance.name}; "
+                "go on with the same command and --resume"
+            )
 
     def _stop_if_asked(self, saved: Checkpoints) -> None:
         if self.stopping.is_set():
@@ -188,7 +200,7 @@ class Runner:
             self._bar = self.bars.add_task(
                 self.group.guidance.name, total=schedule.total_steps, note="", completed=now.step
             )
-        for row in now.stretches():
+        for row in self._evaluated(saved):
             writer.append(**row)
             if tracker is not None:
                 tracker.log(now.step, tracking.means(row))
@@ -199,3 +211,14 @@ class Runner:
             if now.step % schedule.checkpoint_every == 0 or now.step >= schedule.total_steps:
                 self._save(saved)
             self._stop_if_asked(saved)
+
+    def _evaluated(self, saved: Checkpoints) -> Iterator[dict[str, Any]]:
+        """The rows of the next stretches. A stretch whose evaluation is ended is kept, to be evaluated on resuming."""
+        now = self.training
+        try:
+            yield from now.stretches()
+        except Interrupted:
+            if now.due is not None:
+                write_due(self.folder, now.step, now.due)  # first: beside an older checkpoint it says nothing
+                self._save(saved)
+            raise

@@ -13,7 +13,7 @@ import numpy as np
 from cuelearner_jax.asking import blame, label_slots
 from cuelearner_jax.devices import SHARED, place
 from cuelearner_jax.environment import Environment, actions_of
-from cuelearner_jax.evaluate import episodes
+from cuelearner_jax.evaluate import Tell, episodes, untold
 from cuelearner_jax.loop import start_clock
 from cuelearner_jax.policies import Agent, Guided, Policy, uniform_in
 from cuelearner_jax.records import label_files
@@ -24,22 +24,25 @@ from cuelearner_jax.types import Clock, Label, Teacher, TrainState
 class Training:
     """Where a group of lanes stands, and its next stretches.
 
-    Between two of them its `clock`, `blocks` and `wall` are all there is to keep.
+    Between two of them its `clock`, `blocks` and `wall` are all there is to keep; after an evaluation that was ended,
+    `due` too.
     """
 
-    def __init__(self, group: LaneGroup, examined: Environment, split: str) -> None:
+    def __init__(self, group: LaneGroup, examined: Environment, split: str, tell: Tell = untold) -> None:
         """At the beginning.
 
         Args:
             group: the lanes.
             examined: the environment of evaluations.
             split: of the episodes of evaluations, see `evaluate.SPLITS`.
+            tell: called while evaluations run; what it raises ends them.
         """
-        self.group, self.split = group, split
+        self.group, self.split, self.tell = group, split, tell
         self.examined = place(group.mesh, examined, SHARED)
         self.clock: Clock = place(group.mesh, start_clock(), SHARED)
         self.blocks: list[TrainState] = []
         self.wall = 0.0  # seconds of labelling and training
+        self.due: dict[str, np.ndarray] | None = None  # the newest stretch's columns, until its evaluation is done
         self._guides: tuple[int, dict[str, np.ndarray]] | None = None  # the round of the newest measurement, and that
 
     def begin(self) -> None:
@@ -47,10 +50,12 @@ class Training:
         self._guides = None
         self.blocks = self.group.start()
 
-    def go_on(self, blocks: list[TrainState], clock: Clock, wall: float) -> None:
+    def go_on(
+        self, blocks: list[TrainState], clock: Clock, wall: float, due: dict[str, np.ndarray] | None = None
+    ) -> None:
         """From where others stood."""
         self._guides = None
-        self.blocks, self.wall = blocks, wall
+        self.blocks, self.wall, self.due = blocks, wall, due
         self.clock = place(self.group.mesh, clock, SHARED)
 
     @property
@@ -135,12 +140,15 @@ class Training:
         if self.step == 0:
             yield {**self.evaluation(), **self.guide_alone()}
         iterations = schedule.eval_every // group.config.sizes.num_envs
-        while self.step < until:
-            started = time.perf_counter()
-            self.clock, self.blocks, metrics = group.train(self.clock, self.blocks, iterations)
-            self.wall += time.perf_counter() - started
-            trained = group.columns([{f"train_{name}": v for name, v in block.items()} for block in metrics])
-            yield {**self.evaluation(), **self._of_finite(trained)}
+        while self.step < until or self.due is not None:
+            if self.due is None:
+                started = time.perf_counter()
+                self.clock, self.blocks, metrics = group.train(self.clock, self.blocks, iterations)
+                self.wall += time.perf_counter() - started
+                self.due = group.columns([{f"train_{name}": v for name, v in block.items()} for block in metrics])
+            row = {**self.evaluation(), **self._of_finite(self.due)}
+            self.due = None
+            yield row
 
     def evaluation(self) -> dict[str, Any]:
         """The columns of one evaluation of all agents: scalars, or (lanes,); NaN where a failed lane has no metric."""
@@ -173,7 +181,8 @@ class Training:
     def _measured(self, policy_of: Any) -> dict[str, np.ndarray]:
         schedule = self.group.config.schedule
         key = episodes(self.split)
-        found = self.group.evaluate(policy_of, self.examined, key, schedule.eval_envs, schedule.eval_steps, self.blocks)
+        size = (schedule.eval_envs, schedule.eval_steps)
+        found = self.group.evaluate(policy_of, self.examined, key, *size, self.blocks, self.tell)
         return self._of_finite(found)
 
     def _of_finite(self, columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

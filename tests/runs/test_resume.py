@@ -267,6 +267,29 @@ def test_stopped_in_the_last_round_of_labels(whole, tmp_path):
     assert_same_run(out, whole)
 
 
+@pytest.mark.parametrize("evaluating", [1, 60])  # before the first label, and after a stretch of steps
+def test_stopped_in_an_evaluation(whole, tmp_path, evaluating):
+    """Twice: the stretch that waits for its evaluation is kept, and evaluated once the run goes on."""
+    out = tmp_path / "run"
+    with stopping_at(evaluating=evaluating), pytest.raises(Interrupted, match="stopped in an evaluation at step"):
+        run(out)
+    with stopping_at(evaluating=2), pytest.raises(Interrupted, match="stopped in an evaluation at step"):
+        run(out, resume=True)
+    run(out, resume=True)
+    assert_same_run(out, whole)
+
+
+def test_the_note_of_a_stretch_that_waits_is_of_its_step_and_whole(tmp_path):
+    assert kept.read_due(tmp_path, 48, lanes=2) is None
+    kept.write_due(tmp_path, 48, {"train_loss": np.array([0.1, np.nan], np.float32)})
+    np.testing.assert_array_equal(kept.read_due(tmp_path, 48, lanes=2)["train_loss"], np.float32([0.1, np.nan]))
+    assert kept.read_due(tmp_path, 64, lanes=2) is None  # it lay beside another checkpoint
+    for values in ({"step": 48}, {"step": 48, "columns": [1.0]}, {"step": 48, "columns": {"train_loss": [1.0]}}):
+        formats.write("due", tmp_path / kept.DUE, values)
+        with pytest.raises(UserError, match=r"due\.json is damaged"):
+            kept.read_due(tmp_path, 48, lanes=2)
+
+
 def test_stopped_after_the_last_step(whole, tmp_path):
     out = tmp_path / "run"
     with stopping_at(6 + 6), pytest.raises(Interrupted):
