@@ -24,7 +24,7 @@ from cuelearner_jax.actions import DIRECTIONS, to_angle
 from cuelearner_jax.evaluate import episodes
 from cuelearner_jax.records.provenance import provenance
 
-TABLES = {"easy": Table.easy, "regulation": Table.regulation}
+WORLDS = (BilliardsConfig("easy"), BilliardsConfig("regulation"))
 
 
 def situations(env: Any, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -69,9 +69,10 @@ def main() -> None:
     asked = parser.parse_args()
     rows = []
     print(f"{'table':12}{'step [s]':>10}{'same pocketed':>15}{'reward here':>13}{'in Chipmunk':>13}")
-    for name, make in TABLES.items():
-        table = make()
-        places, gone, angles = situations(make_environment(BilliardsConfig(name)), asked.shots)
+    for world in WORLDS:
+        env = make_environment(world)
+        name, table = world.table, env.table
+        places, gone, angles = situations(env, asked.shots)
         ours = np.asarray(jax.jit(simulate_many)(table, places, gone, angles).pocketed)
         for step in (FINE_STEP, USUAL_STEP):
             theirs = in_chipmunk(table, step, places, gone, angles)

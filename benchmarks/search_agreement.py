@@ -32,6 +32,7 @@ from cuelearner_jax.agent.choice import greedy_actions, values
 from cuelearner_jax.config import AgentSizes
 from cuelearner_jax.evaluate import episodes, rollout
 from cuelearner_jax.guidance import registry as guidance
+from cuelearner_jax.policies import BY_LANE, SHARED
 from cuelearner_jax.records.provenance import provenance
 from cuelearner_jax.runs import grid as runs
 from cuelearner_jax.runs.grid import Grid
@@ -58,6 +59,11 @@ class Searching(struct.PyTreeNode):
     def act(self, key: jax.Array, states: Any, obs: jax.Array) -> jax.Array:
         """The action with the largest value that the search finds."""
         return greedy_actions(self.sizes, DIRECTIONS, self.env, self.params, obs)
+
+    @property
+    def axes(self) -> Any:
+        """Each lane has its own network."""
+        return self.replace(params=BY_LANE, env=SHARED)
 
 
 class Agents(NamedTuple):
