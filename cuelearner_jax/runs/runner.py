@@ -111,7 +111,7 @@ class Runner:
         """Ends an evaluation if that was asked for: an `evaluate.Tell`, called by several threads."""
         if self.stopping.wait(0):
             raise Interrupted(
-                f"stopped in an evaluation at step {self.training.step} of {self.group.guidance.name}; "
+                f"stopped at step {self.training.step} of {self.group.guidance.name}, before its evaluation; "
                 "go on with the same command and --resume"
             )
 

@@ -271,9 +271,9 @@ def test_stopped_in_the_last_round_of_labels(whole, tmp_path):
 def test_stopped_in_an_evaluation(whole, tmp_path, evaluating):
     """Twice: the stretch that waits for its evaluation is kept, and evaluated once the run goes on."""
     out = tmp_path / "run"
-    with stopping_at(evaluating=evaluating), pytest.raises(Interrupted, match="stopped in an evaluation at step"):
+    with stopping_at(evaluating=evaluating), pytest.raises(Interrupted, match="before its evaluation"):
         run(out)
-    with stopping_at(evaluating=2), pytest.raises(Interrupted, match="stopped in an evaluation at step"):
+    with stopping_at(evaluating=2), pytest.raises(Interrupted, match="before its evaluation"):
         run(out, resume=True)
     run(out, resume=True)
     assert_same_run(out, whole)
