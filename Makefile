@@ -3,12 +3,14 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 UV := $(BIN)/python -m uv
+PYTEST := $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 UV_VERSION := $(shell sed -n 's/^uv==\([0-9.]*\).*/\1/p' constraints.txt)
 
-.PHONY: help setup quickstart smoke test test-quick fuzz lint format docs bench constraints clean
+.PHONY: help setup quickstart smoke test test-all test-quick fuzz lint format docs bench constraints clean
 help:
 	@echo "make quickstart   train, report and film the small billiards example (two to three minutes)"
-	@echo "make test         run the tests (about 12 minutes on 2 idle cores)"
+	@echo "make test         run the tests (under 9 minutes on 2 idle cores)"
+	@echo "make test-all     these, and those that only take long (about twice as long)"
 	@echo "make test-quick   those of them that compile next to nothing (under 3 minutes)"
 	@echo "make smoke        one tiny sweep of every form of feedback and of every adaptation on both tasks (minutes on 2 cores)"
 	@echo "make fuzz         damaged run folders by chance, CASES=2000 SEED=0 (hours on 2 cores)"
@@ -47,10 +49,13 @@ smoke: $(VENV)/.installed
 	$(BIN)/python experiments/adaptation_navigation.py --scale smoke --pieces unchanged turned_lidar corridor_left --resume
 
 test: $(VENV)/.tested
-	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
+	$(PYTEST) -m "not long"
+
+test-all: $(VENV)/.tested
+	$(PYTEST)
 
 test-quick: $(VENV)/.tested
-	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder -m "not slow"
+	$(PYTEST) -m "not slow and not long"
 
 CASES ?= 2000
 SEED ?= 0

@@ -304,7 +304,7 @@ def test_what_cannot_be_is_refused(adapted, refused, tmp_path):
     refused([*plain, "--base.seeds", "3"], "own_turned:straight is none: leave it out", tmp_path)
     refused([*plain, "--labels-from", tmp_path / "no.parquet"], "no label file at", tmp_path)
     refused(["adapt", "own_turned:narrow", *TASK, *new], "returned actions of shape (1, 1)", tmp_path)
-    refused(["adapt", "own_turned:failing", *TASK, *new], "policy failing raised RuntimeError: out of ink: mend it first", tmp_path)
+    refused(["adapt", "own_turned:failing", *TASK, *new], "failing raised RuntimeError: out of ink: mend", tmp_path)
     refused(["adapt", "own_turned:OWN", *TASK, *new], "has no 'OWN'", tmp_path)
     refused(["adapt", "own_turned:TASK", *TASK, *new], "a Task is no policy", tmp_path)
     refused([*CODE, "--out", adapted], "is not empty: give --overwrite", adapted)
