@@ -16,7 +16,7 @@ from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 
-from cuelearner_jax.errors import NotFinite, UserError, raised_by
+from cuelearner_jax.errors import NotFinite, UserError, no_space, raised_by
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -69,8 +69,11 @@ def told(function: Callable[P, T]) -> Callable[P, T]:
 
 
 def raise_in_one_line(error: Exception) -> None:
-    """Raises a UserError from an exception that the user's own code raised; does nothing about any other."""
-    if isinstance(error, UserError | NotFinite):
+    """Raises a UserError from an exception that the user's own code raised; does nothing about any other.
+
+    A full disk is no fault of the code that met it first.
+    """
+    if isinstance(error, UserError | NotFinite) or no_space(error):
         return
     if code := _of_user(error):
         name = getattr(code, "co_qualname", code.co_name)
