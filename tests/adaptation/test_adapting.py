@@ -207,6 +207,7 @@ def quarter(obs):
     return (jnp if isinstance(obs, jax.Array) else np).stack([-obs[:, 1], obs[:, 0]], -1)
 
 
+@pytest.mark.long
 def test_an_opaque_function_gives_what_the_same_in_jax_gives():
     lanes = program.product(1, (0,), (30,), (60.0,))
     policies = [policy_of(quarter), policy_of(jax.jit(quarter))]
@@ -267,6 +268,7 @@ def test_defaults_go_together():
 FALLING = dataclasses.replace(SCALARS, eps_deg=20.0, eps_last_deg=4.0)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("kind", "more"),
     [("relative", {}), ("relative", {"sees_turn": True}), ("intent", {"aim_layers": (8,)})],

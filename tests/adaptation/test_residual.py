@@ -56,6 +56,7 @@ def lane_of(policy, index):
     return policy.replace(model=model, bound=bound)
 
 
+@pytest.mark.long
 def test_a_constant_shift_is_recovered(adapted):
     _, policy = adapted
     for lane in range(2):

@@ -86,6 +86,7 @@ def row(work):
     return bench.measure(work, 3, lane_mesh(), seconds=0.01)
 
 
+@pytest.mark.long
 def test_a_row_s_figures_agree_with_each_other(work, row):
     assert set(row) == set(machines.ROW)
     assert row["steps_a_second"] == pytest.approx(3 * 1e3 / row["ms_a_step"])

@@ -237,6 +237,7 @@ def assert_learned(before, after, metrics, losses):
         assert np.isfinite(metrics[name]), name
 
 
+@pytest.mark.long
 def test_ppo_of_brax_learns_on_billiards():
     env = to_brax(billiards.make_environment(billiards.BilliardsConfig(table="one_ball")))
     before, after, step, metrics = train_ppo(env, None)  # with brax's own wrappers
@@ -244,6 +245,7 @@ def test_ppo_of_brax_learns_on_billiards():
     assert_learned(before, after, metrics, ["training/policy_loss", "training/v_loss", "training/entropy_loss"])
 
 
+@pytest.mark.long
 def test_ppo_of_brax_learns_on_navigation():
     env = to_brax(navigation.make_environment(navigation.NavigationConfig(style="clutter", worlds=8)))
     before, after, step, metrics = train_ppo(env, wrap_for_training, num_timesteps=128)
@@ -251,6 +253,7 @@ def test_ppo_of_brax_learns_on_navigation():
     assert_learned(before, after, metrics, ["training/policy_loss", "training/v_loss", "training/entropy_loss"])
 
 
+@pytest.mark.long
 def test_sac_of_brax_learns_and_its_evaluator_counts_a_truncated_episode():
     reported = {}
     _, params, _ = sac.train(

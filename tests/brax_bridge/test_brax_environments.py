@@ -137,6 +137,7 @@ def test_what_does_not_fit_is_refused_in_one_line(env, to_action, words):
 BOOTSTRAPPING = probes.config(scalars={"discount": 0.9}, schedule={"target_every": 2})
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "make",
     [Field, functools.partial(envs.get_environment, "inverted_pendulum", backend="positional")],

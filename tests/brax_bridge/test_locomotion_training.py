@@ -88,6 +88,7 @@ def trained(tmp_path_factory):
     return out, about, told
 
 
+@pytest.mark.long
 def test_it_learns_what_is_commanded(trained):
     _, about, _ = trained
     before, *errors = (row[2] for row in about["history"]["rows"])
@@ -135,6 +136,7 @@ def test_a_policy_that_is_not_finite_is_not_written(tmp_path, monkeypatch):
     assert len(json.loads((tmp_path / "wild" / "policy.json").read_text())["history"]["rows"]) == 2
 
 
+@pytest.mark.long
 def test_training_that_dies_leaves_the_newest_policy(tmp_path):
     count = []
 

@@ -138,6 +138,7 @@ def test_a_function_is_adapted_and_its_folder_evaluated(adapted, tmp_path):
     assert max(row["guide_reward"] for row in curve if row["bound_deg"] == 45.0) == 1.0
 
 
+@pytest.mark.long
 def test_labels_lie_beside_and_lead_to_the_same_policy(adapted, tmp_path):
     file = adapted / "labels-45deg.parquet"
     assert len(label_files.read(file).seeds) == 80
@@ -151,6 +152,7 @@ def test_labels_lie_beside_and_lead_to_the_same_policy(adapted, tmp_path):
     assert (tmp_path / "again" / "labels.parquet").exists()
 
 
+@pytest.mark.long
 def test_a_file_of_falling_strengths_says_so_by_itself(home, tmp_path, refused):
     command = ["adapt", "own_turned:straight", *TASK, "--scenario", "aslant", *FIT, "--judge-episodes", "20"]
     command += ["--labels", "35"]
@@ -233,6 +235,7 @@ def test_what_is_adapted_saved_and_loaded_acts_bitwise_alike(home, tmp_path):
         cl.load_policy(tmp_path / "better")
 
 
+@pytest.mark.long
 def test_lanes_of_a_run_are_adapted_one_each_and_again(home, tmp_path):
     run, out, chain = home / "run", tmp_path / "out", tmp_path / "chain"
     sweep = ["sweep", "own_turned:TASK", "--guidance", "none", "--seeds", "2", "--schedule.total-steps", "960"]

@@ -59,6 +59,7 @@ def test_a_policy_is_measured_trial_by_trial(tmp_path, monkeypatch, capsys):
     assert "mujoco, clean" in capsys.readouterr().out
 
 
+@pytest.mark.long
 def test_an_agent_of_the_simple_robot_walks_in_c_mujoco(tmp_path, capsys):
     out = tmp_path / "measured.json"
     command = ["evaluate", str(AGENT), "--robot", "anymal", "--engine", "mujoco", *FEW]
@@ -97,6 +98,7 @@ def opengl():
         pytest.skip(str(error))
 
 
+@pytest.mark.long
 def test_its_episodes_are_filmed_from_above_and_from_the_side(opengl, tmp_path):
     command = ["render", str(AGENT), "--robot", "anymal", "--steps", "2", "--task.worlds", "8", "--out", str(tmp_path)]
     assert main(command) == 0

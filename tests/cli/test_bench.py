@@ -35,6 +35,7 @@ def measured(tmp_path_factory):
     return done, out
 
 
+@pytest.mark.long
 def test_it_says_what_it_does_and_prints_figures_beside_known_machines(measured):
     done, out = measured
     assert "MB a seed at rest" in done.stderr
@@ -87,6 +88,7 @@ def test_a_damaged_measurement_stays_out_of_the_table(refused, tmp_path):
     assert machines.TABLE.read_bytes() == before
 
 
+@pytest.mark.long
 def test_ctrl_c_stops_it_with_what_was_measured_and_no_file(tmp_path):
     out = tmp_path / "entry.json"
     command = [sys.executable, "-m", "cuelearner_jax.cli", *SMALL, "--seeds", "2", "--seconds", "600"]

@@ -94,6 +94,7 @@ def halted(process):
     return set(states) == {"T"}
 
 
+@pytest.mark.long
 def test_submitted_twice_then_one_killed_then_submitted_again_gives_what_one_process_gives(whole, tmp_path, capsys):
     out = tmp_path / "run"
     command = [*LOCAL, "--out", str(out)]
@@ -132,6 +133,7 @@ def test_submitted_twice_then_one_killed_then_submitted_again_gives_what_one_pro
     assert list((out / "jobs").iterdir()) == submissions
 
 
+@pytest.mark.long
 def test_ctrl_c_stops_the_jobs_of_this_machine_and_loses_nothing(whole, tmp_path, capsys):
     out = tmp_path / "run"
     options = ["--schedule.checkpoint-every", "800", "--out", str(out)]
@@ -155,6 +157,7 @@ def test_ctrl_c_stops_the_jobs_of_this_machine_and_loses_nothing(whole, tmp_path
     assert rows(out) == whole
 
 
+@pytest.mark.long
 def test_slurm_gets_an_array_and_a_job_told_to_end_goes_on_when_started_again(whole, slurm, tmp_path, capsys):
     out = tmp_path / "run"
     options = "--job.partition gpus --job.account lab --job.gpus 1 --job.cpus 8 --job.memory-gb 1.5 --job.minutes 90"

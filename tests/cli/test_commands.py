@@ -84,6 +84,7 @@ def test_two_policies_are_compared_on_the_same_episodes(run_folder, tmp_path, ca
     assert capsys.readouterr().out.count("difference over seeds") == 3  # a table for each kind and budget
 
 
+@pytest.mark.long
 def test_labels_in_instalments_each_about_the_situation_that_members_disagree_on(tmp_path):
     out, task = tmp_path / "run", "examples.reach:TASK"
     command = ["train", task, "--preset", "quickstart", "--guidance", "relative", "--labels", "25"]
@@ -147,6 +148,7 @@ def test_a_report_has_curves_and_tables(run_folder, tmp_path):
     assert (out / "label_efficiency.png").exists()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("film", ["gif", "mp4"])
 def test_render_makes_a_film_and_a_still(run_folder, tmp_path, film):
     command = ["render", str(run_folder), "--guidance", "relative", "--labels", "10", "--seed", "2001", "--film", film]

@@ -1,10 +1,12 @@
 """A few damaged run folders; `make fuzz` tries thousands."""
 
 import damaged_folders
+import pytest
 
 CASES, SEED = 24, 0
 
 
+@pytest.mark.long
 def test_no_damage_gives_a_traceback_or_another_number(run_folder, tmp_path):
     damaged_folders.make_runs(tmp_path, run_folder)
     tried = damaged_folders.cases(tmp_path, CASES, SEED)
