@@ -248,6 +248,7 @@ def test_reports_that_cannot_be_made_are_refused(refused, copy, tmp_path):
     refused(["report", copy, *out], "overwrite", tmp_path)
 
 
+@pytest.mark.long
 def test_pictures_and_measurements_are_not_replaced_unasked(refused, copy, tmp_path):
     render = ["render", str(copy), "--steps", "1", "--policy", "heuristic", "--out", str(tmp_path / "pictures")]
     assert main(render) == 0

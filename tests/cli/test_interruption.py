@@ -55,6 +55,7 @@ def test_ctrl_c_and_sigterm_save_and_resume_goes_on_as_if_never_stopped(tmp_path
     assert rows(folder) == uninterrupted
 
 
+@pytest.mark.long
 def test_kill_loses_one_stretch_at_most_and_resume_goes_on(tmp_path, uninterrupted):
     folder = tmp_path / "run"
     process = start_and_wait_for(folder, 300)
@@ -84,6 +85,7 @@ def test_an_evaluation_ends_at_once_in_one_line(seconds, number):
     assert told == "stopped at once; what was saved before is safe\n"
 
 
+@pytest.mark.long
 def test_a_closed_standard_error_and_a_path_like_markup_disturb_no_sweep(tmp_path):
     folder = tmp_path / "br[" / "x]" / ":smile:"
     options = ["sweep", "billiards", "--preset", "quickstart", *SMALL, "--guidance", "none", "--seeds", "1"]

@@ -27,6 +27,7 @@ def walked(tmp_path_factory) -> Path:
     return folder
 
 
+@pytest.mark.long
 def test_every_evaluation_accounts_for_all_its_episodes(walked):
     rows = results.read(walked / "relative").to_pylist()
     assert [row["step"] for row in rows] == [0, 0, 100, 100, 200, 200]
@@ -36,6 +37,7 @@ def test_every_evaluation_accounts_for_all_its_episodes(walked):
         assert row["duration"] <= 4.0 + 1e-5  # 20 steps of 0.2 s
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("policy", ["corrected", "teacher"])
 def test_policies_are_evaluated_in_worlds_of_another_style(walked, tmp_path, policy):
     out = tmp_path / "measured.json"

@@ -82,6 +82,7 @@ def test_other_options_for_a_piece_that_has_begun_are_refused(refused, tmp_path)
     refused([*second, "--seeds", "4"], "is a piece of a sweep with another shard.seeds: give the same", tmp_path)
 
 
+@pytest.mark.long
 def test_a_piece_that_was_killed_goes_on_with_the_same_command(tmp_path, capsys):
     command = [*SWEEP, "--schedule.total-steps", "1000", "--shard", "1/2"]
     calm, killed = tmp_path / "calm", tmp_path / "killed"

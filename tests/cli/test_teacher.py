@@ -28,6 +28,7 @@ def test_a_tiny_teacher_is_trained(trained):
     assert {path.name for path in trained.iterdir()} == {".lock", "network", "teacher.json"}
 
 
+@pytest.mark.long
 def test_it_teaches_and_is_known_by_its_contents(trained, refused, tmp_path):
     own, run, out = tmp_path / "teacher", tmp_path / "run", tmp_path / "measured.json"
     shutil.copytree(trained, own)

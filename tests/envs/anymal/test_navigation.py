@@ -58,6 +58,7 @@ def test_agents_see_the_same_as_on_the_simple_robot(env):
     assert obs.shape == (WALKERS, env.obs_size)
 
 
+@pytest.mark.long
 def test_every_end_has_its_name(walked):
     _, (first, _, _) = walked
     outcome = {name: np.asarray(value).tolist() for name, value in first.outcome.items() if name != "duration"}

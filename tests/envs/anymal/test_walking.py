@@ -142,6 +142,7 @@ def shipped():
     return policy.load()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("trial", "error", "falls"), [("clean", 0.05, 0), ("disturbed", 0.08, 1), ("varied", 0.08, 1)])
 def test_the_shipped_policy_tracks_random_commands(shipped, trial, error, falls):
     robots = 12

@@ -130,6 +130,7 @@ def easy():
     return states, alone
 
 
+@pytest.mark.long
 def test_a_learned_teacher_knows_of_a_turned_strike(easy):
     states, clean = easy
     env, teacher = learned(action_turn_deg=3.0)
@@ -178,6 +179,7 @@ nearest = jax.jit(
 )
 
 
+@pytest.mark.long
 def test_shots_near_proposals_are_as_good_as_all_of_them_in_every_changed_world(near):
     local, full, rewards, states, obs = near
     worth = np.asarray(jax.vmap(actions.expected_values, (0, None))(rewards, full.aim_error))
@@ -188,6 +190,7 @@ def test_shots_near_proposals_are_as_good_as_all_of_them_in_every_changed_world(
     assert worth[np.arange(len(worth)), unchanged % PROPOSALS].sum() <= found.sum()  # it knows of the change
 
 
+@pytest.mark.long
 def test_the_nearest_good_shot_is_looked_for_by_shots(near):
     """From half a degree beside the search's own best shot, which the network need not propose."""
     local, full, _, states, obs = near
@@ -237,6 +240,7 @@ def test_a_learned_teacher_refuses_other_physics_than_it_knows(changes, told):
     assert f"teacher train billiards --task.table easy --task.acceleration {x} {y} --out" in str(refused.value)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("table", "least"), [("easy", 0.75), ("regulation", 0.45)])
 def test_the_shipped_teachers_play_well(table, least):
     config = BilliardsConfig(table, teacher="learned")

@@ -140,6 +140,7 @@ def useful(roadmap):
     return np.isfinite(roadmap.lengths).any(-1)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("index", WORLDS)
 def test_lengths_to_goals_are_those_of_dijkstra_on_the_same_graph(teacher, index):
     world, roadmap = one(teacher.env.worlds, index), one(teacher.maps, index)

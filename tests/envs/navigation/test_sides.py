@@ -109,6 +109,7 @@ def test_the_sides_of_an_episode_are_its_outcome():
 walked = jax.jit(lambda teacher, env: rollout(Taught(teacher), env, episodes("tuning"), 20, 20 * 120))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("wish", "side"), [("left", 1.0), ("right", -1.0)])
 def test_a_teacher_passes_where_it_is_wanted(wish, side):
     found = walked(make_sided_teacher(TWO, jnp.float32(side)), TWO)
