@@ -19,13 +19,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from cuelearner_jax import asking
+from cuelearner_jax import asking, user_code
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.labelling import controls
 from cuelearner_jax.labelling.learner import Fitted, Learner
 from cuelearner_jax.labelling.living import advance, begin, keys_of, lived
 from cuelearner_jax.labelling.plan import Plan
 from cuelearner_jax.labelling.programs import programs
+from cuelearner_jax.policies import named
 from cuelearner_jax.records import label_files
 from cuelearner_jax.records.label_checks import ANSWERED, UNDONE, UNSURE
 from cuelearner_jax.records.provenance import provenance
@@ -169,6 +170,7 @@ class Session:
         guide = guide.replace(model=self._learner.newest.model)
         scalars, base = self.plan.config.scalars, self.plan.base.policy
         action = self._programs.question(self.env, scalars, base, guide, keys, self._bound)
+        user_code.check_actions(np.isfinite(action), named(base))
         return Item(number, guide, np.asarray(action))
 
     def _refined(self, item: Item) -> Item:

@@ -6,12 +6,18 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
 
-from cuelearner_jax.environment import Environment
+from cuelearner_jax import user_code
+from cuelearner_jax.actions import Actions
+from cuelearner_jax.environment import Environment, actions_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import episodes
-from cuelearner_jax.policies import Policy
+from cuelearner_jax.policies import Policy, acted, named
 from cuelearner_jax.task import Pictures
+from cuelearner_jax.types import EnvState
 
 FILMS = ("gif", "mp4")
 
@@ -51,8 +57,14 @@ def film(pictures: Pictures, env: Environment, policy: Policy, episode: int, ste
 
     Returns:
         The reward of each step.
+
+    Raises:
+        UserError: the policy gave something else than actions; nothing has been written.
     """
-    frames, rewards = pictures.record(env, policy, _start(episode), steps)
+    acting = _Watched(policy, actions_of(env))
+    frames, rewards = pictures.record(env, acting, _start(episode), steps)
+    jax.effects_barrier()
+    user_code.check_actions(np.array(acting.sound, bool), named(policy))
     to.film.parent.mkdir(parents=True, exist_ok=True)
     pictures.still(env, frames, to.still)
     pictures.animate(env, frames, to.film)
@@ -60,7 +72,10 @@ def film(pictures: Pictures, env: Environment, policy: Policy, episode: int, ste
 
 
 def question(pictures: Pictures, env: Environment, policy: Policy, episode: int, to: Path) -> None:
-    """Writes a picture of the situation that a validation episode begins with, with the policy's action in question."""
+    """Writes a picture of the situation that a validation episode begins with, with the policy's action in question.
+
+    Raises UserError, and writes nothing, if the policy gives something else than an action.
+    """
 
     @jax.jit
     def first(env: Environment, key: jax.Array) -> tuple[Any, jax.Array, jax.Array]:
@@ -68,11 +83,26 @@ def question(pictures: Pictures, env: Environment, policy: Policy, episode: int,
         k_act, _ = jax.random.split(jax.random.fold_in(k_play, 0))  # as a film draws its first step
         state, obs = env.reset(k_reset)
         states = jax.tree.map(lambda leaf: leaf[None], state)
-        return state, obs, policy.act(k_act, states, obs[None])[0]
+        return state, obs, acted(policy, k_act, states, obs[None], actions_of(env))[0]
 
     state, obs, action = first(env, _start(episode))
+    user_code.check_actions(action, named(policy))
     to.parent.mkdir(parents=True, exist_ok=True)
     pictures.question(env, state, obs, action, to)
+
+
+class _Watched:
+    """A policy that takes note of whether it gave actions; films are drawn inside compiled programs."""
+
+    def __init__(self, policy: Policy, actions: Actions) -> None:
+        self.policy, self.sound = policy, []
+        self._actions = actions
+
+    def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
+        """What the policy does, NaN in place of what is no action."""
+        chosen = acted(self.policy, key, states, obs, self._actions)
+        jax.debug.callback(lambda sound: self.sound.append(bool(sound)), jnp.isfinite(chosen).all())
+        return chosen
 
 
 def _start(episode: int) -> jax.Array:

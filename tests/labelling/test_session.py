@@ -305,3 +305,10 @@ def test_labels_are_compared_with_the_teacher_in_the_situations_they_were_given_
     file = label_files.read(tmp_path / "labels")
     found = comparing.with_teacher(page_task.TASK, file, rows, probes.SCALARS)
     assert (found.count, found.value) == (6, pytest.approx(5 / 6))
+
+
+def test_a_policy_that_gives_no_actions_is_named_before_a_question_is_asked(opened, tmp_path):
+    nothing = Opaque(lambda obs: obs * np.where(obs.any(), np.nan, 1.0), on_host=True)
+    with pytest.raises(UserError, match=r"policy .*lambda.* gave no direction"):
+        opened(base=Base(nothing, "mine"))
+    assert not label_files.readable(tmp_path / "labels")  # there is no label in it
