@@ -30,6 +30,7 @@ from cuelearner_jax.types import Label
 HELD_OUT = 5  # every fifth label
 LABELS = "labels"  # what is judged by, in place of a metric
 STEPS = 100  # of an environment, where a task counts steps
+MOST_BOUNDS = 16  # shares of a bound
 
 
 class Judged(NamedTuple):
@@ -172,6 +173,8 @@ def within_deg(block: Adapting) -> np.ndarray:
 
 def check_bounds(shares: tuple[float, ...], by: str, named: str) -> None:
     """Raises UserError for shares of a bound that cannot be tried; `named` is what the user calls them."""
+    if len(shares) > MOST_BOUNDS:
+        raise UserError(f"{named} has {len(shares):,} shares, each played by itself: give at most {MOST_BOUNDS}")
     if not all(0 < share < 1 for share in shares) or len(set(shares)) < len(shares):
         given = " ".join(f"{share:g}" for share in shares)
         raise UserError(f"{named} is {given}: give shares of the bound above 0 and below 1, each once")

@@ -18,6 +18,7 @@ policies), or `policies.Common(policy)` where there is but one. `guidance` is a 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from functools import partial
 from itertools import product as combinations
@@ -38,7 +39,11 @@ from cuelearner_jax.environment import Environment
 from cuelearner_jax.evaluate import one_lane
 from cuelearner_jax.guidance.bundle import Guidance
 from cuelearner_jax.policies import Guided, Policy
+from cuelearner_jax.records.room import check_room
 from cuelearner_jax.types import GuideState, Label, Teacher
+
+FLOAT = 4  # bytes
+OPTIMIZER = 4  # times the parameters: with their gradients and two moments
 
 
 class Lanes(NamedTuple):
@@ -118,7 +123,16 @@ def begin(guidance: Guidance, sizes: GuideSizes, env: Environment, lanes: Lanes)
     slots = rounds(lanes, sizes) * sizes.labels_per_round
     bound = jnp.deg2rad(jnp.asarray(lanes.bound_deg))
     columns = (*(jnp.asarray(column) for column in (lanes.base, lanes.seed, lanes.budget)), bound)
+    check_memory(sizes, jax.eval_shape(partial(_begin, guidance, sizes, slots), env, columns))
     return _begin(guidance, sizes, slots, env, columns)
+
+
+def check_memory(sizes: GuideSizes, kept: Any) -> None:
+    """Raises UserError if guides and their fitting need more memory than is free; `kept`: a tree of their shapes."""
+    size = sum(math.prod(leaf.shape) * leaf.dtype.itemsize for leaf in jax.tree.leaves(kept))
+    fitting = 3 * FLOAT * sizes.ensemble * sizes.fit_batch_size * sum(sizes.feedback_layers)  # activations, gradients
+    declared = f"sizes.feedback_layers {sizes.feedback_layers} with sizes.fit_batch_size {sizes.fit_batch_size}"
+    check_room(declared, OPTIMIZER * size + fitting, "lower these, or the number of labels and lanes")
 
 
 def _kept_finite(block: Adapting, guide: GuideState) -> Adapting:

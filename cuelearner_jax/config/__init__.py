@@ -4,11 +4,13 @@ from cuelearner_jax.config.checks import (
     LARGEST,
     LARGEST_FLOAT,
     LARGEST_ROUND,
+    MOST_LAYERS,
     check,
     check_agent,
     check_guide,
     check_types,
     check_whole,
+    settled,
 )
 from cuelearner_jax.config.groups import (
     AgentScalars,
@@ -22,12 +24,13 @@ from cuelearner_jax.config.groups import (
     Sizes,
     TeacherFaults,
 )
-from cuelearner_jax.config.plain import defaults, digest, from_json, to_json
+from cuelearner_jax.config.plain import defaults, digest, from_json, plain, to_json
 
 __all__ = [
     "LARGEST",
     "LARGEST_FLOAT",
     "LARGEST_ROUND",
+    "MOST_LAYERS",
     "AgentScalars",
     "AgentSizes",
     "Frame",
@@ -46,5 +49,7 @@ __all__ = [
     "defaults",
     "digest",
     "from_json",
+    "plain",
+    "settled",
     "to_json",
 ]

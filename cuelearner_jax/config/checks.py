@@ -5,17 +5,18 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
-from typing import Any, Literal, get_args, get_origin, get_type_hints
-
-import numpy as np
+from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 from cuelearner_jax.config.groups import AgentSizes, GuideScalars, GuideSizes, RunConfig
-from cuelearner_jax.config.plain import fits
+from cuelearner_jax.config.plain import fits, plain
 from cuelearner_jax.errors import UserError, closest, shown
 
 LARGEST = 2**31 - 1  # counters and indices are 32-bit integers
 LARGEST_ROUND = 1 << 30  # so that budgets of as many labels, in whole rounds, are such an integer too
 LARGEST_FLOAT = 3.4028234e38  # scalars are computed in single precision
+MOST_LAYERS = 64  # each is compiled by itself
+
+GroupT = TypeVar("GroupT")
 
 
 def check(config: RunConfig) -> None:
@@ -103,13 +104,20 @@ def check_types(group: Any, prefix: str, **changes: Any) -> dict[str, Any]:
     for name, given in values.items():
         if name not in fields:
             raise UserError(f"{prefix} has no field {shown(name)}{closest(name, fields)}")
-        value = given.item() if isinstance(given, np.generic) else tuple(given) if isinstance(given, list) else given
+        value = plain(given)
         kind = kinds[name]
         if not fits(value, kind):
             words = " or ".join(map(str, get_args(kind))) if get_origin(kind) is Literal else ""
             raise UserError(f"{prefix}.{name} is {shown(value)}: give {words or f'a value of type {_called(kind)}'}")
         kept[name] = value
     return kept
+
+
+def settled(group: GroupT, prefix: str) -> GroupT:
+    """A configuration with its values as they are kept. Raises UserError as `check_types`."""
+    kept = check_types(group, prefix)
+    changed = {name: value for name, value in kept.items() if value is not getattr(group, name)}
+    return dataclasses.replace(group, **changed) if changed else group  # pyright: ignore[reportArgumentType]
 
 
 def _called(kind: Any) -> str:
@@ -214,8 +222,8 @@ def _check_positive(sizes: Any, names: tuple[str, ...]) -> None:
 
 
 def _check_layers(layers: tuple[int, ...], name: str) -> None:
-    if not layers or min(layers) < 1:
-        raise UserError(f"{name}: give at least one layer of positive width")
+    if not 1 <= len(layers) <= MOST_LAYERS or min(layers) < 1:
+        raise UserError(f"{name}: give at least one layer of positive width, at most {MOST_LAYERS}")
 
 
 def _check_numbers(scalars: Any) -> None:

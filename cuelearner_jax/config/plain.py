@@ -8,7 +8,29 @@ import json
 from types import UnionType
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
+import numpy as np
+
 from cuelearner_jax.errors import UserError
+
+NUMBERS = "biufU"  # kinds of NumPy's values that Python has too
+
+
+def plain(given: Any) -> Any:
+    """A value as Python has it: numbers and words of NumPy and JAX, and tuples for lists and arrays of one axis.
+
+    Anything else is returned as it is.
+    """
+    if isinstance(given, list | tuple):
+        return tuple(map(plain, given))
+    kind = getattr(given, "dtype", None)
+    if not isinstance(kind, np.dtype) or kind.kind not in NUMBERS or getattr(given, "ndim", 2) > 1:
+        return given
+    try:
+        found = np.asarray(given)
+    except (TypeError, ValueError, RuntimeError):  # traced, or deleted
+        return given
+    listed = (found.astype(float) if kind.kind == "f" else found).tolist()
+    return tuple(listed) if found.ndim else listed
 
 
 def to_json(config: Any) -> dict[str, Any]:

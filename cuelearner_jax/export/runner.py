@@ -12,8 +12,10 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import operator
 import threading
+import zipfile
 from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -26,6 +28,8 @@ VERSION = 1  # of contracts and graphs
 DIGEST = "digest"  # the name under which a contract holds the digest of its other values
 VECTORS = ("observation", "action")
 MOST = 1 << 20  # entries of an observation or an action, and golden cases
+LARGEST_CONTRACT, LARGEST_FILE = 1 << 26, 1 << 30  # bytes, unpacked
+LARGEST_ARRAY = 1 << 28  # entries that an operation makes of fewer
 LOOSEST = 1e-2  # tolerance that still says that two actions are one
 
 Values = dict[str, np.ndarray]
@@ -110,6 +114,7 @@ class Decision:
 
     def _golden(self) -> tuple[np.ndarray, np.ndarray]:
         """Observations (cases, obs) and actions (cases, action). Raises ValueError unless they are as many as told."""
+        _check_unpacked(self.folder / GOLDEN)
         with np.load(self.folder / GOLDEN, allow_pickle=False) as golden:
             obs, actions = golden["obs"], golden["actions"]
         cases, sizes = self.contract["golden"]["cases"], (self.contract[part]["size"] for part in VECTORS)
@@ -118,6 +123,13 @@ class Decision:
         if not all(array.dtype.kind == "f" and np.isfinite(array).all() for array in (obs, actions)):
             raise ValueError("golden cases are not finite")
         return obs, actions
+
+
+def _check_unpacked(path: Path) -> None:
+    """Raises ValueError for arrays that are packed more densely than any decision's."""
+    with zipfile.ZipFile(path) as packed:
+        if sum(part.file_size for part in packed.infolist()) > LARGEST_FILE:
+            raise ValueError(f"{path.name} declares more than {LARGEST_FILE:,} bytes")
 
 
 def _numbers(obs: Any) -> np.ndarray:
@@ -144,7 +156,8 @@ def read_contract(folder: Path) -> dict[str, Any]:
     """
     path = folder / CONTRACT
     try:
-        contract = json.loads(path.read_text(encoding="utf-8"))
+        small = path.stat().st_size <= LARGEST_CONTRACT
+        contract = json.loads(path.read_text(encoding="utf-8") if small else "")
         told = contract.pop(DIGEST)
         sound = told == digest(contract)
     except OSError as error:
@@ -163,6 +176,8 @@ def read_contract(folder: Path) -> dict[str, Any]:
         raise ContractError(f"{path} makes no sense ({told[:160]}): export the policy anew") from None
     for name, recorded in contract["files"].items():
         try:
+            if (folder / name).stat().st_size > LARGEST_FILE:
+                raise ContractError(f"{folder / name} is larger than any decision: export the policy anew")
             found = hashlib.sha256((folder / name).read_bytes()).hexdigest()
         except OSError as error:
             raise ContractError(f"{folder / name} cannot be read ({error.strerror}): export the policy anew") from None
@@ -198,6 +213,7 @@ Batch = Callable[[np.ndarray], np.ndarray]  # observations (n, obs) -> actions (
 
 
 def _of_numpy(folder: Path, contract: dict[str, Any]) -> Batch:
+    _check_unpacked(folder / contract["artefact"]["file"])
     with np.load(folder / contract["artefact"]["file"], allow_pickle=False) as stored:
         graph = json.loads(stored["graph"].tobytes())
         constants = {name: stored[name] for name in stored.files if name != "graph"}
@@ -434,7 +450,18 @@ def _slices(start: list[int], stop: list[int], step: list[int]) -> Callable[...,
     return operator.itemgetter(tuple(slice(*each) for each in zip(start, stop, step, strict=True)))
 
 
+def _spread(shape: list[int]) -> Callable[..., Any]:
+    _check_entries(math.prod(shape))
+    return lambda x: np.broadcast_to(x, shape)
+
+
+def _check_entries(count: int) -> None:
+    if count > LARGEST_ARRAY:
+        raise ContractError(f"this decision makes an array of {count:,} entries: export the policy anew")
+
+
 def _filling(low: list[int], high: list[int]) -> Callable[..., Any]:
+    _check_entries(max([*low, *high], default=0))
     return lambda x, value: np.pad(x, list(zip(low, high, strict=True)), constant_values=value)
 
 
@@ -502,7 +529,7 @@ SETTLED: dict[str, Callable[..., Callable[..., Any]]] = {
     "cast": lambda dtype: operator.methodcaller("astype", dtype),
     "reshape": lambda shape: operator.methodcaller("reshape", tuple(shape)),
     "transpose": lambda axes: operator.methodcaller("transpose", tuple(axes)),
-    "broadcast": lambda shape: lambda x: np.broadcast_to(x, shape),
+    "broadcast": _spread,
     "concatenate": lambda axis: lambda *parts: np.concatenate(parts, axis),
     "slice": _slices,
     "pad": _filling,

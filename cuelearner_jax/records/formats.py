@@ -28,6 +28,7 @@ from cuelearner_jax.records.whole import replacing, unreadable
 
 DIGEST = "digest"  # the name under which a JSON file holds the digest of its other values
 FORMATS = {"config": 2, "labels": 3, "teacher": 3, "policy": 2, "due": 2}
+LARGEST = 1 << 26  # bytes of a JSON file
 SEALED_SINCE = 2  # the format from which on a JSON file must carry a digest
 REMEDIES = {  # what a message says of a damaged file, after its path
     "config": "is damaged or of another program: restore it, or start anew with --overwrite",
@@ -53,6 +54,8 @@ def read(kind: str, path: Path) -> Values:
         UserError: it cannot be read, is damaged, was changed since it was written, or is newer than this program.
     """
     try:
+        if (size := path.stat().st_size) > LARGEST:
+            raise damaged(kind, path, f"{size:,} bytes, more than any such file has")
         values = json.loads(path.read_text(encoding="utf-8"))
         if isinstance(values, dict):
             number, told = values.get("format", 0), values.pop(DIGEST, None)

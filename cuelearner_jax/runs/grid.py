@@ -129,19 +129,21 @@ def load(folder: Path, find: Callable[[str], Task]) -> tuple[Task, RunConfig, Gr
         if values["split"] not in SPLITS or values["total_steps"] != config.schedule.total_steps:
             raise ValueError("what it says of its evaluations makes no sense")
         configuration.check(config)
-        _check_room(path, config.sizes, grid)
+        _check_room(path, config, grid)
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise formats.damaged("config", path) from error
     return task, config, grid
 
 
-def _check_room(path: Path, sizes: Sizes, grid: Grid) -> None:
-    """Raises UserError if the networks of a run, or a search of their actions, are more than memory holds."""
+def _check_room(path: Path, config: RunConfig, grid: Grid) -> None:
+    """Raises UserError if a run's networks, a search of actions, or an evaluation are more than memory holds."""
+    sizes, envs = config.sizes, config.schedule.eval_envs
     layers, remedy = sizes.q_layers, "restore the file"
     lanes, weights = len(grid.seeds) * max(1, len(grid.labels)), sum(layers) + math.prod(layers[:2])
     check_room(f"{path} has {lanes:,} lanes of layers {layers}", 4 * weights * lanes, remedy)
     told = f"{path} has {sizes.directions:,} sizes.directions"
     check_room(told, 8 * max(layers) * sizes.directions, remedy)  # of a layer, before and after its activation
+    check_room(f"{path} has {envs:,} schedule.eval_envs", 8 * max(layers) * envs, remedy)
 
 
 def _grid(values: dict[str, Any]) -> Grid:

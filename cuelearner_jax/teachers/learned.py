@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,6 +12,8 @@ from jaxtyping import Array, Float
 from cuelearner_jax import actions as geometry
 from cuelearner_jax.agent.networks import applied, q_network
 from cuelearner_jax.agent.view import seen
+from cuelearner_jax.config import LARGEST, MOST_LAYERS
+from cuelearner_jax.errors import UserError
 from cuelearner_jax.types import Params
 
 
@@ -42,6 +45,29 @@ class TeacherConfig:
     """Share of shots played in a uniform direction."""
     spread_deg: float = 2.0
     """Largest standard deviation of the directions tried round a promising one [deg]."""
+
+
+def check_config(config: TeacherConfig) -> None:
+    """Raises UserError for values that cannot work."""
+    for name in ("tables", "search", "directions", "memory", "updates", "batch_size", "rounds"):
+        if not 1 <= getattr(config, name) <= LARGEST:
+            raise UserError(f"teacher.{name} is {getattr(config, name)}: give a positive number of at most {LARGEST}")
+    if config.rounds * config.updates > LARGEST:
+        raise UserError(
+            f"teacher.rounds times teacher.updates is {config.rounds * config.updates}: give at most {LARGEST}"
+        )
+    if not 4 <= config.tries <= LARGEST:
+        raise UserError(
+            f"teacher.tries is {config.tries}: give at least 4 (the best, a promising one, two uniform ones)"
+        )
+    if not 1 <= len(config.layers) <= MOST_LAYERS or min(config.layers) < 1 or max(config.layers) > LARGEST:
+        raise UserError(f"teacher.layers: give at least one layer of positive width, at most {MOST_LAYERS}")
+    if not 0 < config.learning_rate < math.inf:
+        raise UserError(f"teacher.learning_rate is {config.learning_rate}: give a positive, finite number")
+    if not 0 <= config.explore_probability <= 1:
+        raise UserError(f"teacher.explore_probability is {config.explore_probability}: give a number from 0 to 1")
+    if not 0 <= config.spread_deg <= 180:
+        raise UserError(f"teacher.spread_deg is {config.spread_deg}: give a number from 0 to 180")
 
 
 def expected_reward(

@@ -19,7 +19,8 @@ from cuelearner_jax.config import from_json, to_json
 from cuelearner_jax.errors import NotFinite, UserError
 from cuelearner_jax.records import formats
 from cuelearner_jax.records.checkpoint import checkpoints
-from cuelearner_jax.teachers.learned import LearnedTeacher, TeacherConfig
+from cuelearner_jax.records.room import check_room
+from cuelearner_jax.teachers.learned import LearnedTeacher, TeacherConfig, check_config
 from cuelearner_jax.teachers.program import Trainer
 
 ABOUT = "teacher.json"
@@ -51,8 +52,11 @@ def load(folder: Path, env: Any, aim_error: Any, habit: Any) -> LearnedTeacher:
     about = _about(folder)
     try:
         config = from_json(TeacherConfig, about["config"])
-    except (ValueError, KeyError, TypeError) as error:
-        raise formats.damaged("teacher", folder / ABOUT) from error
+        check_config(config)
+    except (ValueError, KeyError, TypeError, UserError) as error:
+        raise formats.damaged("teacher", folder / ABOUT, error if isinstance(error, UserError) else "") from error
+    told = f"{folder / ABOUT} has {config.directions:,} directions"
+    check_room(told, 8 * max(config.layers) * config.directions, "restore the file")  # as of a run's (`grid.load`)
     template = jax.eval_shape(Trainer(config).init, env, jax.random.key(0)).params
     halves = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, jnp.float16), template)
     with checkpoints(folder / "network", read_only=True) as saved:

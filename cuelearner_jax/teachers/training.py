@@ -25,7 +25,7 @@ from cuelearner_jax.records.provenance import provenance
 from cuelearner_jax.records.whole import replacing, unreadable
 from cuelearner_jax.task import Task
 from cuelearner_jax.teachers import stored
-from cuelearner_jax.teachers.learned import LearnedTeacher, TeacherConfig
+from cuelearner_jax.teachers.learned import LearnedTeacher, TeacherConfig, check_config
 from cuelearner_jax.teachers.program import TeacherProgram, Trainer, finished, make_program
 from cuelearner_jax.terminal import Interrupted, console, interruptible, progress_bars
 
@@ -37,25 +37,7 @@ TRAINING, HISTORY = "training", "history.json"  # kept in the folder until the t
 
 def check(config: TeacherConfig, seed: int = 0, eval_steps: int = 1) -> None:
     """Raises UserError for values that cannot work."""
-    for name in ("tables", "search", "directions", "memory", "updates", "batch_size", "rounds"):
-        if not 1 <= getattr(config, name) <= LARGEST:
-            raise UserError(f"teacher.{name} is {getattr(config, name)}: give a positive number of at most {LARGEST}")
-    if config.rounds * config.updates > LARGEST:
-        raise UserError(
-            f"teacher.rounds times teacher.updates is {config.rounds * config.updates}: give at most {LARGEST}"
-        )
-    if not 4 <= config.tries <= LARGEST:
-        raise UserError(
-            f"teacher.tries is {config.tries}: give at least 4 (the best, a promising one, two uniform ones)"
-        )
-    if not config.layers or min(config.layers) < 1 or max(config.layers) > LARGEST:
-        raise UserError("teacher.layers: give at least one layer of positive width")
-    if not 0 < config.learning_rate < math.inf:
-        raise UserError(f"teacher.learning_rate is {config.learning_rate}: give a positive, finite number")
-    if not 0 <= config.explore_probability <= 1:
-        raise UserError(f"teacher.explore_probability is {config.explore_probability}: give a number from 0 to 1")
-    if not 0 <= config.spread_deg <= 180:
-        raise UserError(f"teacher.spread_deg is {config.spread_deg}: give a number from 0 to 180")
+    check_config(config)
     if not 0 <= seed <= LARGEST:
         raise UserError(f"--seed is {seed}: give a number from 0 to {LARGEST}")
     if not 1 <= eval_steps <= LARGEST or eval_steps % min(EVAL_ENVS, eval_steps):

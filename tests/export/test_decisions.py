@@ -436,3 +436,20 @@ def test_from_python(tmp_path):
         cl.export_policy(narrow, tmp_path / "other", world)
     with pytest.raises(UserError, match="cannot be read"):
         cl.load_exported(tmp_path / "other")
+
+
+def test_what_declares_more_than_a_decision_has_is_refused_before_it_is_unpacked(folder, tmp_path, monkeypatch):
+    there = copied(folder / "numpy", tmp_path)
+    monkeypatch.setattr(runner, "LARGEST_FILE", 200_000)  # bytes, unpacked
+    np.savez_compressed(there / "golden.npz", obs=np.zeros((50_000, 2)), actions=np.zeros((1, 2)))
+    sealed(there, lambda told: None)
+    monkeypatch.setattr(runner, "RUNNERS", dict.fromkeys(runner.RUNNERS, lambda *_: lambda batch: batch))
+    monkeypatch.setattr(np, "load", None)
+    with pytest.raises(UserError, match=r"golden.npz declares more than 200,000 bytes"):
+        contract.checked(there)
+    monkeypatch.setattr(runner, "LARGEST_CONTRACT", 100)
+    with pytest.raises(UserError, match=r"contract.json is damaged or was changed"):
+        contract.checked(there)
+    for name, attributes in (("broadcast", {"shape": [1 << 33, 2]}), ("pad", {"low": [0], "high": [1 << 40]})):
+        with pytest.raises(runner.ContractError, match=r"makes an array of [\d,]* entries"):
+            runner.compiled([[name, ["obs", "zero"], ["wide"], attributes]])

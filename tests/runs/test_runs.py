@@ -274,6 +274,7 @@ def test_a_missing_teacher_is_said_before_anything_is_deleted(out):
     [
         ("grid", {"seeds": list(range(200_000))}, "has [0-9,]*00,000 lanes of layers"),
         ("sizes", {"directions": 2**31 - 1}, "has 2,147,483,647 sizes.directions"),
+        ("schedule", {"eval_envs": 2**30, "eval_steps": 2**30}, "has 1,073,741,824 schedule.eval_envs"),
         ("sizes", {"q_layers": [2**30, 2**30]}, "lanes of layers .1073741824, 1073741824., which needs"),
     ],
 )
