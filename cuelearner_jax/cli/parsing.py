@@ -20,7 +20,7 @@ from cuelearner_jax import plugins
 from cuelearner_jax.errors import UserError, closest, no_space
 from cuelearner_jax.guidance import registry as guidances
 from cuelearner_jax.policies import policy_of
-from cuelearner_jax.records import policy_folders
+from cuelearner_jax.records import policy_folders, whole
 from cuelearner_jax.runs.trained import POLICIES, PolicySource
 from cuelearner_jax.task import Preset, Task
 from cuelearner_jax.tasks import registry
@@ -184,6 +184,7 @@ def source_of(arguments: list[str], command: str, kind: type) -> tuple[PolicySou
     if rest and (known is None or not rest[0].startswith("-")):
         name, rest = rest[0], rest[1:]
         folder = Path(name)
+        whole.check_not_aside(folder)
         holds = (folder / "config.json").exists() or policy_folders.is_one(folder)
         if holds or (folder.exists() and name not in registry.names()):
             return _of_folder(folder, known, code), rest

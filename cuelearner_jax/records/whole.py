@@ -21,7 +21,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 
-from cuelearner_jax.errors import UserError
+from cuelearner_jax.errors import UserError, no_space
 from cuelearner_jax.records.locks import held, locked
 from cuelearner_jax.signals import saving
 from cuelearner_jax.terminal import console
@@ -155,6 +155,32 @@ def is_used(folder: Path) -> bool:
 
 
 @contextmanager
+def _writable(told: Path) -> Iterator[None]:
+    """Raises UserError where the file system cannot have a folder; a full disk is told as everywhere."""
+    try:
+        yield
+    except (OSError, RuntimeError) as error:  # RuntimeError: links in a circle
+        if no_space(error):
+            raise
+        why = getattr(error, "strerror", None) or "links that lead in a circle"
+        raise UserError(f"{told} cannot be written ({why}): give another --out") from error
+
+
+def check_not_aside(folder: Path) -> None:
+    """Raises UserError for a folder whose replacement was cut short, so that what was there stands aside."""
+    try:
+        place = folder.resolve()
+        if not place.name or is_used(place) or not (old := beside(place, "old")).exists():
+            return
+    except (OSError, RuntimeError):  # a name that is too long, or links in a circle: nothing can stand there
+        return
+    raise UserError(
+        f"{folder}: replacing it was cut short, and the folder that was there stands aside as {old}: "
+        "rename it back, or give the command that was cut short again"
+    )
+
+
+@contextmanager
 def place_of(folder: Path, check: Callable[[Path], None], overwrite: bool = False) -> Iterator[Place]:
     """Keeps the place of a folder for this process while it works on what goes there (`Place.writing`).
 
@@ -166,12 +192,16 @@ def place_of(folder: Path, check: Callable[[Path], None], overwrite: bool = Fals
     Raises:
         UserError: as `check`, or another process has the place.
     """
-    told, folder = folder, folder.resolve()
+    told = folder
+    with _writable(told):
+        folder = folder.resolve()
     check(told)
     missing = [parent for parent in folder.parents if not parent.exists()]
-    folder.parent.mkdir(parents=True, exist_ok=True)
     try:
-        with held(beside(folder, "lock"), told, stays=False):
+        with contextlib.ExitStack() as stack:
+            with _writable(told):
+                folder.parent.mkdir(parents=True, exist_ok=True)
+                stack.enter_context(held(beside(folder, "lock"), told, stays=False))
             place = Place(folder, lambda: check(told), overwrite)
             place.recover()
             check(told)  # nobody else who asks can change it any more

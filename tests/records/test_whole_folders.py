@@ -179,3 +179,17 @@ def test_a_signal_that_ends_the_process_leaves_no_lock(tmp_path, monkeypatch):
         assert names(tmp_path) == [".out.lock"]
         signals._leave(2)
         assert names(tmp_path) == []
+
+
+def test_readers_say_where_a_folder_stands_aside_and_writers_put_it_back(tmp_path, killed_at):
+    write(tmp_path / "out", "one")
+    revive = killed_at(3)  # the new folder is made, the old one is moved aside
+    with pytest.raises(Killed):
+        write(tmp_path / "out", "two")
+    revive()
+    assert not (tmp_path / "out").exists()
+    with pytest.raises(UserError, match=r"out: replacing it was cut short, .* stands aside as .*\.out\.old: rename it"):
+        whole.check_not_aside(tmp_path / "out")
+    with whole.place_of(tmp_path / "out", check, overwrite=True):
+        whole.check_not_aside(tmp_path / "out")
+    assert (tmp_path / "out" / "ours").read_text() == "one"
