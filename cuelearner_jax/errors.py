@@ -13,11 +13,24 @@ FILE_SYSTEM = (
 )
 
 
+def one_line(text: str) -> str:
+    """The text with every character that is not printable as its escape, for instance a newline as `\\n`."""
+    return "".join(
+        character if character.isprintable() else character.encode("unicode_escape").decode("ascii")
+        for character in text
+    )
+
+
 class UserError(Exception):
     """Bad input: its message is one clear line that says what is wrong and what to do.
 
-    The command line prints the message alone, without a traceback, and exits with status 2.
+    The command line prints the message alone, without a traceback, and exits with status 2. Whatever a path or a name
+    in the message holds, there are no line breaks and no escape sequences in it.
     """
+
+    def __init__(self, message: object = "") -> None:
+        """Keeps the message, on one line."""
+        super().__init__(one_line(" ".join(str(message).splitlines())))
 
 
 class NotFinite(Exception):
@@ -75,8 +88,11 @@ def raised_by(named: str, error: Exception) -> UserError:
         named: what the code is, for instance "policy my_policy".
         error: what it raised.
     """
-    said = " ".join(str(error).split())[:200]
-    return UserError(f"{named} raised {type(error).__name__}{': ' if said else ''}{said}: mend it first")
+    try:
+        words = " ".join(str(error).split())[:200]
+    except Exception:  # it has not even words
+        words = ""
+    return UserError(f"{named} raised {type(error).__name__}{': ' if words else ''}{words}: mend it first")
 
 
 def closest(word: str, known: Iterable[str]) -> str:

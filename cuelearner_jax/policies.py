@@ -270,7 +270,7 @@ class Opaque(struct.PyTreeNode):
                 )
             return chosen
         except UserError as error:
-            user_code.leave(error)
+            user_code.leave(named(self), error)
             return nothing
 
     def _called(self, rows: np.ndarray) -> np.ndarray:
@@ -289,7 +289,7 @@ class Opaque(struct.PyTreeNode):
             found = as_array(chosen)
         except (TypeError, ValueError) as error:
             raise UserError(f"{named(self)} returned {shown(chosen)}: return an array of shape {wanted}") from error
-        if found.dtype.kind not in "fiu" and not jnp.issubdtype(found.dtype, jnp.floating):
+        if getattr(found.dtype, "kind", "key") not in "fiu" and not jnp.issubdtype(found.dtype, jnp.floating):
             raise UserError(f"{named(self)} returned {found.dtype} numbers: return real ones, of shape {wanted}")
         if found.shape != wanted:
             raise UserError(

@@ -14,7 +14,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from cuelearner_jax.signals import Interrupted, interruptible
 
-__all__ = ["Interrupted", "abandon", "console", "interruptible", "one_line", "progress_bars"]
+__all__ = ["Interrupted", "abandon", "console", "interruptible", "progress_bars"]
 
 
 class _StandardError:
@@ -56,14 +56,6 @@ def abandon(stream: Any) -> None:
 # Text is the user's in parts (paths, names of tasks): nothing in it is markup.
 PLAIN: dict[str, Any] = {"markup": False, "emoji": False, "highlight": False, "soft_wrap": True}
 console = Console(file=cast(IO[str], _StandardError()), **PLAIN)
-
-
-def one_line(text: str) -> str:
-    """The text with every character that is not printable as its escape, for instance a newline as `\\n`."""
-    return "".join(
-        character if character.isprintable() else character.encode("unicode_escape").decode("ascii")
-        for character in text
-    )
 
 
 @contextmanager

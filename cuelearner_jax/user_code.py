@@ -2,14 +2,18 @@
 
 Such code runs inside compiled programs, from which no exception finds its way out in one line. A function that is
 called back on the host leaves what it raised here and gives NaN; NaN spreads, and whoever looks at a program's results
-on the host asks here first. What raises while JAX traces is told apart by the frames of its traceback.
+on the host asks here first. What raises while JAX traces is told apart by the frames of its traceback. Threads may call
+policies at the same time: each is then told of its own policy alone.
 """
 
 from __future__ import annotations
 
 import functools
 import sysconfig
-from collections.abc import Callable
+import threading
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
 from typing import Any, ParamSpec, TypeVar
@@ -29,25 +33,51 @@ _PACKAGE = Path(__file__).parent
 _OURS = (_PACKAGE, *(_PACKAGE.parent / place / "cuelearner_envs" for place in ("", "envs")))
 _LIBRARIES = tuple(Path(sysconfig.get_path(name)) for name in ("stdlib", "purelib", "platlib"))
 
-_left: list[UserError] = []  # by functions on the host, which other threads call
+_left: dict[str, UserError] = {}  # by functions on the host, which other threads call; by what messages call them
+_working: Counter[int] = Counter()  # calls of `told` functions at work, by thread
+_counting = threading.Lock()
 
 
-def leave(error: UserError) -> None:
-    """Keeps what a function on the host raised until `tell` is called; of several, the first."""
-    _left.append(error)
+def leave(whose: str, error: UserError) -> None:
+    """Keeps what a function on the host raised until `tell` is called; of several errors of one function, the first."""
+    _left.setdefault(whose, error)
 
 
 def is_waiting() -> bool:
-    """Return whether a function on the host has failed since `tell` was last called."""
-    return bool(_left)
+    """Return whether a function on the host has failed since `tell` was last called, and nobody else may be meant."""
+    return bool(_left) and _is_alone()
 
 
-def tell() -> None:
-    """Raises the UserError that a function on the host left, if there is one, and forgets all of them."""
-    if _left:
-        first = _left[0]
-        _left.clear()
-        raise first
+def tell(whose: str = "") -> None:
+    """Raises the UserError that a function on the host left, if there is one, and forgets all of them.
+
+    While other threads work, only the error of the policy `whose` is raised and forgotten.
+    """
+    names = list(_left) if _is_alone() else [whose] if whose in _left else []
+    first = [error for name in names if (error := _left.pop(name, None))][:1]
+    if first:
+        raise first[0]
+
+
+def _is_alone() -> bool:
+    with _counting:
+        return len(_working) <= 1
+
+
+@contextmanager
+def _at_work() -> Iterator[None]:
+    own = threading.get_ident()
+    with _counting:
+        _working[own] += 1
+        if len(_working) == 1 and _working[own] == 1:
+            _left.clear()
+    try:
+        yield
+    finally:
+        with _counting:
+            _working[own] -= 1
+            if not _working[own]:
+                del _working[own]
 
 
 def told(function: Callable[P, T]) -> Callable[P, T]:
@@ -55,15 +85,15 @@ def told(function: Callable[P, T]) -> Callable[P, T]:
 
     @functools.wraps(function)
     def wrapped(*arguments: P.args, **named: P.kwargs) -> T:
-        _left.clear()
-        try:
-            found = function(*arguments, **named)
-        except Exception as error:
+        with _at_work():
+            try:
+                found = function(*arguments, **named)
+            except Exception as error:
+                tell()
+                raise_in_one_line(error)
+                raise
             tell()
-            raise_in_one_line(error)
-            raise
-        tell()
-        return found
+            return found
 
     return wrapped
 
@@ -105,7 +135,7 @@ def check_actions(actions: Any, whose: str) -> None:
         actions: on the host, of any shape; or whether all of them are finite.
         whose: for the message, for instance "policy my_policy".
     """
-    tell()
+    tell(whose)
     found = np.asarray(actions)
     if not (found if found.dtype == bool else np.isfinite(found)).all():
         raise UserError(f"{whose} gave actions that are not finite, or zero: give a direction in every situation")

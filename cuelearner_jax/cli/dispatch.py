@@ -21,7 +21,7 @@ from cuelearner_jax.cli.parsing import HELP, summary
 from cuelearner_jax.errors import NotFinite, UserError, blamed, closest
 from cuelearner_jax.runs.cluster import JobsFailed
 from cuelearner_jax.tasks import registry
-from cuelearner_jax.terminal import Interrupted, abandon, console, one_line
+from cuelearner_jax.terminal import Interrupted, abandon, console
 
 # Each is a file beside this one with `run(arguments)` and `OPTIONS`, the options of what it does by its full name.
 COMMANDS = (
@@ -39,7 +39,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         finally:
             sys.stdout.flush()  # here, where it is heard if nobody reads
     except UserError as error:
-        console.print(f"error: {one_line(' '.join(str(error).splitlines()))}")
+        console.print(f"error: {error}")
         return 2
     except (Interrupted, JobsFailed, NotFinite) as error:
         console.print(str(error))

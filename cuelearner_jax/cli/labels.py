@@ -15,7 +15,7 @@ from rich.table import Table
 from cuelearner_jax.cli.parsing import HELP, out, parse, summary
 from cuelearner_jax.cli.shared_options import Flag
 from cuelearner_jax.config import Scalars
-from cuelearner_jax.errors import UserError, closest
+from cuelearner_jax.errors import UserError, closest, one_line
 from cuelearner_jax.labelling import comparing
 from cuelearner_jax.records import label_files
 from cuelearner_jax.records.label_checks import UNDONE, UNSURE
@@ -24,7 +24,7 @@ from cuelearner_jax.records.whole import replacing
 from cuelearner_jax.report.escaping import cell
 from cuelearner_jax.task import Task, shape_of
 from cuelearner_jax.tasks import registry
-from cuelearner_jax.terminal import console, one_line
+from cuelearner_jax.terminal import console
 
 Files = Annotated[tuple[Path, ...], tyro.conf.Positional]
 

@@ -18,6 +18,7 @@ from cuelearner_jax.errors import UserError
 from cuelearner_jax.face import arguments
 from cuelearner_jax.face.worlds import World, a_world
 from cuelearner_jax.policies import Policy, acted, named
+from cuelearner_jax.records import whole
 from cuelearner_jax.runs import trained
 from cuelearner_jax.task import Task, shape_of
 from cuelearner_jax.tasks import registry
@@ -41,8 +42,11 @@ class CallablePolicy:
     asks: bool = False  # does it ask a teacher, who looks at the true state?
 
     def __post_init__(self) -> None:
-        """Raises UserError for a policy that is none."""
+        """Raises UserError for a policy that is none, or a description of observations that is none."""
         arguments.policy("policy", self.policy)
+        if not all(isinstance(part, Quantity) for part in arguments.several("observation", self.observation, "slices")):
+            raise arguments.refused("observation", self.observation, "slices, as a world's observation has them")
+        arguments.flag("asks", self.asks)
 
     @user_code.told
     def __call__(self, obs: Any, key: PRNGKeyArray | None = None) -> np.ndarray:
@@ -63,7 +67,7 @@ class CallablePolicy:
         rows = arguments.observations("obs", obs, sum(quantity.size for quantity in self.observation) or None)
         batch = rows[None] if rows.ndim == 1 else rows
         key = jax.random.key(0) if key is None else arguments.key("key", key)
-        chosen = np.asarray(_act(self.policy, key, jnp.asarray(batch)))
+        chosen = np.array(_act(self.policy, key, jnp.asarray(batch)))  # a copy, which the caller may write in
         user_code.check_actions(chosen, named(self.policy))
         return chosen[0] if rows.ndim == 1 else chosen
 
@@ -78,6 +82,21 @@ def as_policy(given: Any, name: str = "policy") -> Policy:
     Raises UserError, which says the argument's name, for what is none of them.
     """
     return given.policy if isinstance(given, CallablePolicy) else arguments.policy(name, given)
+
+
+def entries_of(policy: Any) -> int:
+    """Entries of the observations that a policy expects, 0 where that is not known."""
+    return sum(quantity.size for quantity in policy.observation) if isinstance(policy, CallablePolicy) else 0
+
+
+def as_policy_in(given: Any, env: Any) -> Policy:
+    """`as_policy` for a world. Raises UserError for a policy of other observations, or one that cannot act there."""
+    policy, seen = as_policy(given), entries_of(given)
+    own = sum(quantity.size for quantity in getattr(env, "observation", ()))
+    if seen and own and seen != own:
+        raise UserError(f"the policy's observations have {seen} entries, this world's {own}: keep its structure")
+    arguments.acts_in("policy", policy, env)
+    return policy
 
 
 @user_code.told
@@ -124,6 +143,7 @@ def load_policy(
         arguments.instance("task", task, Task, "a task, or its name")
     if world is not None:
         a_world("world", world)
+    whole.check_not_aside(path)
     if not path.exists():
         raise UserError(f"folder {path} does not exist: give the folder of a run, or of an adapted policy")
     find = lambda name: task if task and task.name == name else registry.find(name)  # noqa: E731

@@ -19,7 +19,7 @@ from cuelearner_jax.config import GuideSizes, Scalars
 from cuelearner_jax.environment import Environment, spaces_of
 from cuelearner_jax.errors import UserError, closest
 from cuelearner_jax.face import arguments
-from cuelearner_jax.face.acting import CallablePolicy, as_policy
+from cuelearner_jax.face.acting import CallablePolicy, as_policy, as_policy_in
 from cuelearner_jax.face.feedback import Labels, diverged, given_settings, label_path, labels_of, rows_of, settings
 from cuelearner_jax.face.worlds import World
 from cuelearner_jax.guidance import given, registry
@@ -138,8 +138,9 @@ def adapt(
     kind = registry.resolve(arguments.text("guidance", guidance))
     if not kind.asks:
         raise UserError(f"guidance {guidance!r} asks nothing that could be learned from: choose another")
+    as_policy_in(policy, place.env)
     if teacher is not None:
-        arguments.teacher("teacher", teacher)
+        arguments.answers_in("teacher", arguments.teacher("teacher", teacher), place.env)
     file = label_files.read(label_path(labels)) if isinstance(labels, str | os.PathLike) else None
     if file is not None:
         eps_deg = file.eps_deg if eps_deg is None else eps_deg

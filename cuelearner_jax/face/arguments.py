@@ -18,12 +18,15 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Float, PRNGKeyArray
 
+from cuelearner_jax import user_code
 from cuelearner_jax.actions import Actions
-from cuelearner_jax.config import LARGEST_FLOAT, check_types
+from cuelearner_jax.config import LARGEST_FLOAT, plain, settled
 from cuelearner_jax.errors import UserError, closest, shown
 from cuelearner_jax.policies import Policy, policy_of
 from cuelearner_jax.runs.grid import LARGEST_BUDGET, LARGEST_SEED
 from cuelearner_jax.types import Teacher
+
+LONGEST = 200  # characters of a name
 
 KindT = TypeVar("KindT")
 
@@ -47,8 +50,8 @@ def flag(name: str, value: Any) -> bool:
 
 def text(name: str, value: Any, known: Iterable[str] = ()) -> str:
     """A word: one of those that are known, if any are named."""
-    if not isinstance(value, str) or not value or not value.isprintable():
-        raise refused(name, value, "a name, in printable characters")
+    if not isinstance(value, str) or not 0 < len(value) <= LONGEST or not value.isprintable():
+        raise refused(name, value, f"a name, in up to {LONGEST} printable characters")
     if (known := list(known)) and value not in known:
         raise UserError(f"{name} is {shown(value)}{closest(value, known)}")
     return value
@@ -82,10 +85,10 @@ def angle(name: str, value: Any) -> float:
 
 def number(name: str, value: Any, most: float, wanted: str) -> float:
     """A number above 0, up to a bound."""
-    plain = value.item() if isinstance(value, np.generic) else value
-    if isinstance(plain, bool) or not isinstance(plain, int | float) or not 0 < plain <= most:  # NaN is neither
+    found = plain(value)
+    if isinstance(found, bool) or not isinstance(found, int | float) or not 0 < found <= most:  # NaN is neither
         raise refused(name, value, wanted)
-    return float(plain)
+    return float(found)
 
 
 def several(name: str, values: Any, of_what: str) -> list[Any]:
@@ -100,6 +103,12 @@ def path(name: str, value: Any) -> Path:
     given = os.fspath(value) if isinstance(value, str | os.PathLike) else None
     if not isinstance(given, str) or not given or "\0" in given:
         raise refused(name, value, "a path, as text or pathlib.Path")
+    try:
+        given.encode()
+        Path(given).exists()
+    except (OSError, UnicodeError) as error:
+        why = getattr(error, "strerror", None) or "its name is not UTF-8"
+        raise UserError(f"{name} can be no path ({why}): give another") from error
     return Path(given)
 
 
@@ -116,19 +125,27 @@ def like(name: str, value: Any, shapes: Any) -> Any:
     """A tree of arrays such as these shapes, without more axes."""
     leaves, structure = jax.tree.flatten(value)
     wanted, known = jax.tree.flatten(shapes)
-    if structure != known or any(np.shape(one) != other.shape for one, other in zip(leaves, wanted, strict=True)):
+    if structure != known or not all(map(_is_like, leaves, wanted)):
         raise refused(name, value, "a state of this world, as its reset and step give them")
     return value
+
+
+def _is_like(leaf: Any, shape: Any) -> bool:
+    counts = isinstance(leaf, bool | int | float | jax.Array)  # traced ones too
+    of_numpy = isinstance(leaf, np.ndarray | np.generic) and leaf.dtype.kind in "biuf"
+    return (counts or of_numpy) and np.shape(leaf) == shape.shape
 
 
 def numbers(name: str, value: Any) -> Float[np.ndarray, "..."]:
     """Numbers that single precision holds, of any shape, all of them finite."""
     try:
         found = np.asarray(value)
-    except (TypeError, ValueError, OverflowError):  # rows of different lengths
+    except Exception:  # rows of different lengths, an array of JAX's that was deleted, whatever else can be no array
         found = np.empty(0, object)
-    if found.dtype.kind not in "fiu":
+    if found.dtype.kind not in "fiu" and not jnp.issubdtype(found.dtype, jnp.floating):  # bfloat16 is of no kind
         raise refused(name, value, "an array of real numbers")
+    if isinstance(value, np.ma.MaskedArray) and np.ma.getmaskarray(value).any():
+        raise UserError(f"{name} is an array with masked numbers: leave these rows out")
     if not (np.abs(found.astype(np.float64)) <= LARGEST_FLOAT).all():
         raise UserError(f"{name} holds numbers that are not finite (in single precision): leave these rows out")
     return found.astype(np.float32)
@@ -153,6 +170,31 @@ def action(name: str, value: Any, space: Actions) -> Any:
     return found
 
 
+def acts_in(name: str, policy: Any, env: Any) -> None:
+    """Raises UserError for a policy that cannot act in a world, without acting."""
+    _tried(name, "act", env, policy.act)
+
+
+def answers_in(name: str, teacher: Any, env: Any) -> None:
+    """Raises UserError for a teacher that cannot answer in a world, without asking."""
+    _tried(name, "answer", env, lambda key, states, obs: jax.vmap(teacher.best_action)(states, obs))
+
+
+def _tried(name: str, verb: str, env: Any, function: Any) -> None:
+    """Traces a function of a key, states (1, ...) and observations (1, obs) of a world."""
+    own = jax.random.key(0)
+    states, obs = jax.eval_shape(lambda: jax.vmap(env.reset)(own[None]))
+    try:
+        jax.eval_shape(function, own, states, obs)
+    except UserError:
+        raise
+    except Exception as error:
+        user_code.raise_in_one_line(error)
+        raise UserError(
+            f"{name} cannot {verb} in this world, whose observations have {obs.shape[-1]} entries: give one made for it"
+        ) from error
+
+
 def policy(name: str, value: Any) -> Policy:
     """Anything that acts as a policy, as a policy: see `policies.policy_of`."""
     try:
@@ -163,12 +205,12 @@ def policy(name: str, value: Any) -> Policy:
 
 def teacher(name: str, value: Any) -> Teacher:
     """Who answers."""
-    if isinstance(value, type) or not callable(getattr(value, "best_action", None)):
+    leaf = any(leaf is value for leaf in jax.tree.leaves(value))  # no pytree: it cannot be given to a program
+    if isinstance(value, type) or leaf or not callable(getattr(value, "best_action", None)):
         raise refused(name, value, "a teacher, for instance teacher_of(world)")
     return value
 
 
 def settings(name: str, value: Any, kind: type[KindT]) -> KindT:
     """A group of settings with values of its fields' types; their bounds are checked where they are used."""
-    check_types(instance(name, value, kind, f"a cuelearner_jax.config.{kind.__name__}"), name)
-    return value
+    return settled(instance(name, value, kind, f"a cuelearner_jax.config.{kind.__name__}"), name)

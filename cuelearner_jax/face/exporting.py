@@ -7,11 +7,11 @@ from typing import Any
 
 from cuelearner_jax import user_code
 from cuelearner_jax.config import to_json
-from cuelearner_jax.environment import Quantity, action_of
+from cuelearner_jax.environment import action_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.export import contract, decisions, runner
 from cuelearner_jax.face import arguments
-from cuelearner_jax.face.acting import CallablePolicy, as_policy
+from cuelearner_jax.face.acting import as_policy, as_policy_in
 from cuelearner_jax.face.worlds import World, a_world
 
 
@@ -31,13 +31,11 @@ def export_policy(policy: Any, out: str | Path, world: World, format: str = "sta
     Raises:
         UserError: the folder is in use; the policy acts at random, asks a teacher, holds Python code, or does not fit.
     """
-    out, acting = arguments.path("out", out), as_policy(policy)
+    out, _ = arguments.path("out", out), as_policy(policy)
     a_world("world", world)
     contract.check_request(arguments.text("format", format), out)
-    wanted, given = (sum(quantity.size for quantity in seen) for seen in (_seen(policy), world.observation))
-    if wanted not in (0, given):
-        raise UserError(f"the policy's observations have {wanted} entries, this world's {given}: keep its structure")
     env = world.env
+    acting = as_policy_in(policy, env)
     about = {"subject": type(policy).__name__, "world": {"name": world.task.name, **to_json(world.config)}}
     drawn = lambda: decisions.observations(env, acting)  # noqa: E731
     return contract.write(acting, env.observation, action_of(env), drawn, format, out, about)
@@ -55,8 +53,3 @@ def load_exported(folder: str | Path) -> runner.Decision:
     except runner.ContractError as error:
         raise UserError(str(error)) from error
     return decide
-
-
-def _seen(policy: Any) -> tuple[Quantity, ...]:
-    """What a policy expects to see; nothing where that is not known."""
-    return policy.observation if isinstance(policy, CallablePolicy) else ()

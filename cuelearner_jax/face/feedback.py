@@ -24,10 +24,10 @@ from cuelearner_jax.actions import DIRECTIONS
 from cuelearner_jax.adaptation import adapting, program
 from cuelearner_jax.agent.learning import all_finite
 from cuelearner_jax.config import GuideSizes, Scalars, check_guide
-from cuelearner_jax.environment import Spaces, spaces_of
+from cuelearner_jax.environment import Quantity, Spaces, spaces_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.face import arguments
-from cuelearner_jax.face.acting import CallablePolicy, as_policy
+from cuelearner_jax.face.acting import CallablePolicy, as_policy, as_policy_in, entries_of
 from cuelearner_jax.face.worlds import World, a_world
 from cuelearner_jax.guidance import given, registry
 from cuelearner_jax.guidance.answers import RELATIVE, check_teacher
@@ -100,6 +100,7 @@ def fit_feedback(
     rows = Label(*(jnp.asarray(part) for part in (labels.obs, labels.action, labels.answer[:, None], valid)))
     rows = rows.replace(eps_deg=None if own_eps is None else jnp.asarray(own_eps))
     k_init, k_fit = jax.random.split(jax.random.key(seed))
+    program.check_memory(sizes, jax.eval_shape(guidance.init, k_init))
     fit = jax.jit(lambda key, rows, former, scalars: guidance.fit(key, None, rows, former, scalars))
     return FeedbackModel(guidance, _finite(fit(k_fit, rows, guidance.init(k_init), scalars)), scalars, labels, sizes)
 
@@ -133,14 +134,16 @@ def ask(
     Raises:
         UserError: settings that make no sense, or with which the fit diverges.
     """
-    base, labels, seed = as_policy(policy), arguments.budget("labels", labels), arguments.seed("seed", seed)
+    as_policy(policy)
+    labels, seed = arguments.budget("labels", labels), arguments.seed("seed", seed)
     a_world("world", world)
     bound_deg = arguments.angle("bound_deg", bound_deg)
     sizes, scalars = settings(*given_settings(sizes, scalars, eps_deg))
     check_teacher(arguments.teacher("teacher", teacher), scalars)
     adapting.check_angles([bound_deg], scalars)
     env, guidance = world.env, _relative(sizes, spaces_of(world.env))
-    lanes, base = program.product(1, (seed,), (labels,), (bound_deg,)), Common(base)
+    arguments.answers_in("teacher", teacher, env)
+    lanes, base = program.product(1, (seed,), (labels,), (bound_deg,)), Common(as_policy_in(policy, env))
     block = program.begin(guidance, sizes, env, lanes)
     for _ in range(program.rounds(lanes, sizes)):
         block = program.ask_round(guidance, sizes, env, teacher, scalars, base, block)
@@ -174,7 +177,11 @@ def refine(policy: Any, model: FeedbackModel, bound_deg: float | None = None) ->
     base = as_policy(policy)
     arguments.instance("model", model, FeedbackModel, "a model, as cl.ask and cl.fit_feedback give it")
     bound_deg = None if bound_deg is None else arguments.angle("bound_deg", bound_deg)
-    reach = max(adapting.reach(base, model.labels.obs, model.labels.action), model.scalars.eps_deg)
+    labels = _checked_model(model).labels
+    width, seen = labels.obs.shape[1], entries_of(policy)
+    if seen not in (0, width):
+        raise UserError(f"model is of observations with {width} entries, the policy's have {seen}: give one of its own")
+    reach = max(adapting.reach(base, labels.obs, labels.action), model.scalars.eps_deg)
     if bound_deg is not None and bound_deg > reach * 1.05 and bound_deg > model.scalars.eps_deg:
         warnings.warn(
             f"the labels lie within {reach:.1f} degrees of this policy's own actions, and refinement may lead up to "
@@ -183,9 +190,15 @@ def refine(policy: Any, model: FeedbackModel, bound_deg: float | None = None) ->
             stacklevel=2,
         )
     bound = jnp.deg2rad(jnp.float32(reach if bound_deg is None else bound_deg))
-    observation = policy.observation if isinstance(policy, CallablePolicy) else ()
     guided = Guided(base, model.model, model.env, model.scalars, model.guidance, bound, model.sizes)
-    return CallablePolicy(guided, observation)
+    return CallablePolicy(guided, policy.observation if seen else (Quantity("observation", width, ""),))
+
+
+def _checked_model(model: FeedbackModel) -> FeedbackModel:
+    """A model whose parts are of their kinds. Raises UserError for any other."""
+    for name, kind in (("guidance", Guidance), ("scalars", Scalars), ("labels", Labels), ("model", GuidanceModel)):
+        arguments.instance(f"model.{name}", getattr(model, name), kind, "a model as cl.ask and cl.fit_feedback give it")
+    return model
 
 
 def _relative(sizes: GuideSizes, spaces: Spaces) -> Guidance:

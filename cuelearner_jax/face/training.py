@@ -101,7 +101,7 @@ def train(
     """
     a_world("world", world)
     if teacher is not None:
-        arguments.teacher("teacher", teacher)
+        arguments.answers_in("teacher", arguments.teacher("teacher", teacher), world.env)
     guidance = [arguments.text("guidance", kind) for kind in arguments.several("guidance", guidance, "kinds")]
     budgets = tuple(arguments.budget("labels", one) for one in arguments.several("labels", labels, "label budgets"))
     arguments.text("split", split, SPLITS)
@@ -154,7 +154,10 @@ def _seeds(seeds: int | Sequence[int]) -> tuple[int, ...]:
 
 def _config(world: World, config: RunConfig | str) -> RunConfig:
     if isinstance(config, RunConfig):
-        return config
+        groups = ("sizes", "scalars", "schedule")
+        return dataclasses.replace(
+            config, **{name: configuration.settled(getattr(config, name), name) for name in groups}
+        )
     presets = world.task.presets
     if not isinstance(config, str):
         raise arguments.refused("config", config, "a RunConfig, or the name of a preset")

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from cuelearner_jax import user_code
 from cuelearner_jax.actions import Actions
-from cuelearner_jax.config import check_types
+from cuelearner_jax.config import settled
 from cuelearner_jax.environment import Environment, Quantity, actions_of
 from cuelearner_jax.evaluate import SPLITS
 from cuelearner_jax.face import arguments
@@ -33,7 +33,7 @@ class World:
         """Raises UserError for a configuration that is none of the task's."""
         arguments.instance("task", self.task, Task, "a task, as tasks.registry finds it")
         arguments.instance("config", self.config, self.task.config, f"a {self.task.config.__name__}, or use cl.make")
-        check_types(self.config, "task")
+        object.__setattr__(self, "config", settled(self.config, "task"))
 
     @cached_property
     def env(self) -> Environment:
@@ -113,5 +113,5 @@ def teacher_of(source: World | Policy) -> Teacher:
     if isinstance(source, World):
         return source.task.make_teacher(source.config, source.env)
     if not hasattr(source, "policy"):  # of a `CallablePolicy`, which stands above this file
-        arguments.policy("source", source)
+        source = arguments.policy("source", source)
     return Teaching(source)

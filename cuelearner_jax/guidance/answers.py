@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 from cuelearner_jax import actions as geometry
 from cuelearner_jax.actions import DIRECTIONS
 from cuelearner_jax.config import GuideScalars, Scalars, TeacherFaults
-from cuelearner_jax.errors import UserError
+from cuelearner_jax.errors import UserError, shown
 from cuelearner_jax.guidance.bundle import AnswerForm
 from cuelearner_jax.types import EnvState, Teacher, ValuesDirections
 
@@ -46,12 +46,16 @@ def in_mind(
 
 def _taught(teacher: Any, given: Any, action: Float[Array, " action"]) -> Float[Array, " action"]:
     """A teacher's action; NaN where it is none. Raises UserError if it has another shape than actions have."""
-    given = jnp.asarray(given)
-    if given.shape != action.shape:
-        raise UserError(
-            f"teacher {type(teacher).__name__} gave an action of shape {given.shape}: give one of shape {action.shape}"
-        )
-    return geometry.only_actions(given)
+    wanted = f"give an action of shape {action.shape}, of real numbers"
+    try:
+        found = jnp.asarray(given)
+    except (TypeError, ValueError) as error:
+        raise UserError(f"teacher {type(teacher).__name__} gave {shown(given)}: {wanted}") from error
+    if found.shape != action.shape:
+        raise UserError(f"teacher {type(teacher).__name__} gave an action of shape {found.shape}: {wanted}")
+    if not jnp.issubdtype(found.dtype, jnp.floating) and not jnp.issubdtype(found.dtype, jnp.integer):
+        raise UserError(f"teacher {type(teacher).__name__} gave {found.dtype} numbers: {wanted}")
+    return geometry.only_actions(found.astype(action.dtype))
 
 
 def of_strength(scalars: GuideScalarsT, eps_deg: Float[Array, "*labels"] | None) -> GuideScalarsT:

@@ -17,9 +17,10 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from cuelearner_jax.errors import one_line
 from cuelearner_jax.records.room import check_size
 from cuelearner_jax.records.whole import replacing, unreadable
-from cuelearner_jax.terminal import console, one_line
+from cuelearner_jax.terminal import console
 
 Row = dict[str, Any]
 CHECKSUM = re.compile(rb', "crc": "([0-9a-f]{8})"}$')  # the end of a line

@@ -10,7 +10,7 @@ import html
 import re
 from typing import TypeVar
 
-from cuelearner_jax.terminal import one_line
+from cuelearner_jax.errors import one_line
 
 ValueT = TypeVar("ValueT")
 
