@@ -13,7 +13,7 @@ help:
 	@echo "make test-all     these, and those that only take long (about twice as long)"
 	@echo "make test-quick   those of them that compile next to nothing (under 3 minutes)"
 	@echo "make smoke        one tiny sweep of every form of feedback and of every adaptation on both tasks (minutes on 2 cores)"
-	@echo "make fuzz         damaged run folders by chance, CASES=2000 SEED=0 (hours on 2 cores)"
+	@echo "make fuzz         damaged folders and files by chance, CASES=2000 SEED=0 (hours on 2 cores)"
 	@echo "make lint         ruff and pyright"
 	@echo "make format       what ruff can put right by itself"
 	@echo "make docs         the pages of docs/ as a site, in site/ (under half a minute)"
@@ -61,6 +61,7 @@ CASES ?= 2000
 SEED ?= 0
 fuzz: $(VENV)/.tested
 	PYTHONPATH=tests JAX_PLATFORMS=cpu $(BIN)/python tests/damaged_folders.py --cases $(CASES) --seed $(SEED)
+	PYTHONPATH=tests JAX_PLATFORMS=cpu $(BIN)/python tests/damaged_files.py --cases $(CASES) --seed $(SEED)
 
 lint: $(VENV)/.tested
 	$(BIN)/ruff check .

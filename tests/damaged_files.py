@@ -1,0 +1,328 @@
+"""Damaged policy folders, exports, label files, teachers, tables: each reader says so, or gives what it gave before.
+
+python tests/damaged_files.py [--cases 2000] [--seed 0]   tries many cases and prints what went wrong
+
+A case is a kind of folder, one of its files and a kind of damage; where the file is JSON it may be signed anew. It goes
+wrong with anything but a UserError of one line, with a refusal that changed something, or with other values than those
+of the whole folder. What was signed anew may be believed, and then may give other values, but finite actions.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import copy
+import functools
+import hashlib
+import io
+import json
+import shutil
+import sys
+import tempfile
+import traceback
+from collections import Counter
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import probes
+import small_policies
+from damaged_folders import DAMAGES
+from probes import files_of
+
+import cuelearner_jax as cl
+from cuelearner_jax import config as configuration
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.export import runner
+from cuelearner_jax.policies import Heuristic
+from cuelearner_jax.records import guides, label_files, results
+from cuelearner_jax.runs import kept
+from cuelearner_jax.teachers import stored
+from cuelearner_jax.teachers.learned import LearnedTeacher, TeacherConfig
+from cuelearner_jax.teachers.program import Trainer
+
+ANGLES = np.linspace(0.0, 6.0, 12)
+SEEN = np.stack([np.cos(ANGLES), np.sin(ANGLES)], -1).astype(np.float32)
+LANES, STEP = 2, 48
+ROW = {"seed": 0, "said": "answer", "seconds": 1.5, "who": "Ada", "when": "2026-01-01T00:00:00+00:00"}
+
+
+class Case(NamedTuple):
+    """What is done to which file."""
+
+    kind: str
+    file: str  # relative to the folder
+    damage: str
+    at: int  # where, as a share of 2^32
+
+
+# --- what is written, and what its readers give ----------------------------------------------------------------------
+
+
+def _policy(folder: Path) -> None:
+    small_policies.write(folder)
+
+
+def _acts(folder: Path) -> Any:
+    return cl.load_policy(folder, task=small_policies.TASK)(SEEN)
+
+
+def _exported(format: str, folder: Path) -> None:
+    world = cl.World(small_policies.TASK, probes.WindowConfig())
+    cl.export_policy(Heuristic(small_policies.ENV), folder, world, format)
+
+
+def _decides(folder: Path) -> Any:
+    return cl.load_exported(folder)(SEEN)
+
+
+def _labels(folder: Path) -> None:
+    with label_files.LabelWriter(folder, {"name": "window", "half_width_deg": 28.0}, "relative", 20.0) as writer:
+        for item, obs in enumerate(SEEN):
+            writer.append(**ROW, item=item, obs=obs, action=obs, answer=np.float32([item % 3 - 1]))
+
+
+def _labels_in_parquet(folder: Path) -> None:
+    _labels(folder)
+    label_files.finish(folder)
+
+
+def _labels_read(folder: Path) -> Any:
+    file = label_files.read(folder)
+    return [file.task, file.answers, file.eps_deg, file.seeds, *jax.tree.leaves(file.labels), *(file.people or ())]
+
+
+def _teacher(folder: Path) -> None:
+    config = TeacherConfig(layers=(8,), directions=8)
+    params = Trainer(config).init(small_policies.ENV, jax.random.key(0)).params
+    made = LearnedTeacher(small_policies.ENV, params, jnp.zeros(()), jnp.zeros(()), config.layers, config.directions)
+    about = {"config": configuration.to_json(config), "task": {"name": "window", "half_width_deg": 28.0}}
+    stored.save(folder, made, about)
+
+
+def _teacher_read(folder: Path) -> Any:
+    stored.world_of(folder, "window", probes.WindowConfig(), ())
+    return jax.tree.leaves(stored.load(folder, small_policies.ENV, 0.0, 0.0).params)
+
+
+def _due(folder: Path) -> None:
+    folder.mkdir()
+    kept.write_due(folder, STEP, {"train_loss": np.float32([0.1, 0.2])})
+
+
+def _due_read(folder: Path) -> Any:
+    found = kept.read_due(folder, STEP, LANES)
+    if found is None:  # no stretch waits for its evaluation: its row must be there, or the run is refused
+        raise UserError("rows are missing")
+    return sorted(found.items())
+
+
+def _curve(folder: Path) -> None:
+    with guides.GuideWriter(
+        folder, run="r", task="window", guidance="relative", split="tuning", config_hash=""
+    ) as writer:
+        for number in (1, 2, 3):
+            columns = {"seed": [0, 1], "labels": [10, 10], "asked": [number] * 2, "guide_reward": [0.1, 0.2]}
+            writer.append(round=number, step=0, wall_s=0.0, **{k: np.array(v) for k, v in columns.items()})
+
+
+def _curve_in_parquet(folder: Path) -> None:
+    _curve(folder)
+    guides.finish(folder)
+
+
+def _curve_read(folder: Path) -> Any:
+    return results.read(folder, schema=guides.SCHEMA).drop_columns(["folder"]).to_pylist()
+
+
+class Kind(NamedTuple):
+    """A folder."""
+
+    write: Callable[[Path], None]
+    read: Callable[[Path], Any]
+    signed: Callable[[Path], None] | None = None  # seals a folder one of whose JSON files was changed
+
+
+def _sign(name: str) -> Callable[[Path], None]:
+    return lambda folder: probes.edit_json(folder / name, lambda values: None)
+
+
+def _sign_contract(folder: Path) -> None:
+    """Writes the digests of an export's files anew."""
+    path = folder / runner.CONTRACT
+    contract = json.loads(path.read_text())
+    contract.pop(runner.DIGEST, None)
+    if isinstance(files := contract.get("files"), dict):
+        there = {name: folder / name for name in files if "/" not in name and (folder / name).is_file()}
+        files |= {name: hashlib.sha256(path.read_bytes()).hexdigest() for name, path in there.items()}
+    path.write_text(json.dumps({**contract, runner.DIGEST: runner.digest(contract)}))
+
+
+KINDS = {
+    "policy": Kind(_policy, _acts, _sign("policy.json")),
+    **{name: Kind(functools.partial(_exported, name), _decides, _sign_contract) for name in runner.RUNNERS},
+    "lines of labels": Kind(_labels, _labels_read),
+    "table of labels": Kind(_labels_in_parquet, _labels_read),
+    "teacher": Kind(_teacher, _teacher_read, _sign(stored.ABOUT)),
+    "due": Kind(_due, _due_read, _sign(kept.DUE)),
+    "lines of a curve": Kind(_curve, _curve_read),
+    "table of a curve": Kind(_curve_in_parquet, _curve_read),
+}
+
+
+# --- what is done to them --------------------------------------------------------------------------------------------
+
+PIECE = 64  # bytes
+NONSENSE = (None, True, -1, 0, 2**31, 2**63, 10**400, 1e308, float("nan"), 0.5, "", "x\n\x1b[31m", "../x", [], {}, [[]])
+
+
+def _pieces(path: Path, at: int, change: Callable[[bytearray, int, int], None]) -> None:
+    content = bytearray(path.read_bytes())
+    size = min(PIECE, len(content) // 3)
+    change(content, at * max(1, len(content) - 2 * size) >> 32, size)
+    path.write_bytes(content)
+
+
+def _swapped(path: Path, at: int) -> None:
+    def change(content: bytearray, start: int, size: int) -> None:
+        middle, end = start + size, start + 2 * size
+        content[start:end] = content[middle:end] + content[start:middle]
+
+    _pieces(path, at, change)
+
+
+def _zeroed(path: Path, at: int) -> None:
+    def change(content: bytearray, start: int, size: int) -> None:
+        content[start : start + size] = bytes(size)
+
+    _pieces(path, at, change)
+
+
+def _repeated(path: Path, at: int) -> None:
+    def change(content: bytearray, start: int, size: int) -> None:
+        content[start:start] = content[start : start + size]
+
+    _pieces(path, at, change)
+
+
+def _signed(path: Path, at: int) -> None:
+    """Another value in the place of one of a JSON file's; a flipped bit in any other file."""
+    if path.suffix != ".json":
+        DAMAGES["flipped"](path, at)
+        return
+    values = json.loads(path.read_text())
+    ways = [way for way in _ways(values) if way[0] not in ("digest", runner.DIGEST)]
+    way = ways[at % len(ways)]
+    parent = functools.reduce(lambda part, name: part[name], way[:-1], values)
+    chosen = at // len(ways) % (len(NONSENSE) + 2)
+    if chosen < len(NONSENSE):
+        parent[way[-1]] = NONSENSE[chosen]
+    elif chosen == len(NONSENSE):
+        del parent[way[-1]]
+    else:
+        parent[way[-1]] = [copy.deepcopy(parent[way[-1]])] * 3
+    path.write_text(json.dumps(values))
+
+
+def _ways(values: Any, way: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+    """The ways to everything in nested JSON values."""
+    if isinstance(values, dict | list):
+        for name, value in values.items() if isinstance(values, dict) else enumerate(values):
+            yield (*way, name)
+            yield from _ways(value, (*way, name))
+
+
+FILE_DAMAGES = {**DAMAGES, "swapped": _swapped, "zeroed": _zeroed, "repeated": _repeated, "signed": _signed}
+
+
+# --- cases -----------------------------------------------------------------------------------------------------------
+
+
+def make_folders(home: Path) -> dict[str, Any]:
+    """Writes a folder of each kind; returns what their readers give."""
+    for name, kind in KINDS.items():
+        kind.write(home / name)
+    return {name: _read(kind, home / name)[0] for name, kind in KINDS.items()}
+
+
+def cases(home: Path, count: int, seed: int) -> list[Case]:
+    """`count` cases by chance, each kind of folder equally often, however many files it has."""
+    rng, names, found = np.random.default_rng(seed), sorted(KINDS), []
+    for index in range(count):
+        kind = names[index % len(names)]
+        files = [path.relative_to(home / kind) for path in sorted((home / kind).rglob("*")) if path.is_file()]
+        damage, file = str(rng.choice(list(FILE_DAMAGES))), str(files[rng.integers(len(files))])
+        if damage == "signed":
+            damage, file = _what_is_signed(kind, file, rng)
+        found.append(Case(kind, file, damage, int(rng.integers(1 << 32))))
+    return found
+
+
+def _what_is_signed(kind: str, file: str, rng: np.random.Generator) -> tuple[str, str]:
+    if KINDS[kind].signed is None:
+        return "flipped", file
+    if kind in runner.RUNNERS:
+        return "signed", file if rng.random() < 0.3 else runner.CONTRACT
+    return "signed", {"policy": "policy.json", "teacher": stored.ABOUT, "due": kept.DUE}[kind]
+
+
+def _read(kind: Kind, folder: Path) -> tuple[Any, str]:
+    """What a reader gives, and what it tells meanwhile."""
+    told = io.StringIO()
+    with contextlib.redirect_stderr(told), contextlib.redirect_stdout(told):
+        return kind.read(folder), told.getvalue()
+
+
+def wrong(home: Path, expected: dict[str, Any], case: Case) -> str | None:
+    """What goes wrong with a case; None: nothing."""
+    kind = KINDS[case.kind]
+    with tempfile.TemporaryDirectory() as work:
+        folder = Path(shutil.copytree(home / case.kind, Path(work) / "folder"))
+        FILE_DAMAGES[case.damage](folder / case.file, case.at)
+        if case.damage == "signed" and kind.signed:
+            kind.signed(folder)
+        before = files_of(folder)
+        try:
+            found, told = _read(kind, folder)
+        except UserError as error:
+            one_line = len(str(error).splitlines()) == 1 and str(error).isprintable()
+            sound = one_line and files_of(folder) == before
+            return None if sound else f"not one line, or after a change: {str(error)!r}"
+        except BaseException:
+            return f"traceback: {traceback.format_exc().strip()}"
+    if case.damage == "signed":
+        acts = case.kind in ("policy", *runner.RUNNERS)
+        return f"gives {found}" if acts and not np.isfinite(found).all() else None
+    if not _same(found, expected[case.kind]) and not told:
+        return f"gives {str(found)[:200]} in place of {str(expected[case.kind])[:200]}, without a word"
+    return None
+
+
+def _same(one: Any, other: Any) -> bool:
+    one, other = jax.tree.leaves(one), jax.tree.leaves(other)
+    return len(one) == len(other) and all(np.array_equal(a, b) for a, b in zip(one, other, strict=True))
+
+
+def _main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--cases", type=int, default=2000)
+    parser.add_argument("--seed", type=int, default=0)
+    asked = parser.parse_args()
+    found = 0
+    with tempfile.TemporaryDirectory() as name:
+        expected = make_folders(Path(name))
+        tried = cases(Path(name), asked.cases, asked.seed)
+        for case in tried:
+            if outcome := wrong(Path(name), expected, case):
+                found += 1
+                print(f"{case}\n    {outcome}", flush=True)
+    told = Counter((case.kind, case.damage) for case in tried)
+    print(f"{len(tried)} cases ({len(told)} kinds of folder and damage), {found} went wrong")
+    return 1 if found else 0
+
+
+if __name__ == "__main__":
+    sys.exit(_main())
