@@ -130,6 +130,7 @@ def runs(home):
     return home / "runs"
 
 
+@pytest.mark.long
 def test_the_documented_commands_run(runs, home):
     assert [len(documented(name)) for name in ("reach", "clone", "brax_task", "policy")] == [5, 3, 2, 0]
     assert {row["guidance"] for row in results.read(runs / "reach").to_pylist()} == {"none", "relative"}
@@ -263,6 +264,7 @@ def test_a_kind_of_ones_own_that_asks_needs_labels(tmp_path, capsys):
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.long
 def test_any_function_is_corrected(capsys):
     from examples.correct_a_policy import main as correct
 

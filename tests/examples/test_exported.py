@@ -23,6 +23,7 @@ def walker(tmp_path_factory):
     return out
 
 
+@pytest.mark.long
 def test_the_policy_crosses_a_hall_in_mujoco_without_jax(walker):
     """As its docstring tells, in a process of its own, which fails where JAX was loaded."""
     command = [sys.executable, "examples/exported_in_mujoco.py", str(walker)]

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import nbclient
 import nbformat
+import pytest
 
 NOTEBOOK = Path(__file__).resolve().parents[2] / "examples" / "quickstart.ipynb"
 LESS = """KINDS = ("relative",)
@@ -11,6 +12,7 @@ SEEDS, LABELS, STEPS = 1, 10, 200
 NETWORKS = {"q_layers": (8,), "feedback_layers": (8,), "directions": 36, "fit_steps": 20}"""
 
 
+@pytest.mark.long
 def test_the_notebook_runs_from_top_to_bottom(tmp_path):
     notebook = nbformat.read(NOTEBOOK, as_version=4)
     cells = [cell for cell in notebook.cells if cell.cell_type == "code"]

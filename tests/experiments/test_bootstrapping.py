@@ -194,6 +194,7 @@ def test_a_page_shows_sections_between_their_marks_and_nothing_else_changes(modu
     page.rendered(real, dict.fromkeys(marks, "x"))  # every world has its place
 
 
+@pytest.mark.long
 def test_a_smoke_of_the_easy_table_runs_resumes_and_reports(modules, tmp_path, capsys):
     data = modules["billiards_bootstrapping"]
     asked = ["--scale", "smoke", "--out", str(tmp_path), "--pieces", "easy/frame/none", "easy/frame/relative"]

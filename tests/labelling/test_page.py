@@ -126,6 +126,7 @@ def test_when_all_is_answered_the_page_says_so(opened):
     shown(session, acts)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", ["demonstration", "scalar"])
 def test_other_forms_of_feedback_have_a_page_of_the_same_parts(opened, tmp_path, kind):
     session = opened(kind=kind)

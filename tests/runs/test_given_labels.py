@@ -147,6 +147,7 @@ def test_demonstrations_are_written_and_taken_again_by_their_own_kind_alone(tmp_
             read_for(path, Grid((other,), (4,), (10,)))
 
 
+@pytest.mark.long
 def test_a_run_with_falling_strengths_and_a_coach_leaves_a_file_that_is_taken_again(tmp_path):
     sizes = {**SMALL, "eps_falls": True, "candidates": 3, "chosen_by": "teacher"}
     config = dataclasses.replace(probes.config(sizes=sizes, scalars={"eps_last_deg": EPS / 4}), schedule=RUN.schedule)

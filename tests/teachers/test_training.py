@@ -91,6 +91,7 @@ def begun(tmp_path):
     return out
 
 
+@pytest.mark.long
 def test_a_stopped_training_goes_on_to_the_same_teacher(whole, begun):
     train(begun, resume=True)
     assert {path.name for path in begun.iterdir()} == {LOCK, "network", "teacher.json"}

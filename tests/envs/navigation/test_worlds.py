@@ -112,6 +112,7 @@ def test_the_body_reaches_as_far_as_these_tests_say():
     assert float(Robot().reach) == pytest.approx(REACH)
 
 
+@pytest.mark.long
 def test_every_goal_can_be_reached_by_the_body_however_it_is_turned(sample):
     _, many = sample
     for number, (boxes, circles, starts, goals, extent) in enumerate(each(many)):
@@ -284,6 +285,7 @@ def test_another_key_gives_another_world(sample):
     assert len(np.unique(many.starts.reshape(KEYS, -1), axis=0)) == KEYS
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("sample", ["rooms"], indirect=True)
 @pytest.mark.parametrize("at_once", [None, 3, 64])
 def test_worlds_generated_together_are_those_generated_alone(sample, monkeypatch, at_once):
