@@ -57,7 +57,7 @@ def test_pieces_are_bounded_and_no_lane_is_trained_twice(experiment):
         assert piece.lanes <= 64, piece.path
         assert 0 < piece.minutes <= 30, piece.path
         if all(map(known_kind, piece.kinds)):
-            assert bool(piece.labels) == any(registry.find(kind).asks for kind in piece.kinds), piece.path
+            assert bool(piece.labels) == any(registry.resolve(kind).asks for kind in piece.kinds), piece.path
     lanes = [
         (piece.world, piece.run, kind, budget, piece.first_seed + seed)
         for piece in experiment.pieces
@@ -112,7 +112,7 @@ def test_every_piece_is_a_sweep_that_would_begin(experiment, scale, modules, mon
     for piece in different.values():
         assert main(pieces.sweep_command(experiment.task, piece, tmp_path, resume=False)) == 0, piece.path
         order = orders[-1]
-        assert order.grid.guidance == tuple(registry.find(kind).name for kind in piece.kinds)
+        assert order.grid.guidance == tuple(registry.resolve(kind).name for kind in piece.kinds)
         assert order.grid.labels == piece.labels or not piece.labels
         assert order.grid.seeds == tuple(range(4000, 4000 + piece.seeds))
         assert order.out == tmp_path / piece.path
@@ -125,7 +125,7 @@ def test_every_piece_is_a_sweep_that_would_begin(experiment, scale, modules, mon
 
 @pytest.mark.parametrize("table", ["regulation", "easy"])
 def test_a_perfect_guide_does_what_the_tables_teacher_holds_for_best(modules, table):
-    kind, env = registry.find(f"_perfect_guide:{table.upper()}"), make_environment(BilliardsConfig(table))
+    kind, env = registry.resolve(f"_perfect_guide:{table.upper()}"), make_environment(BilliardsConfig(table))
     guidance = registry.make(kind.name, GuideSizes(), env)
     _, obs = jax.vmap(env.reset)(jax.random.split(jax.random.key(3), 12))
     base = DIRECTIONS.uniform(jax.random.key(4), (12,))
