@@ -83,6 +83,7 @@ def assert_alike(one, other):
         np.testing.assert_allclose(other[name], values, rtol=1e-5, atol=1e-6, err_msg=name)
 
 
+@pytest.mark.long
 def test_four_devices_learn_what_one_does(alone, shared):
     assert_alike(measured(alone), measured(shared[0]))
     assert "on each of 4 devices" in shared[1]
@@ -92,6 +93,7 @@ def test_no_device_waits_for_another():
     assert on_four("communication")[0] == "4 []"
 
 
+@pytest.mark.long
 def test_a_run_begun_on_four_devices_goes_on_with_one(alone, tmp_path):
     out = tmp_path / "run"
     on_four("run", out, 5)  # three rounds of labels, then in the middle of training
@@ -99,6 +101,7 @@ def test_a_run_begun_on_four_devices_goes_on_with_one(alone, tmp_path):
     assert_alike(measured(alone), measured(out))
 
 
+@pytest.mark.long
 def test_a_run_begun_on_one_device_goes_on_with_four(alone, tmp_path):
     out = tmp_path / "run"
     many_devices.run(out, 2)  # amid the labels
@@ -106,6 +109,7 @@ def test_a_run_begun_on_one_device_goes_on_with_four(alone, tmp_path):
     assert_alike(measured(alone), measured(out))
 
 
+@pytest.mark.long
 def test_policies_of_four_devices_are_those_of_one(alone, shared):
     found = []
     for folder in (alone, shared[0]):
@@ -119,6 +123,7 @@ def test_policies_of_four_devices_are_those_of_one(alone, shared):
         np.testing.assert_allclose(mine, theirs, rtol=1e-4, atol=1e-6)
 
 
+@pytest.mark.long
 def test_a_checkpoint_of_fewer_lanes_is_refused(shared):
     task = many_devices.probes.make_task()
     _, config, _ = load(shared[0], {task.name: task}.__getitem__)

@@ -50,6 +50,7 @@ def test_policies_are_evaluated_in_worlds_of_another_style(walked, tmp_path, pol
         assert min(row["success"]) >= 0.75  # the road map's word, alone or as what refines the agent's actions
 
 
+@pytest.mark.long
 def test_an_evaluation_is_of_whole_episodes(walked, refused, tmp_path, capsys):
     """By default, by number, and never of the short ones alone."""
     evaluate = ["evaluate", str(walked), "--policy", "uniform"]

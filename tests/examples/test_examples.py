@@ -154,11 +154,13 @@ def refused(capsys, command, says):
     assert says in told[0], told[0]
 
 
+@pytest.mark.long
 def test_a_run_folder_alone_loads_no_code(runs, capsys):
     refused(capsys, ["evaluate", runs / "reach"], "add --task examples.reach:TASK if you trust that code")
     refused(capsys, ["render", runs / "clone"], "add --task examples.reach:TASK if you trust that code")
 
 
+@pytest.mark.long
 def test_a_kind_from_outside_must_be_named_again(runs, capsys):
     command = ["evaluate", runs / "clone", "--task", "examples.reach:TASK"]
     refused(capsys, command, "--guidance package.module:NAME")
@@ -183,6 +185,7 @@ def test_a_teacher_that_knows_the_best_action_alone_answers_about_no_other(home,
     assert not (home / "new").exists()
 
 
+@pytest.mark.long
 def test_a_run_goes_on_with_the_same_command(runs, home):
     described = (runs / "clone" / "config.json").read_text()
     rows = results.read(runs / "clone").num_rows
@@ -207,6 +210,7 @@ def test_the_boats_page_shows_where_things_are_and_where_an_action_leads():
     assert len(away.frames) == reach.FILM
 
 
+@pytest.mark.long
 def test_the_parts_keep_the_laws(tmp_path):
     reach, clone, brax, policy = (
         importlib.import_module(f"examples.{name}") for name in ("reach", "clone", "brax_task", "policy")

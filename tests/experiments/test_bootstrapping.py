@@ -123,6 +123,7 @@ def test_every_piece_is_a_sweep_that_would_begin(experiment, scale, modules, mon
         assert [sizes[run].pace for run in ("frame", "raw", "paced")] == [False, False, True]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("table", ["regulation", "easy"])
 def test_a_perfect_guide_does_what_the_tables_teacher_holds_for_best(modules, table):
     kind, env = registry.resolve(f"_perfect_guide:{table.upper()}"), make_environment(BilliardsConfig(table))

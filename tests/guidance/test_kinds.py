@@ -166,7 +166,7 @@ def test_a_coached_policy_comes_nearer_to_what_its_coach_has_in_mind():
 def test_answers_that_mean_no_turn_have_no_strength_that_could_fall(kind):
     falling = dataclasses.replace(SIZES, eps_falls=True)
     with pytest.raises(UserError, match=r"answers, which have no strength .* leave out --sizes\.eps-falls") as refusal:
-        registry.make(kind, falling, ENV)
+        registry.make(registry.resolve(kind).name, falling, ENV)
     assert "\n" not in str(refusal.value)
     for other in ("none", "relative", "dcoach"):
         assert registry.make(other, falling, ENV).name == other

@@ -248,6 +248,7 @@ def test_killed_before_anything_was_saved(whole, tmp_path):
     assert_same_run(out, whole)
 
 
+@pytest.mark.long
 def test_killed_between_the_labels_and_the_first_row(whole, tmp_path):
     out = tmp_path / "run"
     with killed_at(1, "_train"), pytest.raises(Killed):
@@ -259,6 +260,7 @@ def test_killed_between_the_labels_and_the_first_row(whole, tmp_path):
     assert_same_run(out, whole)
 
 
+@pytest.mark.long
 def test_stopped_in_the_last_round_of_labels(whole, tmp_path):
     out = tmp_path / "run"
     with stopping_at(6), pytest.raises(Interrupted):
@@ -321,6 +323,7 @@ def test_a_block_filled_up_with_repeats_has_a_row_for_each_seed(whole, tmp_path)
     assert [row for row in table if row["seed"] != 7] == expected
 
 
+@pytest.mark.long
 def test_a_run_whose_labels_fall_and_whose_questions_a_coach_chooses_goes_on_as_one(tmp_path):
     own = {**SMALL, "eps_falls": True, "candidates": 3, "chosen_by": "teacher"}
     config = probes.config(

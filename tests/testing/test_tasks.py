@@ -154,6 +154,7 @@ def test_the_probe_keeps_the_laws(tmp_path):
         check_task(PROBE, CONFIG)
 
 
+@pytest.mark.long
 def test_navigation_keeps_them():
     check_task(NAVIGATION, NavigationConfig(worlds=8, max_steps=12, mirrors=True), steps=24)
 
