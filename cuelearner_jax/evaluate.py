@@ -223,7 +223,7 @@ Tell = Callable[[int, int], None]  # (done, of how many): called between stretch
 
 
 def untold(done: int, count: int) -> None:
-    """Nobody watches."""
+    """Ignore progress."""
 
 
 def part_of(tell: Tell, number: int, parts: int) -> Tell:

@@ -32,7 +32,7 @@ KindT = TypeVar("KindT")
 
 
 def refused(name: str, value: Any, wanted: str) -> UserError:
-    """What is raised of an argument."""
+    """Build the error for an argument: what was given, and what is wanted."""
     return UserError(f"{name} is {shown(value)}: give {wanted}")
 
 

@@ -42,7 +42,7 @@ Values = dict[str, Any]
 
 
 def damaged(kind: str, path: Path, reason: object = "") -> UserError:
-    """What is raised for a file that makes no sense; `reason`: why, where that is known."""
+    """Build the error for a file that makes no sense; `reason`: why, where that is known."""
     why = (str(reason).splitlines() or [""])[0][:200]
     return UserError(f"{path} {REMEDIES[kind]}{f' ({why})' if why else ''}")
 

@@ -32,7 +32,7 @@ class Damaged(ValueError):
 
 
 class Lines(NamedTuple):
-    """What a file holds."""
+    """Rows of a file, and whether its closing line is there."""
 
     rows: list[Row]  # without checksums and closing line
     is_closed: bool  # does the closing line follow?
