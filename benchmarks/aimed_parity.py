@@ -22,7 +22,7 @@ from cuelearner_envs.billiards import Table, simulate_many
 from cuelearner_envs.billiards.config import BilliardsConfig, make_environment
 from cuelearner_jax.actions import DIRECTIONS, to_angle
 from cuelearner_jax.evaluate import episodes
-from cuelearner_jax.records.provenance import provenance
+from cuelearner_jax.storage.provenance import provenance
 
 WORLDS = (BilliardsConfig("easy"), BilliardsConfig("regulation"))
 

@@ -26,7 +26,7 @@ from cuelearner_envs.anymal.environment import LeggedNavigation
 from cuelearner_envs.navigation.config import NavigationConfig
 from cuelearner_envs.navigation.config import make_environment as make_navigation
 from cuelearner_jax import actions
-from cuelearner_jax.records.provenance import provenance
+from cuelearner_jax.storage.provenance import provenance
 
 RESULTS = Path(__file__).parent / "results" / "anymal_speed.json"
 

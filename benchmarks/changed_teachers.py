@@ -23,7 +23,7 @@ from cuelearner_envs.billiards.config import BilliardsConfig, make_environment
 from cuelearner_envs.billiards.teacher import LocalSearchTeacher, SearchTeacher
 from cuelearner_jax.actions import distance, expected_values, to_angle
 from cuelearner_jax.evaluate import episodes
-from cuelearner_jax.records.provenance import provenance
+from cuelearner_jax.storage.provenance import provenance
 from cuelearner_jax.tasks.billiards import SCENARIOS, make_teacher
 
 SHOTS = 4  # played before a situation is one of those that are looked at, none to three

@@ -25,7 +25,7 @@ import numpy as np  # noqa: E402
 
 from cuelearner_jax.cli import main  # noqa: E402
 from cuelearner_jax.export.runner import GOLDEN, Decision  # noqa: E402
-from cuelearner_jax.records.provenance import provenance  # noqa: E402
+from cuelearner_jax.storage.provenance import provenance  # noqa: E402
 
 LIMIT_MS = 5.0
 

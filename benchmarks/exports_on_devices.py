@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from cuelearner_jax.export.runner import GOLDEN, Decision
-from cuelearner_jax.records.provenance import provenance
+from cuelearner_jax.storage.provenance import provenance
 
 CALLS = 200
 

@@ -41,8 +41,8 @@ import numpy as np
 from _way import Scene
 from playwright.sync_api import Browser, Page, sync_playwright  # pyright: ignore[reportMissingImports]
 
-from cuelearner_jax.records import label_files
-from cuelearner_jax.records.provenance import provenance
+from cuelearner_jax.storage import label_files
+from cuelearner_jax.storage.provenance import provenance
 
 KEYS = {"ArrowLeft": 1.0, "ArrowUp": 0.0, "ArrowRight": -1.0, "ArrowDown": None}
 UNSURE, MISTAKES = 0.1, 0.1  # shares of a script's keys, and of its answers

@@ -24,7 +24,7 @@ import numpy as np
 
 from cuelearner_envs.navigation.config import NavigationConfig, Style, make_environment
 from cuelearner_envs.navigation.lidar import MAX_RANGE, scan
-from cuelearner_jax.records.provenance import provenance
+from cuelearner_jax.storage.provenance import provenance
 
 RESULTS = Path(__file__).parent / "results" / "lidar_parity.json"
 STYLES: tuple[Style, ...] = ("clutter", "rooms", "corridor")

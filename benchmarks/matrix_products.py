@@ -18,7 +18,7 @@ from scaling import REPLAY
 
 from cuelearner_jax import devices
 from cuelearner_jax.bench.measuring import Work, measure
-from cuelearner_jax.records.provenance import provenance
+from cuelearner_jax.storage.provenance import provenance
 from cuelearner_jax.tasks import registry
 
 WAYS = {"compiled": 2**30, "library": 0}  # from how many lanes on the library is used

@@ -34,7 +34,7 @@ import jax.numpy as jnp
 from cuelearner_envs.navigation.config import NavigationConfig, make_environment
 from cuelearner_envs.navigation.environment import Navigation
 from cuelearner_jax.actions import from_angle
-from cuelearner_jax.records.provenance import provenance
+from cuelearner_jax.storage.provenance import provenance
 
 RESULTS = Path(__file__).parent / "results" / "navigation_speed.json"
 PEER = "JaxNav"

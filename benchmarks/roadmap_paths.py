@@ -36,7 +36,7 @@ from cuelearner_envs.navigation.roadmap import BLOCKED, LINE_MARGIN, RoadMapTeac
 from cuelearner_envs.navigation.world import FAR_AWAY, World
 from cuelearner_jax import evaluate
 from cuelearner_jax.policies import Heuristic, Policy, Taught, Uniform
-from cuelearner_jax.records.provenance import provenance
+from cuelearner_jax.storage.provenance import provenance
 
 RESULTS = Path(__file__).parent / "results" / "roadmap_paths.json"
 STYLES: tuple[Style, ...] = ("clutter", "rooms", "corridor")

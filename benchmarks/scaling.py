@@ -28,8 +28,8 @@ from matplotlib.figure import Figure
 
 from cuelearner_jax.bench.measuring import Timed, Work, learning, measure
 from cuelearner_jax.devices import lane_mesh
-from cuelearner_jax.records.provenance import provenance
 from cuelearner_jax.report.figures import OTHER_COLOURS, STYLE, save_figure
+from cuelearner_jax.storage.provenance import provenance
 from cuelearner_jax.tasks import registry
 
 REPLAY = 100_000

@@ -21,7 +21,7 @@ import jax.numpy as jnp
 from cuelearner_envs.billiards import Table
 from cuelearner_envs.billiards.physics import Shot, simulate_many
 from cuelearner_envs.billiards.table import rack
-from cuelearner_jax.records.provenance import provenance
+from cuelearner_jax.storage.provenance import provenance
 
 
 def scattered(table: Table, tables: int, block: int) -> tuple[jax.Array, jax.Array]:

@@ -17,36 +17,36 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from cuelearner_jax.api.acting import CallablePolicy, load_policy
+    from cuelearner_jax.api.adaptation import AdaptedPolicy, adapt
+    from cuelearner_jax.api.exporting import export_policy, load_exported
+    from cuelearner_jax.api.feedback import FeedbackModel, Labels, ask, fit_feedback, refine
+    from cuelearner_jax.api.training import Run, train
+    from cuelearner_jax.api.worlds import World, make, teacher_of
     from cuelearner_jax.errors import UserError
-    from cuelearner_jax.face.acting import CallablePolicy, load_policy
-    from cuelearner_jax.face.adaptation import AdaptedPolicy, adapt
-    from cuelearner_jax.face.exporting import export_policy, load_exported
-    from cuelearner_jax.face.feedback import FeedbackModel, Labels, ask, fit_feedback, refine
-    from cuelearner_jax.face.training import Run, train
-    from cuelearner_jax.face.worlds import World, make, teacher_of
 
 __version__ = "0.1.0"
 
 # Where each name lies. They are loaded when they are first used: tasks import the bottom rooms of this package, and the
 # command line needs little of it at a time.
 _PLACES = {
-    "AdaptedPolicy": "face.adaptation",
-    "CallablePolicy": "face.acting",
-    "FeedbackModel": "face.feedback",
-    "Labels": "face.feedback",
-    "Run": "face.training",
+    "AdaptedPolicy": "api.adaptation",
+    "CallablePolicy": "api.acting",
+    "FeedbackModel": "api.feedback",
+    "Labels": "api.feedback",
+    "Run": "api.training",
     "UserError": "errors",
-    "World": "face.worlds",
-    "adapt": "face.adaptation",
-    "ask": "face.feedback",
-    "export_policy": "face.exporting",
-    "fit_feedback": "face.feedback",
-    "load_exported": "face.exporting",
-    "load_policy": "face.acting",
-    "make": "face.worlds",
-    "refine": "face.feedback",
-    "teacher_of": "face.worlds",
-    "train": "face.training",
+    "World": "api.worlds",
+    "adapt": "api.adaptation",
+    "ask": "api.feedback",
+    "export_policy": "api.exporting",
+    "fit_feedback": "api.feedback",
+    "load_exported": "api.exporting",
+    "load_policy": "api.acting",
+    "make": "api.worlds",
+    "refine": "api.feedback",
+    "teacher_of": "api.worlds",
+    "train": "api.training",
 }
 
 __all__ = [

@@ -17,9 +17,9 @@ from cuelearner_jax import choosing, user_code
 from cuelearner_jax.actions import only_actions
 from cuelearner_jax.config import GuideScalars, GuideSizes, Scalars
 from cuelearner_jax.environment import Environment, actions_of
-from cuelearner_jax.guidance.answers import of_strength
-from cuelearner_jax.guidance.bounding import within
-from cuelearner_jax.guidance.bundle import Guidance
+from cuelearner_jax.feedback.answers import of_strength
+from cuelearner_jax.guides.bounding import within
+from cuelearner_jax.guides.bundle import Guidance
 from cuelearner_jax.policies import Policy, acted, best_actions, named
 from cuelearner_jax.types import GuideState, Label, Stream, Teacher
 

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 from cuelearner_jax.actions import rotate
 from cuelearner_jax.config import Scalars
 from cuelearner_jax.environment import Environment, actions_of
-from cuelearner_jax.guidance.bundle import Guidance
+from cuelearner_jax.guides.bundle import Guidance
 from cuelearner_jax.policies import wanted_actions
 from cuelearner_jax.types import GuideState, Teacher
 

@@ -17,7 +17,8 @@ from jax.sharding import Mesh
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from cuelearner_jax import asking
-from cuelearner_jax.agent.learning import Learner, all_finite, learner, stored_step
+from cuelearner_jax.agents.learning import Learner, all_finite, learner, stored_step
+from cuelearner_jax.arbiters import paced as pace
 from cuelearner_jax.asking import label_slots
 from cuelearner_jax.config import RunConfig, Scalars, Schedule, Sizes
 from cuelearner_jax.devices import (
@@ -30,10 +31,9 @@ from cuelearner_jax.devices import (
     over_lanes,
 )
 from cuelearner_jax.environment import Environment
-from cuelearner_jax.guidance import pace
-from cuelearner_jax.guidance.bounding import act_within
-from cuelearner_jax.guidance.bundle import Guidance
-from cuelearner_jax.guidance.refining import Refined, untouched
+from cuelearner_jax.guides.bounding import act_within
+from cuelearner_jax.guides.bundle import Guidance
+from cuelearner_jax.guides.refining import Refined, untouched
 from cuelearner_jax.policies import Agent, Uniform
 from cuelearner_jax.types import Clock, GuideState, Label, Params, Stream, Teacher, TrainState
 

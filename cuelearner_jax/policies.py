@@ -19,15 +19,15 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from cuelearner_jax import types, user_code
 from cuelearner_jax.actions import DIRECTIONS, Actions, only_actions, rotate
-from cuelearner_jax.agent.choice import greedy_actions
+from cuelearner_jax.agents.choice import greedy_actions
 from cuelearner_jax.config import AgentSizes, GuideScalars, GuideSizes
 from cuelearner_jax.devices import portions
 from cuelearner_jax.environment import actions_of
 from cuelearner_jax.errors import UserError, raised_by, shown
-from cuelearner_jax.guidance.answers import in_mind, relative_feedback
-from cuelearner_jax.guidance.bounding import act_within
-from cuelearner_jax.guidance.bundle import Guidance
-from cuelearner_jax.guidance.refining import refine
+from cuelearner_jax.feedback.answers import in_mind, relative_feedback
+from cuelearner_jax.guides.bounding import act_within
+from cuelearner_jax.guides.bundle import Guidance
+from cuelearner_jax.guides.refining import refine
 from cuelearner_jax.types import EnvState, GuidanceModel, Params, Teacher
 
 SHARED, BY_LANE = None, 0  # of a leaf: the same for all lanes, or one for each

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from cuelearner_jax.config import GuideSizes, RunConfig, Scalars, check_types
 from cuelearner_jax.environment import Environment
 from cuelearner_jax.errors import UserError, closest, shown
-from cuelearner_jax.records.room import check_room
+from cuelearner_jax.storage.room import check_room
 from cuelearner_jax.types import EnvState, Reel, Sketch, Teacher
 
 COPIES = 3  # of a world while it is made

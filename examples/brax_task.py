@@ -19,7 +19,7 @@ from brax import envs
 from jaxtyping import Array, Float
 
 from cuelearner_envs.bounds import MOST_STEPS, check_number
-from cuelearner_jax.brax_bridge.adapter import BraxTask, from_brax
+from cuelearner_jax.bridges.brax import BraxTask, from_brax
 from cuelearner_jax.config import RunConfig, Scalars, Schedule, Sizes
 from cuelearner_jax.task import Body, Preset, Task
 

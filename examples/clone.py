@@ -16,14 +16,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from cuelearner_jax.actions import evenly_spaced, rotate
-from cuelearner_jax.agent.networks import applied, residual_network
+from cuelearner_jax.agents.networks import applied, residual_network
 from cuelearner_jax.config import GuideScalars, GuideSizes, Scalars
 from cuelearner_jax.environment import Spaces
-from cuelearner_jax.guidance.bundle import AnswerForm, Guidance
-from cuelearner_jax.guidance.fitting import fit_least_squares, lessons
-from cuelearner_jax.guidance.kind import Kind
-from cuelearner_jax.guidance.questions import about_refined
-from cuelearner_jax.guidance.refining import Refined
+from cuelearner_jax.guides.bundle import AnswerForm, Guidance
+from cuelearner_jax.guides.fitting import fit_least_squares, lessons
+from cuelearner_jax.guides.kind import Kind
+from cuelearner_jax.guides.questions import about_refined
+from cuelearner_jax.guides.refining import Refined
 from cuelearner_jax.types import EnvState, GuidanceModel, Label, Params, Teacher
 
 POINTS = 8  # of the compass, counterclockwise from the x axis

@@ -9,8 +9,8 @@ over validation episodes. A few minutes on 2 cores.
 import numpy as np
 
 import cuelearner_jax as cl
+from cuelearner_jax.api.acting import as_policy
 from cuelearner_jax.evaluate import episodes, watched
-from cuelearner_jax.face.acting import as_policy
 
 ANGLE = np.radians(40.0)
 TURN = np.array([[np.cos(ANGLE), -np.sin(ANGLE)], [np.sin(ANGLE), np.cos(ANGLE)]])

@@ -25,11 +25,11 @@ from cuelearner_jax.config import GuideSizes, RunConfig
 from cuelearner_jax.environment import actions_of, spaces_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import episodes, one_lane, watched_lanes
-from cuelearner_jax.guidance import registry as guidances
+from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.policies import Agent, Corrected
-from cuelearner_jax.records import table as tables
-from cuelearner_jax.records.provenance import provenance
 from cuelearner_jax.runs.trained import PolicySource, several
+from cuelearner_jax.storage import table as tables
+from cuelearner_jax.storage.provenance import provenance
 from cuelearner_jax.task import Task
 from cuelearner_jax.tasks import registry
 

@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from _adaptation import JUDGED, SCHEMA, UNCHANGED, Study
 
-from cuelearner_jax.records import table as tables
 from cuelearner_jax.report.statistics import interquartile_mean, interval
+from cuelearner_jax.storage import table as tables
 
 NAMES = {
     "none": "not adapted",

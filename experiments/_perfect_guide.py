@@ -18,13 +18,13 @@ from jaxtyping import Array, Bool, Float
 
 from cuelearner_envs.billiards.config import BilliardsConfig, make_environment
 from cuelearner_jax.actions import DIRECTIONS
-from cuelearner_jax.agent.choice import greedy_actions
+from cuelearner_jax.agents.choice import greedy_actions
 from cuelearner_jax.config import GuideScalars, GuideSizes
 from cuelearner_jax.environment import Spaces
-from cuelearner_jax.guidance.bundle import Guidance
-from cuelearner_jax.guidance.kind import Kind
-from cuelearner_jax.guidance.refining import Refined
-from cuelearner_jax.guidance.unlabelled import unlabelled
+from cuelearner_jax.guides.bundle import Guidance
+from cuelearner_jax.guides.kind import Kind
+from cuelearner_jax.guides.refining import Refined
+from cuelearner_jax.guides.unlabelled import unlabelled
 from cuelearner_jax.tasks.billiards import SEEN_FROM_THE_STRIKE, SHIPPED_TEACHERS
 from cuelearner_jax.teachers import stored
 from cuelearner_jax.teachers.learned import LearnedTeacher

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from cuelearner_jax.cli import main as cuelearner
-from cuelearner_jax.guidance.registry import resolve
+from cuelearner_jax.guides.registry import resolve
 
 FIRST_SEED = 4000  # of reported runs; settings are chosen on seeds from 0 on, with --tuning
 Options = Mapping[str, object]  # of `cuelearner sweep`: a value, several in a tuple, or whether a flag is on

@@ -30,9 +30,9 @@ from cuelearner_envs.billiards.teacher import NearbyTeacher
 from cuelearner_jax.config import AgentSizes, GuideSizes, Scalars
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import episodes
-from cuelearner_jax.guidance.answers import relative_feedback
+from cuelearner_jax.feedback.answers import relative_feedback
 from cuelearner_jax.policies import Agent, Taught, Teaching, best_actions
-from cuelearner_jax.records.provenance import provenance
+from cuelearner_jax.storage.provenance import provenance
 from cuelearner_jax.tasks.billiards import SHIPPED_TEACHERS
 from cuelearner_jax.teachers import stored
 

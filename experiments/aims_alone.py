@@ -23,7 +23,7 @@ from cuelearner_envs.billiards.config import BilliardsConfig, make_environment
 from cuelearner_jax.actions import DIRECTIONS
 from cuelearner_jax.evaluate import SPLITS, episodes, evaluate_policy
 from cuelearner_jax.policies import SHARED, Heuristic, Uniform
-from cuelearner_jax.records.provenance import provenance
+from cuelearner_jax.storage.provenance import provenance
 
 TABLES = ("easy", "regulation")
 

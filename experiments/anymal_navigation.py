@@ -34,9 +34,9 @@ from cuelearner_envs.navigation.environment import Navigation
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import episodes, rollout
 from cuelearner_jax.policies import Agent
-from cuelearner_jax.records.provenance import provenance
 from cuelearner_jax.runs.grid import load
 from cuelearner_jax.runs.trained import PolicySource
+from cuelearner_jax.storage.provenance import provenance
 from cuelearner_jax.tasks import registry
 
 ROOT = Path(__file__).parents[1]

@@ -14,10 +14,10 @@ import numpy as np
 
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.loop import start_clock
-from cuelearner_jax.records import formats
-from cuelearner_jax.records.checkpoint import checkpoints
 from cuelearner_jax.runs.grid import load
 from cuelearner_jax.runs.trained import Lanes, PolicySource
+from cuelearner_jax.storage import formats
+from cuelearner_jax.storage.checkpoint import checkpoints
 from cuelearner_jax.tasks import registry
 
 

@@ -16,9 +16,9 @@ from pathlib import Path
 import numpy as np
 
 from cuelearner_jax.cli import main as cuelearner
-from cuelearner_jax.records import results
-from cuelearner_jax.records.provenance import provenance
 from cuelearner_jax.report.statistics import interval
+from cuelearner_jax.storage import results
+from cuelearner_jax.storage.provenance import provenance
 
 STRENGTHS_DEG = (1, 2, 5)
 

@@ -17,8 +17,8 @@ from pathlib import Path
 import numpy as np
 
 from cuelearner_jax.cli import main as cuelearner
-from cuelearner_jax.records import results
 from cuelearner_jax.report.statistics import interval
+from cuelearner_jax.storage import results
 
 GUIDES = {
     "relative, 100 labels": ["--guidance", "relative"],

@@ -33,10 +33,10 @@ from jaxtyping import Array, Float
 
 from cuelearner_envs.navigation.config import NavigationConfig
 from cuelearner_jax.actions import DIRECTIONS
-from cuelearner_jax.agent.networks import applied, residual_network
+from cuelearner_jax.agents.networks import applied, residual_network
 from cuelearner_jax.environment import Aims, spaces_of
 from cuelearner_jax.evaluate import episodes, evaluate_policy, watched_lanes
-from cuelearner_jax.guidance.intent import Weights
+from cuelearner_jax.guides.intent import Weights
 from cuelearner_jax.policies import BY_LANE, SHARED, Taught, best_actions
 from cuelearner_jax.tasks import registry
 

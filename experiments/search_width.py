@@ -24,8 +24,8 @@ from typing import Any
 
 import numpy as np
 
-from cuelearner_jax.records import results
 from cuelearner_jax.report.statistics import interval
+from cuelearner_jax.storage import results
 
 SEARCHES = {
     "all 3,600": {"coarse-directions": 0},

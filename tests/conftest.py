@@ -63,7 +63,7 @@ def pytest_runtest_setup(item):
 # What `make test-quick` leaves out: files and folders with a compile of more than a few seconds, or with processes of
 # their own to wait for.
 SLOW = (
-    *("adaptation", "bench", "brax_bridge", "cli", "envs/anymal", "examples", "face", "labelling", "teachers"),
+    *("adaptation", "bench", "bridges", "cli", "envs/anymal", "examples", "api", "labelling", "teachers"),
     *("testing", "experiments/test_bootstrapping.py", "export/test_decisions.py", "records/test_tracking.py"),
     *("agent/test_choice.py", "agent/test_n_step.py", "records/test_checkpoint.py", "runs/test_runs.py"),
     *("runs/test_failures.py", "runs/test_given_labels.py", "runs/test_lanes.py", "runs/test_resume.py"),

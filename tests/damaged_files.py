@@ -38,8 +38,8 @@ from cuelearner_jax import config as configuration
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.export import runner
 from cuelearner_jax.policies import Heuristic
-from cuelearner_jax.records import guides, label_files, results
 from cuelearner_jax.runs import kept
+from cuelearner_jax.storage import guides, label_files, results
 from cuelearner_jax.teachers import stored
 from cuelearner_jax.teachers.learned import LearnedTeacher, TeacherConfig
 from cuelearner_jax.teachers.program import Trainer

@@ -34,8 +34,8 @@ from probes import files_of
 from small_runs import SWEEP
 
 from cuelearner_jax.cli import main
-from cuelearner_jax.records import results
 from cuelearner_jax.runs import sweep
+from cuelearner_jax.storage import results
 
 RUNS = {"finished": None, "stopped": 5}  # at which look at Ctrl-C the run is stopped
 VOLATILE = ("wall_s", "commit", "command", "folder", "run")

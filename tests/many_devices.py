@@ -12,7 +12,7 @@ from pathlib import Path
 import jax
 import probes
 
-from cuelearner_jax.guidance import registry as guidances
+from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.loop import start_clock
 from cuelearner_jax.runs import lanes, sweep
 from cuelearner_jax.runs.grid import Grid

@@ -11,7 +11,7 @@ import numpy as np
 import page_task
 import probes
 
-from cuelearner_jax.guidance import registry as guidances
+from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.labelling.plan import Base, Plan
 from cuelearner_jax.policies import Uniform
 

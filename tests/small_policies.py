@@ -10,15 +10,15 @@ import probes
 from cuelearner_jax.adaptation import program
 from cuelearner_jax.adaptation.adapting import Adaptation, Adapted, Judging
 from cuelearner_jax.adaptation.judging import Judged
-from cuelearner_jax.agent import view
-from cuelearner_jax.agent.networks import q_network
+from cuelearner_jax.agents import view
+from cuelearner_jax.agents.networks import q_network
 from cuelearner_jax.config import GuideSizes
 from cuelearner_jax.environment import spaces_of
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.guidance import registry as guidances
+from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.policies import Agent, Common
-from cuelearner_jax.records import policy_folders
 from cuelearner_jax.runs import adapted
+from cuelearner_jax.storage import policy_folders
 
 TASK = probes.make_task()
 ENV = TASK.environment(probes.CONFIG.task)

@@ -11,7 +11,7 @@ import probes
 import pytest
 
 from cuelearner_jax import actions, asking, loop
-from cuelearner_jax.guidance import registry as guidances
+from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.loop import start_clock
 from cuelearner_jax.policies import Agent, Heuristic, Taught, Teaching, Uniform
 

@@ -15,9 +15,9 @@ import pytest
 
 from cuelearner_jax.devices import BY_LANE, SHARED, each_lane, each_lane_in_place, lane_mesh, over_lanes
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.records import results
 from cuelearner_jax.runs.grid import load
 from cuelearner_jax.runs.trained import PolicySource
+from cuelearner_jax.storage import results
 
 SCRIPT = Path(many_devices.__file__)
 

@@ -9,7 +9,7 @@ import probes
 import pytest
 
 from cuelearner_jax.actions import DIRECTIONS, difference, evenly_spaced, rotate
-from cuelearner_jax.brax_bridge.adapter import from_brax, to_brax
+from cuelearner_jax.bridges.brax import from_brax, to_brax
 from cuelearner_jax.environment import (
     Described,
     Quantity,

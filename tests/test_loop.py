@@ -12,10 +12,10 @@ import probes
 import pytest
 
 from cuelearner_jax import actions, asking, evaluate, loop
-from cuelearner_jax.agent.learning import mirrored
-from cuelearner_jax.agent.networks import applied, q_network
+from cuelearner_jax.agents.learning import mirrored
+from cuelearner_jax.agents.networks import applied, q_network
 from cuelearner_jax.devices import lane_mesh
-from cuelearner_jax.guidance import registry as guidances
+from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.policies import Agent, Guided, Uniform
 from cuelearner_jax.types import Label, Transition
 

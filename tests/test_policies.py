@@ -11,13 +11,13 @@ import probes
 import pytest
 
 from cuelearner_jax import actions
-from cuelearner_jax.agent import choice
-from cuelearner_jax.agent.networks import applied, q_network, residual_network
+from cuelearner_jax.agents import choice
+from cuelearner_jax.agents.networks import applied, q_network, residual_network
 from cuelearner_jax.devices import lane_mesh
 from cuelearner_jax.environment import Aims
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import evaluate_lanes, evaluate_policy, one_lane, rollout
-from cuelearner_jax.guidance import registry as guidances
+from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.loop import start_clock
 from cuelearner_jax.policies import (
     Agent,

@@ -23,7 +23,7 @@ from cuelearner_jax.devices import BY_LANE, SHARED, lane_mesh, place
 from cuelearner_jax.environment import Environment
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import Rolled, Tell, untold
-from cuelearner_jax.guidance.bundle import Guidance
+from cuelearner_jax.guides.bundle import Guidance
 from cuelearner_jax.policies import Guided, Policy, named
 from cuelearner_jax.types import Label, Teacher
 

@@ -29,8 +29,8 @@ from cuelearner_jax.config import RunConfig, Scalars, Schedule, check
 from cuelearner_jax.devices import compiler_options, each_lane, each_lane_in_place
 from cuelearner_jax.environment import Environment, actions_of
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.guidance import registry as guidances
-from cuelearner_jax.guidance.none import KIND
+from cuelearner_jax.guides import registry as guidances
+from cuelearner_jax.guides.none import KIND
 from cuelearner_jax.loop import Lane, make_lane, start_clock
 from cuelearner_jax.policies import Agent
 from cuelearner_jax.types import Clock, TrainState

@@ -22,8 +22,8 @@ from cuelearner_jax.devices import each_lane
 from cuelearner_jax.environment import Environment, actions_of
 from cuelearner_jax.errors import UserError, closest
 from cuelearner_jax.evaluate import Rolled, Tell, episodes, mean_interval, roll_lanes, untold, watched, watched_lanes
-from cuelearner_jax.guidance.answers import of_strength
-from cuelearner_jax.guidance.bundle import Guidance
+from cuelearner_jax.feedback.answers import of_strength
+from cuelearner_jax.guides.bundle import Guidance
 from cuelearner_jax.policies import Common, Policy
 from cuelearner_jax.types import Label
 

@@ -32,14 +32,14 @@ from jax.sharding import Mesh
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from cuelearner_jax import asking
-from cuelearner_jax.agent.learning import all_finite
+from cuelearner_jax.agents.learning import all_finite
 from cuelearner_jax.config import GuideSizes, Scalars
 from cuelearner_jax.devices import BY_LANE, SHARED, each_lane, lane_mesh, over_lanes
 from cuelearner_jax.environment import Environment
 from cuelearner_jax.evaluate import one_lane
-from cuelearner_jax.guidance.bundle import Guidance
+from cuelearner_jax.guides.bundle import Guidance
 from cuelearner_jax.policies import Guided, Policy
-from cuelearner_jax.records.room import check_room
+from cuelearner_jax.storage.room import check_room
 from cuelearner_jax.types import GuideState, Label, Teacher
 
 FLOAT = 4  # bytes

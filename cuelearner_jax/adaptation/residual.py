@@ -17,10 +17,10 @@ from jaxtyping import Array, Float
 
 from cuelearner_jax.config import GuideScalars, GuideSizes
 from cuelearner_jax.environment import Spaces
-from cuelearner_jax.guidance.answers import DEMONSTRATION
-from cuelearner_jax.guidance.bundle import Guidance
-from cuelearner_jax.guidance.correcting import correcting
-from cuelearner_jax.guidance.kind import Kind
+from cuelearner_jax.feedback.answers import DEMONSTRATION
+from cuelearner_jax.guides.bundle import Guidance
+from cuelearner_jax.guides.correcting import correcting
+from cuelearner_jax.guides.kind import Kind
 from cuelearner_jax.types import Label
 
 

@@ -22,13 +22,13 @@ import jax
 import jax.numpy as jnp
 
 from cuelearner_jax import config as configuration
-from cuelearner_jax.agent import view
-from cuelearner_jax.agent.networks import q_network
+from cuelearner_jax.agents import view
+from cuelearner_jax.agents.networks import q_network
 from cuelearner_jax.config import AgentSizes, GuideSizes, Scalars, check_agent, check_guide
 from cuelearner_jax.environment import actions_of, offers, spaces_of
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.guidance import registry as guidances
-from cuelearner_jax.guidance.kind import NAME
+from cuelearner_jax.guides import registry as guidances
+from cuelearner_jax.guides.kind import NAME
 from cuelearner_jax.policies import Agent, Common, Corrected, Guided, Heuristic, Taught, uniform_in
 from cuelearner_jax.policies import Uniform as UniformPolicy
 

@@ -11,8 +11,8 @@ from collections.abc import Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
-from cuelearner_jax.agent import view
-from cuelearner_jax.agent.choice import looked_at
+from cuelearner_jax.agents import view
+from cuelearner_jax.agents.choice import looked_at
 from cuelearner_jax.config import Sizes
 from cuelearner_jax.environment import Spaces
 

@@ -32,12 +32,12 @@ from cuelearner_jax.config import RunConfig
 from cuelearner_jax.devices import SHARED, lane_mesh, place
 from cuelearner_jax.environment import Environment, Spaces, spaces_of
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.guidance import registry as guidances
+from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.loop import start_clock
-from cuelearner_jax.records.provenance import provenance
 from cuelearner_jax.runs.grid import LARGEST_SEED, Grid
 from cuelearner_jax.runs.lanes import CORES, LaneGroup
 from cuelearner_jax.runs.memory_report import memory_report, state_bytes
+from cuelearner_jax.storage.provenance import provenance
 from cuelearner_jax.task import Task, shape_of
 from cuelearner_jax.terminal import Interrupted, console, interruptible, progress_bars
 from cuelearner_jax.types import Teacher

@@ -15,10 +15,10 @@ from cuelearner_jax.config import GuideSizes, Scalars
 from cuelearner_jax.errors import NotFinite, UserError
 from cuelearner_jax.evaluate import Tell
 from cuelearner_jax.plugins import REFERENCE
-from cuelearner_jax.records import label_files
 from cuelearner_jax.runs import adaptation
 from cuelearner_jax.runs.adaptation import Base, Order
 from cuelearner_jax.runs.trained import PolicySource
+from cuelearner_jax.storage import label_files
 from cuelearner_jax.task import Scenario
 from cuelearner_jax.terminal import console, progress_bars
 

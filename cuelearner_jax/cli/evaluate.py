@@ -13,10 +13,10 @@ from cuelearner_jax.cli.parsing import about, out, parse, source_of, world_of
 from cuelearner_jax.cli.shared_options import TaskT
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import Tell
-from cuelearner_jax.records import policy_folders
 from cuelearner_jax.runs import measured
 from cuelearner_jax.runs.measured import Measured
 from cuelearner_jax.runs.trained import POLICIES, PolicySource
+from cuelearner_jax.storage import policy_folders
 from cuelearner_jax.task import Task
 from cuelearner_jax.tasks import registry
 from cuelearner_jax.terminal import console, progress_bars

@@ -17,11 +17,11 @@ from cuelearner_jax.cli.shared_options import Flag
 from cuelearner_jax.config import Scalars
 from cuelearner_jax.errors import UserError, closest, one_line
 from cuelearner_jax.labelling import comparing
-from cuelearner_jax.records import label_files
-from cuelearner_jax.records.label_checks import UNDONE, UNSURE
-from cuelearner_jax.records.label_files import LabelFile
-from cuelearner_jax.records.whole import replacing
 from cuelearner_jax.report.escaping import cell
+from cuelearner_jax.storage import label_files
+from cuelearner_jax.storage.label_checks import UNDONE, UNSURE
+from cuelearner_jax.storage.label_files import LabelFile
+from cuelearner_jax.storage.whole import replacing
 from cuelearner_jax.task import Task, shape_of
 from cuelearner_jax.tasks import registry
 from cuelearner_jax.terminal import console

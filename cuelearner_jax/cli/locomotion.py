@@ -8,8 +8,8 @@ from pathlib import Path
 
 import tyro
 
-from cuelearner_jax.brax_bridge import walking
-from cuelearner_jax.brax_bridge.walking import LocomotionConfig
+from cuelearner_jax.bridges import walking
+from cuelearner_jax.bridges.walking import LocomotionConfig
 from cuelearner_jax.cli.parsing import HELP, out, parse, summary
 from cuelearner_jax.errors import UserError, closest
 from cuelearner_jax.tasks.walking import anymal

@@ -18,10 +18,10 @@ from rich.console import Console
 
 from cuelearner_jax import plugins
 from cuelearner_jax.errors import UserError, closest, no_space
-from cuelearner_jax.guidance import registry as guidances
+from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.policies import policy_of
-from cuelearner_jax.records import policy_folders, whole
 from cuelearner_jax.runs.trained import POLICIES, PolicySource
+from cuelearner_jax.storage import policy_folders, whole
 from cuelearner_jax.task import Preset, Task
 from cuelearner_jax.tasks import registry
 from cuelearner_jax.terminal import PLAIN

@@ -10,7 +10,7 @@ import tyro
 
 from cuelearner_jax.config import RunConfig
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.guidance import registry as guidances
+from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.runs.grid import LARGEST_SEED, Grid
 from cuelearner_jax.runs.order import Order
 from cuelearner_jax.runs.shards import Shard

@@ -10,7 +10,7 @@ from typing import Generic
 from cuelearner_jax.cli.parsing import HELP, out, parse, preset_of, summary, task_of
 from cuelearner_jax.cli.shared_options import Flag, TaskT
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.records.room import free_bytes
+from cuelearner_jax.storage.room import free_bytes
 from cuelearner_jax.task import shape_of
 from cuelearner_jax.teachers import training
 from cuelearner_jax.teachers.learned import TeacherConfig

@@ -27,8 +27,8 @@ from cuelearner_jax.export import runner
 from cuelearner_jax.export.decisions import TOLERANCE, clip_radius_deg, described, golden_cases
 from cuelearner_jax.export.formats import FORMATS, traced
 from cuelearner_jax.policies import Policy
-from cuelearner_jax.records.provenance import provenance
-from cuelearner_jax.records.whole import Place, is_used, place_of, replacing
+from cuelearner_jax.storage.provenance import provenance
+from cuelearner_jax.storage.whole import Place, is_used, place_of, replacing
 
 ANGLE = "atan2(action[1], action[0]) [rad]: 0 along x, positive counterclockwise (from x to y)"
 

@@ -14,13 +14,13 @@ from cuelearner_jax import config as configuration
 from cuelearner_jax.config import Scalars
 from cuelearner_jax.environment import Environment
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.guidance import given
-from cuelearner_jax.guidance import registry as guidances
-from cuelearner_jax.guidance.bundle import AnswerForm
+from cuelearner_jax.feedback import given
+from cuelearner_jax.guides import registry as guidances
+from cuelearner_jax.guides.bundle import AnswerForm
 from cuelearner_jax.labelling.living import keys_of, lived
 from cuelearner_jax.labelling.programs import Agreement, agreement, as_teacher
-from cuelearner_jax.records import label_files
-from cuelearner_jax.records.label_files import LabelFile
+from cuelearner_jax.storage import label_files
+from cuelearner_jax.storage.label_files import LabelFile
 from cuelearner_jax.task import Task
 
 

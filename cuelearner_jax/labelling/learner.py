@@ -15,8 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PRNGKeyArray
 
-from cuelearner_jax.agent.learning import all_finite
-from cuelearner_jax.guidance.fitting import held_out
+from cuelearner_jax.agents.learning import all_finite
+from cuelearner_jax.guides.fitting import held_out
 from cuelearner_jax.labelling.plan import Plan
 from cuelearner_jax.labelling.programs import Agreement, Programs, agreement
 from cuelearner_jax.types import GuidanceModel, GuideState, Label

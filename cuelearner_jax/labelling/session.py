@@ -27,9 +27,9 @@ from cuelearner_jax.labelling.living import advance, begin, keys_of, lived
 from cuelearner_jax.labelling.plan import Plan
 from cuelearner_jax.labelling.programs import programs
 from cuelearner_jax.policies import named
-from cuelearner_jax.records import label_files
-from cuelearner_jax.records.label_checks import ANSWERED, UNDONE, UNSURE
-from cuelearner_jax.records.provenance import provenance
+from cuelearner_jax.storage import label_files
+from cuelearner_jax.storage.label_checks import ANSWERED, UNDONE, UNSURE
+from cuelearner_jax.storage.provenance import provenance
 from cuelearner_jax.task import shape_of
 from cuelearner_jax.types import GuideState, Label, Reel, Sketch
 

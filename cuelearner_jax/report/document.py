@@ -18,12 +18,12 @@ import pyarrow as pa
 from matplotlib.figure import Figure
 
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.records.folders import in_use
 from cuelearner_jax.report import escaping, extent, tables
 from cuelearner_jax.report.efficiency import Efficiency, Question, efficiency_of
 from cuelearner_jax.report.efficiency_document import efficiency_figures, efficiency_lines
 from cuelearner_jax.report.figures import draw_curves, draw_label_efficiency, save_figure
 from cuelearner_jax.report.variants import Group, PathLike, Variant, read_groups, variants_of
+from cuelearner_jax.storage.folders import in_use
 
 FIGURES = ("curves", "label_efficiency", "labels_to_quality", "steps_saved")
 PERMISSIVE: dict[str, Any] = {"promote_options": "permissive"}  # runs may differ in their metrics

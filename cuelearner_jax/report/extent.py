@@ -11,10 +11,10 @@ import numpy as np
 import pyarrow as pa
 
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.records import formats, results
-from cuelearner_jax.records.folders import CONFIG
 from cuelearner_jax.report.variants import Variant
 from cuelearner_jax.runs import failures, shards
+from cuelearner_jax.storage import formats, results
+from cuelearner_jax.storage.folders import CONFIG
 
 LISTED = 20  # numbers in a line
 

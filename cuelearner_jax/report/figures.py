@@ -15,7 +15,7 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from cuelearner_jax.guidance import registry
+from cuelearner_jax.guides import registry
 from cuelearner_jax.report.escaping import one_line
 from cuelearner_jax.report.statistics import Curve, Interval
 from cuelearner_jax.report.variants import Variant, guidance_name

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from cuelearner_jax.records import results
 from cuelearner_jax.report import escaping
 from cuelearner_jax.report.statistics import steps_to_reach, stretches_apart
 from cuelearner_jax.report.variants import Group, Variant
+from cuelearner_jax.storage import results
 
 Row = dict[str, str | int | float]  # of a table
 

@@ -13,12 +13,12 @@ import pyarrow.compute as pc
 from jaxtyping import Float, Int
 
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.guidance import registry
-from cuelearner_jax.records import results
-from cuelearner_jax.records.guides import read_guides
+from cuelearner_jax.guides import registry
 from cuelearner_jax.report.escaping import one_line
 from cuelearner_jax.report.statistics import Curve, Interval, curve, interval, mean_over_curve
 from cuelearner_jax.runs import failures
+from cuelearner_jax.storage import results
+from cuelearner_jax.storage.guides import read_guides
 
 PathLike = str | os.PathLike[str]
 LONGEST_NAME = 40  # characters of a kind of guidance, or of a run, in a figure

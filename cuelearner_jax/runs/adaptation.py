@@ -17,16 +17,16 @@ from cuelearner_jax.adaptation.adapting import Adaptation, Adapted, Judging
 from cuelearner_jax.config import GuideSizes, RunConfig, Scalars, Sizes, check_guide
 from cuelearner_jax.errors import UserError, closest
 from cuelearner_jax.evaluate import Tell, untold
-from cuelearner_jax.guidance import registry as guidances
-from cuelearner_jax.guidance.answers import check_teacher
-from cuelearner_jax.guidance.relative import KIND
+from cuelearner_jax.feedback.answers import check_teacher
+from cuelearner_jax.guides import registry as guidances
+from cuelearner_jax.guides.relative import KIND
 from cuelearner_jax.policies import Common
-from cuelearner_jax.records import label_files, policy_folders
 from cuelearner_jax.runs import adapted, trained
 from cuelearner_jax.runs.grid import Grid, check_grid
 from cuelearner_jax.runs.order import Order as RunOrder
 from cuelearner_jax.runs.order import read_labels
 from cuelearner_jax.runs.trained import PolicySource
+from cuelearner_jax.storage import label_files, policy_folders
 from cuelearner_jax.terminal import console
 
 DEFAULT_KIND = KIND.name

@@ -12,7 +12,7 @@ import numpy as np
 import pyarrow as pa
 
 from cuelearner_jax.errors import NotFinite, UserError
-from cuelearner_jax.records import results
+from cuelearner_jax.storage import results
 from cuelearner_jax.terminal import console
 
 LISTED = 8  # lanes of one kind of guidance and budget that a message names

@@ -14,14 +14,14 @@ from cuelearner_jax import config as configuration
 from cuelearner_jax.config import RunConfig, Scalars, Schedule, Sizes
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import SPLITS
-from cuelearner_jax.guidance import registry as guidances
-from cuelearner_jax.guidance.bundle import Guidance
-from cuelearner_jax.guidance.kind import NAME
+from cuelearner_jax.guides import registry as guidances
+from cuelearner_jax.guides.bundle import Guidance
+from cuelearner_jax.guides.kind import NAME
 from cuelearner_jax.plugins import REFERENCE
-from cuelearner_jax.records import formats, label_files
-from cuelearner_jax.records.folders import CONFIG
-from cuelearner_jax.records.room import check_room
 from cuelearner_jax.runs.shards import Shard
+from cuelearner_jax.storage import formats, label_files
+from cuelearner_jax.storage.folders import CONFIG
+from cuelearner_jax.storage.room import check_room
 from cuelearner_jax.task import Task
 
 LARGEST_SEED = min(SPLITS.values())  # seeds and splits are folded into one key

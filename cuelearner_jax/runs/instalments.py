@@ -9,7 +9,7 @@ import numpy as np
 from cuelearner_jax.asking import label_slots, share
 from cuelearner_jax.config import GuideSizes, RunConfig, Schedule
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.guidance import registry as guidances
+from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.runs.grid import Grid
 
 

@@ -17,7 +17,7 @@ from cuelearner_jax.config import RunConfig
 from cuelearner_jax.devices import BY_LANE, lane_mesh, place
 from cuelearner_jax.environment import Environment
 from cuelearner_jax.evaluate import Tell, evaluate_lanes, untold, watched_lanes
-from cuelearner_jax.guidance.bundle import Guidance
+from cuelearner_jax.guides.bundle import Guidance
 from cuelearner_jax.loop import Program, make_program
 from cuelearner_jax.policies import Policy
 from cuelearner_jax.runs.grid import Grid

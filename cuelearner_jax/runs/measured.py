@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from cuelearner_jax.evaluate import Rolled, Tell, episodes, part_of, untold, watched, watched_lanes
-from cuelearner_jax.guidance import registry as guidances
+from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.policies import Common
 from cuelearner_jax.runs.trained import POLICIES, Parts, PolicySource, blocks_of
 from cuelearner_jax.task import Rollout

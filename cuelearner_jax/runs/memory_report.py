@@ -7,13 +7,13 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from cuelearner_jax.agent.choice import looked_at
+from cuelearner_jax.agents.choice import looked_at
 from cuelearner_jax.asking import label_slots
 from cuelearner_jax.devices import portions
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.guidance.registry import registered
-from cuelearner_jax.records.room import free_bytes
+from cuelearner_jax.guides.registry import registered
 from cuelearner_jax.runs.lanes import LaneGroup
+from cuelearner_jax.storage.room import free_bytes
 from cuelearner_jax.types import TrainState
 
 FLOAT = 4  # bytes

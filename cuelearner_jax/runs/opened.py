@@ -13,14 +13,14 @@ import numpy as np
 
 from cuelearner_jax.config import RunConfig
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.guidance import registry as guidances
-from cuelearner_jax.guidance.bundle import Guidance
-from cuelearner_jax.records import formats
-from cuelearner_jax.records.folders import CONFIG, differences
+from cuelearner_jax.guides import registry as guidances
+from cuelearner_jax.guides.bundle import Guidance
 from cuelearner_jax.runs import shards
 from cuelearner_jax.runs.grid import Grid, defaults, load
 from cuelearner_jax.runs.kept import restore_policies
 from cuelearner_jax.runs.lanes import LaneGroup
+from cuelearner_jax.storage import formats
+from cuelearner_jax.storage.folders import CONFIG, differences
 from cuelearner_jax.task import Task, shape_of
 from cuelearner_jax.terminal import console
 

@@ -15,13 +15,13 @@ from cuelearner_jax.asking import label_slots
 from cuelearner_jax.config import RunConfig
 from cuelearner_jax.environment import spaces_of
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.guidance import given
-from cuelearner_jax.guidance import registry as guidances
-from cuelearner_jax.records import formats, label_files, results, tracking
-from cuelearner_jax.records.folders import CONFIG, check_folder
+from cuelearner_jax.feedback import given
+from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.runs import instalments
 from cuelearner_jax.runs.grid import Grid, check_grid, defaults, describe
 from cuelearner_jax.runs.shards import Shard
+from cuelearner_jax.storage import formats, label_files, results, tracking
+from cuelearner_jax.storage.folders import CONFIG, check_folder
 from cuelearner_jax.task import Task, shape_of
 
 

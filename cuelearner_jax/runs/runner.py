@@ -12,16 +12,16 @@ from rich.progress import Progress, TaskID
 
 from cuelearner_jax import config as configuration
 from cuelearner_jax.environment import Environment
-from cuelearner_jax.records import guides as guide_records
-from cuelearner_jax.records import label_files, provenance, results, tracking
-from cuelearner_jax.records.checkpoint import Checkpoints, checkpoints
-from cuelearner_jax.records.guides import GuideWriter
 from cuelearner_jax.runs.failures import LISTED, variant_name
 from cuelearner_jax.runs.grid import config_hash
 from cuelearner_jax.runs.kept import items, read_due, restore_blocks, write_due
 from cuelearner_jax.runs.lanes import LaneGroup
 from cuelearner_jax.runs.order import Order
 from cuelearner_jax.runs.training import Training, mean_of_finite
+from cuelearner_jax.storage import guides as guide_records
+from cuelearner_jax.storage import label_files, provenance, results, tracking
+from cuelearner_jax.storage.checkpoint import Checkpoints, checkpoints
+from cuelearner_jax.storage.guides import GuideWriter
 from cuelearner_jax.terminal import Interrupted, console
 from cuelearner_jax.types import Teacher
 

@@ -11,8 +11,8 @@ import numpy as np
 
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import SPLITS
-from cuelearner_jax.records import formats
-from cuelearner_jax.records.folders import CONFIG, differences
+from cuelearner_jax.storage import formats
+from cuelearner_jax.storage.folders import CONFIG, differences
 
 MOST_PIECES = min(SPLITS.values())  # one for each seed that there can be
 OWN = ("grid.seeds", "shard.index")  # of what config.json says, that which differs between pieces of one sweep

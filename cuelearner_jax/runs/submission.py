@@ -9,11 +9,11 @@ from statistics import fmean
 import jax
 
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.records.folders import holder
 from cuelearner_jax.runs import cluster, failures
 from cuelearner_jax.runs.cluster import Job
 from cuelearner_jax.runs.order import Plan
 from cuelearner_jax.runs.shards import Shard
+from cuelearner_jax.storage.folders import holder
 
 
 def check(place: str | None, shards: int | None, job: Job, shard: str | None, overwrite: bool, out: Path) -> None:

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 from cuelearner_jax.devices import SHARED, lane_mesh, place
-from cuelearner_jax.guidance import registry as guidances
-from cuelearner_jax.guidance.answers import check_teacher
-from cuelearner_jax.records import formats
-from cuelearner_jax.records.folders import CONFIG, check_folder, claimed, prepare_folder
+from cuelearner_jax.feedback.answers import check_teacher
+from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.runs import failures
 from cuelearner_jax.runs.grid import defaults
 from cuelearner_jax.runs.kept import check_standing
@@ -14,6 +12,8 @@ from cuelearner_jax.runs.lanes import LaneGroup
 from cuelearner_jax.runs.memory_report import memory_report
 from cuelearner_jax.runs.order import Order, planned
 from cuelearner_jax.runs.runner import Runner
+from cuelearner_jax.storage import formats
+from cuelearner_jax.storage.folders import CONFIG, check_folder, claimed, prepare_folder
 from cuelearner_jax.task import shape_of
 from cuelearner_jax.terminal import console, interruptible, progress_bars
 

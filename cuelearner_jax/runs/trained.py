@@ -13,13 +13,13 @@ from cuelearner_jax.config import RunConfig
 from cuelearner_jax.environment import actions_of, offers, spaces_of
 from cuelearner_jax.errors import UserError, closest
 from cuelearner_jax.evaluate import one_lane
-from cuelearner_jax.guidance import registry as guidances
+from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.policies import Agent, Common, Corrected, Guided, Heuristic, Policy, Taught, uniform_in
-from cuelearner_jax.records import policy_folders
 from cuelearner_jax.runs.adapted import AdaptedLanes, alone, open_folder
 from cuelearner_jax.runs.failures import without_failed
 from cuelearner_jax.runs.grid import Grid
 from cuelearner_jax.runs.opened import Lanes, Piece, lanes_of, open_run
+from cuelearner_jax.storage import policy_folders
 from cuelearner_jax.task import Task, shape_of
 from cuelearner_jax.terminal import console
 from cuelearner_jax.types import Teacher

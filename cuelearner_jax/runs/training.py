@@ -16,8 +16,8 @@ from cuelearner_jax.environment import Environment, actions_of
 from cuelearner_jax.evaluate import Tell, episodes, untold
 from cuelearner_jax.loop import start_clock
 from cuelearner_jax.policies import Agent, Guided, Policy, uniform_in
-from cuelearner_jax.records import label_files
 from cuelearner_jax.runs.lanes import LaneGroup
+from cuelearner_jax.storage import label_files
 from cuelearner_jax.types import Clock, Label, Teacher, TrainState
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from cuelearner_jax.brax_bridge.walking import LocomotionTask
+from cuelearner_jax.bridges.walking import LocomotionTask
 
 
 def anymal() -> LocomotionTask:

@@ -10,8 +10,8 @@ from flax import struct
 from jaxtyping import Array, Float
 
 from cuelearner_jax import actions as geometry
-from cuelearner_jax.agent.networks import applied, q_network
-from cuelearner_jax.agent.view import seen
+from cuelearner_jax.agents.networks import applied, q_network
+from cuelearner_jax.agents.view import seen
 from cuelearner_jax.config import LARGEST, MOST_LAYERS
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.types import Params

@@ -18,9 +18,9 @@ from flax import struct
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from cuelearner_jax import actions as geometry
-from cuelearner_jax.agent.learning import all_finite
-from cuelearner_jax.agent.networks import q_network
-from cuelearner_jax.agent.view import seen
+from cuelearner_jax.agents.learning import all_finite
+from cuelearner_jax.agents.networks import q_network
+from cuelearner_jax.agents.view import seen
 from cuelearner_jax.environment import random_symmetries
 from cuelearner_jax.teachers.learned import LearnedTeacher, TeacherConfig, expected_reward
 from cuelearner_jax.types import Params

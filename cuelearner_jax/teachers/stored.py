@@ -14,12 +14,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from cuelearner_jax.agent.learning import all_finite
+from cuelearner_jax.agents.learning import all_finite
 from cuelearner_jax.config import from_json, to_json
 from cuelearner_jax.errors import NotFinite, UserError
-from cuelearner_jax.records import formats
-from cuelearner_jax.records.checkpoint import checkpoints
-from cuelearner_jax.records.room import check_room
+from cuelearner_jax.storage import formats
+from cuelearner_jax.storage.checkpoint import checkpoints
+from cuelearner_jax.storage.room import check_room
 from cuelearner_jax.teachers.learned import LearnedTeacher, TeacherConfig, check_config
 from cuelearner_jax.teachers.program import Trainer
 

@@ -17,12 +17,12 @@ from cuelearner_jax.config import LARGEST
 from cuelearner_jax.errors import NotFinite, UserError
 from cuelearner_jax.evaluate import episodes, evaluate_policy
 from cuelearner_jax.policies import Taught
-from cuelearner_jax.records import formats
-from cuelearner_jax.records.checkpoint import checkpoints
-from cuelearner_jax.records.folders import CONFIG, check_folder, claimed, in_use, prepare_folder
-from cuelearner_jax.records.formats import FORMATS
-from cuelearner_jax.records.provenance import provenance
-from cuelearner_jax.records.whole import replacing, unreadable
+from cuelearner_jax.storage import formats
+from cuelearner_jax.storage.checkpoint import checkpoints
+from cuelearner_jax.storage.folders import CONFIG, check_folder, claimed, in_use, prepare_folder
+from cuelearner_jax.storage.formats import FORMATS
+from cuelearner_jax.storage.provenance import provenance
+from cuelearner_jax.storage.whole import replacing, unreadable
 from cuelearner_jax.task import Task
 from cuelearner_jax.teachers import stored
 from cuelearner_jax.teachers.learned import LearnedTeacher, TeacherConfig, check_config

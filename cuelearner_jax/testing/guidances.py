@@ -1,4 +1,4 @@
-"""The laws of a kind of guidance (`cuelearner_jax.guidance.kind.Kind`), held against it in one environment."""
+"""The laws of a kind of guidance (`cuelearner_jax.guides.kind.Kind`), held against it in one environment."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from jaxtyping import Array, Float
 
 from cuelearner_jax.config import GuideScalars, GuideSizes, Scalars
 from cuelearner_jax.environment import Environment, actions_of, offers, spaces_of
-from cuelearner_jax.guidance.bundle import AnswerForm, Guidance
-from cuelearner_jax.guidance.kind import Kind
+from cuelearner_jax.guides.bundle import AnswerForm, Guidance
+from cuelearner_jax.guides.kind import Kind
 from cuelearner_jax.testing.laws import Laws, Traced, changed
 from cuelearner_jax.types import EnvState, GuidanceModel, Label
 

@@ -19,9 +19,9 @@ from cuelearner_jax.config import GuideSizes
 from cuelearner_jax.devices import lane_mesh
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import one_lane
-from cuelearner_jax.guidance import registry as guidances
+from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.policies import BY_LANE, Common, Opaque, policy_of
-from cuelearner_jax.records import label_files
+from cuelearner_jax.storage import label_files
 from cuelearner_jax.types import Label
 
 HALF = 6.0  # half the width of the winning window [deg]

@@ -8,7 +8,7 @@ import pytest
 
 from cuelearner_jax import actions, evaluate
 from cuelearner_jax.adaptation.finetuning import FineTuning, every
-from cuelearner_jax.agent.networks import q_network
+from cuelearner_jax.agents.networks import q_network
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.policies import Agent
 

@@ -13,9 +13,9 @@ from cuelearner_jax import actions
 from cuelearner_jax.adaptation import program, residual
 from cuelearner_jax.config import GuideSizes, Scalars
 from cuelearner_jax.environment import spaces_of
-from cuelearner_jax.guidance import registry
-from cuelearner_jax.guidance.fitting import lessons
-from cuelearner_jax.guidance.model import residual_model
+from cuelearner_jax.guides import registry
+from cuelearner_jax.guides.fitting import lessons
+from cuelearner_jax.guides.model import residual_model
 from cuelearner_jax.policies import Common, Residual
 from cuelearner_jax.types import Label
 

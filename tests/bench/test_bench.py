@@ -10,8 +10,8 @@ import pytest
 from probes import CONFIG, Window, compilations, make_task
 
 from cuelearner_jax.actions import DIRECTIONS
-from cuelearner_jax.agent import ddqn
-from cuelearner_jax.agent.networks import applied, q_network
+from cuelearner_jax.agents import ddqn
+from cuelearner_jax.agents.networks import applied, q_network
 from cuelearner_jax.bench import known_machines as machines
 from cuelearner_jax.bench import measuring as bench
 from cuelearner_jax.bench.flops import forward, forward_and_backward, step_operations

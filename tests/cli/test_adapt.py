@@ -19,9 +19,9 @@ import cuelearner_jax as cl
 from cuelearner_jax.adaptation import stored
 from cuelearner_jax.cli import main
 from cuelearner_jax.policies import Guided
-from cuelearner_jax.records import guides, label_files, policy_folders
-from cuelearner_jax.records.checkpoint import checkpoints
 from cuelearner_jax.runs.adaptation import told
+from cuelearner_jax.storage import guides, label_files, policy_folders
+from cuelearner_jax.storage.checkpoint import checkpoints
 from cuelearner_jax.tasks import registry
 
 OWN = '''

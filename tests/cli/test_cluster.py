@@ -14,9 +14,9 @@ from small_runs import SMALL, listing
 
 from cuelearner_jax.cli import main
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.records import results
 from cuelearner_jax.runs import cluster
 from cuelearner_jax.runs.shards import Shard
+from cuelearner_jax.storage import results
 
 ENTRY = [str(Path(sys.executable).with_name("cuelearner"))]
 SWEEP = ["sweep", "billiards", "--preset", "quickstart", *SMALL, "--schedule.total-steps", "800", "--guidance", "none"]

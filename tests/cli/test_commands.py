@@ -13,7 +13,7 @@ from small_runs import SMALL
 
 from cuelearner_jax import terminal
 from cuelearner_jax.cli import evaluate, main
-from cuelearner_jax.records import guides, results
+from cuelearner_jax.storage import guides, results
 
 ENTRY = [str(Path(sys.executable).with_name("cuelearner"))]
 

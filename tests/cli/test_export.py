@@ -5,9 +5,9 @@ from functools import partial
 
 import numpy as np
 
+from cuelearner_jax.api.acting import load_policy
 from cuelearner_jax.cli import main
 from cuelearner_jax.export import contract, decisions, runner
-from cuelearner_jax.face.acting import load_policy
 
 
 def test_a_runs_guided_agent_is_exported_and_checked(run_folder, refused, tmp_path, capsys, monkeypatch):

@@ -19,14 +19,14 @@ import small_policies
 
 import cuelearner_jax as cl
 from cuelearner_jax import config as configuration
+from cuelearner_jax.api.worlds import World
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.export import runner
-from cuelearner_jax.face.worlds import World
-from cuelearner_jax.guidance import registry as guidances
+from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.policies import Heuristic
-from cuelearner_jax.records import label_files, results
-from cuelearner_jax.records import table as tables
 from cuelearner_jax.runs.trained import PolicySource
+from cuelearner_jax.storage import label_files, results
+from cuelearner_jax.storage import table as tables
 from cuelearner_jax.tasks import registry as tasks
 from cuelearner_jax.teachers import stored
 from cuelearner_jax.teachers.learned import LearnedTeacher, TeacherConfig
@@ -35,7 +35,7 @@ from cuelearner_jax.teachers.program import Trainer
 HOSTILE = "hostile:KIND"
 CODE = """
 from pathlib import Path
-from cuelearner_jax.guidance.none import KIND
+from cuelearner_jax.guides.none import KIND
 Path(__file__).with_name("executed").touch()
 """
 STARTING = ("subprocess.Popen", "os.system", "os.exec", "os.posix_spawn")

@@ -8,7 +8,7 @@ import pytest
 from small_runs import SMALL
 
 from cuelearner_jax.cli import main
-from cuelearner_jax.records import results
+from cuelearner_jax.storage import results
 
 ENTRY = [str(Path(sys.executable).with_name("cuelearner"))]
 STEPS = 1200

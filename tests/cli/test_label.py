@@ -19,8 +19,8 @@ from cuelearner_jax.labelling import ending
 from cuelearner_jax.labelling.plan import Base
 from cuelearner_jax.labelling.session import Session
 from cuelearner_jax.policies import Uniform
-from cuelearner_jax.records import label_files
-from cuelearner_jax.records.folders import claimed
+from cuelearner_jax.storage import label_files
+from cuelearner_jax.storage.folders import claimed
 from cuelearner_jax.task import shape_of
 from cuelearner_jax.tasks import registry as tasks
 

@@ -7,7 +7,7 @@ import imageio.v2 as imageio
 import pytest
 
 from cuelearner_jax.cli import main
-from cuelearner_jax.records import results
+from cuelearner_jax.storage import results
 
 SMALL = [
     *("--task.worlds", "8", "--task.max-steps", "20", "--sizes.q-layers", "16", "--sizes.feedback-layers", "16"),

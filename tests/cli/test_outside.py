@@ -8,7 +8,7 @@ import sys
 import pytest
 
 from cuelearner_jax.cli import main
-from cuelearner_jax.records import results
+from cuelearner_jax.storage import results
 from cuelearner_jax.tasks import registry
 
 OWN = """

@@ -14,9 +14,9 @@ from small_runs import SMALL
 
 from cuelearner_jax.cli import main
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.records import results
-from cuelearner_jax.records.folders import claimed
 from cuelearner_jax.runs.shards import Shard
+from cuelearner_jax.storage import results
+from cuelearner_jax.storage.folders import claimed
 
 ENTRY = [str(Path(sys.executable).with_name("cuelearner"))]
 SWEEP = ["sweep", "billiards", "--preset", "quickstart", *SMALL, "--seeds", "3", "--first-seed", "7"]

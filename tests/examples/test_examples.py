@@ -17,8 +17,8 @@ from PIL import Image
 
 from cuelearner_jax.cli import main
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.guidance import registry as guidances
-from cuelearner_jax.records import results
+from cuelearner_jax.guides import registry as guidances
+from cuelearner_jax.storage import results
 from cuelearner_jax.tasks import registry as tasks
 from cuelearner_jax.testing import check_environment, check_guidance, check_policy, check_task
 

@@ -11,8 +11,8 @@ import pytest
 
 from cuelearner_jax.adaptation.adapting import check_angles
 from cuelearner_jax.config import GuideSizes, RunConfig, Schedule, Sizes, check, check_guide
-from cuelearner_jax.guidance.answers import check_teacher
-from cuelearner_jax.records import table as tables
+from cuelearner_jax.feedback.answers import check_teacher
+from cuelearner_jax.storage import table as tables
 from cuelearner_jax.tasks import registry
 
 FOLDER = Path(__file__).parents[2] / "experiments"

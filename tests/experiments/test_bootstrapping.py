@@ -21,7 +21,7 @@ from cuelearner_jax.cli import main
 from cuelearner_jax.cli.parsing import parse
 from cuelearner_jax.cli.report import Report
 from cuelearner_jax.config import GuideScalars, GuideSizes, Scalars, Schedule, Sizes
-from cuelearner_jax.guidance import registry
+from cuelearner_jax.guides import registry
 from cuelearner_jax.report.efficiency import Question, efficiency_of
 from cuelearner_jax.report.efficiency_document import efficiency_lines
 from cuelearner_jax.report.variants import read_groups, variants_of

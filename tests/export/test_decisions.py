@@ -19,13 +19,13 @@ import pytest
 from probes import SCALARS, SIZES, Aimed, Expert, Window, WindowConfig, make_task
 
 import cuelearner_jax as cl
-from cuelearner_jax.agent import view
-from cuelearner_jax.agent.networks import q_network
+from cuelearner_jax.agents import view
+from cuelearner_jax.agents.networks import q_network
+from cuelearner_jax.api.acting import CallablePolicy
 from cuelearner_jax.environment import Quantity, action_of, spaces_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.export import contract, decisions, formats, onnx_graph, runner
-from cuelearner_jax.face.acting import CallablePolicy
-from cuelearner_jax.guidance import registry as guidances
+from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.policies import Agent, Corrected, Guided, Heuristic, Opaque, Residual, uniform_in
 
 ENV = Aimed()

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from sessions import served
 
-from cuelearner_jax.records import label_files
+from cuelearner_jax.storage import label_files
 
 playwright = pytest.importorskip("playwright.sync_api")
 pytest.importorskip("nicegui")

@@ -19,12 +19,12 @@ from nicegui import ui
 from nicegui.testing.user_simulation import user_simulation
 
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.guidance.answers import DEMONSTRATION, RELATIVE, SCALAR
-from cuelearner_jax.guidance.bundle import AnswerForm
+from cuelearner_jax.feedback.answers import DEMONSTRATION, RELATIVE, SCALAR
+from cuelearner_jax.guides.bundle import AnswerForm
 from cuelearner_jax.labelling import controls, ending, server, view
 from cuelearner_jax.labelling.ending import Commands
 from cuelearner_jax.labelling.page import Page
-from cuelearner_jax.records import label_files
+from cuelearner_jax.storage import label_files
 
 
 def shown(session, acts, finish=None):

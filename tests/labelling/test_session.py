@@ -17,15 +17,15 @@ from sessions import ENV, expert, give, plan, settled
 
 from cuelearner_jax import asking
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.guidance import registry as guidances
+from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.labelling import comparing
 from cuelearner_jax.labelling.living import keys_of
 from cuelearner_jax.labelling.plan import Base
 from cuelearner_jax.labelling.programs import programs
 from cuelearner_jax.labelling.session import Session
 from cuelearner_jax.policies import Opaque, Uniform
-from cuelearner_jax.records import label_files
-from cuelearner_jax.records.label_files import JSONL, PARQUET
+from cuelearner_jax.storage import label_files
+from cuelearner_jax.storage.label_files import JSONL, PARQUET
 
 
 def lines(folder):
@@ -187,7 +187,7 @@ def test_where_the_disk_takes_no_more_nothing_moves_on_and_nothing_is_saved_late
         raise OSError(errno.ENOSPC, "No space left on device")
 
     with monkeypatch.context() as patched:
-        patched.setattr("cuelearner_jax.records.lines.os.pwrite", full)
+        patched.setattr("cuelearner_jax.storage.lines.os.pwrite", full)
         for _ in range(2):
             with pytest.raises(UserError, match=r"not saved \(No space left on device\): make room, then answer again"):
                 session.answer(1, np.zeros(1))

@@ -10,12 +10,12 @@ import pytest
 
 from cuelearner_jax.cli import main
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.records import results
-from cuelearner_jax.records.guides import GuideWriter
 from cuelearner_jax.report.document import report
 from cuelearner_jax.report.efficiency import Question, efficiency_of
 from cuelearner_jax.report.statistics import Interval, curve, interval, mean_over_curve
 from cuelearner_jax.report.variants import Variant, read_groups, variants_of
+from cuelearner_jax.storage import results
+from cuelearner_jax.storage.guides import GuideWriter
 
 STEPS = np.arange(0, 101, 10)
 

@@ -8,8 +8,8 @@ import numpy as np
 import pyarrow.compute as pc
 import pytest
 
-from cuelearner_jax.records import results
 from cuelearner_jax.report.statistics import interval, mean_over_curve
+from cuelearner_jax.storage import results
 
 ROOT = Path(__file__).parents[2]
 DATA = ROOT / "docs" / "data"

@@ -12,8 +12,8 @@ import pytest
 from matplotlib.image import imread
 
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.records import results
 from cuelearner_jax.report.document import report
+from cuelearner_jax.storage import results
 
 STEPS = np.arange(0, 101, 10)
 

@@ -11,8 +11,8 @@ import small_policies
 
 from cuelearner_jax import config as configuration
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.records import policy_folders
 from cuelearner_jax.runs.adapted import open_folder
+from cuelearner_jax.storage import policy_folders
 
 JUNK = [None, -1, 10**20, "mro", [None], float("nan")]
 TOLD = ("of", "judged", "observation", "conventions", "commit", "versions", "hardware", "command", "arrays")

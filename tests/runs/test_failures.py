@@ -13,11 +13,11 @@ import pytest
 import cuelearner_jax as cl
 from cuelearner_jax.cli import dispatch
 from cuelearner_jax.errors import NotFinite, UserError
-from cuelearner_jax.records import results
 from cuelearner_jax.runs import lanes, measured, submission, sweep, trained
 from cuelearner_jax.runs.cluster import Job
 from cuelearner_jax.runs.grid import Grid, load
 from cuelearner_jax.runs.order import Order, Plan
+from cuelearner_jax.storage import results
 
 CONFIG = probes.config(
     sizes={"q_layers": (8, 8), "feedback_layers": (8,), "fit_steps": 20, "lanes_per_block": 3, "replay_capacity": 40},

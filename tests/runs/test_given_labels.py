@@ -7,10 +7,10 @@ import probes
 import pytest
 
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.records import label_files
 from cuelearner_jax.runs import sweep
 from cuelearner_jax.runs.grid import Grid
 from cuelearner_jax.runs.order import Order, read_labels
+from cuelearner_jax.storage import label_files
 
 TASK = {"name": "window", "half_width_deg": 28.0}
 EPS = probes.CONFIG.scalars.eps_deg

@@ -8,12 +8,12 @@ import pytest
 from small_runs import stopping_at
 
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.records import guides, label_files, results
-from cuelearner_jax.records import table as tables
 from cuelearner_jax.runs import order, runner, sweep
 from cuelearner_jax.runs.grid import Grid
 from cuelearner_jax.runs.instalments import Instalments
 from cuelearner_jax.runs.order import Order
+from cuelearner_jax.storage import guides, label_files, results
+from cuelearner_jax.storage import table as tables
 from cuelearner_jax.terminal import Interrupted
 
 CONFIG = probes.config(

@@ -10,7 +10,7 @@ from probes import CONFIG, SIZES, Window, compilations
 
 from cuelearner_jax.devices import SHARED, compiler_options, place
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.guidance import registry as guidance
+from cuelearner_jax.guides import registry as guidance
 from cuelearner_jax.loop import start_clock
 from cuelearner_jax.runs import lanes
 from cuelearner_jax.runs.grid import Grid

@@ -11,7 +11,7 @@ from probes import Aimed, Window
 from cuelearner_jax import config as configuration
 from cuelearner_jax.config import LARGEST, RunConfig, Scalars, Schedule, Sizes
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.guidance import registry
+from cuelearner_jax.guides import registry
 from cuelearner_jax.runs import memory_report
 from cuelearner_jax.runs.grid import Grid, check_grid
 from cuelearner_jax.runs.lanes import LaneGroup

@@ -15,16 +15,16 @@ from small_runs import stopping_at
 
 from cuelearner_jax.asking import label_slots
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.guidance import registry as guidances
+from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.loop import make_program, start_clock
-from cuelearner_jax.records import formats, label_files, lines, results
-from cuelearner_jax.records import table as tables
-from cuelearner_jax.records.checkpoint import checkpoints
-from cuelearner_jax.records.folders import prepare_folder
 from cuelearner_jax.runs import kept, lanes, runner, sweep, training
 from cuelearner_jax.runs.grid import Grid, config_hash
 from cuelearner_jax.runs.kept import items
 from cuelearner_jax.runs.order import Order
+from cuelearner_jax.storage import formats, label_files, lines, results
+from cuelearner_jax.storage import table as tables
+from cuelearner_jax.storage.checkpoint import checkpoints
+from cuelearner_jax.storage.folders import prepare_folder
 from cuelearner_jax.terminal import Interrupted
 
 # Bootstraps and is paced, so that target network, next observations, Adam's moments and what each arm has earned are in

@@ -11,13 +11,13 @@ import pytest
 
 from cuelearner_jax import config as configuration
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.guidance import registry as guidances
-from cuelearner_jax.records import formats, results, room
-from cuelearner_jax.records.folders import check_folder, prepare_folder
+from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.runs import grid as runs
 from cuelearner_jax.runs import sweep
 from cuelearner_jax.runs.grid import Grid
 from cuelearner_jax.runs.order import Order
+from cuelearner_jax.storage import formats, results, room
+from cuelearner_jax.storage.folders import check_folder, prepare_folder
 
 ROOT = Path(__file__).resolve().parents[2]
 TASK = probes.make_task()

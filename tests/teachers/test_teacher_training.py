@@ -14,7 +14,7 @@ from cuelearner_jax.config import to_json
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import rollout
 from cuelearner_jax.policies import Taught
-from cuelearner_jax.records import formats
+from cuelearner_jax.storage import formats
 from cuelearner_jax.teachers import program as training_program
 from cuelearner_jax.teachers import stored
 from cuelearner_jax.teachers.learned import TeacherConfig

@@ -12,7 +12,7 @@ import probes
 import pytest
 
 from cuelearner_jax.errors import NotFinite, UserError
-from cuelearner_jax.records.folders import LOCK
+from cuelearner_jax.storage.folders import LOCK
 from cuelearner_jax.teachers import program, stored, training
 from cuelearner_jax.teachers.learned import TeacherConfig
 from cuelearner_jax.terminal import Interrupted

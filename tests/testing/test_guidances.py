@@ -6,8 +6,8 @@ import jax.numpy as jnp
 import pytest
 from probes import Aimed, Chain, Window
 
-from cuelearner_jax.guidance import registry
-from cuelearner_jax.guidance.refining import Refined
+from cuelearner_jax.guides import registry
+from cuelearner_jax.guides.refining import Refined
 from cuelearner_jax.testing import check_guidance
 from cuelearner_jax.testing.guidances import SMALL
 

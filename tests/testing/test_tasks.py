@@ -10,7 +10,7 @@ from probes import CONFIG, Expert, Window, WindowConfig, make_task
 
 from cuelearner_envs.billiards.config import BilliardsConfig
 from cuelearner_envs.navigation.config import NavigationConfig
-from cuelearner_jax.brax_bridge.adapter import from_brax
+from cuelearner_jax.bridges.brax import from_brax
 from cuelearner_jax.config import Scalars
 from cuelearner_jax.environment import Quantity
 from cuelearner_jax.task import Body, Pictures, Preset, Scenario

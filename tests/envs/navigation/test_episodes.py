@@ -15,7 +15,7 @@ from cuelearner_envs.navigation.lidar import Lidar
 from cuelearner_envs.navigation.robot import collides
 from cuelearner_envs.navigation.worlds import generate_many
 from cuelearner_jax import actions
-from cuelearner_jax.agent.learning import learner, stored_step
+from cuelearner_jax.agents.learning import learner, stored_step
 
 KEY = jax.random.key(0)
 LEFT = jnp.array([0.0, 1.0])

@@ -16,7 +16,7 @@ from cuelearner_envs.navigation.config import NavigationConfig
 from cuelearner_envs.navigation.environment import PLAIN, Navigation
 from cuelearner_envs.navigation.lidar import BEAM_ANGLES
 from cuelearner_jax.actions import from_angle
-from cuelearner_jax.agent.networks import q_network
+from cuelearner_jax.agents.networks import q_network
 from cuelearner_jax.config import AgentSizes
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.policies import Agent

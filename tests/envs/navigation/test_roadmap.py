@@ -18,8 +18,8 @@ from cuelearner_envs.navigation.worlds import generate_many
 from cuelearner_jax import evaluate
 from cuelearner_jax.actions import difference, from_angle
 from cuelearner_jax.config import Scalars, Sizes
-from cuelearner_jax.guidance import registry as guidances
-from cuelearner_jax.guidance.answers import human_answer, relative_answer
+from cuelearner_jax.feedback.answers import human_answer, relative_answer
+from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.policies import Taught
 from cuelearner_jax.types import Label
 

@@ -1,0 +1,156 @@
+"""Policies to call: on one observation or on many, from a folder or of one's own making."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from cuelearner_jax import user_code
+from cuelearner_jax.actions import DIRECTIONS
+from cuelearner_jax.api import arguments
+from cuelearner_jax.api.worlds import World, a_world
+from cuelearner_jax.environment import Quantity
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.policies import Policy, acted, named
+from cuelearner_jax.runs import trained
+from cuelearner_jax.storage import whole
+from cuelearner_jax.task import Task, shape_of
+from cuelearner_jax.tasks import registry
+from cuelearner_jax.types import EnvState
+
+
+@jax.jit
+def _act(policy: Policy, key: PRNGKeyArray, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
+    return acted(policy, key, None, obs, DIRECTIONS)
+
+
+@dataclasses.dataclass(frozen=True)
+class CallablePolicy:
+    """A policy that can be called: `policy(obs)` on an observation (obs,), or on a batch (n, obs).
+
+    `policy.policy` is the pytree behind it, `policy.act(key, states, obs)` what evaluation calls.
+    """
+
+    policy: Policy
+    observation: tuple[Quantity, ...] = ()  # what it expects to see; empty: not known
+    asks: bool = False  # does it ask a teacher, who looks at the true state?
+
+    def __post_init__(self) -> None:
+        """Raises UserError for a policy that is none, or a description of observations that is none."""
+        arguments.policy("policy", self.policy)
+        if not all(isinstance(part, Quantity) for part in arguments.several("observation", self.observation, "slices")):
+            raise arguments.refused("observation", self.observation, "slices, as a world's observation has them")
+        arguments.flag("asks", self.asks)
+
+    @user_code.told
+    def __call__(self, obs: Any, key: PRNGKeyArray | None = None) -> np.ndarray:
+        """Actions for observations.
+
+        Args:
+            obs: (obs,) or (n, obs), as `observation` orders them.
+            key: for a policy that acts at random (default: always the same).
+
+        Returns:
+            Unit vectors (2,) or (n, 2).
+
+        Raises:
+            UserError: observations of another size, numbers that are not finite, or a policy that asks a teacher.
+        """
+        if self.asks:
+            raise UserError("this policy asks a teacher, who looks at the true state: call its act(key, states, obs)")
+        rows = arguments.observations("obs", obs, sum(quantity.size for quantity in self.observation) or None)
+        batch = rows[None] if rows.ndim == 1 else rows
+        key = jax.random.key(0) if key is None else arguments.key("key", key)
+        chosen = np.array(_act(self.policy, key, jnp.asarray(batch)))  # a copy, which the caller may write in
+        user_code.check_actions(chosen, named(self.policy))
+        return chosen[0] if rows.ndim == 1 else chosen
+
+    def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
+        """As `types.Policy` has it."""
+        return self.policy.act(key, states, obs)
+
+
+def as_policy(given: Any, name: str = "policy") -> Policy:
+    """Anything that acts as a policy: a `CallablePolicy`, or what `policies.policy_of` takes.
+
+    Raises UserError, which says the argument's name, for what is none of them.
+    """
+    return given.policy if isinstance(given, CallablePolicy) else arguments.policy(name, given)
+
+
+def entries_of(policy: Any) -> int:
+    """Entries of the observations that a policy expects, 0 where that is not known."""
+    return sum(quantity.size for quantity in policy.observation) if isinstance(policy, CallablePolicy) else 0
+
+
+def as_policy_in(given: Any, env: Any) -> Policy:
+    """`as_policy` for a world. Raises UserError for a policy of other observations, or one that cannot act there."""
+    policy, seen = as_policy(given), entries_of(given)
+    own = sum(quantity.size for quantity in getattr(env, "observation", ()))
+    if seen and own and seen != own:
+        raise UserError(f"the policy's observations have {seen} entries, this world's {own}: keep its structure")
+    arguments.acts_in("policy", policy, env)
+    return policy
+
+
+@user_code.told
+def load_policy(
+    folder: str | Path,
+    *,
+    policy: str | None = None,
+    guidance: str | None = None,
+    labels: int | None = None,
+    bound_deg: float | None = None,
+    seed: int | None = None,
+    base: Any = None,
+    task: Task | str | None = None,
+    world: World | None = None,
+) -> CallablePolicy:
+    """What a lane of a finished run acts with, or of a policy folder (`adapt`).
+
+    Args:
+        folder: of the run, or of a sweep in pieces; or the policy folder.
+        policy: "agent", "guided" or another that `cuelearner evaluate --help` lists (default: the trained agent, or the
+            adapted policy).
+        guidance: kind of guidance of the lane (default: the run's last).
+        labels: its label budget (default: the largest).
+        bound_deg: of a policy folder: its bound [deg] (default: the largest).
+        seed: its seed (default: the first).
+        base: the policy that was adapted, where it is code: the folder names it, and does not hold it.
+        task: needed for a run of a task from outside the package, whose code is not loaded because a file names it.
+        world: where it is to act, for policies that look at more than observations (default: as it was trained).
+
+    Raises:
+        UserError: no such folder, lane or policy.
+    """
+    path = arguments.path("folder", folder)
+    for argument, value in (("policy", policy), ("guidance", guidance)):
+        if value is not None:
+            arguments.text(argument, value, trained.POLICIES if argument == "policy" else ())
+    labels = None if labels is None else arguments.budget("labels", labels, least=0)
+    bound_deg = None if bound_deg is None else arguments.angle("bound_deg", bound_deg)
+    seed = None if seed is None else arguments.seed("seed", seed)
+    code = None if base is None else as_policy(base, "base")
+    if isinstance(task, str):
+        task = registry.resolve(arguments.text("task", task))
+    elif task is not None:
+        arguments.instance("task", task, Task, "a task, or its name")
+    if world is not None:
+        a_world("world", world)
+    whole.check_not_aside(path)
+    if not path.exists():
+        raise UserError(f"folder {path} does not exist: give the folder of a run, or of an adapted policy")
+    find = lambda name: task if task and task.name == name else registry.find(name)  # noqa: E731
+    source = trained.PolicySource.of_folder(path, find, code)
+    known, name = source.task, policy or source.default_policy
+    changed = world.config if world else source.config.task
+    source.check(name, changed)
+    env = known.environment(changed)
+    found = trained.one_policy(source, env, changed, name, guidance, labels, seed, bound_deg)
+    return CallablePolicy(found, shape_of(known, changed).observation, trained.POLICIES[name].taught)

@@ -1,0 +1,269 @@
+"""A feedback model of one's own labels, and policies refined by it: in rounds and within a bound by default.
+
+A model knows the actions that it was shown. Labels about a policy's own actions alone say nothing of what refinement
+then leads to; followed far, such a model makes the policy worse without a word. So `ask` questions in rounds, about
+actions refined by the model so far (DAgger), and `refine` goes no farther than labels reach unless it is told to.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import os
+import warnings
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from cuelearner_jax import user_code
+from cuelearner_jax.actions import DIRECTIONS
+from cuelearner_jax.adaptation import adapting, program
+from cuelearner_jax.agents.learning import all_finite
+from cuelearner_jax.api import arguments
+from cuelearner_jax.api.acting import CallablePolicy, as_policy, as_policy_in, entries_of
+from cuelearner_jax.api.worlds import World, a_world
+from cuelearner_jax.config import GuideSizes, Scalars, check_guide
+from cuelearner_jax.environment import Quantity, Spaces, spaces_of
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.feedback import given
+from cuelearner_jax.feedback.answers import RELATIVE, check_teacher
+from cuelearner_jax.guides import registry
+from cuelearner_jax.guides.bundle import Guidance
+from cuelearner_jax.guides.relative import KIND
+from cuelearner_jax.policies import Common, Guided
+from cuelearner_jax.storage import label_files
+from cuelearner_jax.types import GuidanceModel, Label, Teacher
+
+
+class Labels(NamedTuple):
+    """Labels as arrays: what was seen, the action asked about, and the answer."""
+
+    obs: Float[np.ndarray, "labels obs"]
+    action: Float[np.ndarray, "labels 2"]  # unit vectors
+    answer: Float[np.ndarray, "labels"]  # h: +1 counterclockwise ("more to the left"), 0 already right, -1 clockwise
+
+
+@dataclasses.dataclass(frozen=True)
+class FeedbackModel:
+    """A model of relative feedback, fitted by `fit_feedback` or `ask`."""
+
+    guidance: Guidance
+    model: GuidanceModel
+    scalars: Scalars  # eps of the labels, and how actions are refined
+    labels: Labels
+    sizes: GuideSizes  # that the guidance was made with
+    env: Any = None  # says how an observation looks from an action; nobody asks it in the raw frame
+
+
+@user_code.told
+def fit_feedback(
+    labels: Labels | str | os.PathLike[str],
+    *,
+    eps_deg: float | None = None,
+    sizes: GuideSizes | None = None,
+    scalars: Scalars | None = None,
+    seed: int = 0,
+) -> FeedbackModel:
+    """Fits a feedback model to relative labels (paper, Eq. 3).
+
+    Args:
+        labels: arrays, or a label file (its first seed's).
+        eps_deg: strength of an answer [deg]; of arrays 5 if not given, of a file the file's, or of each label its own.
+        sizes: of the network and its fitting (default: small ones, the paper's are `config.GuideSizes()`).
+        scalars: of the fitting and of refinement.
+        seed: of the network.
+
+    Raises:
+        UserError: labels or settings that make no sense, or with which the fit diverges.
+    """
+    seed, own_eps = arguments.seed("seed", seed), None
+    sizes, scalars, eps_deg = given_settings(sizes, scalars, eps_deg)
+    if not isinstance(labels, tuple):
+        labels = label_path(labels)
+        file = label_files.read(labels)
+        if file.answers != RELATIVE.name:
+            raise UserError(f"{labels} holds {file.answers} answers: give a file of {RELATIVE.name} ones")
+        given.check_file(file, None, RELATIVE, str(labels))
+        if eps_deg is not None and not math.isclose(eps_deg, file.eps_deg or 0.0, rel_tol=1e-6):
+            raise UserError(f"{labels} holds answers of {file.eps_deg:g} degrees: leave out eps_deg")
+        own = file.seeds == file.seeds[0]
+        eps_deg = file.eps_deg
+        rows = jax.tree.map(lambda leaf: np.asarray(leaf)[own], file.labels)
+        labels, own_eps = Labels(rows.obs, rows.action, rows.answer[:, 0]), rows.eps_deg
+    labels = _checked(labels, own_eps)
+    sizes, scalars = settings(sizes, scalars, eps_deg)
+    guidance = _relative(sizes, Spaces(labels.obs.shape[1], DIRECTIONS))
+    valid = np.ones(len(labels.obs), bool)
+    rows = Label(*(jnp.asarray(part) for part in (labels.obs, labels.action, labels.answer[:, None], valid)))
+    rows = rows.replace(eps_deg=None if own_eps is None else jnp.asarray(own_eps))
+    k_init, k_fit = jax.random.split(jax.random.key(seed))
+    program.check_memory(sizes, jax.eval_shape(guidance.init, k_init))
+    fit = jax.jit(lambda key, rows, former, scalars: guidance.fit(key, None, rows, former, scalars))
+    return FeedbackModel(guidance, _finite(fit(k_fit, rows, guidance.init(k_init), scalars)), scalars, labels, sizes)
+
+
+@user_code.told
+def ask(
+    policy: Any,
+    world: World,
+    teacher: Teacher,
+    *,
+    labels: int,
+    bound_deg: float = 45.0,
+    eps_deg: float | None = None,
+    sizes: GuideSizes | None = None,
+    scalars: Scalars | None = None,
+    seed: int = 0,
+) -> FeedbackModel:
+    """Asks a teacher about a policy's actions in rounds, each about actions refined by the model so far (DAgger).
+
+    Args:
+        policy: what is to be corrected: a policy, or any function of a batch of observations in NumPy.
+        world: where it acts.
+        teacher: who answers.
+        labels: number of questions.
+        bound_deg: refined actions that are asked about stay within this of the policy's own [deg].
+        eps_deg: strength of an answer [deg] (default: the scalars').
+        sizes: of the network, its fitting, and the labels of a round.
+        scalars: of the fitting, of refinement and of the teacher's faults.
+        seed: of everything random.
+
+    Raises:
+        UserError: settings that make no sense, or with which the fit diverges.
+    """
+    as_policy(policy)
+    labels, seed = arguments.budget("labels", labels), arguments.seed("seed", seed)
+    a_world("world", world)
+    bound_deg = arguments.angle("bound_deg", bound_deg)
+    sizes, scalars = settings(*given_settings(sizes, scalars, eps_deg))
+    check_teacher(arguments.teacher("teacher", teacher), scalars)
+    adapting.check_angles([bound_deg], scalars)
+    env, guidance = world.env, _relative(sizes, spaces_of(world.env))
+    arguments.answers_in("teacher", teacher, env)
+    lanes, base = program.product(1, (seed,), (labels,), (bound_deg,)), Common(as_policy_in(policy, env))
+    block = program.begin(guidance, sizes, env, lanes)
+    for _ in range(program.rounds(lanes, sizes)):
+        block = program.ask_round(guidance, sizes, env, teacher, scalars, base, block)
+    if block.failed.any():
+        program.blame(base, teacher, block)
+        raise diverged()
+    guide = jax.tree.map(lambda leaf: leaf[0], block.guide)
+    return FeedbackModel(guidance, guide.model, scalars, labels_of(guide.labels), sizes, env)
+
+
+def labels_of(rows: Label) -> Labels:
+    """A lane's labels that count, as arrays."""
+    given = jax.device_get(rows)
+    return Labels(*(np.asarray(part)[given.valid] for part in (given.obs, given.action, given.answer[:, 0])))
+
+
+@user_code.told
+def refine(policy: Any, model: FeedbackModel, bound_deg: float | None = None) -> CallablePolicy:
+    """A policy's actions refined by a feedback model, within a bound (paper, Eqs. 2 to 5).
+
+    Args:
+        policy: as for `ask`.
+        model: from `ask` or `fit_feedback`.
+        bound_deg: how far refinement may lead from the policy's own actions [deg]. By default as far as the labels
+            reach: the distance within which 95% of the actions asked about lie from the policy's own, at least eps.
+            A larger one is a warning: there the model was shown nothing.
+
+    Raises:
+        UserError: a bound that is no positive angle.
+    """
+    base = as_policy(policy)
+    arguments.instance("model", model, FeedbackModel, "a model, as cl.ask and cl.fit_feedback give it")
+    bound_deg = None if bound_deg is None else arguments.angle("bound_deg", bound_deg)
+    labels = _checked_model(model).labels
+    width, seen = labels.obs.shape[1], entries_of(policy)
+    if seen not in (0, width):
+        raise UserError(f"model is of observations with {width} entries, the policy's have {seen}: give one of its own")
+    reach = max(adapting.reach(base, labels.obs, labels.action), model.scalars.eps_deg)
+    if bound_deg is not None and bound_deg > reach * 1.05 and bound_deg > model.scalars.eps_deg:
+        warnings.warn(
+            f"the labels lie within {reach:.1f} degrees of this policy's own actions, and refinement may lead up to "
+            f"{bound_deg:g} away, where the model was shown nothing and may make the policy worse: ask in rounds "
+            "(cuelearner_jax.ask), or leave out bound_deg",
+            stacklevel=2,
+        )
+    bound = jnp.deg2rad(jnp.float32(reach if bound_deg is None else bound_deg))
+    guided = Guided(base, model.model, model.env, model.scalars, model.guidance, bound, model.sizes)
+    return CallablePolicy(guided, policy.observation if seen else (Quantity("observation", width, ""),))
+
+
+def _checked_model(model: FeedbackModel) -> FeedbackModel:
+    """A model whose parts are of their kinds. Raises UserError for any other."""
+    for name, kind in (("guidance", Guidance), ("scalars", Scalars), ("labels", Labels), ("model", GuidanceModel)):
+        arguments.instance(f"model.{name}", getattr(model, name), kind, "a model as cl.ask and cl.fit_feedback give it")
+    return model
+
+
+def _relative(sizes: GuideSizes, spaces: Spaces) -> Guidance:
+    return registry.made_for(KIND, sizes, spaces)
+
+
+def given_settings(sizes: Any, scalars: Any, eps_deg: Any) -> tuple[GuideSizes | None, Scalars | None, float | None]:
+    """These arguments as they are, each of them one of its kind or None. Raises UserError for the first that is not."""
+    return (
+        None if sizes is None else arguments.settings("sizes", sizes, GuideSizes),
+        None if scalars is None else arguments.settings("scalars", scalars, Scalars),
+        None if eps_deg is None else arguments.angle("eps_deg", eps_deg),
+    )
+
+
+def label_path(labels: Any) -> Path:
+    """The path of a label file. Raises UserError where nothing lies there."""
+    path = arguments.path("labels", labels)
+    if not path.exists():
+        raise UserError(f"labels: there is no label file at {path}: give one that a run or a person wrote, or arrays")
+    return path
+
+
+def settings(sizes: GuideSizes | None, scalars: Scalars | None, eps_deg: float | None) -> tuple[GuideSizes, Scalars]:
+    """Sizes and scalars, by default those of `adapting`. Raises UserError for what cannot work."""
+    sizes, scalars = sizes or adapting.SIZES, adapting.settling(scalars or Scalars(), eps_deg)
+    check_guide(sizes, scalars)
+    return sizes, scalars
+
+
+def rows_of(labels: Any) -> Labels:
+    """Labels of finite floats. Raises UserError if they are not three arrays of one length."""
+    if not isinstance(labels, tuple) or len(labels) != 3:
+        raise arguments.refused("labels", labels, "a label file, or Labels(obs, action, answer)")
+    obs, action, answer = (
+        arguments.numbers(f"labels.{name}", part) for name, part in zip(Labels._fields, labels, strict=True)
+    )
+    answer = answer[:, 0] if answer.ndim == 2 and answer.shape[1] == 1 else answer
+    if obs.ndim != 2 or not obs.size or action.shape[:1] != (len(obs),) or answer.shape[:1] != (len(obs),):
+        raise UserError(
+            f"labels have shapes {obs.shape}, {action.shape}, {answer.shape}: give observations (n, obs), "
+            "actions (n, 2) and answers (n,)"
+        )
+    return Labels(obs, action, answer)
+
+
+def _checked(labels: Any, own_eps: Any) -> Labels:
+    """Labels that a model can be fitted to. Raises UserError for what makes no sense."""
+    obs, action, answer = labels = rows_of(labels)
+    if len(obs) < 2:
+        raise UserError(f"{len(obs)} labels teach nothing: give more")
+    answers = answer[:, None] if answer.ndim == 1 else answer
+    rows = Label(obs, action, answers, np.ones(len(obs), bool), None, own_eps)  # pyright: ignore[reportArgumentType]
+    given.check(rows, Spaces(obs.shape[1], DIRECTIONS), RELATIVE)
+    return labels
+
+
+def _finite(model: GuidanceModel) -> GuidanceModel:
+    """A fitted model. Raises UserError if it is not finite."""
+    if not all_finite(model):
+        raise diverged()
+    return model
+
+
+def diverged() -> UserError:
+    """What is raised where a fit is no longer finite."""
+    return UserError("the fit of the feedback model diverged: lower scalars.feedback_learning_rate")

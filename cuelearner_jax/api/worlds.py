@@ -1,0 +1,117 @@
+"""Worlds and teachers by name."""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import cached_property
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from cuelearner_jax import user_code
+from cuelearner_jax.actions import Actions
+from cuelearner_jax.api import arguments
+from cuelearner_jax.config import settled
+from cuelearner_jax.environment import Environment, Quantity, actions_of
+from cuelearner_jax.evaluate import SPLITS
+from cuelearner_jax.policies import Teaching
+from cuelearner_jax.task import Task
+from cuelearner_jax.tasks import registry
+from cuelearner_jax.types import EnvState, Policy, Step, Teacher
+
+
+@dataclasses.dataclass(frozen=True)
+class World:
+    """A task in one configuration: an environment for training, others for validation, and who can teach in it."""
+
+    task: Task
+    config: Any
+
+    def __post_init__(self) -> None:
+        """Raises UserError for a configuration that is none of the task's."""
+        arguments.instance("task", self.task, Task, "a task, as tasks.registry finds it")
+        arguments.instance("config", self.config, self.task.config, f"a {self.task.config.__name__}, or use cl.make")
+        object.__setattr__(self, "config", settled(self.config, "task"))
+
+    @cached_property
+    def env(self) -> Environment:
+        """The environment that agents train in: a pytree, see `environment.Environment`."""
+        return self.environment("training")
+
+    def environment(self, split: str) -> Environment:
+        """That of a split: "training", "tuning" or "validation". Raises UserError for any other."""
+        return self.task.environment(self.config, arguments.text("split", split, ("training", *SPLITS)))
+
+    @property
+    def observation(self) -> tuple[Quantity, ...]:
+        """The slices of an observation, each with name, size and unit."""
+        return self.env.observation
+
+    @property
+    def actions(self) -> Actions:
+        """The action space."""
+        return actions_of(self.env)
+
+    @user_code.told
+    def reset(self, key: PRNGKeyArray) -> tuple[EnvState, Float[Array, " obs"]]:
+        """Starts an episode: (state, observation). Raises UserError for what is no key."""
+        return jax.jit(self.env.reset)(arguments.key("key", key))
+
+    @cached_property
+    def _state(self) -> Any:
+        """A state with shapes in place of arrays."""
+        return jax.eval_shape(self.env.reset, jax.random.key(0))[0]
+
+    @user_code.told
+    def step(
+        self, key: PRNGKeyArray, state: EnvState, action: Float[Array, " action"] | Float[np.ndarray, " action"]
+    ) -> tuple[EnvState, Step]:
+        """Executes an action; a new episode begins by itself where one ends.
+
+        Raises UserError for what is no key, no state of this world, or no action.
+        """
+        arguments.like("state", state, self._state)
+        action = arguments.action("action", action, self.actions)
+        return jax.jit(self.env.step)(arguments.key("key", key), state, action)
+
+
+@user_code.told
+def make(name: str | Task, *, scenario: str | None = None, robot: str | None = None, **changes: Any) -> World:
+    """A world of a task.
+
+    Args:
+        name: of the task ("billiards", "navigation", one of an installed package, `package.module:NAME`), or the task.
+        scenario: a changed world of the task's by name.
+        robot: what acts there (default: the task's own), "anymal" in navigation, "pooltool" in billiards.
+        changes: fields of its configuration, as `cuelearner evaluate TASK --help` lists them under "task options".
+
+    Raises:
+        UserError: no such task, scenario, robot or field.
+    """
+    task = registry.resolve(arguments.text("name", name)) if isinstance(name, str) else name
+    task = arguments.instance("name", task, Task, "the name of a task, or a task")
+    task = task.on(None if robot is None else arguments.text("robot", robot))
+    if scenario is not None:
+        arguments.text("scenario", scenario)
+    return World(task, task.configured(scenario, **changes))
+
+
+def a_world(name: str, value: Any) -> World:
+    """A world, as an argument. Raises UserError for anything else."""
+    return arguments.instance(name, value, World, "a world, as cl.make gives it")
+
+
+@user_code.told
+def teacher_of(source: World | Policy) -> Teacher:
+    """Who teaches: in a world its task's own teacher, of a policy (a finished agent, say) that policy.
+
+    Raises:
+        UserError: the task has no teacher, or it cannot be had; what is neither a world nor a policy.
+    """
+    if isinstance(source, World):
+        return source.task.make_teacher(source.config, source.env)
+    if not hasattr(source, "policy"):  # of a `CallablePolicy`, which stands above this file
+        source = arguments.policy("source", source)
+    return Teaching(source)

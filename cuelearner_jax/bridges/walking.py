@@ -1,0 +1,268 @@
+"""Training a walking policy by brax's PPO on the host: progress, regular saving, the finished policy measured.
+
+The folder of a policy always holds the newest one measured, with its history: a run that is cut leaves it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+from jaxtyping import PRNGKeyArray
+
+from cuelearner_jax import config as configuration
+from cuelearner_jax.agents.learning import all_finite
+from cuelearner_jax.errors import NotFinite, UserError
+from cuelearner_jax.storage.folders import claimed, in_use
+from cuelearner_jax.storage.provenance import provenance
+from cuelearner_jax.terminal import Interrupted, interruptible
+
+COLUMNS = ("steps", "wall_s", "error", "turning_error", "falls")  # of the history
+VALUE_LAYERS = (256, 256, 256, 256)
+
+
+class LocomotionTask(NamedTuple):
+    """What training has to know of a robot that learns to walk. Figures are numbers by name."""
+
+    environment: Any  # brax.envs.Env: velocity commands are to be tracked
+    policy: Callable[[Any], Any]  # brax's parameters -> a policy
+    measure: Callable[[Any, PRNGKeyArray, int], dict[str, float]]  # (policy, key, robots) -> figures while it learns
+    examine: Callable[[Any, PRNGKeyArray, int], Iterator[tuple[str, dict[str, float]]]]  # of a finished one, by trial
+    save: Callable[[Path, Any, dict[str, Any]], None]  # (folder, policy, what is to be known of it)
+    load: Callable[..., Any]  # (folder) -> the policy; the shipped one without a folder
+
+
+@dataclass(frozen=True)
+class LocomotionConfig:
+    """How walking is learned (brax's PPO)."""
+
+    steps: int = 100_000_000
+    """Steps of control, over all robots."""
+    seconds: float = 0.0
+    """Stop at the first measurement after this time [s]; 0: only after all steps."""
+    robots: int = 4096
+    """Robots that walk in parallel."""
+    layers: tuple[int, ...] = (256, 128, 64)
+    """Hidden layers of the policy."""
+    unroll: int = 20
+    """Steps of control in a piece of experience."""
+    minibatches: int = 16
+    """Parts into which a batch is split."""
+    batch_size: int = 256
+    """Pieces of experience in a minibatch; times minibatches it must be a multiple of the robots."""
+    updates: int = 4
+    """Passes over each batch."""
+    learning_rate: float = 3e-4
+    """Adam's step size."""
+    entropy: float = 0.01
+    """Weight of the policy's entropy."""
+    discount: float = 0.97
+    """Discount factor."""
+    max_grad_norm: float = 1.0
+    """Bound on the gradient's norm."""
+    episode: int = 1000
+    """Steps of control of an episode."""
+    measurements: int = 20
+    """Times at which the policy is measured and saved."""
+    measured_robots: int = 512
+    """Robots that a measurement watches for 20 s."""
+
+
+LARGEST_ROBOTS = 1 << 20  # each keeps some kilobytes of physics
+
+
+def check(config: LocomotionConfig) -> None:
+    """Raises UserError for values that cannot work."""
+    configuration.check_whole(config, "train")
+    for name in ("robots", "measured_robots"):
+        if getattr(config, name) > LARGEST_ROBOTS:
+            raise UserError(f"train.{name} is {getattr(config, name)}: give at most {LARGEST_ROBOTS}")
+    for field in dataclasses.fields(config):
+        value = getattr(config, field.name)
+        if field.name not in ("seconds", "entropy", "layers") and value <= 0:
+            raise UserError(f"train.{field.name} is {value}: give a positive number")
+    if config.seconds < 0 or config.entropy < 0:
+        raise UserError("train.seconds and train.entropy can't be negative")
+    if not all(math.isfinite(value) for value in dataclasses.asdict(config).values() if isinstance(value, float)):
+        raise UserError("train: give finite numbers")
+    if not config.layers or min(config.layers) < 1:
+        raise UserError("train.layers: give at least one layer of positive width")
+    if config.batch_size * config.minibatches % config.robots:
+        raise UserError(
+            f"train.batch_size times train.minibatches is {config.batch_size * config.minibatches}: "
+            f"give a multiple of train.robots ({config.robots})"
+        )
+
+
+def _check_seed(seed: int) -> None:
+    if not 0 <= seed <= configuration.LARGEST:
+        raise UserError(f"--seed is {seed}: give a number from 0 to {configuration.LARGEST}")
+
+
+class _Enough(Exception):
+    """The time is over, or somebody asked to stop."""
+
+
+def train(
+    robot: LocomotionTask,
+    config: LocomotionConfig,
+    out: Path,
+    seed: int,
+    command: str,
+    tell: Callable[[str], None] = print,
+) -> dict[str, Any]:
+    """Trains a walking policy, measures it and writes it.
+
+    Returns:
+        What is written beside it: settings, history, figures.
+
+    Raises:
+        UserError: bad configuration, or a folder in use; nothing has been changed then.
+        Interrupted: Ctrl-C or SIGTERM; the newest measured policy is saved.
+        NotFinite: the training diverged; the newest measured policy that was finite is saved.
+    """
+    check(config)
+    _check_seed(seed)
+    if in_use(out):
+        raise UserError(f"{out} is not empty: give another --out")
+    with claimed(out):
+        if in_use(out):  # nobody else can change it any more
+            raise UserError(f"{out} is not empty: give another --out")
+        return _trained(robot, config, out, seed, command, tell)
+
+
+def _trained(
+    robot: LocomotionTask, config: LocomotionConfig, out: Path, seed: int, command: str, tell: Callable[[str], None]
+) -> dict[str, Any]:
+    """`train` in a folder that is kept for it."""
+    about = {"config": configuration.to_json(config), "seed": seed, **provenance(), "command": command}
+    history: list[list[float]] = []
+    key = jax.random.key(seed)
+    began = time.perf_counter()
+
+    def look(steps: int, _: Any, params: Any) -> None:
+        if not all_finite(params):
+            held = "holds the policy of the measurement before" if history and history[-1][0] else "holds no policy"
+            raise NotFinite(
+                f"the walking policy is no longer finite by step {steps:,}, and was not written; {out} {held}: train "
+                "with a smaller --train.learning-rate and another --out"
+            )
+        policy = robot.policy(params)
+        found = robot.measure(policy, jax.random.fold_in(key, 0), config.measured_robots)
+        wall = time.perf_counter() - began
+        history.append([steps, round(wall, 1), *(round(found[name], 4) for name in COLUMNS[2:])])
+        tell(
+            f"{wall:6.0f} s {steps / 1e6:7.1f}M steps   error {found['error']:.3f} m/s, "
+            f"turning {found['turning_error']:.3f} rad/s, falls {found['falls']:.1%}"
+        )
+        if steps:  # what is still untrained is not worth keeping
+            told = {"columns": list(COLUMNS), "rows": history}
+            robot.save(out, jax.device_get(policy), {**about, "finished": False, "history": told})
+        if stopping.is_set() or (steps and config.seconds and wall > config.seconds):
+            raise _Enough
+
+    tell(f"{jax.devices()[0].device_kind}: compiling takes a minute or so")
+    with interruptible("the next measurement") as stopping:
+        try:
+            _ppo(robot, config, seed, look)
+        except _Enough:
+            if stopping.is_set():
+                learned = (
+                    f"{out} holds the policy of the last measurement" if history[-1][0] else "nothing was learned yet"
+                )
+                raise Interrupted(f"stopped; {learned}") from None
+    trained = time.perf_counter() - began
+    figures = _examined(robot, robot.load(out), jax.random.fold_in(key, 1), config.measured_robots, tell)
+    about |= {
+        "finished": True,
+        "trained_steps": history[-1][0],
+        "training_s": round(trained, 1),
+        "figures": figures,
+        "history": {"columns": list(COLUMNS), "rows": history},
+    }
+    robot.save(out, robot.load(out), about)
+    return about
+
+
+def evaluate(
+    robot: LocomotionTask,
+    folder: Path | None,
+    robots: int,
+    seed: int,
+    command: str,
+    out: Path | None = None,
+    tell: Callable[[str], None] = print,
+) -> dict[str, dict[str, float]]:
+    """Figures of a policy (the shipped one if no folder is given), trial by trial; written to `out`, if given.
+
+    Raises:
+        UserError: no policy there, or `out` exists.
+    """
+    if not 1 <= robots <= LARGEST_ROBOTS:
+        raise UserError(f"--robots is {robots}: give a number from 1 to {LARGEST_ROBOTS}")
+    _check_seed(seed)
+    if out and out.exists():
+        raise UserError(f"{out} exists: give another --out")
+    policy = robot.load(folder) if folder else robot.load()
+    figures = _examined(robot, policy, jax.random.key(seed), robots, tell)
+    if out:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        contents = {"seed": seed, **provenance(), "command": command, "figures": figures}
+        out.write_text(json.dumps(contents, indent=1) + "\n")
+    return figures
+
+
+def _ppo(robot: LocomotionTask, config: LocomotionConfig, seed: int, look: Callable[[int, Any, Any], None]) -> None:
+    """brax's PPO with the settings; `look` is called now and then with (steps, _, parameters)."""
+    from brax.training.agents.ppo import networks  # takes seconds to load, which other commands need not wait for
+    from brax.training.agents.ppo import train as ppo
+
+    from cuelearner_jax.bridges.brax import supply_device_put_replicated
+
+    supply_device_put_replicated()
+    ppo.train(
+        environment=robot.environment,
+        num_timesteps=config.steps,
+        max_devices_per_host=1,
+        num_envs=config.robots,
+        episode_length=config.episode,
+        learning_rate=config.learning_rate,
+        entropy_cost=config.entropy,
+        discounting=config.discount,
+        unroll_length=config.unroll,
+        batch_size=config.batch_size,
+        num_minibatches=config.minibatches,
+        num_updates_per_batch=config.updates,
+        normalize_observations=True,
+        max_grad_norm=config.max_grad_norm,
+        network_factory=partial(
+            networks.make_ppo_networks,
+            policy_hidden_layer_sizes=config.layers,
+            value_hidden_layer_sizes=VALUE_LAYERS,
+        ),
+        seed=seed,
+        num_evals=config.measurements + 1,
+        num_eval_envs=1,
+        run_evals=False,  # its evaluation is another compile and knows nothing of settled errors
+        policy_params_fn=look,
+    )
+
+
+def _examined(
+    robot: LocomotionTask, policy: Any, key: jax.Array, robots: int, tell: Callable[[str], None]
+) -> dict[str, dict[str, float]]:
+    """Figures of a policy by trial, each told as soon as it is measured."""
+    figures = {}
+    tell(f"{robots} robots walk for 20 s, trial by trial")
+    for name, found in robot.examine(policy, key, robots):
+        figures[name] = {figure: round(value, 5) for figure, value in found.items()}
+        tell(f"{name:20}" + ", ".join(f"{figure} {value:.4g}" for figure, value in figures[name].items()))
+    return figures

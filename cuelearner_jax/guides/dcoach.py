@@ -1,0 +1,120 @@
+"""Deep COACH: every correction moves a policy network itself, which is never fitted afresh.
+
+Source: Perez-Dattari, Celemin, Ruiz-del-Solar, Kober, "Interactive learning with corrective feedback for policies based
+on deep neural networks" (ISER 2018), Algorithm 1: of a correction h the target a + e h, a gradient step on it, and one
+on a minibatch of a replay of the newest corrections (their code: 200 of them, minibatches of 50). Here e is eps.
+
+What differs, and why: corrections come in rounds, so a round's are learned one after the other at its end
+(`--sizes.labels-per-round 1` learns each at once). "Already right" is an answer here where silence is meant there, and
+holds the policy where it is. There the replay is learned from at every tenth step too, of which a person corrects few;
+here every step is asked about, and `replay_steps` minibatches follow a correction. Adam in place of their SGD: the
+paper's appendix gives all auxiliary policies the same optimiser. Members of an ensemble are corrected each by itself,
+and differ by where they began and by what they drew from the replay.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import struct
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+from cuelearner_jax.config import GuideScalars, GuideSizes
+from cuelearner_jax.environment import Spaces
+from cuelearner_jax.feedback.answers import RELATIVE
+from cuelearner_jax.guides.auxiliary import auxiliary_policy
+from cuelearner_jax.guides.bundle import Guidance
+from cuelearner_jax.guides.ensemble import for_each
+from cuelearner_jax.guides.fitting import Lesson, lessons, optimizer
+from cuelearner_jax.guides.kind import Kind
+from cuelearner_jax.guides.questions import about_refined
+from cuelearner_jax.guides.refining import Refined
+from cuelearner_jax.types import GuidanceModel, Label, Params
+
+
+class Coached(struct.PyTreeNode):
+    """A policy on its way, as the parameters of a model; of several members with a leading axis."""
+
+    policy: Params
+    optimizer: Any  # state
+    learned: Int[Array, ""]  # labels that it has been corrected by: the next are new
+
+
+def make(sizes: GuideSizes, spaces: Spaces) -> Guidance:
+    """The bundle for an environment's spaces."""
+    space, policies = spaces.actions, auxiliary_policy(sizes, spaces)
+    member = auxiliary_policy(dataclasses.replace(sizes, ensemble=1), spaces)
+
+    def begin(key: PRNGKeyArray) -> Coached:
+        params = member.init(key)
+        return Coached(params, optimizer(GuideScalars()).init(params), jnp.zeros((), jnp.int32))
+
+    def init(key: PRNGKeyArray) -> GuidanceModel:
+        return GuidanceModel(for_each(sizes.ensemble, begin, key), jnp.array(False))
+
+    def target(label: Label, scalars: GuideScalars) -> Float[Array, " action"]:
+        """The action turned by h * eps."""
+        return space.toward(label.action, label.answer[0], scalars.radians("eps"))
+
+    def fit(key: PRNGKeyArray, env: Any, labels: Label, former: GuidanceModel, scalars: GuideScalars) -> GuidanceModel:
+        """The former policy, corrected by the labels that are new, in the order in which they were given."""
+        rows = lessons(labels, target, scalars)
+        order = jnp.argsort(~rows.valid, stable=True)
+        count = rows.valid.sum()
+
+        def loss(params: Params, batch: Lesson) -> Array:
+            error = member.vectors(env, params, batch.obs, batch.action) - batch.target
+            return jnp.mean(jnp.sum(jnp.square(error), -1))
+
+        def step(coached: Coached, numbers: Int[Array, " batch"], key: PRNGKeyArray) -> Coached:
+            batch = member.seen_again(key, jax.tree.map(lambda leaf: leaf[order[numbers]], rows))
+            gradient = jax.grad(loss)(coached.policy, batch)
+            updates, state = optimizer(scalars).update(gradient, coached.optimizer, coached.policy)
+            return coached.replace(policy=optax.apply_updates(coached.policy, updates), optimizer=state)
+
+        def corrected(key: PRNGKeyArray, number: Int[Array, ""], coached: Coached) -> Coached:
+            """By label `number` of those that count, and by a replay of the newest up to it."""
+            oldest = jnp.maximum(number + 1 - scalars.correction_replay, 0)
+
+            def replay(coached: Coached, key: PRNGKeyArray) -> tuple[Coached, None]:
+                k_draw, k_see = jax.random.split(key)
+                numbers = jax.random.randint(k_draw, (sizes.fit_batch_size,), oldest, number + 1)
+                return step(coached, numbers, k_see), None
+
+            k_new, k_replay = jax.random.split(jax.random.fold_in(key, number))
+            coached = step(coached, number[None], k_new)
+            coached, _ = jax.lax.scan(replay, coached, jax.random.split(k_replay, sizes.replay_steps))
+            return coached.replace(learned=number + 1)
+
+        def taught(key: PRNGKeyArray, coached: Coached) -> Coached:
+            return jax.lax.fori_loop(coached.learned, count, partial(corrected, key), coached)
+
+        return GuidanceModel(for_each(sizes.ensemble, taught, key, former.params), former.fitted | (count > 0))
+
+    def act(
+        model: GuidanceModel,
+        env: Any,
+        obs: Float[Array, "n obs"],
+        actions: Float[Array, "n action"],
+        active: Bool[Array, " n"],
+        scalars: GuideScalars,
+    ) -> Refined:
+        return policies.act(env, model.params.policy, obs, actions, active & model.fitted, scalars)
+
+    def disagreement(
+        model: GuidanceModel, env: Any, obs: Float[Array, "n obs"], actions: Float[Array, "n action"]
+    ) -> Float[Array, " n"]:
+        """The variance of the members' vectors, summed over their entries."""
+        assert policies.disagreement is not None
+        return policies.disagreement(model.replace(params=model.params.policy), env, obs, actions)
+
+    members = disagreement if policies.disagreement else None
+    return Guidance("dcoach", RELATIVE, init, about_refined(act), target, fit, act, members)
+
+
+KIND = Kind("dcoach", "a policy moved by each correction", make, form=RELATIVE, title="deep COACH", colour="#56B4E9")

@@ -1,0 +1,183 @@
+"""Relative feedback read as intent: of the aims that a situation offers, which one does the teacher have in mind?
+
+"More to the left" says that what the teacher means lies to the left: of the aims there (`Environment.aims`) some remain
+likely, the others do not. One network weighs every aim by its features, with the same weights for all; it is fitted by
+the likelihood of the teacher's words, summed over what may have been meant. (Inferring goals from what somebody does or
+says: Baker, Saxe, Tenenbaum, "Action understanding as inverse planning", Cognition 2009.) A pass of refinement goes by
+at most eps toward the likeliest aim and ends there, so precision is the aim's and not the label's. Where the teacher
+seems to mean none of them (`aim_doubt`), actions stay as they are: the same bad shot again and again is worse than the
+agent's own. With `aim_share` below 1 the nearest of the aims about as likely is taken, which earned more by itself on
+the regulation table, and less on the easy one; agents did not learn faster from it (docs/results/bootstrapping.md).
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
+
+from cuelearner_jax.actions import Actions
+from cuelearner_jax.config import GuideScalars, GuideSizes
+from cuelearner_jax.environment import Aims, Spaces
+from cuelearner_jax.feedback.answers import RELATIVE, of_strength
+from cuelearner_jax.guides.bundle import Guidance
+from cuelearner_jax.guides.ensemble import ensemble
+from cuelearner_jax.guides.fitting import fit_model
+from cuelearner_jax.guides.kind import Kind
+from cuelearner_jax.guides.questions import about_refined
+from cuelearner_jax.guides.refining import Refined, refine
+from cuelearner_jax.types import GuidanceModel, Label, Params
+
+SPREAD_DEG = 1.0  # how far what a teacher means may lie from the aim that describes it
+ELSEWHERE = 360  # evenly spaced actions that stand for "it means none of these"
+SLIPS = 0.02  # share of answers that say nothing: any of the words
+WORDS = 3
+
+
+class Weights(nn.Module):
+    """log-weights of a situation's aims, and of none of them: every aim goes through the same layers."""
+
+    layers: tuple[int, ...]
+
+    @nn.compact
+    def __call__(
+        self, features: Float[Array, "aims features"], possible: Bool[Array, " aims"]
+    ) -> Float[Array, " aims_and_none"]:
+        """Starts out without a preference."""
+        x = features
+        for width in self.layers:
+            x = nn.relu(nn.Dense(width, kernel_init=nn.initializers.xavier_uniform())(x))
+        weights = nn.Dense(1, kernel_init=nn.initializers.zeros)(x)[:, 0]
+        none = self.param("none", nn.initializers.zeros, (1,))
+        return jnp.concatenate([jnp.where(possible, weights, -jnp.inf), none])
+
+
+class Evidence(struct.PyTreeNode):
+    """What one answer says of what may have been meant."""
+
+    features: Float[Array, "aims features"]
+    possible: Bool[Array, " aims"]
+    likelihood: Float[Array, " aims_and_none"]  # of the answer, if this was meant
+    valid: Bool[Array, ""]
+
+
+def likelihood(
+    space: Actions,
+    action: Float[Array, " action"],
+    goals: Float[Array, "goals action"],
+    h: Float[Array, ""],
+    eps: Float[Array, ""],
+) -> Float[Array, " goals"]:
+    """Probability of the answer h about `action` from somebody who means each of the goals.
+
+    What is meant lies round the goal with a logistic error of `SPREAD_DEG`; within eps / 2 of the action it is right.
+    """
+    offset = space.sense(action[None], goals) * space.distance(action[None], goals)
+    width = jnp.deg2rad(SPREAD_DEG)
+    above = jax.nn.sigmoid((offset - eps / 2) / width)
+    below = jax.nn.sigmoid((-offset - eps / 2) / width)
+    return jnp.where(h > 0, above, jnp.where(h < 0, below, 1.0 - above - below))
+
+
+def evidence_of(env: Any, space: Actions, label: Label, scalars: GuideScalars) -> Evidence:
+    """What a label says of the aims of its situation, by its own strength if it has one."""
+    aims: Aims = env.aims(label.obs)
+    eps = of_strength(scalars, label.eps_deg).radians("eps")
+    of_aims = likelihood(space, label.action, aims.actions, label.answer[0], eps)
+    of_none = likelihood(space, label.action, space.spread(ELSEWHERE), label.answer[0], eps).mean(keepdims=True)
+    return Evidence(aims.features, aims.possible, jnp.concatenate([of_aims, of_none]), label.valid)
+
+
+def followed(
+    space: Actions,
+    share: Float[Array, " aims_and_none"],
+    aims: Float[Array, "aims action"],
+    action: Float[Array, " action"],
+    scalars: GuideScalars,
+) -> tuple[Float[Array, " action"], Bool[Array, ""]]:
+    """Of the aims about as likely as the likeliest the nearest to an action, and whether it is likely enough at all."""
+    most = share[:-1].max()
+    likely = share[:-1] >= scalars.aim_share * most
+    goal = aims[jnp.argmin(jnp.where(likely, space.distance(action[None], aims), jnp.inf))]
+    return goal, (most > 0.0) & (scalars.aim_doubt * most > share[-1])
+
+
+def make(sizes: GuideSizes, spaces: Spaces) -> Guidance:
+    """The bundle for an environment's spaces."""
+    space = spaces.actions
+    network = Weights(sizes.aim_layers)
+    width = spaces.aims or 0
+
+    def shares(
+        env: Any, params: Params, features: Float[Array, "n aims features"], possible: Bool[Array, "n aims"]
+    ) -> Float[Array, "n aims_and_none"]:
+        """The probability that each aim, or none, is meant; the mean of several members is one too."""
+        return jax.nn.softmax(jnp.asarray(jax.vmap(network.apply, (None, 0, 0))(params, features, possible)))
+
+    def init_params(key: PRNGKeyArray) -> Params:
+        return network.init(key, jnp.zeros((1, width)), jnp.ones(1, bool))
+
+    weighing = ensemble(sizes.ensemble, init_params, shares)
+
+    def init(key: PRNGKeyArray) -> GuidanceModel:
+        return GuidanceModel(weighing.init(key), jnp.array(False))
+
+    def target(label: Label, scalars: GuideScalars) -> Float[Array, "1"]:
+        """h itself: what is fitted is its probability."""
+        return label.answer
+
+    def surprise(params: Params, rows: Evidence) -> Float[Array, " rows"]:
+        """-log of the probability of each answer."""
+        share = weighing.predict(None, params, rows.features, rows.possible)
+        return -jnp.log((1.0 - SLIPS) * (share * rows.likelihood).sum(-1) + SLIPS / WORDS)
+
+    def fit(key: PRNGKeyArray, env: Any, labels: Label, former: GuidanceModel, scalars: GuideScalars) -> GuidanceModel:
+        rows = jax.vmap(lambda label: evidence_of(env, space, label, scalars))(labels)
+        return fit_model(key, rows, scalars, init=weighing.init, losses=surprise, sizes=sizes)
+
+    def act(
+        model: GuidanceModel,
+        env: Any,
+        obs: Float[Array, "n obs"],
+        actions: Float[Array, "n action"],
+        active: Bool[Array, " n"],
+        scalars: GuideScalars,
+    ) -> Refined:
+        aims: Aims = jax.vmap(env.aims)(obs)
+        share = weighing.predict(env, model.params, aims.features, aims.possible)
+        if aims.open is not None:
+            share = share.at[:, :-1].multiply(aims.open)
+        goals, sure = jax.vmap(partial(followed, space), (0, 0, 0, None))(share, aims.actions, actions, scalars)
+
+        def residual(current: Float[Array, "n action"]) -> Float[Array, "n action"]:
+            step = jnp.minimum(scalars.radians("eps"), space.distance(current, goals))
+            return space.toward(current, space.sense(current, goals), step) - current
+
+        return refine(
+            residual,
+            actions,
+            active & sure & model.fitted,
+            space=space,
+            tau=scalars.radians("tau"),
+            tau_max=scalars.radians("tau_max"),
+            k_max=scalars.k_max,
+        )
+
+    def disagreement(
+        model: GuidanceModel, env: Any, obs: Float[Array, "n obs"], actions: Float[Array, "n action"]
+    ) -> Float[Array, " n"]:
+        """The variance of the members' probabilities, summed over aims; of situations, whatever the action."""
+        assert weighing.disagreement is not None
+        aims: Aims = jax.vmap(env.aims)(obs)
+        return weighing.disagreement(model, env, aims.features, aims.possible)
+
+    members = disagreement if weighing.disagreement else None
+    return Guidance("intent", RELATIVE, init, about_refined(act), target, fit, act, members)
+
+
+KIND = Kind("intent", "relative feedback about the task's aims", make, form=RELATIVE, needs=("aims",), colour="#CC79A7")

@@ -1,0 +1,112 @@
+"""The one place that lists the kinds of guidance: those of the package, of installed packages, and of one's own.
+
+A kind of one's own is a `Kind`: pass it to `register`, offer it under the entry-point group `cuelearner.guidances`, or
+name it as `package.module:NAME` wherever the name of a kind is asked for.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from importlib import metadata
+from typing import Any
+
+from cuelearner_jax.config import GuideSizes
+from cuelearner_jax.environment import Spaces, offers, spaces_of
+from cuelearner_jax.errors import UserError, closest
+from cuelearner_jax.guides import dcoach, demonstration, heuristic, intent, none, relative, scalar
+from cuelearner_jax.guides.bundle import Guidance
+from cuelearner_jax.guides.kind import Kind
+from cuelearner_jax.plugins import load
+
+ENTRY_POINTS = "cuelearner.guidances"
+
+_BUILT_IN = (none, relative, intent, heuristic, demonstration, scalar, dcoach)
+_KINDS: dict[str, Kind] = {module.KIND.name: module.KIND for module in _BUILT_IN}
+
+
+def register(kind: Kind) -> Kind:
+    """Makes a kind known under its name. Raises UserError if another one has the name."""
+    if _KINDS.setdefault(kind.name, kind) != kind:
+        raise UserError(f"there is another guidance called {kind.name!r}: give yours another name")
+    return kind
+
+
+def known() -> tuple[Kind, ...]:
+    """The kinds that can be named, those of installed packages included."""
+    _register_installed()
+    return tuple(_KINDS.values())
+
+
+def registered(name: str) -> Kind | None:
+    """The kind of that name, or None: of results whose kind is not known here."""
+    _register_installed()
+    return _KINDS.get(name)
+
+
+def find(name: str) -> Kind:
+    """The kind of that name; no code is loaded that the name leads to. Raises UserError if there is none."""
+    _register_installed()
+    if name not in _KINDS:
+        raise UserError(
+            f"unknown guidance {name!r}{closest(name, _KINDS)} (one of your own is named as package.module:NAME)"
+        )
+    return _KINDS[name]
+
+
+def resolve(text: str) -> Kind:
+    """The kind that a user or caller names: by its name, or as `package.module:NAME`, whose code is loaded.
+
+    Never call it with what a file says. Raises UserError if there is no such kind.
+    """
+    return register(load(text, Kind, "a kind of guidance")) if ":" in text else find(text)
+
+
+def named(text: str) -> str:
+    """Name of the kind that a user or caller names, as `resolve`; a name alone need not be known here."""
+    return resolve(text).name if ":" in text else text
+
+
+def possible(env: Any, taught: bool) -> tuple[str, ...]:
+    """Names of the kinds that an environment can have; `taught`: is there a teacher to ask?"""
+    fitting = (kind for kind in known() if (taught or not kind.asks) and all(offers(env, need) for need in kind.needs))
+    return tuple(kind.name for kind in fitting)
+
+
+def make(name: str, sizes: GuideSizes, env: Any) -> Guidance:
+    """A kind's bundle for an environment (shapes in place of arrays will do); the same one for the same sizes.
+
+    Raises:
+        UserError: no such kind, or the environment lacks what it needs.
+    """
+    kind = find(name)
+    for need in kind.needs:
+        if not offers(env, need):
+            raise UserError(f"guidance {kind.name!r} needs an environment with `{need}`, which this task's has not")
+    return made_for(kind, sizes, spaces_of(env))
+
+
+@cache
+def made_for(kind: Kind, sizes: GuideSizes, spaces: Spaces) -> Guidance:
+    """A kind's bundle for an observation and action space; the same one for the same sizes and spaces."""
+    made = kind.make(sizes, spaces)
+    if made.form != kind.form or made.name != kind.name:
+        raise ValueError(f"guidance {kind.name!r} was made with another name or form of answers than its kind has")
+    if sizes.sees_turn and made.onward is None:
+        raise UserError(f"guidance {kind.name!r} does not see how far actions were turned: leave out --sizes.sees-turn")
+    if sizes.eps_falls and made.form is not None and not made.form.by_eps:
+        raise UserError(
+            f"guidance {kind.name!r} asks for {made.form.name} answers, which have no strength that could fall: leave "
+            "out --sizes.eps-falls"
+        )
+    if made.asks and made.disagreement is None and sizes.ensemble > 1:
+        raise UserError(
+            f"guidance {kind.name!r} has one model, no ensemble of them: leave out --sizes.ensemble and "
+            "--sizes.candidates, or run it by itself"
+        )
+    return made
+
+
+@cache
+def _register_installed() -> None:
+    for point in metadata.entry_points(group=ENTRY_POINTS):
+        register(load(point.value, Kind, "a kind of guidance"))

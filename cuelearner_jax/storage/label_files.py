@@ -1,0 +1,393 @@
+"""Label files: one row a label, with what the numbers mean written into the file.
+
+A label is what a teacher said of an action in a state: the answer, not what some model is to learn from it, so that one
+file serves every kind of guidance that takes this form of answer. A file holds one set of labels, or one for each seed
+of a run. `write` writes a whole file; `LabelWriter` one row at a time, each of which is safe once the call returns.
+
+| column  | type           | meaning                                                                              |
+|---------|----------------|--------------------------------------------------------------------------------------|
+| seed    | int            | whose label it is                                                                    |
+| obs     | list of floats | the task's observation at the question                                               |
+| action  | list of floats | the action asked about                                                               |
+| answer  | list of floats | what the teacher said; the file names the form of it; absent where nothing was said  |
+| item    | int            | people: number of the question, from 0                                               |
+| said    | string         | people: one of `SAID`; of several rows of one item the last one holds                |
+| eps_deg | float          | strength of the answer [deg]: of people as the file's own; else where it falls       |
+| seconds | float          | people: from the question on the screen to the answer [s]                            |
+| who     | string         | people: a name                                                                       |
+| when    | string         | people: time of the answer, ISO 8601 in UTC                                          |
+
+Rows of simulated teachers have the first four columns, and strengths where these differ. A row is never changed: what
+is taken back stays, and a later row of the same item says so. Readers give the labels that stand.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections import Counter
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+import pyarrow as pa
+
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.storage import formats
+from cuelearner_jax.storage import table as tables
+from cuelearner_jax.storage.label_checks import ANSWERED, PEOPLE, ROW, SAID, check_head, check_rows
+from cuelearner_jax.types import Label
+
+SCHEMA = tables.Schema(
+    stem="labels",
+    mark="action",
+    required=("seed", "obs", "action"),
+    strings=("said", "who", "when"),
+    integers=("seed", "item"),
+    lists=ROW,
+    remedy=formats.REMEDIES["labels"],
+)
+JSONL, PARQUET = SCHEMA.jsonl, SCHEMA.parquet
+LISTED = 20  # seeds that a message names
+CONVENTIONS = {
+    "obs": "the task's observation at the question",
+    "action": "unit vector asked about",
+    "answer": "what the teacher said of the action, in the form that `answers` names",
+    "eps_deg": "strength of an answer [deg], null where the form has none; a row that tells its own has that",
+    "angles": "radians, counterclockwise positive",
+}
+TOLD = ("format", "task", "answers", "eps_deg", "session")  # what must be the same for labels to share a file
+
+
+class People(NamedTuple):
+    """What a person's labels have beside what was said, (labels,) each."""
+
+    item: np.ndarray  # number of the question
+    seconds: np.ndarray  # taken for the answer [s]
+    who: np.ndarray  # names
+    when: np.ndarray  # ISO 8601
+
+
+class LabelFile(NamedTuple):
+    """Label sets and where they come from."""
+
+    task: dict[str, Any]  # {"name": ..., configuration of the task}
+    answers: str  # name of the form of the answers, see `guidance.answers`
+    eps_deg: float | None  # strength of an answer [deg], where it falls of the first; None where the form has none
+    seeds: np.ndarray  # (labels,)
+    labels: Label  # rows (labels, ...), in the order they were given; those that stand
+    people: People | None = None  # None: a simulated teacher's, or of several people's merged with such
+    session: dict[str, Any] | None = None  # how a page asked, see `labelling.session`
+    said: dict[str, int] | None = None  # rows of each kind (`SAID`), those that no longer stand included
+
+    @property
+    def strengths(self) -> np.ndarray | None:
+        """Of each label [deg], (labels,); None where the form has none."""
+        own = self.labels.eps_deg
+        if own is None and self.eps_deg is not None:
+            return np.full(len(self.seeds), self.eps_deg)
+        return None if own is None else np.asarray(own)
+
+
+class LabelWriter(tables.TableWriter):
+    """Appends rows to `labels.jsonl` of a folder; each is on the disk when the call returns.
+
+    Opening an existing file continues it: a torn last line, left by a crash, is dropped first, and a finished file
+    (Parquet) becomes JSONL again.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        task: dict[str, Any],
+        answers: str,
+        eps_deg: float | None,
+        meaning: str = "",
+        session: dict[str, Any] | None = None,
+        **told: Any,
+    ) -> None:
+        """Opens the file, creating it and the folder where needed.
+
+        Args:
+            folder: where the file lies.
+            task: {"name": ..., configuration of the task}.
+            answers: form of the answers.
+            eps_deg: strength of an answer [deg]; None where the form has none.
+            meaning: of an answer's numbers, written into the file.
+            session: what else must be the same for labels to share a file.
+            told: what else a new file says of itself, such as the versions that wrote it.
+
+        Raises:
+            UserError: the folder holds labels of something else, or they cannot be read; nothing has been changed.
+        """
+        about = {**_about(task, answers, eps_deg, meaning), **({} if session is None else {"session": session})}
+        there = found_in(folder)
+        self._widths: dict[str, int] = {}
+        self._eps = about["eps_deg"]
+        if there is not None:
+            table, before = _told(there)
+            if before is not None:
+                _check_same(there, before, about)
+            for name in set(ROW) & set(table.column_names):
+                answered = [values for values in table[name].to_pylist() if values is not None]
+                self._widths |= {name: len(answered[-1])} if answered else {}
+        super().__init__(folder, SCHEMA, about={**about, **told})
+
+    def append(
+        self, *, seed: int, obs: np.ndarray, action: np.ndarray, answer: np.ndarray | None, **person: Any
+    ) -> None:
+        """Appends one row.
+
+        Args:
+            seed: whose label it is.
+            obs: the task's observation at the question, (obs,).
+            action: the action asked about, (action,).
+            answer: what the teacher said, (width,); None: nothing, or what was said is taken back.
+            person: the columns `PEOPLE`, of a person's label.
+
+        Raises:
+            ValueError: a number is not finite, or a width is not that of the labels before.
+            OSError: the disk takes no more. The row is not in the file, now or later; the call may be repeated.
+        """
+        values = {name: value for name, value in zip(ROW, (obs, action, answer), strict=True) if value is not None}
+        columns = {name: np.asarray(value, np.float32) for name, value in values.items()}
+        for name, value in columns.items():
+            if value.shape != (self._widths.setdefault(name, value.size),):
+                raise ValueError(f"{name} has the shape {value.shape}, expected ({self._widths[name]},)")
+            if not np.isfinite(value).all():
+                raise ValueError(f"{name} is not finite: {value}")
+        if person and (set(person) != set(PEOPLE) or person["said"] not in SAID):
+            raise ValueError(f"a person's row has the columns {', '.join(PEOPLE)}, and said one of {', '.join(SAID)}")
+        if person and (answer is not None) != (person["said"] == ANSWERED):
+            raise ValueError(f"a row that says {person['said']!r} has {'no' if answer is None else 'an'} answer")
+        strength = {"eps_deg": self._eps} if person and self._eps is not None else {}
+        super().append(seed=int(seed), **columns, **person, **strength)
+
+
+def found_in(place: Path) -> Path | None:
+    """The label file at a place: that file, or the one in that folder; None: there is none."""
+    if not place.is_dir():
+        return place if place.exists() else None
+    return next((place / name for name in (PARQUET, JSONL) if (place / name).exists()), None)
+
+
+def history(path: Path) -> list[dict[str, Any]]:
+    """Every row of a person's file, in the order of writing, those that no longer stand included; columns absent: None.
+
+    Raises UserError if the file is damaged.
+    """
+    table, _ = _told(path)
+    return table.to_pylist()
+
+
+def finish(folder: Path) -> Path:
+    """Turns the labels of a `LabelWriter` into Parquet; returns that file. Raises UserError if there are none."""
+    return tables.finish(folder, SCHEMA)
+
+
+def write(
+    path: Path,
+    task: dict[str, Any],
+    answers: str,
+    eps_deg: float | None,
+    seeds: np.ndarray,
+    labels: Label,
+    meaning: str = "",
+) -> None:
+    """Writes the labels that count as Parquet, replacing `path` in one step.
+
+    Args:
+        path: where to.
+        task: {"name": ..., configuration of the task}.
+        answers: form of the answers.
+        eps_deg: strength of an answer [deg], where it falls of the first; None where the form has none.
+        seeds: of the lanes, (lanes,).
+        labels: (lanes, slots, ...).
+        meaning: of an answer's numbers, written into the file.
+    """
+    valid = np.asarray(labels.valid)
+    rows = jax.tree.map(lambda leaf: np.asarray(leaf)[valid], labels)
+    seed = np.broadcast_to(np.asarray(seeds)[:, None], valid.shape)[valid]
+    columns = {"seed": pa.array(seed.astype(np.int64))}
+    for name in ROW:
+        columns[name] = pa.array(list(getattr(rows, name)), SCHEMA.type(name))
+    if rows.eps_deg is not None:
+        columns["eps_deg"] = pa.array(rows.eps_deg.astype(np.float64))
+    tables.write(path, pa.table(columns), SCHEMA, about=_about(task, answers, eps_deg, meaning))
+
+
+def write_file(path: Path, file: LabelFile, **told: Any) -> None:
+    """Writes labels as a new Parquet file, with what a person's have beside them; `told`: see `LabelWriter`.
+
+    Raises UserError if the file exists.
+    """
+    columns = {"seed": pa.array(np.asarray(file.seeds, np.int64))}
+    for name in ROW:
+        columns[name] = pa.array(list(np.asarray(getattr(file.labels, name), np.float32)), SCHEMA.type(name))
+    if file.people is not None:
+        person = {**file.people._asdict(), "said": [ANSWERED] * len(file.seeds)}
+        columns |= {name: pa.array(list(person[name]), SCHEMA.type(name)) for name in PEOPLE}
+    if file.strengths is not None and (file.people is not None or file.labels.eps_deg is not None):
+        columns["eps_deg"] = pa.array(file.strengths.astype(np.float64))
+    about = _about(file.task, file.answers, file.eps_deg, "")
+    session = {} if file.session is None else {"session": file.session}
+    tables.write(path, pa.table(columns), SCHEMA, about={**about, **session, **told}, fresh=True)
+
+
+def read(path: Path) -> LabelFile:
+    """The labels that stand in a Parquet or JSONL file, or a folder with one.
+
+    Raises:
+        UserError: the file is missing, damaged, of a newer program, or holds no labels.
+    """
+    found = found_in(path)
+    if found is None or not found.is_file():
+        raise UserError(f"no label file at {path}: give the path of a labels.parquet that a run or a person wrote")
+    path = found
+    table, head = _told(path)
+    if head is None:
+        raise UserError(f"{path} holds no labels: collect some first")
+    said = dict(Counter(table["said"].to_pylist())) if "said" in table.column_names else None
+    table = _standing(table)
+    if not table.num_rows:
+        raise UserError(f"{path} holds no labels: collect some first")
+    columns, eps = {name: _array(table[name], name) for name in table.column_names}, head["eps_deg"]
+    own = _differing(columns.get("eps_deg"), eps)
+    rows = {name: columns[name] for name in ROW}
+    labels = Label(**rows, valid=np.ones(table.num_rows, bool), eps_deg=own)  # pyright: ignore[reportArgumentType]
+    named = dict(head["task"]), head["answers"], None if eps is None else float(eps), columns["seed"], labels
+    people = None
+    if "item" in columns and not (columns["item"] < 0).any():
+        people = People(*(columns[name] for name in People._fields))
+    return LabelFile(*named, people, head.get("session"), said)
+
+
+def _differing(told: np.ndarray | None, eps_deg: float | None) -> np.ndarray | None:
+    """Strengths (labels,) [deg] that rows tell, NaN for the file's own; None: all are of that, or the form has none."""
+    if told is None or eps_deg is None:
+        return None
+    own = np.where(np.isnan(told), np.float32(eps_deg), told)
+    return None if (own == np.float32(eps_deg)).all() else own
+
+
+def _standing(table: pa.Table) -> pa.Table:
+    """The rows that hold: of a person's item the last, if it is an answer; in the order of items."""
+    if not {"item", "said"} <= set(table.column_names):
+        return table
+    last: dict[Any, int] = {}
+    for row, (seed, item) in enumerate(zip(*(table[name].to_pylist() for name in ("seed", "item")), strict=True)):
+        last[(seed, row, None) if item is None else (seed, item, "item")] = row
+    said = table["said"].to_pylist()
+    kept = [row for _, row in sorted(last.items(), key=lambda entry: entry[0][:2]) if said[row] in (None, ANSWERED)]
+    return table.take(pa.array(kept, pa.int64()))
+
+
+def readable(path: Path) -> bool:
+    """Is there a label file that is whole?"""
+    try:
+        read(path)
+    except UserError:
+        return False
+    return True
+
+
+def digest(path: Path) -> str:
+    """What tells a file's contents from others of the same name."""
+    return hashlib.sha256((found_in(path) or path).read_bytes()).hexdigest()[:12]
+
+
+def for_lanes(file: LabelFile, seeds: np.ndarray, budgets: np.ndarray, slots: int) -> Label:
+    """Label sets of lanes, padded: rows (lanes, slots, ...).
+
+    A file with one set serves every seed; with several, each lane gets its own seed's, up to its budget.
+
+    Raises:
+        UserError: a seed's labels are missing, or there are fewer than a lane's budget.
+    """
+    kept = np.unique(file.seeds)
+    sets = []
+    for seed, budget in zip(seeds, budgets, strict=True):
+        own = kept[0] if len(kept) == 1 else seed
+        chosen = np.flatnonzero(file.seeds == own)
+        if own not in kept:
+            raise UserError(
+                f"the label file has labels for the seeds {_listed(kept)}, none for seed {seed}: "
+                "give --first-seed and --seeds (train: --seed) of these, or the labels of another run"
+            )
+        if len(chosen) < budget:
+            raise UserError(
+                f"the label file has {len(chosen)} labels for seed {seed}, the budget is {budget}: "
+                "lower --labels or collect more"
+            )
+        chosen = chosen[:budget]
+        sets.append(jax.tree.map(lambda leaf, rows=chosen: _padded(leaf[rows], slots), file.labels))
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *sets)
+
+
+def _listed(seeds: np.ndarray) -> str:
+    """Seeds in order, as a range where none between is absent."""
+    if len(seeds) > 2 and seeds[-1] - seeds[0] == len(seeds) - 1:
+        return f"{seeds[0]} to {seeds[-1]}"
+    return ", ".join(map(str, seeds[:LISTED])) + (" and others" if len(seeds) > LISTED else "")
+
+
+def _about(task: dict[str, Any], answers: str, eps_deg: float | None, meaning: str) -> dict[str, Any]:
+    """What a file of labels says of itself."""
+    return {
+        "format": formats.FORMATS["labels"],
+        "task": task,
+        "answers": answers,
+        "eps_deg": None if eps_deg is None else float(eps_deg),
+        "conventions": {**CONVENTIONS, **({"answer": meaning} if meaning else {})},
+    }
+
+
+def _check_same(path: Path, before: dict[str, Any], now: dict[str, Any]) -> None:
+    """Raises UserError, with the first difference in words, unless labels may share a file."""
+    parts = [("", name, before.get(name), now.get(name)) for name in TOLD]
+    for group in ("task", "session"):
+        old, new = before.get(group) or {}, now.get(group) or {}
+        parts += [(f"{group}.", name, old.get(name), new.get(name)) for name in {**old, **new} if old and new]
+    differing = [part for part in parts if part[2] != part[3] and part[1] != "from"]
+    for prefix, name, old, new in differing:  # of a group its parts say more
+        if prefix or name not in ("task", "session"):
+            raise UserError(
+                f"{path} holds labels of another {prefix}{name} ({_short(old)}, asked for is {_short(new)}): "
+                "give the same, or another folder (--out)"
+            )
+    if differing:
+        raise UserError(f"{path} holds labels that were given otherwise ({differing[0][1]}): give another folder")
+
+
+def _short(value: Any) -> str:
+    text = str(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def _told(path: Path) -> tuple[pa.Table, dict[str, Any] | None]:
+    """A file's table and head in the current format, both checked; None: the file has just begun."""
+    table = tables.read(path, SCHEMA)
+    try:
+        head = tables.about_of(table)
+        if head is None and table.num_rows:
+            raise ValueError("it does not say what it holds")
+        if head is not None:
+            head = formats.upgrade("labels", head, path)
+            check_head(head)
+            check_rows(table, head)
+        return table, head
+    except (ValueError, RecursionError) as error:
+        raise formats.damaged("labels", path, error) from error
+
+
+def _array(column: pa.ChunkedArray, name: str) -> np.ndarray:
+    """A column as an array. An item that has no number is -1."""
+    if name in SCHEMA.strings:
+        return np.array([value or "" for value in column.to_pylist()])
+    if name in SCHEMA.integers:
+        return np.array([-1 if value is None else value for value in column.to_pylist()], np.int64)
+    return np.array(column.to_pylist(), np.float32)
+
+
+def _padded(rows: np.ndarray, slots: int) -> np.ndarray:
+    return np.concatenate([rows, np.zeros((slots - len(rows), *rows.shape[1:]), rows.dtype)])

@@ -1,0 +1,181 @@
+"""Sealed lines of JSON in a file that grows: a reader gets what was written, or is told what is wrong.
+
+Each line is an object that ends in a checksum of itself and of all lines before it. The closing line, `{"end": N}`,
+says how many lines there are; whoever appends writes over it and puts a new one behind, in one step. So a changed line,
+a line taken out, a line without its checksum and a cut at any byte are all seen.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import json
+import os
+import re
+import zlib
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from cuelearner_jax.errors import one_line
+from cuelearner_jax.storage.room import check_size
+from cuelearner_jax.storage.whole import replacing, unreadable
+from cuelearner_jax.terminal import console
+
+Row = dict[str, Any]
+CHECKSUM = re.compile(rb', "crc": "([0-9a-f]{8})"}$')  # the end of a line
+END = "end"  # the key of the closing line
+
+
+class Damaged(ValueError):
+    """Lines that are not what was written: its message says which and why."""
+
+
+class Lines(NamedTuple):
+    """Rows of a file, and whether its closing line is there."""
+
+    rows: list[Row]  # without checksums and closing line
+    is_closed: bool  # does the closing line follow?
+
+
+class Writer:
+    """Appends lines to a file; they are on the disk when the call returns, or the file is as it was before."""
+
+    def __init__(self, path: Path, rows: Iterable[Row]) -> None:
+        """Replaces the file by these lines, in one step, and opens it for more."""
+        text, self._count, self._checksum = _sealed(rows, 0, 0)
+        self._closing = _closing(self._count, self._checksum)
+        with replacing(path, "wb") as file:
+            file.write(text + self._closing)
+        self._at = len(text)  # where the closing line begins [bytes]
+        self._file = path.open("r+b", buffering=0)
+
+    def append(self, rows: Iterable[Row]) -> None:
+        """Appends lines. Raises OSError where the disk refuses."""
+        text, count, checksum = _sealed(rows, self._count, self._checksum)
+        closing = _closing(count, checksum)
+        try:
+            self._put(text + closing)
+        except OSError:
+            with contextlib.suppress(OSError):  # these bytes were on the disk before
+                self._file.truncate(self._at)
+                self._put(self._closing)
+            raise
+        self._at, self._count, self._checksum, self._closing = self._at + len(text), count, checksum, closing
+
+    def close(self) -> None:
+        """Closes the file."""
+        self._file.close()
+
+    def _put(self, content: bytes) -> None:
+        number, at = self._file.fileno(), self._at
+        while content:
+            written = os.pwrite(number, content, at)
+            content, at = content[written:], at + written
+        os.fsync(number)
+
+
+def read(path: Path) -> Lines:
+    """The lines of a file, parsed.
+
+    Where the closing line is missing, the file was cut, or torn by a crash of the machine: what is whole is given, and
+    standard error told.
+
+    Raises:
+        UserError: the file cannot be read, or is larger than memory.
+        Damaged: a line is not what was written.
+    """
+    try:
+        check_size(path)
+        *lines, rest = path.read_bytes().split(b"\n")
+    except OSError as error:
+        raise unreadable(path, error) from error
+    rows: list[Row] = []
+    checksum, closed = 0, False
+    for number, line in enumerate(lines, start=1):
+        if closed:
+            raise Damaged(f"line {number}: it follows the closing line")
+        try:
+            row, checksum = _opened(line, checksum)
+        except (ValueError, RecursionError) as error:
+            raise Damaged(f"line {number}: {error}") from error
+        closed = row.keys() == {END}
+        if closed and row[END] != len(rows):
+            raise Damaged(f"line {number}: it closes {row[END]} lines")
+        if not closed:
+            rows.append(row)
+    if not closed:
+        with contextlib.suppress(ValueError, RecursionError):
+            row, _ = _opened(rest, checksum)
+            rows += [row] if row.keys() != {END} else []
+    closed = closed and not rest
+    if not closed:
+        _tell(
+            f"{path} lacks its closing line: it was cut, or torn by a crash; only its {len(rows)} whole lines are read"
+        )
+    return Lines(rows, closed)
+
+
+@functools.cache  # whoever reads a file several times is told once
+def _tell(words: str) -> None:
+    console.print(f"warning: {one_line(words)}")
+
+
+def newest(path: Path, most: int) -> Row | None:
+    """The last line but the closing one, of a file that may be growing; None: there is none, or it is not whole.
+
+    Args:
+        path: the file.
+        most: bytes to look at, from its end.
+
+    Raises FileNotFoundError.
+    """
+    with path.open("rb") as file:
+        file.seek(max(0, file.seek(0, os.SEEK_END) - most))
+        lines = file.read().split(b"\n")[:-1]
+    for line in lines[:-3:-1]:
+        try:
+            found = json.loads(line)
+        except (ValueError, RecursionError):  # whoever reads the whole table says so
+            return None
+        if not isinstance(found, dict):
+            return None
+        found.pop("crc", None)
+        if found.keys() != {END}:
+            return found
+    return None
+
+
+def _sealed(rows: Iterable[Row], count: int, checksum: int) -> tuple[bytes, int, int]:
+    """Lines as they are written, after so many with that checksum: (text, count, checksum of the last)."""
+    text = []
+    for row in rows:
+        line, checksum = _seal(row, checksum)
+        text.append(line)
+    return b"".join(text), count + len(text), checksum
+
+
+def _closing(count: int, checksum: int) -> bytes:
+    return _seal({END: count}, checksum)[0]
+
+
+def _seal(row: Row, before: int) -> tuple[bytes, int]:
+    """A line as it is written, its checksum at its end, and that checksum; `before`: that of the line before."""
+    text = json.dumps(row, allow_nan=False).encode()
+    checksum = zlib.crc32(text, before)
+    return text[:-1] + f', "crc": "{checksum:08x}"}}\n'.encode(), checksum
+
+
+def _opened(line: bytes, before: int) -> tuple[Row, int]:
+    """A line without its checksum, and that; the inverse of `_seal`. Raises ValueError if it was changed."""
+    found = CHECKSUM.search(line)
+    if not found:
+        raise ValueError("it has no checksum, so it, or a line before it, is not what was written")
+    text = line[: found.start()] + b"}"
+    checksum = zlib.crc32(text, before)
+    if int(found[1], 16) != checksum:
+        raise ValueError("it, or a line before it, is not what was written")
+    row = json.loads(text)
+    if not isinstance(row, dict):
+        raise ValueError("it is no JSON object")
+    return row, checksum

@@ -1,0 +1,79 @@
+"""Policy folders: a finished policy with everything that acting needs, in one folder.
+
+    policy.json       what it is made of, where it was adapted, how it was judged
+    arrays/           networks and bounds, as a checkpoint with digests
+    labels.parquet    what was answered; labels-60deg.parquet and so on where lanes differ in their bounds
+    guide.parquet     what the policy was worth after so many labels
+
+The folder appears in one step, once all of it is written (`whole.Place`). Code is named in it, never kept.
+"""
+
+from __future__ import annotations
+
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import Any
+
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.storage import formats, whole
+from cuelearner_jax.storage.checkpoint import checkpoints, digest
+from cuelearner_jax.storage.whole import Place, is_used
+
+POLICY, ARRAYS = "policy.json", "arrays"
+
+
+def is_one(folder: Path) -> bool:
+    """Is this a policy folder?"""
+    return (folder / POLICY).exists()
+
+
+def check_free(folder: Path, overwrite: bool) -> None:
+    """Raises UserError unless a policy folder may be written there: nothing is, or one that may be overwritten."""
+    if not is_used(folder):
+        return
+    if not overwrite:
+        raise UserError(f"{folder} is not empty: give --overwrite to delete it, or another --out")
+    if not is_one(folder):
+        raise UserError(f"{folder} is not a policy folder, so --overwrite will not delete it: give another --out")
+
+
+def place_of(folder: Path, overwrite: bool) -> AbstractContextManager[Place]:
+    """Keeps the place of a policy folder for this process (`whole.place_of`). Raises UserError as `check_free`."""
+    return whole.place_of(folder, lambda there: check_free(there, overwrite), overwrite)
+
+
+def write(folder: Path, described: dict[str, Any], arrays: Any) -> None:
+    """Writes what a policy is (plain JSON values) and its arrays into a folder."""
+    (folder / ARRAYS).mkdir()
+    with checkpoints(folder / ARRAYS) as saved:
+        saved.save(0, {"policy": arrays})
+    formats.write("policy", folder / POLICY, {**described, "arrays": digest(arrays)})
+
+
+def read(folder: Path) -> dict[str, Any]:
+    """What a folder says of its policy. Raises UserError if it cannot be read or is damaged."""
+    return formats.read("policy", folder / POLICY)
+
+
+def read_arrays(folder: Path, like: Any, described: dict[str, Any]) -> Any:
+    """The arrays of a policy.
+
+    Args:
+        folder: the policy's.
+        like: a tree of their shapes.
+        described: from `read`.
+
+    Raises:
+        UserError: they cannot be read, are damaged, or are those of another policy.
+    """
+    place = folder / ARRAYS
+    remedy = "it is damaged: restore it, or adapt the policy anew"
+    if not place.is_dir():
+        raise UserError(f"{place} is missing: restore it, or adapt the policy anew")
+    with checkpoints(place, read_only=True, damaged=remedy) as saved:
+        if saved.latest() is None:
+            raise UserError(f"{place} holds no arrays: restore it, or adapt the policy anew")
+        found = saved.restore({"policy": like})["policy"]
+    if digest(found) != described.get("arrays"):
+        raise UserError(f"{place} holds the arrays of another policy: restore it, or adapt the policy anew")
+    return found

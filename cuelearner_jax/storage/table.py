@@ -1,0 +1,381 @@
+"""An append-only table on disk: JSONL while it grows, Parquet once it is done; nothing here knows what a row means.
+
+Each line of the JSONL file is an object, of one of three kinds:
+
+    {"about": {...}}         what the table is, once, at its head; in Parquet it is metadata of the schema
+    {"constants": {...}}     columns that stay the same: they hold for all lines after it, until the next such line
+    {"step": 10, ...}        a row
+
+A line is on the disk when the call that writes it returns; `records.lines` says how lines are sealed. Whatever replaces
+a file does so in one step. Parquet holds a digest of its contents. A file without these is refused.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import os
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.storage import lines
+from cuelearner_jax.storage.footer import declared
+from cuelearner_jax.storage.lines import Row
+from cuelearner_jax.storage.room import check_room
+from cuelearner_jax.storage.whole import replacing, unreadable
+
+META = b"cuelearner"  # the key under which Parquet holds what the table is
+DIGEST = b"cuelearner.sha256"  # and the one of the digest of its contents
+TAIL = 1 << 16  # more than the longest row of most tables [bytes]
+VALUE = 64  # of memory, that a value takes while it is read: as Arrow's, as Python's, as NumPy's [bytes]
+
+PathLike = str | os.PathLike[str]
+Writer = TypeVar("Writer", bound="TableWriter")
+
+
+@dataclass(frozen=True)
+class Schema:
+    """What the rows of a kind of table are. Columns that are not named here hold floats."""
+
+    stem: str  # of the files' names, and what messages call the rows
+    mark: str  # a line of JSON with this key is a row
+    required: tuple[str, ...]
+    strings: tuple[str, ...] = ()
+    integers: tuple[str, ...] = ()
+    lists: tuple[str, ...] = ()  # of 32-bit floats
+    remedy: str = "is damaged: restore it"  # what a message says of a damaged file, after its path
+
+    @property
+    def jsonl(self) -> str:
+        """Name of the file while the table grows."""
+        return f"{self.stem}.jsonl"
+
+    @property
+    def parquet(self) -> str:
+        """Name of the file once the table is done."""
+        return f"{self.stem}.parquet"
+
+    def growing(self, path: PathLike) -> Path:
+        """The JSONL file of a table, given that, its Parquet file or its folder."""
+        path = Path(path)
+        return path.with_name(self.jsonl) if path.name in (self.jsonl, self.parquet) else path / self.jsonl
+
+    def type(self, name: str) -> pa.DataType:
+        """The type of a column."""
+        if name in self.strings:
+            return pa.string()
+        if name in self.integers:
+            return pa.int64()
+        return pa.list_(pa.float32()) if name in self.lists else pa.float64()
+
+
+class TableWriter:
+    """Appends rows to the JSONL file of one table; every append is on the disk when the call returns.
+
+    Opening an existing table continues it: a torn last line, left by a crash, is dropped first, and a table that was
+    already finished (Parquet) becomes JSONL again.
+    """
+
+    def __init__(
+        self, folder: PathLike, schema: Schema, constants: Row | None = None, about: Row | None = None
+    ) -> None:
+        """Opens the table in `folder`, creating both where needed.
+
+        Args:
+            folder: where the table lies.
+            schema: what its rows are.
+            constants: columns with one value for all rows to come; None: there are none.
+            about: what the table is, written at the head of a new one; that of an existing one stays.
+        """
+        self.path = Path(folder) / schema.jsonl
+        self._schema, self._columns = schema, set(constants or ())
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        _reopen(self.path, schema)
+        rows = _rows(self.path, schema) if self.path.exists() else []
+        header = None if constants is None else {name: _plain(value) for name, value in constants.items()}
+        if about is not None and not any("about" in row for row in rows):
+            rows.append({"about": about})
+        last = next((row["constants"] for row in reversed(rows) if "constants" in row), None)
+        if header is not None and header != last:
+            rows.append({"constants": header})
+        self._lines = lines.Writer(self.path, rows)
+
+    def append(self, **columns: Any) -> None:
+        """Appends rows.
+
+        Args:
+            columns: what holds for all rows (a scalar; for a column of lists, one list), or arrays with the rows as
+                leading axis, all of one length. For instance `append(step=1000, seed=seeds, reward=rewards)`.
+
+        Raises:
+            ValueError: if a required column is missing or the lengths differ.
+            OSError: the disk takes no more. None of the rows is in the table, now or later; the call may be repeated.
+        """
+        missing = [name for name in self._schema.required if name not in columns and name not in self._columns]
+        if missing:
+            raise ValueError(f"a row of {self._schema.stem} needs the columns {', '.join(missing)}")
+        arrays = {name: np.asarray(value) for name, value in columns.items()}
+        own = {name: array.ndim == (name in self._schema.lists) for name, array in arrays.items()}  # one for all rows
+        lengths = {len(array) for name, array in arrays.items() if not own[name]}
+        if len(lengths) > 1:
+            raise ValueError(f"columns of one append must have one length, got {sorted(lengths)}")
+        # tolist() turns NumPy and JAX values into plain Python ones, in one transfer for each column.
+        values = {name: array.tolist() for name, array in arrays.items()}
+        self._lines.append(
+            {name: _plain(value if own[name] else value[row]) for name, value in values.items()}
+            for row in range(lengths.pop() if lengths else 1)
+        )
+
+    def close(self) -> None:
+        """Closes the file; the table stays JSONL until `finish`."""
+        self._lines.close()
+
+    def __enter__(self: Writer) -> Writer:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def last_row(path: PathLike, schema: Schema) -> Row | None:
+    """The newest complete row of a table that is still being written, without looking at the others."""
+    try:
+        found = lines.newest(schema.growing(path), TAIL)
+    except FileNotFoundError:
+        return None
+    return found if found is not None and schema.mark in found else None
+
+
+def truncate(path: PathLike, schema: Schema, keep: Callable[[Row], bool]) -> None:
+    """Drops the rows that are not to be kept and a torn last line; without a table nothing happens.
+
+    Args:
+        path: folder of the table, or its file.
+        schema: what its rows are.
+        keep: says of a row whether it stays.
+    """
+    path = schema.growing(path)
+    _reopen(path, schema)
+    if path.exists():
+        kept = [row for row in _rows(path, schema) if schema.mark not in row or keep(row)]
+        lines.Writer(path, kept).close()
+
+
+def finish(path: PathLike, schema: Schema) -> Path:
+    """Turns the JSONL of a table that is done into Parquet and removes it; returns the Parquet file.
+
+    Args:
+        path: folder of the table, or its file. A table that is finished already is left as it is.
+        schema: what its rows are.
+
+    Raises:
+        UserError: if there is no table, it has no rows or it cannot be read.
+    """
+    path = schema.growing(path)
+    target = path.with_name(schema.parquet)
+    if path.exists():
+        table = read(path, schema)
+        if table.num_rows == 0:
+            raise UserError(f"{path} has no rows: a table of {schema.stem} cannot be finished before its first one")
+        write(target, table, schema)
+        path.unlink()
+    elif not target.exists():
+        raise UserError(f"no {schema.stem} in {path.parent}: expected {schema.jsonl} or {schema.parquet}")
+    return target
+
+
+def write(path: Path, table: pa.Table, schema: Schema, about: Row | None = None, fresh: bool = False) -> None:
+    """Writes a whole table as Parquet, in one step.
+
+    Args:
+        path: the file.
+        table: its rows.
+        schema: what they are.
+        about: what the table is.
+        fresh: make folders as needed, and raise UserError rather than replace a file.
+    """
+    told = about_of(table) if about is None else about
+    table = _typed(table, schema)
+    told = {} if told is None else {META: json.dumps(told).encode()}
+    table = table.replace_schema_metadata({**told, DIGEST: digest(table, told.get(META, b"")).encode()})
+    with replacing(path, "wb", fresh) as file:
+        pq.write_table(table, file, compression="zstd", write_page_checksum=True)
+
+
+def digest(table: pa.Table, about: bytes = b"") -> str:
+    """SHA-256 of a table's columns: their names, types and values, in order; and of what it says of itself."""
+    found = hashlib.sha256(about)
+    for name in table.column_names:
+        column = table[name].combine_chunks()
+        found.update(json.dumps([name, str(column.type), len(column)]).encode())
+        if pa.types.is_list(column.type):
+            found.update(np.asarray(column.value_lengths().fill_null(-1)).tobytes())
+            column = column.flatten()
+        if pa.types.is_string(column.type):
+            column = column.dictionary_encode()
+            found.update(json.dumps(column.dictionary.to_pylist()).encode())
+            column = column.indices
+        found.update(np.asarray(column.is_null()).tobytes())
+        found.update(np.asarray(column.fill_null(0)).tobytes())
+    return found.hexdigest()
+
+
+def read(path: Path, schema: Schema) -> pa.Table:
+    """One file of a table with its types; no rows, no columns where it has just begun.
+
+    Raises:
+        UserError: if the file is corrupt or is no table of this schema.
+    """
+    if path.suffix != ".parquet" and not path.exists():
+        path = path.with_name(schema.parquet)  # the table was finished since the file was found
+    try:
+        table = _finished(path, schema) if _is_parquet(path) else _grown(path, schema)
+    except OSError as error:
+        if error.errno is None:  # Arrow's own
+            raise _damaged(path, schema, error) from error
+        raise unreadable(path, error) from error
+    except (KeyError, TypeError, ValueError, MemoryError, OverflowError, pa.ArrowException) as error:
+        raise _damaged(path, schema, error) from error
+    missing = [name for name in schema.required if name not in table.column_names]
+    if missing and table.num_rows:
+        raise UserError(
+            f"{path} lacks the columns {', '.join(missing)}: it is not a table of {schema.stem} of this package"
+        )
+    return table
+
+
+def about_of(table: pa.Table) -> Row | None:
+    """What a table says of itself. Raises ValueError if that is no JSON object."""
+    told = (table.schema.metadata or {}).get(META)
+    about = None if told is None else json.loads(told)
+    if not isinstance(about, dict | None):
+        raise ValueError(f"a table says of itself {about!r}, which is no JSON object")
+    return about
+
+
+def _damaged(path: Path, schema: Schema, reason: object) -> UserError:
+    return UserError(f"{path} {schema.remedy} ({(str(reason).splitlines() or [''])[0]})")
+
+
+def _typed(table: pa.Table, schema: Schema) -> pa.Table:
+    """With the columns' types, and what it says of itself."""
+    types = [(name, schema.type(name)) for name in table.column_names]
+    return table.cast(pa.schema(types, metadata=table.schema.metadata))
+
+
+def _finished(path: Path, schema: Schema) -> pa.Table:
+    """The table of a Parquet file. Raises ValueError if it is not what was written."""
+    held = declared(path)
+    what, remedy = f"{path} declares {held.rows:,} rows with {held.values:,} values", f"it {schema.remedy}"
+    check_room(what, VALUE * held.values + held.page_bytes, remedy)
+    # Equal strings stand once in the file and need not do so in memory.
+    table = pq.read_table(path, page_checksum_verification=True, read_dictionary=list(held.strings))
+    chunks = [chunk for name in held.strings for chunk in table[name].chunks]
+    check_room(what, VALUE * held.values + 2 * sum(map(_letters, chunks)), remedy)
+    table = _typed(table, schema)
+    metadata = table.schema.metadata or {}
+    if DIGEST not in metadata:
+        raise ValueError("it has no digest of its contents, so this program did not write it")
+    if metadata[DIGEST].decode() != digest(table, metadata.get(META, b"")):
+        raise ValueError("its contents are not those that were written")
+    return table.replace_schema_metadata({META: metadata[META]} if META in metadata else None)
+
+
+def _letters(texts: pa.DictionaryArray) -> int:
+    """Length of all strings of a column together, where equal ones stand once [bytes]."""
+    used = np.bincount(np.asarray(texts.indices.drop_null()), minlength=len(texts.dictionary))
+    return sum(int(count) * len(text or "") for count, text in zip(used, texts.dictionary.to_pylist(), strict=True))
+
+
+def _is_parquet(path: Path) -> bool:
+    if path.suffix in (".parquet", ".jsonl"):
+        return path.suffix == ".parquet"
+    with path.open("rb") as file:
+        return file.read(4) == b"PAR1"
+
+
+def _plain(value: Any) -> Any:
+    """A JSON value: strict JSON has no NaN and no infinity, so they become null; a success is 1.0, not true."""
+    if isinstance(value, list):
+        return [_plain(entry) for entry in value]
+    value = value.item() if isinstance(value, np.generic) else value
+    value = float(value) if isinstance(value, bool) else value
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _rows(path: Path, schema: Schema) -> list[Row]:
+    """The lines of a JSONL file, parsed. Raises UserError for one that is damaged."""
+    try:
+        rows = lines.read(path).rows
+    except lines.Damaged as error:
+        raise _damaged(path, schema, error) from error
+    for number, row in enumerate(rows, start=1):
+        kinds = row.keys() & {"about", "constants", schema.mark}
+        if not kinds or not all(isinstance(row[name], dict) for name in kinds - {schema.mark}):
+            raise _damaged(path, schema, f"line {number}: it is not a row of {schema.stem}")
+    return rows
+
+
+def _reopen(path: Path, schema: Schema) -> None:
+    """Turns a finished table back into JSONL, so that it can be continued."""
+    whole = path.with_name(schema.parquet)
+    if not whole.exists():
+        return
+    if not path.exists():
+        table = read(whole, schema)
+        told = about_of(table)
+        rows = [] if told is None else [{"about": told}]
+        rows += [{name: value for name, value in row.items() if value is not None} for row in table.to_pylist()]
+        lines.Writer(path, rows).close()
+    whole.unlink()
+
+
+def _grown(path: Path, schema: Schema) -> pa.Table:
+    """The table of a JSONL file, constants included."""
+    told: Row | None = None
+    constants: Row = {}
+    columns: dict[str, list[Any]] = {}
+    count, rows = 0, _rows(path, schema)
+    check_room(f"{path} holds {len(rows):,} lines", _extent(rows), f"it {schema.remedy}")
+    for line in rows:
+        if "about" in line or "constants" in line:
+            told, constants = line.get("about", told), line.get("constants", constants)
+            continue
+        for name, value in (constants | line).items():
+            column = columns.setdefault(name, [])
+            column.extend([None] * (count - len(column)))  # a column that earlier rows lacked
+            column.append(value)
+        count += 1
+    # Whole numbers are cast, since Arrow would cut a broken one off.
+    types = {name: None if name in schema.integers else schema.type(name) for name in columns}
+    padded = {name: column + [None] * (count - len(column)) for name, column in columns.items()}
+    table = pa.table({name: pa.array(column, types[name]) for name, column in padded.items()})
+    table = _typed(table, schema)
+    return table if told is None else table.replace_schema_metadata({META: json.dumps(told).encode()})
+
+
+def _extent(rows: Iterable[Row]) -> int:
+    """Memory that the table of these lines takes [bytes]: constants hold for each row, a column for all."""
+    names: set[str] = set()
+    count, found, shared = 0, 0, 0
+    for row in rows:
+        if "about" in row:
+            continue
+        values = row.get("constants", row)
+        names.update(values)
+        lists = sum(len(value) for value in values.values() if isinstance(value, list))
+        texts = sum(len(value) for value in values.values() if isinstance(value, str))
+        size = VALUE * lists + 2 * texts
+        if "constants" in row:
+            shared = size
+        else:
+            count, found = count + 1, found + shared + size
+    return found + VALUE * count * len(names)

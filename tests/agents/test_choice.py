@@ -1,0 +1,115 @@
+"""The quick argmax against the full one: where it must agree, and what it may miss."""
+
+import dataclasses
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from probes import CONFIG, SIZES
+
+from cuelearner_jax import config as configuration
+from cuelearner_jax.actions import DIRECTIONS, evenly_spaced, from_angle
+from cuelearner_jax.agents import choice as search
+from cuelearner_jax.agents import ddqn
+from cuelearner_jax.agents.networks import applied, q_network, widened
+from cuelearner_jax.devices import Portions
+from cuelearner_jax.errors import UserError
+
+LAYERS = (24, 24, 17)
+FULL = dataclasses.replace(SIZES, q_layers=LAYERS, directions=360, coarse_directions=0)
+
+
+def agent(key=0, scale=3.0):
+    """An agent whose values rise and fall several times round the circle."""
+    params = q_network(LAYERS).init(jax.random.key(key), jnp.zeros(5), jnp.zeros(2))
+    return jax.tree.map(lambda leaf: leaf * scale, params)
+
+
+def bump(centre_deg, width_deg, height):
+    """Values with one triangular peak."""
+
+    def q(params, obs, actions):
+        off = jnp.rad2deg(jnp.arccos(jnp.clip(actions @ from_angle(jnp.deg2rad(centre_deg)), -1, 1)))
+        return (height * jnp.maximum(0.0, 1.0 - off / width_deg))[..., None]
+
+    return q
+
+
+def chosen_deg(q, peaks=2, coarse=36, n=360):
+    options = evenly_spaced(n)
+    rough = q(None, jnp.zeros(1), options[:: n // coarse])[:, 0]
+    x, y = ddqn.greedy_near_peaks(q, None, jnp.zeros(1), options, rough, peaks)
+    return float(jnp.rad2deg(jnp.arctan2(y, x)) % 360)
+
+
+@pytest.mark.parametrize("centre", [0.0, 3.0, 117.0, 355.0])
+def test_a_peak_between_two_directions_of_the_first_look_is_found(centre):
+    assert chosen_deg(bump(centre, 12.0, 1.0)) == pytest.approx(centre, abs=0.01)
+
+
+def test_the_higher_of_two_peaks_is_found_though_the_first_look_sees_it_lower():
+    # At multiples of 10 degrees the broad peak shows 0.9, the narrow one (half-width 6, at 204) 2 * (1 - 4 / 6) = 0.67.
+    broad, narrow = bump(90.0, 50.0, 0.9), bump(204.0, 6.0, 2.0)
+    both = lambda *args: broad(*args) + narrow(*args)  # noqa: E731
+    assert chosen_deg(both, peaks=2) == pytest.approx(204.0, abs=0.01)
+    assert chosen_deg(both, peaks=1) == pytest.approx(90.0, abs=0.01)  # which one peak alone does not see
+
+
+@pytest.mark.parametrize("coarse", [36, 120, 360])
+def test_the_quick_choice_of_a_network_is_the_full_one(coarse):
+    obs = jax.random.normal(jax.random.key(1), (64, 5))
+    quick = dataclasses.replace(FULL, coarse_directions=coarse, peaks=4)
+    fast, full = (search.greedy_actions(sizes, DIRECTIONS, None, agent(), obs) for sizes in (quick, FULL))
+    assert len(np.unique(np.asarray(full), axis=0)) > 5  # choices differ from state to state
+    np.testing.assert_array_equal(fast, full)
+
+
+def test_a_first_look_in_bfloat16_gives_up_hardly_any_value():
+    obs, params = jax.random.normal(jax.random.key(1), (64, 5)), agent()
+    rough = dataclasses.replace(FULL, coarse_directions=60, coarse_dtype="bfloat16", peaks=4)
+    chosen = search.greedy_actions(rough, DIRECTIONS, None, params, obs)
+    q = applied(q_network(LAYERS))
+    values = jax.vmap(lambda seen: q(params, seen, evenly_spaced(360))[:, 0])(obs)
+    taken = jax.vmap(lambda seen, action: q(params, seen, action)[0])(obs, chosen)
+    given_up = (values.max(1) - taken) / (values.max(1) - values.mean(1))
+    assert float(given_up.max()) < 0.02
+    assert float(jnp.mean(given_up == 0)) > 0.9
+
+
+def test_actions_do_not_depend_on_how_many_states_are_searched_at_once(monkeypatch):
+    obs = jax.random.normal(jax.random.key(2), (7, 5))
+    together = search.greedy_actions(FULL, DIRECTIONS, None, agent(), obs)
+    monkeypatch.setattr(search, "portions", lambda: Portions(actions=360, agents=1, states=1))
+    np.testing.assert_allclose(search.greedy_actions(FULL, DIRECTIONS, None, agent(), obs), together, atol=1e-6)
+
+
+def test_units_that_fill_up_a_layer_add_exactly_nothing():
+    params, obs = agent(), jax.random.normal(jax.random.key(3), (5,))
+    wide, layers = widened(params, LAYERS, 16)
+    assert layers == (32, 32, 32)
+    chex.assert_shape(wide["params"]["Dense_1"]["kernel"], (32, 32))
+    options = evenly_spaced(8)
+    before, after = applied(q_network(LAYERS))(params, obs, options), applied(q_network(layers))(wide, obs, options)
+    np.testing.assert_allclose(after, before, rtol=1e-6, atol=1e-6)
+
+
+def test_values_are_counted_as_they_are_taken():
+    assert search.looked_at(FULL) == 360
+    # 36 at first, then 4 peaks of 2 * 9 neighbours and themselves.
+    assert search.looked_at(dataclasses.replace(FULL, coarse_directions=36, peaks=4)) == 36 + 4 * 19
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"coarse_directions": 7}, "sizes.coarse_directions is 7: give a divisor of sizes.directions"),
+        ({"coarse_directions": 4, "peaks": 5}, "sizes.peaks is 5: give at most"),
+        ({"peaks": 0}, "sizes.peaks is 0"),
+    ],
+)
+def test_a_search_that_cannot_work_is_refused(change, says):
+    sizes = dataclasses.replace(SIZES, directions=16, **change)
+    with pytest.raises(UserError, match=says):
+        configuration.check(dataclasses.replace(CONFIG, sizes=sizes))

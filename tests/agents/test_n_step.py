@@ -1,0 +1,276 @@
+"""N-step returns: by hand, out of the ring buffer, and in the whole loop on a chain whose values are known."""
+
+import dataclasses
+from functools import cache
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+import probes
+import pytest
+
+from cuelearner_jax import loop
+from cuelearner_jax.actions import evenly_spaced
+from cuelearner_jax.agents import ddqn
+from cuelearner_jax.agents.learning import learner
+from cuelearner_jax.agents.networks import MLP, Joined, applied, q_network
+from cuelearner_jax.agents.replay import Following
+from cuelearner_jax.config import Scalars, check
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.guides import registry as guidances
+from cuelearner_jax.types import StoredStep, Transition
+
+HALF = 0.5  # the discount factor of everything worked out by hand
+
+summed = jax.jit(ddqn.n_step_return)
+
+
+def window(rewards=(1.0, 2.0, 4.0), discounts=(1, 1, 1), ended=(0, 0, 0), known=(True, True, True)):
+    """One window of three steps."""
+    rewards, discounts, ended = (jnp.array(values, jnp.float32) for values in (rewards, discounts, ended))
+    return Following(rewards, discounts, ended, jnp.array(known))
+
+
+def returned(following, discount=HALF):
+    """(sum, factor of the value that follows, last step)."""
+    total, factor, last = summed(*following, discount)
+    return float(total), float(factor), int(last)
+
+
+# By hand.
+
+
+def test_a_whole_window_sums_its_discounted_rewards_and_the_value_after_it_is_discounted_thrice():
+    assert returned(window()) == (1 + 2 / 2 + 4 / 4, 1 / 4, 2)
+    # One further discount is the target's: 3 + 0.5 * 0.25 * 8.
+    item = Transition(jnp.zeros(1), jnp.zeros(2), jnp.array(3.0), jnp.array(0.25), jnp.zeros(1))
+    eight = lambda params, obs, actions: jnp.full((*actions.shape[:-1], 1), 8.0)  # noqa: E731
+    assert float(ddqn.target(eight, {}, {}, item, evenly_spaced(4), HALF)) == 4.0
+
+
+def test_a_window_of_one_step_is_the_one_step_transition():
+    for discount, ended in ((1, 0), (1, 1), (0, 1)):
+        assert returned(window([7.0], [discount], [ended], [True])) == (7, discount, 0)
+
+
+def test_after_a_termination_neither_rewards_nor_a_value_count():
+    assert returned(window((1, 2, 1e6), (1, 0, 1), (0, 1, 0))) == (2, 0, 1)
+    assert returned(window((1, 1e6, 1e6), (0, 1, 1), (1, 0, 0))) == (1, 0, 0)
+    assert returned(window((1, 2, 4), (1, 1, 0), (0, 0, 1))) == (3, 0, 2)
+
+
+def test_after_a_truncation_the_value_counts_but_no_reward_does():
+    assert returned(window((1, 2, 1e6), (1, 1, 1), (0, 1, 0))) == (2, 1 / 2, 1)
+    assert returned(window((1, 1e6, 1e6), (1, 1, 1), (1, 0, 0))) == (1, 1, 0)
+    assert returned(window((1, 2, 4), (1, 1, 1), (0, 0, 1))) == (3, 1 / 4, 2)
+
+
+def test_what_ends_a_later_episode_changes_nothing():
+    assert returned(window((1, 2, 1e6), (1, 1, 0), (0, 1, 1))) == (2, 1 / 2, 1)
+    assert returned(window((1, 2, 1e6), (1, 0, 0), (0, 1, 1))) == (2, 0, 1)
+
+
+def test_steps_that_have_not_been_made_yet_shorten_the_window():
+    assert returned(window((1, 2, 1e6), (1, 1, 0), (0, 0, 1), (True, True, False))) == (2, 1 / 2, 1)
+    assert returned(window((1, 1e6, 1e6), (1, 0, 0), (0, 1, 1), (True, False, False))) == (1, 1, 0)
+    assert returned(window((1, 1e6, 1e6), (0, 1, 1), (1, 0, 0), (True, True, False))) == (1, 0, 0)
+
+
+# Out of the ring buffer.
+
+ENVS, CAPACITY, WINDOW = 3, 24, 4
+SIZES = dataclasses.replace(probes.SIZES, n_step=WINDOW, num_envs=ENVS, replay_capacity=CAPACITY)
+CHAIN = probes.Chain(jnp.array(False))
+AGENT = learner(SIZES, True, CHAIN)
+BUFFER = AGENT.buffer
+
+
+def course(count):
+    """`count` steps of each environment: their episodes are 1 to 6 steps long and end either way."""
+    rng = np.random.default_rng(4)
+    ended = rng.random((count, ENVS)) < 0.3
+    terminated = ended & (rng.random((count, ENVS)) < 0.5)
+    rewards = rng.normal(size=(count, ENVS))
+    number = np.arange(count)[:, None] + 100.0 * np.arange(ENVS)  # tells a step from every other
+    return ended, terminated, rewards, number
+
+
+def stored(count):
+    ended, terminated, rewards, number = course(count)
+    rows, add = BUFFER.empty(CAPACITY), jax.jit(BUFFER.add)
+    for index in range(count):
+        memory = StoredStep(
+            obs=np.stack([number[index], number[index]], -1),
+            action=np.stack([number[index] + 0.25, number[index]], -1),
+            reward=rewards[index],
+            discount=1.0 - terminated[index, :, None],
+            ended=ended[index, :, None],
+            aftermath=np.stack([number[index] + 0.5, number[index]], -1),
+        )
+        memory = jax.tree.map(lambda leaf: jnp.array(leaf, jnp.float32), memory)
+        rows = add(rows, jnp.array(index * ENVS), memory)
+    return rows
+
+
+n_step = jax.jit(lambda rows, filled, numbers, scalars: AGENT.n_step(CHAIN, rows, filled, numbers, scalars))
+
+
+@pytest.mark.parametrize("count", [5, 8, 13, 16])  # not yet full, just full, in the second turn, at its end
+def test_transitions_out_of_the_ring_buffer_are_those_of_a_walk_along_each_environments_steps(count):
+    ended, terminated, rewards, number = course(count)
+    kept = range(max(0, count - CAPACITY // ENVS), count)
+    begins = [(index, env) for index in kept for env in range(ENVS)]
+    numbers = jnp.array([(index * ENVS + env) % CAPACITY for index, env in begins])
+    numbers = jnp.resize(numbers, (CAPACITY,))  # one shape, one compilation
+    found = n_step(stored(count), jnp.array(count * ENVS), numbers, Scalars(discount=0.9))
+    cuts = set()
+    for row, (index, env) in enumerate(begins):
+        total, factor, place = 0.0, 1.0, index
+        while True:
+            total += factor * rewards[place, env]
+            last = place
+            if ended[place, env] or place + 1 == count or place + 1 == index + WINDOW:
+                break
+            place, factor = place + 1, factor * 0.9
+        cuts.add((bool(ended[last, env]), bool(terminated[last, env]), last - index))
+        assert float(found.reward[row]) == pytest.approx(total, abs=1e-5)
+        assert float(found.discount[row]) == pytest.approx(0.0 if terminated[last, env] else factor, abs=1e-6)
+        np.testing.assert_array_equal(found.obs[row], [number[index, env]] * 2)
+        np.testing.assert_array_equal(found.action[row], [number[index, env] + 0.25, number[index, env]])
+        np.testing.assert_array_equal(found.next_obs[row], [number[last, env] + 0.5, number[last, env]])
+    assert {(end, termination) for end, termination, _ in cuts} == {(False, False), (True, False), (True, True)}
+
+
+# The average of the two targets.
+
+
+def constant(value):
+    """Parameters of a value function that is `value` everywhere."""
+    params = jax.tree.map(jnp.zeros_like, q_network(SIZES.q_layers).init(jax.random.key(0), jnp.zeros(2), jnp.zeros(2)))
+    layer = params["params"][f"Dense_{len(SIZES.q_layers)}"]
+    return {"params": {**params["params"], f"Dense_{len(SIZES.q_layers)}": {**layer, "bias": jnp.array([value])}}}
+
+
+@pytest.mark.parametrize(("weight", "expected"), [(0.0, [5.0, 2.0]), (1.0, [4.0, 3.0]), (0.25, [4.75, 2.25])])
+def test_the_target_lies_between_that_of_one_step_and_that_of_many_by_the_weight(weight, expected):
+    def batch(reward, discount):
+        return Transition(
+            jnp.zeros((2, 2)), jnp.zeros((2, 2)), jnp.array(reward), jnp.array(discount), jnp.ones((2, 2))
+        )
+
+    # Value 8 to the target network, which is what counts, and -3 to the online one. One step: 1 + 0.5 * 8 and a
+    # termination with 2; three steps: 3 + 0.5 * 0.25 * 8 and 3 with a termination.
+    near, far = batch([1.0, 2.0], [1.0, 0.0]), batch([3.0, 3.0], [0.25, 0.0])
+    scalars = Scalars(discount=HALF, n_step_weight=weight)
+    np.testing.assert_allclose(
+        AGENT.targets(probes.Window(), constant(-3.0), constant(8.0), [near, far], scalars), expected, rtol=1e-6
+    )
+    np.testing.assert_allclose(
+        AGENT.targets(probes.Window(), constant(-3.0), constant(8.0), [near], scalars), [5.0, 2.0], rtol=1e-6
+    )
+
+
+# The whole loop.
+
+LOOP = probes.config(
+    sizes={"num_envs": 2, "n_step": 3},
+    scalars={"discount": HALF, "polyak": 0.05, "learning_rate": 5e-3},
+    schedule={"random_steps": 2000, "learn_after": 50, "target_every": 1},
+)
+
+
+@cache
+def program():
+    return loop.make_program(LOOP, guidances.make("none", LOOP.sizes, CHAIN), CHAIN, 0)
+
+
+def learned(truncates, weight, **schedule):
+    """Values at both places of east, north, west and south, learned from uniform actions."""
+    env = probes.Chain(jnp.array(truncates))
+    scalars = dataclasses.replace(LOOP.scalars, n_step_weight=weight)
+    schedule = dataclasses.replace(LOOP.schedule, **schedule)
+    state = probes.start(program(), [3], [0], env)
+    _, state, _ = program().train(env, scalars, schedule, loop.start_clock(), state, 1000)
+    q, params = applied(q_network(LOOP.sizes.q_layers)), probes.lane(state.agent.params, 0)
+    return [np.asarray(q(params, env.observe(place), evenly_spaced(4)))[:, 0] for place in (0, 1)]
+
+
+@pytest.mark.parametrize("weight", [0.0, 0.5, 1.0])
+def test_values_of_a_chain_that_terminates(weight):
+    # Place 1: Q(1, a) = a_x. Place 0: a_y / 2 and half of what follows, which is the best (1) to the one-step target
+    # and what a uniform action gets on average (0) to the n-step one.
+    start, end = learned(False, weight)
+    np.testing.assert_allclose(end, [1, 0, -1, 0], atol=0.08)
+    np.testing.assert_allclose(start, np.array([0, 0.5, 0, -0.5]) + 0.5 * (1 - weight), atol=0.1)
+
+
+@pytest.mark.parametrize("weight", [0.5, 1.0])
+def test_values_of_a_chain_that_is_truncated(weight):
+    # Place 1 goes on as if it had no end, whatever the window: Q(1, a) = a_x + 1, at most 2. Place 0: a_y / 2 plus
+    # 0.5 * 2 by one step; plus 0.5 * 0 + 0.25 * 2 by two, for the episode's end cuts the window of three.
+    start, end = learned(True, weight)
+    np.testing.assert_allclose(end, [2, 1, 0, 1], atol=0.12)
+    np.testing.assert_allclose(start, np.array([0, 0.5, 0, -0.5]) + 1.0 - 0.5 * weight, atol=0.12)
+
+
+def test_windows_that_reach_the_end_need_no_target_network():
+    start, end = learned(False, 1.0, target_every=10**6)
+    np.testing.assert_allclose(end, [1, 0, -1, 0], atol=0.08)
+    np.testing.assert_allclose(start, [0, 0.5, 0, -0.5], atol=0.1)
+
+
+def test_other_weights_and_schedules_compiled_nothing():
+    learned(False, 0.3, target_every=7)
+    assert probes.compilations(program().train) == [1]
+
+
+@pytest.mark.parametrize(
+    ("sizes", "scalars", "words"),
+    [
+        ({"n_step": 0}, {"discount": 0.5}, "sizes.n_step is 0"),
+        ({"n_step": 2}, {"discount": 0.0}, "sizes.n_step is 2"),
+        ({"n_step": 2}, {"discount": 0.5, "n_step_weight": 1.5}, "scalars.n_step_weight is 1.5"),
+        ({"n_step": 2}, {"discount": 0.5, "n_step_weight": -0.1}, "scalars.n_step_weight is -0.1"),
+    ],
+)
+def test_impossible_windows_and_weights_are_refused(sizes, scalars, words):
+    with pytest.raises(UserError, match=words):
+        check(probes.config(sizes, scalars))
+    check(probes.config({"n_step": 2}, {"discount": 0.5, "n_step_weight": 1.0}))
+
+
+# The first layer, which many actions of one observation share.
+
+
+def test_the_joined_layer_is_a_dense_layer_on_the_concatenation():
+    obs = jax.random.normal(jax.random.key(0), (7, 5))
+    action = jax.random.normal(jax.random.key(1), (7, 2))
+    together = jnp.concatenate([obs, action], -1)
+    dense = nn.Dense(16)
+    params = dense.init(jax.random.key(2), together)
+    params = jax.tree.map(lambda leaf: leaf + 0.1 * jax.random.normal(jax.random.key(3), leaf.shape), params)
+    shapes = jax.eval_shape(Joined(16).init, jax.random.key(2), obs, action)
+    assert jax.tree.map(jnp.shape, shapes) == jax.tree.map(jnp.shape, params)
+    np.testing.assert_allclose(Joined(16).apply(params, obs, action), dense.apply(params, together), atol=1e-5)
+    weights = jax.random.normal(jax.random.key(4), (7, 16))
+    slopes = [
+        jax.grad(lambda p, network=network, inputs=inputs: jnp.sum(weights * network.apply(p, *inputs)))(params)
+        for network, inputs in ((Joined(16), (obs, action)), (dense, (together,)))
+    ]
+    for mine, theirs in zip(*map(jax.tree.leaves, slopes), strict=True):
+        np.testing.assert_allclose(mine, theirs, atol=1e-5)
+
+
+def test_many_actions_of_one_observation_have_the_values_of_each_pair():
+    network = MLP((16, 8), 1)
+    obs = jax.random.normal(jax.random.key(0), (5,))
+    actions = jax.random.normal(jax.random.key(1), (9, 2))
+    params = network.init(jax.random.key(2), obs, actions[0])
+    layers = [params["params"][f"Dense_{place}"] for place in range(3)]
+    x = np.concatenate([np.tile(obs, (9, 1)), actions], -1).astype(np.float64)
+    for place, layer in enumerate(layers):
+        x = x @ np.asarray(layer["kernel"], np.float64) + np.asarray(layer["bias"])
+        x = np.maximum(x, 0) if place < 2 else x
+    assert x.std() > 0.02
+    np.testing.assert_allclose(network.apply(params, obs, actions), x, atol=1e-5)

@@ -1,0 +1,120 @@
+"""The ring buffer: order, wrap-around, and what may be drawn."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from cuelearner_jax.agents.replay import ring_buffer
+from cuelearner_jax.types import StoredStep
+
+EXAMPLE = StoredStep(jnp.zeros(3), jnp.zeros(2), jnp.zeros(()), jnp.zeros(1), jnp.zeros(1), jnp.zeros(3))
+
+
+def numbered(first, count, bootstraps=True):
+    """Steps whose every entry is their own number, apart from its place."""
+    kept = slice(None) if bootstraps else slice(0)
+    numbers = jnp.arange(first, first + count, dtype=jnp.float32)
+    return StoredStep(
+        obs=numbers[:, None] + jnp.array([[0.0, 0.1, 0.2]]),
+        action=numbers[:, None] + jnp.array([[0.3, 0.4]]),
+        reward=numbers + 0.5,
+        discount=(numbers[:, None] + 0.6)[:, kept],
+        ended=(numbers[:, None] + 0.7)[:, kept],
+        aftermath=(numbers[:, None] + jnp.array([[0.8, 0.9, 1.0]]))[:, kept],
+    )
+
+
+def filled(buffer, capacity, at_once, steps, bootstraps=True):
+    rows, add = buffer.empty(capacity), jax.jit(buffer.add)
+    for step in range(0, steps, at_once):
+        rows = add(rows, jnp.array(step), numbered(step, at_once, bootstraps))
+    return rows
+
+
+def test_rows_lie_in_the_order_of_time_with_every_field():
+    buffer = ring_buffer(EXAMPLE)
+    assert buffer.width == 11
+    rows = np.asarray(filled(buffer, capacity=6, at_once=2, steps=4))
+    assert rows.shape == (6, 11)
+    np.testing.assert_allclose(rows[:4], np.arange(4)[:, None] + np.arange(11) / 10, rtol=1e-6)
+    np.testing.assert_array_equal(rows[4:], 0)
+
+
+def test_the_oldest_rows_are_written_over():
+    rows = filled(ring_buffer(EXAMPLE), capacity=6, at_once=2, steps=10)
+    np.testing.assert_array_equal(np.asarray(rows)[:, 0], [6, 7, 8, 9, 4, 5])
+
+
+def drawn_from(buffer, rows, key, steps, count):
+    return buffer.read(rows, buffer.draw(jax.random.key(key), rows, jnp.array(steps), count))
+
+
+def test_samples_are_whole_steps():
+    buffer = ring_buffer(EXAMPLE)
+    drawn = drawn_from(buffer, filled(buffer, 6, 2, 6), 0, 6, 50)
+    number = np.asarray(drawn.reward) - 0.5
+    np.testing.assert_allclose(drawn.obs, number[:, None] + [0.0, 0.1, 0.2], rtol=1e-5)
+    np.testing.assert_allclose(drawn.action, number[:, None] + [0.3, 0.4], rtol=1e-5)
+    np.testing.assert_allclose(drawn.discount[:, 0], number + 0.6, rtol=1e-5)
+    np.testing.assert_allclose(drawn.ended[:, 0], number + 0.7, rtol=1e-5)
+    np.testing.assert_allclose(drawn.aftermath, number[:, None] + [0.8, 0.9, 1.0], rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("steps", "numbers"), [(1, {0}), (4, {0, 1, 2, 3}), (8, set(range(8))), (14, set(range(6, 14)))]
+)
+def test_only_filled_rows_are_drawn_and_all_of_them(steps, numbers):
+    buffer = ring_buffer(EXAMPLE)
+    drawn = drawn_from(buffer, filled(buffer, 8, 1, steps), 1, steps, 500)
+    assert set((np.asarray(drawn.reward) - 0.5).tolist()) == numbers  # an empty row would be -0.5
+
+
+def test_draws_are_uniform():
+    buffer = ring_buffer(EXAMPLE)
+    drawn = drawn_from(buffer, filled(buffer, 8, 1, 8), 2, 8, 8000)
+    counts = np.bincount(np.asarray(drawn.obs[:, 0]).astype(int), minlength=8)
+    assert counts.min() > 850  # 1000 each, standard deviation 30
+    assert counts.max() < 1150
+
+
+def test_where_nothing_bootstraps_no_next_observation_is_stored():
+    nothing = jnp.zeros(0)
+    buffer = ring_buffer(EXAMPLE.replace(discount=nothing, ended=nothing, aftermath=nothing))
+    assert buffer.width == 6
+    drawn = drawn_from(buffer, filled(buffer, 4, 2, 4, bootstraps=False), 0, 4, 5)
+    assert drawn.aftermath.shape == (5, 0)
+    np.testing.assert_allclose(drawn.reward, drawn.action[:, 0] + 0.2, rtol=1e-5)
+
+
+@pytest.mark.parametrize("steps", [10, 16, 24])
+def test_what_follows_a_step_is_its_own_environments(steps):
+    """Two environments in turn, 12 rows: row n's followers are n + 2, n + 4, ... up to the newest, across the seam."""
+    buffer = ring_buffer(EXAMPLE)
+    rows = filled(buffer, 12, 2, steps)
+    oldest = max(0, steps - 12)
+    numbers = jnp.arange(oldest, steps)
+    after = buffer.follow(rows, jnp.array(steps), numbers % 12, 4, 2)
+    expected = np.arange(oldest, steps)[:, None] + 2 * np.arange(4)
+    np.testing.assert_array_equal(after.known, expected < steps)
+    for found, part in ((after.rewards, 0.5), (after.discounts, 0.6), (after.ended, 0.7)):
+        np.testing.assert_allclose(np.asarray(found)[expected < steps], expected[expected < steps] + part, rtol=1e-5)
+
+
+def test_in_lanes_the_write_stays_one_slice_update():
+    buffer = ring_buffer(EXAMPLE)
+    rows = jnp.stack([buffer.empty(6), buffer.empty(6)])
+    lanes = jax.tree.map(lambda *leaves: jnp.stack(leaves), numbered(10, 2), numbered(20, 2))
+    add = jax.vmap(buffer.add, (0, None, 0))
+    np.testing.assert_array_equal(
+        add(rows, jnp.array(10), lanes)[:, :, 0], [[0, 0, 0, 0, 10, 11], [0, 0, 0, 0, 20, 21]]
+    )
+    program = str(jax.make_jaxpr(add)(rows, jnp.array(10), lanes))
+    assert "dynamic_update_slice" in program
+    assert "scatter" not in program
+
+
+def test_a_capacity_that_is_no_multiple_is_refused():
+    buffer = ring_buffer(EXAMPLE)
+    with pytest.raises(ValueError, match="no multiple"):
+        buffer.add(buffer.empty(7), jnp.array(0), numbered(0, 2))

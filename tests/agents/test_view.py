@@ -1,0 +1,83 @@
+"""What networks see from an action: the same of situations that differ by a turn."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import probes
+import pytest
+
+from cuelearner_jax import actions as geometry
+from cuelearner_jax.actions import DIRECTIONS
+from cuelearner_jax.agents import view
+from cuelearner_jax.agents.choice import greedy_actions, values
+from cuelearner_jax.agents.networks import q_network
+from cuelearner_jax.config import Sizes
+from cuelearner_jax.environment import Features, spaces_of
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.guides.model import guide_model, residual_model
+
+ENV = probes.Window()
+OBS = geometry.from_angle(jnp.array([0.3, -2.0, 1.1]))
+CHOSEN = geometry.from_angle(jnp.array([1.0, 0.5, -3.0]))
+SIZES = Sizes(frame="action", q_layers=(16, 16), feedback_layers=(16, 16), directions=72)
+
+
+class Turned(probes.Window):
+    """The bandit seen from the action alone: nothing tells where the table's own axes point."""
+
+    def features(self, obs, action):
+        return Features(jnp.zeros(1), geometry.inward(jnp.broadcast_to(obs, action.shape), action))
+
+
+def test_raw_networks_see_what_there_is():
+    assert view.seen("raw", None, OBS, CHOSEN) == (OBS, CHOSEN)
+    assert view.widths("raw", spaces_of(ENV)) == (2, 2)
+    assert view.outward("raw", spaces_of(ENV), OBS, CHOSEN) is OBS
+
+
+def test_rows_are_seen_each_from_its_own_action():
+    own, turned = view.seen("action", ENV, OBS, CHOSEN)
+    for row in range(3):
+        alone = ENV.features(OBS[row], CHOSEN[row])
+        np.testing.assert_allclose(own[row], alone.own, atol=1e-6)
+        np.testing.assert_allclose(turned[row], alone.turned, atol=1e-6)
+    assert view.widths("action", spaces_of(ENV)) == (2, 4)
+
+
+def test_a_vector_goes_outward_as_it_came_inward():
+    np.testing.assert_allclose(geometry.outward(jnp.array([2.0, 1.0]), jnp.array([0.0, 1.0])), [-1.0, 2.0], atol=1e-6)
+    np.testing.assert_allclose(geometry.outward(geometry.inward(OBS, CHOSEN), CHOSEN), OBS, atol=1e-6)
+    ahead = geometry.inward(geometry.rotate(CHOSEN, 0.2), CHOSEN)
+    np.testing.assert_allclose(ahead, np.tile([np.cos(0.2), np.sin(0.2)], (3, 1)), atol=1e-6)
+
+
+def test_what_a_guide_says_turns_with_the_situation():
+    env, turn = Turned(), 0.7
+    model = residual_model(SIZES, spaces_of(env))
+    params = model.init(jax.random.key(0))
+    before = model.predict(env, params, OBS, CHOSEN)
+    after = model.predict(env, params, geometry.rotate(OBS, turn), geometry.rotate(CHOSEN, turn))
+    np.testing.assert_allclose(after, geometry.rotate(before, turn), atol=1e-5)
+    assert float(jnp.abs(before).max()) > 0.01
+    numbers = guide_model(SIZES, spaces_of(env), 3)
+    assert numbers.predict(env, numbers.init(jax.random.key(0)), OBS, CHOSEN).shape == (3, 3)
+
+
+@pytest.mark.parametrize("coarse", [0, 12])
+def test_the_greedy_choice_turns_with_the_situation(coarse):
+    env, sizes = Turned(), Sizes(frame="action", q_layers=(16,), directions=72, coarse_directions=coarse, peaks=12)
+    params = q_network(sizes.q_layers).init(jax.random.key(3), jnp.zeros(1), jnp.zeros(2))
+    choose = jax.jit(partial(greedy_actions, sizes, DIRECTIONS, env, params))
+    turn = 7 * np.pi / 36  # as far as seven of the directions
+    chosen = choose(OBS)
+    np.testing.assert_allclose(choose(geometry.rotate(OBS, turn)), geometry.rotate(chosen, turn), atol=1e-5)
+    options = geometry.evenly_spaced(72)
+    best = jax.vmap(lambda obs: values(sizes, env)(params, obs, options)[:, 0].max())(OBS)
+    np.testing.assert_allclose(jax.vmap(partial(values(sizes, env), params))(OBS, chosen)[:, 0], best, atol=1e-6)
+
+
+def test_an_environment_without_features_is_refused_in_the_actions_frame():
+    with pytest.raises(UserError, match=r"give --sizes\.frame raw"):
+        residual_model(SIZES, spaces_of(probes.Chain()))

@@ -1,0 +1,203 @@
+"""The face for Python: what it gives, that it leads to rounds and a bound, and what it refuses."""
+
+import dataclasses
+import subprocess
+import sys
+import warnings
+
+import jax
+import numpy as np
+import probes
+import pytest
+
+import cuelearner_jax as cl
+from cuelearner_jax.config import GuideSizes
+from cuelearner_jax.policies import Agent, Uniform
+from cuelearner_jax.runs import sweep
+from cuelearner_jax.runs.grid import Grid
+from cuelearner_jax.runs.order import Order
+from cuelearner_jax.storage import label_files, results
+from cuelearner_jax.types import Label
+
+TASK = dataclasses.replace(probes.make_task(), presets={})
+WORLD = cl.World(TASK, probes.WindowConfig())
+TEACHER = cl.teacher_of(WORLD)
+ERROR = 11.7  # of the policy that is to be corrected [deg]
+SIZES = GuideSizes(feedback_layers=(32, 32), fit_steps=200, fit_batch_size=32)
+SCALARS = dataclasses.replace(probes.SCALARS, eps_deg=5.0, tau_deg=0.5, k_max=50)
+WILD = dataclasses.replace(SCALARS, feedback_learning_rate=1e30)
+rng = np.random.default_rng(0)
+ANGLES = rng.integers(0, 4, 200) * (np.pi / 2)
+SEEN = np.stack([np.cos(ANGLES), np.sin(ANGLES)], -1).astype(np.float32)
+
+
+def turned(directions, degrees):
+    angle = np.radians(degrees)
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    return np.asarray(directions) @ turn.T
+
+
+def best(obs):
+    return turned(obs, np.degrees(0.6))
+
+
+def policy(obs):
+    """Off by `ERROR`, clockwise."""
+    return turned(best(obs), -ERROR)
+
+
+def errors(acting):
+    """Mean distance from the best actions [deg]."""
+    chosen = acting(SEEN)
+    return np.degrees(np.arccos(np.clip((chosen * best(SEEN)).sum(-1), -1, 1))).mean()
+
+
+def own_labels():
+    """Answers about the policy's own actions alone: all of them say counterclockwise."""
+    return cl.Labels(SEEN, policy(SEEN).astype(np.float32), np.ones(len(SEEN)))
+
+
+def test_importing_the_package_loads_nothing_heavy():
+    script = "import sys, cuelearner_jax; print([name for name in ('jax', 'matplotlib') if name in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_every_name_of_the_face_is_there_and_documented():
+    for name in cl.__all__:
+        assert getattr(cl, name).__doc__
+        assert name in dir(cl)
+    with pytest.raises(AttributeError, match="no attribute 'nonsense'"):
+        cl.nonsense  # noqa: B018
+
+
+def test_a_world_by_name():
+    world = cl.make("billiards", table="one_ball", scenario="turned_strike")
+    assert (world.config.table, world.config.action_turn_deg) == ("one_ball", 0.8)
+    state, obs = world.reset(jax.random.key(0))
+    assert obs.shape == (sum(quantity.size for quantity in world.observation),)
+    assert world.step(jax.random.key(1), state, np.array([1.0, 0.0], np.float32))[1].reward.shape == ()
+    for bad, says in (
+        (lambda: cl.make("billards"), "did you mean 'billiards'"),
+        (lambda: cl.make("billiards", tabel="easy"), "did you mean 'table'"),
+        (lambda: cl.make("billiards", scenario="flood"), "unknown scenario 'flood'"),
+        (lambda: cl.make("nowhere.at_all:TASK"), "no module 'nowhere'"),
+    ):
+        with pytest.raises(cl.UserError, match=says):
+            bad()
+
+
+def test_a_policy_of_a_run_acts_on_one_observation_and_on_many(tmp_path):
+    folder = tmp_path / "run"
+    sweep.run(Order(TASK, probes.CONFIG, Grid(("none",), (3, 5), ()), folder))
+    loaded = cl.load_policy(folder, seed=5, task=TASK)
+    many = loaded(SEEN)
+    np.testing.assert_allclose(np.linalg.norm(many, axis=-1), 1, atol=1e-6)
+    np.testing.assert_array_equal(loaded(SEEN[0]), many[0])
+    assert isinstance(loaded.policy, Agent)
+    np.testing.assert_array_equal(loaded.act(jax.random.key(0), None, jax.numpy.asarray(SEEN)), many)
+    with pytest.raises(cl.UserError, match="no lane with seed 4"):
+        cl.load_policy(folder, seed=4, task=TASK)
+    with pytest.raises(cl.UserError, match=r"shape \(3,\): give \(2,\) or \(n, 2\)"):
+        loaded(np.zeros(3))
+    with pytest.raises(cl.UserError, match="not finite"):
+        loaded(np.array([np.nan, 0.0]))
+    taught = cl.teacher_of(loaded.policy)
+    np.testing.assert_array_equal(taught.best_action(SEEN[0], jax.numpy.asarray(SEEN[0])), many[0])
+
+
+def test_labels_about_a_policys_own_actions_alone_lead_no_farther_than_they_reach():
+    assert errors(policy) == pytest.approx(ERROR, abs=0.01)
+    model = cl.fit_feedback(own_labels(), eps_deg=5.0, sizes=SIZES, scalars=SCALARS)
+    careful = cl.refine(policy, model)
+    assert errors(careful) == pytest.approx(ERROR - 5.0, abs=0.5)
+    with pytest.warns(UserWarning, match="ask in rounds"):
+        reckless = cl.refine(policy, model, bound_deg=180.0)
+    assert errors(reckless) > 60  # each pass turns on, past the best action and round
+
+
+def test_rounds_find_the_best_action_and_warn_of_nothing():
+    model = cl.ask(policy, WORLD, TEACHER, labels=60, bound_deg=45.0, sizes=SIZES, scalars=SCALARS)
+    assert len(model.labels.obs) == 60
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        better = cl.refine(policy, model)
+    assert errors(better) < 4.0  # within eps / 2 the teacher says "already right"
+
+
+def test_a_label_file_gives_what_its_arrays_give(tmp_path):
+    labels = own_labels()
+    rows = Label(labels.obs[None], labels.action[None], labels.answer[None, :, None], np.ones((1, 200), bool))
+    label_files.write(tmp_path / "labels.parquet", {"name": "window"}, "relative", 5.0, np.array([4]), rows)
+    of_file = cl.fit_feedback(tmp_path / "labels.parquet", sizes=SIZES, scalars=SCALARS)
+    of_arrays = cl.fit_feedback(labels, eps_deg=5.0, sizes=SIZES, scalars=SCALARS)
+    for one, other in zip(jax.tree.leaves(of_file.model), jax.tree.leaves(of_arrays.model), strict=True):
+        np.testing.assert_array_equal(one, other)
+    with pytest.raises(cl.UserError, match="leave out eps_deg"):
+        cl.fit_feedback(tmp_path / "labels.parquet", eps_deg=7.0)
+    # Labels of two fifths of that turn by two fifths of that, and a file of them by all of its own.
+    rows = rows.replace(eps_deg=np.full((1, 200), 2.0, np.float32))
+    label_files.write(tmp_path / "finer.parquet", {"name": "window"}, "relative", 5.0, np.array([4]), rows)
+    finer = cl.fit_feedback(tmp_path / "finer.parquet", sizes=SIZES, scalars=dataclasses.replace(SCALARS, k_max=1))
+    assert errors(cl.refine(policy, finer)) == pytest.approx(ERROR - 2.0, abs=0.3)
+
+
+def changed(**parts):
+    return own_labels()._replace(**parts)
+
+
+NONSENSE = [
+    (lambda: cl.fit_feedback(changed(answer=np.full(200, 0.5))), "an answer is none of -1, 0, 1"),
+    (lambda: cl.fit_feedback(changed(action=np.zeros((200, 2)))), "no unit vectors"),
+    (
+        lambda: cl.fit_feedback(changed(action=np.full((200, 2), np.nan))),
+        "labels.action holds numbers that are not finite",
+    ),
+    (lambda: cl.fit_feedback(changed(obs=np.full((200, 2), np.inf))), "labels.obs holds numbers that are not finite"),
+    (lambda: cl.fit_feedback(changed(answer=np.ones(7))), r"give observations \(n, obs\)"),
+    (lambda: cl.fit_feedback(cl.Labels(SEEN[:1], SEEN[:1], np.ones(1))), "1 labels teach nothing"),
+    (lambda: cl.fit_feedback(own_labels(), eps_deg=0.0), "eps_deg is 0.0"),
+    (lambda: cl.fit_feedback(own_labels(), sizes=SIZES, scalars=WILD), "the fit of the feedback model diverged"),
+    (lambda: cl.fit_feedback("nowhere.parquet"), "no label file at nowhere.parquet"),
+    (lambda: cl.ask(policy, WORLD, TEACHER, labels=0), "labels is 0"),
+    (lambda: cl.ask(policy, WORLD, TEACHER, labels=5, bound_deg=200.0), "bound_deg is 200.0:"),
+    (lambda: cl.ask(42, WORLD, TEACHER, labels=5), "42 is no policy"),
+    (lambda: cl.load_policy("nowhere"), "folder nowhere does not exist"),
+    (lambda: cl.train(WORLD, None, probes.CONFIG, guidance=["relative"], seeds=1), "asks a teacher: give one"),
+    (lambda: cl.train(WORLD, TEACHER, "quickstat", seeds=1), "unknown preset 'quickstat'"),
+    (lambda: cl.train(WORLD, TEACHER, probes.CONFIG, seeds=0), "seeds is 0: give a whole number from 1"),
+    (lambda: cl.train(WORLD, TEACHER, probes.CONFIG, guidance=["telepathy"]), "unknown guidance 'telepathy'"),
+]
+
+
+@pytest.mark.parametrize(("call", "says"), NONSENSE, ids=[says for _, says in NONSENSE])
+def test_nonsense_is_refused_in_one_line(call, says):
+    with pytest.raises(cl.UserError, match=says) as refused:
+        call()
+    assert "\n" not in str(refused.value)
+
+
+def rows_of(rows, columns):
+    return sorted(tuple(str(row[name]) for name in columns) for row in rows)
+
+
+def test_training_from_python_gives_what_the_command_gives(tmp_path):
+    kinds = ["none", "relative"]
+    run = cl.train(WORLD, TEACHER, probes.CONFIG, guidance=kinds, labels=[10], seeds=[3, 5], progress=False)
+    grid = Grid(("none", "relative"), (3, 5), (10,))
+    sweep.run(Order(TASK, probes.CONFIG, grid, tmp_path / "run"))
+    columns = ("guidance", "labels", "seed", "step", "reward", "train_loss", "guide_reward")
+    recorded = results.read(tmp_path / "run").to_pylist()
+    one, other = (
+        sorted(tuple(str(row[name]) for name in columns) for row in rows)
+        for rows in (run.results.to_pylist(), recorded)
+    )
+    assert one == other
+    assert run.policy(guidance="none", seed=5)(SEEN).shape == (200, 2)
+    with pytest.raises(cl.UserError, match="no lane with seed 9"):
+        run.policy(seed=9)
+
+
+def test_chance_is_a_policy_too():
+    model = cl.ask(Uniform(), WORLD, TEACHER, labels=10, bound_deg=180.0, sizes=SIZES, scalars=SCALARS)
+    assert cl.refine(Uniform(), model)(SEEN).shape == (200, 2)

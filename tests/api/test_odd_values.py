@@ -1,0 +1,231 @@
+"""Values as other libraries have them work; what only looks like one is refused; threads are told of their own."""
+
+import dataclasses
+import os
+import threading
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import probes
+import pytest
+from flax import struct
+
+import cuelearner_jax as cl
+from cuelearner_jax.api import arguments
+from cuelearner_jax.config import GuideSizes, Scalars
+from cuelearner_jax.policies import Heuristic, Opaque
+
+TASK = dataclasses.replace(probes.make_task(), presets={})
+WORLD = cl.World(TASK, probes.WindowConfig())
+TEACHER = cl.teacher_of(WORLD)
+SEEN = np.float32([[1, 0], [0, 1], [-1, 0], [0, -1]])
+POLICY = cl.CallablePolicy(Heuristic(WORLD.env), WORLD.env.observation)
+SIZES = GuideSizes(feedback_layers=(8,), fit_steps=20, fit_batch_size=8)
+LABELS = cl.Labels(SEEN, SEEN, np.float32([1, 0, -1, 1]))
+WAYS = {
+    "bfloat16": lambda rows: jnp.asarray(rows, jnp.bfloat16),
+    "float16": lambda rows: rows.astype(np.float16),
+    "big-endian": lambda rows: rows.astype(">f8"),
+    "of Fortran": np.asfortranarray,
+    "backwards": lambda rows: rows[::-1][::-1],
+    "nothing masked": np.ma.asarray,
+    "lists": np.ndarray.tolist,
+    "a view": memoryview,
+}
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_observations_of_every_make_are_the_same_and_actions_can_be_written_in(way):
+    actions = POLICY(WAYS[way](SEEN))
+    np.testing.assert_array_equal(actions, POLICY(SEEN))
+    actions[:] = 0.0
+    assert POLICY(SEEN).any()
+
+
+class Lying:
+    """Says that it is long, and has nothing."""
+
+    def __len__(self):
+        return 10**12
+
+    def __getitem__(self, index):
+        raise IndexError
+
+
+def deleted():
+    array = jnp.asarray(SEEN) + 0
+    array.delete()
+    return array
+
+
+@pytest.mark.parametrize(
+    "rows", [np.ma.masked_array(SEEN, SEEN > 0), Lying(), deleted()], ids=["masked", "long", "gone"]
+)
+def test_what_only_looks_like_an_array_is_refused(rows):
+    with pytest.raises(cl.UserError, match=r"^obs is a"):
+        POLICY(rows)
+
+
+@pytest.mark.parametrize("kind", [np.float16, np.float32, np.float64, np.longdouble, np.int8, jnp.float32, np.array])
+def test_a_number_of_numpy_or_jax_is_a_number(kind):
+    assert arguments.angle("bound_deg", kind(5)) == 5.0
+    assert arguments.settings("scalars", Scalars(eps_deg=kind(5)), Scalars).eps_deg == 5.0
+    assert cl.World(TASK, probes.WindowConfig(kind(28))).config.half_width_deg == 28.0
+
+
+@pytest.mark.parametrize("layers", [[8], (np.int64(8),), np.array([8])])
+def test_layers_may_be_a_list_or_an_array_and_are_kept_as_a_tuple(layers):
+    sizes = arguments.settings("sizes", dataclasses.replace(SIZES, feedback_layers=layers), GuideSizes)
+    assert sizes == SIZES
+    assert hash(sizes) == hash(SIZES)
+
+
+@pytest.mark.parametrize("changes", [{"feedback_layers": (10**9,)}, {"fit_batch_size": 2**31 - 1}, {"ensemble": 10**9}])
+def test_a_guide_that_memory_does_not_hold_is_refused_before_it_is_made(changes):
+    sizes = dataclasses.replace(SIZES, **changes)
+    for call in (
+        lambda: cl.fit_feedback(LABELS, sizes=sizes),
+        lambda: cl.ask(POLICY, WORLD, TEACHER, labels=5, sizes=sizes),
+        lambda: cl.adapt(POLICY, WORLD, TEACHER, labels=5, sizes=sizes),
+    ):
+        with pytest.raises(cl.UserError, match=r"sizes.feedback_layers .* GB are free"):
+            call()
+    with pytest.raises(cl.UserError, match="at most 64"):
+        cl.fit_feedback(LABELS, sizes=dataclasses.replace(SIZES, feedback_layers=(8,) * 65))
+
+
+class Odd(struct.PyTreeNode):
+    """A teacher that gives what no teacher gives."""
+
+    given: object = struct.field(pytree_node=False, default=None)
+
+    def best_action(self, state, obs):
+        return self.given
+
+
+class NoPytree:
+    def best_action(self, state, obs):
+        return obs
+
+
+class OtherArguments(struct.PyTreeNode):
+    def best_action(self, state):
+        return state
+
+
+TABLE = cl.make("billiards")
+OF_BILLIARDS = cl.CallablePolicy(Heuristic(TABLE.env), TABLE.env.observation)
+TEACHERS = [Odd(None), Odd("east"), Odd((1j, 0.0)), Odd(((1.0,), ())), NoPytree(), OtherArguments()]
+
+
+@pytest.mark.parametrize("teacher", [*TEACHERS, cl.teacher_of(OF_BILLIARDS)], ids=lambda one: type(one).__name__)
+def test_a_teacher_of_something_else_is_refused(teacher):
+    with pytest.raises(cl.UserError, match="teacher"):
+        cl.ask(POLICY, WORLD, teacher, labels=5, sizes=SIZES)
+
+
+def test_no_more_bounds_are_tried_than_anyone_can_wait_for():
+    shares = np.linspace(0.01, 0.99, 100_000)
+    with pytest.raises(cl.UserError, match="judge_bounds has 100,000 shares, each played by itself: give at most 16"):
+        cl.adapt(POLICY, WORLD, TEACHER, labels=5, sizes=SIZES, judge_bounds=shares)
+
+
+def test_a_policy_of_another_world_is_refused():
+    for policy, says in (
+        (OF_BILLIARDS, "this world's 2: keep"),
+        (Heuristic(TABLE.env), "^policy cannot act in this wo"),
+    ):
+        for call in (
+            lambda policy=policy: cl.ask(policy, WORLD, TEACHER, labels=5, sizes=SIZES),
+            lambda policy=policy: cl.adapt(policy, WORLD, TEACHER, labels=5, sizes=SIZES),
+            lambda policy=policy: cl.export_policy(policy, "nowhere", WORLD, "numpy"),
+        ):
+            with pytest.raises(cl.UserError, match=says):
+                call()
+
+
+def test_models_and_policies_with_parts_of_something_else_are_refused():
+    model = cl.FeedbackModel(None, None, Scalars(), LABELS, SIZES)
+    with pytest.raises(cl.UserError, match=r"^model.guidance is None"):
+        cl.refine(POLICY, model)
+    with pytest.raises(cl.UserError, match=r"^observation is 'abc'"):
+        cl.CallablePolicy(Heuristic(WORLD.env), "abc")
+    wide = cl.fit_feedback(LABELS._replace(obs=np.ones((4, 5), np.float32)), sizes=SIZES)
+    with pytest.raises(cl.UserError, match="model is of observations with 5 entries, the policy's have 2"):
+        cl.refine(POLICY, wide)
+    with pytest.raises(cl.UserError, match="state"):
+        WORLD.step(jax.random.key(0), np.array(["a", "b"]), [1, 0])
+
+
+@pytest.mark.parametrize("name", ["a" * 5000, "\x1b[31mred\nline", "\u202eback", "\udcff"])
+def test_a_message_is_one_line_whatever_a_path_holds(name):
+    for call in (cl.load_policy, cl.load_exported, cl.fit_feedback):
+        with pytest.raises(cl.UserError) as refused:
+            call(name)
+        assert str(refused.value).isprintable()
+
+
+class Wordless(Exception):
+    def __str__(self):
+        raise RuntimeError
+
+
+@pytest.mark.parametrize("error", [Wordless(), ValueError("\x1b[31mred\n" * 1000)], ids=["no words", "red"])
+def test_what_a_function_raises_is_told_in_one_line(error):
+    def failing(obs):
+        raise error
+
+    with pytest.raises(cl.UserError, match="failing raised") as refused:
+        cl.CallablePolicy(Opaque(failing, on_host=True))(SEEN)
+    assert str(refused.value).isprintable()
+    assert len(str(refused.value)) < 1200
+
+
+def test_threads_are_told_of_their_own_policy():
+    """One policy works, another fails, at the same time, over and over."""
+
+    def sound(obs):
+        return np.tile([1.0, 0.0], (len(obs), 1))
+
+    def broken(obs):
+        if obs.any():
+            raise ValueError("broken one")
+        return sound(obs)
+
+    policies = {call: cl.CallablePolicy(Opaque(call, on_host=True)) for call in (sound, broken)}
+    wrong = []
+
+    def work(call):
+        for _ in range(40):
+            try:
+                policies[call](SEEN)
+                wrong.extend(["broken acted"] * (call is broken))
+            except cl.UserError as error:
+                wrong.extend([str(error)] * (call is sound or "broken one" not in str(error)))
+
+    policies[sound](SEEN)
+    threads = [threading.Thread(target=work, args=[call]) for call in (sound, broken)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert wrong == []
+
+
+def test_a_folder_whose_replacement_was_cut_short_is_said_to_stand_aside(tmp_path):
+    os.mkdir(tmp_path / ".mine.old")
+    with pytest.raises(cl.UserError, match=r"stands aside as .*\.mine\.old: rename it back"):
+        cl.load_policy(tmp_path / "mine")
+
+
+@pytest.mark.parametrize("out", ["a" * 255, "file/below", "loop", "/proc/new"])
+def test_a_place_that_cannot_be_is_refused_in_one_line(out, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").touch()
+    (tmp_path / "loop").symlink_to("loop")
+    with pytest.raises(cl.UserError, match="cannot be written"):
+        cl.export_policy(POLICY, out, WORLD, "numpy")
+    with pytest.raises(cl.UserError):
+        cl.load_policy(out)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "loop"]

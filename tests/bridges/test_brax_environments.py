@@ -1,0 +1,157 @@
+"""brax's environments as ours, and in our loop."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import probes
+import pytest
+from brax import envs
+from brax.envs.wrappers import training
+
+from cuelearner_jax import loop
+from cuelearner_jax.actions import evenly_spaced
+from cuelearner_jax.bridges.brax import from_brax, to_brax
+from cuelearner_jax.environment import Environment, offers, symmetries_of
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.guides import registry as guidances
+
+
+class Field(envs.Env):
+    """A walk in the plane: half the action is added to the place; pays x; ends past a length of 1."""
+
+    def __init__(self, size=2):
+        self.size = size
+
+    observation_size = 2
+    backend = "none"
+
+    @property
+    def action_size(self):
+        return self.size
+
+    def reset(self, rng):
+        place = 0.1 * jax.random.uniform(rng, (2,))
+        return envs.State(None, place, jnp.zeros(()), jnp.zeros(()), {"length": jnp.zeros(())})
+
+    def step(self, state, action):
+        place = state.obs + 0.5 * jnp.zeros(2).at[: self.size].set(action[:2])
+        length = jnp.linalg.norm(place)
+        state.metrics.update(length=length)
+        return state.replace(obs=place, reward=place[0], done=(length > 1).astype(jnp.float32))
+
+
+def walk(env, actions):
+    """Steps of one of our environments, as NumPy."""
+    state, obs = env.reset(jax.random.key(1))
+    steps = []
+    for index, action in enumerate(actions):
+        state, step = env.step(jax.random.key(index), state, jnp.array(action))
+        steps.append(jax.tree.map(np.asarray, step))
+    return np.asarray(obs), steps
+
+
+def test_a_step_is_that_of_brax():
+    env: Environment = from_brax(Field())
+    assert (env.obs_size, symmetries_of(env)) == (2, 1)
+    start, steps = walk(env, [(1.0, 0.0)] * 4)
+    assert [bool(step.terminated) for step in steps] == [False, True, False, True]
+    assert not any(step.truncated for step in steps)
+    np.testing.assert_allclose(steps[0].obs, start + np.array([0.5, 0]))
+    np.testing.assert_array_equal(steps[0].obs, steps[0].final_obs)
+    np.testing.assert_allclose(steps[1].final_obs, start + np.array([1.0, 0]))
+    fresh = env.reset(jax.random.key(1))[1]  # the step's own key
+    np.testing.assert_array_equal(steps[1].obs, fresh)
+    np.testing.assert_allclose(steps[2].final_obs, fresh + np.array([0.5, 0]))
+    for step in steps:
+        assert (step.reward, step.reward.dtype) == (step.final_obs[0], np.float32)
+        assert step.outcome == {}
+        np.testing.assert_allclose(step.metrics["length"], np.linalg.norm(step.final_obs))
+        np.testing.assert_array_equal(step.aftermath, step.final_obs)
+
+
+def test_time_runs_out_only_where_nothing_ended():
+    _, steps = walk(from_brax(Field(), max_steps=2), [(1.0, 0.0), (1.0, 0.0), (1.0, 0.0), (-1.0, 0.0)])
+    assert [bool(step.terminated) for step in steps] == [False, True, False, False]
+    assert [bool(step.truncated) for step in steps] == [False, False, False, True]
+    assert np.abs(steps[3].obs - steps[3].final_obs).max() > 0
+
+
+def test_a_truncation_of_brax_is_one_of_ours():
+    _, steps = walk(from_brax(training.EpisodeWrapper(Field(), 1, 1)), [(1.0, 0.0)] * 2)
+    assert [bool(step.truncated) for step in steps] == [True, True]
+    assert not any(step.terminated for step in steps)
+
+
+@pytest.mark.parametrize("truncates", [False, True])
+def test_there_and_back(truncates):
+    chain = probes.Chain(jnp.array(truncates))
+    actions = np.asarray(evenly_spaced(6))
+    (start, expected), (same, steps) = walk(chain, actions), walk(from_brax(to_brax(chain)), actions)
+    np.testing.assert_array_equal(same, start)
+    for one, other in zip(steps, expected, strict=True):
+        jax.tree.map(functools.partial(np.testing.assert_allclose, atol=1e-6), one, other)
+
+
+def test_a_step_leaves_the_state_that_it_was_given():
+    env = from_brax(Field())
+    state, _ = env.reset(jax.random.key(0))
+    env.step(jax.random.key(1), state, jnp.array([1.0, 0.0]))
+    assert state.brax.metrics["length"] == 0
+
+
+def test_actions_of_another_size():
+    start, steps = walk(from_brax(Field(1)), [(-0.6, 0.8)])
+    np.testing.assert_allclose(steps[0].final_obs, start + np.array([-0.3, 0.0]), atol=1e-7)
+    three = from_brax(Field(3), to_action=lambda direction: jnp.append(-direction, 0.0))
+    start, steps = walk(three, [(-0.6, 0.8)])
+    np.testing.assert_allclose(steps[0].final_obs, start + np.array([0.3, -0.4]), atol=1e-7)
+
+
+def test_there_is_an_obvious_direction_where_one_is_given():
+    assert not offers(from_brax(Field()), "heuristic")
+    given = from_brax(Field(), heuristic=lambda obs: -obs)
+    np.testing.assert_array_equal(given.heuristic(jnp.array([0.0, 1.0])), [0, -1])
+
+
+@pytest.mark.parametrize(
+    ("env", "to_action", "words"),
+    [
+        (Field(3), None, "Field: an action has 3 entries: pass to_action"),
+        (Field(3), lambda direction: direction, r"Field: to_action returns shape \(2,\), but .* \(3,\)"),
+        (envs.get_environment("fast", obs_mode="dict_state"), None, r"Fast: .* dictionary \(state\)"),
+        (training.VmapWrapper(Field(), 2), None, r"Field: observations have shape \(2, 2\)"),
+        (training.AutoResetWrapper(Field()), None, "Field: AutoResetWrapper hides"),
+    ],
+)
+def test_what_does_not_fit_is_refused_in_one_line(env, to_action, words):
+    with pytest.raises(UserError, match=words) as refused:
+        from_brax(env, to_action)
+    assert "\n" not in str(refused.value)
+
+
+# Our loop on brax's.
+
+
+BOOTSTRAPPING = probes.config(scalars={"discount": 0.9}, schedule={"target_every": 2})
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    "make",
+    [Field, functools.partial(envs.get_environment, "inverted_pendulum", backend="positional")],
+    ids=["field", "pendulum"],
+)
+def test_our_loop_learns_on_an_environment_of_brax(make):
+    env = from_brax(make(), max_steps=5)
+    program = loop.make_program(BOOTSTRAPPING, guidances.make("none", probes.SIZES, env), env, 0)
+    state = probes.start(program, [0], [0], env)
+    fresh = probes.lane(state.agent.params, 0)
+    clock, state, metrics = program.train(env, probes.SCALARS, probes.SCHEDULE, loop.start_clock(), state, 12)
+    assert (int(clock.step), int(clock.update)) == (48, 48)
+    assert np.isfinite(metrics["loss"]).all()
+    assert np.isfinite(metrics["reward"]).all()
+    for old, new in zip(jax.tree.leaves(fresh), jax.tree.leaves(probes.lane(state.agent.params, 0)), strict=True):
+        assert np.isfinite(new).all()
+        assert (old != new).any()

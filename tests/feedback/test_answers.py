@@ -1,0 +1,130 @@
+"""What teachers answer in each form, by hand: of their best action or of the nearest good one, with their faults."""
+
+import dataclasses
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import probes
+import pytest
+from flax import struct
+
+from cuelearner_jax import actions
+from cuelearner_jax.config import Scalars
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.feedback.answers import DEMONSTRATION, RELATIVE, SCALAR, check_teacher
+from cuelearner_jax.types import ValuesDirections
+
+FORMS = {"relative": RELATIVE, "demonstration": DEMONSTRATION, "scalar": SCALAR}
+ENV = probes.Window(half_width=math.radians(10.0), offset=math.radians(50.0))
+SCALARS = Scalars(eps_deg=10.0, nearest_aim_deg=0.0)
+X = jnp.array([1.0, 0.0])
+
+
+@struct.dataclass
+class TwoWindows:
+    """Holds 50 degrees for best and 95 to 105, worth 0.7 of that, for good."""
+
+    def best_action(self, state, obs):
+        return actions.from_angle(jnp.deg2rad(50.0))
+
+    def nearest_good(self, state, obs, action, spread, share):
+        degrees = jnp.arange(360.0)
+        values = jnp.where(degrees == 50, 1.0, jnp.where(jnp.abs(degrees - 100) <= 5, 0.7, 0.0))
+        return actions.nearest_direction(values, spread, share, action)
+
+
+def direction(degrees):
+    return actions.from_angle(jnp.deg2rad(jnp.float32(degrees)))
+
+
+@jax.jit
+def said(scalars, action, keys):
+    """Answers of every form to one question, asked again and again."""
+
+    def one(key):
+        return {name: form.answer(key, ENV, TwoWindows(), X, X, action, scalars) for name, form in FORMS.items()}
+
+    return jax.vmap(one)(keys)
+
+
+def answers(action_deg, **changes):
+    """Of the forms: h; the angle shown [deg]; good or not."""
+    found = said(dataclasses.replace(SCALARS, **changes), direction(action_deg), jax.random.split(jax.random.key(0), 1))
+    h, shown, good = (np.asarray(found[name][0][0]) for name in FORMS)
+    assert all(bool(found[name][1][0]) for name in FORMS)
+    return float(h[0]), round(float(np.degrees(actions.to_angle(shown))), 2), float(good[0])
+
+
+@pytest.mark.parametrize(
+    ("action_deg", "best", "nearest"),
+    [
+        (0, (1, 50, 0), (1, 50, 0)),
+        (46, (0, 50, 1), (0, 50, 1)),  # within eps / 2; within 5 degrees
+        (44, (1, 50, 0), (1, 50, 0)),
+        (80, (-1, 50, 0), (1, 95, 0)),  # the nearest good one lies the other way
+        (91, (-1, 50, 0), (0, 95, 1)),
+        (100, (-1, 50, 0), (0, 100, 1)),  # good already
+        (120, (-1, 50, 0), (-1, 105, 0)),
+        (-150, (-1, 50, 0), (-1, 105, 0)),  # -160 and -105 the short way
+    ],
+)
+def test_answers_by_hand(action_deg, best, nearest):
+    assert answers(action_deg) == best
+    assert answers(action_deg, answer="nearest") == nearest
+    assert answers(action_deg, answer="nearest", nearest_share=0.8) == best  # the best one alone is good
+
+
+def test_how_near_is_good_is_said_in_degrees():
+    assert [answers(62, scalar_within_deg=within)[2] for within in (11.9, 12.1)] == [0, 1]
+
+
+def test_a_shot_that_scored_is_good_where_that_counts():
+    assert answers(44)[2] == answers(61, scalar_good="scored")[2] == 0
+    assert answers(44, scalar_good="scored")[2] == answers(59, scalar_good="scored")[2] == 1
+
+
+FAULTS = {
+    "mistaken": ({"mistake_probability": 1.0}, (-1, -50, 1), (0, 42, 0)),  # near: 4 degrees off, as much the other way
+    "biased": ({"teacher_bias_deg": -40.0}, (1, 10, 0), (-1, 10, 0)),
+    "indifferent": ({"indifference_deg": 45.0}, (1, 50, 0), (0, 46, 1)),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_faults_mean_something_in_every_form(fault):
+    changes, far, near = FAULTS[fault]
+    assert answers(0, **changes) == far
+    assert answers(46, **changes) == near
+
+
+def test_a_biased_teacher_looks_for_the_nearest_good_one_where_it_takes_it_to_be():
+    # All turned by -40: 10 is held for best, 55 to 65 for good.
+    changes = {"answer": "nearest", "teacher_bias_deg": -40.0}
+    assert [answers(angle, **changes)[1] for angle in (0, 30, 40, 60, 80)] == [10, 10, 55, 60, 65]
+
+
+def test_faults_come_with_their_probabilities_and_independently_in_every_form():
+    scalars = dataclasses.replace(SCALARS, mistake_probability=0.3, silence_probability=0.2)
+    found = said(scalars, X, jax.random.split(jax.random.key(0), 2000))
+    mistaken = {
+        "relative": found["relative"][0][:, 0] < 0,
+        "demonstration": found["demonstration"][0][:, 1] < 0,
+        "scalar": found["scalar"][0][:, 0] > 0,
+    }
+    for name in FORMS:
+        wrong, answered = np.asarray(mistaken[name]), np.asarray(found[name][1])
+        assert wrong.mean() == pytest.approx(0.3, abs=0.05)  # standard deviation 0.01
+        assert answered.mean() == pytest.approx(0.8, abs=0.05)
+        assert wrong[answered].mean() == pytest.approx(0.3, abs=0.06)
+
+
+def test_who_knows_the_best_action_alone_cannot_tell_the_nearest_good_one():
+    nearest = dataclasses.replace(SCALARS, answer="nearest")
+    assert isinstance(TwoWindows(), ValuesDirections)
+    check_teacher(TwoWindows(), nearest)
+    check_teacher(probes.Expert(ENV), SCALARS)
+    with pytest.raises(UserError, match=r"give --scalars\.answer best") as refusal:
+        check_teacher(probes.Expert(ENV), nearest)
+    assert "\n" not in str(refusal.value)

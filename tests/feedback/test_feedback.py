@@ -1,0 +1,307 @@
+"""Relative feedback by hand and against brute force; the teacher's faults; the laws of fitting."""
+
+import dataclasses
+import math
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import probes
+import pytest
+
+from cuelearner_jax import actions, asking
+from cuelearner_jax.agents.networks import applied, residual_network
+from cuelearner_jax.config import Scalars, Sizes
+from cuelearner_jax.environment import random_symmetries
+from cuelearner_jax.feedback.answers import human_answer, relative_feedback
+from cuelearner_jax.guides import registry as guidances
+from cuelearner_jax.guides.fitting import Lesson, fit_least_squares, lessons
+from cuelearner_jax.types import Label
+
+DEG = math.pi / 180
+
+
+def direction(degrees):
+    return actions.from_angle(jnp.array(degrees * DEG))
+
+
+@pytest.mark.parametrize(
+    ("action", "best", "h"),
+    [
+        (0, 30, 1),
+        (30, 0, -1),
+        (0, 4.9, 0),
+        (0, -4.9, 0),
+        (0, 5.1, 1),
+        (0, -5.1, -1),
+        (12, 12, 0),
+        (175, -178, 1),  # 7 deg counterclockwise, over the wrap
+        (-178, 175, -1),
+        (179, -178, 0),
+        (0, 179, 1),
+        (0, -179, -1),
+    ],
+)
+def test_relative_feedback_by_hand(action, best, h):
+    assert float(relative_feedback(direction(action), direction(best), jnp.array(10 * DEG))) == h
+
+
+def test_an_error_of_exactly_half_eps_is_right():
+    action, best = jnp.array([1.0, 0.0]), jnp.array([0.0, 1.0])
+    error = actions.difference(action, best)
+    assert float(relative_feedback(action, best, 2 * error)) == 0
+    assert float(relative_feedback(action, best, 2 * jnp.nextafter(error, 0.0))) == 1
+
+
+def test_opposite_directions_are_told_a_turn():
+    assert abs(float(relative_feedback(direction(0), direction(180), jnp.array(0.1)))) == 1
+
+
+def test_indifference_widens_what_is_right_and_never_narrows_it():
+    told = partial(relative_feedback, direction(0), eps=jnp.array(10 * DEG))
+    assert float(told(direction(7))) == 1
+    assert float(told(direction(7), indifference=8 * DEG)) == 0
+    assert float(told(direction(9), indifference=8 * DEG)) == 1
+    assert float(told(direction(4), indifference=1 * DEG)) == 0
+
+
+@pytest.mark.parametrize("eps_deg", [0.1, 5.0, 20.0, 90.0, 179.0])
+def test_feedback_is_the_turn_that_comes_nearest(eps_deg):
+    rng = np.random.default_rng(int(eps_deg * 10))
+    action, best = rng.uniform(-math.pi, math.pi, (2, 2000))
+    h = jax.vmap(relative_feedback, (0, 0, None))(
+        actions.from_angle(jnp.array(action)), actions.from_angle(jnp.array(best)), jnp.array(eps_deg * DEG)
+    )
+    turns = np.array([-1, 0, 1])
+    left = np.abs(np.angle(np.exp(1j * (best[:, None] - action[:, None] - turns * eps_deg * DEG))))
+    two_best = np.sort(left, axis=1)[:, :2]
+    clear = two_best[:, 1] - two_best[:, 0] > 1e-5
+    assert clear.mean() > 0.98
+    np.testing.assert_array_equal(np.asarray(h)[clear], turns[np.argmin(left, 1)][clear])
+
+
+def target_of(action, h, eps_rad):
+    """What the paper's network is to predict of one answer."""
+    label = Label(jnp.zeros(2), jnp.array(action), jnp.array([h]), jnp.array(True))
+    relative = guidances.make("relative", SIZES, probes.Window())
+    return relative.target(label, Scalars(eps_deg=math.degrees(eps_rad)))
+
+
+def test_the_target_is_the_turned_action_less_the_action():
+    np.testing.assert_allclose(target_of([1.0, 0.0], 1.0, math.pi / 6), [math.sqrt(3) / 2 - 1, 0.5], atol=1e-7)
+    np.testing.assert_allclose(target_of([0.0, 1.0], -1.0, math.pi / 2), [1, -1], atol=1e-6)
+    np.testing.assert_array_equal(target_of([0.6, 0.8], 0.0, 1.0), 0)
+
+
+def test_lessons_are_labels_with_their_targets_in_place_of_the_answers():
+    rng = np.random.default_rng(0)
+    obs, action = jnp.array(rng.normal(size=(2, 7, 2)), jnp.float32)
+    labels = Label(obs, action, jnp.arange(7.0)[:, None], jnp.arange(7) < 5)
+    rows = lessons(labels, lambda label, scalars: scalars.eps_deg * label.answer + label.action, Scalars(eps_deg=3.0))
+    np.testing.assert_allclose(rows.target, 3 * np.arange(7.0)[:, None] + action, rtol=1e-6)
+    for name in ("obs", "action", "valid"):
+        np.testing.assert_array_equal(getattr(rows, name), getattr(labels, name))
+
+
+@pytest.mark.parametrize("kind", ["relative", "dcoach"])
+def test_a_label_of_its_own_strength_asks_for_a_turn_by_that(kind):
+    """The network's units stay eps: of the target of a label half as strong it is to predict half."""
+    strengths, h = np.array([40.0, 20.0, 5.0, 10.0]), np.array([1.0, -1.0, -1.0, 0.0])
+    action = actions.from_angle(jnp.array([0.0, 1.0, 2.0, 3.0]))
+    labels = Label(action, action, jnp.array(h)[:, None], jnp.ones(4, bool), None, jnp.array(strengths))
+    target = guidances.make(kind, SIZES, probes.Window()).target
+    found = lessons(labels, target, Scalars(eps_deg=40.0, eps_last_deg=5.0)).target
+    turned = found if kind == "dcoach" else action + found
+    np.testing.assert_allclose(actions.difference(action, turned) / DEG, strengths * h, atol=1e-4)
+
+
+@jax.jit
+def answers(scalars, best_deg):
+    keys = jax.random.split(jax.random.key(0), 2000)
+    return jax.vmap(lambda key: human_answer(key, direction(0), direction(best_deg), scalars))(keys)
+
+
+def test_a_teacher_without_faults():
+    h, answered = answers(Scalars(eps_deg=10.0), 30.0)
+    assert set(h.tolist()) == {1.0}
+    assert bool(answered.all())
+
+
+def test_a_teacher_that_is_always_mistaken_tells_every_turn_the_wrong_way():
+    scalars = Scalars(eps_deg=10.0, mistake_probability=1.0)
+    assert set(answers(scalars, 30.0)[0].tolist()) == {-1.0}
+    assert set(answers(scalars, -30.0)[0].tolist()) == {1.0}
+    assert set(answers(scalars, 3.0)[0].tolist()) == {0.0}
+
+
+def test_a_silent_teacher_never_answers():
+    assert not bool(answers(Scalars(eps_deg=10.0, silence_probability=1.0), 30.0)[1].any())
+
+
+def test_faults_come_with_their_probabilities_and_independently():
+    scalars = Scalars(eps_deg=10.0, mistake_probability=0.3, silence_probability=0.2)
+    h, answered = (np.asarray(column) for column in answers(scalars, 30.0))
+    assert (h < 0).mean() == pytest.approx(0.3, abs=0.05)  # standard deviation 0.01
+    assert answered.mean() == pytest.approx(0.8, abs=0.05)
+    assert (h[answered] < 0).mean() == pytest.approx(0.3, abs=0.06)
+
+
+def test_a_biased_teacher_holds_a_turned_direction_for_best():
+    scalars = Scalars(eps_deg=10.0, teacher_bias_deg=20.0)
+    assert set(answers(scalars, -20.0)[0].tolist()) == {0.0}
+    assert set(answers(scalars, 0.0)[0].tolist()) == {1.0}
+    assert set(answers(scalars, -30.0)[0].tolist()) == {-1.0}
+
+
+def test_an_indifferent_teacher_passes_larger_errors_for_right():
+    assert set(answers(Scalars(eps_deg=10.0, indifference_deg=25.0), 24.0)[0].tolist()) == {0.0}
+    assert set(answers(Scalars(eps_deg=10.0, indifference_deg=25.0), 26.0)[0].tolist()) == {1.0}
+
+
+SIZES = Sizes(feedback_layers=(32, 32), fit_steps=600, fit_batch_size=32, validate_every=20)
+SCALARS = Scalars(feedback_learning_rate=5e-3)
+ROWS = 100
+NETWORK = residual_network(SIZES.feedback_layers, 2)
+HELD_OUT = np.arange(ROWS) % 5 == 4
+
+
+def fresh(key):
+    return NETWORK.init(key, jnp.zeros(2), jnp.zeros(2))
+
+
+predict = applied(NETWORK)
+
+
+@jax.jit
+def fit(key, rows, scalars=SCALARS):
+    return fit_least_squares(key, rows, scalars, init=fresh, apply=predict, sizes=SIZES)
+
+
+def label_set(seed, noise=0.0, valid=ROWS, dtype=np.float32):
+    """A smooth function of observation and action, in the first `valid` rows."""
+    rng = np.random.default_rng(seed)
+    obs, action = rng.uniform(-1, 1, (2, ROWS, 2)).astype(dtype)
+    action /= np.linalg.norm(action, axis=-1, keepdims=True)
+    target = 0.3 * action[:, ::-1] * obs + noise * rng.normal(size=(ROWS, 2))
+    return Lesson(obs, action, target.astype(dtype), np.arange(ROWS) < valid)
+
+
+def mean_error(model, labels, rows):
+    found = predict(model.params, jnp.asarray(labels.obs), jnp.asarray(labels.action))
+    error = np.asarray(found) - labels.target
+    return float(np.square(error).sum(-1)[rows].mean())
+
+
+def assert_same(one, other):
+    for mine, yours in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
+        np.testing.assert_array_equal(mine, yours)
+
+
+def test_fit_learns_a_function_also_where_it_was_not_shown():
+    labels = label_set(0)
+    model = fit(jax.random.key(0), labels)
+    assert bool(model.fitted)
+    zero = float(np.square(labels.target).sum(-1).mean())
+    assert mean_error(model, labels, ~HELD_OUT) < 0.03 * zero
+    assert mean_error(model, labels, HELD_OUT) < 0.3 * zero
+
+
+@pytest.mark.parametrize("garbage_values", [(1e3, -7.0, 55.0), (math.nan, math.inf, math.nan)])
+def test_what_stands_in_rows_that_are_not_valid_changes_nothing(garbage_values):
+    labels = label_set(1, valid=53)
+    garbage = jax.tree.map(np.copy, labels)
+    for name, value in zip(("obs", "action", "target"), garbage_values, strict=True):
+        getattr(garbage, name)[53:] = value
+    assert_same(fit(jax.random.key(0), labels), fit(jax.random.key(0), garbage))
+
+
+def test_a_gap_among_the_valid_rows_is_left_out_as_well():
+    labels = label_set(1)
+    valid = np.arange(ROWS) % 7 != 3
+    garbage = labels.replace(target=np.where(valid[:, None], labels.target, 55.0), valid=valid)
+    assert_same(fit(jax.random.key(0), labels.replace(valid=valid)), fit(jax.random.key(0), garbage))
+
+
+def test_validation_keeps_the_best_parameters_when_the_last_ones_overfit():
+    labels = label_set(2, noise=0.5, valid=40)
+    validation = HELD_OUT & labels.valid
+    kept = fit(jax.random.key(0), labels)
+    # The same steps without anything to validate: the last parameters are kept.
+    last = fit(jax.random.key(0), labels.replace(valid=labels.valid & ~HELD_OUT))
+    assert mean_error(kept, labels, validation) < 0.9 * mean_error(last, labels, validation)
+    assert mean_error(last, labels, labels.valid & ~HELD_OUT) < 0.9 * mean_error(kept, labels, labels.valid & ~HELD_OUT)
+
+
+def test_of_all_looks_the_one_nearest_to_the_validation_labels_is_kept():
+    # A model of one vector, which walks from 0 by 0.01 a step toward (1, 0): 0.2, 0.4, 0.6, 0.8 at the looks.
+    labels = label_set(0).replace(target=np.stack([np.where(HELD_OUT, 0.45, 1.0), np.zeros(ROWS)], -1))
+    model = fit_least_squares(
+        jax.random.key(0),
+        jax.tree.map(jnp.asarray, labels),
+        Scalars(feedback_learning_rate=0.01, max_grad_norm=0.1),
+        init=lambda key: jnp.zeros(2),
+        apply=lambda params, obs, action: jnp.broadcast_to(params, action.shape),
+        sizes=dataclasses.replace(SIZES, fit_steps=80),
+    )
+    np.testing.assert_allclose(model.params, [0.4, 0.0], atol=1e-3)
+
+
+def test_validation_labels_are_never_trained_on():
+    labels = label_set(3)
+    opposite = labels.replace(target=np.where(HELD_OUT[:, None], -labels.target, labels.target))
+    zero = float(np.square(labels.target).sum(-1)[HELD_OUT].mean())
+    assert mean_error(fit(jax.random.key(0), labels), labels, HELD_OUT) < 0.3 * zero
+    assert mean_error(fit(jax.random.key(0), opposite), opposite, HELD_OUT) > 0.7 * zero
+
+
+def test_without_a_valid_label_nothing_is_fitted():
+    assert not bool(fit(jax.random.key(0), label_set(0, valid=0)).fitted)
+    assert bool(fit(jax.random.key(0), label_set(0, valid=1)).fitted)
+
+
+def test_labels_that_only_validate_fit_nothing():
+    assert not bool(fit(jax.random.key(0), label_set(0).replace(valid=np.arange(ROWS) == 4)).fitted)
+
+
+def test_the_key_and_the_learning_rate_matter():
+    labels = label_set(0)
+    one, other = fit(jax.random.key(0), labels), fit(jax.random.key(1), labels)
+    slow = fit(jax.random.key(0), labels, dataclasses.replace(SCALARS, feedback_learning_rate=1e-6))
+    assert abs(jax.tree.leaves(one.params)[1] - jax.tree.leaves(other.params)[1]).max() > 1e-3
+    assert mean_error(slow, labels, ~HELD_OUT) > 3 * mean_error(one, labels, ~HELD_OUT)
+
+
+def test_vectors_are_turned_with_what_was_observed():
+    labels = jax.tree.map(jnp.asarray, label_set(4))
+    image = random_symmetries(jax.random.key(0), probes.Window(mirrors=True), ROWS)
+    (obs, action), (again, target) = image(labels.obs, labels.action), image(labels.obs, labels.target)
+    np.testing.assert_array_equal(obs, again)
+    turn = actions.difference(labels.obs, obs)
+    quarters = np.round(np.asarray(turn) / (math.pi / 2)).astype(int) % 4
+    np.testing.assert_allclose(np.abs(np.exp(1j * np.asarray(turn)) - 1j**quarters), 0, atol=1e-5)
+    assert set(quarters) == {0, 1, 2, 3}
+    for name, found in (("action", action), ("target", target)):
+        expected = actions.rotate(getattr(labels, name), jnp.array(quarters * math.pi / 2))
+        np.testing.assert_allclose(found, expected, atol=1e-5)
+
+
+def test_every_fit_starts_from_its_key_and_from_no_earlier_model():
+    still = dataclasses.replace(SCALARS, feedback_learning_rate=0.0)
+    model = fit(jax.random.key(7), label_set(0), still)
+    assert_same(model.params, fresh(jax.random.split(jax.random.key(7))[0]))
+
+
+def test_without_symmetries_rows_stay_as_they_are():
+    labels = label_set(4)
+    obs, target = random_symmetries(jax.random.key(0), probes.Window(), ROWS)(labels.obs, labels.target)
+    assert obs is labels.obs
+    assert target is labels.target
+
+
+def test_empty_labels_are_padding():
+    labels = asking.empty_labels(7, 5, 2, 1)
+    assert labels.obs.shape == (7, 5)
+    assert labels.action.shape == (7, 2)
+    assert labels.answer.shape == (7, 1)
+    assert not bool(labels.valid.any())

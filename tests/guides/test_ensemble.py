@@ -1,0 +1,239 @@
+"""Ensembles: their mean, how far members are apart, which question that chooses."""
+
+import dataclasses
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import probes
+import pytest
+
+from cuelearner_jax import actions, asking, choosing
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.guides import registry
+from cuelearner_jax.guides.ensemble import ensemble
+from cuelearner_jax.guides.questions import about_base
+from cuelearner_jax.policies import Uniform
+from cuelearner_jax.types import GuidanceModel, Label
+
+ENV = probes.Aimed()
+OBS = actions.evenly_spaced(5)
+BASE = actions.rotate(OBS, 0.3)
+ONE = dataclasses.replace(probes.SIZES, feedback_layers=(8,), fit_steps=20)
+FOUR = dataclasses.replace(ONE, ensemble=4)
+CHOOSING = dataclasses.replace(FOUR, candidates=6)
+
+
+def linear(env, params, obs, actions):
+    """Two outputs: the observation's first entry times a member's number, and the action's."""
+    return jnp.stack([params * obs[:, 0], params * actions[:, 0]], -1)
+
+
+def test_an_ensemble_predicts_its_members_mean_and_tells_their_variance():
+    made = ensemble(3, jax.random.normal, linear)
+    params = jnp.array([1.0, 2.0, 6.0])
+    np.testing.assert_allclose(made.predict(None, params, OBS, BASE), linear(None, 3.0, OBS, BASE), rtol=1e-6)
+    apart = made.disagreement(GuidanceModel(params, jnp.array(True)), None, OBS, BASE)
+    np.testing.assert_allclose(apart, 14 / 3 * (OBS[:, 0] ** 2 + BASE[:, 0] ** 2), rtol=1e-5)
+    assert len(set(np.asarray(made.init(jax.random.key(0))).tolist())) == 3
+
+
+def test_one_member_is_the_network_itself():
+    made = ensemble(1, jax.random.normal, linear)
+    assert (made.init, made.predict, made.disagreement) == (jax.random.normal, linear, None)
+
+
+@pytest.mark.parametrize("kind", ["relative", "demonstration", "scalar", "dcoach", "intent"])
+def test_members_that_are_the_same_do_what_one_does_and_do_not_disagree(kind):
+    single, several = (registry.make(kind, sizes, ENV) for sizes in (ONE, FOUR))
+    alone = single.init(jax.random.key(0)).replace(fitted=jnp.array(True))
+    same = alone.replace(params=jax.tree.map(lambda leaf: jnp.stack([leaf] * 4), alone.params))
+    everywhere = jnp.ones(5, bool)
+    one, mean = (b.act(m, ENV, OBS, BASE, everywhere, probes.SCALARS) for b, m in ((single, alone), (several, same)))
+    np.testing.assert_allclose(one.actions, mean.actions, atol=1e-5)
+    np.testing.assert_allclose(several.disagreement(same, ENV, OBS, BASE), 0, atol=1e-10)
+    add = jax.vmap(lambda number, params: jax.tree.map(lambda leaf: leaf + 0.1 * number, params))
+    differing = same.replace(params=add(jnp.arange(4.0), same.params))
+    assert several.disagreement(differing, ENV, OBS, BASE).min() > 1e-6
+    assert single.disagreement is None
+
+
+# Which question.
+
+
+def begun(guidance, sizes, budget=20):
+    slots = asking.label_slots(budget, sizes)
+    return asking.start(guidance, ENV, slots, budget, jax.random.key(1), jax.random.key(2), sizes)
+
+
+def test_the_candidate_is_asked_about_on_which_members_disagree_most_and_all_walk_on():
+    several = registry.make("relative", CHOOSING, ENV)
+    told = several._replace(
+        question=about_base, disagreement=lambda model, env, obs, actions: 2 * obs[:, 0] + actions[:, 1]
+    )
+    guide = begun(told, CHOOSING)
+    assert guide.obs.shape == (6, 2)
+    assert len(np.unique(np.asarray(guide.obs), axis=0)) > 1
+    fitted = guide.replace(model=guide.model.replace(fitted=jnp.array(True)))
+    key, expert = jax.random.key(7), probes.Expert(ENV)
+    keys = asking.question_keys(key, 0)
+    proposed = Uniform().act(keys.base, fitted.env, fitted.obs)
+    best = int(np.argmax(2 * fitted.obs[:, 0] + proposed[:, 1]))
+    assert best != 0
+    for asked, index in ((guide, 0), (fitted, best)):  # members that were never fitted have no say
+        after = asking.ask(told, ENV, expert, probes.SCALARS, Uniform(), asked, key, jnp.asarray(0))
+        np.testing.assert_array_equal(after.labels.obs[0], asked.obs[index])
+        np.testing.assert_array_equal(after.labels.action[0], proposed[index])
+        error = actions.difference(proposed[index], ENV.best(asked.obs[index]))
+        h = 0.0 if abs(float(error)) <= np.deg2rad(10) else float(np.sign(error))
+        assert after.labels.answer[0].tolist() == [h]
+        assert after.labels.valid.sum() == 1
+        states, steps = jax.vmap(ENV.step)(jax.random.split(keys.env, 6), asked.env, proposed)
+        chex.assert_trees_all_equal((after.env, after.obs), (states, steps.obs))
+
+
+def test_rounds_of_chosen_questions_fill_the_budget_and_fit_each_member_from_numbers_of_its_own():
+    several = registry.make("relative", CHOOSING, ENV)
+    guide, expert, key = begun(several, CHOOSING, budget=15), probes.Expert(ENV), jax.random.key(3)
+    one = jax.jit(
+        lambda guide: asking.label_round(several, CHOOSING, ENV, expert, probes.SCALARS, Uniform(), guide, key)
+    )
+    for _ in range(2):
+        guide = one(guide)
+    assert np.asarray(guide.labels.valid).tolist() == [True] * 15 + [False] * 5
+    assert int(guide.asked) == 15
+    assert bool(guide.model.fitted)
+    chex.assert_tree_shape_prefix(guide.model.params, (4,))
+    for kernel in (leaf for leaf in jax.tree.leaves(guide.model.params) if leaf.ndim == 3):
+        assert all(not np.array_equal(kernel[i], kernel[j]) for i in range(4) for j in range(i))
+
+
+def test_members_of_deep_coach_are_corrected_each_as_one_alone_is_from_its_own_numbers():
+    single, several = (registry.make("dcoach", sizes, ENV) for sizes in (ONE, dataclasses.replace(ONE, ensemble=2)))
+    obs, asked = OBS[:4], BASE[:4]
+    labels = Label(obs, asked, actions.sense(asked, jax.vmap(ENV.best)(obs))[:, None], jnp.arange(4) < 3)
+    fit = lambda bundle, key, former: jax.jit(bundle.fit)(key, ENV, labels, former, probes.SCALARS)  # noqa: E731
+    former, key = several.init(jax.random.key(5)), jax.random.key(6)
+    assert several.disagreement(former, ENV, OBS, BASE).min() > 1e-6
+    both = fit(several, key, former)
+    assert both.params.learned.tolist() == [3, 3]
+    assert both.fitted.shape == ()
+    for number, own in enumerate(jax.random.split(key, 2)):
+        one = jax.tree.map(lambda leaf, number=number: leaf[number], (former.params, both.params))
+        alone = fit(single, own, former.replace(params=one[0]))
+        chex.assert_trees_all_close(alone.params, one[1], rtol=1e-4, atol=1e-6)
+
+
+def test_kinds_of_one_model_are_refused_where_members_are_wanted(monkeypatch):
+    monkeypatch.setattr(registry, "_KINDS", dict(registry._KINDS))
+    kind = registry.find("relative")
+
+    def make(sizes, spaces):
+        return kind.make(ONE, spaces)._replace(name="single")
+
+    registry.register(dataclasses.replace(kind, name="single", make=make))
+    with pytest.raises(UserError, match="'single' has one model, no ensemble of them: leave out") as refusal:
+        registry.make("single", CHOOSING, ENV)
+    assert "\n" not in str(refusal.value)
+    assert registry.make("none", CHOOSING, ENV).name == "none"  # which asks nothing
+
+
+def test_every_candidate_is_asked_about_at_once_within_the_budget():
+    sizes = dataclasses.replace(ONE, candidates=6, ask_all=True, labels_per_round=12)
+    single = registry.make("relative", sizes, ENV)._replace(question=about_base)
+    assert single.disagreement is None
+    slots, key, expert = asking.label_slots(21, sizes), jax.random.key(7), probes.Expert(ENV)
+    assert slots == 24
+    guide = asking.start(single, ENV, slots, 21, jax.random.key(1), jax.random.key(2), sizes)
+    keys = asking.question_keys(key, 12)
+    proposed = Uniform().act(keys.base, guide.env, guide.obs)
+    after = asking.ask_all(single, ENV, expert, probes.SCALARS, Uniform(), guide, key, jnp.asarray(12))
+    np.testing.assert_array_equal(after.labels.obs[12:18], guide.obs)
+    np.testing.assert_array_equal(after.labels.action[12:18], proposed)
+    errors = jax.vmap(actions.difference)(proposed, jax.vmap(ENV.best)(guide.obs))
+    h = np.where(np.abs(errors) <= np.deg2rad(10), 0.0, np.sign(errors))
+    assert set(h) >= {-1.0, 1.0}
+    np.testing.assert_array_equal(after.labels.answer[12:18, 0], h)
+    assert np.flatnonzero(after.labels.valid).tolist() == list(range(12, 18))
+    states, steps = jax.vmap(ENV.step)(jax.random.split(keys.env, 6), guide.env, proposed)
+    chex.assert_trees_all_equal((after.env, after.obs), (states, steps.obs))
+    one = jax.jit(lambda guide: asking.label_round(single, sizes, ENV, expert, probes.SCALARS, Uniform(), guide, key))
+    guide = one(one(guide))
+    assert np.asarray(guide.labels.valid).tolist() == [True] * 21 + [False] * 3
+    assert (int(guide.asked), bool(guide.model.fitted)) == (21, True)
+    assert len(np.unique(np.asarray(guide.labels.action)[:21], axis=0)) == 21
+
+
+# Where the policy and the teacher part.
+
+WATCHED = dataclasses.replace(ONE, candidates=4, chosen_by="teacher")
+
+
+@pytest.mark.parametrize(
+    ("off", "bias", "index"),
+    [
+        ([10.0, -50.0, 30.0, 49.0], 0.0, 1),
+        ([10.0, -50.0, 170.0, -179.0], 0.0, 3),
+        ([10.0, -50.0, 30.0, 49.0], 20.0, 1),  # 70 from what it takes for best, and 29
+        ([10.0, -50.0, 30.0, 49.0], -20.0, 3),  # 69, and 30
+        ([0.0, 0.0, 0.0, 0.0], 0.0, 0),
+    ],
+)
+def test_a_coach_speaks_where_the_action_is_farthest_from_its_own(off, bias, index):
+    bundle, expert = registry.make("relative", WATCHED, ENV), probes.Expert(ENV)
+    guide = begun(bundle, WATCHED)
+    obs = actions.evenly_spaced(4)
+    guide = guide.replace(env=obs, obs=obs)
+    asked = actions.rotate(jax.vmap(ENV.best)(obs), jnp.deg2rad(jnp.array(off)))
+    scalars = dataclasses.replace(probes.SCALARS, teacher_bias_deg=bias)
+    away = choosing.parting(ENV, expert, scalars, guide, asked)
+    apart = np.abs(np.array(off) - bias)
+    np.testing.assert_allclose(np.degrees(away), np.minimum(apart, 360 - apart), atol=1e-3)
+    first = actions.rotate(asked, 0.1)
+    for fitted in (False, True):  # it needs no model
+        known = guide.replace(model=guide.model.replace(fitted=jnp.array(fitted)))
+        there, action, proposed = choosing.chosen(bundle, ENV, known, asked, first, away)
+        np.testing.assert_array_equal(there.obs, obs[index])
+        np.testing.assert_array_equal(action, asked[index])
+        np.testing.assert_array_equal(proposed, first[index])
+
+
+def test_of_actions_as_far_from_its_own_the_first_is_asked_about():
+    bundle = registry.make("relative", WATCHED, ENV)
+    guide, asked = begun(bundle, WATCHED), actions.evenly_spaced(4)
+    there, _, _ = choosing.chosen(bundle, ENV, guide, asked, asked, jnp.array([0.1, 0.7, 0.7, 0.2]))
+    np.testing.assert_array_equal(there.obs, guide.obs[1])
+
+
+@pytest.mark.parametrize(("members", "fitted"), [(1, False), (1, True), (3, True)])
+def test_questions_that_a_coach_chooses_are_asked_from_the_first_on_and_all_candidates_walk_on(members, fitted):
+    sizes = dataclasses.replace(WATCHED, ensemble=members)
+    bundle, expert = registry.make("relative", sizes, ENV)._replace(question=about_base), probes.Expert(ENV)
+    guide, key = begun(bundle, sizes), jax.random.key(7)
+    guide = guide.replace(model=guide.model.replace(fitted=jnp.array(fitted)))
+    keys = asking.question_keys(key, 0)
+    proposed = Uniform().act(keys.base, guide.env, guide.obs)
+    off = np.abs(actions.difference(proposed, jax.vmap(ENV.best)(guide.obs)))
+    index = int(np.argmax(off))
+    assert index != 0
+    after = asking.ask(bundle, ENV, expert, probes.SCALARS, Uniform(), guide, key, jnp.asarray(0), sizes=sizes)
+    np.testing.assert_array_equal(after.labels.obs[0], guide.obs[index])
+    np.testing.assert_array_equal(after.labels.action[0], proposed[index])
+    assert abs(float(after.labels.answer[0, 0])) == 1.0
+    states, steps = jax.vmap(ENV.step)(jax.random.split(keys.env, 4), guide.env, proposed)
+    chex.assert_trees_all_equal((after.env, after.obs), (states, steps.obs))
+
+
+def test_rounds_of_a_coachs_questions_fill_the_budget_and_the_unguided_have_candidates_too():
+    bundle, expert, key = registry.make("relative", WATCHED, ENV), probes.Expert(ENV), jax.random.key(3)
+    guide = begun(bundle, WATCHED, budget=15)
+    one = jax.jit(lambda guide: asking.label_round(bundle, WATCHED, ENV, expert, probes.SCALARS, Uniform(), guide, key))
+    for _ in range(2):
+        guide = one(guide)
+    assert np.asarray(guide.labels.valid).tolist() == [True] * 15 + [False] * 5
+    off = np.abs(actions.difference(guide.labels.action, jax.vmap(ENV.best)(guide.labels.obs)))
+    assert off[:10].mean() > np.pi * 0.65  # of four uniform actions the farthest: 4/5 of pi on average
+    assert begun(registry.make("none", CHOOSING, ENV), CHOOSING).obs.shape == (6, 2)
+    with pytest.raises(ValueError, match="has no members whose disagreement"):
+        begun(bundle, dataclasses.replace(WATCHED, chosen_by="members"))

@@ -1,0 +1,172 @@
+"""Demonstrations, scalar feedback and deep COACH on the bandit whose best direction is known."""
+
+import dataclasses
+from functools import cache, partial
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import probes
+import pytest
+
+from cuelearner_jax import actions, asking
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.guides import registry
+from cuelearner_jax.policies import Uniform
+from cuelearner_jax.types import Label
+
+ENV = probes.Window()
+SIZES = dataclasses.replace(probes.SIZES, guide_directions=36)
+SCALARS = dataclasses.replace(probes.SCALARS, scalar_within_deg=20.0)
+OBS = actions.evenly_spaced(4)
+BEST = jax.vmap(ENV.best)(OBS)
+KEY = jax.random.key(3)
+
+
+@cache
+def compiled(kind, frame="raw"):
+    """A kind's bundle, its `fit` and its `act`."""
+    bundle = registry.make(kind, dataclasses.replace(SIZES, frame=frame), ENV)
+    return bundle, jax.jit(bundle.fit), jax.jit(bundle.act)
+
+
+def taught(kind, rounds, scalars=SCALARS, frame="raw"):
+    """A guide after rounds of ten questions about its own choices, uniform actions before there is a model."""
+    bundle = compiled(kind, frame)[0]
+    label_round = jax.jit(partial(asking.label_round, bundle, SIZES))
+    guide = asking.start(bundle, ENV, 10 * rounds, 10 * rounds, jax.random.key(1), jax.random.key(2))
+    for _ in range(rounds):
+        guide = label_round(ENV, probes.Expert(ENV), scalars, Uniform(), guide, KEY)
+    return guide
+
+
+def errors(kind, model, base=BEST, scalars=SCALARS, frame="raw"):
+    """Degrees from the best direction in each context, under guidance of base actions."""
+    acted = compiled(kind, frame)[2](model, ENV, OBS, base, jnp.ones(4, bool), scalars).actions
+    return np.degrees(actions.distance(BEST, acted))
+
+
+def labels(answers, obs, asked):
+    """Label sets all of whose rows count."""
+    return Label(obs, asked, answers, jnp.ones(len(obs), bool))
+
+
+def drawn(count):
+    """Contexts and uniform actions."""
+    k_context, k_action = jax.random.split(jax.random.key(7))
+    return OBS[jax.random.randint(k_context, (count,), 0, 4)], actions.uniform(k_action, (count,))
+
+
+@pytest.mark.parametrize(("frame", "rounds", "within"), [("raw", 3, 2), ("action", 6, 10)])
+def test_demonstrations_are_cloned_and_replace_whatever_the_agent_would_do(frame, rounds, within):
+    guide = taught("demonstration", rounds, frame=frame)
+    for base in (BEST, -BEST, actions.rotate(BEST, 1.0)):
+        assert errors("demonstration", guide.model, base, frame=frame).max() < within
+    asked = np.degrees(actions.distance(jax.vmap(ENV.best)(guide.labels.obs), guide.labels.action))
+    assert asked[:10].max() > 60  # uniform
+    assert np.median(asked[20:]) < 20  # about the policy itself, once there is one
+    np.testing.assert_allclose(guide.labels.answer, jax.vmap(ENV.best)(guide.labels.obs), atol=1e-6)
+
+
+def test_demonstrations_are_fitted_from_scratch_whatever_the_former_model():
+    bundle, fit, _ = compiled("demonstration")
+    given = labels(BEST, OBS, OBS)
+    fits = [fit(KEY, ENV, given, bundle.init(jax.random.key(seed)), SCALARS) for seed in (0, 1)]
+    chex.assert_trees_all_equal(*fits)
+
+
+def test_the_argmax_of_scalar_labels_finds_a_planted_window():
+    bundle, fit, _ = compiled("scalar")
+    obs, asked = drawn(400)
+    good = actions.distance(jax.vmap(ENV.best)(obs), asked) < np.deg2rad(20)
+    assert 0.05 < good.mean() < 0.16  # of uniform actions, one in nine
+    model = fit(KEY, ENV, labels(good[:, None] * 1.0, obs, asked), bundle.init(KEY), SCALARS)
+    assert errors("scalar", model).max() < 20
+    assert errors("scalar", model, base=-BEST).max() < 20
+
+
+def test_a_scalar_guide_that_asks_about_its_own_choices_comes_to_choose_what_is_called_good():
+    answers = taught("scalar", 15).labels.answer[:, 0]
+    assert answers[:30].mean() < 0.3
+    assert answers[-50:].mean() > 0.5
+
+
+def test_a_share_of_the_scalar_questions_explores():
+    bundle, _, _ = compiled("scalar")
+    model = bundle.init(KEY).replace(fitted=jnp.array(True))
+    own = compiled("scalar")[2](model, ENV, OBS[:1], BEST[:1], jnp.ones(1, bool), SCALARS).actions[0]
+    keys = jax.random.split(KEY, 400)
+    ask = jax.jit(jax.vmap(lambda key, how: bundle.question(key, model, ENV, OBS[0], BEST[0], how), (0, None)))
+    for explored, refined in ((0.0, 1.0), (0.25, 1.0), (1.0, 1.0), (0.25, 0.5)):
+        scalars = dataclasses.replace(SCALARS, explored_fraction=explored, refined_fraction=refined)
+        found = ask(keys, scalars)
+        about_own = (np.abs(np.asarray(found) - np.asarray(own)).max(-1) < 1e-5).mean()
+        assert about_own == pytest.approx((1 - explored) * refined, abs=0.08)  # standard deviation 0.025
+
+
+def corrections(count):
+    """Corrections toward the best direction about uniform actions."""
+    obs, asked = drawn(count)
+    return labels(actions.sense(asked, jax.vmap(ENV.best)(obs))[:, None], obs, asked)
+
+
+def first(count, given):
+    """The same with so many rows that count."""
+    return given.replace(valid=jnp.arange(len(given.valid)) < count)
+
+
+def test_deep_coach_goes_on_from_where_it_was_by_what_is_new():
+    bundle, fit, _ = compiled("dcoach")
+    given, fresh = corrections(30), bundle.init(KEY)
+    half = fit(KEY, ENV, first(10, given), fresh, SCALARS)
+    assert int(half.params.learned) == 10
+    chex.assert_trees_all_equal(fit(KEY, ENV, first(10, given), half, SCALARS), half)  # nothing is new
+    at_once = fit(KEY, ENV, given, fresh, SCALARS)
+    chex.assert_trees_all_equal(fit(KEY, ENV, given, half, SCALARS), at_once)
+    other = half.replace(params=half.params.replace(policy=bundle.init(jax.random.key(9)).params.policy))
+    assert not np.allclose(errors("dcoach", fit(KEY, ENV, given, other, SCALARS)), errors("dcoach", at_once), atol=0.1)
+
+
+def test_answers_that_are_missing_are_no_corrections():
+    bundle, fit, _ = compiled("dcoach")
+    given, fresh = corrections(30), bundle.init(KEY)
+    valid = jnp.arange(30) % 3 > 0
+    gaps = fit(KEY, ENV, given.replace(valid=valid), fresh, SCALARS)
+    assert int(gaps.params.learned) == 20
+    order = np.argsort(~np.asarray(valid), kind="stable")
+    moved = jax.tree.map(lambda leaf: leaf[order], given)
+    chex.assert_trees_all_equal(gaps, fit(KEY, ENV, first(20, moved), fresh, SCALARS))
+    assert not bool(fit(KEY, ENV, first(0, given), fresh, SCALARS).fitted)
+
+
+def test_a_correction_moves_the_policy_its_way_by_eps():
+    bundle, fit, act = compiled("dcoach")
+    model = bundle.init(KEY).replace(fitted=jnp.array(True))
+    scalars = dataclasses.replace(SCALARS, feedback_learning_rate=1e-2, correction_replay=1)
+    everywhere = jnp.ones(4, bool)
+    for h in (1.0, -1.0, 0.0):
+        own = act(model, ENV, OBS, OBS, everywhere, scalars).actions
+        obs, asked = jnp.tile(OBS[:1], (40, 1)), jnp.tile(own[:1], (40, 1))
+        told = fit(KEY, ENV, labels(jnp.full((40, 1), h), obs, asked), model, scalars)
+        moved = actions.difference(own, act(told, ENV, OBS, OBS, everywhere, scalars).actions)[0]
+        assert np.degrees(moved) == pytest.approx(20 * h, abs=2)
+
+
+def test_a_coached_policy_comes_nearer_to_what_its_coach_has_in_mind():
+    guide = taught("dcoach", 20)
+    assert int(guide.model.params.learned) == 200
+    assert errors("dcoach", guide.model).max() < 25
+    asked = np.degrees(actions.distance(jax.vmap(ENV.best)(guide.labels.obs), guide.labels.action))
+    assert np.median(asked[:20]) > 60
+    assert np.median(asked[-20:]) < 15
+
+
+@pytest.mark.parametrize("kind", ["demonstration", "scalar", "cuelearner_jax.adaptation.residual:KIND"])
+def test_answers_that_mean_no_turn_have_no_strength_that_could_fall(kind):
+    falling = dataclasses.replace(SIZES, eps_falls=True)
+    with pytest.raises(UserError, match=r"answers, which have no strength .* leave out --sizes\.eps-falls") as refusal:
+        registry.make(registry.resolve(kind).name, falling, ENV)
+    assert "\n" not in str(refusal.value)
+    for other in ("none", "relative", "dcoach"):
+        assert registry.make(other, falling, ENV).name == other

@@ -1,0 +1,207 @@
+"""Refinement: against a float64 NumPy loop, by hand on known residual fields, and its bounds as laws."""
+
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from cuelearner_jax import actions
+from cuelearner_jax.actions import DIRECTIONS
+from cuelearner_jax.guides.refining import refine, untouched
+
+DEG = math.pi / 180
+ROWS = 256
+
+
+def network(seed, scale):
+    """A smooth random field: weights of a tiny MLP of the action."""
+    rng = np.random.default_rng(seed)
+    return rng.normal(size=(2, 12)), rng.normal(size=12), scale * rng.normal(size=(12, 2)) / math.sqrt(12)
+
+
+def residual_of(weights, tanh, array):
+    first, bias, second = map(array, weights)
+    return lambda action: tanh(action @ first + bias.reshape(*[1] * (action.ndim - 1), -1)) @ second
+
+
+@jax.jit
+def refined_by_network(weights, first, active, tau, tau_max, k_max):
+    residual = residual_of(weights, jnp.tanh, jnp.asarray)
+    return refine(residual, first, active, space=DIRECTIONS, tau=tau, tau_max=tau_max, k_max=k_max)
+
+
+def starts(seed, count=ROWS):
+    angles = np.random.default_rng(seed).uniform(-math.pi, math.pi, count)
+    return np.stack([np.cos(angles), np.sin(angles)], -1)
+
+
+def turn(start, end):
+    return np.arctan2(start[..., 0] * end[..., 1] - start[..., 1] * end[..., 0], (start * end).sum(-1))
+
+
+def refined_by_loop(residual, first, tau, tau_max, k_max):
+    """Eqs. 2-5 of the paper, one row at a time. Returns (action, passes, how close a decision about tau was)."""
+    current, passes, closest = first, 0, math.inf
+    while passes < k_max:
+        proposal = current + residual(current)
+        proposal = proposal / np.linalg.norm(proposal)
+        away = turn(first, proposal)
+        if abs(away) > tau_max:
+            angle = math.atan2(first[1], first[0]) + math.copysign(tau_max, away)
+            proposal = np.array([math.cos(angle), math.sin(angle)])
+        step = abs(turn(current, proposal))
+        closest = min(closest, abs(step - tau))
+        current, passes = proposal, passes + 1
+        if step < tau:
+            break
+    return current, passes, closest
+
+
+@pytest.mark.parametrize(
+    ("scale", "tau_deg", "tau_max_deg", "k_max"),
+    [(0.2, 0.5, 180.0, 50), (0.5, 0.5, 180.0, 50), (0.3, 2.0, 30.0, 50), (0.2, 0.1, 90.0, 4), (0.3, 0.5, 180.0, 0)],
+)
+def test_agrees_with_a_float64_loop(scale, tau_deg, tau_max_deg, k_max):
+    weights, first = network(int(100 * scale), scale), starts(1)
+    result = refined_by_network(weights, first, np.ones(ROWS, bool), tau_deg * DEG, tau_max_deg * DEG, k_max)
+    residual = residual_of(weights, np.tanh, np.asarray)
+    loops = [refined_by_loop(residual, row, tau_deg * DEG, tau_max_deg * DEG, k_max) for row in first]
+    expected, passes, closest = (np.array(column) for column in zip(*loops, strict=True))
+    clear = closest > 1e-5  # elsewhere float32 may stop a pass earlier or later
+    assert clear.mean() > 0.95
+    np.testing.assert_array_equal(np.asarray(result.passes)[clear], passes[clear])
+    assert np.abs(turn(expected, np.asarray(result.actions)))[clear].max() < 1e-4
+
+
+def test_the_cases_above_stop_by_tau_and_by_the_number_of_passes():
+    weights, first, all_rows = network(20, 0.2), starts(1), np.ones(ROWS, bool)
+    settled = refined_by_network(weights, first, all_rows, 0.5 * DEG, math.pi, 50)
+    limited = refined_by_network(weights, first, all_rows, 0.1 * DEG, math.pi, 4)
+    assert np.asarray(settled.passes).max() < 50
+    assert np.asarray(settled.passes).min() < np.asarray(settled.passes).max()
+    assert (np.asarray(limited.passes) == 4).mean() > 0.5
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_never_leaves_the_ball(seed):
+    rng = np.random.default_rng(seed)
+    weights, first = network(seed, scale=10 ** rng.uniform(-1, 2)), starts(seed)
+    radius = rng.uniform(0, math.pi) if seed else 0.0
+    result = refined_by_network(weights, first, np.ones(ROWS, bool), 1e-3, radius, 50)
+    assert np.abs(turn(first, np.asarray(result.actions, np.float64))).max() <= radius + 1e-5
+    np.testing.assert_allclose(np.linalg.norm(result.actions, axis=-1), 1, atol=1e-6)
+
+
+@pytest.mark.parametrize("scale", [0.1, 1.0, 30.0, 1e4])
+@pytest.mark.parametrize("radius", [0.0, 1 * DEG, 30 * DEG, 90 * DEG, 179 * DEG])
+def test_no_iterate_leaves_the_ball(scale, radius):
+    weights, first = network(int(scale), scale), starts(2)
+    farthest = 0.0
+    for k_max in range(1, 9):
+        result = refined_by_network(weights, first, np.ones(ROWS, bool), 0.0, radius, k_max)
+        assert result.passes.tolist() == [k_max] * ROWS
+        away = np.abs(turn(first, np.asarray(result.actions, np.float64)))
+        assert away.max() <= radius + 1e-5
+        farthest = max(farthest, away.max())
+    if scale >= 1:
+        assert farthest > 0.99 * radius  # the bound was met
+
+
+def test_rows_that_are_not_active_come_back_bitwise():
+    first = jnp.asarray(starts(3), jnp.float32)
+    active = np.arange(ROWS) % 3 == 0
+    result = refined_by_network(network(3, 0.5), first, active, 0.5 * DEG, math.pi, 50)
+    alone = refined_by_network(network(3, 0.5), first, np.ones(ROWS, bool), 0.5 * DEG, math.pi, 50)
+    np.testing.assert_array_equal(np.asarray(result.actions)[~active], np.asarray(first)[~active])
+    np.testing.assert_array_equal(np.asarray(result.passes)[~active], 0)
+    np.testing.assert_array_equal(np.asarray(result.actions)[active], np.asarray(alone.actions)[active])
+    assert np.asarray(result.passes)[active].min() > 0
+
+
+def told(goal, eps):
+    """What a perfect model of relative feedback answers: a turn by eps toward a goal that is not within eps / 2."""
+
+    def residual(action):
+        error = actions.difference(action, goal)
+        h = jnp.where(jnp.abs(error) <= eps / 2, 0.0, jnp.sign(error))
+        return actions.rotate(action, h * eps) - action
+
+    return residual
+
+
+def refined_degrees(start, goal, eps, tau_max=180.0, k_max=50):
+    first = actions.from_angle(jnp.array(start) * DEG)
+    residual = told(actions.from_angle(jnp.array(goal * DEG)), eps * DEG)
+    active = jnp.ones(len(start), bool)
+    result = refine(residual, first, active, space=DIRECTIONS, tau=0.1 * DEG, tau_max=tau_max * DEG, k_max=k_max)
+    return np.asarray(actions.to_angle(result.actions)) / DEG, result.passes.tolist()
+
+
+def test_a_perfect_model_of_feedback_by_hand():
+    # 47 -> 37 -> 27 -> 17 -> 7 -> -3, then one pass that moves nothing; 3 deg is right already.
+    degrees, passes = refined_degrees([47.0, -26.0, 3.0], goal=0.0, eps=10.0)
+    np.testing.assert_allclose(degrees, [-3.0, 4.0, 3.0], atol=1e-3)
+    assert passes == [6, 4, 1]
+
+
+def test_a_perfect_model_stops_at_the_bound():
+    degrees, passes = refined_degrees([47.0, -26.0], goal=0.0, eps=10.0, tau_max=25.0)
+    np.testing.assert_allclose(degrees, [22.0, -1.0], atol=1e-3)  # 26 deg: 10, 20, then 5 more to the bound
+    assert passes == [4, 4]
+
+
+def test_a_perfect_model_stops_after_k_max_passes():
+    degrees, passes = refined_degrees([47.0], goal=0.0, eps=10.0, k_max=2)
+    np.testing.assert_allclose(degrees, [27.0], atol=1e-3)
+    assert passes == [2]
+
+
+def test_a_perfect_model_turns_the_shorter_way_over_the_wrap():
+    degrees, passes = refined_degrees([160.0], goal=-170.0, eps=10.0)
+    np.testing.assert_allclose(degrees, [-170.0], atol=1e-3)
+    assert passes == [4]
+
+
+def test_a_perfect_model_ends_within_half_eps_from_anywhere():
+    degrees, passes = refined_degrees(list(np.linspace(-179, 179, 200)), goal=73.0, eps=8.0)
+    error = (degrees - 73.0 + 180) % 360 - 180
+    assert np.abs(error).max() <= 4.0 + 1e-3
+    assert max(passes) <= 180 / 8 + 2
+
+
+def test_under_vmap_each_lane_has_its_own_number_of_passes():
+    goal = actions.from_angle(jnp.zeros(()))
+    first = actions.from_angle(jnp.array([[47.0], [3.0]]) * DEG)
+
+    def one(start):
+        active = jnp.ones(1, bool)
+        residual = told(goal, 10.0 * DEG)
+        return refine(residual, start, active, space=DIRECTIONS, tau=0.1 * DEG, tau_max=math.pi, k_max=50)
+
+    assert jax.vmap(one)(first).passes.tolist() == [[6], [1]]
+
+
+def test_one_row_a_batch_jit_and_vmap_agree():
+    weights, first = network(5, 0.3), jnp.asarray(starts(5, 5), jnp.float32)
+    active = jnp.array([True, True, False, True, True])
+
+    def refined(first, active):
+        residual = residual_of(weights, jnp.tanh, lambda x: jnp.asarray(x, jnp.float32))
+        return refine(residual, first, active, space=DIRECTIONS, tau=0.5 * DEG, tau_max=1.0, k_max=20)
+
+    alone = [refined(first[row : row + 1], active[row : row + 1]) for row in range(5)]
+    passes = [int(result.passes[0]) for result in alone]
+    assert len(set(passes)) > 2
+    lanes = jax.vmap(refined)(first[:, None], active[:, None])
+    for together in (refined(first, active), jax.jit(refined)(first, active), jax.tree.map(lambda x: x[:, 0], lanes)):
+        assert together.passes.tolist() == passes
+        np.testing.assert_allclose(together.actions, [result.actions[0] for result in alone], atol=1e-6)
+
+
+def test_untouched_made_no_pass():
+    first = jnp.asarray(starts(0, 3), jnp.float32)
+    result = untouched(first)
+    np.testing.assert_array_equal(result.actions, first)
+    assert result.passes.tolist() == [0, 0, 0]

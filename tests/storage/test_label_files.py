@@ -1,0 +1,319 @@
+"""Label files: they come back as they were, a kill loses nothing that was said, and damaged files are refused."""
+
+import json
+
+import numpy as np
+import probes
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.storage import formats, lines
+from cuelearner_jax.storage import label_files as files
+from cuelearner_jax.storage import table as tables
+from cuelearner_jax.storage.table import META
+
+TASK = {"name": "window", "half_width_deg": 28.0}
+EPS = 20.0
+NAMES = ("obs", "action", "answer")
+
+
+def label_sets(lanes=2, slots=20, obs_size=3, width=1, seed=0):
+    rng = np.random.default_rng(seed)
+    draw = lambda size: rng.normal(size=(lanes, slots, size)).astype(np.float32)  # noqa: E731
+    return probes.label_set(draw(obs_size), draw(2), np.sign(draw(width)), np.ones((lanes, slots), bool))
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "labels.parquet"
+
+
+def written(path, seeds=(4, 9), task=None, answers="relative", eps_deg=EPS, **kinds):
+    labels = label_sets(lanes=len(seeds), **kinds)
+    files.write(path, task or TASK, answers, eps_deg, np.array(seeds), labels)
+    return labels
+
+
+def test_labels_come_back_as_they_were(path):
+    labels = written(path)
+    file = files.read(path)
+    assert file.task == TASK
+    assert (file.answers, file.eps_deg) == ("relative", EPS)
+    assert file.seeds.tolist() == [4] * 20 + [9] * 20
+    for name in NAMES:
+        whole = getattr(labels, name)
+        np.testing.assert_array_equal(getattr(file.labels, name), whole.reshape(40, whole.shape[-1]))
+    assert file.labels.valid.all()
+    assert sorted(entry.name for entry in path.parent.iterdir()) == ["labels.parquet"]
+
+
+def test_answers_have_the_width_of_their_form_and_a_strength_if_it_has_one(path):
+    labels = written(path, answers="demonstration", eps_deg=None, width=2)
+    file = files.read(path)
+    assert (file.answers, file.eps_deg) == ("demonstration", None)
+    np.testing.assert_array_equal(file.labels.answer, labels.answer.reshape(40, 2))
+
+
+def test_only_labels_that_count_are_written(path):
+    labels = label_sets()
+    labels = labels.replace(valid=np.arange(20)[None] < np.array([[3], [0]]))
+    files.write(path, TASK, "relative", EPS, np.array([4, 9]), labels)
+    file = files.read(path)
+    assert file.seeds.tolist() == [4] * 3
+    np.testing.assert_array_equal(file.labels.obs, labels.obs[0, :3])
+
+
+def test_what_the_numbers_mean_is_written_in_the_file(path):
+    written(path)
+    meta = json.loads(pq.read_schema(path).metadata[META])
+    assert meta["format"] == 3
+    assert meta["conventions"]["angles"] == "radians, counterclockwise positive"
+    assert set(meta["conventions"]) >= set(NAMES)
+
+
+def test_lanes_get_their_own_seeds_labels_padded(path):
+    labels = written(path)
+    rows = files.for_lanes(files.read(path), np.array([9, 4, 9]), np.array([20, 5, 12]), 30)
+    assert rows.obs.shape == (3, 30, 3)
+    assert rows.answer.shape == (3, 30, 1)
+    assert rows.valid.sum(1).tolist() == [20, 5, 12]
+    for lane, (source, budget) in enumerate([(1, 20), (0, 5), (1, 12)]):
+        assert rows.valid[lane, :budget].all()
+        np.testing.assert_array_equal(rows.answer[lane, :budget], labels.answer[source, :budget])
+        np.testing.assert_array_equal(rows.answer[lane, budget:], 0)
+
+
+def test_one_set_serves_every_seed(path):
+    labels = written(path, seeds=(7,))
+    rows = files.for_lanes(files.read(path), np.array([0, 1]), np.array([20, 20]), 20)
+    np.testing.assert_array_equal(rows.obs, np.repeat(labels.obs, 2, 0))
+
+
+def test_too_few_labels_and_missing_seeds_are_refused(path):
+    written(path)
+    with pytest.raises(UserError, match="has 20 labels for seed 4, the budget is 21"):
+        files.for_lanes(files.read(path), np.array([4]), np.array([21]), 30)
+    with pytest.raises(UserError, match="labels for the seeds 4, 9, none for seed 5: give --first-seed"):
+        files.for_lanes(files.read(path), np.array([5]), np.array([1]), 30)
+    written(path, seeds=(3, 4, 5, 6))
+    with pytest.raises(UserError, match="labels for the seeds 3 to 6, none for seed 7"):
+        files.for_lanes(files.read(path), np.array([7]), np.array([1]), 30)
+
+
+def test_a_digest_tells_contents_apart(path):
+    written(path)
+    first = files.digest(path)
+    written(path)
+    assert files.digest(path) == first
+    written(path, seed=1)
+    assert files.digest(path) != first
+
+
+# Files that cannot be read.
+
+
+def test_a_missing_file_is_refused(path):
+    with pytest.raises(UserError, match="no label file"):
+        files.read(path)
+    with pytest.raises(UserError, match="no label file"):
+        files.read(path.parent)
+
+
+def test_a_file_without_labels_is_refused(path):
+    labels = label_sets()
+    files.write(path, TASK, "relative", EPS, np.array([4, 9]), labels.replace(valid=np.zeros((2, 20), bool)))
+    with pytest.raises(UserError, match="holds no labels"):
+        files.read(path)
+
+
+def test_damage_is_noticed_wherever_it_changes_anything(path):
+    labels = written(path)
+    whole = path.read_bytes()
+    columns = whole.index(META)  # the numbers lie before it, what the file says of itself twice after it
+    refusals = 0
+    for at in range(0, len(whole) - 60, 60):
+        path.write_bytes(whole[:at] + bytes(60) + whole[at + 60 :])
+        try:
+            file = files.read(path)
+        except UserError as refusal:
+            assert "damaged" in str(refusal)
+            refusals += 1
+            continue
+        assert at > columns
+        assert (file.task, file.answers, file.eps_deg) == (TASK, "relative", EPS)
+        np.testing.assert_array_equal(file.labels.obs, labels.obs.reshape(40, 3))
+    assert refusals > columns // 60
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5, 0.99])
+def test_a_cut_off_file_is_refused(path, share):
+    written(path)
+    path.write_bytes(path.read_bytes()[: int(share * path.stat().st_size)])
+    with pytest.raises(UserError, match="damaged"):
+        files.read(path)
+
+
+def test_text_and_foreign_tables_are_refused(path):
+    path.write_text("seed,obs\n1,2\n")
+    with pytest.raises(UserError, match="not a label file"):
+        files.read(path)
+    pq.write_table(pa.table({"seed": [1]}), path)
+    with pytest.raises(UserError, match="has no digest of its contents"):
+        files.read(path)
+    tables.write(path, pa.table({"seed": [1]}), files.SCHEMA)
+    with pytest.raises(UserError, match="lacks the columns obs, action"):
+        files.read(path)
+
+
+# One label at a time.
+
+
+def said(folder, numbers, answers="relative", eps_deg=EPS):
+    """Appends some of the labels of `label_sets(1)`, by number."""
+    labels = label_sets(lanes=1)
+    with files.LabelWriter(folder, TASK, answers, eps_deg) as writer:
+        for index in numbers:
+            writer.append(seed=7, **{name: getattr(labels, name)[0, index] for name in NAMES})
+    return labels
+
+
+def assert_holds(file, labels, count):
+    assert (file.task, file.answers, file.eps_deg) == (TASK, "relative", EPS)
+    assert file.seeds.tolist() == [7] * count
+    for name in NAMES:
+        np.testing.assert_array_equal(getattr(file.labels, name), getattr(labels, name)[0, :count])
+
+
+def test_each_label_can_be_read_before_the_writer_closes(tmp_path):
+    labels = label_sets(lanes=1)
+    writer = files.LabelWriter(tmp_path, TASK, "relative", EPS)
+    with pytest.raises(UserError, match="holds no labels"):
+        files.read(tmp_path / files.JSONL)
+    for index in range(3):
+        writer.append(seed=7, **{name: getattr(labels, name)[0, index] for name in NAMES})
+        assert_holds(files.read(tmp_path / files.JSONL), labels, index + 1)
+    writer.close()
+
+
+@pytest.mark.parametrize("torn", [b'{"seed": 7, "ob', b'{"seed": 7, "obs": [1.0', b"\x00\x00\x00"])
+def test_a_killed_session_goes_on_where_it_was(tmp_path, torn):
+    labels = said(tmp_path, range(5))
+    with (tmp_path / files.JSONL).open("ab") as file:
+        file.write(torn)
+    assert_holds(files.read(tmp_path / files.JSONL), labels, 5)
+    said(tmp_path, range(5, 8))
+    assert_holds(files.read(tmp_path / files.JSONL), labels, 8)
+
+
+def test_a_file_cut_in_its_first_line_starts_anew_and_says_so(tmp_path, capsys):
+    (tmp_path / files.JSONL).write_text('{"about": {"form')
+    labels = said(tmp_path, range(2))
+    assert "labels.jsonl lacks its closing line: it was cut" in capsys.readouterr().err
+    assert_holds(files.read(tmp_path / files.JSONL), labels, 2)
+
+
+def test_a_finished_session_is_a_label_file_and_can_be_continued(tmp_path):
+    labels = said(tmp_path, range(20))
+    assert files.finish(tmp_path) == tmp_path / files.PARQUET
+    assert [entry.name for entry in tmp_path.iterdir()] == [files.PARQUET]
+    assert_holds(files.read(tmp_path / files.PARQUET), labels, 20)
+    files.write(tmp_path / "whole.parquet", TASK, "relative", EPS, np.array([7]), labels)
+    assert (tmp_path / "whole.parquet").read_bytes() == (tmp_path / files.PARQUET).read_bytes()
+    said(tmp_path, [3])
+    assert len(files.read(tmp_path / files.JSONL).seeds) == 21
+    assert not (tmp_path / files.PARQUET).exists()
+
+
+@pytest.mark.parametrize(
+    ("other", "named"),
+    [
+        ({"answers": "scalar"}, r"answers \(relative, asked for is scalar\)"),
+        ({"eps_deg": 5.0}, r"eps_deg \(20.0, asked for is 5.0\)"),
+        ({"answers": "scalar", "eps_deg": None}, r"answers \(relative, asked for is scalar\)"),
+    ],
+)
+@pytest.mark.parametrize("done", [False, True])
+def test_labels_of_another_kind_are_not_mixed_in(tmp_path, other, named, done):
+    said(tmp_path, range(3))
+    if done:
+        files.finish(tmp_path)
+    before = probes.files_of(tmp_path)
+    with pytest.raises(UserError, match=f"holds labels of another {named}: give the same, or another folder"):
+        said(tmp_path, [3], **other)
+    assert probes.files_of(tmp_path) == before
+
+
+def test_foreign_files_are_not_continued(tmp_path):
+    lines.Writer(tmp_path / files.JSONL, [{"seed": 1, "obs": [1.0], "action": [1.0], "answer": [1.0]}]).close()
+    before = probes.files_of(tmp_path)
+    with pytest.raises(UserError, match=r"not a label file.*\(it does not say what it holds\)"):
+        said(tmp_path, [3])
+    assert probes.files_of(tmp_path) == before
+
+
+def test_a_label_that_could_not_be_read_is_not_written(tmp_path):
+    labels = said(tmp_path, range(2))
+    row = {name: getattr(labels, name)[0, 2] for name in NAMES}
+    with files.LabelWriter(tmp_path, TASK, "relative", EPS) as writer:
+        for name, wrong, message in (
+            ("obs", np.zeros(4), r"obs has the shape \(4,\), expected \(3,\)"),
+            ("action", np.array(1.0), "action has the shape"),
+            ("answer", np.array([np.nan]), "answer is not finite"),
+        ):
+            with pytest.raises(ValueError, match=message):
+                writer.append(seed=7, **{**row, name: wrong})
+    assert_holds(files.read(tmp_path / files.JSONL), labels, 2)
+
+
+def test_a_damaged_line_of_a_person_s_work_is_named(tmp_path):
+    said(tmp_path, range(4))
+    path = tmp_path / files.JSONL
+    written = path.read_text().splitlines()
+    path.write_text("\n".join([*written[:2], written[2][:-9], *written[3:]]) + "\n")
+    with pytest.raises(UserError, match=r"damaged: .*\(line 3: it has no checksum, so it, or a line before it"):
+        files.read(path)
+
+
+# Strengths of their own.
+
+
+def falling(lanes=1):
+    labels = label_sets(lanes=lanes)
+    return labels.replace(eps_deg=np.geomspace(EPS, 3.3, lanes * 20, dtype=np.float32).reshape(lanes, 20))
+
+
+def test_strengths_come_back_to_the_last_bit_and_lanes_get_them_padded(path):
+    labels = falling(2)
+    labels = labels.replace(valid=np.arange(20) % 4 + np.zeros((2, 1)) < 3)
+    files.write(path, TASK, "relative", EPS, np.array([4, 9]), labels)
+    file = files.read(path)
+    assert file.eps_deg == EPS
+    assert file.labels.eps_deg.dtype == np.float32
+    np.testing.assert_array_equal(file.labels.eps_deg, labels.eps_deg[labels.valid])
+    np.testing.assert_array_equal(file.strengths, labels.eps_deg[labels.valid])
+    rows = files.for_lanes(file, np.array([9]), np.array([7]), 10)
+    np.testing.assert_array_equal(rows.eps_deg[0, :7], labels.eps_deg[1][labels.valid[1]][:7])
+    np.testing.assert_array_equal(rows.eps_deg[0, 7:], 0)
+    files.write_file(path.with_name("again.parquet"), file)
+    np.testing.assert_array_equal(files.read(path.with_name("again.parquet")).labels.eps_deg, file.labels.eps_deg)
+
+
+def test_labels_that_are_all_of_the_files_strength_have_none_of_their_own(path):
+    labels = falling().replace(eps_deg=np.full((1, 20), EPS, np.float32))
+    files.write(path, TASK, "relative", EPS, np.array([4]), labels)
+    file = files.read(path)
+    assert file.labels.eps_deg is None
+    assert file.strengths.tolist() == [EPS] * 20
+    written(path, answers="demonstration", eps_deg=None, width=2)
+    assert files.read(path).strengths is None
+
+
+def test_a_file_of_the_format_before_is_read_and_gone_on_with(tmp_path, monkeypatch):
+    monkeypatch.setitem(formats.FORMATS, "labels", 2)
+    labels = said(tmp_path, range(3))
+    monkeypatch.undo()
+    assert_holds(files.read(tmp_path), labels, 3)
+    said(tmp_path, range(3, 5))
+    assert_holds(files.read(tmp_path), labels, 5)

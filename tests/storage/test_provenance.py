@@ -1,0 +1,45 @@
+"""Provenance: what every recorded number says of its origin."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import cuelearner_jax
+from cuelearner_jax.storage import provenance as origin
+from cuelearner_jax.storage.provenance import provenance
+
+ROOT = Path(cuelearner_jax.__file__).resolve().parents[1]
+
+
+def test_it_names_versions_and_hardware():
+    columns = provenance()
+    assert set(columns) == {"commit", "versions", "hardware", "command"}
+    assert "jax 0." in columns["versions"]
+    assert columns["versions"].startswith(f"python {sys.version.split()[0]}, ")
+    assert columns["hardware"]
+
+
+def test_the_command_can_be_given_again(monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["/some/where/cuelearner", "sweep", "a task", "--seeds", "2"])
+    assert provenance()["command"] == "cuelearner sweep 'a task' --seeds 2"
+
+
+def test_the_commit_is_that_of_the_checkout_or_empty():
+    commit = provenance()["commit"].removesuffix("-dirty")
+    if not (ROOT / ".git").exists():
+        assert commit == ""
+        return
+    head = subprocess.run(["git", "-C", ROOT, "rev-parse", "HEAD"], capture_output=True, text=True, check=True).stdout
+    assert len(commit) == 12
+    assert head.startswith(commit)
+
+
+def test_outside_a_checkout_there_is_no_commit(monkeypatch, tmp_path):
+    monkeypatch.setattr(origin, "__file__", str(tmp_path / "package" / "records" / "provenance.py"))
+    assert provenance()["commit"] == ""
+
+
+def test_a_package_that_is_not_there_is_left_out(monkeypatch):
+    monkeypatch.setattr(origin, "_version", lambda package: "" if package == "optax" else "1.0")
+    assert "optax" not in provenance()["versions"]
+    assert "flax 1.0" in provenance()["versions"]

@@ -1,0 +1,187 @@
+"""The results table: what is appended is there, what is torn is dropped, what is wrong is said in one line."""
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.storage import lines, results
+
+CONSTANTS = {"run": "a", "task": "one_ball", "guidance": "relative", "config_hash": "0f", "hardware": "1 x cpu"}
+SEEDS, LABELS = np.array([3, 4]), np.array([100, 500])
+
+
+def write(folder, steps=(0, 10, 20), **constants):
+    with results.ResultsWriter(folder, **(CONSTANTS | constants)) as writer:
+        for step in steps:
+            reward = np.array([step / 100, step / 50])
+            writer.append(step=step, split="validation", seed=SEEDS, labels=LABELS, reward=reward, wall_s=1.5)
+
+
+def rows(folder):
+    return results.read(folder).drop_columns("folder").to_pylist()
+
+
+def test_a_row_for_each_lane_with_its_types(tmp_path):
+    write(tmp_path)
+    table = results.read(tmp_path)
+    assert table.num_rows == 6
+    assert table["seed"].to_pylist() == [3, 4] * 3
+    assert table["labels"].to_pylist() == [100, 500] * 3
+    assert table["step"].type == pa.int64()
+    assert table["reward"].to_pylist() == [0.0, 0.0, 0.1, 0.2, 0.2, 0.4]
+    assert set(table["hardware"].to_pylist()) == {"1 x cpu"}
+    assert results.metrics(table) == ["reward"]
+
+
+def test_every_append_is_readable_before_the_writer_closes(tmp_path):
+    writer = results.ResultsWriter(tmp_path, **CONSTANTS)
+    writer.append(step=0, split="training", seed=0, labels=0, reward=1.0)
+    assert len(rows(tmp_path)) == 1
+    writer.close()
+
+
+def test_values_that_are_not_finite_are_null_in_strict_json(tmp_path):
+    with results.ResultsWriter(tmp_path, **CONSTANTS) as writer:
+        writer.append(step=0, split="training", seed=[0, 1, 2], labels=0, reward=[float("nan"), float("inf"), 2.0])
+        writer.append(step=1, split="training", seed=[0], labels=0, success=np.array([True]))
+    text = (tmp_path / results.JSONL).read_text()
+    assert "NaN" not in text
+    assert "Infinity" not in text
+    table = results.read(tmp_path)
+    assert table["reward"].to_pylist() == [None, None, 2.0, None]
+    assert table["success"].to_pylist() == [None, None, None, 1.0]
+
+
+def test_append_refuses_rows_that_cannot_be_told_apart(tmp_path):
+    with results.ResultsWriter(tmp_path, **CONSTANTS) as writer:
+        with pytest.raises(ValueError, match="seed"):
+            writer.append(step=0, split="training", labels=0, reward=1.0)
+        with pytest.raises(ValueError, match="one length"):
+            writer.append(step=0, split="training", seed=[1, 2], labels=0, reward=[1.0, 2.0, 3.0])
+
+
+@pytest.mark.parametrize("torn", [b'{"step": 30, "se', b"\x00\x00\x00", b'{"step": 30, "split": "valid\xc3'])
+def test_a_torn_last_line_is_not_read_and_not_continued(tmp_path, torn):
+    write(tmp_path)
+    whole = rows(tmp_path)
+    with (tmp_path / results.JSONL).open("ab") as file:
+        file.write(torn)
+    assert rows(tmp_path) == whole
+    write(tmp_path, steps=[30])
+    assert len(rows(tmp_path)) == len(whole) + 2
+    assert rows(tmp_path)[: len(whole)] == whole
+
+
+def test_a_whole_last_line_without_its_line_end_is_kept(tmp_path):
+    write(tmp_path)
+    path = tmp_path / results.JSONL
+    path.write_bytes(path.read_bytes().rstrip(b"\n"))
+    write(tmp_path, steps=[30])
+    assert len(rows(tmp_path)) == 8
+
+
+def test_a_broken_line_in_the_middle_is_an_error_that_names_it(tmp_path):
+    write(tmp_path)
+    path = tmp_path / results.JSONL
+    lines = path.read_text().splitlines()
+    lines[2] = lines[2][:-5]
+    path.write_text("\n".join(lines) + "\n")
+    with pytest.raises(UserError, match="line 3"):
+        results.read(tmp_path)
+
+
+def test_truncation_and_a_resumed_writer_give_the_uninterrupted_table(tmp_path):
+    write(tmp_path / "whole", steps=[0, 10, 20, 30])
+    write(tmp_path / "resumed", steps=[0, 10, 20])
+    with (tmp_path / "resumed" / results.JSONL).open("a") as file:
+        file.write('{"step": 20, "torn')
+    results.truncate_after(tmp_path / "resumed", 10)
+    assert {row["step"] for row in rows(tmp_path / "resumed")} == {0, 10}
+    write(tmp_path / "resumed", steps=[20, 30])
+    assert (tmp_path / "resumed" / results.JSONL).read_bytes() == (tmp_path / "whole" / results.JSONL).read_bytes()
+
+
+def test_changed_constants_hold_from_the_resumption_on(tmp_path):
+    write(tmp_path, steps=[0, 10])
+    write(tmp_path, steps=[20], hardware="8 x gpu")
+    assert [row["hardware"] for row in rows(tmp_path)] == ["1 x cpu"] * 4 + ["8 x gpu"] * 2
+
+
+def test_truncating_nothing_does_nothing(tmp_path):
+    results.truncate_after(tmp_path, 10)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_parquet_round_trip_keeps_every_value_and_leaves_one_file(tmp_path):
+    write(tmp_path)
+    before = rows(tmp_path)
+    path = results.finish(tmp_path)
+    assert [file.name for file in tmp_path.iterdir()] == [results.PARQUET]
+    assert rows(tmp_path) == before
+    assert pq.read_table(path)["labels"].type == pa.int64()
+    assert results.finish(tmp_path) == path
+
+
+def test_a_finished_run_can_be_continued(tmp_path):
+    write(tmp_path, steps=[0, 10])
+    results.finish(tmp_path)
+    results.truncate_after(tmp_path, 0)
+    write(tmp_path, steps=[10, 20])
+    assert [file.name for file in tmp_path.iterdir()] == [results.JSONL]
+    assert [row["step"] for row in rows(tmp_path)] == [0, 0, 10, 10, 20, 20]
+    assert rows(tmp_path)[0]["hardware"] == "1 x cpu"
+
+
+def test_a_crash_between_parquet_and_removal_does_not_double_rows(tmp_path):
+    write(tmp_path)
+    text = (tmp_path / results.JSONL).read_bytes()
+    results.finish(tmp_path)
+    (tmp_path / results.JSONL).write_bytes(text)
+    assert results.read(tmp_path).num_rows == 6
+
+
+def test_reads_runs_at_any_depth_done_or_not_with_their_own_metrics(tmp_path):
+    write(tmp_path / "x" / "done")
+    results.finish(tmp_path / "x" / "done")
+    write(tmp_path / "going", guidance="none", run="b")
+    with results.ResultsWriter(tmp_path / "going", **CONSTANTS) as writer:
+        writer.append(step=30, split="training", seed=0, labels=0, success=0.5)
+    results.ResultsWriter(tmp_path / "just_begun", **CONSTANTS).close()
+    table = results.read(tmp_path)
+    assert table.num_rows == 13
+    assert len(set(table["folder"].to_pylist())) == 2
+    assert results.metrics(table) == ["reward", "success"]
+    # The same run given twice, once through the folder above it, counts once.
+    assert results.read([tmp_path, tmp_path / "going" / results.JSONL]).num_rows == 13
+
+
+def test_errors_are_one_clear_line(tmp_path):
+    def message(*args, **options):
+        with pytest.raises(UserError) as caught:
+            results.read(*args, **options)
+        assert "\n" not in str(caught.value)
+        return str(caught.value)
+
+    assert "does not exist" in message(tmp_path / "nowhere")
+    assert "no results below" in message(tmp_path)
+    results.ResultsWriter(tmp_path / "empty", **CONSTANTS).close()
+    assert "no rows yet" in message(tmp_path / "empty")
+    with pytest.raises(UserError, match="no rows"):
+        results.finish(tmp_path / "empty")
+
+    write(tmp_path / "a")
+    write(tmp_path / "b", task="easy")
+    assert "easy, one_ball" in message(tmp_path)
+    assert set(results.read(tmp_path, task="easy")["task"].to_pylist()) == {"easy"}
+    assert "'hard'" in message(tmp_path, task="hard")
+
+    (tmp_path / "c").mkdir()
+    (tmp_path / "c" / results.PARQUET).write_bytes(b"PAR1 and then rubbish")
+    assert "is damaged" in message(tmp_path / "c")
+    (tmp_path / "d").mkdir()
+    lines.Writer(tmp_path / "d" / results.JSONL, [{"step": 1, "reward": 2.0}]).close()
+    assert "lacks the columns" in message(tmp_path / "d")
+    lines.Writer(tmp_path / "d" / results.JSONL, [{"step": "three"}]).close()
+    assert "is damaged" in message(tmp_path / "d")
