@@ -19,7 +19,8 @@ from cuelearner_jax.actions import evenly_spaced, rotate
 from cuelearner_jax.agents.networks import applied, residual_network
 from cuelearner_jax.config import GuideScalars, GuideSizes, Scalars
 from cuelearner_jax.environment import Spaces
-from cuelearner_jax.guides.bundle import AnswerForm, Guidance
+from cuelearner_jax.feedback.forms import AnswerForm
+from cuelearner_jax.guides.bundle import Guidance
 from cuelearner_jax.guides.fitting import fit_least_squares, lessons
 from cuelearner_jax.guides.kind import Kind
 from cuelearner_jax.guides.questions import about_refined

@@ -64,8 +64,8 @@ def pytest_runtest_setup(item):
 # their own to wait for.
 SLOW = (
     *("adaptation", "bench", "bridges", "cli", "envs/anymal", "examples", "api", "labelling", "teachers"),
-    *("testing", "experiments/test_bootstrapping.py", "export/test_decisions.py", "records/test_tracking.py"),
-    *("agent/test_choice.py", "agent/test_n_step.py", "records/test_checkpoint.py", "runs/test_runs.py"),
+    *("testing", "experiments/test_bootstrapping.py", "export/test_decisions.py", "storage/test_tracking.py"),
+    *("agents/test_choice.py", "agents/test_n_step.py", "storage/test_checkpoint.py", "runs/test_runs.py"),
     *("runs/test_failures.py", "runs/test_given_labels.py", "runs/test_lanes.py", "runs/test_resume.py"),
     *("envs/billiards/test_environment.py", "envs/billiards/test_mirrors.py", "envs/billiards/test_parity.py"),
     *("envs/billiards/test_teacher.py", "envs/navigation/test_drawing.py", "envs/navigation/test_environment.py"),

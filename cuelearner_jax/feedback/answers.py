@@ -13,7 +13,7 @@ from cuelearner_jax import actions as geometry
 from cuelearner_jax.actions import DIRECTIONS
 from cuelearner_jax.config import GuideScalars, Scalars, TeacherFaults
 from cuelearner_jax.errors import UserError, shown
-from cuelearner_jax.guides.bundle import AnswerForm
+from cuelearner_jax.feedback.forms import AnswerForm
 from cuelearner_jax.types import EnvState, Teacher, ValuesDirections
 
 GuideScalarsT = TypeVar("GuideScalarsT", bound=GuideScalars)

@@ -8,7 +8,7 @@ import numpy as np
 from cuelearner_jax.actions import DIRECTIONS
 from cuelearner_jax.environment import Spaces
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.guides.bundle import AnswerForm
+from cuelearner_jax.feedback.forms import AnswerForm
 from cuelearner_jax.storage.label_files import LabelFile
 from cuelearner_jax.types import Label
 

@@ -9,39 +9,10 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from cuelearner_jax.config import GuideScalars, Scalars
+from cuelearner_jax.config import GuideScalars
+from cuelearner_jax.feedback.forms import AnswerForm
 from cuelearner_jax.guides.refining import Refined
-from cuelearner_jax.types import EnvState, GuidanceModel, Label, Teacher
-
-
-@runtime_checkable
-class AnswerFunction(Protocol):
-    """What a simulated teacher with the faults of `scalars` says about an action in a situation."""
-
-    def __call__(
-        self,
-        key: PRNGKeyArray,
-        env: Any,
-        teacher: Teacher,
-        state: EnvState,
-        obs: Float[Array, " obs"],
-        action: Float[Array, " action"],
-        scalars: Scalars,
-    ) -> tuple[Float[Array, " answer"], Bool[Array, ""]]:
-        """(answer, answered)."""
-        ...
-
-
-class AnswerForm(NamedTuple):
-    """A form of answer. Label files are marked with its name; every guidance of the same form can use them."""
-
-    name: str
-    width: int  # entries of an answer
-    meaning: str  # of an entry, in a few words
-    answer: AnswerFunction
-    values: tuple[float, ...] | None = None  # that an entry may have; None: any finite number
-    is_action: bool = False  # is an answer an action itself?
-    by_eps: bool = False  # does it mean a turn by eps? Label files then say how much that was
+from cuelearner_jax.types import GuidanceModel, Label
 
 
 @runtime_checkable

@@ -13,8 +13,9 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from cuelearner_jax.config import GuideScalars, GuideSizes
 from cuelearner_jax.environment import Spaces
+from cuelearner_jax.feedback.forms import AnswerForm
 from cuelearner_jax.guides import turning
-from cuelearner_jax.guides.bundle import AnswerForm, Guidance, TargetFunction
+from cuelearner_jax.guides.bundle import Guidance, TargetFunction
 from cuelearner_jax.guides.fitting import fit_least_squares, lessons
 from cuelearner_jax.guides.model import residual_model
 from cuelearner_jax.guides.questions import about_refined

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 
 from cuelearner_jax.config import GuideSizes
 from cuelearner_jax.environment import Spaces
-from cuelearner_jax.guides.bundle import AnswerForm, Guidance
+from cuelearner_jax.feedback.forms import AnswerForm
+from cuelearner_jax.guides.bundle import Guidance
 
 NAME = re.compile(r"[a-z][a-z0-9_-]*")  # of kinds, also in files: neither a path nor a reference to code
 

@@ -20,7 +20,8 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 from cuelearner_jax.actions import Actions
 from cuelearner_jax.config import GuideScalars, GuideSizes
 from cuelearner_jax.environment import Spaces
-from cuelearner_jax.guides.bundle import AnswerForm, Guidance, TargetFunction
+from cuelearner_jax.feedback.forms import AnswerForm
+from cuelearner_jax.guides.bundle import Guidance, TargetFunction
 from cuelearner_jax.guides.fitting import fit_least_squares, held_out, lessons
 from cuelearner_jax.guides.model import residual_model
 from cuelearner_jax.guides.questions import about_refined

@@ -15,8 +15,8 @@ from cuelearner_jax.config import Scalars
 from cuelearner_jax.environment import Environment
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.feedback import given
+from cuelearner_jax.feedback.forms import AnswerForm
 from cuelearner_jax.guides import registry as guidances
-from cuelearner_jax.guides.bundle import AnswerForm
 from cuelearner_jax.labelling.living import keys_of, lived
 from cuelearner_jax.labelling.programs import Agreement, agreement, as_teacher
 from cuelearner_jax.storage import label_files

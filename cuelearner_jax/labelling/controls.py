@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cuelearner_jax.guides.bundle import AnswerForm
+from cuelearner_jax.feedback.forms import AnswerForm
 
 
 class Control(NamedTuple):

@@ -10,7 +10,8 @@ import jax
 import numpy as np
 
 from cuelearner_jax.config import RunConfig, to_json
-from cuelearner_jax.guides.bundle import AnswerForm, Guidance
+from cuelearner_jax.feedback.forms import AnswerForm
+from cuelearner_jax.guides.bundle import Guidance
 from cuelearner_jax.policies import Policy
 from cuelearner_jax.task import Task
 

@@ -15,7 +15,8 @@ from jaxtyping import Array, Float
 from cuelearner_jax import asking
 from cuelearner_jax.config import Scalars
 from cuelearner_jax.environment import Environment, actions_of
-from cuelearner_jax.guides.bundle import AnswerForm, Guidance
+from cuelearner_jax.feedback.forms import AnswerForm
+from cuelearner_jax.guides.bundle import Guidance
 from cuelearner_jax.types import EnvState, GuideState, Label, Teacher
 
 

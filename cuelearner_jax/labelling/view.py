@@ -6,7 +6,7 @@ import html
 import json
 import math
 
-from cuelearner_jax.guides.bundle import AnswerForm
+from cuelearner_jax.feedback.forms import AnswerForm
 from cuelearner_jax.labelling.controls import LEFT, RIGHT, angle_of
 from cuelearner_jax.labelling.session import Item
 from cuelearner_jax.types import Reel, Sketch

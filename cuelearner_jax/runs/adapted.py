@@ -16,7 +16,7 @@ from cuelearner_jax.adaptation.adapting import Adapted
 from cuelearner_jax.adaptation.program import Lanes
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import one_lane
-from cuelearner_jax.guides.bundle import AnswerForm
+from cuelearner_jax.feedback.forms import AnswerForm
 from cuelearner_jax.policies import Common, Guided
 from cuelearner_jax.runs.grid import LARGEST_BUDGET, LARGEST_SEED, world_of
 from cuelearner_jax.storage import formats, guides, label_files, policy_folders

@@ -14,7 +14,8 @@ from jaxtyping import Array, Float
 
 from cuelearner_jax.config import GuideScalars, GuideSizes, Scalars
 from cuelearner_jax.environment import Environment, actions_of, offers, spaces_of
-from cuelearner_jax.guides.bundle import AnswerForm, Guidance
+from cuelearner_jax.feedback.forms import AnswerForm
+from cuelearner_jax.guides.bundle import Guidance
 from cuelearner_jax.guides.kind import Kind
 from cuelearner_jax.testing.laws import Laws, Traced, changed
 from cuelearner_jax.types import EnvState, GuidanceModel, Label

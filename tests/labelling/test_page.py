@@ -20,7 +20,7 @@ from nicegui.testing.user_simulation import user_simulation
 
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.feedback.answers import DEMONSTRATION, RELATIVE, SCALAR
-from cuelearner_jax.guides.bundle import AnswerForm
+from cuelearner_jax.feedback.forms import AnswerForm
 from cuelearner_jax.labelling import controls, ending, server, view
 from cuelearner_jax.labelling.ending import Commands
 from cuelearner_jax.labelling.page import Page
