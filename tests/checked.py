@@ -13,7 +13,7 @@ PACKAGES = ["cuelearner_envs", "cuelearner_jax"]  # whose functions and methods 
 # Folders and files of tests in which an operand of a lower rank is filled up by NumPy's rule,
 # which brax and MuJoCo's MJX rely on; elsewhere it is an error.
 DOORS = "cuelearner_jax.api."  # what users call looks at its arguments itself, and says more
-LOOSE_RANKS = ("bridges", "cli/test_anymal.py", "envs/anymal", "examples")
+LOOSE_RANKS = ("bridges", "experiments/test_train_walking.py", "cli/test_anymal.py", "envs/anymal", "examples")
 
 _conf = BeartypeConf(is_pep484_tower=True)  # an int is a float, as pyright has it
 

@@ -34,15 +34,13 @@ from damaged_folders import DAMAGES
 from probes import files_of
 
 import cuelearner_jax as cl
-from cuelearner_jax import config as configuration
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.export import runner
 from cuelearner_jax.policies import Heuristic
 from cuelearner_jax.runs import kept
 from cuelearner_jax.storage import guides, label_files, results
 from cuelearner_jax.teachers import stored
-from cuelearner_jax.teachers.learned import LearnedTeacher, TeacherConfig
-from cuelearner_jax.teachers.program import Trainer
+from cuelearner_jax.teachers.learned import LearnedTeacher, initial_params
 
 ANGLES = np.linspace(0.0, 6.0, 12)
 SEEN = np.stack([np.cos(ANGLES), np.sin(ANGLES)], -1).astype(np.float32)
@@ -96,10 +94,9 @@ def _labels_read(folder: Path) -> Any:
 
 
 def _teacher(folder: Path) -> None:
-    config = TeacherConfig(layers=(8,), directions=8)
-    params = Trainer(config).init(small_policies.ENV, jax.random.key(0)).params
-    made = LearnedTeacher(small_policies.ENV, params, jnp.zeros(()), jnp.zeros(()), config.layers, config.directions)
-    about = {"config": configuration.to_json(config), "task": {"name": "window", "half_width_deg": 28.0}}
+    params = initial_params((8,), small_policies.ENV, jax.random.key(0))
+    made = LearnedTeacher(small_policies.ENV, params, jnp.zeros(()), jnp.zeros(()), (8,), 8)
+    about = {"config": {"layers": [8], "directions": 8}, "task": {"name": "window", "half_width_deg": 28.0}}
     stored.save(folder, made, about)
 
 

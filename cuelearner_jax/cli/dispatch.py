@@ -26,7 +26,7 @@ from cuelearner_jax.terminal import Interrupted, abandon, console
 # Each is a file beside this one with `run(arguments)` and `OPTIONS`, the options of what it does by its full name.
 COMMANDS = (
     *("train", "sweep", "adapt", "evaluate", "report", "render", "label", "labels", "export"),
-    *("teacher", "bench", "locomotion"),
+    "bench",
 )
 
 

@@ -124,7 +124,7 @@ def _seen_in_another_order(values: Values) -> Values:
     """What a teacher's network takes stood ball by ball; now what hangs on the direction stands apart."""
     raise UserError(
         "the teacher was trained by an earlier cuelearner, whose networks saw the table in another order: train it "
-        "anew with `cuelearner teacher train`"
+        "anew with `python experiments/train_teacher.py`"
     )
 
 

@@ -98,7 +98,7 @@ def _anymal(folder: Path | None = None) -> Body:
 
         policy.load(folder)
         digest = hashlib.sha256((folder / policy.WEIGHTS).read_bytes()).hexdigest()[:12]
-    about = "a quadruped with full physics; anymal:FOLDER walks by a policy that `cuelearner locomotion train` made"
+    about = "a quadruped with full physics; anymal:FOLDER walks by a policy that experiments/train_walking.py made"
     environment = partial(_legged, folder=folder)
     return Body("anymal", about, environment, {"mujoco": _judged}, _legged_pictures, _anymal, digest)
 

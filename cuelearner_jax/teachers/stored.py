@@ -8,6 +8,7 @@ from __future__ import annotations
 import hashlib
 import shutil
 from collections.abc import Collection
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,21 +16,29 @@ import jax
 import jax.numpy as jnp
 
 from cuelearner_jax.agents.learning import all_finite
-from cuelearner_jax.config import from_json, to_json
+from cuelearner_jax.config import LARGEST, MOST_LAYERS, from_json, to_json
 from cuelearner_jax.errors import NotFinite, UserError
 from cuelearner_jax.storage import formats
 from cuelearner_jax.storage.checkpoint import checkpoints
 from cuelearner_jax.storage.room import check_room
-from cuelearner_jax.teachers.learned import LearnedTeacher, TeacherConfig, check_config
-from cuelearner_jax.teachers.program import Trainer
+from cuelearner_jax.teachers.learned import LearnedTeacher, initial_params
 
 ABOUT = "teacher.json"
+TRAIN = "python experiments/train_teacher.py"  # of the repository, in messages
+
+
+@dataclass(frozen=True)
+class Shape:
+    """What a reader has to know of a teacher's network."""
+
+    layers: tuple[int, ...]
+    directions: int
 
 
 def save(folder: Path, teacher: LearnedTeacher, about: dict[str, Any]) -> None:
     """Writes a teacher: its network in half precision, and teacher.json: what it is and how it was made.
 
-    `about` must hold the `config` (a TeacherConfig's fields) under that name.
+    `about` must hold the `layers` and `directions` of the network under `config`.
 
     Raises NotFinite, and writes nothing, for weights that half precision cannot hold.
     """
@@ -51,19 +60,22 @@ def load(folder: Path, env: Any, aim_error: Any, habit: Any) -> LearnedTeacher:
     """A teacher that `save` wrote. Raises UserError if there is none, or one for other observations."""
     about = _about(folder)
     try:
-        config = from_json(TeacherConfig, about["config"])
-        check_config(config)
-    except (ValueError, KeyError, TypeError, UserError) as error:
-        raise formats.damaged("teacher", folder / ABOUT, error if isinstance(error, UserError) else "") from error
-    told = f"{folder / ABOUT} has {config.directions:,} directions"
-    check_room(told, 8 * max(config.layers) * config.directions, "restore the file")  # as of a run's (`grid.load`)
-    template = jax.eval_shape(Trainer(config).init, env, jax.random.key(0)).params
+        shape = from_json(Shape, {name: about["config"][name] for name in ("layers", "directions")})
+    except (ValueError, KeyError, TypeError) as error:
+        raise formats.damaged("teacher", folder / ABOUT) from error
+    if not 1 <= len(shape.layers) <= MOST_LAYERS or not all(
+        1 <= n <= LARGEST for n in (*shape.layers, shape.directions)
+    ):
+        raise formats.damaged("teacher", folder / ABOUT, "layers or directions that no teacher has")
+    told = f"{folder / ABOUT} has {shape.directions:,} directions"
+    check_room(told, 8 * max(shape.layers) * shape.directions, "restore the file")  # as of a run's (`grid.load`)
+    template = jax.eval_shape(lambda key: initial_params(shape.layers, env, key), jax.random.key(0))
     halves = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, jnp.float16), template)
     with checkpoints(folder / "network", read_only=True) as saved:
         params = saved.restore({"params": halves})["params"]
     params = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), params)
     aim = jnp.asarray(aim_error, jnp.float32), jnp.asarray(habit, jnp.float32)
-    return LearnedTeacher(env, params, *aim, config.layers, config.directions)
+    return LearnedTeacher(env, params, *aim, shape.layers, shape.directions)
 
 
 def world_of(folder: Path, task: str, config: Any, apart: Collection[str]) -> Any:
@@ -93,7 +105,7 @@ def world_of(folder: Path, task: str, config: Any, apart: Collection[str]) -> An
             raise UserError(
                 f"the teacher in {folder} learned with {_typed({field: value})} and knows nothing of this world's "
                 f"{_typed({field: now[field]})}: use the search teacher (--task.teacher search), or train one for this "
-                f"world (cuelearner teacher train {task} {_typed(now)} --out FOLDER) and give --task.teacher FOLDER"
+                f"world ({TRAIN} {task} {_typed(now)} --out FOLDER) and give --task.teacher FOLDER"
             )
     return own
 
@@ -112,7 +124,7 @@ def _about(folder: Path) -> dict[str, Any]:
     """What teacher.json says. Raises UserError if there is none or it is damaged."""
     if not (folder / ABOUT).is_file():
         raise UserError(
-            f"no teacher in {folder}: train one with `cuelearner teacher train` and give its folder "
+            f"no teacher in {folder}: train one with `{TRAIN}` and give its folder "
             "(--task.teacher FOLDER), or use the search teacher (--task.teacher search)"
         )
     return formats.read("teacher", folder / ABOUT)

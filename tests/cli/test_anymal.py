@@ -7,7 +7,7 @@ import imageio.v2 as imageio
 import numpy as np
 import pytest
 
-from cuelearner_envs.anymal import model, policy, tracking
+from cuelearner_envs.anymal import model, policy
 from cuelearner_envs.anymal.scene import Studio
 from cuelearner_jax.cli import main
 from cuelearner_jax.errors import UserError
@@ -24,12 +24,6 @@ REFUSED = [
     (["render", "billiards", "--robot", "pooltool"], "billiards has no pictures of pooltool: evaluate it instead"),
     (["evaluate", "navigation", "--robot", "anymal:nowhere"], "no walking policy in nowhere: train one with"),
     (["render", "navigation", "--robot", "simple:nowhere"], "simple takes no folder: leave out 'nowhere'"),
-    (["locomotion", "walk"], "unknown command 'locomotion walk': choose one of train, evaluate"),
-    (["locomotion", "train", "--train.robots", "0"], "train.robots is 0: give a positive number"),
-    (["locomotion", "train", "--train.robots", "100"], "give a multiple of train.robots (100)"),
-    (["locomotion", "evaluate", "nowhere"], "no walking policy in nowhere: train one with"),
-    (["locomotion", "evaluate", "--robots", "0"], "--robots is 0: give a number from 1"),
-    (["locomotion", "evaluate", "--robts", "3"], "perhaps you meant --robots"),
 ]
 
 
@@ -37,26 +31,6 @@ REFUSED = [
 def test_bad_combinations_are_refused(refused, tmp_path, monkeypatch, command, says):
     monkeypatch.chdir(tmp_path)
     refused(command, says, tmp_path)
-
-
-def test_files_in_use_are_left_alone(refused, tmp_path):
-    kept = tmp_path / "kept.json"
-    kept.write_text("mine")
-    refused(["locomotion", "train", "--out", tmp_path], "not empty: give another --out", tmp_path)
-    refused(["locomotion", "evaluate", "--out", kept], "exists: give another --out", tmp_path)
-
-
-def test_a_policy_is_measured_trial_by_trial(tmp_path, monkeypatch, capsys):
-    short = {"clean": tracking.CLEAN}
-    monkeypatch.setattr(tracking, "TRIALS", short)
-    monkeypatch.setattr(tracking, "SECONDS", 4.0)
-    monkeypatch.setattr(tracking, "ENGINES", ("mujoco",))  # MJX compiles for long
-    out = tmp_path / "figures.json"
-    assert main(["locomotion", "evaluate", str(policy.SHIPPED), "--robots", "3", "--out", str(out)]) == 0
-    figures = json.loads(out.read_text())["figures"]
-    assert list(figures) == ["mujoco, clean"]
-    assert figures["mujoco, clean"]["robots"] == 3
-    assert "mujoco, clean" in capsys.readouterr().out
 
 
 @pytest.mark.long

@@ -169,9 +169,8 @@ def test_render_makes_the_picture_of_a_question(run_folder, refused, tmp_path):
 def test_the_overview_has_a_line_for_each_command_and_the_version_can_be_asked_for(capsys):
     assert main(["--help"]) == 0
     told = capsys.readouterr().out
-    locomotion = ("locomotion train", "locomotion evaluate")
     labels = ("label", "labels inspect", "labels merge", "labels export")
-    for name in ("train", "sweep", "evaluate", "report", "render", "teacher train", "bench", *labels, *locomotion):
+    for name in ("train", "sweep", "evaluate", "report", "render", "bench", *labels):
         assert re.search(rf"^  {name} +[A-Z].*\.$", told, re.MULTILINE), name
     assert main(["--version"]) == 0
     assert re.fullmatch(r"cuelearner \d+\.\d+\.\d+\n", capsys.readouterr().out)
@@ -206,9 +205,9 @@ def test_tuning_episodes_are_others_and_stay_out_of_reports(run_folder, tmp_path
     assert main(["report", str(out), "--split", "tuning", "--out", str(tmp_path / "report")]) == 0
 
 
-@pytest.mark.parametrize("command", ["train", "sweep", "evaluate", "report", "render", "teacher", "bench"])
+@pytest.mark.parametrize("command", ["train", "sweep", "evaluate", "report", "render", "bench"])
 def test_every_command_explains_itself(command, capsys):
-    task = {"teacher": ["train", "billiards"], "report": []}.get(command, ["billiards"])
+    task = [] if command == "report" else ["billiards"]
     with pytest.raises(SystemExit) as stopped:
         main([command, *task, "--help"])
     assert not stopped.value.code

@@ -48,7 +48,7 @@ ARGUMENTS = [
     ([*QUICK, "--resume", "--overwrite"], "give one of them"),
     ([*QUICK, "--labels-from", "nowhere.parquet", "--guidance", "relative"], "no label file"),
     (["train", "billiards", "--preset", "quickstart", "--guidance", "all"], "unknown guidance 'all'"),
-    (["train", "billiards", "--preset", "quickstart", "--task.teacher", "learned"], "cuelearner teacher train"),
+    (["train", "billiards", "--preset", "quickstart", "--task.teacher", "learned"], "experiments/train_teacher.py"),
     (["evaluate", "nowhere"], "neither a run folder nor a task"),
     (["evaluate", "billiards", "--policy", "agent"], "needs a trained run"),
     (["evaluate", "billiards", "--policy", "agnt"], "did you mean 'agent'"),
@@ -70,17 +70,12 @@ ARGUMENTS = [
     (["evaluate", "billiards", "--envs", "1000000000"], "--envs is 1000000000: give a number from 1 to 100,000"),
     (["evaluate", "billiards", "--steps", "100000000000"], "at most 1,000,000 for each of the environments"),
     (["evaluate", "billiards", "--task.table", "one_ball", "--policy", "teacher"], "--task.teacher search"),
-    (["teacher", "trian"], "cuelearner teacher train"),
-    (["teacher", "train", "billiards", "--teacher.tries", "2"], "at least 4"),
-    (["teacher", "train", "billiards", "--teacher.learning-rate", "nan"], "teacher.learning_rate is nan"),
-    (["teacher", "train", "billiards", "--teacher.tables", "1000000000"], "GB are free: lower --teacher.tables"),
-    (["teacher", "train", "billiards", "--eval-steps", "0"], "--eval-steps is 0"),
 ]
 
 
 @pytest.mark.parametrize(("command", "says"), ARGUMENTS, ids=[" ".join(c)[-40:] for c, _ in ARGUMENTS])
 def test_bad_arguments_are_refused(refused, tmp_path, command, says):
-    takes_out = command[0] in ("sweep", "train", "teacher", "render") and len(command) > 2 and command[-1] != "--preset"
+    takes_out = command[0] in ("sweep", "train", "render") and len(command) > 2 and command[-1] != "--preset"
     refused([*command, *(["--out", tmp_path / "new"] if takes_out else [])], says, tmp_path)
     assert not (tmp_path / "new").exists()
 
@@ -89,9 +84,6 @@ WITH_OUT = [
     QUICK,
     [*QUICK, "--cluster", "local", "--shards", "2"],
     ["train", "billiards"],
-    ["teacher", "train", "billiards"],
-    ["locomotion", "train"],
-    ["locomotion", "evaluate"],
     ["evaluate", "billiards"],
     ["render", "billiards"],
     ["report", "docs/data/navigation"],
@@ -118,11 +110,9 @@ def test_an_out_that_cannot_be_is_refused_before_any_work(refused, tmp_path, com
     ("command", "advice"),
     [
         ("sweep billiards", "go on with the same command and --resume"),
-        ("teacher train", "go on with the same command and --resume"),
         ("adapt runs/a", "give the same command again"),
         ("export runs/a", "give the same command again"),
         ("labels export a.parquet", "give the same command again"),
-        ("locomotion train", "give the same command again"),
     ],
 )
 def test_a_full_disk_advises_what_the_command_can_do(command, advice, capsys, monkeypatch):
@@ -140,7 +130,6 @@ def test_a_folder_in_use_is_left_alone(refused, run_folder, tmp_path):
     (tmp_path / "thesis.txt").write_text("mine")
     refused([*SWEEP, "--out", tmp_path, "--overwrite"], "will not delete it", tmp_path)
     refused([*SWEEP, "--out", tmp_path, "--resume"], "nothing to resume", tmp_path)
-    refused(["teacher", "train", "billiards", "--out", tmp_path], "not empty", tmp_path)
 
 
 def test_resume_with_other_options_names_them(refused, run_folder):

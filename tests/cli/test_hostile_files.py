@@ -29,8 +29,7 @@ from cuelearner_jax.storage import label_files, results
 from cuelearner_jax.storage import table as tables
 from cuelearner_jax.tasks import registry as tasks
 from cuelearner_jax.teachers import stored
-from cuelearner_jax.teachers.learned import LearnedTeacher, TeacherConfig
-from cuelearner_jax.teachers.program import Trainer
+from cuelearner_jax.teachers.learned import LearnedTeacher, initial_params
 
 HOSTILE = "hostile:KIND"
 CODE = """
@@ -187,10 +186,9 @@ def test_no_string_of_a_policy_folder_is_imported(tmp_path):
 
 
 def test_no_string_of_a_teacher_is_imported(tmp_path):
-    config = TeacherConfig(layers=(8,), directions=8)
-    params = Trainer(config).init(small_policies.ENV, jax.random.key(0)).params
-    made = LearnedTeacher(small_policies.ENV, params, jnp.zeros(()), jnp.zeros(()), config.layers, config.directions)
-    about = {"config": configuration.to_json(config), "task": {"name": "window", "half_width_deg": 28.0}, "by": "me"}
+    params = initial_params((8,), small_policies.ENV, jax.random.key(0))
+    made = LearnedTeacher(small_policies.ENV, params, jnp.zeros(()), jnp.zeros(()), (8,), 8)
+    about = {"config": {"layers": [8], "directions": 8}, "task": {"name": "window", "half_width_deg": 28.0}, "by": "me"}
     stored.save(tmp_path / "teacher", made, about)
 
     def read(folder):

@@ -4,6 +4,7 @@ import json
 import shutil
 
 import pytest
+import train_teacher
 from probes import edit_json
 from small_runs import SMALL
 
@@ -18,13 +19,13 @@ RUN = ["train", "billiards", "--preset", "quickstart", *SMALL, "--guidance", "re
 def trained(tmp_path_factory):
     """Where a tiny teacher of one ball lies."""
     folder = tmp_path_factory.mktemp("own") / "teacher"
-    assert main(["teacher", "train", "billiards", "--preset", "quickstart", *TINY, "--out", str(folder)]) == 0
+    assert train_teacher.main(["billiards", "--preset", "quickstart", *TINY, "--out", str(folder)]) == 0
     return folder
 
 
 def test_a_tiny_teacher_is_trained(trained):
     told = json.loads((trained / "teacher.json").read_text())
-    assert told["command"].startswith("cuelearner teacher train billiards")
+    assert told["command"].startswith("python experiments/train_teacher.py billiards")
     assert {path.name for path in trained.iterdir()} == {".lock", "network", "teacher.json"}
 
 

@@ -105,7 +105,8 @@ def load(folder: Path = SHIPPED) -> WalkingPolicy:
     """A policy that `save` wrote, the shipped one by default. Raises UserError if there is none, or it is damaged."""
     file = folder / WEIGHTS
     if not file.is_file():
-        raise UserError(f"no walking policy in {folder}: train one with `cuelearner locomotion train --out {folder}`")
+        command = f"python experiments/train_walking.py train --out {folder}"
+        raise UserError(f"no walking policy in {folder}: train one with `{command}`")
     try:
         with np.load(file) as stored:
             arrays = {name: np.asarray(stored[name], np.float32) for name in stored.files}

@@ -31,7 +31,7 @@ class BilliardsConfig:
     """Changed world: constant acceleration of the balls on a tilted table, x and y [m/s^2] (paper: 0 0.005)."""
     teacher: str = "search"
     """Who labels: search (every direction is tried), learned (shipped for easy and regulation), local_search (shots
-    near what the learned one proposes are tried), or the folder of a teacher that `cuelearner teacher train` made."""
+    near what the learned one proposes are tried), or a folder that `experiments/train_teacher.py` made."""
     aim_error_deg: float = 0.5
     """The teacher values directions for a player whose aim has this standard deviation [deg]."""
     habit: float = 0.2

@@ -96,7 +96,9 @@ def test_arrays_that_do_not_fit_are_refused(tmp_path, name, values, told):
 
 
 def test_what_is_no_policy_is_refused(tmp_path):
-    with pytest.raises(UserError, match=r"no walking policy in .*: train one with `cuelearner locomotion train"):
+    with pytest.raises(
+        UserError, match=r"no walking policy in .*: train one with `python experiments/train_walking.py train"
+    ):
         policy.load(tmp_path)
     (tmp_path / policy.WEIGHTS).write_bytes(b"nothing")
     with pytest.raises(UserError, match="is damaged"):

@@ -237,7 +237,7 @@ def test_a_learned_teacher_refuses_other_physics_than_it_knows(changes, told):
         make_teacher(config, make_environment(config))
     assert "--task.teacher search" in str(refused.value)
     x, y = config.acceleration
-    assert f"teacher train billiards --task.table easy --task.acceleration {x} {y} --out" in str(refused.value)
+    assert f"train_teacher.py billiards --task.table easy --task.acceleration {x} {y} --out" in str(refused.value)
 
 
 @pytest.mark.long
@@ -264,7 +264,7 @@ def test_the_shipped_teachers_tell_how_they_were_made(table, preset, least):
 
 def test_a_table_without_a_shipped_teacher_says_what_to_do():
     config = BilliardsConfig("one_ball", teacher="learned")
-    with pytest.raises(UserError, match=r"cuelearner teacher train.*search teacher"):
+    with pytest.raises(UserError, match=r"train_teacher.py.*search teacher"):
         make_teacher(config, make_environment(config))
 
 

@@ -1,25 +1,32 @@
-"""Training a walking policy by brax's PPO on the host: progress, regular saving, the finished policy measured.
+"""Train the quadruped's walking policy by brax's PPO, or measure one in MJX and in C MuJoCo.
 
-The folder of a policy always holds the newest one measured, with its history: a run that is cut leaves it.
+    python experiments/train_walking.py train --out runs/anymal-policy --train.seconds 270   # minutes on an accelerator
+    python experiments/train_walking.py evaluate [FOLDER]                                    # default: the shipped one
+
+The shipped policy was made so (`envs/cuelearner_envs/anymal`). The folder of a policy always holds the newest one
+measured, with its history: a run that is cut leaves it.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import math
+import shlex
+import sys
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
+import tyro
 from jaxtyping import PRNGKeyArray
 
 from cuelearner_jax import config as configuration
 from cuelearner_jax.agents.learning import all_finite
+from cuelearner_jax.bridges.brax import supply_device_put_replicated
 from cuelearner_jax.errors import NotFinite, UserError
 from cuelearner_jax.storage.folders import claimed, in_use
 from cuelearner_jax.storage.provenance import provenance
@@ -29,7 +36,7 @@ COLUMNS = ("steps", "wall_s", "error", "turning_error", "falls")  # of the histo
 VALUE_LAYERS = (256, 256, 256, 256)
 
 
-class LocomotionTask(NamedTuple):
+class Walker(NamedTuple):
     """What training has to know of a robot that learns to walk. Figures are numbers by name."""
 
     environment: Any  # brax.envs.Env: velocity commands are to be tracked
@@ -41,7 +48,7 @@ class LocomotionTask(NamedTuple):
 
 
 @dataclass(frozen=True)
-class LocomotionConfig:
+class Training:
     """How walking is learned (brax's PPO)."""
 
     steps: int = 100_000_000
@@ -76,22 +83,46 @@ class LocomotionConfig:
     """Robots that a measurement watches for 20 s."""
 
 
+@dataclass(frozen=True)
+class Train:
+    """Train the quadruped's walking policy."""
+
+    out: Path = Path("runs/anymal-policy")
+    """Folder for the policy."""
+    train: Training = field(default_factory=Training)
+    seed: int = 0
+    """Seed."""
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Measure a walking policy in MJX and in C MuJoCo."""
+
+    policy: tyro.conf.Positional[Path | None] = None
+    """Folder of a policy (default: the shipped one)."""
+    robots: int = 512
+    """Robots that walk for 20 s in each trial."""
+    seed: int = 1
+    """Decides commands, grounds, noise and pushes."""
+    out: Path | None = None
+    """Also write the figures to this JSON file."""
+
+
 LARGEST_ROBOTS = 1 << 20  # each keeps some kilobytes of physics
 
 
-def check(config: LocomotionConfig) -> None:
+def check(config: Training) -> None:
     """Raises UserError for values that cannot work."""
     configuration.check_whole(config, "train")
     for name in ("robots", "measured_robots"):
         if getattr(config, name) > LARGEST_ROBOTS:
             raise UserError(f"train.{name} is {getattr(config, name)}: give at most {LARGEST_ROBOTS}")
-    for field in dataclasses.fields(config):
-        value = getattr(config, field.name)
-        if field.name not in ("seconds", "entropy", "layers") and value <= 0:
-            raise UserError(f"train.{field.name} is {value}: give a positive number")
+    for name, value in vars(config).items():
+        if name not in ("seconds", "entropy", "layers") and value <= 0:
+            raise UserError(f"train.{name} is {value}: give a positive number")
     if config.seconds < 0 or config.entropy < 0:
         raise UserError("train.seconds and train.entropy can't be negative")
-    if not all(math.isfinite(value) for value in dataclasses.asdict(config).values() if isinstance(value, float)):
+    if not all(math.isfinite(value) for value in vars(config).values() if isinstance(value, float)):
         raise UserError("train: give finite numbers")
     if not config.layers or min(config.layers) < 1:
         raise UserError("train.layers: give at least one layer of positive width")
@@ -112,8 +143,8 @@ class _Enough(Exception):
 
 
 def train(
-    robot: LocomotionTask,
-    config: LocomotionConfig,
+    robot: Walker,
+    config: Training,
     out: Path,
     seed: int,
     command: str,
@@ -140,7 +171,7 @@ def train(
 
 
 def _trained(
-    robot: LocomotionTask, config: LocomotionConfig, out: Path, seed: int, command: str, tell: Callable[[str], None]
+    robot: Walker, config: Training, out: Path, seed: int, command: str, tell: Callable[[str], None]
 ) -> dict[str, Any]:
     """`train` in a folder that is kept for it."""
     about = {"config": configuration.to_json(config), "seed": seed, **provenance(), "command": command}
@@ -193,7 +224,7 @@ def _trained(
 
 
 def evaluate(
-    robot: LocomotionTask,
+    robot: Walker,
     folder: Path | None,
     robots: int,
     seed: int,
@@ -220,12 +251,10 @@ def evaluate(
     return figures
 
 
-def _ppo(robot: LocomotionTask, config: LocomotionConfig, seed: int, look: Callable[[int, Any, Any], None]) -> None:
+def _ppo(robot: Walker, config: Training, seed: int, look: Callable[[int, Any, Any], None]) -> None:
     """brax's PPO with the settings; `look` is called now and then with (steps, _, parameters)."""
-    from brax.training.agents.ppo import networks  # takes seconds to load, which other commands need not wait for
+    from brax.training.agents.ppo import networks  # takes seconds to load
     from brax.training.agents.ppo import train as ppo
-
-    from cuelearner_jax.bridges.brax import supply_device_put_replicated
 
     supply_device_put_replicated()
     ppo.train(
@@ -257,7 +286,7 @@ def _ppo(robot: LocomotionTask, config: LocomotionConfig, seed: int, look: Calla
 
 
 def _examined(
-    robot: LocomotionTask, policy: Any, key: jax.Array, robots: int, tell: Callable[[str], None]
+    robot: Walker, policy: Any, key: jax.Array, robots: int, tell: Callable[[str], None]
 ) -> dict[str, dict[str, float]]:
     """Figures of a policy by trial, each told as soon as it is measured."""
     figures = {}
@@ -266,3 +295,42 @@ def _examined(
         figures[name] = {figure: round(value, 5) for figure, value in found.items()}
         tell(f"{name:20}" + ", ".join(f"{figure} {value:.4g}" for figure, value in figures[name].items()))
     return figures
+
+
+def anymal() -> Walker:
+    """The quadruped."""
+    from cuelearner_envs.anymal import policy, tracking
+    from cuelearner_envs.anymal.locomotion import Locomotion
+
+    return Walker(
+        environment=Locomotion(),
+        policy=policy.from_brax,
+        measure=tracking.measure_training,
+        examine=tracking.examine,
+        save=policy.save,
+        load=policy.load,
+    )
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Read the arguments, then train or evaluate; return the exit status."""
+    arguments = sys.argv[1:] if arguments is None else arguments
+    asked = tyro.cli(Train | Evaluate, args=arguments, prog=Path(__file__).name, description=__doc__)
+    command = shlex.join(["python", f"experiments/{Path(__file__).name}", *arguments])
+    try:
+        if isinstance(asked, Train):
+            check(asked.train)
+            train(anymal(), asked.train, asked.out, asked.seed, command)
+        else:
+            evaluate(anymal(), asked.policy, asked.robots, asked.seed, command, asked.out)
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    except (Interrupted, NotFinite) as error:
+        print(error, file=sys.stderr)
+        return error.status
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -7,7 +7,9 @@ tried in one state.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -19,13 +21,66 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from cuelearner_jax import actions as geometry
 from cuelearner_jax.agents.learning import all_finite
-from cuelearner_jax.agents.networks import q_network
-from cuelearner_jax.agents.view import seen
+from cuelearner_jax.config import LARGEST, MOST_LAYERS
 from cuelearner_jax.environment import random_symmetries
-from cuelearner_jax.teachers.learned import LearnedTeacher, TeacherConfig, expected_reward
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.teachers.learned import LearnedTeacher, expected_reward, initial_params
 from cuelearner_jax.types import Params
 
 SHARPNESS = 0.05  # values that differ by this are told apart when promising directions are drawn
+
+
+@dataclass(frozen=True)
+class TeacherConfig:
+    """How the teacher is trained."""
+
+    layers: tuple[int, ...] = (512, 512, 512, 512)
+    """Hidden layers."""
+    tables: int = 4096
+    """Environments that play in parallel."""
+    tries: int = 8
+    """Directions tried in each state: the best, promising ones near their peaks, uniform ones."""
+    search: int = 360
+    """Directions over which it looks for promising ones (turned at random each time)."""
+    directions: int = 3600
+    """Directions among which the finished teacher takes its best."""
+    memory: int = 64
+    """Rounds of play kept for training."""
+    updates: int = 8
+    """Gradient steps a round."""
+    batch_size: int = 8192
+    """Tries in a gradient step."""
+    learning_rate: float = 1e-3
+    """Adam's peak step size (cosine decay over the run)."""
+    rounds: int = 8000
+    """Rounds of play."""
+    explore_probability: float = 0.05
+    """Share of shots played in a uniform direction."""
+    spread_deg: float = 2.0
+    """Largest standard deviation of the directions tried round a promising one [deg]."""
+
+
+def check_config(config: TeacherConfig) -> None:
+    """Raises UserError for values that cannot work."""
+    for name in ("tables", "search", "directions", "memory", "updates", "batch_size", "rounds"):
+        if not 1 <= getattr(config, name) <= LARGEST:
+            raise UserError(f"--teacher.{name} is {getattr(config, name)}: give a positive number of at most {LARGEST}")
+    if config.rounds * config.updates > LARGEST:
+        raise UserError(
+            f"teacher.rounds times teacher.updates is {config.rounds * config.updates}: give at most {LARGEST}"
+        )
+    if not 4 <= config.tries <= LARGEST:
+        raise UserError(
+            f"teacher.tries is {config.tries}: give at least 4 (the best, a promising one, two uniform ones)"
+        )
+    if not 1 <= len(config.layers) <= MOST_LAYERS or min(config.layers) < 1 or max(config.layers) > LARGEST:
+        raise UserError(f"teacher.layers: give at least one layer of positive width, at most {MOST_LAYERS}")
+    if not 0 < config.learning_rate < math.inf:
+        raise UserError(f"teacher.learning_rate is {config.learning_rate}: give a positive, finite number")
+    if not 0 <= config.explore_probability <= 1:
+        raise UserError(f"teacher.explore_probability is {config.explore_probability}: give a number from 0 to 1")
+    if not 0 <= config.spread_deg <= 180:
+        raise UserError(f"teacher.spread_deg is {config.spread_deg}: give a number from 0 to 180")
 
 
 class TeacherState(struct.PyTreeNode):
@@ -88,7 +143,7 @@ class Trainer(NamedTuple):
         c = self.config
         k_params, k_env, key = jax.random.split(key, 3)
         env_state, obs = jax.vmap(env.reset)(jax.random.split(k_env, c.tables))
-        params = q_network(c.layers).init(k_params, *seen("action", env, obs[0], jnp.array([1.0, 0.0])))
+        params = initial_params(c.layers, env, k_params)
         return TeacherState(
             params=params,
             average=jax.tree.map(jnp.copy, params),

@@ -7,15 +7,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import train_walking
 from brax import envs
 from small_runs import listing
 
-from cuelearner_jax.bridges import walking as locomotion
-from cuelearner_jax.bridges.walking import LocomotionConfig
+from cuelearner_envs.anymal import policy, tracking
 from cuelearner_jax.errors import NotFinite, UserError
 from cuelearner_jax.storage.folders import claimed
 
-SMALL = LocomotionConfig(
+SMALL = train_walking.Training(
     steps=20_000,
     robots=16,
     layers=(16,),
@@ -71,7 +71,7 @@ def walker(after_measure=lambda: None):
         folder.mkdir(parents=True, exist_ok=True)
         (folder / "policy.json").write_text(json.dumps({**policy, **about}))
 
-    return locomotion.LocomotionTask(
+    return train_walking.Walker(
         environment=Point(),
         policy=lambda params: {"error": error(params)},
         measure=measure,
@@ -84,7 +84,7 @@ def walker(after_measure=lambda: None):
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
     out, told = tmp_path_factory.mktemp("walkers") / "point", []
-    about = locomotion.train(walker(), SMALL, out, 0, "the command", told.append)
+    about = train_walking.train(walker(), SMALL, out, 0, "the command", told.append)
     return out, about, told
 
 
@@ -114,13 +114,13 @@ def test_a_folder_in_use_is_left_alone(trained):
     out, _, _ = trained
     before = listing(out)
     with pytest.raises(UserError, match="not empty: give another --out"):
-        locomotion.train(walker(), SMALL, out, 0, "again")
+        train_walking.train(walker(), SMALL, out, 0, "again")
     assert listing(out) == before
 
 
 def test_a_folder_that_another_process_writes_in_is_left_alone(tmp_path):
     with claimed(tmp_path), pytest.raises(UserError, match="is being written by"):
-        locomotion.train(walker(), SMALL, tmp_path, 0, "at the same time")
+        train_walking.train(walker(), SMALL, tmp_path, 0, "at the same time")
 
 
 def test_a_policy_that_is_not_finite_is_not_written(tmp_path, monkeypatch):
@@ -130,9 +130,9 @@ def test_a_policy_that_is_not_finite_is_not_written(tmp_path, monkeypatch):
             normaliser = Normaliser(jnp.zeros(1), jnp.ones(1))
             look(steps, None, [normaliser, {"params": jax.tree.map(lambda leaf, by=weight: leaf * by, layers)}])
 
-    monkeypatch.setattr(locomotion, "_ppo", diverge)
+    monkeypatch.setattr(train_walking, "_ppo", diverge)
     with pytest.raises(NotFinite, match=r"by step 2, and was not written; .* holds the policy of the meas"):
-        locomotion.train(walker(), SMALL, tmp_path / "wild", 0, "the command", lambda line: None)
+        train_walking.train(walker(), SMALL, tmp_path / "wild", 0, "the command", lambda line: None)
     assert len(json.loads((tmp_path / "wild" / "policy.json").read_text())["history"]["rows"]) == 2
 
 
@@ -146,7 +146,7 @@ def test_training_that_dies_leaves_the_newest_policy(tmp_path):
             raise RuntimeError("the machine is taken away")
 
     with pytest.raises(RuntimeError, match="taken away"):
-        locomotion.train(walker(die), SMALL, tmp_path / "cut", 0, "the command", lambda line: None)
+        train_walking.train(walker(die), SMALL, tmp_path / "cut", 0, "the command", lambda line: None)
     kept = json.loads((tmp_path / "cut" / "policy.json").read_text())
     assert not kept["finished"]
     assert len(kept["history"]["rows"]) == 2
@@ -166,7 +166,36 @@ def test_training_that_dies_leaves_the_newest_policy(tmp_path):
     ],
 )
 def test_what_cannot_work_is_refused(tmp_path, changed, says):
-    config = LocomotionConfig(**{**SMALL.__dict__, **changed})
+    config = train_walking.Training(**{**SMALL.__dict__, **changed})
     with pytest.raises(UserError, match=says):
-        locomotion.train(walker(), config, tmp_path / "new", 0, "x")
+        train_walking.train(walker(), config, tmp_path / "new", 0, "x")
     assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["evaluate", "nowhere"], "no walking policy in nowhere: train one with"),
+        (["evaluate", "--robots", "0"], "--robots is 0: give a number from 1"),
+        (["evaluate", "--out", "kept.json"], "exists: give another --out"),
+        (["train", "--out", "."], "not empty: give another --out"),
+    ],
+)
+def test_its_command_refuses_in_one_line(tmp_path, monkeypatch, capsys, arguments, says):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "kept.json").write_text("mine")
+    assert train_walking.main(arguments) == 2
+    assert says in capsys.readouterr().err
+    assert (tmp_path / "kept.json").read_text() == "mine"
+
+
+def test_a_policy_is_measured_trial_by_trial(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(tracking, "TRIALS", {"clean": tracking.CLEAN})
+    monkeypatch.setattr(tracking, "SECONDS", 4.0)
+    monkeypatch.setattr(tracking, "ENGINES", ("mujoco",))  # MJX compiles for long
+    out = tmp_path / "figures.json"
+    assert train_walking.main(["evaluate", str(policy.SHIPPED), "--robots", "3", "--out", str(out)]) == 0
+    figures = json.loads(out.read_text())["figures"]
+    assert list(figures) == ["mujoco, clean"]
+    assert figures["mujoco, clean"]["robots"] == 3
+    assert "mujoco, clean" in capsys.readouterr().out

@@ -1,0 +1,197 @@
+"""Train a billiards teacher from exhaustive tries in parallel (minutes on an accelerator).
+
+    python experiments/train_teacher.py billiards --preset easy --task.mirrors --out runs/easy-teacher [--resume]
+
+The shipped teachers were made so (`envs/cuelearner_envs/billiards/teachers`). The first argument names a task, as
+package.module:NAME one of your own; its environment must have `features`, and an action's value must be its reward.
+A run is labelled by the folder with --task.teacher FOLDER.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import shlex
+import shutil
+import sys
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+import jax
+import numpy as np
+import tyro
+from _teacher_program import TeacherConfig, Trainer, check_config, finished, make_program
+
+from cuelearner_jax import config as configuration
+from cuelearner_jax.config import LARGEST
+from cuelearner_jax.errors import NotFinite, UserError
+from cuelearner_jax.evaluate import episodes, evaluate_policy
+from cuelearner_jax.policies import Taught
+from cuelearner_jax.storage import formats
+from cuelearner_jax.storage.checkpoint import checkpoints
+from cuelearner_jax.storage.folders import CONFIG, check_folder, claimed, in_use, prepare_folder
+from cuelearner_jax.storage.provenance import provenance
+from cuelearner_jax.storage.room import free_bytes
+from cuelearner_jax.task import Task, shape_of
+from cuelearner_jax.tasks import registry
+from cuelearner_jax.teachers import stored
+from cuelearner_jax.teachers.learned import LearnedTeacher
+from cuelearner_jax.terminal import Interrupted, interruptible, progress_bars
+
+ROUNDS_A_STRETCH = 50  # in one jitted call
+SECONDS_BETWEEN_CHECKPOINTS = 60.0
+EVAL_ENVS = 100  # environments that share the validation steps
+TRAINING = "training"  # checkpoints, kept in the folder until the teacher is finished
+COLUMNS = ("round", "wall_s", "reward", "loss")
+TaskT = TypeVar("TaskT")
+
+
+@dataclass(frozen=True)
+class Asked(Generic[TaskT]):
+    """Options."""
+
+    task: TaskT
+    out: Path
+    """Folder for the teacher."""
+    teacher: TeacherConfig = field(default_factory=TeacherConfig)
+    seed: int = 0
+    """Seed."""
+    eval_steps: int = 10_000
+    """Validation steps at the end (a multiple of 100)."""
+    resume: bool = False
+    """Go on with an interrupted training."""
+
+
+def check(task: Task, asked: Asked) -> None:
+    """Raises UserError for values that cannot work, or for more memory than is free."""
+    check_config(asked.teacher)
+    if not 0 <= asked.seed <= LARGEST:
+        raise UserError(f"--seed is {asked.seed}: give a number from 0 to {LARGEST}")
+    if not 1 <= asked.eval_steps <= LARGEST or asked.eval_steps % min(EVAL_ENVS, asked.eval_steps):
+        raise UserError(f"--eval-steps is {asked.eval_steps}: give a positive number, beyond {EVAL_ENVS} a multiple")
+    shape = shape_of(task, asked.task)
+    if not hasattr(shape, "features"):
+        raise UserError(f"{task.name} gives a teacher no features to learn from")
+    needed, free = needed_bytes(asked.teacher, shape), free_bytes()
+    if free and needed > free:
+        raise UserError(
+            f"the training needs about {needed / 1e9:,.1f} GB, {free / 1e9:.1f} GB are free: lower --teacher.tables, "
+            "--teacher.memory or --teacher.search"
+        )
+
+
+def needed_bytes(config: TeacherConfig, env: Any) -> int:
+    """Memory that a training takes, about [bytes]: what it keeps, and the activations of its widest pass twice."""
+    state = jax.eval_shape(Trainer(config).init, env, jax.random.key(0))
+    kept = sum(math.prod(leaf.shape) * leaf.dtype.itemsize for leaf in jax.tree.leaves(state))
+    rows = max(config.tables * config.search, config.batch_size * len(config.layers))
+    return kept + 2 * 4 * max(config.layers) * rows
+
+
+def train(task: Task, asked: Asked, command: str) -> float:
+    """Train a teacher, validate and write it.
+
+    Returns:
+        Its reward a step over the validation steps.
+
+    Raises:
+        UserError: bad options, or a folder in use; nothing has been changed then.
+        Interrupted: Ctrl-C; everything is saved.
+        NotFinite: the training diverged; what its newest checkpoint holds is finite.
+    """
+    check(task, asked)
+    out, config, world = asked.out, asked.teacher, configuration.to_json(asked.task)
+    described = {"config": configuration.to_json(config), "task": {"name": task.name, **world}, "seed": asked.seed}
+    env = task.environment(asked.task)
+    if in_use(out) and (out / stored.ABOUT).exists() and not (out / CONFIG).exists():
+        raise UserError(f"{out} holds a finished teacher: give another --out")
+    with claimed(out):
+        check_folder(out, {"format": formats.FORMATS["config"], **described}, asked.resume, overwrite=False)
+        prepare_folder(out, described, clean=False)
+        made, history = _learn(env, config, out, asked.seed)
+        reward = validate(made, env, asked.eval_steps)
+        rows = history[:: max(1, len(history) // 50)]
+        about = {
+            **described,
+            "reward": round(reward, 4),
+            "eval_steps": asked.eval_steps,
+            **provenance(),
+            "command": command,
+            "history": {"columns": list(COLUMNS), "rows": [[int(row[0]), *np.round(row[1:], 5)] for row in rows]},
+        }
+        stored.save(out, made, about)
+        (out / CONFIG).unlink()  # first: a folder that has it is still to be trained
+        shutil.rmtree(out / TRAINING)
+    return reward
+
+
+def _learn(env: Any, config: TeacherConfig, out: Path, seed: int) -> tuple[LearnedTeacher, list[list[float]]]:
+    """All rounds, from wherever the folder's newest checkpoint is. Returns the teacher and `COLUMNS` a stretch."""
+    program = make_program(config)
+    with checkpoints(out / TRAINING) as saved, interruptible() as stopping, progress_bars() as bars:
+        state = program.init(env, jax.random.key(seed))
+        history = np.zeros((-(-config.rounds // ROUNDS_A_STRETCH), len(COLUMNS)), np.float32)
+        if saved.latest() is not None:
+            whole = saved.restore(jax.eval_shape(lambda: {"state": state, "history": history}))
+            state, history = whole["state"], np.array(whole["history"])
+        before, started, kept = history[:, 1].max(), time.perf_counter(), time.perf_counter()
+        bar = bars.add_task("teacher", total=config.rounds, note="", completed=int(state.round))
+        while (done := int(state.round)) < config.rounds:
+            state, metrics = program.train(env, state, min(ROUNDS_A_STRETCH, config.rounds - done))
+            if not metrics["finite"]:
+                raise NotFinite(_diverged(out, saved.latest(), int(state.round)))
+            reward, loss, now = float(metrics["reward"]), float(metrics["loss"]), time.perf_counter()
+            history[done // ROUNDS_A_STRETCH] = int(state.round), before + now - started, reward, loss
+            bars.update(bar, completed=int(state.round), note=f"reward {reward:.3f} loss {loss:.4f}")
+            if now - kept > SECONDS_BETWEEN_CHECKPOINTS or stopping.is_set() or int(state.round) >= config.rounds:
+                saved.save(int(state.round), {"state": state, "history": history})
+                kept = time.perf_counter()
+            if stopping.is_set():
+                raise Interrupted(f"stopped at round {int(state.round)}; go on with the same command and --resume")
+    return finished(config, env, state), history.tolist()
+
+
+def _diverged(out: Path, kept: int | None, done: int) -> str:
+    held = "nothing was saved before" if kept is None else f"{out} holds the checkpoint of round {kept}"
+    return (
+        f"the teacher is no longer finite by round {done:,}, and was not written; {held}: "
+        "train with a smaller --teacher.learning-rate and another --out"
+    )
+
+
+def validate(made: LearnedTeacher, env: Any, steps: int) -> float:
+    """Reward a step of a teacher's own choices on validation episodes."""
+    found = evaluate_policy(env, Taught(made), episodes(), min(EVAL_ENVS, steps), steps)
+    return float(np.asarray(found["reward"]))
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Read the arguments and train; return the exit status."""
+    arguments = sys.argv[1:] if arguments is None else arguments
+    named, rest = (arguments[:1], arguments[1:]) if arguments and arguments[0][0] != "-" else ([], arguments)
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("--preset")
+    preset, rest = parser.parse_known_args(rest)
+    try:
+        task = registry.resolve(*(named or ["billiards"]))
+        if preset.preset is not None and preset.preset not in task.presets:
+            raise UserError(f"unknown --preset {preset.preset!r}: choose one of {', '.join(task.presets)}")
+        world = task.presets[preset.preset or next(iter(task.presets))].config.task
+        default = Asked(world, Path("runs") / f"{task.name}-teacher")
+        kind: Any = Asked[task.config]  # pyright: ignore[reportInvalidTypeArguments]
+        asked = tyro.cli(kind, args=rest, default=default, prog=Path(__file__).name, description=__doc__)
+        reward = train(task, asked, shlex.join(["python", f"experiments/{Path(__file__).name}", *arguments]))
+        print(f"reward a step over {asked.eval_steps} validation steps: {reward:.4f}; wrote {asked.out}")
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    except (Interrupted, NotFinite) as error:
+        print(error, file=sys.stderr)
+        return error.status
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

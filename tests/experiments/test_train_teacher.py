@@ -1,0 +1,193 @@
+"""Training a teacher: it learns a bandit whose best direction is known, can be stopped, keeps what is finite."""
+
+import dataclasses
+import json
+import math
+from contextlib import contextmanager
+from pathlib import Path
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import probes
+import pytest
+import train_teacher
+from _teacher_program import TeacherConfig, Trainer, check_config, finished, make_program
+
+from cuelearner_jax import actions
+from cuelearner_jax.config import to_json
+from cuelearner_jax.errors import NotFinite, UserError
+from cuelearner_jax.evaluate import rollout
+from cuelearner_jax.policies import Taught
+from cuelearner_jax.storage.folders import LOCK
+from cuelearner_jax.teachers import stored
+from cuelearner_jax.terminal import Interrupted
+
+TASK, WORLD = probes.make_task(), probes.WindowConfig()
+ENV, OBS = probes.Window(mirrors=True), actions.evenly_spaced(4)
+CONFIG = TeacherConfig(
+    layers=(32, 32),
+    tables=32,
+    tries=6,
+    search=24,
+    directions=72,
+    memory=8,
+    updates=4,
+    batch_size=128,
+    learning_rate=5e-3,
+    rounds=200,
+    spread_deg=10.0,
+)
+PROGRAM = make_program(CONFIG)  # compiled once for all tests here: two stretches of 100 rounds
+
+
+@pytest.fixture(autouse=True)
+def _compiled_once(monkeypatch):
+    monkeypatch.setattr(train_teacher, "make_program", lambda config: PROGRAM)
+    monkeypatch.setattr(train_teacher, "ROUNDS_A_STRETCH", 100)
+
+
+def train(out, **changed):
+    asked = train_teacher.Asked(WORLD, out, **{"teacher": CONFIG, "eval_steps": 20, **changed})
+    return train_teacher.train(TASK, asked, "the command")
+
+
+def refused(out, says, **changed):
+    """Refused in one line that changes nothing but the mark of who writes there."""
+
+    def files():
+        return {name: found for name, found in probes.files_of(out).items() if name.name != LOCK}
+
+    before = files()
+    with pytest.raises(UserError, match=says):
+        train(out, **changed)
+    assert files() == before
+
+
+@pytest.fixture(scope="module")
+def trained():
+    state, metrics = PROGRAM.init(ENV, jax.random.key(0)), []
+    for _ in range(2):
+        state, measured = PROGRAM.train(ENV, state, 100)
+        metrics.append(jax.tree.map(float, measured))
+    return finished(CONFIG, ENV, state), metrics
+
+
+@pytest.fixture
+def begun(tmp_path):
+    """A training that Ctrl-C has stopped in its first stretch."""
+
+    @contextmanager
+    def interruptible():
+        yield SimpleNamespace(is_set=lambda: True)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(train_teacher, "interruptible", interruptible)
+        with pytest.raises(Interrupted, match="stopped at round 100"):
+            train(tmp_path / "teacher")
+    return tmp_path / "teacher"
+
+
+def test_it_learns_to_win_nearly_always(trained):
+    made, metrics = trained
+    measure = jax.jit(lambda made: rollout(Taught(made), ENV, jax.random.key(5), 20, 200))
+    assert float(measure(made)["reward"]) > 0.97
+    assert metrics[1]["reward"] > metrics[0]["reward"]
+    assert metrics[1]["loss"] < 0.5 * metrics[0]["loss"]
+
+
+def test_its_values_are_chances_to_win_and_an_imperfect_aim_goes_to_the_middle(trained):
+    made, best = trained[0], ENV.best(OBS)
+    inside, outside = (jax.vmap(lambda obs, action: made.values(obs, action[None])[0])(OBS, s * best) for s in (1, -1))
+    np.testing.assert_allclose(inside, 1, atol=0.15)
+    np.testing.assert_allclose(outside, 0, atol=0.15)
+    careful = made.replace(aim_error=0.3)
+    error = [float(actions.difference(ENV.best(obs), careful.best_action(None, obs))) for obs in OBS]
+    assert np.abs(error).max() < math.radians(12)
+
+
+def test_tries_come_first_from_the_best_and_last_from_anywhere():
+    training, state = Trainer(CONFIG), PROGRAM.init(ENV, jax.random.key(1))
+    keys = jax.random.split(jax.random.key(2), 500)
+    tried = jax.jit(jax.vmap(lambda key: training.propose(ENV, state.params, OBS[0], key)))(keys)
+    np.testing.assert_allclose(jnp.linalg.norm(tried, axis=-1), 1, atol=1e-5)
+    best_value = training.value(ENV, state.params, OBS[0], actions.evenly_spaced(3600)).max()
+    first = training.value(ENV, state.params, OBS[0], tried[:, 0])
+    assert float((best_value - first).max()) < 0.1  # as fine as the search is
+    counts, _ = np.histogram(actions.to_angle(tried[:, -2:]).ravel(), bins=6, range=(-math.pi, math.pi))
+    assert counts.min() > 120  # 167 each
+
+
+def test_a_stopped_training_goes_on_to_the_same_teacher_and_mixes_with_nothing(begun, tmp_path):
+    refused(begun, "--resume to go on")
+    refused(begun, "another seed", resume=True, seed=1)
+    other = dataclasses.replace(CONFIG, rounds=300)
+    refused(begun, r"another config\.rounds", resume=True, teacher=other)
+    refused(tmp_path, "nothing to resume", resume=True)
+    assert train(begun, resume=True) == train(tmp_path / "whole")
+    assert {path.name for path in begun.iterdir()} == {LOCK, "network", "teacher.json"}
+    mine, yours = (
+        jax.tree.leaves(stored.load(folder, TASK.environment(WORLD), 0.0, 0.0).params)
+        for folder in (begun, tmp_path / "whole")
+    )
+    for one, another in zip(mine, yours, strict=True):
+        np.testing.assert_array_equal(one, another)
+    told = json.loads((begun / "teacher.json").read_text())
+    assert [row[0] for row in told["history"]["rows"]] == [100, 200]
+    assert told["config"] == to_json(CONFIG)
+    refused(begun, "holds a finished teacher", resume=True)
+
+
+def test_a_training_that_diverges_stops_and_keeps_what_was_finite(begun, monkeypatch):
+    newest = begun / "training" / "100"
+    before = probes.files_of(newest)
+
+    def poisoned(env, state, rounds):
+        return PROGRAM.train(
+            env, state.replace(params=jax.tree.map(lambda leaf: leaf * math.inf, state.params)), rounds
+        )
+
+    monkeypatch.setattr(train_teacher, "make_program", lambda config: PROGRAM._replace(train=poisoned))
+    with pytest.raises(NotFinite, match=r"by round 200, and was not written; .* holds the checkpoint of round 100"):
+        train(begun, resume=True)
+    assert probes.files_of(newest) == before
+    assert not (begun / "teacher.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"learning_rate": math.nan}, "positive, finite"),
+        ({"explore_probability": math.nan}, "from 0 to 1"),
+        ({"spread_deg": math.nan}, "from 0 to 180"),
+        ({"tables": 0}, "teacher.tables is 0"),
+        ({"tables": 10**12}, "at most 2147483647"),
+        ({"rounds": 10**6, "updates": 10**6}, "teacher.rounds times teacher.updates"),
+        ({"tries": 3}, "at least 4"),
+        ({"layers": (8, 0)}, "positive width"),
+    ],
+    ids=str,
+)
+def test_settings_that_cannot_work_are_refused(change, says):
+    with pytest.raises(UserError, match=says):
+        check_config(dataclasses.replace(CONFIG, **change))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["--seed", "-1"], "--seed is -1"),
+        (["--eval-steps", "150"], "beyond 100 a multiple"),
+        (["--teacher.tables", "1000000000"], "GB are free: lower --teacher.tables"),
+        (["--preset", "no"], "unknown --preset 'no'"),
+        (["--out", "."], "not empty"),
+    ],
+    ids=str,
+)
+def test_its_command_refuses_in_one_line(arguments, says, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    Path("thesis.txt").write_text("mine")
+    assert train_teacher.main(["billiards", *arguments]) == 2
+    assert says in capsys.readouterr().err
+    assert sorted(path.name for path in tmp_path.iterdir()) in (["thesis.txt"], [LOCK, "thesis.txt"])
