@@ -12,7 +12,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         from cuelearner_jax import signals  # before anything else, which takes seconds to load
 
         signals.listen()
-    from cuelearner_jax.cli import dispatch  # loads JAX
+    from cuelearner_jax.cli import dispatch
 
     return dispatch.main(argv)
 

@@ -7,22 +7,23 @@ finite, all else saved; 141 nobody reads the output any more (of progress and me
 
 from __future__ import annotations
 
+import ast
 import importlib
 import os
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 from types import ModuleType
 
 # Before JAX starts: warnings of its start-up are not the user's.
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
 
-from cuelearner_jax import __version__, user_code
-from cuelearner_jax.cli.parsing import HELP, summary
-from cuelearner_jax.errors import NotFinite, UserError, blamed, closest
-from cuelearner_jax.runs.cluster import JobsFailed
-from cuelearner_jax.tasks import registry
-from cuelearner_jax.terminal import Interrupted, abandon, console
+# What loads JAX, and takes seconds, is imported where a command needs it: `--version` and `--help` wait for nothing.
+from cuelearner_jax import __version__
+from cuelearner_jax.errors import JobsFailed, NotFinite, UserError, blamed, closest
+from cuelearner_jax.signals import Interrupted
 
+HELP = ("-h", "--help")
 # Each is a file beside this one with `run(arguments)` and `OPTIONS`, the options of what it does by its full name.
 COMMANDS = (
     *("train", "sweep", "adapt", "evaluate", "report", "render", "label", "labels", "export"),
@@ -35,27 +36,35 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = list(sys.argv[1:] if argv is None else argv)
     try:
         try:
-            return user_code.told(_dispatch)(arguments)
+            return _dispatch(arguments)
         finally:
             sys.stdout.flush()  # here, where it is heard if nobody reads
     except UserError as error:
-        console.print(f"error: {error}")
+        _tell(f"error: {error}")
         return 2
     except (Interrupted, JobsFailed, NotFinite) as error:
-        console.print(str(error))
+        _tell(str(error))
         return error.status
     except BrokenPipeError:  # whoever read our output has gone, as `head` does
+        from cuelearner_jax.terminal import abandon
+
         abandon(sys.stdout)
         return 141
     except Exception as error:
         told = blamed(error, _resumes(arguments))
         if told is None:
             raise
-        console.print(f"error: {told}")
+        _tell(f"error: {told}")
         return 1
     except KeyboardInterrupt:  # of a process that does more than this command: see `signals`
-        console.print("stopped at once; what was saved before is safe")
+        _tell("stopped at once; what was saved before is safe")
         return 130
+
+
+def _tell(line: str) -> None:
+    from cuelearner_jax.terminal import console
+
+    console.print(line)
 
 
 def _dispatch(arguments: list[str]) -> int:
@@ -71,7 +80,9 @@ def _dispatch(arguments: list[str]) -> int:
         return 0
     if command not in COMMANDS:
         raise UserError(f"unknown command {command!r}{closest(command, COMMANDS)}; see cuelearner --help")
-    _file(command).run(arguments[1:])
+    from cuelearner_jax import user_code
+
+    user_code.told(_file(command).run)(arguments[1:])
     return 0
 
 
@@ -87,9 +98,26 @@ def _file(command: str) -> ModuleType:
     return importlib.import_module(f"cuelearner_jax.cli.{command}")
 
 
+def summaries(command: str) -> dict[str, str]:
+    """One line about each command of a file, by its full name: the start of its options' docstring.
+
+    The file is read, not imported, because importing it loads JAX.
+    """
+    module = ast.parse(Path(__file__).with_name(f"{command}.py").read_text(encoding="utf-8"))
+    abouts = {node.name: ast.get_docstring(node) or "" for node in module.body if isinstance(node, ast.ClassDef)}
+    assigned = [node for node in module.body if isinstance(node, ast.Assign)]
+    (options,) = [node.value for node in assigned if ast.unparse(node.targets[0]) == "OPTIONS"]
+    assert isinstance(options, ast.Dict)
+    named = zip(options.keys, options.values, strict=True)
+    abouts = {ast.literal_eval(name): abouts[ast.unparse(kind)] for name, kind in named if name}
+    return {name: " ".join(about.split("\n\n")[0].split()) for name, about in abouts.items()}
+
+
 def _overview() -> None:
+    from cuelearner_jax.tasks import registry
+
     print("usage: cuelearner COMMAND ...\n\nLearning from relative feedback with off-policy deep RL.\n\ncommands:")
-    told = {name: summary(kind) for command in COMMANDS for name, kind in _file(command).OPTIONS.items()}
+    told = {name: about for command in COMMANDS for name, about in summaries(command).items()}
     width = max(map(len, told)) + 2
     for name, about in told.items():
         print(f"  {name:<{width}}{about}")

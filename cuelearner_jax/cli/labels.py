@@ -12,7 +12,8 @@ import numpy as np
 import tyro
 from rich.table import Table
 
-from cuelearner_jax.cli.parsing import HELP, out, parse, summary
+from cuelearner_jax.cli.dispatch import HELP
+from cuelearner_jax.cli.parsing import out, parse, summary
 from cuelearner_jax.cli.shared_options import Flag
 from cuelearner_jax.config import Scalars
 from cuelearner_jax.errors import UserError, closest, one_line
@@ -59,8 +60,8 @@ class Export:
     """The new file, .csv or .parquet; one that is there is not replaced."""
 
 
-KINDS = {"inspect": Inspect, "merge": Merge, "export": Export}
-OPTIONS = {f"labels {name}": kind for name, kind in KINDS.items()}
+OPTIONS = {"labels inspect": Inspect, "labels merge": Merge, "labels export": Export}
+KINDS = {name.split()[1]: kind for name, kind in OPTIONS.items()}
 
 
 def run(arguments: list[str]) -> None:

@@ -17,6 +17,7 @@ import tyro
 from rich.console import Console
 
 from cuelearner_jax import plugins
+from cuelearner_jax.cli.dispatch import HELP
 from cuelearner_jax.errors import UserError, closest, no_space
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.policies import policy_of
@@ -26,7 +27,6 @@ from cuelearner_jax.task import Preset, Task
 from cuelearner_jax.tasks import registry
 from cuelearner_jax.terminal import PLAIN
 
-HELP = ("-h", "--help")
 PAPER = "paper"  # the preset that holds where none is given
 
 

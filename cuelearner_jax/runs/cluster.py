@@ -24,7 +24,7 @@ from types import ModuleType
 from typing import Any
 
 from cuelearner_jax import signals
-from cuelearner_jax.errors import UserError
+from cuelearner_jax.errors import JobsFailed, UserError
 from cuelearner_jax.runs.shards import Shard
 from cuelearner_jax.terminal import console, progress_bars
 
@@ -35,14 +35,6 @@ OURS = ("array", "error", "nodes", "open_mode", "output", "requeue", "signal")  
 REQUEUE_S = 30  # of the notice, for submitit to put the job back
 FOREVER_MIN = 10 * 365 * 24 * 60  # jobs of this machine have no time limit
 POLL_S = 0.5
-
-
-class JobsFailed(Exception):
-    """Not every piece came to its end: a line on each that did not, and how to go on."""
-
-    def __init__(self, message: str, status: int) -> None:
-        super().__init__(message)
-        self.status = status  # that a command ends with
 
 
 @dataclass(frozen=True)

@@ -9,10 +9,13 @@ from __future__ import annotations
 import dataclasses
 import importlib
 from importlib.metadata import EntryPoint, entry_points
+from typing import TYPE_CHECKING
 
 from cuelearner_jax import plugins
 from cuelearner_jax.errors import UserError, closest
-from cuelearner_jax.task import Task
+
+if TYPE_CHECKING:
+    from cuelearner_jax.task import Task
 
 GROUP = "cuelearner.tasks"  # of entry points: the task's name = "package.module:name"
 BUILT_IN = {
@@ -40,7 +43,7 @@ def find(name: str) -> Task:
         raise UserError(
             f"unknown task {name!r}{closest(name, names())} (one of your own is named as package.module:NAME)"
         )
-    task = plugins.load(installed[name].value, Task, "a task")
+    task = _loaded(installed[name].value)
     if task.name != name:
         raise UserError(f"the installed task {name!r} calls itself {task.name!r}: its package must use one name")
     return task
@@ -66,9 +69,15 @@ def resolve(text: str) -> Task:
     """
     if ":" not in text:
         return find(text)
-    task = dataclasses.replace(plugins.load(text, Task, "a task"), origin=text)
+    task = dataclasses.replace(_loaded(text), origin=text)
     installed = _installed().get(task.name)
     return find(task.name) if installed and installed.value == text else register(task)
+
+
+def _loaded(reference: str) -> Task:
+    from cuelearner_jax.task import Task  # loads JAX, which names alone do not need
+
+    return plugins.load(reference, Task, "a task")
 
 
 def _installed() -> dict[str, EntryPoint]:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from types import SimpleNamespace
 
 import jax.numpy as jnp
 import numpy as np
@@ -143,7 +144,8 @@ def test_what_raises_while_it_is_compiled_is_named_with_its_cause():
 
 
 def test_the_command_line_says_it_in_one_line(monkeypatch, capsys):
-    monkeypatch.setattr(dispatch, "_dispatch", functools.partial(Failing.Window().step, None, None))
-    assert dispatch.main([]) == 2
+    failing = SimpleNamespace(run=functools.partial(Failing.Window().step, None, None))
+    monkeypatch.setattr(dispatch, "_file", lambda command: failing)
+    assert dispatch.main(["train"]) == 2
     told = capsys.readouterr().err.split()
     assert " ".join(told).startswith("error: environment Failing.Window.step raised ZeroDivisionError")

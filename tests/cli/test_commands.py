@@ -12,7 +12,7 @@ from rich.console import Console
 from small_runs import SMALL
 
 from cuelearner_jax import terminal
-from cuelearner_jax.cli import evaluate, main
+from cuelearner_jax.cli import dispatch, evaluate, main
 from cuelearner_jax.storage import guides, results
 
 ENTRY = [str(Path(sys.executable).with_name("cuelearner"))]
@@ -166,14 +166,25 @@ def test_render_makes_the_picture_of_a_question(run_folder, refused, tmp_path):
     refused(command, "give --overwrite to replace it", tmp_path)
 
 
-def test_the_overview_has_a_line_for_each_command_and_the_version_can_be_asked_for(capsys):
+def test_the_overview_has_a_line_for_each_command(capsys):
     assert main(["--help"]) == 0
     told = capsys.readouterr().out
-    labels = ("label", "labels inspect", "labels merge", "labels export")
-    for name in ("train", "sweep", "evaluate", "report", "render", "bench", *labels):
+    for name in (name for command in dispatch.COMMANDS for name in dispatch._file(command).OPTIONS):
         assert re.search(rf"^  {name} +[A-Z].*\.$", told, re.MULTILINE), name
-    assert main(["--version"]) == 0
-    assert re.fullmatch(r"cuelearner \d+\.\d+\.\d+\n", capsys.readouterr().out)
+
+
+@pytest.mark.parametrize("option", ["--help", "--version"])
+def test_what_needs_no_jax_does_not_load_it(option):
+    code = f"""
+import sys
+from cuelearner_jax.cli import main
+assert main([{option!r}]) == 0
+slow = {{"jax", "numpy", "tyro", "rich", "cuelearner_envs"}}
+print(*sorted(slow & {{name.partition(".")[0] for name in sys.modules}}))
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert re.match(r"usage: cuelearner COMMAND|cuelearner \d+\.\d+\.\d+\n", done.stdout)
+    assert done.stdout.splitlines()[-1] == ""
 
 
 def test_the_task_may_be_named_by_an_option(run_folder, tmp_path):
