@@ -189,9 +189,9 @@ class Spaces(NamedTuple):
     aims: int | None = None  # entries of one row of `Aims.features`, if it offers any
 
 
-def spaces_of(env: Any, sees: int | None = None) -> Spaces:
-    """An environment's; shapes in place of its arrays will do. `sees`: of its first entries alone (None: of all)."""
-    spaces = Spaces(env.obs_size if sees is None else sees, actions_of(env))
+def spaces_of(env: Any) -> Spaces:
+    """An environment's; shapes in place of its arrays will do."""
+    spaces = Spaces(env.obs_size, actions_of(env))
     obs, action = jnp.zeros(spaces.obs_size), jnp.zeros(spaces.actions.size)
     if offers(env, "features"):
         seen = jax.eval_shape(_features, env, obs, action)

@@ -50,8 +50,6 @@ class Agent(struct.PyTreeNode):
     sizes: AgentSizes = struct.field(pytree_node=False)
     actions: Actions = struct.field(pytree_node=False, default=DIRECTIONS)
     env: Any = None  # says how an observation looks from an action; nobody asks it in the raw frame
-    # Entries of an observation that it was trained with, where a changed world adds some at the end; None: all.
-    sees: int | None = struct.field(pytree_node=False, default=None)
 
     def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
         """The action with the largest value of all in the set.
@@ -59,9 +57,8 @@ class Agent(struct.PyTreeNode):
         The rough first look (`sizes.coarse_directions`) is for play while learning alone: where values are sharp it
         misses peaks, which costs a finished agent reward (`benchmarks/search_agreement.py`).
         """
-        seen = obs if self.sees is None else obs[:, : self.sees]
         whole = dataclasses.replace(self.sizes, coarse_directions=0)
-        return greedy_actions(whole, self.actions, self.env, self.params, seen)
+        return greedy_actions(whole, self.actions, self.env, self.params, obs)
 
     @property
     def axes(self) -> Agent:

@@ -68,7 +68,7 @@ EACH: Mapping[str, Any] = {
     "sizes.labels_per_round": 50,
     "task.look_ahead": False,  # the scenario looks ahead
 }
-SPACED, MEMORY = {"sizes.question_every": 10}, {"task.memory": True}
+SPACED = {"sizes.question_every": 10}
 LOOK_AHEAD = {"task.look_ahead": True}
 # The likeliest way is always gone: in doubt the base would act, which walks into walls.
 SURE: Mapping[str, Any] = {**EACH, **SPACED, "scalars.aim_doubt": 1000.0, "sizes.aim_layers": (64, 64)}
@@ -78,32 +78,28 @@ FALLING = {"sizes.eps_falls": True, "scalars.eps_deg": 40.0, "scalars.eps_last_d
 PARTING = {"sizes.candidates": 16, "sizes.chosen_by": "teacher", "sizes.question_every": 1}
 IN_ROOMS: dict[str, dict[str, Mapping[str, Any]]] = {
     "intent": {
-        "members-memory": {**SURE, **MEMBERS, **MEMORY},
         "members": {**SURE, **MEMBERS},
-        "active-memory": {**SURE, **ACTIVE, **MEMORY},
-        "memory": {**SURE, **MEMORY},
-        "look-ahead": {**SURE, **MEMBERS, **MEMORY, **LOOK_AHEAD},
+        "active": {**SURE, **ACTIVE},
         "look-ahead-only": {**SURE, **MEMBERS, **LOOK_AHEAD},
-        "contrary": {**SURE, **MEMBERS, **MEMORY, "scalars.mistake_probability": 0.5},  # do labels matter at all?
-        "doubting": {**SURE, **MEMBERS, **MEMORY, "scalars.aim_doubt": 2.0},
-        "small": {**SURE, **MEMBERS, **MEMORY, "sizes.aim_layers": (32, 32)},
-        "close": {**SURE, **MEMBERS, **MEMORY, "sizes.question_every": 1},
-        "eps-10": {**SURE, **MEMBERS, **MEMORY, "scalars.eps_deg": 10.0},
-        "eps-40": {**SURE, **MEMBERS, **MEMORY, "scalars.eps_deg": 40.0},
-        "eps-falls": {**SURE, **MEMBERS, **MEMORY, **FALLING},
-        "parting": {**SURE, **MEMBERS, **MEMORY, **PARTING},
+        "contrary": {**SURE, **MEMBERS, "scalars.mistake_probability": 0.5},  # do labels matter at all?
+        "doubting": {**SURE, **MEMBERS, "scalars.aim_doubt": 2.0},
+        "small": {**SURE, **MEMBERS, "sizes.aim_layers": (32, 32)},
+        "close": {**SURE, **MEMBERS, "sizes.question_every": 1},
+        "eps-10": {**SURE, **MEMBERS, "scalars.eps_deg": 10.0},
+        "eps-40": {**SURE, **MEMBERS, "scalars.eps_deg": 40.0},
+        "eps-falls": {**SURE, **MEMBERS, **FALLING},
+        "parting": {**SURE, **MEMBERS, **PARTING},
     },
     "relative": {
         "close": EACH,
         "spaced": {**EACH, **SPACED},
         "spaced-members": {**EACH, **SPACED, **MEMBERS},
-        "spaced-memory": {**EACH, **SPACED, **MEMORY},
         "spaced-eps-falls": {**EACH, **SPACED, **FALLING},
         "parting": {**EACH, **PARTING},
     },
 }
-BEST_IN_ROOMS, FARTHER_IN_ROOMS = IN_ROOMS["intent"]["members-memory"], IN_ROOMS["intent"]["look-ahead"]
-SIDED_INTENT = IN_ROOMS["intent"]["members"]
+BEST_IN_ROOMS = SIDED_INTENT = IN_ROOMS["intent"]["members"]
+FARTHER_IN_ROOMS = IN_ROOMS["intent"]["look-ahead-only"]
 SWEPT_RATES, SWEPT_NOISES_DEG = (0.0001, 0.001, 0.01), (0.0, 5.0, 20.0)
 
 
@@ -162,7 +158,7 @@ def rooms() -> list[Piece]:
     """The table of the rooms: unadapted, and learned and by the road map within either bound.
 
     The paper's labels, refined in the action frame; then read as intent among the ways that the lidar sees, asked in
-    situations farther apart, with a memory of the way tried, and with look-ahead too.
+    situations farther apart, and with look-ahead too.
     """
     pieces = [Piece(ROOMS, "none", minutes=2, serves="success in rooms")]
     for bound in ROOMS_BOUNDS_DEG:
@@ -171,7 +167,7 @@ def rooms() -> list[Piece]:
         pieces.append(
             Piece(ROOMS, "relative", labels=(250, 500, 1_000), settings=ROOMY, judge_by="success", minutes=20, **asked)
         )
-        for name, settings in (("memory", BEST_IN_ROOMS), ("look-ahead", FARTHER_IN_ROOMS)):
+        for name, settings in (("members", BEST_IN_ROOMS), ("look-ahead", FARTHER_IN_ROOMS)):
             asked |= {"variant": f"{bound:g}-{name}", "settings": settings, "judge_by": "success"}
             pieces.append(Piece(ROOMS, "intent", labels=(250, 500, 1_000), minutes=15, **asked))
     tried = compared(ROOMS, 180.0, "success", {"relative": RELATIVE})

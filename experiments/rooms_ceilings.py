@@ -1,13 +1,13 @@
 """How well rooms can be walked by what the robot sees: policies cloned from very many of the road map's actions.
 
-    python experiments/rooms_ceilings.py --out FOLDER [--variants ways ways-memory] [--scale smoke]
+    python experiments/rooms_ceilings.py --out FOLDER [--variants network ways] [--scale smoke]
 
 A clone acts, the road map says at every step what it would have done, and the network goes on learning from all that
 was said so far (DAgger: Ross, Gordon, Bagnell, 2011). What it reaches after 150,000 actions is about the most that this
-observation allows a model of relative labels to reach. Two kinds of network, each with and without a memory of the way
-tried (`task.memory`): an MLP of the scan as it looks from the goal's direction, and the weights of guidance `intent`,
-one network for all ways (`Navigation.aims`). All seeds of a variant are one program. The road map itself is measured
-too. Success on validation episodes goes to FOLDER/ceilings.json. On an H100 by estimate two minutes a variant.
+observation allows a model of relative labels to reach. Two kinds of network: an MLP of the scan as it looks from the
+goal's direction, and the weights of guidance `intent`, one network for all ways (`Navigation.aims`). All seeds of a
+variant are one program. The road map itself is measured too. Success on validation episodes goes to
+FOLDER/ceilings.json. On an H100 by estimate two minutes a variant.
 
 The third ceiling, agents trained in rooms under guidance, is an ordinary sweep:
 
@@ -65,7 +65,7 @@ SCALES = {
         1024, 256, (25_600, 51_200, 102_400, 153_600), 12_800, 3_000, 512, 2_000, 4, (512, 512, 512), (64, 64)
     ),
 }
-VARIANTS = ("network", "network-memory", "ways", "ways-memory")
+VARIANTS = ("network", "ways")
 
 
 class Clone(struct.PyTreeNode):
@@ -176,9 +176,9 @@ def stretch(clone: Clone, scale: Scale, adam: Any, teacher: Any, seed: Array, do
 def cloned(variant: str, scale: Scale) -> list[dict[str, Any]]:
     """A variant's rows: all seeds after every number of actions."""
     task = registry.find("navigation")
-    world = NavigationConfig(style="rooms", worlds=scale.worlds, memory=variant.endswith("memory"))
+    world = NavigationConfig(style="rooms", worlds=scale.worlds)
     env, shown = task.environment(world, "training"), task.environment(world, "validation")
-    teacher, ways = task.make_teacher(world, env), variant.startswith("ways")
+    teacher, ways = task.make_teacher(world, env), variant == "ways"
     clone = Clone({}, env, scale.ways if ways else scale.layers, ways)
     rate = optax.cosine_decay_schedule(1e-3, scale.counts[-1] // scale.each * scale.steps, 0.1)
     adam = optax.chain(optax.clip_by_global_norm(1.0), optax.adam(rate))

@@ -51,8 +51,7 @@ def told(policy: Any, named: str | None = None) -> Told:
     if isinstance(policy, Common):
         return told(policy.policy, named)
     if isinstance(policy, Agent):
-        sees = {} if policy.sees is None else {"sees": policy.sees}
-        return {"policy": "agent", "sizes": _part(AgentSizes, policy.sizes), **sees}
+        return {"policy": "agent", "sizes": _part(AgentSizes, policy.sizes)}
     if isinstance(policy, UniformPolicy):
         return {"policy": "uniform"}
     if isinstance(policy, Heuristic):
@@ -97,8 +96,6 @@ def check(values: Told, outermost: bool = True, depth: int = MOST_LAYERS) -> Non
         raise ValueError(f"{kind!r} is no policy here")
     if kind == "agent":
         check_agent(configuration.from_json(AgentSizes, values["sizes"]))
-        if (sees := values.get("sees")) is not None and (type(sees) is not int or sees < 1):
-            raise ValueError(f"an agent sees {sees!r} entries")
     if kind == "code" and not isinstance(values["named"], str):
         raise TypeError(f"code is named {values['named']!r}")
     if kind == "guided":
@@ -137,11 +134,7 @@ def shapes_of(values: Told, env: Any, rows: int | None = None) -> Any:
     def one(values: Told) -> Any:
         if values["policy"] == "agent":
             sizes = configuration.from_json(AgentSizes, values["sizes"])
-            sees = values.get("sees")
-            if sees is not None and sees > env.obs_size:
-                raise ValueError(f"an agent sees {sees} of {env.obs_size} entries")
-            own = spaces if sees is None else spaces_of(env, sees)
-            seen = [jnp.zeros(width) for width in view.widths(sizes.frame, own)]
+            seen = [jnp.zeros(width) for width in view.widths(sizes.frame, spaces)]
             return {"params": q_network(sizes.q_layers).init(jax.random.key(0), *seen)}
         if values["policy"] == "guided":
             bound = {"bound": jnp.zeros(())} if values["bounded"] else {}
@@ -169,7 +162,7 @@ def made(values: Told, arrays: Any, env: Any, code: Any = None) -> Any:
     kind = values["policy"]
     if kind == "agent":
         sizes = configuration.from_json(AgentSizes, values["sizes"])
-        return Agent(arrays["params"], sizes, actions_of(env), env, values.get("sees"))
+        return Agent(arrays["params"], sizes, actions_of(env), env)
     if kind == "uniform":
         return uniform_in(env)
     if kind == "heuristic":

@@ -33,13 +33,12 @@ class Parts(NamedTuple):
     teacher: Teacher | None
     lanes: Lanes | None
     adapted: AdaptedLanes | None = None
-    sees: int | None = None  # entries of an observation that the agents see; None: all
 
     @property
     def agent(self) -> Agent:
         """The lanes' agents."""
         assert self.lanes is not None
-        return Agent(self.lanes.policies["params"], self.config.sizes, actions_of(self.env), self.env, self.sees)
+        return Agent(self.lanes.policies["params"], self.config.sizes, actions_of(self.env), self.env)
 
     def guided(self, base: Policy, own: bool = False) -> Guided:
         """A policy under the lanes' guidance; of the agents' `own` actions it is bounded as in the guided episodes."""
@@ -80,7 +79,6 @@ def _folder_of(parts: Parts) -> AdaptedLanes:
     return parts.adapted
 
 
-SEE_THEIR_OWN = ("agent", "corrected")  # policies of agents, who may see the first part of an observation alone
 POLICIES: dict[str, Named] = {
     "agent": Named("the trained agent", lambda parts: parts.agent, trained=True),
     "guide": Named("guidance of uniform actions", lambda parts: parts.guided(uniform_in(parts.env)), trained=True),
@@ -145,8 +143,8 @@ class PolicySource:
         """Raises UserError unless the policy can be had and acts in the changed world.
 
         What was trained sees the observations that it was trained on, and aims as they were told then; other policies
-        act in any world. An agent also acts where a world says that it adds to them at their end (`plain_size`).
-        `lanes`: options that choose among a run's lanes, by name; one that is given must choose something.
+        act in any world. `lanes`: options that choose among a run's lanes, by name; one that is given must choose
+        something.
         """
         if policy not in POLICIES:
             raise UserError(f"unknown policy {policy!r}{closest(policy, POLICIES)}")
@@ -169,12 +167,11 @@ class PolicySource:
         if not POLICIES[policy].kept:
             return
         known = shape_of(self.task, self.config.task)
-        longer = getattr(after, "plain_size", None) == known.obs_size and policy in SEE_THEIR_OWN
-        if (size := known.obs_size) != after.obs_size and not longer:
+        if (size := known.obs_size) != after.obs_size:
             raise UserError(
                 f"the {what}'s observations have {size} entries, this world's {after.obs_size}: keep its structure"
             )
-        if policy in SEE_THEIR_OWN:
+        if policy in ("agent", "corrected"):
             return
         chosen = next((value for name, value in lanes.items() if name.endswith("guidance") and value), None)
         if not self._weighs_aims((chosen,) if isinstance(chosen, str) else chosen):
@@ -243,11 +240,9 @@ def blocks_of(
         policy = named.make(Parts(source.config, env, teacher, None, kept))
         return [Block(kept.guidance, *columns, 0, policy, np.zeros(kept.lanes.number, bool))]
     loaded = source.load(kinds)
-    size = shape_of(source.task, source.config.task).obs_size
-    sees = None if size == env.obs_size else size  # see `PolicySource.check`
     blocks = []
     for lanes in loaded if failed_too else without_failed(loaded):
-        policy = named.make(Parts(source.config, env, teacher, lanes, sees=sees))
+        policy = named.make(Parts(source.config, env, teacher, lanes))
         columns = (lanes.seeds, lanes.budgets, np.zeros(len(lanes.seeds)))
         blocks.append(Block(lanes.guidance.name, *columns, lanes.step, policy, np.asarray(lanes.policies["failed"])))
     return blocks

@@ -119,7 +119,6 @@ TABLE = {
         "lidar_rotation_deg": (NAN, INF, "15", None, True),
         "lidar_dropout": (-0.1, 1.1, NAN, "none"),
         "mirrors": (1, "yes", None, NAN, []),
-        "memory": (0, "no"),
         "preferred_side": ("up", "left", 1, None),
     },
     world_of: {"task": (None, "navigation", 3, type(TASK)), "config": (None, {}, probes.WindowConfig, "regulation")},

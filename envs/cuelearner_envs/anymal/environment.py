@@ -21,7 +21,6 @@ from cuelearner_envs.navigation.config import make_environment as make_navigatio
 from cuelearner_envs.navigation.environment import Navigation, latest_first
 from cuelearner_envs.navigation.lidar import scan_tilted
 from cuelearner_jax.actions import difference, from_angle, rotate
-from cuelearner_jax.errors import UserError
 
 Scalar = float | Float[Array, ""]
 SENSOR_NOISE = 0.02  # standard deviation of a scanner's own error [m]
@@ -154,12 +153,10 @@ class LeggedNavigation(Navigation, kw_only=True):
 def make_environment(
     config: NavigationConfig, split: str = "training", walking: WalkingPolicy | None = None
 ) -> LeggedNavigation:
-    """The environment of a configuration with the quadruped for a robot. Raises UserError if it can't be.
+    """The environment of a configuration with the quadruped for a robot.
 
     It walks by a policy (default: the shipped one).
     """
-    if config.memory:
-        raise UserError("task.memory is of the simple robot: leave it out, or choose --robot simple")
     plain = make_navigation(config, split)
     noise = jnp.hypot(plain.lidar.noise, SENSOR_NOISE)
     return LeggedNavigation(

@@ -12,7 +12,6 @@ import math
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from cuelearner_envs.navigation import memory
 from cuelearner_envs.navigation.geometry import free_path
 from cuelearner_envs.navigation.lidar import BEAM_ANGLES, BEAMS, MAX_RANGE
 from cuelearner_envs.navigation.look_ahead import EVERY, look_ahead
@@ -35,7 +34,7 @@ def aims_of(obs: Float[Array, " obs"], ahead: bool = False) -> Aims:
     """The ways of a situation; see `Navigation.aims`.
 
     Args:
-        obs: the observation; one with a memory tells ways by that too.
+        obs: the observation.
         ahead: tell also, as the last three features, where two legs lead (`look_ahead.look_ahead`).
     """
     goal, away = obs[BEAMS : BEAMS + 2], obs[BEAMS + 2] * FARTHEST
@@ -47,10 +46,6 @@ def aims_of(obs: Float[Array, " obs"], ahead: bool = False) -> Aims:
     previous = obs[BEAMS + 3 : BEAMS + 9].reshape(-1, 2)
     rows = [*_lengths(ways, free[1], goal, away), *_seen_from(ways, goal[None]), *_seen_from(ways, previous)]
     rows += [jnp.full(WAYS, away / SCALE), ways[:, 0], ways[:, 1], seen.astype(jnp.float32)]
-    if obs.shape[0] > BEAMS + 9:
-        tried = memory.turned(obs[BEAMS + 9 :], ways).reshape(WAYS, -1, memory.SECTORS)
-        middle = memory.SECTORS // 2
-        rows += [tried[:, :, middle + step : middle + step + 2].mean(-1).T for step in (-1, -5, 3)]
     if ahead:
         left, detour, leg = look_ahead(points_of(obs)[::EVERY], ways, free[2], away * goal, RADII[2])
         rows += [left / SCALE, jnp.clip(detour / SCALE, 0.0, 3.0), leg / SCALE]

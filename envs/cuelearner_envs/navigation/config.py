@@ -49,9 +49,6 @@ class NavigationConfig:
     """Changed world: probability that a beam reads the full range."""
     mirrors: bool = False
     """Multiply transitions by their mirror images, whatever the guidance; labels stay as they were given."""
-    memory: bool = False
-    """Does the robot remember where it has been? 72 numbers of it then end the observation; policies that were trained
-    without them see the rest."""
     look_ahead: bool = False
     """Do ways, as guidance intent weighs them, tell where a second leg would lead? Observations stay as they are."""
     preferred_side: Literal["none", "left", "right"] = "none"
@@ -93,6 +90,5 @@ def make_environment(config: NavigationConfig, split: str = "training") -> Navig
         goal_radius=jnp.float32(config.goal_radius),
         mirrors=config.mirrors,
         sides=config.style == "corridor",
-        memory=config.memory,
         look_ahead=config.look_ahead,
     )

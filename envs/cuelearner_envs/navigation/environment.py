@@ -12,7 +12,6 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray
 
-from cuelearner_envs.navigation import memory as way_tried
 from cuelearner_envs.navigation.aims import aims_of
 from cuelearner_envs.navigation.lidar import BEAMS, Lidar
 from cuelearner_envs.navigation.robot import Motion, Robot, collides, walk
@@ -24,10 +23,8 @@ from cuelearner_jax.environment import Aims, Described, Features, Quantity
 from cuelearner_jax.types import Step
 
 REMEMBERED = 3  # actions in the observation
-PLAIN = BEAMS + 3 + 2 * REMEMBERED  # entries of an observation without a memory
 RING = 360  # directions all round in which `features` gives how near things are: as far apart as beams are
 UNSEEN = -1.0  # what it gives where the lidar does not look; nearness is from 0 to 1
-WAY_TRIED = Quantity("way so far", way_tried.SEEN, "1", "how much of it lies 1 m and 2.5 m off in 36 directions")
 Scalar = float | Float[Array, ""]
 
 
@@ -42,15 +39,13 @@ class Walker(struct.PyTreeNode):
     route: Int[Array, ""]  # of that world
     steps: Int[Array, ""]  # taken in this episode
     passed: Float[Array, "2"] | None = None  # obstacles on the left and on the right in this episode, where they count
-    trail: Float[Array, "places 2"] | None = None  # the way so far, where it is remembered (`memory.longer`) [m]
-    tried: Float[Array, " seen"] | None = None  # what is remembered of it (`memory.around`)
 
 
 AnyWalker = Any  # a `Walker`, or what another body has in its place: pose, goal, previous, world, route and steps
 
 
 class Navigation(Described, struct.PyTreeNode):
-    """The environment (`cuelearner_jax.environment.Environment`). Everything but the last four fields is traced."""
+    """The environment (`cuelearner_jax.environment.Environment`). Everything but the last three fields is traced."""
 
     worlds: World  # leading axis: worlds
     robot: Robot = Robot()
@@ -60,26 +55,15 @@ class Navigation(Described, struct.PyTreeNode):
     goal_radius: Scalar = 0.5  # nearer than this, the goal is reached [m]
     mirrors: bool = struct.field(pytree_node=False, default=False)  # offer the mirror image as data?
     sides: bool = struct.field(pytree_node=False, default=False)  # say on which side obstacles were passed?
-    memory: bool = struct.field(pytree_node=False, default=False)  # does the robot remember where it has been?
     look_ahead: bool = struct.field(pytree_node=False, default=False)  # do aims tell where a second leg leads?
 
-    perceived = (
+    observation = (
         Quantity("lidar", BEAMS, "1", "exp(-distance / 1 m) of each beam, from -135 to +135 degrees, counterclockwise"),
         Quantity("goal: direction", 2, "1", "unit vector in the body's frame"),
         Quantity("goal: distance", 1, f"{FARTHEST:g} m"),
         Quantity("previous actions", 2 * REMEMBERED, "1", "unit vectors, the latest first; zeros before the first"),
     )
     action = Quantity("direction", 2, "1", "unit vector in the body's frame, x ahead, y to the left; walked for a step")
-
-    @property
-    def observation(self) -> tuple[Quantity, ...]:
-        """What the entries of an observation mean; those of the memory, if there is one, come last."""
-        return (*self.perceived, WAY_TRIED) if self.memory else self.perceived
-
-    @property
-    def plain_size(self) -> int:
-        """Entries of an observation that come before what a memory adds."""
-        return PLAIN
 
     @property
     def symmetries(self) -> int:
@@ -128,10 +112,7 @@ class Navigation(Described, struct.PyTreeNode):
         return {**outcome, "duration": after.steps * jnp.asarray(self.period)}, terminated, truncated
 
     def counted(self, before: AnyWalker, after: AnyWalker) -> AnyWalker:
-        """The state after a step with the obstacles that it passed, where these count, and the way remembered."""
-        if self.memory:
-            trail = way_tried.longer(before.trail, before.steps, before.pose[:2])
-            after = after.replace(trail=trail, tried=way_tried.around(trail, after.pose))
+        """The state after a step with the obstacles that it passed, where these count."""
         if not self.sides:
             return after
         world, ahead = self.world(before.world), heading(self.worlds.starts[before.world, before.route], before.goal)
@@ -166,8 +147,8 @@ class Navigation(Described, struct.PyTreeNode):
         return {"collision": self.collided(state)}
 
     def place(self, state: AnyWalker) -> Float[Array, " place"]:
-        """Where the sensor is, with the body, and what is remembered of the way: what replay keeps of it."""
-        return jnp.concatenate([state.pose, state.tried]) if self.memory else state.pose
+        """Where the sensor is, with the body: what replay keeps of it."""
+        return state.pose
 
     def placed(
         self,
@@ -178,8 +159,7 @@ class Navigation(Described, struct.PyTreeNode):
         route: Int[Array, ""],
     ) -> AnyWalker:
         """A state at rest at a place."""
-        state = Walker(place[:3], jnp.zeros(2), goal, previous, world, route, jnp.zeros((), jnp.int32))
-        return state.replace(trail=way_tried.nothing(), tried=place[3:]) if self.memory else state
+        return Walker(place, jnp.zeros(2), goal, previous, world, route, jnp.zeros((), jnp.int32))
 
     def collided(self, state: AnyWalker) -> Bool[Array, ""]:
         """Does the body touch anything?"""
@@ -195,18 +175,11 @@ class Navigation(Described, struct.PyTreeNode):
         - 271 entries: how near the lidar's beams end, from right behind to left behind, exp(-distance / 1 m) of
         - 2: direction to the goal in the body's frame; 1: distance to the goal over 15 m
         - 6: the last three actions, the latest first
-        - with a memory 72: how much of the way so far lies in each direction (`memory.around`)
         """
         offset = rotate(state.goal - state.pose[:2], -state.pose[2])
         distance = jnp.linalg.norm(offset)
         return jnp.concatenate(
-            [
-                jnp.exp(-self.ranges(state)),
-                retract(offset),
-                distance[None] / FARTHEST,
-                state.previous.ravel(),
-                *([state.tried] if self.memory else []),
-            ]
+            [jnp.exp(-self.ranges(state)), retract(offset), distance[None] / FARTHEST, state.previous.ravel()]
         )
 
     def heuristic(self, obs: Float[Array, " obs"]) -> Float[Array, "2"]:
@@ -219,8 +192,7 @@ class Navigation(Described, struct.PyTreeNode):
         - own, 1: the distance to the goal
         - turned, 370: nearness all round in steps of one degree, from behind by way of the right, the direction itself
           in the middle (of the two nearest beams, by how near they are); `UNSEEN` where the lidar does not look; goal
-          and previous actions along and across the direction; the direction in the body's frame; of an observation
-          with a memory 72 more, that as it looks from the direction
+          and previous actions along and across the direction; the direction in the body's frame
         """
         count = actions.shape[:-1]
         ring = jnp.concatenate([obs[:BEAMS], jnp.full(RING - BEAMS, UNSEEN)])  # from -135 degrees on, counterclockwise
@@ -232,11 +204,10 @@ class Navigation(Described, struct.PyTreeNode):
         slices = jax.vmap(lambda number: jax.lax.dynamic_slice(twice, (number,), (RING + 1,)))(numbers.ravel())
         slices = slices.reshape(*count, RING + 1)
         around = slices[..., :-1] + near * (slices[..., 1:] - slices[..., :-1])
-        vectors = jnp.concatenate([obs[BEAMS : BEAMS + 2], obs[BEAMS + 3 : PLAIN]]).reshape(-1, 2)
+        vectors = jnp.concatenate([obs[BEAMS : BEAMS + 2], obs[BEAMS + 3 :]]).reshape(-1, 2)
         shape = (*count, *vectors.shape)
         seen = inward(jnp.broadcast_to(vectors, shape), jnp.broadcast_to(actions[..., None, :], shape))
-        tried = [way_tried.turned(obs[PLAIN:], actions)] if obs.shape[0] > PLAIN else []
-        turned = jnp.concatenate([around, seen.reshape(*count, -1), actions, *tried], axis=-1)
+        turned = jnp.concatenate([around, seen.reshape(*count, -1), actions], axis=-1)
         return Features(obs[BEAMS + 2 : BEAMS + 3], turned)
 
     def aims(self, obs: Float[Array, " obs"]) -> Aims:
@@ -244,9 +215,8 @@ class Navigation(Described, struct.PyTreeNode):
 
         Any may be meant; open are those where the lidar looks and the body would not soon touch what it sees. One
         network weighs each from its own side: ways of three widths there and beside it, detours, goal and previous
-        actions, and, of an observation with a memory, how much of the way so far lies there. With `look_ahead` also
-        what is left to the goal after two legs of which the first goes there, what a detour they are, and the first
-        leg's length (`look_ahead.look_ahead`).
+        actions. With `look_ahead` also what is left to the goal after two legs of which the first goes there, what a
+        detour they are, and the first leg's length (`look_ahead.look_ahead`).
         """
         return aims_of(obs, self.look_ahead)
 
@@ -255,9 +225,8 @@ class Navigation(Described, struct.PyTreeNode):
     ) -> tuple[Float[Array, " obs"], Float[Array, "2"]]:
         """0: as it is; 1: left and right exchanged. Exact unless the sensor is turned."""
         sign = jnp.array([1.0, -1.0])
-        goal, distance, previous = obs[BEAMS : BEAMS + 2], obs[BEAMS + 2], obs[BEAMS + 3 : PLAIN].reshape(REMEMBERED, 2)
-        tried = [way_tried.mirrored(obs[PLAIN:])] if self.memory else []
-        parts = [obs[:BEAMS][::-1], goal * sign, distance[None], (previous * sign[None]).ravel(), *tried]
+        goal, distance, previous = obs[BEAMS : BEAMS + 2], obs[BEAMS + 2], obs[BEAMS + 3 :].reshape(REMEMBERED, 2)
+        parts = [obs[:BEAMS][::-1], goal * sign, distance[None], (previous * sign[None]).ravel()]
         image = jnp.concatenate(parts)
         return jnp.where(which == 1, image, obs), jnp.where(which == 1, vector * sign, vector)
 
@@ -291,8 +260,8 @@ class Navigation(Described, struct.PyTreeNode):
         return state.replace(passed=jnp.zeros(2)) if self.sides else state
 
     def at_rest(self, pose: Float[Array, "3"]) -> Float[Array, " place"]:
-        """The place of a body that stands still at a pose and remembers nothing."""
-        return jnp.concatenate([pose, jnp.zeros(way_tried.SEEN)]) if self.memory else pose
+        """The place of a body that stands still at a pose."""
+        return pose
 
 
 def _remembered(memory: Float[Array, " memory"]) -> tuple[jax.Array, ...]:

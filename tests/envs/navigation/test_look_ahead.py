@@ -26,7 +26,7 @@ from cuelearner_jax.runs.trained import PolicySource
 from cuelearner_jax.task import shape_of
 from cuelearner_jax.tasks import registry
 
-PLAINLY = 45  # features of a way without a memory and without look-ahead
+PLAINLY = 45  # features of a way without look-ahead
 POSE = jnp.zeros(3)
 RADIUS = RADII[2]
 
@@ -175,8 +175,6 @@ def test_the_option_widens_aims_and_leaves_observations_alone():
     plain, more = (spaces_of(shape_of(task, world(look_ahead=on))) for on in (False, True))
     assert (plain.aims, more.aims) == (PLAINLY, PLAINLY + 3)
     assert plain._replace(aims=None) == more._replace(aims=None)
-    remembering, both = (spaces_of(shape_of(task, world(memory=True, look_ahead=on))).aims or 0 for on in (False, True))
-    assert both == remembering + 3 > PLAINLY + 3
     assert not NavigationConfig().look_ahead
 
 

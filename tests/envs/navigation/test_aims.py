@@ -1,0 +1,50 @@
+"""The ways that aims are: laws of geometry."""
+
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from cuelearner_envs.navigation import World
+from cuelearner_envs.navigation.aims import ROOM, free_ways
+from cuelearner_envs.navigation.environment import Navigation
+from cuelearner_envs.navigation.lidar import BEAM_ANGLES
+from cuelearner_jax.actions import from_angle
+
+WORLD = World(
+    boxes=jnp.array([[6.1, 0, 0, 0.1, 4.2], [-6.1, 0, 0, 0.1, 4.2], [0, 4.1, 0, 6.2, 0.1], [0, -4.1, 0, 6.2, 0.1]]),
+    box_heights=jnp.full(4, 1.5),
+    circles=jnp.array([[2.0, 0.0, 0.5]]),
+    circle_heights=jnp.ones(1),
+    extent=jnp.array([12.0, 8.0]),
+    starts=jnp.array([[-4.0, 0.0]]),
+    goals=jnp.array([[4.0, 0.0]]),
+)
+ENV = Navigation(worlds=jax.tree.map(lambda leaf: leaf[None], WORLD))
+AHEAD = jnp.array([1.0, 0.0])
+
+
+def test_a_disc_is_stopped_where_it_touches():
+    """Before a wall at 3 m, and beside a post at 2 m that is 0.3 m off the line."""
+    beams = from_angle(jnp.asarray(BEAM_ANGLES))
+    wall = jnp.where(beams[:, 0] > 0.3, 3.0 / jnp.maximum(beams[:, 0], 0.3), 10.0)
+    obs = jnp.concatenate([jnp.exp(-jnp.minimum(wall, 10.0)), jnp.zeros(9)])
+    np.testing.assert_allclose(free_ways(obs, AHEAD[None])[:, 0], 3.0 - np.array([0.28, 0.42, 0.55]), atol=1e-3)
+    post = jnp.full(271, 10.0).at[135 + 9].set(2.0)  # 9 degrees to the left
+    obs = jnp.concatenate([jnp.exp(-post), jnp.zeros(9)])
+    along, across = 2.0 * math.cos(math.radians(9)), 2.0 * math.sin(math.radians(9))
+    stopped = [10.0, *(along - math.sqrt(radius**2 - across**2) for radius in (0.42, 0.55))]
+    np.testing.assert_allclose(free_ways(obs, AHEAD[None])[:, 0], stopped, atol=1e-3)
+
+
+def test_aims_are_ways_with_room_and_the_goal_comes_first():
+    obs = jax.jit(jax.vmap(lambda key: ENV.reset(key)[1]))(jax.random.split(jax.random.key(3), 12))
+    aims = jax.jit(jax.vmap(ENV.aims))(obs)
+    np.testing.assert_allclose(aims.actions[:, 0], obs[:, 271:273], atol=1e-6)
+    behind = np.abs(np.arctan2(aims.actions[..., 1], aims.actions[..., 0])) > math.radians(136)
+    possible = np.asarray(aims.open)
+    assert np.asarray(aims.possible).all()
+    assert not possible[behind].any()
+    free = jax.jit(jax.vmap(free_ways))(obs, aims.actions)
+    assert np.asarray(free[:, 0])[possible].min() > ROOM[0]
