@@ -19,6 +19,7 @@ from cuelearner_jax.storage.room import check_room
 from cuelearner_jax.types import EnvState, Reel, Sketch, Teacher
 
 COPIES = 3  # of a world while it is made
+PAPER = "paper"  # the preset that holds where none is given
 
 # (policy, environment, key, environments, steps, tell) -> values (environments,) by name, as `evaluate.Rolled.each`;
 # now and then it calls `tell` with how far it is, and of how much
@@ -159,6 +160,10 @@ class Task:
             config = self.scenario(scenario).applied(config)
         values = check_types(config, "task", **changes) if changes else {}
         return dataclasses.replace(config, **values)
+
+    def first_preset(self, default: str = PAPER) -> str:
+        """The name of the preset that holds where none is given: `default`, or the first."""
+        return default if default in self.presets else next(iter(self.presets))
 
     def environment(self, config: Any, split: str = "training") -> Environment:
         """The world of a configuration with the first body in it, for the episodes of a split.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import IO, Any, cast
 
@@ -14,7 +14,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from cuelearner_jax.signals import Interrupted, interruptible
 
-__all__ = ["Interrupted", "abandon", "console", "interruptible", "progress_bars"]
+__all__ = ["Interrupted", "abandon", "console", "interruptible", "progress_bars", "watched_by"]
 
 
 class _StandardError:
@@ -70,3 +70,13 @@ def progress_bars(shown: bool = True, counted: bool = True) -> Iterator[Progress
     )
     with Progress(*columns, console=console, disable=not shown) as bars:
         yield bars
+
+
+def watched_by(bars: Progress) -> Callable[[str], Callable[[int, int], None]]:
+    """Return a function that starts a bar for a piece of work and returns who is told how far that is."""
+
+    def watch(what: str) -> Callable[[int, int], None]:
+        bar = bars.add_task(what, total=None, note="")
+        return lambda done, count: bars.update(bar, completed=done, total=count)
+
+    return watch

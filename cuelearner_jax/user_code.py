@@ -18,6 +18,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, ParamSpec, TypeVar
 
+import jax
 import numpy as np
 
 from cuelearner_jax.errors import NotFinite, UserError, no_space, raised_by
@@ -126,6 +127,31 @@ def _is_users(frame: FrameType) -> bool:
     if file.startswith("<frozen") or not frame.f_globals.get("__name__", ""):
         return False
     return not any(Path(file).is_relative_to(place) for place in (*_OURS, *_LIBRARIES))
+
+
+def acts_in(name: str, policy: Any, env: Any) -> None:
+    """Raises UserError for a policy that cannot act in a world, without acting."""
+    _tried(name, "act", env, policy.act)
+
+
+def answers_in(name: str, teacher: Any, env: Any) -> None:
+    """Raises UserError for a teacher that cannot answer in a world, without asking."""
+    _tried(name, "answer", env, lambda key, states, obs: jax.vmap(teacher.best_action)(states, obs))
+
+
+def _tried(name: str, verb: str, env: Any, function: Any) -> None:
+    """Traces a function of a key, states (1, ...) and observations (1, obs) of a world."""
+    own = jax.random.key(0)
+    states, obs = jax.eval_shape(lambda: jax.vmap(env.reset)(own[None]))
+    try:
+        jax.eval_shape(function, own, states, obs)
+    except UserError:
+        raise
+    except Exception as error:
+        raise_in_one_line(error)
+        raise UserError(
+            f"{name} cannot {verb} in this world, whose observations have {obs.shape[-1]} entries: give one made for it"
+        ) from error
 
 
 def check_actions(actions: Any, whose: str) -> None:

@@ -30,6 +30,7 @@ ROWS = [
     ["adaptation"],
     ["teachers"],
     ["runs"],
+    ["studies"],
     ["report"],
     ["bench"],
     ["labelling"],

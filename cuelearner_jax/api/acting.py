@@ -15,6 +15,7 @@ from cuelearner_jax import user_code
 from cuelearner_jax.actions import DIRECTIONS
 from cuelearner_jax.api import arguments
 from cuelearner_jax.api.worlds import World, a_world
+from cuelearner_jax.config import RunConfig
 from cuelearner_jax.environment import Quantity
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.policies import Policy, acted, named
@@ -40,6 +41,7 @@ class CallablePolicy:
     policy: Policy
     observation: tuple[Quantity, ...] = ()  # what it expects to see; empty: not known
     asks: bool = False  # does it ask a teacher, who looks at the true state?
+    trained: RunConfig | None = None  # with which configuration; None: no folder says so
 
     def __post_init__(self) -> None:
         """Raises UserError for a policy that is none, or a description of observations that is none."""
@@ -47,6 +49,8 @@ class CallablePolicy:
         if not all(isinstance(part, Quantity) for part in arguments.several("observation", self.observation, "slices")):
             raise arguments.refused("observation", self.observation, "slices, as a world's observation has them")
         arguments.flag("asks", self.asks)
+        if self.trained is not None:
+            arguments.instance("trained", self.trained, RunConfig, "a RunConfig")
 
     @user_code.told
     def __call__(self, obs: Any, key: PRNGKeyArray | None = None) -> np.ndarray:
@@ -95,7 +99,7 @@ def as_policy_in(given: Any, env: Any) -> Policy:
     own = sum(quantity.size for quantity in getattr(env, "observation", ()))
     if seen and own and seen != own:
         raise UserError(f"the policy's observations have {seen} entries, this world's {own}: keep its structure")
-    arguments.acts_in("policy", policy, env)
+    user_code.acts_in("policy", policy, env)
     return policy
 
 
@@ -153,4 +157,4 @@ def load_policy(
     source.check(name, changed)
     env = known.environment(changed)
     found = trained.one_policy(source, env, changed, name, guidance, labels, seed, bound_deg)
-    return CallablePolicy(found, shape_of(known, changed).observation, trained.POLICIES[name].taught)
+    return CallablePolicy(found, shape_of(known, changed).observation, trained.POLICIES[name].taught, source.config)

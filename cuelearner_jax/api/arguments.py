@@ -18,7 +18,6 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Float, PRNGKeyArray
 
-from cuelearner_jax import user_code
 from cuelearner_jax.actions import Actions
 from cuelearner_jax.config import LARGEST_FLOAT, plain, settled
 from cuelearner_jax.errors import UserError, closest, shown
@@ -168,31 +167,6 @@ def action(name: str, value: Any, space: Actions) -> Any:
     if found.shape != (space.size,) or not found.any():
         raise refused(name, value, f"an action of shape ({space.size},), for instance [1.0, 0.0]")
     return found
-
-
-def acts_in(name: str, policy: Any, env: Any) -> None:
-    """Raises UserError for a policy that cannot act in a world, without acting."""
-    _tried(name, "act", env, policy.act)
-
-
-def answers_in(name: str, teacher: Any, env: Any) -> None:
-    """Raises UserError for a teacher that cannot answer in a world, without asking."""
-    _tried(name, "answer", env, lambda key, states, obs: jax.vmap(teacher.best_action)(states, obs))
-
-
-def _tried(name: str, verb: str, env: Any, function: Any) -> None:
-    """Traces a function of a key, states (1, ...) and observations (1, obs) of a world."""
-    own = jax.random.key(0)
-    states, obs = jax.eval_shape(lambda: jax.vmap(env.reset)(own[None]))
-    try:
-        jax.eval_shape(function, own, states, obs)
-    except UserError:
-        raise
-    except Exception as error:
-        user_code.raise_in_one_line(error)
-        raise UserError(
-            f"{name} cannot {verb} in this world, whose observations have {obs.shape[-1]} entries: give one made for it"
-        ) from error
 
 
 def policy(name: str, value: Any) -> Policy:

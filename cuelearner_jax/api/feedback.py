@@ -143,7 +143,7 @@ def ask(
     check_teacher(arguments.teacher("teacher", teacher), scalars)
     adapting.check_angles([bound_deg], scalars)
     env, guidance = world.env, _relative(sizes, spaces_of(world.env))
-    arguments.answers_in("teacher", teacher, env)
+    user_code.answers_in("teacher", teacher, env)
     lanes, base = program.product(1, (seed,), (labels,), (bound_deg,)), Common(as_policy_in(policy, env))
     block = program.begin(guidance, sizes, env, lanes)
     for _ in range(program.rounds(lanes, sizes)):

@@ -101,7 +101,7 @@ def train(
     """
     a_world("world", world)
     if teacher is not None:
-        arguments.answers_in("teacher", arguments.teacher("teacher", teacher), world.env)
+        user_code.answers_in("teacher", arguments.teacher("teacher", teacher), world.env)
     guidance = [arguments.text("guidance", kind) for kind in arguments.several("guidance", guidance, "kinds")]
     budgets = tuple(arguments.budget("labels", one) for one in arguments.several("labels", labels, "label budgets"))
     arguments.text("split", split, SPLITS)

@@ -28,12 +28,15 @@ class World:
 
     task: Task
     config: Any
+    scenario: str | None = None  # the changed world of the task's that it is; `adapt` follows its suggestions
 
     def __post_init__(self) -> None:
         """Raises UserError for a configuration that is none of the task's."""
         arguments.instance("task", self.task, Task, "a task, as tasks.registry finds it")
         arguments.instance("config", self.config, self.task.config, f"a {self.task.config.__name__}, or use cl.make")
         object.__setattr__(self, "config", settled(self.config, "task"))
+        if self.scenario is not None:
+            self.task.scenario(arguments.text("scenario", self.scenario))
 
     @cached_property
     def env(self) -> Environment:
@@ -95,7 +98,7 @@ def make(name: str | Task, *, scenario: str | None = None, robot: str | None = N
     task = task.on(None if robot is None else arguments.text("robot", robot))
     if scenario is not None:
         arguments.text("scenario", scenario)
-    return World(task, task.configured(scenario, **changes))
+    return World(task, task.configured(scenario, **changes), scenario)
 
 
 def a_world(name: str, value: Any) -> World:

@@ -12,14 +12,13 @@ from rich.table import Table
 from cuelearner_jax.cli.parsing import about, out, parse, source_of, world_of
 from cuelearner_jax.cli.shared_options import TaskT
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.evaluate import Tell
 from cuelearner_jax.runs import measured
 from cuelearner_jax.runs.measured import Measured
 from cuelearner_jax.runs.trained import POLICIES, PolicySource
 from cuelearner_jax.storage import policy_folders
 from cuelearner_jax.task import Task
 from cuelearner_jax.tasks import registry
-from cuelearner_jax.terminal import console, progress_bars
+from cuelearner_jax.terminal import console, progress_bars, watched_by
 
 if TYPE_CHECKING:
     from cuelearner_jax.report.measurements import Difference
@@ -76,11 +75,7 @@ def run(arguments: list[str]) -> None:
         raise UserError(f"{asked.out} exists: give another --out")
     other = _other(source, asked) if asked.compare is not None else None
     with progress_bars(shown=console.is_terminal) as bars:
-
-        def watch(kind: str) -> Tell:
-            bar = bars.add_task(kind, total=None, note="")
-            return lambda done, count: bars.update(bar, completed=done, total=count)
-
+        watch = watched_by(bars)
         found = measured.evaluate(source, asked.task, asked.policy, asked.guidance, envs, steps, engine, watch)
         others = measured.evaluate(*other, (), envs, steps, engine, watch) if other else []
     from cuelearner_jax.report import measurements  # loads SciPy

@@ -23,11 +23,11 @@ from cuelearner_jax.config import GuideScalars, GuideSizes, RunConfig
 from cuelearner_jax.environment import offers
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides import registry as guidances
+from cuelearner_jax.guides.relative import KIND
 from cuelearner_jax.labelling import controls
 from cuelearner_jax.labelling.plan import Base, Plan
 from cuelearner_jax.plugins import REFERENCE
 from cuelearner_jax.policies import NearAims, uniform_in
-from cuelearner_jax.runs import adaptation
 from cuelearner_jax.runs.grid import LARGEST_SEED
 from cuelearner_jax.runs.trained import PolicySource
 from cuelearner_jax.storage import label_files
@@ -132,7 +132,7 @@ def run(arguments: list[str]) -> None:
         _part(GuideSizes, sizes),
         _part(GuideScalars, scalars),
         Path("labels") / task.name,
-        guidance=asking_kind(preset_kinds(task, preset)) if named is None else adaptation.DEFAULT_KIND,
+        guidance=asking_kind(preset_kinds(task, preset)) if named is None else KIND.name,
         bound_deg=bound,
         labels=max(preset.labels) if named is None else Label.labels,
         questions=NEAR_AIMS if named is None and task.near_aims else UNIFORM,

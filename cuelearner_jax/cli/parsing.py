@@ -23,11 +23,9 @@ from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.policies import policy_of
 from cuelearner_jax.runs.trained import POLICIES, PolicySource
 from cuelearner_jax.storage import policy_folders, whole
-from cuelearner_jax.task import Preset, Task
+from cuelearner_jax.task import PAPER, Preset, Task
 from cuelearner_jax.tasks import registry
 from cuelearner_jax.terminal import PLAIN
-
-PAPER = "paper"  # the preset that holds where none is given
 
 
 class _Output(Console):
@@ -151,18 +149,10 @@ def preset_of(task: Task, arguments: list[str], default: str = PAPER) -> tuple[s
     if not task.presets:
         raise UserError(f"{task.name} has no preset to start from: give its Task one")
     name, rest = taken(arguments, "--preset", ", ".join(task.presets))
-    name = _default_preset(task, default) if name is None else name
+    name = task.first_preset(default) if name is None else name
     if name not in task.presets:
         raise UserError(f"unknown preset {name!r}{closest(name, task.presets)}")
     return name, task.presets[name], rest
-
-
-def _default_preset(task: Task, default: str = PAPER) -> str:
-    """The same for all commands but one, so that what is evaluated without a run is the world that is trained in.
-
-    A person who labels waits for nothing longer than minutes (`cli.label`).
-    """
-    return default if default in task.presets else next(iter(task.presets))
 
 
 def source_of(arguments: list[str], command: str, kind: type) -> tuple[PolicySource, list[str]]:
@@ -266,7 +256,7 @@ def _choices(task: Task, preset: str = PAPER) -> str:
     scenarios = {name: f"{one.about} ({_as_options(one.changes)})" for name, one in task.scenarios.items()}
     bodies = {body.name: body.about for body in task.bodies} if len(task.bodies) > 1 else {}
     presets = {name: f"{one.about}{f' ({one.takes})' if one.takes else ''}" for name, one in task.presets.items()}
-    default = f"; {_default_preset(task, preset)} where none is given" if presets else ""
+    default = f"; {task.first_preset(preset)} where none is given" if presets else ""
     groups = {
         f"presets (--preset{default})": presets,
         "changed worlds (--scenario of adapt, evaluate and render)": scenarios,

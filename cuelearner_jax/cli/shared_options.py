@@ -9,9 +9,8 @@ from typing import Annotated, Generic, TypeVar
 import tyro
 
 from cuelearner_jax.config import RunConfig
-from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides import registry as guidances
-from cuelearner_jax.runs.grid import LARGEST_SEED, Grid
+from cuelearner_jax.runs.grid import Grid
 from cuelearner_jax.runs.order import Order
 from cuelearner_jax.runs.shards import Shard
 from cuelearner_jax.task import Preset, Task, shape_of
@@ -68,14 +67,3 @@ def asking_kind(kinds: tuple[str, ...]) -> str:
     """The first of the kinds that asks a teacher, or else the first."""
     asking = [kind for kind in kinds if guidances.resolve(kind).asks]
     return (asking or list(kinds))[0]
-
-
-def seeds_of(first: int, count: int) -> tuple[int, ...]:
-    """So many seeds. Raises UserError, before any is made, where there are none or more than there can be."""
-    if count < 1:
-        raise UserError(f"--seeds is {count}: give --seeds of at least 1")
-    if first < 0 or first + count > LARGEST_SEED:
-        raise UserError(
-            f"--seeds {count} from --first-seed {first} on: seeds are numbers from 0 to {LARGEST_SEED - 1}, give others"
-        )
-    return tuple(range(first, first + count))

@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Generic, Literal
 
 from cuelearner_jax.cli.parsing import about, out, parse, preset_of, task_of
-from cuelearner_jax.cli.shared_options import TaskT, Training, preset_kinds, seeds_of
+from cuelearner_jax.cli.shared_options import TaskT, Training, preset_kinds
 from cuelearner_jax.runs import submission, sweep
 from cuelearner_jax.runs.cluster import Job
-from cuelearner_jax.runs.grid import Grid
+from cuelearner_jax.runs.grid import Grid, seeds_of
 from cuelearner_jax.runs.order import Plan, planned
 from cuelearner_jax.runs.shards import Shard
 

@@ -43,6 +43,17 @@ class Grid:
         return np.array([p[0] for p in pairs], np.int32), np.array([p[1] for p in pairs], np.int32)
 
 
+def seeds_of(first: int, count: int) -> tuple[int, ...]:
+    """So many seeds. Raises UserError, before any is made, where there are none or more than there can be."""
+    if count < 1:
+        raise UserError(f"--seeds is {count}: give --seeds of at least 1")
+    if first < 0 or first + count > LARGEST_SEED:
+        raise UserError(
+            f"--seeds {count} from --first-seed {first} on: seeds are numbers from 0 to {LARGEST_SEED - 1}, give others"
+        )
+    return tuple(range(first, first + count))
+
+
 def check_grid(grid: Grid) -> None:
     """Raises UserError for a grid that makes no sense."""
     kinds = [guidances.find(kind) for kind in grid.guidance]

@@ -12,7 +12,7 @@ import numpy as np
 
 from cuelearner_jax import config as configuration
 from cuelearner_jax.asking import label_slots
-from cuelearner_jax.config import RunConfig
+from cuelearner_jax.config import GuideSizes, RunConfig, Scalars
 from cuelearner_jax.environment import spaces_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.feedback import given
@@ -82,7 +82,9 @@ def planned(order: Order) -> Plan:
     order.task.check_evaluations(order.config)
     for kind in order.grid.guidance:
         guidances.make(kind, order.config.sizes, env)
-    labels = read_labels(order) if order.labels_from else None
+    config, labels = order.config, None
+    if order.labels_from:
+        labels = read_labels(order.labels_from, order.task, config.task, config.sizes, config.scalars, order.grid)
     described = describe(order.task, order.config, order.grid, order.split, order.labels_from, piece)
     if order.shard:
         order.shard.check_sweep(sweep, described, defaults(order.task))
@@ -109,14 +111,14 @@ def check_world(path: Path, told: dict[str, Any], task: Task, world: Any) -> Non
         )
 
 
-def read_labels(order: Order) -> label_files.LabelFile:
-    """A label file that fits the task and the grid. Raises UserError if it does not."""
-    path, config, grid = order.labels_from, order.config, order.grid
-    assert path is not None
+def read_labels(
+    path: Path, task: Task, world: Any, sizes: GuideSizes, scalars: Scalars, grid: Grid
+) -> label_files.LabelFile:
+    """A label file that fits a task's world (a configuration) and a grid. Raises UserError if it does not."""
     file = label_files.read(path)
-    env = shape_of(order.task, config.task)
-    check_world(path, file.task, order.task, config.task)
-    made = [guidances.make(kind, config.sizes, env) for kind in grid.guidance]
+    env = shape_of(task, world)
+    check_world(path, file.task, task, world)
+    made = [guidances.make(kind, sizes, env) for kind in grid.guidance]
     asking = [guidance for guidance in made if guidance.form is not None]
     if not asking:
         fitting = [kind.name for kind in guidances.known() if kind.form and kind.form.name == file.answers]
@@ -129,12 +131,12 @@ def read_labels(order: Order) -> label_files.LabelFile:
                 "give fitting labels"
             )
         given.check_file(file, spaces_of(env), guidance.form, str(path))
-    if file.eps_deg is not None and not math.isclose(file.eps_deg, config.scalars.eps_deg, rel_tol=1e-6):
+    if file.eps_deg is not None and not math.isclose(file.eps_deg, scalars.eps_deg, rel_tol=1e-6):
         raise UserError(
-            f"{path} holds labels of {file.eps_deg:g} degrees, the run's are of {config.scalars.eps_deg:g}: "
+            f"{path} holds labels of {file.eps_deg:g} degrees, the run's are of {scalars.eps_deg:g}: "
             f"give --scalars.eps-deg {file.eps_deg:g}, or other labels"
         )
-    if file.labels.eps_deg is not None and not config.sizes.eps_falls:
+    if file.labels.eps_deg is not None and not sizes.eps_falls:
         last = float(np.min(file.labels.eps_deg))
         raise UserError(
             f"{path} holds labels of strengths down to {last:g} degrees: give --sizes.eps-falls --scalars.eps-last-deg "
@@ -142,5 +144,5 @@ def read_labels(order: Order) -> label_files.LabelFile:
         )
     for guidance in asking:
         seeds, budgets = grid.lanes(guidance)
-        label_files.for_lanes(file, seeds, budgets, label_slots(int(budgets.max()), config.sizes))
+        label_files.for_lanes(file, seeds, budgets, label_slots(int(budgets.max()), sizes))
     return file

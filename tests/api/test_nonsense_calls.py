@@ -18,7 +18,7 @@ SEEN = np.float32([[1, 0], [0, 1], [-1, 0], [0, -1]])
 LABELS = cl.Labels(SEEN, SEEN, np.float32([1, 0, -1, 1]))
 KEY = jax.random.key(0)
 POLICY = cl.CallablePolicy(Uniform(), WORLD.env.observation)
-ADAPTED = cl.AdaptedPolicy(Uniform(), WORLD.env.observation, found=None, world=WORLD, named="chance")
+ADAPTED = cl.AdaptedPolicy(Uniform(), WORLD.env.observation, outcome=None, named="chance")
 MODEL = cl.FeedbackModel(None, None, Scalars(), LABELS, GuideSizes())
 RUN = cl.Run(WORLD, probes.CONFIG, None, {})
 NAN, INF, HUGE, ESCAPE = float("nan"), float("inf"), 10**5000, "\x1b[31mred\nline"
@@ -149,13 +149,13 @@ TABLE = {
         "labels": (*NO_LABELS, 0, -1, 0.5, True, NAN, 2**40, HUGE),
         "bound_deg": NO_ANGLES,
         "eps_deg": NO_ANGLES,
-        "guidance": (*NO_NAMES, None, "telepathy", "none"),
+        "guidance": (*NO_NAMES, "telepathy", "none"),
         "sizes": NO_SIZES,
         "scalars": NO_SCALARS,
         "seed": (*NO_WHOLE, None),
-        "judge_by": (*NO_NAMES, None, "luck"),
+        "judge_by": (*NO_NAMES, "luck"),
         "judge_episodes": (*NO_WHOLE, None, 0, 10**9),
-        "judge_bounds": (3, None, "half", [0], [2], [NAN], [None], ["x"], [True], 0.5, [[0.5]]),
+        "judge_bounds": (3, "half", [0], [2], [NAN], [None], ["x"], [True], 0.5, [[0.5]]),
     },
     asked: {
         "policy": NO_POLICIES,

@@ -18,10 +18,11 @@ from small_runs import listing
 import cuelearner_jax as cl
 from cuelearner_jax.adaptation import stored
 from cuelearner_jax.cli import main
+from cuelearner_jax.config import GuideSizes
 from cuelearner_jax.policies import Guided
-from cuelearner_jax.runs.adaptation import told
 from cuelearner_jax.storage import guides, label_files, policy_folders
 from cuelearner_jax.storage.checkpoint import checkpoints
+from cuelearner_jax.studies.adapt import sentences
 from cuelearner_jax.tasks import registry
 
 OWN = '''
@@ -48,6 +49,11 @@ TASK = Task(
         "told": Scenario(
             "how is said too", {"offset_deg": 20.0}, guidance="residual", judge_by="labels",
             sizes={"labels_per_round": 40, "frame": "raw"}, scalars={"k_max": 7},
+        ),
+        "ruled": Scenario(
+            "all is said", {"offset_deg": 20.0}, bound_deg=28.0, eps_deg=4.0, guidance="demonstration", judge_by="hit",
+            judge_bounds=(0.5,), scalars={"k_max": 7},
+            sizes={"labels_per_round": 20, "feedback_layers": (16,), "fit_steps": 40, "frame": "action"},
         ),
         "tried": Scenario("bounds are tried", {"offset_deg": 20.0}, judge_bounds=(0.5, 0.25)),
     },
@@ -138,6 +144,39 @@ def test_a_function_is_adapted_and_its_folder_evaluated(adapted, tmp_path):
     assert max(row["guide_reward"] for row in curve if row["bound_deg"] == 45.0) == 1.0
 
 
+RULED = GuideSizes(labels_per_round=20, feedback_layers=(16,), fit_steps=40, fit_batch_size=64, frame="action")
+
+
+@pytest.mark.parametrize(
+    ("world", "options", "settings"),
+    [
+        ({"scenario": "ruled"}, [], {}),
+        (
+            {"offset_deg": 20.0},
+            [*("--guidance", "demonstration", "--sizes.labels-per-round", "20", "--sizes.feedback-layers", "16"),
+             *("--sizes.fit-steps", "40", "--sizes.frame", "action", "--judge-by", "hit", "--first-seed", "7")],
+            {"guidance": "demonstration", "judge_by": "hit", "seed": 7, "sizes": RULED},
+        ),
+    ],
+    ids=["a scenario's rules", "a plain world"],
+)  # fmt: skip
+def test_python_adapts_as_the_command_does(home, tmp_path, world, options, settings):
+    name = "scenario" if "scenario" in world else "task.offset-deg"
+    command = ["adapt", "own_turned:straight", *TASK, f"--{name}", str(*world.values()), *options, "--labels", "20"]
+    assert main([*command, "--judge-episodes", "20", "--out", str(tmp_path / "command")]) == 0
+    made, code = cl.make("own_turned:TASK", **world), importlib.import_module("own_turned").straight
+    better = cl.adapt(code, made, cl.teacher_of(made), labels=20, judge_episodes=20, **settings)
+    better.save(tmp_path / "python")
+    told = [json.loads((tmp_path / name / "policy.json").read_text()) for name in ("command", "python")]
+    for values in told:  # what was typed, and the digest of all that is told
+        del values["command"], values["digest"]
+    assert told[0] == told[1]  # with the digest of the arrays
+    assert told[0]["policy"]["guidance"] == "demonstration"
+    assert (told[0]["judged"]["by"], told[0]["policy"]["scalars"]["k_max"]) == ("hit", 7 if not options else 50)
+    files = [tmp_path / name / "labels.parquet" for name in ("command", "python")]
+    chex.assert_trees_all_equal(*(label_files.read(file).labels for file in files))
+
+
 @pytest.mark.long
 def test_labels_lie_beside_and_lead_to_the_same_policy(adapted, tmp_path):
     file = adapted / "labels-45deg.parquet"
@@ -201,7 +240,7 @@ def test_a_scenario_says_how_unless_another_kind_is_asked_for(home, capsys):
     assert defaults_of(capsys, "--scenario", "told") == ["residual", "labels", "40", "7"]
     kind, by, a_round, passes = defaults_of(capsys)
     assert (kind, by, a_round, passes) == ("relative", "reward", "10", "50")
-    assert defaults_of(capsys, "--scenario", "told", "--guidance", "dcoach") == [kind, "labels", a_round, passes]
+    assert defaults_of(capsys, "--scenario", "told", "--guidance", "dcoach") == ["dcoach", "labels", a_round, passes]
 
 
 def test_a_scenario_says_which_bounds_are_tried_unless_labels_decide(home, capsys):
@@ -220,7 +259,7 @@ def test_what_is_adapted_saved_and_loaded_acts_bitwise_alike(home, tmp_path):
     assert better.used
     assert better.judged == ("reward", 0.0, 1.0)
     assert (better.difference, better.rewarded_steps) == ((1.0, 1.0, 1.0), 2 * 20 * 100)
-    assert "difference +1 [+1, +1]; 4,000 rewarded steps)" in told(better.found)[0]
+    assert "difference +1 [+1, +1]; 4,000 rewarded steps)" in sentences(better.outcome.found)[0]
     assert len(better.labels.obs) == 80
     better.save(tmp_path / "better")
     with pytest.raises(cl.UserError, match="is not empty: give --overwrite"):
@@ -278,7 +317,7 @@ def test_a_bound_is_learned_and_kept(home, tmp_path):
     near = cl.adapt(code, world, judge_bounds=(0.02,), **settings)
     assert near.used
     assert near.judged == ("reward", 1.0, 1.0)
-    (line,) = told(near.found)
+    (line,) = sentences(near.outcome.found)
     zero = "difference +0 [+0, +0], which includes 0; 6,000 rewarded steps"
     assert line.endswith(f"1 before, 1 after ({zero}), used within 3.6 degrees")
     moved = np.degrees(np.arccos(np.clip((near(SEEN) * SEEN).sum(-1), -1, 1)))
@@ -300,10 +339,10 @@ def test_what_cannot_be_is_refused(adapted, refused, tmp_path):
     refused([*plain, "--guidance", "none"], "asks nothing that could be learned from", tmp_path)
     refused([*plain, "--guidance", "relativ"], "did you mean 'relative'", tmp_path)
     refused([*plain, "--judge-by", "hits"], "no metric of turned, did you mean 'hit'", tmp_path)
-    refused([*plain, "--judge-episodes", "0"], "--judge-episodes is 0", tmp_path)
-    refused([*plain, "--judge-every", "7"], "--judge-every is 7: give a multiple", tmp_path)
-    refused([*plain, "--judge-bounds", "0.5", "1.5"], "--judge-bounds is 0.5 1.5: give shares", tmp_path)
-    refused([*plain, "--judge-bounds", "0.5", "--judge-by", "labels"], "--judge-bounds needs episodes", tmp_path)
+    refused([*plain, "--judge-episodes", "0"], "judge_episodes is 0", tmp_path)
+    refused([*plain, "--judge-every", "7"], "judge_every is 7: give a multiple", tmp_path)
+    refused([*plain, "--judge-bounds", "0.5", "1.5"], "judge_bounds is 0.5 1.5: give shares", tmp_path)
+    refused([*plain, "--judge-bounds", "0.5", "--judge-by", "labels"], "judge_bounds needs episodes", tmp_path)
     refused([*plain, "--base.seeds", "3"], "own_turned:straight is none: leave it out", tmp_path)
     refused([*plain, "--labels-from", tmp_path / "no.parquet"], "no label file at", tmp_path)
     refused(["adapt", "own_turned:narrow", *TASK, *new], "returned actions of shape (1, 1)", tmp_path)

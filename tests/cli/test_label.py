@@ -221,10 +221,11 @@ def test_runs_take_a_pages_folder(labelled, tmp_path):
     from page_task import TASK
 
     from cuelearner_jax.runs.grid import Grid
-    from cuelearner_jax.runs.order import Order, read_labels
+    from cuelearner_jax.runs.order import read_labels
 
-    order = Order(TASK, probes.CONFIG, Grid(("relative",), (5,), (12,)), tmp_path, labels_from=labelled / "one")
-    assert len(read_labels(order).seeds) == 12
+    config, grid = probes.CONFIG, Grid(("relative",), (5,), (12,))
+    file = read_labels(labelled / "one", TASK, config.task, config.sizes, config.scalars, grid)
+    assert len(file.seeds) == 12
 
 
 def test_a_page_that_is_kept_is_not_opened_twice(labelled, refused):

@@ -38,7 +38,7 @@ GRID = Grid(("none", "relative"), seeds=(4, 9), labels=(10, 15))
 
 
 def read_for(path, grid=GRID, task=None, config=probes.CONFIG):
-    return read_labels(Order(task or probes.make_task(), config, grid, path.parent / "run", labels_from=path))
+    return read_labels(path, task or probes.make_task(), config.task, config.sizes, config.scalars, grid)
 
 
 def test_labels_that_fit_a_run(path):

@@ -1,0 +1,337 @@
+"""Adaptation as one request, which the command line and Python fill alike; the rules of scenarios are applied here.
+
+request = suggested(source, scenario="rooms")    # what holds where nothing else is given
+found = run(Subject(source), replace(request, labels=(250,)))
+with policy_folders.place_of(out) as place:
+    found.write(place)
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Generic, NamedTuple, TypeVar
+
+import numpy as np
+
+from cuelearner_jax import user_code
+from cuelearner_jax.adaptation import adapting, judging, program, stored
+from cuelearner_jax.adaptation.adapting import Adaptation, Adapted, Judging
+from cuelearner_jax.config import GuideSizes, RunConfig, Scalars, check_guide
+from cuelearner_jax.environment import Environment, spaces_of
+from cuelearner_jax.errors import UserError, closest
+from cuelearner_jax.evaluate import Tell, untold
+from cuelearner_jax.feedback import given
+from cuelearner_jax.feedback.answers import check_teacher
+from cuelearner_jax.guides import registry as guidances
+from cuelearner_jax.guides.bundle import Guidance
+from cuelearner_jax.guides.relative import KIND
+from cuelearner_jax.policies import Common
+from cuelearner_jax.runs import adapted, trained
+from cuelearner_jax.runs.grid import Grid, check_grid, seeds_of
+from cuelearner_jax.runs.order import read_labels
+from cuelearner_jax.runs.trained import PolicySource
+from cuelearner_jax.storage import label_files
+from cuelearner_jax.storage.whole import Place
+from cuelearner_jax.task import Scenario, Task
+from cuelearner_jax.terminal import console
+from cuelearner_jax.types import Label, Teacher
+
+TaskT = TypeVar("TaskT")
+
+MOST_ENVS = 100_000  # that memory has room for
+AS_IT_IS = Scenario("the world as it is", {})
+
+
+@dataclass(frozen=True)
+class Base:
+    """Which lanes of the folder are adapted."""
+
+    policy: str = "agent"
+    """Which of its policies, see above."""
+    guidance: str | None = None
+    """Kind of guidance of the lanes (default: the run's last)."""
+    labels: int | None = None
+    """Their label budget (default: the largest)."""
+    bound_deg: float | None = None
+    """Of a policy folder: their bound (default: the largest) [deg]."""
+    seeds: tuple[int, ...] = ()
+    """Their seeds; several are adapted side by side, each with its own (default: the first lane)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Request(Generic[TaskT]):
+    """What adaptation is asked for."""
+
+    task: TaskT
+    labels: tuple[int, ...] = (500,)
+    """Label budgets (with --labels-from by default all that the file has)."""
+    bound_deg: tuple[float, ...] = ()
+    """How far corrections may lead from the policy's own actions, one or more bounds [deg] (default: the scenario's, as
+    far as the labels of a file reach, or else 45)."""
+    seeds: int = 1
+    """Number of seeds; not with several base policies, of which each is adapted with its own."""
+    first_seed: int = 0
+    """The first seed; the others follow."""
+    guidance: str = KIND.name
+    """Kind of guidance: what is asked, and what a model makes of the answers, see above."""
+    scenario: str | None = None
+    """The changed world of this name, see above; options of the task (--task.…) come on top of it."""
+    robot: str | None = None
+    """Another robot, see above (default: the task's own); with a folder, as anymal:FOLDER, one with your own walking
+    policy."""
+    labels_from: Path | None = None
+    """Use the labels of this file instead of asking the teacher."""
+    judge_by: str = "reward"
+    """A model that makes the policy worse than it was is not used: by this metric on tuning episodes of the changed
+    world, or by its prediction of held-out labels (labels)."""
+    judge_episodes: int = 100
+    """Tuning episodes that policies are judged on; where the task counts steps, each is 100 of them."""
+    judge_every: int = 0
+    """Also measure the policy after every so many labels on the way, kept in guide.parquet (0: at the end alone)."""
+    judge_bounds: tuple[float, ...] = ()
+    """Also try the model within these shares of its bound (0.5 0.25), and use it within what is worth most on the
+    tuning episodes."""
+    sizes: GuideSizes = adapting.SIZES
+    scalars: Scalars = field(default_factory=Scalars)
+
+
+class Subject(NamedTuple):
+    """What is adapted, and who answers."""
+
+    source: PolicySource  # with the task that acts, and the configuration that policies were trained with
+    base: Base = Base()  # which of the source's policies
+    policy: Any = None  # in place of one of the source's; None: none
+    named: str | None = None  # package.module:NAME of the code, that policy or what the source's folder holds
+    teacher: Teacher | None = None  # None: the task's own
+    rows: Label | None = None  # labels (labels, ...) in place of questions; None: none
+
+
+class Outcome(NamedTuple):
+    """What an adaptation has led to, and from what."""
+
+    found: Adapted
+    subject: Subject
+    request: Request
+    origin: dict[str, Any]  # what was adapted, in plain values
+
+    def write(self, place: Place) -> None:
+        """Write the policy folder. Raises UserError if the policy cannot be kept."""
+        path = self.request.labels_from
+        used = {"labels_from": f"{path.name} {label_files.digest(path)}" if path else None, "robot": self.request.robot}
+        adapted.write(place, self.found, self.subject.source.task, self.request.task, self.origin, used)
+
+
+def start_of(task: Task) -> RunConfig:
+    """The configuration that a policy is taken to be trained with where no folder says so."""
+    return task.presets[task.first_preset()].config if task.presets else RunConfig(task.config())
+
+
+def suggested(
+    source: PolicySource,
+    scenario: str | None = None,
+    guidance: str | None = None,
+    judge_by: str | None = None,
+    labels_from: Path | None = None,
+    eps_deg: float | None = None,
+    sizes: GuideSizes | None = None,
+    scalars: Scalars | None = None,
+) -> Request:
+    """The request that holds where nothing else is given: the only place where the rules of scenarios are applied.
+
+    Args:
+        source: what is adapted; a model takes the frame and the scalars that the source's policies were trained with.
+        scenario: the changed world. Its suggestions hold for the kind of guidance that it suggests, and its shares of a
+            bound for what is judged on episodes.
+        guidance, judge_by: where these are chosen; None: as the scenario suggests, or as for any world.
+        labels_from: a label file, whose budget and strength of answers hold.
+        eps_deg: strength of an answer [deg]; None: the file's, that of given scalars, the scenario's, or the source's.
+        sizes, scalars: where all of them are given.
+
+    Raises:
+        UserError: there is no such scenario or label file.
+    """
+    rules = source.task.scenario(scenario) if scenario else AS_IT_IS
+    if guidance not in (None, rules.guidance):
+        rules = replace(rules, guidance=None, sizes={}, scalars={})  # which are for the suggested kind
+    if judge_by == judging.LABELS:
+        rules = replace(rules, judge_bounds=())  # which are tried on episodes
+    strengths, labels = None, Request.labels
+    if labels_from is not None:
+        file = label_files.read(labels_from)
+        eps_deg, strengths = file.eps_deg if eps_deg is None else eps_deg, file.labels.eps_deg
+        labels = (int(np.unique(file.seeds, return_counts=True)[1].min()),)
+    sizes = sizes or replace(adapting.SIZES, **{"frame": source.config.sizes.frame, **rules.sizes})
+    if scalars is None:
+        of_run = replace(source.config.scalars, eps_last_deg=Scalars.eps_last_deg)  # of its own labels
+        eps_deg = rules.eps_deg if eps_deg is None else eps_deg
+        scalars = replace(adapting.settling(of_run, eps_deg), **rules.scalars)
+    else:
+        scalars = adapting.settling(scalars, eps_deg)
+    sizes, scalars = adapting.falling(sizes, scalars, strengths)
+    return Request(
+        task=rules.applied(source.config.task),
+        labels=labels,
+        bound_deg=() if rules.bound_deg is None else (rules.bound_deg,),
+        guidance=guidance or rules.guidance or Request.guidance,
+        scenario=scenario,
+        labels_from=labels_from,
+        judge_by=judge_by or rules.judge_by or Request.judge_by,
+        judge_bounds=rules.judge_bounds,
+        sizes=sizes,
+        scalars=scalars,
+    )
+
+
+def run(
+    subject: Subject,
+    request: Request,
+    watch: Callable[[str], Tell] = lambda what: untold,
+    note: Callable[[str], None] = console.print,
+) -> Outcome:
+    """Check a request and adapt; nothing is written.
+
+    Args:
+        subject: what is adapted, and who answers.
+        request: how.
+        watch: by what is being done, who is told how far it is.
+        note: takes what may be meant otherwise.
+
+    Raises:
+        UserError: what makes no sense, or cannot be adapted.
+    """
+    task, sizes, scalars = subject.source.task, request.sizes, request.scalars
+    check_guide(sizes, scalars)
+    kind = guidances.resolve(request.guidance)
+    if not kind.asks:
+        raise UserError(f"guidance {kind.name!r} asks nothing that could be learned from: choose another kind")
+    env = task.environment(request.task)
+    guidance = guidances.make(kind.name, sizes, env)
+    bases, seeds, origin = _bases(subject, request, env)
+    shared = isinstance(bases, Common)
+    if not shared and (request.seeds, request.first_seed) != (1, 0):
+        raise UserError("several base policies are adapted each with its own seed: leave out --seeds and --first-seed")
+    seeds = seeds_of(request.first_seed, request.seeds) if shared else seeds
+    rows, request = _rows(subject, request, guidance, env, bases, seeds)
+    if note_of := adapting.check_angles(request.bound_deg, scalars):
+        note(note_of)
+    each = program.one_each(seeds, request.labels, request.bound_deg)
+    lanes = program.product(1, seeds, request.labels, request.bound_deg) if shared else each
+    how = _judging(task, request, env)
+    teacher = None
+    if rows is None:
+        teacher = subject.teacher or task.make_teacher(request.task, env)
+        check_teacher(teacher, scalars)
+    asked = Adaptation(guidance, sizes, scalars, env, bases, lanes, how)
+    if subject.policy is None or subject.named:  # it is to be kept in a folder
+        stored.told(program.adapted(guidance, sizes, env, scalars, bases, program.begin(guidance, sizes, env, lanes)))
+    if rows is not None:
+        slots = program.rounds(lanes, sizes) * sizes.labels_per_round
+        rows = label_files.for_lanes(rows, lanes.seed, lanes.budget, slots)
+    return Outcome(adapting.adapt(asked, teacher, rows, watch=watch), subject, request, origin)
+
+
+def _bases(subject: Subject, request: Request, env: Any) -> tuple[Any, tuple[int, ...], dict[str, Any]]:
+    """The base policies, their seeds, and what they are in plain values."""
+    source, base, named = subject.source, subject.base, subject.named
+    if subject.policy is not None:
+        if base != Base(policy=source.default_policy):
+            raise UserError(f"--base.… chooses among the lanes of a folder, and {named} is none: leave it out")
+        user_code.acts_in(named or "policy", subject.policy, env)
+        return Common(subject.policy), (0,), {"code": named}
+    chosen = {"base.guidance": base.guidance, "base.labels": base.labels, "base.seeds": base.seeds}
+    source.check(base.policy, request.task, **chosen, **{"base.bound-deg": base.bound_deg})
+    if trained.POLICIES[base.policy].taught:
+        raise UserError(f"policy {base.policy!r} asks the teacher, so there is nothing to adapt: choose another")
+    if len(set(base.seeds)) < len(base.seeds):
+        raise UserError("--base.seeds: give each seed once")
+    policies, seeds = trained.several(
+        source, env, request.task, base.policy, base.guidance, base.labels, base.seeds, base.bound_deg
+    )
+    told = {name: value for name, value in dataclasses.asdict(base).items() if value not in (None, ())}
+    origin = {"folder": source.folder.name, **told, "seeds": list(seeds), **({"code": named} if named else {})}
+    return Common(policies[0]) if len(policies) == 1 else program.side_by_side(policies), seeds, origin
+
+
+def _rows(
+    subject: Subject, request: Request, guidance: Guidance, env: Environment, bases: Any, seeds: tuple[int, ...]
+) -> tuple[label_files.LabelFile | None, Request]:
+    """Labels in place of questions (None: none), and the request with its budgets and bounds in it.
+
+    Raises UserError for labels that do not fit.
+    """
+    task, path, rows = subject.source.task, request.labels_from, subject.rows
+    grid = Grid((guidance.name,), seeds, request.labels)
+    check_grid(grid)
+    file, form = None, guidance.form
+    assert form is not None  # it asks
+    if path is not None:
+        file = read_labels(path, task, request.task, request.sizes, request.scalars, grid)
+    elif rows is not None:
+        given.check(rows, spaces_of(env), form)
+        request = replace(request, labels=(len(rows.obs),))
+        eps = request.scalars.eps_deg if form.by_eps else None
+        file = label_files.LabelFile({}, form.name, eps, np.full(len(rows.obs), seeds[0]), rows)
+    bounds = request.bound_deg or (adapting.BOUND_DEG if file is None else _reach(bases, file, request.scalars),)
+    return file, replace(request, bound_deg=bounds)
+
+
+def _reach(bases: Any, file: label_files.LabelFile, scalars: Scalars) -> float:
+    """How far labels reach from what the base policy does [deg]; at least eps."""
+    if not isinstance(bases, Common):
+        raise UserError("labels of several base policies reach differently far: give --bound-deg")
+    return max(adapting.reach(bases.policy, file.labels.obs, file.labels.action), scalars.eps_deg)
+
+
+def _judging(task: Task, request: Request, env: Environment) -> Judging:
+    """How policies are judged. Raises UserError for what makes no sense."""
+    by, envs, unit = request.judge_by, request.judge_episodes, request.sizes.labels_per_round
+    if not 1 <= envs <= MOST_ENVS:
+        raise UserError(f"judge_episodes is {envs}: give a number from 1 to {MOST_ENVS:,}")
+    if request.judge_every < 0 or request.judge_every % unit:
+        raise UserError(f"judge_every is {request.judge_every}: give a multiple of sizes.labels_per_round ({unit})")
+    judging.check_bounds(request.judge_bounds, by, "judge_bounds")
+    known = [*judging.metrics_of(env), judging.LABELS]
+    if by not in known:
+        raise UserError(f"judge_by is {by!r}, no metric of {task.name}{closest(by, known)}")
+    steps = task.longest(request.task) if task.longest else judging.STEPS
+    plays = by != judging.LABELS or request.judge_every
+    tuned = task.environment(request.task, "tuning") if plays else None
+    return Judging(tuned, envs, envs * steps, by, request.judge_every, bounds=request.judge_bounds)
+
+
+def _difference(lanes: np.ndarray) -> str:
+    """Differences (lanes, 3) in words: one with its 95% interval, or how many of several exclude 0."""
+    if len(lanes) > 1:
+        return f"the difference's 95% interval lies above 0 in {int((lanes[:, 1] > 0).sum())} of {len(lanes)} lanes"
+    ((estimate, lower, upper),) = lanes
+    zero = ", which includes 0" if lower <= 0 <= upper else ""
+    return f"difference {estimate:+.3g} [{lower:+.3g}, {upper:+.3g}]{zero}"
+
+
+def _steps(lanes: np.ndarray) -> str:
+    """Rewarded steps (lanes,) in words."""
+    return f"{int(np.mean(lanes)):,} rewarded steps{'' if len(lanes) == 1 else ' a lane'}"
+
+
+def sentences(found: Adapted) -> list[str]:
+    """What adaptation has led to, a line for each budget and bound."""
+    lanes, judged, lines = found.asked.lanes, found.judged, []
+    for bound, budget in sorted({*zip(lanes.bound_deg.tolist(), lanes.budget.tolist(), strict=True)}):
+        own = (lanes.bound_deg == bound) & (lanes.budget == budget)
+        before, after = (f"{float(np.mean(values[own])):.4g}" for values in (judged.before, judged.after))
+        if judged.by == judging.LABELS:
+            worth, worse = f"predicts {after} of held-out answers, always 'already right' {before}", "fewer than that"
+        else:
+            worth, worse = f"{judged.by} on tuning episodes {before} before, {after} after", "worse than before"
+            worth += f" ({_difference(judged.difference[own])}; {_steps(judged.rewarded_steps[own])})"
+        lines.append(f"{budget} labels within {bound:g} degrees: {worth}")
+        if narrowed := sorted({*judged.within_deg[own & judged.used].round(3).tolist()} - {round(bound, 3)}):
+            lines[-1] += f", used within {' or '.join(f'{angle:g}' for angle in narrowed)} degrees"
+        left = lanes.seed[own & ~judged.used]
+        if len(left):
+            which = f"seed {left[0]}" if len(left) == 1 else f"{len(left)} of {int(own.sum())} seeds"
+            lines[-1] += f"; {which}: {worse}, so the model is not used and the policy stays what it was"
+    return lines
