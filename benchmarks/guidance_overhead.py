@@ -17,12 +17,13 @@ from typing import Any
 
 import jax
 import numpy as np
+from _measuring import Labelled
 
-from cuelearner_jax.bench.measuring import Timed, learning
+from cuelearner_jax.runs.speed import learning
 from cuelearner_jax.tasks.billiards import BILLIARDS
 
 
-class Run(Timed):
+class Run(Labelled):
     """One kind of guidance, its labels given, ready to train."""
 
     def __init__(self, kind: str, config: Any, seeds: int, labels: int) -> None:

@@ -17,7 +17,7 @@ import jax
 from scaling import REPLAY
 
 from cuelearner_jax import devices
-from cuelearner_jax.bench.measuring import Work, measure
+from cuelearner_jax.runs.speed import measure
 from cuelearner_jax.storage.provenance import provenance
 from cuelearner_jax.tasks import registry
 
@@ -33,18 +33,15 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=2.0, help="of each measurement")
     parser.add_argument("--out", type=Path, help="write the figures to this JSON file")
     asked = parser.parse_args()
-    config = registry.find(asked.task).presets[asked.preset].config
+    task = registry.find(asked.task)
+    config = task.presets[asked.preset].config
     config = dataclasses.replace(config, sizes=dataclasses.replace(config.sizes, replay_capacity=REPLAY))
-    work, mesh, rows = (
-        Work(registry.find(asked.task), asked.preset, config),
-        devices.lane_mesh(jax.local_devices()[:1]),
-        [],
-    )
+    mesh, rows = devices.lane_mesh(jax.local_devices()[:1]), []
     print(f"{'lanes':>6}  " + "  ".join(f"{way + ' [ms]':>14}" for way in WAYS))
     for lanes in asked.lanes:
         found = {}
         for way, devices.LIBRARY_LANES in WAYS.items():
-            found[way] = measure(work, lanes, mesh, asked.seconds)["ms_a_step"]
+            found[way] = measure(config, lambda: task.environment(config.task), lanes, asked.seconds, mesh)["ms_a_step"]
         rows.append({"task": asked.task, "lanes": lanes, **found})
         print(f"{lanes:>6}  " + "  ".join(f"{value:>14.4f}" for value in found.values()), flush=True)
         if asked.out:

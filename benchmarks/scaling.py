@@ -23,13 +23,15 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib
+from _measuring import Labelled, measure
 from matplotlib import ticker
 from matplotlib.figure import Figure
 
-from cuelearner_jax.bench.measuring import Timed, Work, learning, measure
-from cuelearner_jax.devices import lane_mesh
+from cuelearner_jax.config import RunConfig
 from cuelearner_jax.report.figures import OTHER_COLOURS, STYLE, save_figure
+from cuelearner_jax.runs.speed import learning
 from cuelearner_jax.storage.provenance import provenance
+from cuelearner_jax.task import Task
 from cuelearner_jax.tasks import registry
 
 REPLAY = 100_000
@@ -58,14 +60,18 @@ def main() -> int:
         if {name: contents.get(name) for name in setting} != setting:
             raise SystemExit(f"{asked.out} holds measurements of another setting: give another --out")
     sizes = dataclasses.replace(preset.config.sizes, replay_capacity=min(REPLAY, preset.config.sizes.replay_capacity))
-    work = Work(registry.find(asked.task), asked.preset, dataclasses.replace(preset.config, sizes=sizes))
+    task, config = registry.find(asked.task), dataclasses.replace(preset.config, sizes=sizes)
     began = time.perf_counter()
     for axis, value in _points(asked, contents["rows"]):
         if asked.stop_after and time.perf_counter() - began > asked.stop_after:
             print(f"stopped after {asked.stop_after:g} s: the same command goes on")
             return 0
         print(f"{axis} {value} ...", flush=True)
-        figures = _labels(work, asked.base_seeds, value) if axis == "labels" else _training(work, asked, axis, value)
+        figures = (
+            _labels(task, config, asked.base_seeds, value)
+            if axis == "labels"
+            else _training(task, config, asked, axis, value)
+        )
         contents["rows"].append({"axis": axis, "value": value, **figures})
         temporary = asked.out.with_name(asked.out.name + ".tmp")  # in one step: a killed call leaves the points before
         temporary.write_text(json.dumps(contents, indent=1) + "\n")
@@ -108,9 +114,9 @@ def _points(asked: argparse.Namespace, rows: Sequence[dict[str, Any]]) -> list[t
     return [(axis, value) for axis, values in grid.items() for value in values if (axis, value) not in measured]
 
 
-def _training(work: Work, asked: argparse.Namespace, axis: str, value: int) -> dict[str, Any]:
+def _training(task: Task, config: RunConfig, asked: argparse.Namespace, axis: str, value: int) -> dict[str, Any]:
     """Figures of training with one thing changed."""
-    sizes, seeds = work.config.sizes, asked.base_seeds
+    sizes, seeds = config.sizes, asked.base_seeds
     if axis == "seeds":
         seeds = value
     elif axis == "directions":
@@ -118,16 +124,15 @@ def _training(work: Work, asked: argparse.Namespace, axis: str, value: int) -> d
     else:
         layers = tuple(max(1, width * value // sizes.q_layers[0]) for width in sizes.q_layers)
         sizes = dataclasses.replace(sizes, q_layers=layers)
-    changed = dataclasses.replace(work, config=dataclasses.replace(work.config, sizes=sizes))
-    return measure(changed, seeds, lane_mesh(), asked.seconds)
+    return measure(task, dataclasses.replace(config, sizes=sizes), seeds, asked.seconds)
 
 
-def _labels(work: Work, seeds: int, budget: int) -> dict[str, Any]:
+def _labels(task: Task, config: RunConfig, seeds: int, budget: int) -> dict[str, Any]:
     """Seconds of a round of questions with its fit, of the fit alone, and of all rounds of a budget."""
-    env = work.task.environment(work.config.task)
-    teacher = work.task.make_teacher(work.config.task, env)
+    env = task.environment(config.task)
+    teacher = task.make_teacher(config.task, env)
     began = time.perf_counter()
-    timed = Timed(learning(work.config), env, "relative", seeds, budget)
+    timed = Labelled(learning(config), env, "relative", seeds, budget)
     timed.label_round(teacher)
     first = time.perf_counter() - began
     round_s = statistics.median(timed.label_round(teacher) for _ in range(ROUNDS))

@@ -4,7 +4,7 @@
 
 Cart and pole, the paper's six hidden layers, batch 256, one gradient step an environment step, double DQN with two
 directions. The whole loop is timed: acting, environment, replay, targets, gradient, optimiser, target network. Floating
-point operations are counted from the layers (`cuelearner_jax.bench.flops`), not taken from the compiler; the peak is a
+point operations are counted from the layers (`_flops.py`), not taken from the compiler; the peak is a
 large float32 matrix product measured between the timed stretches of the same run. Medians over rounds, compile time
 apart.
 Peers measured on another day on the same kind of machine (purejaxrl, rejax): 54 to 56% at 8 and 32 seeds.
@@ -18,12 +18,13 @@ from pathlib import Path
 
 import jax
 import numpy as np
+from _flops import step_operations
+from _measuring import matmul_rate
 from cartpole import CartPole
 
-from cuelearner_jax.bench.flops import step_operations
-from cuelearner_jax.bench.measuring import Timed, learning, matmul_rate
 from cuelearner_jax.config import RunConfig, Scalars, Schedule, Sizes
 from cuelearner_jax.environment import spaces_of
+from cuelearner_jax.runs.speed import Timed, learning
 
 BATCH, ENVS, DIRECTIONS = 256, 8, 2
 

@@ -63,7 +63,7 @@ def pytest_runtest_setup(item):
 # What `make test-quick` leaves out: files and folders with a compile of more than a few seconds, or with processes of
 # their own to wait for.
 SLOW = (
-    *("adaptation", "bench", "bridges", "cli", "envs/anymal", "examples", "api", "labelling"),
+    *("adaptation", "bridges", "cli", "envs/anymal", "examples", "api", "labelling"),
     *("testing", "experiments", "export/test_decisions.py", "storage/test_tracking.py"),
     *("agents/test_choice.py", "agents/test_n_step.py", "storage/test_checkpoint.py", "runs/test_runs.py"),
     *("runs/test_failures.py", "runs/test_given_labels.py", "runs/test_lanes.py", "runs/test_resume.py"),

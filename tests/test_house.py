@@ -32,7 +32,6 @@ ROWS = [
     ["runs"],
     ["studies"],
     ["report"],
-    ["bench"],
     ["labelling"],
     ["bridges"],
     ["tasks"],

@@ -2,34 +2,62 @@
 
 from __future__ import annotations
 
+import json
+import math
 import shlex
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Generic
+from typing import Annotated, Any, Generic
 
+import jax
 import tyro
+from jax.sharding import Mesh
 
-from cuelearner_jax.bench import known_machines, measuring
-from cuelearner_jax.bench.measuring import Measuring
+from cuelearner_jax import config as configuration
 from cuelearner_jax.cli.parsing import out, parse, preset_of, task_of
-from cuelearner_jax.cli.shared_options import Flag, TaskT
+from cuelearner_jax.cli.shared_options import TaskT
 from cuelearner_jax.config import RunConfig
+from cuelearner_jax.devices import lane_mesh
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.runs import speed
+from cuelearner_jax.runs.grid import LARGEST_SEED
+from cuelearner_jax.runs.memory_report import memory_report
+from cuelearner_jax.storage.provenance import provenance
+from cuelearner_jax.task import Task, shape_of
 from cuelearner_jax.tasks import registry
+from cuelearner_jax.terminal import Interrupted, console, interruptible, progress_bars
+
+COLUMNS = {  # of the table: what is measured and its format
+    "steps/s": ("steps_a_second", ",.0f"),
+    "ms/step": ("ms_a_step", ".3f"),
+    "MB/seed": ("mb_a_seed", ".2f"),
+    "peak GB": ("peak_gb", ".2f"),
+    "first step s": ("first_step_s", ".1f"),
+}
 
 
 @dataclass(frozen=True)
-class Bench:
-    """Throughput, memory a seed and share of peak of this machine, beside known machines.
+class Measuring:
+    """How to measure."""
 
-    Measures the small presets (quickstart) of the package's tasks, which takes about a minute. Name a task first to
+    seeds: tuple[int, ...] = (8,)
+    """Numbers of seeds that train at once, over all devices."""
+    seconds: float = 2.0
+    """Time of each measurement once it is compiled (three stretches at least)."""
+    devices: int = 0
+    """Devices that share the seeds (0: all)."""
+    out: Path | None = None
+    """Also write the figures to this JSON file."""
+
+
+@dataclass(frozen=True)
+class Bench(Measuring):
+    """Measure this machine: steps a second, memory a seed, time to the first step.
+
+    Trains the small presets (quickstart) of the package's tasks, which takes about a minute. Name a task first to
     measure one configuration: cuelearner bench billiards --preset paper --seeds 8 75
     """
-
-    measuring: Annotated[Measuring, tyro.conf.arg(name="")] = field(default_factory=Measuring)
-    full: Flag[bool] = False
-    """The paper-sized presets instead (paper); minutes."""
-    add: Path | None = None
-    """Measure nothing: take this file, which --out wrote, into the table of known machines."""
 
 
 @dataclass(frozen=True)
@@ -44,33 +72,72 @@ OPTIONS = {"bench": Bench}
 
 
 def run(arguments: list[str]) -> None:
-    """Runs the command. Raises UserError for what cannot be measured."""
+    """Run the command. Raises UserError for what cannot be measured."""
+    works: list[tuple[Task, str, RunConfig]]
     named = any(argument == "--task" or argument.startswith("--task=") for argument in arguments)
     if named or (arguments and not arguments[0].startswith("-")):
         task, rest = task_of(arguments, "bench", Bench)
         name, preset, rest = preset_of(task, rest)
         kind = BenchTask[task.config]  # pyright: ignore[reportInvalidTypeArguments]
-        asked = parse(kind, rest, f"bench {task.name}", kind(preset.config))
-        works = [measuring.Work(task, name, asked.run)]
+        given = parse(kind, rest, f"bench {task.name}", kind(preset.config))
+        asked, works = given.measuring, [(task, name, given.run)]
     else:
         asked = parse(Bench, arguments, "bench")
-        if asked.add:
-            known_machines.add(asked.add)
-            out.print(f"{known_machines.TABLE.name} holds {asked.add} now")
-            return
-        name = "paper" if asked.full else "quickstart"
         tasks = [registry.find(task) for task in registry.BUILT_IN]
-        works = [measuring.Work(task, name, task.presets[name].config) for task in tasks if name in task.presets]
-    known = known_machines.read()
-    entry = measuring.run(works, asked.measuring, shlex.join(["cuelearner", "bench", *_without_out(arguments)]))
-    out.print(known_machines.figures(entry["rows"]), known_machines.beside(entry, known), sep="\n\n")
-    if asked.measuring.out:
-        out.print(f"wrote {asked.measuring.out}")
+        works = [(task, "quickstart", task.presets["quickstart"].config) for task in tasks]
+    mesh = _check(asked, works)
+    rows: list[dict[str, Any]] = []
+    plan = [(*work, seeds) for work in works for seeds in sorted(asked.seeds)]  # a device's peak never falls again
+    with interruptible() as stopping, progress_bars() as bars:
+        bar = bars.add_task("bench", total=len(plan), note="")
+
+        def watch(name: str, note: str) -> None:
+            bars.update(bar, note=f"{name}: {note}")
+            if stopping.is_set():
+                raise Interrupted(f"stopped after {len(rows)} of {len(plan)} measurements; nothing was written")
+
+        for task, preset, config, seeds in plan:
+            env = partial(task.environment, config.task)
+            told = partial(watch, f"{task.name} {preset}, {seeds} seeds")
+            found = speed.measure(config, env, seeds, asked.seconds, mesh, told)
+            rows.append({"task": task.name, "preset": preset, **found})
+            bars.advance(bar)
+    out.print(_table(rows))
+    if asked.out:
+        told = {**provenance(), "command": shlex.join(["cuelearner", "bench", *arguments]), "rows": rows}
+        with asked.out.open("x", encoding="utf-8") as file:
+            file.write(json.dumps(told, indent=1) + "\n")
+        out.print(f"wrote {asked.out}")
 
 
-def _without_out(arguments: list[str]) -> list[str]:
-    """Arguments less --out and its path, which change no figure."""
-    given = [
-        not (a.startswith("--out=") or "--out" in arguments[max(i - 1, 0) : i + 1]) for i, a in enumerate(arguments)
-    ]
-    return [argument for argument, keep in zip(arguments, given, strict=True) if keep]
+def _check(asked: Measuring, works: list[tuple[Task, str, RunConfig]]) -> Mesh:
+    """The devices to measure on. Raises UserError for what cannot be measured, or not in the memory that is free."""
+    if (
+        not asked.seeds
+        or len(set(asked.seeds)) < len(asked.seeds)
+        or not all(0 < s < LARGEST_SEED for s in asked.seeds)
+    ):
+        raise UserError(f"--seeds {' '.join(map(str, asked.seeds))}: give different positive numbers")
+    if not 0 < asked.seconds < math.inf:
+        raise UserError(f"--seconds is {asked.seconds}: give a positive number")
+    if not 0 <= asked.devices <= jax.local_device_count():
+        raise UserError(f"--devices is {asked.devices}: there are {jax.local_device_count()} (0: all)")
+    if asked.out and asked.out.exists():
+        raise UserError(f"{asked.out} exists: give another --out")
+    mesh = lane_mesh(jax.local_devices()[: asked.devices or None])
+    for task, preset, config in works:
+        configuration.check(config)
+        for seeds in asked.seeds:
+            lanes = speed.lanes(config, shape_of(task, config.task), "none", seeds, mesh=mesh)
+            console.print(f"{task.name} {preset}, {memory_report(lanes)}")
+    return mesh
+
+
+def _table(rows: list[dict[str, Any]]) -> str:
+    """Measured rows as a table of text."""
+    lines = [["task", "preset", "seeds", *COLUMNS]]
+    for row in rows:
+        cells = ["-" if row[name] is None else format(row[name], form) for name, form in COLUMNS.values()]
+        lines.append([row["task"], row["preset"], str(row["seeds"]), *cells])
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    return "\n".join("  ".join(map(str.rjust, line, widths)) for line in lines)

@@ -1,1 +1,0 @@
-"""Measuring a machine, and the machines that are known."""

@@ -1,0 +1,118 @@
+"""What training costs on this machine: throughput, memory a seed, time to the first step.
+
+Every measurement trains unguided lanes by the program that `cuelearner sweep` runs, learning from the first step on.
+Compiling and the first stretch stay apart; figures are medians over stretches of some iterations.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import statistics
+import time
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import jax
+from jax.sharding import Mesh
+
+from cuelearner_jax.config import RunConfig
+from cuelearner_jax.devices import SHARED, lane_mesh, place
+from cuelearner_jax.environment import Environment
+from cuelearner_jax.guides import registry as guidances
+from cuelearner_jax.loop import start_clock
+from cuelearner_jax.runs.grid import Grid
+from cuelearner_jax.runs.lanes import LaneGroup
+from cuelearner_jax.runs.memory_report import state_bytes
+
+FEWEST_STRETCHES = 3
+STEPS_A_STRETCH = {"cpu": 128, "gpu": 1024, "tpu": 1024}  # of a seed
+
+T = TypeVar("T")
+
+
+class Timed:
+    """Lanes of one kind of guidance, ready to be timed."""
+
+    def __init__(
+        self, config: RunConfig, env: Environment, kind: str, seeds: int, labels: int = 0, mesh: Mesh | None = None
+    ) -> None:
+        mesh = mesh or lane_mesh()
+        self.group = lanes(config, place(mesh, env, SHARED), kind, seeds, labels, mesh=mesh)
+        self.clock, self.blocks = place(mesh, start_clock(), SHARED), self.group.start()
+
+    def train(self, iterations: int) -> float:
+        """Seconds of so many iterations of all lanes. The first call with a number compiles."""
+        seconds, done = timed(lambda: self.group.train(self.clock, self.blocks, iterations))
+        self.clock, self.blocks, _ = done
+        return seconds
+
+
+def lanes(config: RunConfig, env: Environment, kind: str, seeds: int, labels: int = 0, *, mesh: Mesh) -> LaneGroup:
+    """The lanes of a measurement; `env` may be its shapes."""
+    made = guidances.make(kind, config.sizes, env)
+    return LaneGroup(config, env, made, Grid((kind,), tuple(range(seeds)), (labels,)), mesh)
+
+
+def learning(config: RunConfig, *, guided: bool = False) -> RunConfig:
+    """The configuration with greedy actions and gradient steps from the first step on; guided throughout, or never."""
+    until = 2**30 if guided else 0
+    schedule = dataclasses.replace(config.schedule, random_steps=0, learn_after=0, guidance_until=until)
+    return dataclasses.replace(config, schedule=schedule)
+
+
+def measure(
+    config: RunConfig,
+    env: Callable[[], Environment],
+    seeds: int,
+    seconds: float,
+    mesh: Mesh | None = None,
+    watch: Callable[[str], None] = lambda note: None,
+) -> dict[str, Any]:
+    """Measure the training of `seeds` unguided lanes.
+
+    Args:
+        config: what is trained; its schedule is that of `learning`.
+        env: makes the environment, which counts into the time to the first step.
+        seeds: how many train at once, over all devices.
+        seconds: time of the measurement once it is compiled (three stretches at least).
+        mesh: devices that share the seeds (default: all).
+        watch: hears of each stretch before it begins.
+
+    Returns:
+        `steps_a_second` (environment steps, of all seeds), `ms_a_step` (one step of every seed), `mb_a_seed` (at rest),
+        `peak_gb` (of the first device in the process so far; None where not known), `first_step_s` (environment,
+        compilation and first step, imports apart), `seeds`, `devices`, `stretches`, `spread` (slowest less fastest
+        stretch, over their median).
+    """
+    watch("compiling")
+    began, mesh = time.perf_counter(), mesh or lane_mesh()
+    group = Timed(learning(config), env(), "none", seeds, mesh=mesh)
+    iterations = max(1, STEPS_A_STRETCH[jax.default_backend()] // config.sizes.num_envs)
+    group.train(iterations)
+    first = time.perf_counter() - began
+    at_rest = sum(state_bytes(block) for block in group.blocks) / sum(block.key.shape[0] for block in group.blocks)
+    stretches = []
+    while len(stretches) < FEWEST_STRETCHES or sum(stretches) < seconds:
+        watch("training")
+        stretches.append(group.train(iterations))
+    typical = statistics.median(stretches)
+    step = typical / iterations / config.sizes.num_envs
+    memory = jax.local_devices()[0].memory_stats() or {}
+    return {
+        "seeds": seeds,
+        "devices": mesh.size,
+        "steps_a_second": seeds / step,
+        "ms_a_step": 1e3 * step,
+        "mb_a_seed": at_rest / 1e6,
+        "peak_gb": memory["peak_bytes_in_use"] / 1e9 if "peak_bytes_in_use" in memory else None,
+        "first_step_s": first - (iterations - 1) / iterations * typical,
+        "stretches": len(stretches),
+        "spread": (max(stretches) - min(stretches)) / typical,
+    }
+
+
+def timed(work: Callable[[], T]) -> tuple[float, T]:
+    """Seconds until everything that `work` returns is there, and that."""
+    began = time.perf_counter()
+    done = jax.block_until_ready(work())
+    return time.perf_counter() - began, done

@@ -1,0 +1,23 @@
+"""Measuring a machine: figures that agree with each other, of lanes that learn from the first step."""
+
+import pytest
+from probes import CONFIG, Window, compilations
+
+from cuelearner_jax.runs import speed
+
+
+def test_a_row_s_figures_agree_with_each_other():
+    row = speed.measure(CONFIG, Window, 3, seconds=0.01)
+    assert row["steps_a_second"] == pytest.approx(3 * 1e3 / row["ms_a_step"])
+    # Replay keeps 4,000 rows of 5 numbers; the networks, Adam's two averages and the rest are small beside it.
+    assert 0.08 < row["mb_a_seed"] < 0.11
+    assert row["stretches"] >= 3
+    assert row["first_step_s"] > 0
+    assert row["spread"] >= 0
+
+
+def test_timed_lanes_learn_and_compile_once():
+    timed = speed.Timed(speed.learning(CONFIG), Window(), "none", 2)
+    assert [timed.train(3) > 0 for _ in range(2)] == [True, True]
+    assert int(timed.clock.step) == int(timed.clock.update) == 2 * 3 * CONFIG.sizes.num_envs
+    assert compilations(timed.group.program.train) == [1]
