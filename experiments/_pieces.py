@@ -7,10 +7,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import label_efficiency
+
 from cuelearner_jax.cli import main as cuelearner
 from cuelearner_jax.guides.registry import resolve
 
 FIRST_SEED = 4000  # of reported runs; settings are chosen on seeds from 0 on, with --tuning
+LABEL_EFFICIENCY = "label_efficiency"  # in the place of a command's name: the report of that file
 Options = Mapping[str, object]  # of `cuelearner sweep`: a value, several in a tuple, or whether a flag is on
 
 
@@ -113,9 +116,14 @@ def report_command(experiment: Experiment, world: str, out: Path, scale: str) ->
     asked = list(experiment.report.get(world, ())) if experiment.scales[scale].reported else []
     if "--reference" in asked and asked[(at := asked.index("--reference")) + 1] not in kinds:
         del asked[at : at + 2]
-    efficiency = ["--efficiency", *asked] if "none" in kinds else []
-    words = ["report", *begun, "--by-run", *experiment.metric, *efficiency]
+    command, more = (LABEL_EFFICIENCY, asked) if "none" in kinds else ("report", [])
+    words = [command, *begun, "--by-run", *experiment.metric, *more]
     return [*words, "--out", str(out / world / "report"), "--overwrite"]
+
+
+def reported(command: list[str]) -> int:
+    """Write the report that `report_command` says; return the exit status."""
+    return label_efficiency.main(command[1:]) if command[0] == LABEL_EFFICIENCY else cuelearner(command)
 
 
 def chosen(experiment: Any, names: Sequence[str]) -> list[Any]:
@@ -172,4 +180,4 @@ def run(experiment: Experiment, about: str, arguments: Sequence[str] | None = No
             return status
     worlds = dict.fromkeys(piece.world for piece in pieces)
     reports = [report_command(experiment, world, out, asked.scale) for world in worlds]
-    return next((status for command in reports if command and (status := cuelearner(command))), 0)
+    return next((status for command in reports if command and (status := reported(command))), 0)

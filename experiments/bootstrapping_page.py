@@ -3,8 +3,7 @@
     python experiments/bootstrapping_page.py --data docs/data/bootstrapping --page docs/results/bootstrapping.md
 
 For every table or hall of which there are runs in the data (WORLD/RUN/PIECE, as the two experiments of that name leave
-them) the command `cuelearner report --efficiency` writes WORLD/report, and its section on label efficiency goes between
-the lines `<!-- WORLD -->` and `<!-- end of WORLD -->` of the page, in place of what was there. Runs at the scale `cpu`
+them) `label_efficiency.py` writes WORLD/report, and its section on label efficiency goes between the lines `<!-- WORLD -->` and `<!-- end of WORLD -->` of the page, in place of what was there. Runs at the scale `cpu`
 (cpu/WORLD/RUN/PIECE) have places of their own, `<!-- WORLD-cpu -->`.
 """
 
@@ -19,9 +18,7 @@ from typing import NamedTuple
 
 import billiards_bootstrapping
 import navigation_bootstrapping
-from _pieces import Experiment, folder_at, report_command
-
-from cuelearner_jax.cli import main as cuelearner
+from _pieces import LABEL_EFFICIENCY, Experiment, folder_at, report_command, reported
 
 EXPERIMENTS = (billiards_bootstrapping.EXPERIMENT, navigation_bootstrapping.EXPERIMENT)
 FIRST, LAST = "## Label efficiency\n", "## Where the numbers come from"
@@ -42,7 +39,7 @@ class Place(NamedTuple):
     def command(self, data: Path) -> list[str] | None:
         """That writes its report, or None where there are no runs of it, or no unguided ones to compare with."""
         command = report_command(self.experiment, self.world, folder_at(data, self.scale), self.scale)
-        return command if command and "--efficiency" in command else None
+        return command if command and command[0] == LABEL_EFFICIENCY else None
 
     def report(self, data: Path) -> Path:
         """The folder of its report."""
@@ -96,7 +93,7 @@ def main() -> int:
         if command is None:
             print(f"{place.mark}: no runs in {asked.data}, or no unguided ones")
             continue
-        if status := cuelearner(command):
+        if status := reported(command):
             return status
         folder = place.report(asked.data)
         seen = Path(os.path.relpath(folder, asked.page.parent)).as_posix()

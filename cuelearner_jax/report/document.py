@@ -2,25 +2,22 @@
 
 A report is a folder: `report.md` (table, figures, what is missing, where the numbers come from), `summary.csv` (the
 table), `curves.csv` (what the curves show), `curves.png/.svg` and, where there are several label budgets,
-`label_efficiency.png/.svg`. Where it is asked how far labels carry (`efficiency`), there are `efficiency.csv`,
-`labels_to_level.csv`, `equal_area.csv`, `labels_to_quality.png/.svg` and `steps_saved.png/.svg` besides. The same
+`label_efficiency.png/.svg`. A study may add tables, figures and a section (`experiments/label_efficiency.py`). The same
 results always give the same bytes.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import pyarrow as pa
 from matplotlib.figure import Figure
 
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.report import escaping, extent, tables
-from cuelearner_jax.report.efficiency import Efficiency, Question, efficiency_of
-from cuelearner_jax.report.efficiency_document import efficiency_figures, efficiency_lines
 from cuelearner_jax.report.figures import draw_curves, draw_label_efficiency, save_figure
 from cuelearner_jax.report.variants import Group, PathLike, Variant, read_groups, variants_of
 from cuelearner_jax.storage.folders import in_use
@@ -28,6 +25,14 @@ from cuelearner_jax.storage.folders import in_use
 FIGURES = ("curves", "label_efficiency", "labels_to_quality", "steps_saved")
 PERMISSIVE: dict[str, Any] = {"promote_options": "permissive"}  # runs may differ in their metrics
 TABLES = ("summary", "curves", "efficiency", "labels_to_level", "equal_area")
+
+
+class Study(NamedTuple):
+    """What a study adds to a report."""
+
+    lines: Sequence[str]  # of Markdown, below the summary
+    tables: dict[str, list[tables.Row]]  # by the name of the file
+    figures: dict[str, Figure]
 
 
 def report(
@@ -39,7 +44,7 @@ def report(
     task: str | None = None,
     lower_is_better: bool = False,
     by_run: bool = False,
-    efficiency: Question | None = None,
+    study: Callable[[Sequence[Variant], str], Study] | None = None,
     overwrite: bool = False,
     command: str = "",
 ) -> Path:
@@ -53,7 +58,7 @@ def report(
         task: keeps the runs of this task only; needed where there are several.
         lower_is_better: small values of the metric are good ones: what is best, and when a value is reached.
         by_run: tells the folders apart by their names, as runs whose configurations differ need.
-        efficiency: also says how far labels carry, to this level.
+        study: adds to the report; takes its variants and its title.
         overwrite: write over a report that is there already.
         command: command line that makes this report, noted in it.
 
@@ -62,7 +67,7 @@ def report(
 
     Raises:
         UserError: if `out` is there already, or the results are missing, corrupt, of several tasks, lack the metric or
-            the split, hold a seed twice, or are of failed lanes alone; or if nothing can be said of the level.
+            the split, hold a seed twice, or are of failed lanes alone.
     """
     folders = [folders] if isinstance(folders, str | os.PathLike) else list(folders)
     out = Path(out)
@@ -78,13 +83,12 @@ def report(
     figures = {"curves": draw_curves(variants, title, metric)}
     if len({variant.labels for variant in variants if variant.labels}) > 1:
         figures["label_efficiency"] = draw_label_efficiency(variants, title, metric)
-    found = efficiency_of(variants, efficiency, lower_is_better) if efficiency else None
-    if found:
-        written |= found.tables()
-        figures |= efficiency_figures(found, title, metric)
+    added = study(variants, title) if study else Study((), {}, {})
+    written |= added.tables
+    figures |= added.figures
     _write(out, written, figures)
     missing = _missing(folders, groups, variants, metric, split)
-    text = _markdown(title, written["summary"], list(figures), found, missing, _provenance(groups, command))
+    text = _markdown(title, written["summary"], list(figures), added.lines, missing, _provenance(groups, command))
     (out / "report.md").write_text(text, encoding="utf-8")
     return out / "report.md"
 
@@ -142,12 +146,11 @@ def _markdown(
     title: str,
     rows: Sequence[tables.Row],
     figures: Sequence[str],
-    found: Efficiency | None,
+    added: Sequence[str],
     missing: Sequence[str],
     provenance: Sequence[str],
 ) -> str:
     lines = [f"# {escaping.markdown(title)}", ""]
-    of_efficiency = efficiency_lines(found) if found else []
     first = [name for name in figures if name in FIGURES[:2]]
     lines += [f"![{name.replace('_', ' ')}]({name}.png)\n" for name in first]
     lines += tables.summary_lines(rows)
@@ -156,7 +159,7 @@ def _markdown(
         "Interquartile means over seeds with their 95% percentile bootstrap intervals in brackets; with fewer than 10 "
         "seeds such intervals are too narrow. Steps are environment steps of one seed. Intervals are compared at each "
         "evaluation by itself, so a short stretch may be chance.",
-        *of_efficiency,
+        *added,
     ]
     lines += [
         "",

@@ -11,26 +11,30 @@ from typing import cast
 
 import jax
 import jax.numpy as jnp
+import label_efficiency
 import numpy as np
 import pytest
+from _efficiency import efficiency_of
+from _efficiency_document import efficiency_lines
 
 from cuelearner_envs.billiards.config import BilliardsConfig, make_environment
 from cuelearner_envs.billiards.teacher import Transferred
 from cuelearner_jax.actions import DIRECTIONS, evenly_spaced
 from cuelearner_jax.cli import main
-from cuelearner_jax.cli.parsing import parse
-from cuelearner_jax.cli.report import Report
 from cuelearner_jax.config import GuideScalars, GuideSizes, Scalars, Schedule, Sizes
 from cuelearner_jax.guides import registry
-from cuelearner_jax.report.efficiency import Question, efficiency_of
-from cuelearner_jax.report.efficiency_document import efficiency_lines
 from cuelearner_jax.report.variants import read_groups, variants_of
 from cuelearner_jax.runs import sweep
 from cuelearner_jax.runs.order import planned
 from cuelearner_jax.tasks.billiards import make_teacher
 
 FOLDER = Path(__file__).parents[2] / "experiments"
-KINDS = {"heuristic": [], "none": ["--efficiency"], "relative": ["--efficiency", "--reference"]}  # what each adds
+# What is called once a kind has been begun, and with what.
+KINDS = {
+    "heuristic": ["report"],
+    "none": ["label_efficiency"],
+    "relative": ["label_efficiency", "--reference"],
+}  # what each adds
 BUDGETS = [25, 50, 100, 350, 500, 1_000, 2_000, 5_000]
 
 
@@ -173,7 +177,7 @@ def test_what_is_asked_of_a_report_is_what_its_runs_can_answer(experiment, modul
         config.parent.mkdir(parents=True)
         config.touch()
         command = asked(experiment, world, tmp_path, "paper")
-        assert [name for name in ("--efficiency", "--reference") if name in command] == options
+        assert [name for name in ("report", "label_efficiency", "--reference") if name in command] == options
     assert "--reference" not in asked(experiment, world, tmp_path, "smoke")
 
 
@@ -225,10 +229,9 @@ def said_of(mark, modules):
     command = place.command(data)
     if command is None:
         return shown, ""
-    asked = parse(Report, command[1:], "report")
-    groups = read_groups(asked.folders, None, asked.metric, asked.split, by_run=True)
-    question = Question(**asked.question)
-    lines = efficiency_lines(efficiency_of(variants_of(groups, asked.metric), question, asked.lower_is_better))
+    asked = label_efficiency.parsed(command[1:])
+    groups = read_groups(asked.folders, None, asked.metric, "validation", by_run=True)
+    lines = efficiency_lines(efficiency_of(variants_of(groups, asked.metric), asked.question, asked.lower_is_better))
     seen = Path("../data/bootstrapping") / place.report(data).relative_to(data)
     return shown, page.section("\n".join([*lines, page.LAST]), seen.as_posix())
 

@@ -100,15 +100,6 @@ def test_steps_to_reach_is_the_first_crossing_or_infinity():
     np.testing.assert_array_equal(found, [10.0, 0.0, np.inf])
 
 
-def test_a_level_is_reached_on_the_line_between_two_evaluations():
-    steps = np.array([0, 10, 30])
-    curves = np.array([[0.0, 1.0, 1.0], [0.0, 0.2, 0.6], [0.5, 0.0, 0.0], [0.0, 0.1, 0.2], [0.0, 0.5, 0.5]])
-    np.testing.assert_allclose(statistics.step_at_level(steps, curves, 0.5), [5.0, 25.0, 0.0, np.inf, 10.0])
-    # A level for each curve, and one curve alone.
-    np.testing.assert_allclose(statistics.step_at_level(steps, curves[:2], np.array([0.1, 0.4])), [1.0, 20.0])
-    assert statistics.step_at_level(steps, curves[1], 0.3) == pytest.approx(15.0)
-
-
 def test_draws_are_those_of_the_bootstrap_of_an_interval():
     values = np.random.default_rng(3).normal(size=(9, 4)) + np.arange(4)
     drawn = statistics.resampled(values, resamples=4000)
@@ -121,36 +112,3 @@ def test_draws_are_those_of_the_bootstrap_of_an_interval():
     np.testing.assert_array_equal(twice[:, 0], twice[:, 1])
     assert (statistics.resampled(values, seed=1)[:4000] != drawn[:2000]).any()
     np.testing.assert_array_equal(statistics.resampled(np.full((5, 2), 0.25), resamples=7), np.full((7, 2), 0.25))
-
-
-def test_what_never_gets_there_is_known_to_take_longer_than_its_last_step():
-    found = statistics.censored(np.array([40.0, np.inf]), 100)
-    np.testing.assert_array_equal(found, [[40.0, 100.0], [40.0, np.inf]])
-
-
-def test_ratios_of_bounds_by_hand():
-    """30 over 60; more than 100 over 50; 30 over more than 100; of two that are more than 100 nothing is known."""
-    above = statistics.censored(np.array([30.0, np.inf, 30.0, np.inf, 0.0]), 100)
-    below = statistics.censored(np.array([60.0, 50.0, np.inf, np.inf, 0.0]), 100)
-    found = statistics.ratio_bounds(above, below)
-    np.testing.assert_allclose(found.lower, [0.5, 2.0, 0.0, 0.0, 0.0])
-    np.testing.assert_allclose(found.upper, [0.5, np.inf, 0.3, np.inf, np.inf])
-
-
-def test_percentiles_are_values_of_samples_and_never_lie_between_a_number_and_infinity():
-    lower = np.arange(100.0)
-    upper = np.where(lower < 98, lower, np.inf)
-    assert statistics.percentiles(statistics.Bounds(lower, upper)) == (2.0, 97.0)
-    assert statistics.percentiles(statistics.Bounds(lower, np.where(lower < 97, lower, np.inf))) == (2.0, np.inf)
-    same = np.full(50, 0.3)
-    assert statistics.percentiles(statistics.Bounds(same, same)) == (0.3, 0.3)
-
-
-def test_labels_for_an_area_lie_between_budgets_on_the_logarithm():
-    budgets = np.array([10, 100, 1000])
-    areas = statistics.isotonic(np.array([[0.0, 0.2, 0.4], [0.3, 0.1, 0.5]]))
-    np.testing.assert_allclose(areas, [[0.0, 0.2, 0.4], [0.2, 0.2, 0.5]])  # a pair out of order is their mean
-    found = statistics.labels_for(budgets, areas, np.array([0.3, 0.35]))
-    np.testing.assert_allclose(found, [[10**2.5, 10**2.5]] * 2)
-    assert [float(bound[0]) for bound in statistics.labels_for(budgets, areas[:1], np.array([0.5]))] == [1000, np.inf]
-    assert [float(bound[0]) for bound in statistics.labels_for(budgets, areas[1:], np.array([0.1]))] == [0, 10]

@@ -6,11 +6,11 @@ from collections.abc import Sequence
 
 import matplotlib
 import numpy as np
+from _efficiency import Carried, Efficiency, Known
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from cuelearner_jax.report import escaping
-from cuelearner_jax.report.efficiency import Carried, Efficiency, Known
 from cuelearner_jax.report.escaping import one_line
 from cuelearner_jax.report.figures import STYLE, axis_name, colour_of, draw_budgets
 from cuelearner_jax.report.statistics import Interval

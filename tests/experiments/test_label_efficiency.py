@@ -5,13 +5,15 @@ import json
 from collections.abc import Sequence
 from xml.etree import ElementTree
 
+import _efficiency_statistics as statistics
+import label_efficiency
 import numpy as np
 import pytest
+from _efficiency import Question, efficiency_of
 
 from cuelearner_jax.cli import main
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.report.document import report
-from cuelearner_jax.report.efficiency import Question, efficiency_of
 from cuelearner_jax.report.statistics import Interval, curve, interval, mean_over_curve
 from cuelearner_jax.report.variants import Variant, read_groups, variants_of
 from cuelearner_jax.storage import results
@@ -238,8 +240,8 @@ def rows(file):
 
 def test_the_command_writes_tables_figures_and_a_section(runs, tmp_path):
     out = tmp_path / "report"
-    command = ["report", str(runs / "raw"), str(runs / "frame"), "--by-run", "--efficiency", "--level", "0.4"]
-    assert main([*command, "--reference", "relative", "--out", str(out)]) == 0
+    command = [str(runs / "raw"), str(runs / "frame"), "--by-run", "--level", "0.4"]
+    assert label_efficiency.main([*command, "--reference", "relative", "--out", str(out)]) == 0
     text = (out / "report.md").read_text()
     section = text.split("## Label efficiency")[1].split("## Missing")[0]
     assert "The level is 0.400: given." in section
@@ -273,17 +275,16 @@ def test_the_command_writes_tables_figures_and_a_section(runs, tmp_path):
 def test_what_cannot_be_asked_is_refused_in_one_line(runs, tmp_path, capsys):
     def refused(*options, says):
         capsys.readouterr()
-        assert main(["report", str(runs / "raw"), "--out", str(tmp_path / "report"), *options]) == 2
+        assert label_efficiency.main([str(runs / "raw"), "--out", str(tmp_path / "report"), *options]) == 2
         told = capsys.readouterr().err.splitlines()
         assert len(told) == 1
         assert told[0].startswith("error: ")
         assert says in told[0]
         assert not (tmp_path / "report").exists()
 
-    refused("--level", "0.3", says="--level says what --efficiency is to look for: give both")
-    refused("--efficiency", "--level", "0.3", "--level-at", "50", says="give one of them")
-    refused("--efficiency", "--level-at", "51", says="has no such step")
-    refused("--efficiency", "--within", "1.5", says="--within is 1.5")
+    refused("--level", "0.3", "--level-at", "50", says="give one of them")
+    refused("--level-at", "51", says="has no such step")
+    refused("--within", "1.5", says="--within is 1.5")
     (tmp_path / "more").mkdir()
     (runs / "frame").rename(tmp_path / "more" / "raw")
     both = [tmp_path / "raw", tmp_path / "more" / "raw"]
@@ -291,3 +292,45 @@ def test_what_cannot_be_asked_is_refused_in_one_line(runs, tmp_path, capsys):
         report(both, tmp_path / "report")
     with pytest.raises(UserError, match="several folders are called raw"):
         report(both, tmp_path / "report", by_run=True)
+
+
+def test_a_level_is_reached_on_the_line_between_two_evaluations():
+    steps = np.array([0, 10, 30])
+    curves = np.array([[0.0, 1.0, 1.0], [0.0, 0.2, 0.6], [0.5, 0.0, 0.0], [0.0, 0.1, 0.2], [0.0, 0.5, 0.5]])
+    np.testing.assert_allclose(statistics.step_at_level(steps, curves, 0.5), [5.0, 25.0, 0.0, np.inf, 10.0])
+    # A level for each curve, and one curve alone.
+    np.testing.assert_allclose(statistics.step_at_level(steps, curves[:2], np.array([0.1, 0.4])), [1.0, 20.0])
+    assert statistics.step_at_level(steps, curves[1], 0.3) == pytest.approx(15.0)
+
+
+def test_what_never_gets_there_is_known_to_take_longer_than_its_last_step():
+    found = statistics.censored(np.array([40.0, np.inf]), 100)
+    np.testing.assert_array_equal(found, [[40.0, 100.0], [40.0, np.inf]])
+
+
+def test_ratios_of_bounds_by_hand():
+    """30 over 60; more than 100 over 50; 30 over more than 100; of two that are more than 100 nothing is known."""
+    above = statistics.censored(np.array([30.0, np.inf, 30.0, np.inf, 0.0]), 100)
+    below = statistics.censored(np.array([60.0, 50.0, np.inf, np.inf, 0.0]), 100)
+    found = statistics.ratio_bounds(above, below)
+    np.testing.assert_allclose(found.lower, [0.5, 2.0, 0.0, 0.0, 0.0])
+    np.testing.assert_allclose(found.upper, [0.5, np.inf, 0.3, np.inf, np.inf])
+
+
+def test_percentiles_are_values_of_samples_and_never_lie_between_a_number_and_infinity():
+    lower = np.arange(100.0)
+    upper = np.where(lower < 98, lower, np.inf)
+    assert statistics.percentiles(statistics.Bounds(lower, upper)) == (2.0, 97.0)
+    assert statistics.percentiles(statistics.Bounds(lower, np.where(lower < 97, lower, np.inf))) == (2.0, np.inf)
+    same = np.full(50, 0.3)
+    assert statistics.percentiles(statistics.Bounds(same, same)) == (0.3, 0.3)
+
+
+def test_labels_for_an_area_lie_between_budgets_on_the_logarithm():
+    budgets = np.array([10, 100, 1000])
+    areas = statistics.isotonic(np.array([[0.0, 0.2, 0.4], [0.3, 0.1, 0.5]]))
+    np.testing.assert_allclose(areas, [[0.0, 0.2, 0.4], [0.2, 0.2, 0.5]])  # a pair out of order is their mean
+    found = statistics.labels_for(budgets, areas, np.array([0.3, 0.35]))
+    np.testing.assert_allclose(found, [[10**2.5, 10**2.5]] * 2)
+    assert [float(bound[0]) for bound in statistics.labels_for(budgets, areas[:1], np.array([0.5]))] == [1000, np.inf]
+    assert [float(bound[0]) for bound in statistics.labels_for(budgets, areas[1:], np.array([0.1]))] == [0, 10]

@@ -2,8 +2,8 @@
 
 Intervals are 95% percentile bootstraps over seeds: the seeds of every variant are drawn with replacement, independently
 of those of others, 2,000 times; what is computed of the interquartile means of the real seeds is computed of each
-draw's. A level is held fixed. A curve that ends below the level is right-censored (`statistics.Bounds`): its steps are
-"more than the last", which ratios and intervals carry on as a bound, never as a number.
+draw's. A level is held fixed. A curve that ends below the level is right-censored (`Bounds`): its steps are "more than the last", which
+ratios and intervals carry on as a bound, never as a number.
 """
 
 from __future__ import annotations
@@ -14,11 +14,13 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
+import _efficiency_statistics as bounds
 import numpy as np
+from _efficiency_statistics import Bounds
 
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.report import statistics
-from cuelearner_jax.report.statistics import Bounds, Interval
+from cuelearner_jax.report.statistics import Interval
 from cuelearner_jax.report.tables import Row, named, unguided_of
 from cuelearner_jax.report.variants import Variant
 
@@ -93,16 +95,16 @@ class Drawn:
 
     def steps_to(self, level: float) -> tuple[Bounds, Bounds]:
         """Steps to a (signed) level: of the interquartile mean, each (), and of each draw's, each (resamples,)."""
-        one = statistics.step_at_level(self.steps, self.curve, level)
-        many = statistics.step_at_level(self.steps, self.curves, level)
-        return statistics.censored(one, self.last), statistics.censored(many, self.last)
+        one = bounds.step_at_level(self.steps, self.curve, level)
+        many = bounds.step_at_level(self.steps, self.curves, level)
+        return bounds.censored(one, self.last), bounds.censored(many, self.last)
 
 
 def known(one: Bounds, many: Bounds, *drawn: Drawn) -> Known:
     """An estimate with the interval of its draws, which has no ends where one of the variants has a single seed."""
     if any(each.alone for each in drawn):
         return Known(one, np.nan, np.nan)
-    return Known(one, *statistics.percentiles(many))
+    return Known(one, *bounds.percentiles(many))
 
 
 def exactly(values: np.ndarray | float) -> Bounds:
@@ -258,12 +260,12 @@ def _carried(own: Drawn, unguided: Drawn | None, level: float) -> Carried:
     if unguided is None:
         return Carried(own.variant, None, guide, steps, reached, None, None, None)
     below, belows = unguided.steps_to(level)
-    ratio = known(statistics.ratio_bounds(one, below), statistics.ratio_bounds(many, belows), own, unguided)
+    ratio = known(bounds.ratio_bounds(one, below), bounds.ratio_bounds(many, belows), own, unguided)
     (area, areas), (other, others) = own.areas, unguided.areas
     difference = known(exactly(area - other), exactly(areas - others), own, unguided)
     more = Interval(difference.bounds.lower, np.array(difference.lower), np.array(difference.upper))
     pairs = ((area, other), (areas, others))
-    one, many = (statistics.ratio_bounds(exactly(above), exactly(under)) for above, under in pairs)
+    one, many = (bounds.ratio_bounds(exactly(above), exactly(under)) for above, under in pairs)
     times = known(one, many, own, unguided)
     share = Interval(np.where(other == 0, np.nan, one.lower), np.array(times.lower), np.array(times.upper))
     return Carried(own.variant, unguided.variant, guide, steps, reached, ratio, more, share)
@@ -277,7 +279,7 @@ def _labels_to_level(own: Sequence[Drawn], unguided: Drawn, level: float, within
         limit = within * np.atleast_1d(unguided.steps_to(level)[which].lower)
         in_time = np.stack([np.atleast_1d(each.steps_to(level)[which].upper) <= limit for each in own])
         smallest.append(np.where(in_time.any(axis=0), budgets[in_time.argmax(axis=0)], np.inf))
-    one, many = (statistics.censored(found, budgets[-1]) for found in smallest)
+    one, many = (bounds.censored(found, budgets[-1]) for found in smallest)
     labels = known(Bounds(one.lower[0], one.upper[0]), many, unguided, *own)
     variant = own[0].variant
     reached = float(np.isfinite(many.upper).mean())
@@ -291,7 +293,7 @@ def _equal_area(asking: dict[str, list[Drawn]], reference: str | None, sign: flo
     for kind, own in asking.items():
         one = np.array([[each.areas[0] for each in own]])
         many = np.stack([each.areas[1] for each in own], axis=1)
-        fitted[kind] = statistics.isotonic(sign * one), statistics.isotonic(sign * many)
+        fitted[kind] = bounds.isotonic(sign * one), bounds.isotonic(sign * many)
     found = []
     for base, own in asking.items():
         if reference not in (None, base):
@@ -301,7 +303,7 @@ def _equal_area(asking: dict[str, list[Drawn]], reference: str | None, sign: flo
                 if kind == base:
                     continue
                 one, many = (
-                    statistics.labels_for(budgets[kind], fitted[kind][which], fitted[base][which][:, place])
+                    bounds.labels_for(budgets[kind], fitted[kind][which], fitted[base][which][:, place])
                     for which in (0, 1)
                 )
                 one = Bounds(one.lower[0], one.upper[0])
