@@ -2,8 +2,8 @@
 
 Intervals are 95% percentile bootstraps over seeds: the seeds of every variant are drawn with replacement, independently
 of those of others, 2,000 times; what is computed of the interquartile means of the real seeds is computed of each
-draw's. A level is held fixed. A curve that ends below the level is right-censored (`Bounds`): its steps are "more than the last", which
-ratios and intervals carry on as a bound, never as a number.
+draw's. A level is held fixed. A curve that ends below the level is right-censored (`Bounds`): its steps are "more than
+the last", which ratios and intervals carry on as a bound, never as a number.
 """
 
 from __future__ import annotations

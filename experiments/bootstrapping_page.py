@@ -3,8 +3,9 @@
     python experiments/bootstrapping_page.py --data docs/data/bootstrapping --page docs/results/bootstrapping.md
 
 For every table or hall of which there are runs in the data (WORLD/RUN/PIECE, as the two experiments of that name leave
-them) `label_efficiency.py` writes WORLD/report, and its section on label efficiency goes between the lines `<!-- WORLD -->` and `<!-- end of WORLD -->` of the page, in place of what was there. Runs at the scale `cpu`
-(cpu/WORLD/RUN/PIECE) have places of their own, `<!-- WORLD-cpu -->`.
+them) `label_efficiency.py` writes WORLD/report. Its section on label efficiency goes between the lines `<!-- WORLD -->`
+and `<!-- end of WORLD -->` of the page, in place of what was there. Runs at the scale `cpu` (cpu/WORLD/RUN/PIECE) have
+places of their own, `<!-- WORLD-cpu -->`.
 """
 
 from __future__ import annotations
