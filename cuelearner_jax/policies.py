@@ -208,27 +208,6 @@ class Corrected(struct.PyTreeNode):
         return self.replace(base=self.base.axes, teacher=SHARED, scalars=SHARED)
 
 
-class Residual(struct.PyTreeNode):
-    """Another policy's actions plus what a function adds to them, once, within a bound."""
-
-    base: Any  # a policy
-    params: Params
-    bound: Float[Array, ""] | float  # [rad]
-    residual: Callable[[Params, Array, Array], Array] = struct.field(pytree_node=False)  # (params, obs, actions)
-    actions: Actions = struct.field(pytree_node=False, default=DIRECTIONS)
-
-    def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
-        """The base's actions, corrected."""
-        base = self.base.act(key, states, obs)
-        moved = self.actions.retract(base + self.residual(self.params, obs, base))
-        return self.actions.clip(moved, base, self.bound)
-
-    @property
-    def axes(self) -> Residual:
-        """Each lane has its own base and parameters."""
-        return self.replace(base=self.base.axes, params=BY_LANE, bound=SHARED)
-
-
 class Opaque(struct.PyTreeNode):
     """Any function of a batch of observations: of JAX arrays, or, `on_host`, of NumPy arrays in plain Python.
 

@@ -14,12 +14,13 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import _residual as residual
 import _trajectories as trajectories
 import numpy as np
+from _finetuning import FineTuning, every
 from _pieces import chosen, listed
 
-from cuelearner_jax.adaptation import adapting, program, residual
-from cuelearner_jax.adaptation.finetuning import FineTuning, every
+from cuelearner_jax.adaptation import adapting, program
 from cuelearner_jax.cli import main as cuelearner
 from cuelearner_jax.config import GuideSizes, RunConfig
 from cuelearner_jax.environment import actions_of, spaces_of

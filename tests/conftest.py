@@ -70,7 +70,7 @@ SLOW = (
     *("envs/billiards/test_environment.py", "envs/billiards/test_mirrors.py", "envs/billiards/test_parity.py"),
     *("envs/billiards/test_teacher.py", "envs/navigation/test_drawing.py", "envs/navigation/test_environment.py"),
     *("envs/navigation/test_episodes.py", "envs/navigation/test_roadmap.py", "envs/navigation/test_worlds.py"),
-    *("envs/navigation/test_sides.py", "adaptation/test_finetuning.py", "adaptation/test_residual.py"),
+    "envs/navigation/test_sides.py",
     *("test_asking.py", "test_devices.py", "test_environment.py", "test_evaluate.py", "test_loop.py"),
     *("tasks/test_registry.py", "test_policies.py"),
 )

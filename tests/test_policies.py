@@ -12,7 +12,7 @@ import pytest
 
 from cuelearner_jax import actions
 from cuelearner_jax.agents import choice
-from cuelearner_jax.agents.networks import applied, q_network, residual_network
+from cuelearner_jax.agents.networks import applied, q_network
 from cuelearner_jax.devices import lane_mesh
 from cuelearner_jax.environment import Aims
 from cuelearner_jax.errors import UserError
@@ -26,7 +26,6 @@ from cuelearner_jax.policies import (
     Heuristic,
     NearAims,
     Opaque,
-    Residual,
     Taught,
     Teaching,
     Uniform,
@@ -41,7 +40,6 @@ KEY = jax.random.key(5)
 Q = q_network(probes.SIZES.q_layers)
 AGENT = Agent(Q.init(jax.random.key(1), jnp.zeros(2), jnp.zeros(2)), probes.SIZES)
 LANES, MESH = 3, lane_mesh()
-PHI = residual_network((8,), 2)
 
 
 def act(policy, key=KEY, obs=OBS):
@@ -139,24 +137,6 @@ def test_corrections_keep_to_the_bound():
     np.testing.assert_allclose(np.rad2deg(moved), 30.0, atol=1e-2)  # 92 degrees short, so as far as allowed
 
 
-def test_a_residual_adds_to_the_base_and_stays_within_its_bound():
-    def add(params, obs, base):
-        return params * actions.rotate(base, np.pi / 2) + 0.0 * obs
-
-    def moved(size, bound):
-        return np.asarray(actions.difference(act(AGENT), act(Residual(AGENT, jnp.array(size), bound, add))))
-
-    np.testing.assert_allclose(moved(0.3, 1.0), np.arctan(0.3), atol=1e-5)
-    np.testing.assert_allclose(moved(-0.3, 1.0), -np.arctan(0.3), atol=1e-5)
-    np.testing.assert_allclose(moved(0.3, 0.1), 0.1, atol=1e-5)
-    np.testing.assert_allclose(moved(0.0, 1.0), 0.0, atol=1e-6)
-    np.testing.assert_allclose(moved(5.0, 0.0), 0.0, atol=1e-6)
-    wild = Residual(AGENT, jnp.array(1.0), 0.25, lambda params, obs, base: 100 * (BEST + params))
-    away = np.abs(actions.difference(act(AGENT), act(wild)))
-    assert away.max() <= 0.25 + 1e-5
-    assert away.max() > 0.2
-
-
 # Functions of one's own.
 
 
@@ -247,10 +227,6 @@ def guided(base):
     return Guided(base, block().guide.model, ENV, probes.SCALARS, relative)
 
 
-def residual(params, obs, base):
-    return jnp.asarray(PHI.apply(params, obs, base))
-
-
 def agents():
     return Agent(block().agent.params, probes.SIZES)
 
@@ -261,12 +237,6 @@ BLOCKS = {
     "guided uniform": lambda: guided(Uniform()),
     "guided heuristic": lambda: guided(Heuristic(ENV)),
     "corrected agent": lambda: Corrected(agents(), EXPERT, dataclasses.replace(probes.SCALARS, tau_max_deg=60.0)),
-    "residual of uniform": lambda: Residual(
-        Uniform(),
-        jax.vmap(lambda key: PHI.init(key, jnp.zeros(2), jnp.zeros(2)))(jax.random.split(KEY, LANES)),
-        1.0,
-        residual,
-    ),
 }
 
 

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from cuelearner_jax import user_code
 from cuelearner_jax.environment import Environment
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.policies import Agent, Common, Guided, Policy, Residual, named
+from cuelearner_jax.policies import Agent, Common, Guided, Policy, named
 
 TOLERANCE = 1e-5  # by which an entry of an action may differ elsewhere
 NUDGE = 1e-6  # of an entry of an observation, as much as rounding may do
@@ -64,8 +64,6 @@ def _described(layer: Any) -> dict[str, Any]:
             "most_passes": int(scalars.k_max),
             "clip_radius_deg": min(float(scalars.tau_max_deg), bound),
         }
-    if isinstance(layer, Residual):
-        return {"layer": "residual", "clip_radius_deg": float(np.rad2deg(layer.bound))}
     if isinstance(layer, Agent):
         return {"layer": "agent", "directions": layer.sizes.directions, "frame": layer.sizes.frame}
     return {"layer": type(layer).__name__.lower()}

@@ -47,7 +47,7 @@ TASK = Task(
     scenarios={
         "aslant": Scenario("the best direction is turned", {"offset_deg": -20.0}, bound_deg=45.0, eps_deg=5.0),
         "told": Scenario(
-            "how is said too", {"offset_deg": 20.0}, guidance="residual", judge_by="labels",
+            "how is said too", {"offset_deg": 20.0}, guidance="demonstration", judge_by="labels",
             sizes={"labels_per_round": 40, "frame": "raw"}, scalars={"k_max": 7},
         ),
         "ruled": Scenario(
@@ -237,7 +237,7 @@ def defaults_of(capsys, *options):
 
 
 def test_a_scenario_says_how_unless_another_kind_is_asked_for(home, capsys):
-    assert defaults_of(capsys, "--scenario", "told") == ["residual", "labels", "40", "7"]
+    assert defaults_of(capsys, "--scenario", "told") == ["demonstration", "labels", "40", "7"]
     kind, by, a_round, passes = defaults_of(capsys)
     assert (kind, by, a_round, passes) == ("relative", "reward", "10", "50")
     assert defaults_of(capsys, "--scenario", "told", "--guidance", "dcoach") == ["dcoach", "labels", a_round, passes]

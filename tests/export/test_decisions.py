@@ -26,7 +26,7 @@ from cuelearner_jax.environment import Quantity, action_of, spaces_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.export import contract, decisions, formats, onnx_graph, runner
 from cuelearner_jax.guides import registry as guidances
-from cuelearner_jax.policies import Agent, Corrected, Guided, Heuristic, Opaque, Residual, uniform_in
+from cuelearner_jax.policies import Agent, Corrected, Guided, Heuristic, Opaque, uniform_in
 
 ENV = Aimed()
 ANGLES = np.linspace(0.0, 6.0, 40)
@@ -48,17 +48,12 @@ def guided(kind, bound_deg=None, base=None, **sizes):
     return Guided(base or Heuristic(ENV), model, ENV, SCALARS, guidance, bound)
 
 
-def turned(params, obs, actions):
-    return params * actions[:, ::-1] * obs[:, :1]
-
-
 POLICIES = {
     "agent": agent,
     "heuristic": lambda: Heuristic(ENV),
     "refined within a bound": lambda: guided("relative", bound_deg=7.0, base=agent(frame="action"), frame="action"),
     "an ensemble": lambda: guided("demonstration", ensemble=3),
     "aims": lambda: guided("intent"),
-    "residual": lambda: Residual(Heuristic(ENV), jnp.float32(0.4), 0.1, turned),
     "a function": lambda: Opaque(lambda obs: jnp.roll(obs, 1, -1)),
 }
 

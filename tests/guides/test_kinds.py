@@ -162,7 +162,7 @@ def test_a_coached_policy_comes_nearer_to_what_its_coach_has_in_mind():
     assert np.median(asked[-20:]) < 15
 
 
-@pytest.mark.parametrize("kind", ["demonstration", "scalar", "cuelearner_jax.adaptation.residual:KIND"])
+@pytest.mark.parametrize("kind", ["demonstration", "scalar", "_residual:KIND"])
 def test_answers_that_mean_no_turn_have_no_strength_that_could_fall(kind):
     falling = dataclasses.replace(SIZES, eps_falls=True)
     with pytest.raises(UserError, match=r"answers, which have no strength .* leave out --sizes\.eps-falls") as refusal:

@@ -3,12 +3,12 @@
 Source: paper, section V-B ("residual learning": learning to directly predict the needed correction from optimal
 corrective demonstrations, within the same bound). The teacher shows what it would have done instead of an action; the
 network is fitted to the way from the one to the other, cut off at `scalars.tau_max_deg` and in units of
-`scalars.eps_deg` (give the bound for both). With `scalars.k_max` 1 it is applied once, as `policies.Residual` is;
+`scalars.eps_deg` (give the bound for both). With `scalars.k_max` 1 it is applied once;
 more passes correct what it has made of the action, about which questions are from the second round on (DAgger, see
 `scalars.refined_fraction`).
 
 It is a kind of guidance, so the program of adaptation runs it as it runs relative feedback; on the command line it is
-named as `cuelearner_jax.adaptation.residual:KIND`.
+named as `_residual:KIND`, with this folder on the path of Python.
 """
 
 from __future__ import annotations

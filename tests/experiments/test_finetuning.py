@@ -5,9 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import probes
 import pytest
+from _finetuning import FineTuning, every
 
 from cuelearner_jax import actions, evaluate
-from cuelearner_jax.adaptation.finetuning import FineTuning, every
 from cuelearner_jax.agents.networks import q_network
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.policies import Agent

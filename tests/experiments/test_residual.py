@@ -1,7 +1,6 @@
 """Residual learning from optimal actions, on the bandit turned by a constant, through the program of adaptation."""
 
-import dataclasses
-
+import _residual as residual
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,13 +9,12 @@ import pytest
 from flax import struct
 
 from cuelearner_jax import actions
-from cuelearner_jax.adaptation import program, residual
+from cuelearner_jax.adaptation import program
 from cuelearner_jax.config import GuideSizes, Scalars
 from cuelearner_jax.environment import spaces_of
 from cuelearner_jax.guides import registry
 from cuelearner_jax.guides.fitting import lessons
-from cuelearner_jax.guides.model import residual_model
-from cuelearner_jax.policies import Common, Residual
+from cuelearner_jax.policies import Common
 from cuelearner_jax.types import Label
 
 TURN_DEG, BOUND_DEG = 8.0, 12.0
@@ -63,25 +61,6 @@ def test_a_constant_shift_is_recovered(adapted):
         done = lane_of(policy, lane).act(jax.random.key(0), None, OBS)
         off = np.rad2deg(actions.distance(done, jax.vmap(ENV.best)(OBS)))
         assert off.max() < TURN_DEG / 4
-
-
-def test_it_is_the_residual_policy(adapted):
-    """Where it is applied once."""
-    policy = lane_of(adapted[1].replace(scalars=dataclasses.replace(SCALARS, k_max=1)), 0)
-    network, unit = residual_model(SIZES, spaces_of(ENV)), jnp.deg2rad(BOUND_DEG)
-    plain = Residual(
-        policy.base, policy.model.params, policy.bound, lambda params, *seen: unit * network.predict(ENV, params, *seen)
-    )
-    expected = plain.act(jax.random.key(0), None, OBS)
-    np.testing.assert_allclose(policy.act(jax.random.key(0), None, OBS), expected, atol=1e-6)
-
-
-def test_corrections_stay_within_the_bound():
-    _, policy = asked(40, 3.0)  # the same programs, for bounds are values
-    for lane in range(2):
-        done = lane_of(policy, lane).act(jax.random.key(0), None, OBS)
-        away = np.rad2deg(actions.distance(done, policy.base.act(jax.random.key(0), None, OBS)))
-        np.testing.assert_allclose(away, 3.0, atol=1e-3)  # the needed ones are larger
 
 
 def test_targets_are_the_needed_corrections_cut_off():
