@@ -18,8 +18,8 @@ from cuelearner_jax.actions import only_actions
 from cuelearner_jax.config import GuideScalars, GuideSizes, Scalars
 from cuelearner_jax.environment import Environment, actions_of
 from cuelearner_jax.feedback.answers import of_strength
-from cuelearner_jax.guides.bounding import within
-from cuelearner_jax.guides.bundle import Guidance
+from cuelearner_jax.guides.base import Guide
+from cuelearner_jax.guides.refining import within
 from cuelearner_jax.policies import Policy, acted, best_actions, named
 from cuelearner_jax.types import GuideState, Label, Stream, Teacher
 
@@ -107,7 +107,7 @@ def as_kept(labels: Label, guide: GuideState, scalars: GuideScalars) -> Label:
 
 
 def start(
-    guidance: Guidance,
+    guidance: Guide,
     env: Environment,
     slots: int,
     budget: Int[Array, ""] | int,
@@ -121,7 +121,7 @@ def start(
     """
     candidates = sizes.candidates
     by_members = candidates > 1 and sizes.chosen_by == "members" and not sizes.ask_all
-    if by_members and guidance.asks and guidance.disagreement is None:
+    if by_members and guidance.asks and not guidance.has_members:
         raise ValueError(f"guidance {guidance.name!r} has no members whose disagreement could choose its questions")
     state, obs = env.reset(k_env) if candidates == 1 else jax.vmap(env.reset)(jax.random.split(k_env, candidates))
     return GuideState(
@@ -131,7 +131,7 @@ def start(
             env.obs_size,
             actions_of(env).size,
             guidance.answer_width,
-            with_base=guidance.onward is not None,
+            with_base=guidance.kind.sees_base,
             with_eps=guidance.asks and sizes.eps_falls,
         ),
         budget=jnp.asarray(budget, jnp.int32),
@@ -152,7 +152,7 @@ def proposed(
 
 
 def question(
-    guidance: Guidance,
+    guidance: Guide,
     env: Environment,
     scalars: GuideScalars,
     base: Policy,
@@ -168,7 +168,7 @@ def question(
 
 
 def _asked_of(
-    guidance: Guidance,
+    guidance: Guide,
     env: Environment,
     scalars: GuideScalars,
     guide: GuideState,
@@ -220,7 +220,7 @@ def proceed(
 
 
 def fit(
-    guidance: Guidance,
+    guidance: Guide,
     env: Environment,
     scalars: GuideScalars,
     guide: GuideState,
@@ -234,7 +234,7 @@ def fit(
 
 
 def ask(
-    guidance: Guidance,
+    guidance: Guide,
     env: Environment,
     teacher: Teacher,
     scalars: Scalars,
@@ -269,12 +269,12 @@ def ask(
     eps_deg = None if guide.labels.eps_deg is None else strength(scalars, position, guide.budget)
     strong = of_strength(scalars, eps_deg)
     answer, answered = guidance.form.answer(keys.answer, env, teacher, there.env, there.obs, action, strong)
-    told = record(there, position, action, answer, answered, first if guidance.onward else None, eps_deg)
+    told = record(there, position, action, answer, answered, first if guidance.kind.sees_base else None, eps_deg)
     return proceed(env, told.replace(env=guide.env, obs=guide.obs), actions, keys)
 
 
 def ask_all(
-    guidance: Guidance,
+    guidance: Guide,
     env: Environment,
     teacher: Teacher,
     scalars: Scalars,
@@ -302,7 +302,7 @@ def ask_all(
 
     answer_keys = jax.random.split(keys.answer, count)
     answers, answered = jax.vmap(one)(answer_keys, guide.env, guide.obs, actions, eps_deg)
-    first = proposals if guidance.onward else None
+    first = proposals if guidance.kind.sees_base else None
     rows = Label(guide.obs, actions, answers, answered & (positions < guide.budget), first, eps_deg)
     put = lambda known, new: jax.lax.dynamic_update_slice_in_dim(known, new, position, 0)  # noqa: E731
     asked = jnp.minimum(position + count, guide.budget)
@@ -329,7 +329,7 @@ def blame(
 
 
 def walked(
-    guidance: Guidance,
+    guidance: Guide,
     env: Environment,
     scalars: GuideScalars,
     base: Policy,
@@ -347,7 +347,7 @@ def walked(
 
 
 def label_round(
-    guidance: Guidance,
+    guidance: Guide,
     sizes: GuideSizes,
     env: Environment,
     teacher: Teacher,
@@ -383,7 +383,7 @@ def label_round(
 
 
 def take_labels(
-    guidance: Guidance, env: Environment, scalars: GuideScalars, labels: Label, guide: GuideState, lane_key: Any
+    guidance: Guide, env: Environment, scalars: GuideScalars, labels: Label, guide: GuideState, lane_key: Any
 ) -> GuideState:
     """The guide with labels (slots, ...) that were given elsewhere, and a model fitted to them once.
 

@@ -9,13 +9,13 @@ from jaxtyping import Array, Float
 from cuelearner_jax.actions import rotate
 from cuelearner_jax.config import Scalars
 from cuelearner_jax.environment import Environment, actions_of
-from cuelearner_jax.guides.bundle import Guidance
+from cuelearner_jax.guides.base import Guide
 from cuelearner_jax.policies import wanted_actions
 from cuelearner_jax.types import GuideState, Teacher
 
 
 def chosen(
-    guidance: Guidance,
+    guidance: Guide,
     env: Environment,
     guide: GuideState,
     actions: Float[Array, "*candidates action"],
@@ -35,12 +35,11 @@ def chosen(
         away: how far the actions are from a teacher's own, see `parting`: it chooses the farthest, fitted or not, and
             the first of several as far; None: members choose.
     """
-    if guide.obs.ndim == 1 or (away is None and guidance.disagreement is None):
+    if guide.obs.ndim == 1 or (away is None and not guidance.has_members):
         return guide, actions, first
     if away is not None:
         index = jnp.argmax(away)
     else:
-        assert guidance.disagreement is not None
         apart = guidance.disagreement(guide.model, env, guide.obs, actions)
         index = jnp.where(guide.model.fitted, jnp.argmax(apart), 0)
     there = jax.tree.map(lambda leaf: leaf[index], (guide.env, guide.obs, actions, first))

@@ -31,8 +31,7 @@ from cuelearner_jax.devices import (
     over_lanes,
 )
 from cuelearner_jax.environment import Environment
-from cuelearner_jax.guides.bounding import act_within
-from cuelearner_jax.guides.bundle import Guidance
+from cuelearner_jax.guides.base import Guide
 from cuelearner_jax.guides.refining import Refined, untouched
 from cuelearner_jax.policies import Agent, Uniform
 from cuelearner_jax.types import Clock, GuideState, Label, Params, Stream, Teacher, TrainState
@@ -64,7 +63,7 @@ def start_clock() -> Clock:
 
 def make_program(
     config: RunConfig,
-    guidance: Guidance,
+    guidance: Guide,
     env: Environment,
     largest_budget: int,
     mesh: Mesh | None = None,
@@ -91,7 +90,7 @@ def _program_of(
     sizes: Sizes,
     bootstraps: bool,
     noisy: bool,
-    guidance: Guidance,
+    guidance: Guide,
     largest_budget: int,
     structure: Any,
     leaves: tuple[jax.ShapeDtypeStruct, ...],
@@ -155,7 +154,7 @@ class Lane(NamedTuple):
     """The loop of one lane."""
 
     sizes: Sizes
-    guidance: Guidance
+    guidance: Guide
     learner: Learner
     largest_budget: int
     noisy: bool = False  # are actions turned at random?
@@ -316,7 +315,7 @@ class Lane(NamedTuple):
         if len(schedule.ask_at) == 1:
             return guidance.act(*where)
         bound = jnp.where(clock.step >= schedule.ask_at[1], scalars.radians("ask_bound"), jnp.pi)
-        return act_within(bound, guidance, *where)
+        return guidance.act_within(bound, *where)
 
 
 def guides(clock: Clock, schedule: Schedule) -> Bool[Array, ""]:
@@ -324,12 +323,12 @@ def guides(clock: Clock, schedule: Schedule) -> Bool[Array, ""]:
     return (clock.step >= schedule.random_steps) & (clock.step < schedule.guidance_until)
 
 
-def make_lane(config: RunConfig, guidance: Guidance, env: Environment, largest_budget: int) -> Lane:
+def make_lane(config: RunConfig, guidance: Guide, env: Environment, largest_budget: int) -> Lane:
     """The loop of one lane for an environment, whose shapes alone are looked at."""
     return _lane_of(config.sizes, config.bootstraps, config.noisy, guidance, largest_budget, env)
 
 
 def _lane_of(
-    sizes: Sizes, bootstraps: bool, noisy: bool, guidance: Guidance, largest_budget: int, env: Environment
+    sizes: Sizes, bootstraps: bool, noisy: bool, guidance: Guide, largest_budget: int, env: Environment
 ) -> Lane:
     return Lane(sizes, guidance, learner(sizes, bootstraps, env), largest_budget, noisy)

@@ -25,8 +25,7 @@ from cuelearner_jax.devices import portions
 from cuelearner_jax.environment import actions_of
 from cuelearner_jax.errors import UserError, raised_by, shown
 from cuelearner_jax.feedback.answers import in_mind, relative_feedback
-from cuelearner_jax.guides.bounding import act_within
-from cuelearner_jax.guides.bundle import Guidance
+from cuelearner_jax.guides.base import Guide
 from cuelearner_jax.guides.refining import refine
 from cuelearner_jax.types import EnvState, GuidanceModel, Params, Teacher
 
@@ -142,7 +141,7 @@ class Guided(struct.PyTreeNode):
     model: GuidanceModel
     env: Any
     scalars: GuideScalars
-    guidance: Guidance = struct.field(pytree_node=False)
+    guidance: Guide = struct.field(pytree_node=False)
     bound: Float[Array, ""] | None = None  # to the way from the base's actions [rad]; None: wherever guidance leads
     sizes: GuideSizes | None = struct.field(pytree_node=False, default=None)  # of the guidance: needed to store it
 
@@ -152,7 +151,7 @@ class Guided(struct.PyTreeNode):
         where = (self.model, self.env, obs, base, jnp.ones(obs.shape[0], bool), self.scalars)
         if self.bound is None:
             return self.guidance.act(*where).actions
-        return act_within(self.bound, self.guidance, *where).actions
+        return self.guidance.act_within(self.bound, *where).actions
 
     @property
     def axes(self) -> Guided:

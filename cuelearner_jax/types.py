@@ -89,7 +89,7 @@ class Transition(struct.PyTreeNode):
 
 
 class Label(struct.PyTreeNode):
-    """One answer of a teacher: what it said, not what a network is to predict of it (`Guidance.target`)."""
+    """One answer of a teacher: what it said, not what a network is to predict of it (`Guide.target`)."""
 
     obs: Float[Array, " obs"]
     action: Float[Array, " action"]  # the action asked about

@@ -9,6 +9,7 @@ Run in the folder above this one, with any task that has a teacher:
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import jax
@@ -16,14 +17,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from cuelearner_jax.actions import evenly_spaced, rotate
-from cuelearner_jax.agents.networks import applied, residual_network
-from cuelearner_jax.config import GuideScalars, GuideSizes, Scalars
-from cuelearner_jax.environment import Spaces
+from cuelearner_jax.config import GuideScalars, Scalars
+from cuelearner_jax.errors import UserError
 from cuelearner_jax.feedback.forms import AnswerForm
-from cuelearner_jax.guides.bundle import Guidance
-from cuelearner_jax.guides.fitting import fit_least_squares, lessons
-from cuelearner_jax.guides.kind import Kind
-from cuelearner_jax.guides.questions import about_refined
+from cuelearner_jax.guides.base import Guide, Kind
 from cuelearner_jax.guides.refining import Refined
 from cuelearner_jax.types import EnvState, GuidanceModel, Label, Params, Teacher
 
@@ -56,39 +53,44 @@ FORM = AnswerForm(
 )
 
 
-def make(sizes: GuideSizes, spaces: Spaces) -> Guidance:
-    """The bundle for an environment's spaces."""
-    space = spaces.actions
-    network = residual_network(sizes.feedback_layers, space.size)
+@dataclass(frozen=True)
+class Options:
+    """Options that this kind alone has."""
 
-    def init_params(key: PRNGKeyArray) -> Params:
-        return network.init(key, jnp.zeros(spaces.obs_size), jnp.zeros(space.size))
+    way: float = 1.0
+    """Share of the way to the network's action that is gone, above 0 and up to 1."""
 
-    def predict(params: Params, obs: Array, actions: Array) -> Array:
-        """The network's action, whatever the action asked about was."""
-        return applied(network)(params, obs, jnp.zeros_like(actions))
+    def __post_init__(self) -> None:
+        if not 0 < self.way <= 1:
+            raise UserError(f"clone.way is {self.way}: give a number above 0 and up to 1")
 
-    def init(key: PRNGKeyArray) -> GuidanceModel:
-        return GuidanceModel(init_params(key), jnp.array(False))
 
-    def target(label: Label, scalars: GuideScalars) -> Float[Array, "2"]:
+class Clone(Guide):
+    """A network of the points that the teacher names, which acts in the agent's place.
+
+    What is not written here is the base class's: the network, its fit by least squares, and questions about what the
+    network would do, so that the situations which follow are those that it will meet.
+    """
+
+    def target(self, label: Label, scalars: GuideScalars) -> Float[Array, "2"]:
         """The direction of the point that was named."""
         return evenly_spaced(POINTS)[label.answer[0].astype(int)]
 
-    def fit(key: PRNGKeyArray, env: Any, labels: Label, former: GuidanceModel, scalars: GuideScalars) -> GuidanceModel:
-        rows = lessons(labels, target, scalars)
-        return fit_least_squares(key, rows, scalars, init=init_params, apply=predict, sizes=sizes)
+    def predict(self, env: Any, params: Params, obs: Array, actions: Array) -> Array:
+        """The network's action, whatever the action asked about was."""
+        return self.network.predict(env, params, obs, jnp.zeros_like(actions))
 
     def act(
-        model: GuidanceModel, env: Any, obs: Array, actions: Array, active: Array, scalars: GuideScalars
+        self, model: GuidanceModel, env: Any, obs: Array, actions: Array, active: Array, scalars: GuideScalars
     ) -> Refined:
         """The network's actions in active rows, once it has been fitted."""
-        guided = active & model.fitted
-        chosen = space.retract(predict(model.params, obs, actions))
-        return Refined(jnp.where(guided[:, None], chosen, actions), guided.astype(jnp.int32))
 
-    # Questions are about the model's own choices: the situations that follow are those that it will meet.
-    return Guidance("clone", FORM, init, about_refined(act), target, fit, act)
+        def way(current: Array) -> Array:
+            return self.options.way * (self.predict(env, model.params, obs, current) - current)
+
+        return self.refined(way, actions, active & model.fitted, scalars, k_max=1)
 
 
-KIND = Kind("clone", "a network of the points that the teacher names", make, form=FORM, colour="#CC79A7")
+KIND = Kind(
+    "clone", "a network of the points that the teacher names", Clone, form=FORM, colour="#CC79A7", config=Options
+)

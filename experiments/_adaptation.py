@@ -70,7 +70,8 @@ class Piece(NamedTuple):
     variant: str = ""  # of its settings, where there are several
     bound_deg: float = 180.0
     labels: tuple[int, ...] = ()  # budgets
-    settings: Mapping[str, Any] = {}  # "sizes.…" and "scalars.…" of the guide or of the learning agent, "task.…"
+    settings: Mapping[str, Any] = {}  # "sizes.…" and "scalars.…" of the guide or of the learning agent, "task.…";
+    # "guidance" where the kind is another than the method's
     rates: tuple[float, ...] = ()  # of fine-tuning: its step sizes,
     noises_deg: tuple[float, ...] = ()  # and its noises
     steps: int = 0  # of fine-tuning
@@ -188,7 +189,7 @@ def by_labels(kind: Any, bench: Bench) -> Iterator[Row]:
     piece, env = bench.piece, bench.env("training")
     sizes = bench.set("sizes.", GuideSizes(frame=bench.config.sizes.frame))
     scalars = bench.scalars()
-    guidance = guidances.made_for(kind, sizes, spaces_of(env))
+    guidance = kind.make(sizes, spaces_of(env))
     lanes = program.product(len(bench.seeds), (SEED,), piece.labels, (piece.bound_deg,))
     envs = min(bench.envs, JUDGED)
     judge = adapting.Judging(bench.env("tuning"), envs, envs * bench.steps, piece.judge_by, bounds=piece.judge_bounds)
@@ -214,7 +215,8 @@ def by_residuals(bench: Bench) -> Iterator[Row]:
     """The correction itself, learned from optimal actions, in units of the bound."""
     settings = {"scalars.eps_deg": bench.piece.bound_deg, "scalars.tau_max_deg": bench.piece.bound_deg}
     settings |= {"scalars.k_max": 3, **bench.piece.settings}
-    yield from by_labels(residual.KIND, bench._replace(piece=bench.piece._replace(settings=settings)))
+    kind = residual.OFFSET if "guidance" in settings else residual.KIND
+    yield from by_labels(kind, bench._replace(piece=bench.piece._replace(settings=settings)))
 
 
 def fine_tuned(bench: Bench) -> Iterator[Row]:
@@ -241,7 +243,7 @@ def fine_tuned(bench: Bench) -> Iterator[Row]:
 
 
 def _kind(name: str) -> Callable[[Bench], Iterator[Row]]:
-    return lambda bench: by_labels(guidances.find(name), bench)
+    return lambda bench: by_labels(guidances.find(bench.piece.settings.get("guidance", name)), bench)
 
 
 METHODS: dict[str, Callable[[Bench], Iterator[Row]]] = {

@@ -30,7 +30,7 @@ from cuelearner_jax.devices import compiler_options, each_lane, each_lane_in_pla
 from cuelearner_jax.environment import Environment, actions_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides import registry as guidances
-from cuelearner_jax.guides.none import KIND
+from cuelearner_jax.guides.untaught import NONE
 from cuelearner_jax.loop import Lane, make_lane, start_clock
 from cuelearner_jax.policies import Agent
 from cuelearner_jax.types import Clock, TrainState
@@ -115,7 +115,7 @@ class FineTuning:
         self.config = dataclasses.replace(config, scalars=scalars, schedule=schedule)
         check(self.config)
         self.env, self.lanes, self.clock = env, lanes, start_clock()
-        self._lane = make_lane(self.config, guidances.make(KIND.name, config.sizes, env), env, 0)
+        self._lane = make_lane(self.config, guidances.make(NONE.name, config.sizes, env), env, 0)
         self._train = jax.jit(
             _stretch,
             static_argnames=("lane", "iterations"),

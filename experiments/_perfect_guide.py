@@ -9,8 +9,8 @@ in the folder that holds this file or by a script in it. What such a guide earns
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import lru_cache, partial
-from typing import Any, Literal
+from functools import lru_cache
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -19,51 +19,45 @@ from jaxtyping import Array, Bool, Float
 from cuelearner_envs.billiards.config import BilliardsConfig, make_environment
 from cuelearner_jax.actions import DIRECTIONS
 from cuelearner_jax.agents.choice import greedy_actions
-from cuelearner_jax.config import GuideScalars, GuideSizes
-from cuelearner_jax.environment import Spaces
-from cuelearner_jax.guides.bundle import Guidance
-from cuelearner_jax.guides.kind import Kind
+from cuelearner_jax.config import GuideScalars
+from cuelearner_jax.guides.base import Kind
 from cuelearner_jax.guides.refining import Refined
-from cuelearner_jax.guides.unlabelled import unlabelled
+from cuelearner_jax.guides.untaught import Untaught
 from cuelearner_jax.tasks.billiards import SEEN_FROM_THE_STRIKE, SHIPPED_TEACHERS
 from cuelearner_jax.teachers import stored
 from cuelearner_jax.teachers.learned import LearnedTeacher
 from cuelearner_jax.types import GuidanceModel
 
-Table = Literal["regulation", "easy"]
-
 
 @lru_cache
-def teacher(table: Table) -> LearnedTeacher:
+def teacher(table: str) -> LearnedTeacher:
     """The table's shipped network, which aims without error. Its arrays are NumPy's: constants of any program."""
     with jax.ensure_compile_time_eval():
-        found = stored.load(SHIPPED_TEACHERS / table, make_environment(BilliardsConfig(table)), 0.0, 0.0)
+        found = stored.load(SHIPPED_TEACHERS / table, make_environment(BilliardsConfig(cast(Any, table))), 0.0, 0.0)
     return jax.device_get(found)
 
 
-def act(
-    table: Table,
-    model: GuidanceModel,
-    env: Any,
-    obs: Float[Array, "n obs"],
-    actions: Float[Array, "n action"],
-    active: Bool[Array, " n"],
-    scalars: GuideScalars,
-) -> Refined:
-    """The teacher's best action in active rows; searched near the peaks, as agents search theirs: it is asked often."""
-    told = teacher(table)
-    sizes = replace(SEEN_FROM_THE_STRIKE, q_layers=told.layers, directions=told.directions)
-    best = greedy_actions(sizes, DIRECTIONS, env, told.params, obs)
-    return Refined(jnp.where(active[:, None], best, actions), active.astype(jnp.int32))
+class Perfect(Untaught):
+    """The teacher of the table that the kind is named after strikes."""
+
+    def act(
+        self,
+        model: GuidanceModel,
+        env: Any,
+        obs: Float[Array, "n obs"],
+        actions: Float[Array, "n action"],
+        active: Bool[Array, " n"],
+        scalars: GuideScalars,
+    ) -> Refined:
+        """Its best action in active rows; searched near the peaks, as agents search theirs: it is asked often."""
+        told = teacher(self.name.removeprefix("perfect-"))
+        sizes = replace(SEEN_FROM_THE_STRIKE, q_layers=told.layers, directions=told.directions)
+        best = greedy_actions(sizes, DIRECTIONS, env, told.params, obs)
+        return Refined(jnp.where(active[:, None], best, actions), active.astype(jnp.int32))
 
 
-def make(table: Table, sizes: GuideSizes, spaces: Spaces) -> Guidance:
-    """The bundle."""
-    return unlabelled(f"perfect-{table}", partial(act, table))
-
-
-def _kind(table: Table) -> Kind:
-    return Kind(f"perfect-{table}", "the teacher's best shot", partial(make, table), title="perfect", colour="#6A3D9A")
+def _kind(table: str) -> Kind:
+    return Kind(f"perfect-{table}", "the teacher's best shot", Perfect, title="perfect", colour="#6A3D9A")
 
 
 REGULATION, EASY = _kind("regulation"), _kind("easy")

@@ -8,31 +8,39 @@ more passes correct what it has made of the action, about which questions are fr
 `scalars.refined_fraction`).
 
 It is a kind of guidance, so the program of adaptation runs it as it runs relative feedback; on the command line it is
-named as `_residual:KIND`, with this folder on the path of Python.
+named as `_residual:KIND`, or `_residual:OFFSET` to see how far an action has been turned, with this folder on the path
+of Python.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from jaxtyping import Array, Float
 
-from cuelearner_jax.config import GuideScalars, GuideSizes
-from cuelearner_jax.environment import Spaces
+from cuelearner_jax.config import GuideScalars
 from cuelearner_jax.feedback.answers import DEMONSTRATION
-from cuelearner_jax.guides.bundle import Guidance
-from cuelearner_jax.guides.correcting import correcting
-from cuelearner_jax.guides.kind import Kind
+from cuelearner_jax.guides.base import Guide, Kind
+from cuelearner_jax.guides.offset import Offset
+from cuelearner_jax.guides.relative import Relative
 from cuelearner_jax.types import Label
 
 
-def make(sizes: GuideSizes, spaces: Spaces) -> Guidance:
-    """The bundle for an environment's spaces."""
-    space = spaces.actions
+class _Shown(Guide):
+    """Mixed into a guide that corrects: the needed correction is shown, not answered."""
 
-    def target(label: Label, scalars: GuideScalars) -> Float[Array, " action"]:
+    def target(self, label: Label, scalars: GuideScalars) -> Float[Array, " action"]:
         """The needed correction, cut off at the bound."""
-        return space.clip(label.answer, label.action, scalars.radians("tau_max")) - label.action
-
-    return correcting("residual", DEMONSTRATION, target, sizes, spaces)
+        return self.spaces.actions.clip(label.answer, label.action, scalars.radians("tau_max")) - label.action
 
 
-KIND = Kind("residual", "the correction itself, from optimal actions", make, form=DEMONSTRATION, colour="#D55E00")
+class Residual(_Shown, Relative):
+    """Residual learning."""
+
+
+class ResidualOffset(_Shown, Offset):
+    """Residual learning that sees how far an action has been turned."""
+
+
+KIND = Kind("residual", "the correction itself, from optimal actions", Residual, form=DEMONSTRATION, colour="#D55E00")
+OFFSET = replace(KIND, name="residual-offset", guide=ResidualOffset, sees_base=True)

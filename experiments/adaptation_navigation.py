@@ -24,7 +24,7 @@ BUDGETS = (50, 100, 250, 500)
 TUNED, TUNING_BASES = (250,), 4
 
 FRAME: Mapping[str, Any] = {"sizes.frame": "action"}
-TURN: Mapping[str, Any] = {**FRAME, "sizes.sees_turn": True}
+TURN: Mapping[str, Any] = {**FRAME, "guidance": "offset"}  # recorded as `sizes.sees_turn`
 ROOMY: Mapping[str, Any] = {**FRAME, "scalars.eps_deg": 20.0}  # in rooms small turns lead nowhere
 SIDED: Mapping[str, Any] = {**TURN, "scalars.eps_deg": 20.0}
 NARROWER = (0.5, 0.25)  # shares of a bound that are tried on tuning episodes

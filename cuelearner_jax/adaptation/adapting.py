@@ -23,7 +23,7 @@ from cuelearner_jax.devices import BY_LANE, SHARED, lane_mesh, place
 from cuelearner_jax.environment import Environment
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import Rolled, Tell, untold
-from cuelearner_jax.guides.bundle import Guidance
+from cuelearner_jax.guides.base import Guide
 from cuelearner_jax.policies import Guided, Policy, named
 from cuelearner_jax.types import Label, Teacher
 
@@ -51,7 +51,7 @@ class Judging:
 class Adaptation:
     """What is to be adapted, to what, and how."""
 
-    guidance: Guidance
+    guidance: Guide
     sizes: GuideSizes  # that the guidance was made with
     scalars: Scalars
     env: Environment  # the changed world, in which is asked

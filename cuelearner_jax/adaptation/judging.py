@@ -23,7 +23,7 @@ from cuelearner_jax.environment import Environment, actions_of
 from cuelearner_jax.errors import UserError, closest
 from cuelearner_jax.evaluate import Rolled, Tell, episodes, mean_interval, roll_lanes, untold, watched, watched_lanes
 from cuelearner_jax.feedback.answers import of_strength
-from cuelearner_jax.guides.bundle import Guidance
+from cuelearner_jax.guides.base import Guide
 from cuelearner_jax.policies import Common, Policy
 from cuelearner_jax.types import Label
 
@@ -119,7 +119,7 @@ def judged(
 
 
 @partial(jax.jit, static_argnames=("guidance",))
-def _predicted(guidance: Guidance, env: Any, scalars: Any, block: Adapting) -> tuple[Array, Array]:
+def _predicted(guidance: Guide, env: Any, scalars: Any, block: Adapting) -> tuple[Array, Array]:
     """Shares (lanes,) of held-out answers that are 0, and that a model of the others predicts."""
     one_pass = dataclasses.replace(scalars, k_max=1, tau_max_deg=180.0)
     space = actions_of(env)
@@ -141,9 +141,7 @@ def _predicted(guidance: Guidance, env: Any, scalars: Any, block: Adapting) -> t
     return each_lane(one)(block)
 
 
-def judged_by_labels(
-    guidance: Guidance, sizes: GuideSizes, env: Environment, scalars: Scalars, block: Adapting
-) -> Judged:
+def judged_by_labels(guidance: Guide, sizes: GuideSizes, env: Environment, scalars: Scalars, block: Adapting) -> Judged:
     """Compares a model with answering "already right" always, on every fifth label, to which it was not fitted.
 
     The model that is kept is fitted to all of them; this one is made for the comparison alone.

@@ -37,7 +37,7 @@ from cuelearner_jax.config import GuideSizes, Scalars
 from cuelearner_jax.devices import BY_LANE, SHARED, each_lane, lane_mesh, over_lanes
 from cuelearner_jax.environment import Environment
 from cuelearner_jax.evaluate import one_lane
-from cuelearner_jax.guides.bundle import Guidance
+from cuelearner_jax.guides.base import Guide
 from cuelearner_jax.policies import Guided, Policy
 from cuelearner_jax.storage.room import check_room
 from cuelearner_jax.types import GuideState, Label, Teacher
@@ -109,7 +109,7 @@ def rounds(lanes: Lanes, sizes: GuideSizes) -> int:
 
 
 @partial(jax.jit, static_argnames=("guidance", "sizes", "slots"))
-def _begin(guidance: Guidance, sizes: GuideSizes, slots: int, env: Any, columns: Any) -> Adapting:
+def _begin(guidance: Guide, sizes: GuideSizes, slots: int, env: Any, columns: Any) -> Adapting:
     def one(base: Array, seed: Array, budget: Array, bound: Array) -> Adapting:
         k_model, k_env, k_lane = jax.random.split(jax.random.key(seed), 3)
         guide = asking.start(guidance, env, slots, budget, k_model, k_env, sizes)
@@ -118,7 +118,7 @@ def _begin(guidance: Guidance, sizes: GuideSizes, slots: int, env: Any, columns:
     return each_lane(one)(*columns)
 
 
-def begin(guidance: Guidance, sizes: GuideSizes, env: Environment, lanes: Lanes) -> Adapting:
+def begin(guidance: Guide, sizes: GuideSizes, env: Environment, lanes: Lanes) -> Adapting:
     """Lanes that have asked nothing yet. Their number must divide among the devices of the mesh used later."""
     slots = rounds(lanes, sizes) * sizes.labels_per_round
     bound = jnp.deg2rad(jnp.asarray(lanes.bound_deg))
@@ -144,7 +144,7 @@ def _kept_finite(block: Adapting, guide: GuideState) -> Adapting:
 
 @partial(jax.jit, static_argnames=("guidance", "sizes", "mesh"))
 def _ask_round(
-    guidance: Guidance, sizes: GuideSizes, mesh: Mesh, env: Any, teacher: Any, scalars: Any, bases: Any, block: Adapting
+    guidance: Guide, sizes: GuideSizes, mesh: Mesh, env: Any, teacher: Any, scalars: Any, bases: Any, block: Adapting
 ) -> Adapting:
     def of_device(env: Any, teacher: Any, scalars: Any, bases: Any, block: Adapting) -> Adapting:
         def one(lane: Adapting) -> Adapting:
@@ -160,7 +160,7 @@ def _ask_round(
 
 
 def ask_round(
-    guidance: Guidance,
+    guidance: Guide,
     sizes: GuideSizes,
     env: Environment,
     teacher: Teacher,
@@ -189,7 +189,7 @@ def ask_round(
 
 @partial(jax.jit, static_argnames=("guidance", "sizes", "mesh"))
 def _take(
-    guidance: Guidance,
+    guidance: Guide,
     sizes: GuideSizes,
     mesh: Mesh,
     env: Any,
@@ -200,7 +200,7 @@ def _take(
 ) -> Adapting:
     def of_device(env: Any, scalars: Any, bases: Any, labels: Label, block: Adapting) -> Adapting:
         def one(labels: Label, lane: Adapting) -> Adapting:
-            if guidance.onward:  # files do not keep what the base policy does: it tells again
+            if guidance.kind.sees_base:  # files do not keep what the base policy does: it tells again
                 labels = labels.replace(base=one_lane(bases, lane.base).act(lane.key, None, labels.obs))
             labels = asking.as_kept(labels, lane.guide, scalars)
             guide = lane.guide.replace(labels=labels, asked=lane.guide.budget)
@@ -213,7 +213,7 @@ def _take(
 
 
 def take_labels(
-    guidance: Guidance,
+    guidance: Guide,
     sizes: GuideSizes,
     env: Environment,
     scalars: Scalars,
@@ -238,7 +238,7 @@ def blame(bases: Policy, teacher: Teacher | None, block: Adapting) -> None:
 
 
 def adapted(
-    guidance: Guidance, sizes: GuideSizes, env: Environment, scalars: Scalars, bases: Policy, block: Adapting
+    guidance: Guide, sizes: GuideSizes, env: Environment, scalars: Scalars, bases: Policy, block: Adapting
 ) -> Guided:
     """Every lane's policy: its base's actions under its model, within its bound.
 

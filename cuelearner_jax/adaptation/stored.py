@@ -28,7 +28,7 @@ from cuelearner_jax.config import AgentSizes, GuideSizes, Scalars, check_agent, 
 from cuelearner_jax.environment import actions_of, offers, spaces_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides import registry as guidances
-from cuelearner_jax.guides.kind import NAME
+from cuelearner_jax.guides.base import NAME
 from cuelearner_jax.policies import Agent, Common, Corrected, Guided, Heuristic, Taught, uniform_in
 from cuelearner_jax.policies import Uniform as UniformPolicy
 

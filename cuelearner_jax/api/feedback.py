@@ -31,8 +31,7 @@ from cuelearner_jax.environment import Quantity, Spaces, spaces_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.feedback import given
 from cuelearner_jax.feedback.answers import RELATIVE, check_teacher
-from cuelearner_jax.guides import registry
-from cuelearner_jax.guides.bundle import Guidance
+from cuelearner_jax.guides.base import Guide
 from cuelearner_jax.guides.relative import KIND
 from cuelearner_jax.policies import Common, Guided
 from cuelearner_jax.storage import label_files
@@ -51,7 +50,7 @@ class Labels(NamedTuple):
 class FeedbackModel:
     """A model of relative feedback, fitted by `fit_feedback` or `ask`."""
 
-    guidance: Guidance
+    guidance: Guide
     model: GuidanceModel
     scalars: Scalars  # eps of the labels, and how actions are refined
     labels: Labels
@@ -197,13 +196,13 @@ def refine(policy: Any, model: FeedbackModel, bound_deg: float | None = None) ->
 
 def _checked_model(model: FeedbackModel) -> FeedbackModel:
     """A model whose parts are of their kinds. Raises UserError for any other."""
-    for name, kind in (("guidance", Guidance), ("scalars", Scalars), ("labels", Labels), ("model", GuidanceModel)):
+    for name, kind in (("guidance", Guide), ("scalars", Scalars), ("labels", Labels), ("model", GuidanceModel)):
         arguments.instance(f"model.{name}", getattr(model, name), kind, "a model as cl.ask and cl.fit_feedback give it")
     return model
 
 
-def _relative(sizes: GuideSizes, spaces: Spaces) -> Guidance:
-    return registry.made_for(KIND, sizes, spaces)
+def _relative(sizes: GuideSizes, spaces: Spaces) -> Guide:
+    return KIND.make(sizes, spaces)
 
 
 def given_settings(sizes: Any, scalars: Any, eps_deg: Any) -> tuple[GuideSizes | None, Scalars | None, float | None]:

@@ -162,8 +162,6 @@ def planned(
         config.schedule,
     )
     configuration.check_guide(merged.sizes, merged.scalars)
-    if merged.sizes.sees_turn:
-        raise UserError("the page's own model does not see turns: leave out --sizes.sees-turn, and give it to `adapt`")
     if not 1 <= asked.labels <= MOST_LABELS:
         raise UserError(f"--labels is {asked.labels}: give a number from 1 to {MOST_LABELS:,}")
     if not 0 <= asked.seed < LARGEST_SEED:
@@ -181,6 +179,8 @@ def planned(
     robot, task = _robot(task, asked.robot), task.on(asked.robot)
     env = shape_of(task, asked.task)
     guidance = guidances.make(guidances.named(asked.guidance), merged.sizes, env)
+    if guidance.kind.sees_base:
+        raise UserError(f"guidance {guidance.name!r} is for `adapt --labels-from` alone: leave out --guidance here")
     if guidance.form is None:
         asking = [kind.name for kind in guidances.known() if kind.asks]
         raise UserError(f"guidance {guidance.name!r} asks for no labels: give --guidance {' or '.join(asking)}")

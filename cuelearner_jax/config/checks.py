@@ -30,8 +30,6 @@ def check(config: RunConfig) -> None:
             f"sizes.lanes_per_block is {sizes.lanes_per_block}: give a positive number, or 0 to leave it open"
         )
     check_guide(sizes, config.scalars)
-    if sizes.sees_turn:
-        raise UserError("sizes.sees_turn is for adaptation, whose base policy is no random one: leave it out")
     if config.scalars.pace_window < 1:
         raise UserError(f"scalars.pace_window is {config.scalars.pace_window}: give at least 1 episode")
     if config.scalars.pace_floor > 0.5:

@@ -84,9 +84,6 @@ class GuideSizes(_Seeing):
     """Gradient steps on earlier corrections after each new one, of a guide that goes on learning (deep COACH)."""
     ensemble: int = 1
     """Members of the guidance model, each fitted to all labels; it predicts their mean."""
-    sees_turn: bool = False
-    """Does a guide that corrects actions see how far each has been turned already, in units of eps? What is right hangs
-    on what the base policy did, so this is for adaptation."""
     candidates: int = 1
     """Situations among which each question is chosen (1: as they come)."""
     chosen_by: Literal["members", "teacher"] = "members"
@@ -168,10 +165,9 @@ class GuideScalars(_Degrees, _Clipping):
     """Share of the questions that a guide which values actions asks about base actions even so, to find good ones."""
     correction_replay: int = 50
     """Newest corrections that a guide which goes on learning (deep COACH) keeps learning from."""
-    aim_share: float = 1.0
-    """A guide that reads intent takes the nearest of the aims at least this share as likely as the likeliest."""
     aim_doubt: float = 2.0
-    """It leaves actions as they are where it is at least so many times likelier that no aim is meant."""
+    """A guide that reads intent leaves actions as they are where it is at least so many times likelier that no aim is
+    meant."""
     ask_bound_deg: float = 180.0
     """From the second instalment on: questions and guided episodes stay within this of the agent's own action [deg]."""
     guided_probability: float = 0.5

@@ -15,7 +15,7 @@ and differ by where they began and by what they drew from the replay.
 from __future__ import annotations
 
 import dataclasses
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
 import jax
@@ -24,15 +24,12 @@ import optax
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from cuelearner_jax.config import GuideScalars, GuideSizes
-from cuelearner_jax.environment import Spaces
+from cuelearner_jax.config import GuideScalars
 from cuelearner_jax.feedback.answers import RELATIVE
-from cuelearner_jax.guides.auxiliary import auxiliary_policy
-from cuelearner_jax.guides.bundle import Guidance
-from cuelearner_jax.guides.ensemble import for_each
-from cuelearner_jax.guides.fitting import Lesson, lessons, optimizer
-from cuelearner_jax.guides.kind import Kind
-from cuelearner_jax.guides.questions import about_refined
+from cuelearner_jax.guides.base import Kind
+from cuelearner_jax.guides.demonstration import Demonstration
+from cuelearner_jax.guides.fitting import Lesson, optimizer
+from cuelearner_jax.guides.model import for_each
 from cuelearner_jax.guides.refining import Refined
 from cuelearner_jax.types import GuidanceModel, Label, Params
 
@@ -45,34 +42,41 @@ class Coached(struct.PyTreeNode):
     learned: Int[Array, ""]  # labels that it has been corrected by: the next are new
 
 
-def make(sizes: GuideSizes, spaces: Spaces) -> Guidance:
-    """The bundle for an environment's spaces."""
-    space, policies = spaces.actions, auxiliary_policy(sizes, spaces)
-    member = auxiliary_policy(dataclasses.replace(sizes, ensemble=1), spaces)
+class DeepCoach(Demonstration):
+    """A policy that acts as a cloned one does, and is moved by each correction."""
 
-    def begin(key: PRNGKeyArray) -> Coached:
-        params = member.init(key)
-        return Coached(params, optimizer(GuideScalars()).init(params), jnp.zeros((), jnp.int32))
+    @cached_property
+    def member(self) -> DeepCoach:
+        """One member of the ensemble, by itself."""
+        return dataclasses.replace(self, sizes=dataclasses.replace(self.sizes, ensemble=1))
 
-    def init(key: PRNGKeyArray) -> GuidanceModel:
-        return GuidanceModel(for_each(sizes.ensemble, begin, key), jnp.array(False))
+    def init(self, key: PRNGKeyArray) -> GuidanceModel:
+        """A policy that nothing has corrected."""
 
-    def target(label: Label, scalars: GuideScalars) -> Float[Array, " action"]:
+        def begin(key: PRNGKeyArray) -> Coached:
+            params = self.member.network.init(key)
+            return Coached(params, optimizer(GuideScalars()).init(params), jnp.zeros((), jnp.int32))
+
+        return GuidanceModel(for_each(self.sizes.ensemble, begin, key), jnp.array(False))
+
+    def target(self, label: Label, scalars: GuideScalars) -> Float[Array, " action"]:
         """The action turned by h * eps."""
-        return space.toward(label.action, label.answer[0], scalars.radians("eps"))
+        return self.spaces.actions.toward(label.action, label.answer[0], scalars.radians("eps"))
 
-    def fit(key: PRNGKeyArray, env: Any, labels: Label, former: GuidanceModel, scalars: GuideScalars) -> GuidanceModel:
+    def fit(
+        self, key: PRNGKeyArray, env: Any, labels: Label, former: GuidanceModel, scalars: GuideScalars
+    ) -> GuidanceModel:
         """The former policy, corrected by the labels that are new, in the order in which they were given."""
-        rows = lessons(labels, target, scalars)
+        rows = self.lessons(labels, scalars)
         order = jnp.argsort(~rows.valid, stable=True)
         count = rows.valid.sum()
 
         def loss(params: Params, batch: Lesson) -> Array:
-            error = member.vectors(env, params, batch.obs, batch.action) - batch.target
+            error = self.member.predict(env, params, batch.obs, batch.action) - batch.target
             return jnp.mean(jnp.sum(jnp.square(error), -1))
 
         def step(coached: Coached, numbers: Int[Array, " batch"], key: PRNGKeyArray) -> Coached:
-            batch = member.seen_again(key, jax.tree.map(lambda leaf: leaf[order[numbers]], rows))
+            batch = self.redrawn(key, jax.tree.map(lambda leaf: leaf[order[numbers]], rows))
             gradient = jax.grad(loss)(coached.policy, batch)
             updates, state = optimizer(scalars).update(gradient, coached.optimizer, coached.policy)
             return coached.replace(policy=optax.apply_updates(coached.policy, updates), optimizer=state)
@@ -83,20 +87,21 @@ def make(sizes: GuideSizes, spaces: Spaces) -> Guidance:
 
             def replay(coached: Coached, key: PRNGKeyArray) -> tuple[Coached, None]:
                 k_draw, k_see = jax.random.split(key)
-                numbers = jax.random.randint(k_draw, (sizes.fit_batch_size,), oldest, number + 1)
+                numbers = jax.random.randint(k_draw, (self.sizes.fit_batch_size,), oldest, number + 1)
                 return step(coached, numbers, k_see), None
 
             k_new, k_replay = jax.random.split(jax.random.fold_in(key, number))
             coached = step(coached, number[None], k_new)
-            coached, _ = jax.lax.scan(replay, coached, jax.random.split(k_replay, sizes.replay_steps))
+            coached, _ = jax.lax.scan(replay, coached, jax.random.split(k_replay, self.sizes.replay_steps))
             return coached.replace(learned=number + 1)
 
         def taught(key: PRNGKeyArray, coached: Coached) -> Coached:
             return jax.lax.fori_loop(coached.learned, count, partial(corrected, key), coached)
 
-        return GuidanceModel(for_each(sizes.ensemble, taught, key, former.params), former.fitted | (count > 0))
+        return GuidanceModel(for_each(self.sizes.ensemble, taught, key, former.params), former.fitted | (count > 0))
 
     def act(
+        self,
         model: GuidanceModel,
         env: Any,
         obs: Float[Array, "n obs"],
@@ -104,17 +109,16 @@ def make(sizes: GuideSizes, spaces: Spaces) -> Guidance:
         active: Bool[Array, " n"],
         scalars: GuideScalars,
     ) -> Refined:
-        return policies.act(env, model.params.policy, obs, actions, active & model.fitted, scalars)
+        """The policy's action in place of a, as a cloned policy's."""
+        return super().act(model.replace(params=model.params.policy), env, obs, actions, active, scalars)
 
     def disagreement(
-        model: GuidanceModel, env: Any, obs: Float[Array, "n obs"], actions: Float[Array, "n action"]
+        self, model: GuidanceModel, env: Any, obs: Float[Array, "n obs"], actions: Float[Array, "n action"]
     ) -> Float[Array, " n"]:
-        """The variance of the members' vectors, summed over their entries."""
-        assert policies.disagreement is not None
-        return policies.disagreement(model.replace(params=model.params.policy), env, obs, actions)
-
-    members = disagreement if policies.disagreement else None
-    return Guidance("dcoach", RELATIVE, init, about_refined(act), target, fit, act, members)
+        """Variance of the members' vectors, summed over their entries."""
+        return super().disagreement(model.replace(params=model.params.policy), env, obs, actions)
 
 
-KIND = Kind("dcoach", "a policy moved by each correction", make, form=RELATIVE, title="deep COACH", colour="#56B4E9")
+KIND = Kind(
+    "dcoach", "a policy moved by each correction", DeepCoach, form=RELATIVE, title="deep COACH", colour="#56B4E9"
+)

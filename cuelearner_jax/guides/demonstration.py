@@ -1,47 +1,55 @@
 """Guidance by demonstrations: an auxiliary policy is cloned from the actions that the teacher shows.
 
-Source: paper, section V-A and appendix (the networks, the optimiser and the schedule of the relative model). Questions
-are about what the policy itself would do, once there is one (DAgger: Ross, Gordon, Bagnell, 2011).
+Source: paper, section V-A ("train an auxiliary policy that imitates the human teacher") and appendix. Questions are
+about what the policy itself would do, once there is one (DAgger: Ross, Gordon, Bagnell, 2011). On raw observations the
+policy sees nothing else. In the action's frame it sees the situation from some direction and says which way its action
+lies from there. It is taught from all directions, for what is to be done depends on none; and it looks again from the
+action that it came to, until that settles: from there it sees best.
 """
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from cuelearner_jax.config import GuideScalars, GuideSizes
-from cuelearner_jax.environment import Spaces
+from cuelearner_jax.config import GuideScalars
 from cuelearner_jax.feedback.answers import DEMONSTRATION
-from cuelearner_jax.guides.auxiliary import auxiliary_policy
-from cuelearner_jax.guides.bundle import Guidance
-from cuelearner_jax.guides.fitting import fit_least_squares, lessons
-from cuelearner_jax.guides.kind import Kind
-from cuelearner_jax.guides.questions import about_refined
+from cuelearner_jax.guides.base import Guide, Kind
+from cuelearner_jax.guides.fitting import Lesson
 from cuelearner_jax.guides.refining import Refined
-from cuelearner_jax.types import GuidanceModel, Label
+from cuelearner_jax.types import GuidanceModel, Params
 
 
-def make(sizes: GuideSizes, spaces: Spaces) -> Guidance:
-    """The bundle for an environment's spaces."""
-    policy = auxiliary_policy(sizes, spaces)
+class Demonstration(Guide):
+    """A policy that is fitted to the actions shown, and acts in the agent's place."""
 
-    def init(key: PRNGKeyArray) -> GuidanceModel:
-        return GuidanceModel(policy.init(key), jnp.array(False))
+    @property
+    def looks_again(self) -> bool:
+        """Whether what the policy does depends on where it looks from."""
+        return self.sizes.frame == "action"
 
-    def target(label: Label, scalars: GuideScalars) -> Float[Array, " action"]:
-        """What was shown."""
-        return label.answer
+    def predict(
+        self, env: Any, params: Params, obs: Float[Array, "n obs"], actions: Float[Array, "n action"]
+    ) -> Float[Array, "n action"]:
+        """What the policy does, seen from `actions`."""
+        if not self.looks_again:
+            return self.network.predict(env, params, obs, jnp.zeros_like(actions))
+        return actions + self.network.predict(env, params, obs, actions)
 
-    def fit(key: PRNGKeyArray, env: Any, labels: Label, former: GuidanceModel, scalars: GuideScalars) -> GuidanceModel:
-        rows, predict = lessons(labels, target, scalars), partial(policy.vectors, env)
-        return fit_least_squares(
-            key, rows, scalars, init=policy.init, apply=predict, sizes=sizes, redrawn=policy.seen_again
-        )
+    def redrawn(self, key: PRNGKeyArray, batch: Lesson) -> Lesson:
+        """Half of a batch seen from anywhere, for it may be asked from there; half from the actions asked about."""
+        if not self.looks_again:
+            return batch
+        k_half, k_where = jax.random.split(key)
+        half = jax.random.bernoulli(k_half, 0.5, (batch.action.shape[0], 1))
+        anywhere = self.spaces.actions.uniform(k_where, (batch.action.shape[0],))
+        return batch.replace(action=jnp.where(half, anywhere, batch.action))
 
     def act(
+        self,
         model: GuidanceModel,
         env: Any,
         obs: Float[Array, "n obs"],
@@ -49,9 +57,20 @@ def make(sizes: GuideSizes, spaces: Spaces) -> Guidance:
         active: Bool[Array, " n"],
         scalars: GuideScalars,
     ) -> Refined:
-        return policy.act(env, model.params, obs, actions, active & model.fitted, scalars)
+        """The policy's action in place of a, in active rows of a fitted model, within the bound round a."""
 
-    return Guidance("demonstration", DEMONSTRATION, init, about_refined(act), target, fit, act, policy.disagreement)
+        def phi(current: Float[Array, "n action"]) -> Float[Array, "n action"]:
+            return self.predict(env, model.params, obs, current) - current
+
+        return self.refined(phi, actions, active & model.fitted, scalars, k_max=None if self.looks_again else 1)
+
+    def disagreement(
+        self, model: GuidanceModel, env: Any, obs: Float[Array, "n obs"], actions: Float[Array, "n action"]
+    ) -> Float[Array, " n"]:
+        """Variance of the members' vectors, summed over their entries."""
+        return super().disagreement(model, env, obs, actions if self.looks_again else jnp.zeros_like(actions))
 
 
-KIND = Kind("demonstration", "a policy cloned from what the teacher shows", make, form=DEMONSTRATION, colour="#009E73")
+KIND = Kind(
+    "demonstration", "a policy cloned from what the teacher shows", Demonstration, form=DEMONSTRATION, colour="#009E73"
+)

@@ -15,8 +15,7 @@ from jaxtyping import Array, Bool, Float, Key, PRNGKeyArray
 
 from cuelearner_jax.config import GuideScalars, GuideSizes
 from cuelearner_jax.feedback.answers import of_strength
-from cuelearner_jax.guides.bundle import TargetFunction
-from cuelearner_jax.guides.ensemble import fitted_members
+from cuelearner_jax.guides.model import fitted_members
 from cuelearner_jax.types import GuidanceModel, Label, Params
 
 VALIDATION_STRIDE = 5  # every fifth label is a validation label: the 80/20 split of the paper's public code
@@ -31,7 +30,7 @@ class Lesson(struct.PyTreeNode):
     valid: Bool[Array, ""]
 
 
-def lessons(labels: Label, target: TargetFunction, scalars: GuideScalars) -> Lesson:
+def lessons(labels: Label, target: Callable[[Label, GuideScalars], Array], scalars: GuideScalars) -> Lesson:
     """Labels (slots, ...) with what their answers, each of its own strength, mean to a network."""
     targets = jax.vmap(lambda label: target(label, of_strength(scalars, label.eps_deg)))(labels)
     # Rounded here, whatever is computed of them next: fused with that, their last bits would hang on the compiler.

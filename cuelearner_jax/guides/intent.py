@@ -12,7 +12,7 @@ the regulation table, and less on the easy one; agents did not learn faster from
 
 from __future__ import annotations
 
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
 import flax.linen as nn
@@ -22,15 +22,13 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from cuelearner_jax.actions import Actions
-from cuelearner_jax.config import GuideScalars, GuideSizes
-from cuelearner_jax.environment import Aims, Spaces
+from cuelearner_jax.config import GuideScalars
+from cuelearner_jax.environment import Aims
 from cuelearner_jax.feedback.answers import RELATIVE, of_strength
-from cuelearner_jax.guides.bundle import Guidance
-from cuelearner_jax.guides.ensemble import ensemble
+from cuelearner_jax.guides.base import Guide, Kind
 from cuelearner_jax.guides.fitting import fit_model
-from cuelearner_jax.guides.kind import Kind
-from cuelearner_jax.guides.questions import about_refined
-from cuelearner_jax.guides.refining import Refined, refine
+from cuelearner_jax.guides.model import GuideModel, ensemble
+from cuelearner_jax.guides.refining import Refined
 from cuelearner_jax.types import GuidanceModel, Label, Params
 
 SPREAD_DEG = 1.0  # how far what a teacher means may lie from the aim that describes it
@@ -100,47 +98,48 @@ def followed(
     action: Float[Array, " action"],
     scalars: GuideScalars,
 ) -> tuple[Float[Array, " action"], Bool[Array, ""]]:
-    """Of the aims about as likely as the likeliest the nearest to an action, and whether it is likely enough at all."""
+    """Of the aims as likely as the likeliest the nearest to an action, and whether it is likely enough at all."""
     most = share[:-1].max()
-    likely = share[:-1] >= scalars.aim_share * most
-    goal = aims[jnp.argmin(jnp.where(likely, space.distance(action[None], aims), jnp.inf))]
+    goal = aims[jnp.argmin(jnp.where(share[:-1] >= most, space.distance(action[None], aims), jnp.inf))]
     return goal, (most > 0.0) & (scalars.aim_doubt * most > share[-1])
 
 
-def make(sizes: GuideSizes, spaces: Spaces) -> Guidance:
-    """The bundle for an environment's spaces."""
-    space = spaces.actions
-    network = Weights(sizes.aim_layers)
-    width = spaces.aims or 0
+class Intent(Guide):
+    """A guide that weighs the task's aims by what was answered and goes for the likeliest."""
 
-    def shares(
-        env: Any, params: Params, features: Float[Array, "n aims features"], possible: Bool[Array, "n aims"]
-    ) -> Float[Array, "n aims_and_none"]:
-        """The probability that each aim, or none, is meant; the mean of several members is one too."""
-        return jax.nn.softmax(jnp.asarray(jax.vmap(network.apply, (None, 0, 0))(params, features, possible)))
+    @cached_property
+    def network(self) -> GuideModel:
+        """The network, or ensemble, that gives the probability that each aim, or none, is meant.
 
-    def init_params(key: PRNGKeyArray) -> Params:
-        return network.init(key, jnp.zeros((1, width)), jnp.ones(1, bool))
+        Aims' features and which of them are possible stand where other kinds have observations and actions.
+        """
+        weights, width = Weights(self.sizes.aim_layers), self.spaces.aims or 0
 
-    weighing = ensemble(sizes.ensemble, init_params, shares)
+        def init(key: PRNGKeyArray) -> Params:
+            return weights.init(key, jnp.zeros((1, width)), jnp.ones(1, bool))
 
-    def init(key: PRNGKeyArray) -> GuidanceModel:
-        return GuidanceModel(weighing.init(key), jnp.array(False))
+        def shares(
+            env: Any, params: Params, features: Float[Array, "n aims features"], possible: Bool[Array, "n aims"]
+        ) -> Float[Array, "n aims_and_none"]:
+            return jax.nn.softmax(jnp.asarray(jax.vmap(weights.apply, (None, 0, 0))(params, features, possible)))
 
-    def target(label: Label, scalars: GuideScalars) -> Float[Array, "1"]:
-        """h itself: what is fitted is its probability."""
-        return label.answer
+        return ensemble(self.sizes.ensemble, init, shares)
 
-    def surprise(params: Params, rows: Evidence) -> Float[Array, " rows"]:
-        """-log of the probability of each answer."""
-        share = weighing.predict(None, params, rows.features, rows.possible)
-        return -jnp.log((1.0 - SLIPS) * (share * rows.likelihood).sum(-1) + SLIPS / WORDS)
+    def fit(
+        self, key: PRNGKeyArray, env: Any, labels: Label, former: GuidanceModel, scalars: GuideScalars
+    ) -> GuidanceModel:
+        """The model under which the answers are likeliest."""
+        rows = jax.vmap(lambda label: evidence_of(env, self.spaces.actions, label, scalars))(labels)
 
-    def fit(key: PRNGKeyArray, env: Any, labels: Label, former: GuidanceModel, scalars: GuideScalars) -> GuidanceModel:
-        rows = jax.vmap(lambda label: evidence_of(env, space, label, scalars))(labels)
-        return fit_model(key, rows, scalars, init=weighing.init, losses=surprise, sizes=sizes)
+        def surprise(params: Params, rows: Evidence) -> Float[Array, " rows"]:
+            """-log of the probability of each answer."""
+            share = self.network.predict(None, params, rows.features, rows.possible)
+            return -jnp.log((1.0 - SLIPS) * (share * rows.likelihood).sum(-1) + SLIPS / WORDS)
+
+        return fit_model(key, rows, scalars, init=self.network.init, losses=surprise, sizes=self.sizes)
 
     def act(
+        self,
         model: GuidanceModel,
         env: Any,
         obs: Float[Array, "n obs"],
@@ -148,36 +147,27 @@ def make(sizes: GuideSizes, spaces: Spaces) -> Guidance:
         active: Bool[Array, " n"],
         scalars: GuideScalars,
     ) -> Refined:
-        aims: Aims = jax.vmap(env.aims)(obs)
-        share = weighing.predict(env, model.params, aims.features, aims.possible)
+        """By at most eps a pass toward the likeliest aim, in active rows of a fitted model that is sure enough."""
+        space, aims = self.spaces.actions, jax.vmap(env.aims)(obs)
+        share = self.network.predict(env, model.params, aims.features, aims.possible)
         if aims.open is not None:
             share = share.at[:, :-1].multiply(aims.open)
         goals, sure = jax.vmap(partial(followed, space), (0, 0, 0, None))(share, aims.actions, actions, scalars)
 
-        def residual(current: Float[Array, "n action"]) -> Float[Array, "n action"]:
+        def phi(current: Float[Array, "n action"]) -> Float[Array, "n action"]:
             step = jnp.minimum(scalars.radians("eps"), space.distance(current, goals))
             return space.toward(current, space.sense(current, goals), step) - current
 
-        return refine(
-            residual,
-            actions,
-            active & sure & model.fitted,
-            space=space,
-            tau=scalars.radians("tau"),
-            tau_max=scalars.radians("tau_max"),
-            k_max=scalars.k_max,
-        )
+        return self.refined(phi, actions, active & sure & model.fitted, scalars)
 
     def disagreement(
-        model: GuidanceModel, env: Any, obs: Float[Array, "n obs"], actions: Float[Array, "n action"]
+        self, model: GuidanceModel, env: Any, obs: Float[Array, "n obs"], actions: Float[Array, "n action"]
     ) -> Float[Array, " n"]:
         """The variance of the members' probabilities, summed over aims; of situations, whatever the action."""
-        assert weighing.disagreement is not None
         aims: Aims = jax.vmap(env.aims)(obs)
-        return weighing.disagreement(model, env, aims.features, aims.possible)
-
-    members = disagreement if weighing.disagreement else None
-    return Guidance("intent", RELATIVE, init, about_refined(act), target, fit, act, members)
+        return self.network.disagreement(env, model.params, aims.features, aims.possible)
 
 
-KIND = Kind("intent", "relative feedback about the task's aims", make, form=RELATIVE, needs=("aims",), colour="#CC79A7")
+KIND = Kind(
+    "intent", "relative feedback about the task's aims", Intent, form=RELATIVE, needs=("aims",), colour="#CC79A7"
+)

@@ -1,4 +1,9 @@
-"""The network of a guide: what it sees, and what its outputs mean."""
+"""The model of a guide: one network, or an ensemble whose members predict their mean and disagree elsewhere.
+
+Members differ by their random initial parameters and by the batches that they are fitted to, as in Lakshminarayanan,
+Pritzel, Blundell, "Simple and scalable predictive uncertainty estimation using deep ensembles", NeurIPS 2017. Their
+parameters have a leading axis of members; of one member there is no such axis, and nothing is different from a network.
+"""
 
 from __future__ import annotations
 
@@ -13,32 +18,52 @@ from cuelearner_jax.agents import view
 from cuelearner_jax.agents.networks import applied, residual_network
 from cuelearner_jax.config import GuideSizes
 from cuelearner_jax.environment import Spaces
-from cuelearner_jax.guides.bundle import DisagreementFunction
-from cuelearner_jax.guides.ensemble import ensemble
-from cuelearner_jax.types import Params
+from cuelearner_jax.types import GuidanceModel, Params
+
+Predict = Callable[[Any, Params, Array, Array], Array]  # (env, params, obs (n, ...), actions (n, ...)) -> (n, outputs)
 
 
 class GuideModel(NamedTuple):
-    """A network of observation and action, or the mean of an ensemble of such, as pure functions."""
+    """A network of observation and action, or an ensemble of such, as pure functions."""
 
     init: Callable[[PRNGKeyArray], Params]
-    # (env, params, obs (n, obs), actions (n, action)) -> outputs (n, outputs)
-    predict: Callable[[Any, Params, Array, Array], Array]
-    disagreement: DisagreementFunction | None = None  # for the bundle; None: there is but one network
+    predict: Predict  # the members' mean; of parameters with any number of members
+    disagreement: Predict  # of several members: their variance, summed over outputs (n,)
 
 
-def guide_model(sizes: GuideSizes, spaces: Spaces, outputs: int, beside: int = 0) -> GuideModel:
-    """A network whose outputs are numbers, such as the value of an action; with `ensemble` several, and their mean.
+def ensemble(members: int, init: Callable[[PRNGKeyArray], Params], predict: Predict) -> GuideModel:
+    """The model of one kind of network.
 
     Args:
-        sizes: of the network.
+        members: their number.
+        init: one member's parameters.
+        predict: one member's outputs.
+    """
+    each = jax.vmap(predict, in_axes=(None, 0, None, None))
+
+    def mean(env: Any, params: Params, obs: Array, actions: Array) -> Array:
+        return each(env, params, obs, actions).mean(0)
+
+    def disagreement(env: Any, params: Params, obs: Array, actions: Array) -> Float[Array, " n"]:
+        return jnp.sum(each(env, params, obs, actions).var(0), -1)
+
+    return GuideModel(lambda key: for_each(members, init, key), predict if members == 1 else mean, disagreement)
+
+
+def guide_model(sizes: GuideSizes, spaces: Spaces, outputs: int | None = None, beside: int = 0) -> GuideModel:
+    """The networks of these sizes.
+
+    Args:
+        sizes: of the networks.
         spaces: the environment's.
-        outputs: how many numbers.
-        beside: numbers that it sees beside observation and action: actions then have so many entries more, at the end.
+        outputs: how many numbers they predict, such as the value of an action; None: a vector to be added to the
+            action, whichever frame it is seen in.
+        beside: numbers that they see beside observation and action: actions then have so many entries more, at the end.
 
     Raises UserError for a frame in which the environment cannot be seen.
     """
-    network = residual_network(sizes.feedback_layers, outputs)
+    size = spaces.actions.size
+    network = residual_network(sizes.feedback_layers, size if outputs is None else outputs)
     own, turned = view.widths(sizes.frame, spaces)
 
     def init(key: PRNGKeyArray) -> Params:
@@ -47,22 +72,50 @@ def guide_model(sizes: GuideSizes, spaces: Spaces, outputs: int, beside: int = 0
     def predict(
         env: Any, params: Params, obs: Float[Array, "n obs"], actions: Float[Array, "n action"]
     ) -> Float[Array, "n outputs"]:
-        bare, known = jnp.split(actions, [spaces.actions.size], -1)
+        bare, known = jnp.split(actions, [size], -1)
         of_obs, of_action = view.seen(sizes.frame, env, obs, bare)
         return applied(network)(params, of_obs, jnp.concatenate([of_action, known], -1) if beside else of_action)
 
-    return GuideModel(*ensemble(sizes.ensemble, init, predict))
+    made = ensemble(sizes.ensemble, init, predict)
+    if outputs is not None:
+        return made
+
+    def residual(env: Any, params: Params, obs: Array, actions: Array) -> Array:
+        return view.outward(sizes.frame, spaces, made.predict(env, params, obs, actions), actions[..., :size])
+
+    return made._replace(predict=residual)
 
 
-def residual_model(sizes: GuideSizes, spaces: Spaces, beside: int = 0) -> GuideModel:
-    """A network whose outputs are something to add to the action, whichever frame it sees them in.
+def for_each(members: int, function: Callable[..., Any], key: PRNGKeyArray, *parameters: Any) -> Any:
+    """What a function of a key and of one member's parameters makes of every member, each from its own random numbers.
 
-    `beside`: see `guide_model`.
+    Args:
+        members: their number.
+        function: (key, *parameters of one member) -> a tree.
+        key: of all of them; of one member, its own.
+        parameters: the members', with the leading axis that several have.
     """
-    inner = guide_model(sizes, spaces, spaces.actions.size, beside)
+    if members == 1:
+        return function(key, *parameters)
+    return jax.vmap(function)(jax.random.split(key, members), *parameters)
 
-    def predict(env: Any, params: Params, obs: jax.Array, actions: jax.Array) -> jax.Array:
-        outputs = inner.predict(env, params, obs, actions)
-        return view.outward(sizes.frame, spaces, outputs, actions[..., : spaces.actions.size])
 
-    return GuideModel(inner.init, predict, inner.disagreement)
+def fitted_members(
+    members: int,
+    fit: Callable[[PRNGKeyArray, Callable[[PRNGKeyArray], Params]], GuidanceModel],
+    key: PRNGKeyArray,
+    init: Callable[[PRNGKeyArray], Params],
+) -> GuidanceModel:
+    """Each member fitted by itself, from its own random numbers.
+
+    Args:
+        members: their number.
+        fit: the model of one member from a key and its `init`.
+        key: of all of them.
+        init: of the ensemble. A member is fitted as an ensemble of one, whose mean is its own prediction.
+    """
+    if members == 1:
+        return fit(key, init)
+    first = lambda key: jax.tree.map(lambda leaf: leaf[:1], init(key))  # noqa: E731
+    each = jax.vmap(lambda key: fit(key, first))(jax.random.split(key, members))
+    return GuidanceModel(jax.tree.map(lambda leaf: leaf[:, 0], each.params), each.fitted.all())

@@ -6,14 +6,18 @@ everything round it and exports. No randomness.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from cuelearner_jax.actions import Actions
+from cuelearner_jax.config import GuideScalars
+
+GuideScalarsT = TypeVar("GuideScalarsT", bound=GuideScalars)
 
 
 class Refined(NamedTuple):
@@ -26,6 +30,11 @@ class Refined(NamedTuple):
 def untouched(actions: Float[Array, "n action"]) -> Refined:
     """Actions that nothing refined."""
     return Refined(actions, jnp.zeros(actions.shape[0], jnp.int32))
+
+
+def within(scalars: GuideScalarsT, bound: Float[Array, ""]) -> GuideScalarsT:
+    """Scalars with which refinement stays within `bound` [rad] of the first action, or nearer where it did before."""
+    return dataclasses.replace(scalars, tau_max_deg=jnp.minimum(scalars.tau_max_deg, jnp.rad2deg(bound)))
 
 
 def refine(

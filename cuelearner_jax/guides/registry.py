@@ -11,17 +11,17 @@ from importlib import metadata
 from typing import Any
 
 from cuelearner_jax.config import GuideSizes
-from cuelearner_jax.environment import Spaces, offers, spaces_of
+from cuelearner_jax.environment import offers, spaces_of
 from cuelearner_jax.errors import UserError, closest
-from cuelearner_jax.guides import dcoach, demonstration, heuristic, intent, none, relative, scalar
-from cuelearner_jax.guides.bundle import Guidance
-from cuelearner_jax.guides.kind import Kind
+from cuelearner_jax.guides import dcoach, demonstration, intent, offset, relative, scalar, untaught
+from cuelearner_jax.guides.base import Guide, Kind
 from cuelearner_jax.plugins import load
 
 ENTRY_POINTS = "cuelearner.guidances"
 
-_BUILT_IN = (none, relative, intent, heuristic, demonstration, scalar, dcoach)
-_KINDS: dict[str, Kind] = {module.KIND.name: module.KIND for module in _BUILT_IN}
+_TAUGHT = (demonstration.KIND, scalar.KIND, dcoach.KIND, offset.KIND)
+_BUILT_IN = (untaught.NONE, relative.KIND, intent.KIND, untaught.HEURISTIC, *_TAUGHT)
+_KINDS: dict[str, Kind] = {kind.name: kind for kind in _BUILT_IN}
 
 
 def register(kind: Kind) -> Kind:
@@ -67,13 +67,19 @@ def named(text: str) -> str:
 
 
 def possible(env: Any, taught: bool) -> tuple[str, ...]:
-    """Names of the kinds that an environment can have; `taught`: is there a teacher to ask?"""
-    fitting = (kind for kind in known() if (taught or not kind.asks) and all(offers(env, need) for need in kind.needs))
-    return tuple(kind.name for kind in fitting)
+    """Names of the kinds that an agent can be trained with; `taught`: is there a teacher to ask?"""
+    trained = (kind for kind in known() if not kind.sees_base and (taught or not kind.asks))
+    return tuple(kind.name for kind in trained if all(offers(env, need) for need in kind.needs))
 
 
-def make(name: str, sizes: GuideSizes, env: Any) -> Guidance:
-    """A kind's bundle for an environment (shapes in place of arrays will do); the same one for the same sizes.
+def make(name: str, sizes: GuideSizes, env: Any, options: Any = None) -> Guide:
+    """A kind's guide for an environment (shapes in place of arrays will do).
+
+    Args:
+        name: of the kind.
+        sizes: of its model.
+        env: whose spaces are looked at.
+        options: the kind's own, a `Kind.config`; None: its defaults.
 
     Raises:
         UserError: no such kind, or the environment lacks what it needs.
@@ -82,28 +88,12 @@ def make(name: str, sizes: GuideSizes, env: Any) -> Guidance:
     for need in kind.needs:
         if not offers(env, need):
             raise UserError(f"guidance {kind.name!r} needs an environment with `{need}`, which this task's has not")
-    return made_for(kind, sizes, spaces_of(env))
-
-
-@cache
-def made_for(kind: Kind, sizes: GuideSizes, spaces: Spaces) -> Guidance:
-    """A kind's bundle for an observation and action space; the same one for the same sizes and spaces."""
-    made = kind.make(sizes, spaces)
-    if made.form != kind.form or made.name != kind.name:
-        raise ValueError(f"guidance {kind.name!r} was made with another name or form of answers than its kind has")
-    if sizes.sees_turn and made.onward is None:
-        raise UserError(f"guidance {kind.name!r} does not see how far actions were turned: leave out --sizes.sees-turn")
-    if sizes.eps_falls and made.form is not None and not made.form.by_eps:
+    if sizes.eps_falls and kind.form is not None and not kind.form.by_eps:
         raise UserError(
-            f"guidance {kind.name!r} asks for {made.form.name} answers, which have no strength that could fall: leave "
+            f"guidance {kind.name!r} asks for {kind.form.name} answers, which have no strength that could fall: leave "
             "out --sizes.eps-falls"
         )
-    if made.asks and made.disagreement is None and sizes.ensemble > 1:
-        raise UserError(
-            f"guidance {kind.name!r} has one model, no ensemble of them: leave out --sizes.ensemble and "
-            "--sizes.candidates, or run it by itself"
-        )
-    return made
+    return kind.make(sizes, spaces_of(env), options)
 
 
 @cache

@@ -1,26 +1,50 @@
-"""The paper's method: a model of relative feedback ("more left", "more right") that refines the agent's actions."""
+"""The paper's method: a model phi(s, a) of relative feedback ("more left", "more right") that refines actions.
+
+Source: paper, Eqs. 2 to 4. The network predicts corrections in units of eps, so that a small eps fits as easily as a
+large one.
+"""
 
 from __future__ import annotations
 
-from jaxtyping import Array, Float
+from typing import Any
 
-from cuelearner_jax.config import GuideScalars, GuideSizes
-from cuelearner_jax.environment import Spaces
+from jaxtyping import Array, Bool, Float
+
+from cuelearner_jax.config import GuideScalars
 from cuelearner_jax.feedback.answers import RELATIVE
-from cuelearner_jax.guides.bundle import Guidance
-from cuelearner_jax.guides.correcting import correcting
-from cuelearner_jax.guides.kind import Kind
-from cuelearner_jax.types import Label
+from cuelearner_jax.guides.base import Guide, Kind
+from cuelearner_jax.guides.fitting import Lesson
+from cuelearner_jax.guides.refining import Refined
+from cuelearner_jax.types import GuidanceModel, Label
 
 
-def make(sizes: GuideSizes, spaces: Spaces) -> Guidance:
-    """The bundle for an environment's spaces."""
+class Relative(Guide):
+    """A guide that corrects actions until nothing moves."""
 
-    def target(label: Label, scalars: GuideScalars) -> Float[Array, " action"]:
+    def target(self, label: Label, scalars: GuideScalars) -> Float[Array, " action"]:
         """Eq. 3's eps * h as a vector: the action turned by h * eps, less the action."""
-        return spaces.actions.toward(label.action, label.answer[0], scalars.radians("eps")) - label.action
+        return self.spaces.actions.toward(label.action, label.answer[0], scalars.radians("eps")) - label.action
 
-    return correcting("relative", RELATIVE, target, sizes, spaces)
+    def lessons(self, labels: Label, scalars: GuideScalars) -> Lesson:
+        """Labels (slots, ...) with their targets in units of eps."""
+        rows = super().lessons(labels, scalars)
+        return rows.replace(target=rows.target / scalars.radians("eps"))
+
+    def act(
+        self,
+        model: GuidanceModel,
+        env: Any,
+        obs: Float[Array, "n obs"],
+        actions: Float[Array, "n action"],
+        active: Bool[Array, " n"],
+        scalars: GuideScalars,
+    ) -> Refined:
+        """Eq. 4: a <- a + phi(s, a), in active rows of a fitted model."""
+
+        def phi(current: Float[Array, "n action"]) -> Float[Array, "n action"]:
+            return scalars.radians("eps") * self.predict(env, model.params, obs, current)
+
+        return self.refined(phi, actions, active & model.fitted, scalars)
 
 
-KIND = Kind("relative", "a model of the teacher's relative feedback", make, form=RELATIVE, colour="#0072B2")
+KIND = Kind("relative", "a model of the teacher's relative feedback", Relative, form=RELATIVE, colour="#0072B2")

@@ -7,7 +7,7 @@ alone may never see one: a share `explored_fraction` of the questions stays abou
 
 from __future__ import annotations
 
-from functools import partial
+from functools import cached_property
 from typing import Any
 
 import jax
@@ -15,38 +15,24 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from cuelearner_jax.agents.choice import greedy_actions
-from cuelearner_jax.config import AgentSizes, GuideScalars, GuideSizes
-from cuelearner_jax.environment import Spaces
+from cuelearner_jax.config import AgentSizes, GuideScalars
 from cuelearner_jax.feedback.answers import SCALAR
-from cuelearner_jax.guides.bundle import Guidance
-from cuelearner_jax.guides.fitting import fit_least_squares, lessons
-from cuelearner_jax.guides.kind import Kind
-from cuelearner_jax.guides.model import guide_model
-from cuelearner_jax.guides.questions import about_refined
+from cuelearner_jax.guides.base import Guide, Kind
+from cuelearner_jax.guides.model import GuideModel, guide_model
 from cuelearner_jax.guides.refining import Refined
-from cuelearner_jax.types import GuidanceModel, Label
+from cuelearner_jax.types import GuidanceModel
 
 
-def make(sizes: GuideSizes, spaces: Spaces) -> Guidance:
-    """The bundle for an environment's spaces."""
-    space = spaces.actions
-    network = guide_model(sizes, spaces, 1)
-    # The argmax is the agent's own, of a network of these layers in this frame.
-    searched = AgentSizes(sizes.frame, sizes.feedback_layers, sizes.guide_directions)
+class Scalar(Guide):
+    """A guide that values actions."""
 
-    def init(key: PRNGKeyArray) -> GuidanceModel:
-        return GuidanceModel(network.init(key), jnp.array(False))
-
-    def target(label: Label, scalars: GuideScalars) -> Float[Array, "1"]:
-        """Whether it was called good."""
-        return label.answer
-
-    def fit(key: PRNGKeyArray, env: Any, labels: Label, former: GuidanceModel, scalars: GuideScalars) -> GuidanceModel:
-        rows = lessons(labels, target, scalars)
-        predict = partial(network.predict, env)
-        return fit_least_squares(key, rows, scalars, init=network.init, apply=predict, sizes=sizes)
+    @cached_property
+    def network(self) -> GuideModel:
+        """The network, or ensemble, whose output is whether an action is called good."""
+        return guide_model(self.sizes, self.spaces, outputs=1)
 
     def act(
+        self,
         model: GuidanceModel,
         env: Any,
         obs: Float[Array, "n obs"],
@@ -54,13 +40,15 @@ def make(sizes: GuideSizes, spaces: Spaces) -> Guidance:
         active: Bool[Array, " n"],
         scalars: GuideScalars,
     ) -> Refined:
+        """The best of all actions in active rows of a fitted model."""
         guided = active & model.fitted
-        chosen = greedy_actions(searched, space, env, model.params, obs, sizes.ensemble)
+        # The argmax is the agent's own, of a network of these layers in this frame.
+        searched = AgentSizes(self.sizes.frame, self.sizes.feedback_layers, self.sizes.guide_directions)
+        chosen = greedy_actions(searched, self.spaces.actions, env, model.params, obs, self.sizes.ensemble)
         return Refined(jnp.where(guided[:, None], chosen, actions), guided.astype(jnp.int32))
 
-    about_chosen = about_refined(act)
-
     def question(
+        self,
         key: PRNGKeyArray,
         model: GuidanceModel,
         env: Any,
@@ -68,11 +56,10 @@ def make(sizes: GuideSizes, spaces: Spaces) -> Guidance:
         base: Float[Array, " action"],
         scalars: GuideScalars,
     ) -> Float[Array, " action"]:
+        """The base action in a share `explored_fraction` of all questions, the guide's own in the others."""
         k_explore, k_refined = jax.random.split(key)
         explores = jax.random.bernoulli(k_explore, scalars.explored_fraction)
-        return jnp.where(explores, base, about_chosen(k_refined, model, env, obs, base, scalars))
-
-    return Guidance("scalar", SCALAR, init, question, target, fit, act, network.disagreement)
+        return jnp.where(explores, base, super().question(k_refined, model, env, obs, base, scalars))
 
 
-KIND = Kind("scalar", "a model of which actions the teacher calls good", make, form=SCALAR, colour="#E69F00")
+KIND = Kind("scalar", "a model of which actions the teacher calls good", Scalar, form=SCALAR, colour="#E69F00")

@@ -11,7 +11,7 @@ import numpy as np
 
 from cuelearner_jax.config import RunConfig, to_json
 from cuelearner_jax.feedback.forms import AnswerForm
-from cuelearner_jax.guides.bundle import Guidance
+from cuelearner_jax.guides.base import Guide
 from cuelearner_jax.policies import Policy
 from cuelearner_jax.task import Task
 
@@ -45,7 +45,7 @@ class Plan:
 
     task: Task
     config: RunConfig  # of which the world, the sizes and the scalars count
-    guidance: Guidance
+    guidance: Guide
     base: Base
     labels: int  # answers that are wanted
     seed: int = 0

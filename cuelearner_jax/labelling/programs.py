@@ -16,7 +16,7 @@ from cuelearner_jax import asking
 from cuelearner_jax.config import Scalars
 from cuelearner_jax.environment import Environment, actions_of
 from cuelearner_jax.feedback.forms import AnswerForm
-from cuelearner_jax.guides.bundle import Guidance
+from cuelearner_jax.guides.base import Guide
 from cuelearner_jax.types import EnvState, GuideState, Label, Teacher
 
 
@@ -30,7 +30,7 @@ class Programs(NamedTuple):
 
 
 @cache
-def programs(guidance: Guidance) -> Programs:
+def programs(guidance: Guide) -> Programs:
     """Those of a guidance, not compiled yet; the same ones for the same guidance."""
 
     def refined(env: Any, scalars: Any, model: Any, obs: Array, action: Array) -> Array:

@@ -15,8 +15,7 @@ from cuelearner_jax.config import RunConfig, Scalars, Schedule, Sizes
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import SPLITS
 from cuelearner_jax.guides import registry as guidances
-from cuelearner_jax.guides.bundle import Guidance
-from cuelearner_jax.guides.kind import NAME
+from cuelearner_jax.guides.base import NAME, Guide
 from cuelearner_jax.plugins import REFERENCE
 from cuelearner_jax.runs.shards import Shard
 from cuelearner_jax.storage import formats, label_files
@@ -36,7 +35,7 @@ class Grid:
     seeds: tuple[int, ...]
     labels: tuple[int, ...]
 
-    def lanes(self, guidance: Guidance) -> tuple[np.ndarray, np.ndarray]:
+    def lanes(self, guidance: Guide) -> tuple[np.ndarray, np.ndarray]:
         """(seeds, budgets) of one kind's lanes, each (lanes,)."""
         budgets = self.labels if guidance.asks else (0,)
         pairs = [(seed, budget) for budget in budgets for seed in self.seeds]
@@ -54,9 +53,12 @@ def seeds_of(first: int, count: int) -> tuple[int, ...]:
     return tuple(range(first, first + count))
 
 
-def check_grid(grid: Grid) -> None:
-    """Raises UserError for a grid that makes no sense."""
+def check_grid(grid: Grid, adapts: bool = False) -> None:
+    """Raises UserError for a grid that makes no sense; `adapts`: a finished policy is adapted, no agent trained."""
     kinds = [guidances.find(kind) for kind in grid.guidance]
+    for kind in kinds:
+        if kind.sees_base and not adapts:
+            raise UserError(f"guidance {kind.name!r} looks at what a finished policy did: give it to `adapt` alone")
     if not grid.guidance or len(set(grid.guidance)) < len(grid.guidance):
         raise UserError("--guidance: give each kind once, and at least one")
     if not grid.seeds or len(set(grid.seeds)) < len(grid.seeds) or not all(0 <= s < LARGEST_SEED for s in grid.seeds):

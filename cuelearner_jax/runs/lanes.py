@@ -17,7 +17,7 @@ from cuelearner_jax.config import RunConfig
 from cuelearner_jax.devices import BY_LANE, lane_mesh, place
 from cuelearner_jax.environment import Environment
 from cuelearner_jax.evaluate import Tell, evaluate_lanes, untold, watched_lanes
-from cuelearner_jax.guides.bundle import Guidance
+from cuelearner_jax.guides.base import Guide
 from cuelearner_jax.loop import Program, make_program
 from cuelearner_jax.policies import Policy
 from cuelearner_jax.runs.grid import Grid
@@ -32,7 +32,7 @@ T = TypeVar("T")
 class LaneGroup:
     """The lanes of one kind of guidance: one compiled program, its lanes cut into equal blocks."""
 
-    def __init__(self, config: RunConfig, env: Any, guidance: Guidance, grid: Grid, mesh: Mesh | None = None) -> None:
+    def __init__(self, config: RunConfig, env: Any, guidance: Guide, grid: Grid, mesh: Mesh | None = None) -> None:
         self.config, self.env, self.guidance = config, env, guidance
         self.seeds, self.budgets = grid.lanes(guidance)
         self.largest_budget = int(self.budgets.max())

@@ -14,7 +14,7 @@ import numpy as np
 from cuelearner_jax.config import RunConfig
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides import registry as guidances
-from cuelearner_jax.guides.bundle import Guidance
+from cuelearner_jax.guides.base import Guide
 from cuelearner_jax.runs import shards
 from cuelearner_jax.runs.grid import Grid, defaults, load
 from cuelearner_jax.runs.kept import restore_policies
@@ -36,7 +36,7 @@ class Piece(NamedTuple):
 class Lanes:
     """The lanes of one kind of guidance that have come to the same step, as their newest checkpoints have them."""
 
-    guidance: Guidance
+    guidance: Guide
     seeds: np.ndarray  # (lanes,)
     budgets: np.ndarray  # (lanes,)
     policies: Any  # {"params", "guidance"}, leading axis: lanes

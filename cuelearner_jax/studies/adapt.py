@@ -26,7 +26,7 @@ from cuelearner_jax.evaluate import Tell, untold
 from cuelearner_jax.feedback import given
 from cuelearner_jax.feedback.answers import check_teacher
 from cuelearner_jax.guides import registry as guidances
-from cuelearner_jax.guides.bundle import Guidance
+from cuelearner_jax.guides.base import Guide
 from cuelearner_jax.guides.relative import KIND
 from cuelearner_jax.policies import Common
 from cuelearner_jax.runs import adapted, trained
@@ -256,7 +256,7 @@ def _bases(subject: Subject, request: Request, env: Any) -> tuple[Any, tuple[int
 
 
 def _rows(
-    subject: Subject, request: Request, guidance: Guidance, env: Environment, bases: Any, seeds: tuple[int, ...]
+    subject: Subject, request: Request, guidance: Guide, env: Environment, bases: Any, seeds: tuple[int, ...]
 ) -> tuple[label_files.LabelFile | None, Request]:
     """Labels in place of questions (None: none), and the request with its budgets and bounds in it.
 
@@ -264,7 +264,7 @@ def _rows(
     """
     task, path, rows = subject.source.task, request.labels_from, subject.rows
     grid = Grid((guidance.name,), seeds, request.labels)
-    check_grid(grid)
+    check_grid(grid, adapts=True)
     file, form = None, guidance.form
     assert form is not None  # it asks
     if path is not None:

@@ -1,4 +1,4 @@
-"""The laws of a kind of guidance (`cuelearner_jax.guides.kind.Kind`), held against it in one environment."""
+"""The laws of a kind of guidance (`cuelearner_jax.guides.base.Kind`), held against it in one environment."""
 
 from __future__ import annotations
 
@@ -15,8 +15,7 @@ from jaxtyping import Array, Float
 from cuelearner_jax.config import GuideScalars, GuideSizes, Scalars
 from cuelearner_jax.environment import Environment, actions_of, offers, spaces_of
 from cuelearner_jax.feedback.forms import AnswerForm
-from cuelearner_jax.guides.bundle import Guidance
-from cuelearner_jax.guides.kind import Kind
+from cuelearner_jax.guides.base import Guide, Kind
 from cuelearner_jax.testing.laws import Laws, Traced, changed
 from cuelearner_jax.types import EnvState, GuidanceModel, Label
 
@@ -49,39 +48,21 @@ def check_guidance(kind: Kind, env: Environment, sizes: GuideSizes = SMALL, tole
     laws = Laws(f"guidance {kind.name}", tolerance)
     for need in kind.needs:
         laws.hold(offers(env, need), f"it needs a {need}, which {type(env).__name__} lacks: check it in another one")
-    with laws.attempted("`make`", "it gets GuideSizes and Spaces, and returns a Guidance"):
-        guidance = kind.make(sizes, spaces_of(env))
-    laws.hold(guidance.name == kind.name, f"its bundle is called {guidance.name!r}: give both one name")
-    laws.hold(guidance.form == kind.form, "its bundle has another form of answers than its kind: give both the same")
-    key = jax.random.key(0)
-    model = _unfitted(laws, guidance, key)
+    with laws.attempted("`make`", "its class inherits Guide, and its `config` has defaults"):
+        guide = kind.make(sizes, spaces_of(env))
+        model = guide.init(key := jax.random.key(0))
     states, obs = jax.vmap(env.reset)(jax.random.split(key, ROWS))
     actions = actions_of(env).uniform(key, (ROWS,))
-    if guidance.form is not None:
-        labels = _answered(laws, guidance, guidance.form, env, states, obs, actions)
-        fitted = _fitted(laws, guidance, env, model, labels)
-    else:
-        fitted = model
-    _check_act(laws, guidance, env, model, fitted, obs, actions)
-    _check_question(laws, guidance, env, fitted, obs, actions)
-    _check_disagreement(laws, kind, env, sizes, obs, actions)
+    fitted = model
+    if guide.form is not None:
+        fitted = _fitted(laws, guide, env, model, _answered(laws, guide, guide.form, env, states, obs, actions))
+    _check_act(laws, guide, env, model, fitted, obs, actions)
+    _check_question(laws, guide, env, fitted, obs, actions)
+    if guide.form is not None:
+        _check_disagreement(laws, kind, env, sizes, obs, actions)
 
 
-def _unfitted(laws: Laws, guidance: Guidance, key: Array) -> GuidanceModel:
-    with laws.attempted("`init`", "it gets a key and returns a GuidanceModel"):
-        model = guidance.init(key)
-    laws.hold(isinstance(model, GuidanceModel), f"`init` returns a {type(model).__name__}: return a GuidanceModel")
-    laws.hold(
-        np.shape(model.fitted) == () and not np.asarray(model.fitted),
-        "`init` returns a fitted model: `fitted` is one False until labels have been fitted",
-    )
-    laws.hold(laws.same(model, guidance.init(key)), "`init` of one key gives two models: draw from the key alone")
-    return model
-
-
-def _answered(
-    laws: Laws, guidance: Guidance, form: AnswerForm, env: Any, states: Any, obs: Array, actions: Array
-) -> Label:
+def _answered(laws: Laws, guide: Guide, form: AnswerForm, env: Any, states: Any, obs: Array, actions: Array) -> Label:
     """Labels (rows, ...) by a simulated teacher."""
     named = re.fullmatch(r"[a-z][a-z0-9_-]*", form.name) and form.meaning
     laws.hold(named, f"its form {form.name!r} lacks a name in lower case or a meaning: label files tell both")
@@ -99,7 +80,7 @@ def _answered(
     laws.hold(answered.shape == (ROWS,) and answered.dtype == bool, "`answered` is no bool: say whether it answered")
     labels = Label(obs, actions, answers, answered)
     with laws.attempted("`target` under vmap", "it gets one Label and GuideScalars, and returns a vector"):
-        targets = jax.vmap(lambda label: guidance.target(label, GuideScalars()))(labels)
+        targets = jax.vmap(lambda label: guide.target(label, GuideScalars()))(labels)
     laws.hold(
         targets.ndim == 2 and np.isfinite(targets).all(),
         f"`target` of one label has shape {targets.shape[1:]} or is not finite: return one finite vector",
@@ -107,7 +88,7 @@ def _answered(
     return labels
 
 
-def _fitted(laws: Laws, guidance: Guidance, env: Any, model: GuidanceModel, labels: Label) -> GuidanceModel:
+def _fitted(laws: Laws, guide: Guide, env: Any, model: GuidanceModel, labels: Label) -> GuidanceModel:
     """The model of labels, fitted beside a lane that has none."""
     lanes = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), labels)
     lanes = lanes.replace(valid=lanes.valid.at[1].set(False))
@@ -115,7 +96,7 @@ def _fitted(laws: Laws, guidance: Guidance, env: Any, model: GuidanceModel, labe
     keys = jax.random.split(jax.random.key(2), 2)
 
     def fit(key: Array, labels: Label, former: GuidanceModel, env: Any, scalars: GuideScalars) -> GuidanceModel:
-        return guidance.fit(key, env, labels, former, scalars)
+        return guide.fit(key, env, labels, former, scalars)
 
     with laws.attempted("`fit` under jit and vmap", "it is one lane's: no Python branch may look at a value"):
         fits = jax.jit(jax.vmap(fit, (0, 0, 0, None, None)))(keys, lanes, former, env, GuideScalars())
@@ -132,7 +113,7 @@ def _fitted(laws: Laws, guidance: Guidance, env: Any, model: GuidanceModel, labe
 
 def _check_act(
     laws: Laws,
-    guidance: Guidance,
+    guide: Guide,
     env: Any,
     unfitted: GuidanceModel,
     fitted: GuidanceModel,
@@ -140,7 +121,7 @@ def _check_act(
     actions: Array,
 ) -> None:
     """What it does to a batch of actions."""
-    active, act = jnp.arange(ROWS) % 2 == 0, Traced(guidance.act)
+    active, act = jnp.arange(ROWS) % 2 == 0, Traced(guide.act)
     scalars = GuideScalars()
     with laws.attempted("`act` under jit", "it gets a batch of rows and returns Refined(actions, passes)"):
         refined = act(fitted, env, obs, actions, active, scalars)
@@ -158,7 +139,7 @@ def _check_act(
         exact.same(refined.actions[~active], actions[~active]),
         "`act` changes rows that are not active: keep them by jnp.where(active[:, None], ...)",
     )
-    if guidance.asks:
+    if guide.asks:
         everywhere = jnp.ones(ROWS, bool)
         alone = act(unfitted, env, obs, actions, everywhere, scalars).actions
         laws.hold(
@@ -166,22 +147,20 @@ def _check_act(
         )
 
 
-def _check_question(laws: Laws, guidance: Guidance, env: Any, model: GuidanceModel, obs: Array, actions: Array) -> None:
+def _check_question(laws: Laws, guide: Guide, env: Any, model: GuidanceModel, obs: Array, actions: Array) -> None:
     with laws.attempted("`question` under jit", "it gets one situation and the base policy's action there"):
-        asked = jax.jit(guidance.question)(jax.random.key(3), model, env, obs[0], actions[0], GuideScalars())
+        asked = jax.jit(guide.question)(jax.random.key(3), model, env, obs[0], actions[0], GuideScalars())
     laws.hold(asked.shape == actions[0].shape, f"`question` returns shape {asked.shape}: ask about one action")
     laws.actions(actions_of(env), asked, "what `question` asks about")
 
 
 def _check_disagreement(laws: Laws, kind: Kind, env: Any, sizes: GuideSizes, obs: Array, actions: Array) -> None:
-    """What the members of an ensemble say of each other, if the kind can be had with several."""
-    guidance = kind.make(dataclasses.replace(sizes, ensemble=2), spaces_of(env))
-    if guidance.disagreement is None:
-        return
-    model = guidance.init(jax.random.key(4))
+    """What the members of an ensemble say of each other."""
+    guide = kind.make(dataclasses.replace(sizes, ensemble=2), spaces_of(env))
+    model = guide.init(jax.random.key(4))
     model = model.replace(params=jax.tree.map(_moved, model.params))  # members may start out alike
     with laws.attempted("`disagreement` under jit", "it gets a model and a batch of situations and actions"):
-        apart = jax.jit(guidance.disagreement)(model, env, obs, actions)
+        apart = jax.jit(guide.disagreement)(model, env, obs, actions)
     laws.hold(apart.shape == (ROWS,), f"`disagreement` of {ROWS} rows has shape {apart.shape}: give one number a row")
     laws.hold(np.isfinite(apart).all() and (apart >= 0).all(), "`disagreement` is negative or not finite")
     laws.hold(jnp.ptp(apart) > 0, "`disagreement` is the same of all situations: it can choose none of them")

@@ -271,8 +271,8 @@ FALLING = dataclasses.replace(SCALARS, eps_deg=20.0, eps_last_deg=4.0)
 @pytest.mark.long
 @pytest.mark.parametrize(
     ("kind", "more"),
-    [("relative", {}), ("relative", {"sees_turn": True}), ("intent", {"aim_layers": (8,)})],
-    ids=["relative", "turn", "intent"],
+    [("relative", {}), ("offset", {}), ("intent", {"aim_layers": (8,)})],
+    ids=["relative", "offset", "intent"],
 )
 def test_a_file_of_falling_strengths_leads_where_asking_did(tmp_path, kind, more):
     env = probes.Aimed(half_width=jnp.deg2rad(jnp.array(HALF)))

@@ -16,7 +16,7 @@ from cuelearner_jax.agents.networks import q_network
 from cuelearner_jax.config import Sizes
 from cuelearner_jax.environment import Features, spaces_of
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.guides.model import guide_model, residual_model
+from cuelearner_jax.guides.model import guide_model
 
 ENV = probes.Window()
 OBS = geometry.from_angle(jnp.array([0.3, -2.0, 1.1]))
@@ -55,7 +55,7 @@ def test_a_vector_goes_outward_as_it_came_inward():
 
 def test_what_a_guide_says_turns_with_the_situation():
     env, turn = Turned(), 0.7
-    model = residual_model(SIZES, spaces_of(env))
+    model = guide_model(SIZES, spaces_of(env))
     params = model.init(jax.random.key(0))
     before = model.predict(env, params, OBS, CHOSEN)
     after = model.predict(env, params, geometry.rotate(OBS, turn), geometry.rotate(CHOSEN, turn))
@@ -80,4 +80,4 @@ def test_the_greedy_choice_turns_with_the_situation(coarse):
 
 def test_an_environment_without_features_is_refused_in_the_actions_frame():
     with pytest.raises(UserError, match=r"give --sizes\.frame raw"):
-        residual_model(SIZES, spaces_of(probes.Chain()))
+        guide_model(SIZES, spaces_of(probes.Chain()))

@@ -12,7 +12,6 @@ from cuelearner_jax import actions
 from cuelearner_jax.adaptation import program
 from cuelearner_jax.config import GuideSizes, Scalars
 from cuelearner_jax.environment import spaces_of
-from cuelearner_jax.guides import registry
 from cuelearner_jax.guides.fitting import lessons
 from cuelearner_jax.policies import Common
 from cuelearner_jax.types import Label
@@ -21,7 +20,7 @@ TURN_DEG, BOUND_DEG = 8.0, 12.0
 ENV = probes.Window(offset=0.6 + np.deg2rad(TURN_DEG))
 SIZES = GuideSizes(feedback_layers=(32, 32), labels_per_round=10, fit_steps=300, fit_batch_size=32)
 SCALARS = Scalars(eps_deg=BOUND_DEG, tau_max_deg=BOUND_DEG, k_max=10, feedback_learning_rate=5e-3, max_grad_norm=10.0)
-GUIDANCE = registry.made_for(residual.KIND, SIZES, spaces_of(ENV))
+GUIDANCE = residual.KIND.make(SIZES, spaces_of(ENV))
 OBS = actions.evenly_spaced(4)
 
 

@@ -10,12 +10,12 @@ import probes
 import pytest
 
 from cuelearner_jax import actions, asking, choosing
-from cuelearner_jax.errors import UserError
+from cuelearner_jax.environment import spaces_of
 from cuelearner_jax.guides import registry
-from cuelearner_jax.guides.ensemble import ensemble
-from cuelearner_jax.guides.questions import about_base
+from cuelearner_jax.guides.model import ensemble
+from cuelearner_jax.guides.relative import KIND, Relative
 from cuelearner_jax.policies import Uniform
-from cuelearner_jax.types import GuidanceModel, Label
+from cuelearner_jax.types import Label
 
 ENV = probes.Aimed()
 OBS = actions.evenly_spaced(5)
@@ -25,23 +25,42 @@ FOUR = dataclasses.replace(ONE, ensemble=4)
 CHOOSING = dataclasses.replace(FOUR, candidates=6)
 
 
+class AboutBase(Relative):
+    """Asks about the base action always."""
+
+    def question(self, key, model, env, obs, base, scalars):
+        return base
+
+
+class Told(AboutBase):
+    """Its members disagree as told."""
+
+    def disagreement(self, model, env, obs, actions):
+        return 2 * obs[:, 0] + actions[:, 1]
+
+
+def made(guide, sizes):
+    return dataclasses.replace(KIND, guide=guide).make(sizes, spaces_of(ENV))
+
+
 def linear(env, params, obs, actions):
     """Two outputs: the observation's first entry times a member's number, and the action's."""
     return jnp.stack([params * obs[:, 0], params * actions[:, 0]], -1)
 
 
 def test_an_ensemble_predicts_its_members_mean_and_tells_their_variance():
-    made = ensemble(3, jax.random.normal, linear)
+    several = ensemble(3, jax.random.normal, linear)
     params = jnp.array([1.0, 2.0, 6.0])
-    np.testing.assert_allclose(made.predict(None, params, OBS, BASE), linear(None, 3.0, OBS, BASE), rtol=1e-6)
-    apart = made.disagreement(GuidanceModel(params, jnp.array(True)), None, OBS, BASE)
+    np.testing.assert_allclose(several.predict(None, params, OBS, BASE), linear(None, 3.0, OBS, BASE), rtol=1e-6)
+    apart = several.disagreement(None, params, OBS, BASE)
     np.testing.assert_allclose(apart, 14 / 3 * (OBS[:, 0] ** 2 + BASE[:, 0] ** 2), rtol=1e-5)
-    assert len(set(np.asarray(made.init(jax.random.key(0))).tolist())) == 3
+    assert len(set(np.asarray(several.init(jax.random.key(0))).tolist())) == 3
 
 
 def test_one_member_is_the_network_itself():
-    made = ensemble(1, jax.random.normal, linear)
-    assert (made.init, made.predict, made.disagreement) == (jax.random.normal, linear, None)
+    one, key = ensemble(1, jax.random.normal, linear), jax.random.key(0)
+    assert one.predict is linear
+    assert float(one.init(key)) == float(jax.random.normal(key))
 
 
 @pytest.mark.parametrize("kind", ["relative", "demonstration", "scalar", "dcoach", "intent"])
@@ -56,7 +75,8 @@ def test_members_that_are_the_same_do_what_one_does_and_do_not_disagree(kind):
     add = jax.vmap(lambda number, params: jax.tree.map(lambda leaf: leaf + 0.1 * number, params))
     differing = same.replace(params=add(jnp.arange(4.0), same.params))
     assert several.disagreement(differing, ENV, OBS, BASE).min() > 1e-6
-    assert single.disagreement is None
+    assert several.has_members
+    assert not single.has_members
 
 
 # Which question.
@@ -68,10 +88,7 @@ def begun(guidance, sizes, budget=20):
 
 
 def test_the_candidate_is_asked_about_on_which_members_disagree_most_and_all_walk_on():
-    several = registry.make("relative", CHOOSING, ENV)
-    told = several._replace(
-        question=about_base, disagreement=lambda model, env, obs, actions: 2 * obs[:, 0] + actions[:, 1]
-    )
+    told = made(Told, CHOOSING)
     guide = begun(told, CHOOSING)
     assert guide.obs.shape == (6, 2)
     assert len(np.unique(np.asarray(guide.obs), axis=0)) > 1
@@ -125,24 +142,9 @@ def test_members_of_deep_coach_are_corrected_each_as_one_alone_is_from_its_own_n
         chex.assert_trees_all_close(alone.params, one[1], rtol=1e-4, atol=1e-6)
 
 
-def test_kinds_of_one_model_are_refused_where_members_are_wanted(monkeypatch):
-    monkeypatch.setattr(registry, "_KINDS", dict(registry._KINDS))
-    kind = registry.find("relative")
-
-    def make(sizes, spaces):
-        return kind.make(ONE, spaces)._replace(name="single")
-
-    registry.register(dataclasses.replace(kind, name="single", make=make))
-    with pytest.raises(UserError, match="'single' has one model, no ensemble of them: leave out") as refusal:
-        registry.make("single", CHOOSING, ENV)
-    assert "\n" not in str(refusal.value)
-    assert registry.make("none", CHOOSING, ENV).name == "none"  # which asks nothing
-
-
 def test_every_candidate_is_asked_about_at_once_within_the_budget():
     sizes = dataclasses.replace(ONE, candidates=6, ask_all=True, labels_per_round=12)
-    single = registry.make("relative", sizes, ENV)._replace(question=about_base)
-    assert single.disagreement is None
+    single = made(AboutBase, sizes)
     slots, key, expert = asking.label_slots(21, sizes), jax.random.key(7), probes.Expert(ENV)
     assert slots == 24
     guide = asking.start(single, ENV, slots, 21, jax.random.key(1), jax.random.key(2), sizes)
@@ -209,7 +211,7 @@ def test_of_actions_as_far_from_its_own_the_first_is_asked_about():
 @pytest.mark.parametrize(("members", "fitted"), [(1, False), (1, True), (3, True)])
 def test_questions_that_a_coach_chooses_are_asked_from_the_first_on_and_all_candidates_walk_on(members, fitted):
     sizes = dataclasses.replace(WATCHED, ensemble=members)
-    bundle, expert = registry.make("relative", sizes, ENV)._replace(question=about_base), probes.Expert(ENV)
+    bundle, expert = made(AboutBase, sizes), probes.Expert(ENV)
     guide, key = begun(bundle, sizes), jax.random.key(7)
     guide = guide.replace(model=guide.model.replace(fitted=jnp.array(fitted)))
     keys = asking.question_keys(key, 0)

@@ -1,4 +1,4 @@
-"""The bundles of guidance: which rows they touch and when."""
+"""Guides: which rows they touch and when, what they ask about, how they are found."""
 
 import dataclasses
 import math
@@ -12,12 +12,9 @@ import pytest
 
 from cuelearner_jax import actions
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.feedback.answers import RELATIVE
-from cuelearner_jax.guides import none
 from cuelearner_jax.guides import registry as guidance
-from cuelearner_jax.guides.bounding import act_within
-from cuelearner_jax.guides.kind import Kind
-from cuelearner_jax.guides.questions import about_base
+from cuelearner_jax.guides.base import Kind
+from cuelearner_jax.guides.untaught import NONE, Untaught
 from cuelearner_jax.types import Label
 
 ENV = probes.Window()
@@ -139,13 +136,13 @@ def test_within_a_bound_no_kind_leads_farther_and_rows_that_are_not_active_stay(
     for kind in ("heuristic", "relative"):
         bundle, model = made(kind)
         model = model.replace(fitted=jnp.array(True))
-        result = act_within(jnp.array(0.01), bundle, model, ENV, OBS, BASE, ACTIVE, probes.SCALARS)
+        result = bundle.act_within(jnp.array(0.01), model, ENV, OBS, BASE, ACTIVE, probes.SCALARS)
         away = np.abs(actions.difference(BASE, result.actions))
         assert away.max() <= 0.01 + 1e-6
         assert away[ACTIVE].max() == pytest.approx(0.01, abs=1e-5)  # of the heuristic's 1.3 rad
         np.testing.assert_array_equal(result.actions[~ACTIVE], BASE[~ACTIVE])
     bundle, model = made("heuristic")
-    free = act_within(jnp.array(math.pi), bundle, model, ENV, OBS, BASE, ACTIVE, probes.SCALARS)
+    free = bundle.act_within(jnp.array(math.pi), model, ENV, OBS, BASE, ACTIVE, probes.SCALARS)
     alone = bundle.act(model, ENV, OBS, BASE, ACTIVE, probes.SCALARS)
     np.testing.assert_array_equal(free.actions, alone.actions)
 
@@ -174,9 +171,9 @@ def test_a_share_of_the_questions_is_about_refined_actions_and_the_rest_about_th
     np.testing.assert_array_equal(asked(question, 0.0)[0], np.tile(BASE[0], (200, 1)))
 
 
-def test_questions_of_an_unfitted_model_and_of_kinds_that_ask_about_the_base_are_about_the_base():
-    for found, _ in (asked(made("relative")[0].question, 1.0, fitted=False), asked(about_base, 1.0)):
-        np.testing.assert_array_equal(found, np.tile(BASE[0], (200, 1)))
+def test_questions_of_an_unfitted_model_are_about_the_base():
+    found, _ = asked(made("relative")[0].question, 1.0, fitted=False)
+    np.testing.assert_array_equal(found, np.tile(BASE[0], (200, 1)))
 
 
 # The registry.
@@ -188,11 +185,8 @@ def registered(monkeypatch):
     monkeypatch.setattr(guidance, "_KINDS", dict(guidance._KINDS))
 
 
-def kind_of(name, **fields):
-    def make(sizes, spaces):
-        return none.make(sizes, spaces)._replace(name=name)
-
-    return Kind(name, "left alone", make, **fields)
+def kind_of(name, about="left alone", **fields):
+    return Kind(name, about, Untaught, **fields)
 
 
 @pytest.mark.parametrize("kind", guidance.known(), ids=lambda kind: kind.name)
@@ -220,11 +214,11 @@ def test_a_kind_can_be_registered_again_but_not_another_of_its_name(registered):
     assert [kind.name for kind in guidance.known()].count("calm") == 1
     assert guidance.make("calm", probes.SIZES, ENV).name == "calm"
     with pytest.raises(UserError, match="there is another guidance called 'calm': give yours another name"):
-        guidance.register(kind_of("calm"))
+        guidance.register(kind_of("calm", about="another"))
     with pytest.raises(UserError, match="another guidance called 'none'"):
         guidance.register(kind_of("none"))
     assert guidance.find("calm") is one
-    assert guidance.find("none") is none.KIND
+    assert guidance.find("none") is NONE
 
 
 @pytest.mark.parametrize("name", ["", "Calm", "9lives", "two words", "a/b", "a:b"])
@@ -233,21 +227,18 @@ def test_names_that_are_no_folders_are_refused(name):
         kind_of(name)
 
 
-def test_what_is_made_must_be_what_was_announced(registered):
-    guidance.register(Kind("relabelled", "another's name", none.make))
-    guidance.register(kind_of("silent", form=RELATIVE))
-    for name in ("relabelled", "silent"):
-        with pytest.raises(ValueError, match="another name or form of answers"):
-            guidance.make(name, probes.SIZES, ENV)
-
-
 @pytest.mark.parametrize("kind", ["none", "relative", "heuristic"])
-def test_bundles_are_made_once_for_the_same_sizes_and_spaces(kind):
-    bundle = guidance.make(kind, probes.SIZES, ENV)
-    assert guidance.make(kind, probes.SIZES, probes.Window(half_width=0.1, mirrors=True)) is bundle
-    assert guidance.make(kind, dataclasses.replace(probes.SIZES), probes.Window(offset=1.0)) is bundle
-    assert guidance.make(kind, dataclasses.replace(probes.SIZES, feedback_layers=(3,)), ENV) is not bundle
-    assert guidance.make(kind, probes.SIZES, jax.eval_shape(probes.Window)) is bundle
+def test_guides_of_the_same_settings_are_equal_and_hash_alike(kind):
+    one = guidance.make(kind, probes.SIZES, ENV)
+    for sizes, env in (
+        (probes.SIZES, probes.Window(half_width=0.1, mirrors=True)),
+        (dataclasses.replace(probes.SIZES), probes.Window(offset=1.0)),
+        (probes.SIZES, jax.eval_shape(probes.Window)),
+    ):
+        same = guidance.make(kind, sizes, env)
+        assert (same, hash(same)) == (one, hash(one))
+    assert guidance.make(kind, dataclasses.replace(probes.SIZES, feedback_layers=(3,)), ENV) != one
+    assert dataclasses.replace(one, options=1) != one
 
 
 def test_a_kind_is_refused_where_the_environment_lacks_what_it_needs(registered):

@@ -112,7 +112,7 @@ def test_without_a_possible_aim_actions_stay_as_they_are(fitted):
 
 
 def test_actions_stay_where_it_is_likelier_by_far_that_none_is_meant():
-    aims, scalars = actions.evenly_spaced(3), dataclasses.replace(probes.SCALARS, aim_share=1.0, aim_doubt=2.0)
+    aims, scalars = actions.evenly_spaced(3), dataclasses.replace(probes.SCALARS, aim_doubt=2.0)
     for none, sure in ((math.log(3.9), True), (math.log(4.1), False)):
         share = jax.nn.softmax(jnp.array([0.0, math.log(2.0), -jnp.inf, none]))
         goal, found = intent.followed(actions.DIRECTIONS, share, aims, aims[0], scalars)
@@ -122,11 +122,11 @@ def test_actions_stay_where_it_is_likelier_by_far_that_none_is_meant():
     assert not intent.followed(actions.DIRECTIONS, impossible, aims, aims[0], scalars)[1]
 
 
-def test_of_aims_about_as_likely_the_nearest_is_followed():
+def test_of_aims_as_likely_as_the_likeliest_the_nearest_is_followed():
     space, aims = actions.DIRECTIONS, actions.evenly_spaced(4)  # at 0, 90, 180 and 270 degrees
-    scalars = dataclasses.replace(probes.SCALARS, aim_share=0.8, aim_doubt=100.0)
-    # Probabilities 4 : 3.3 : 3.1 : 0, the last impossible; three quarters of all that none is meant.
-    share = jnp.array([4.0, 3.3, 3.1, 0.0, 31.2]) / 41.6
+    scalars = dataclasses.replace(probes.SCALARS, aim_doubt=100.0)
+    # Probabilities 4 : 4 : 3.1 : 0, the last impossible; three quarters of all that none is meant.
+    share = jnp.array([4.0, 4.0, 3.1, 0.0, 33.3]) / 44.4
     for degrees, aim in ((80.0, 1), (30.0, 0), (170.0, 1), (200.0, 1), (271.0, 0)):
         found, sure = intent.followed(space, share, aims, actions.from_angle(jnp.deg2rad(degrees)), scalars)
         np.testing.assert_array_equal(found, aims[aim], err_msg=str(degrees))

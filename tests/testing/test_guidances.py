@@ -14,21 +14,16 @@ from cuelearner_jax.testing.guidances import SMALL
 SIZES = dataclasses.replace(SMALL, feedback_layers=(4,), fit_steps=2, validate_every=2)
 
 
-def altered(**changes):
-    """The paper's kind with other functions in its bundle, each made from the one that is there."""
+def altered(form=lambda form: form, **changes):
+    """The paper's kind with other methods, each made from the one that is there: (method) -> method."""
     kind = registry.find("relative")
-    form = changes.pop("form", lambda form: form)(kind.form)
-
-    def make(sizes, spaces):
-        made = kind.make(sizes, spaces)._replace(form=form)
-        return made._replace(**{name: change(getattr(made, name)) for name, change in changes.items()})
-
-    return dataclasses.replace(kind, make=make, form=form)
+    methods = {name: change(getattr(kind.guide, name)) for name, change in changes.items()}
+    return dataclasses.replace(kind, guide=type("Altered", (kind.guide,), methods), form=form(kind.form))
 
 
 def result(change):
-    """A function whose result is changed."""
-    return lambda function: lambda *given: change(function(*given), *given)
+    """A method whose result is changed."""
+    return lambda method: lambda *given: change(method(*given))
 
 
 def answering(change):
@@ -41,50 +36,40 @@ def in_python(act):
 
 
 def everywhere(act):
-    return lambda model, env, obs, actions, active, scalars: Refined(-actions, active.astype(jnp.int32))
+    return lambda self, model, env, obs, actions, active, scalars: Refined(-actions, active.astype(jnp.int32))
 
 
 def unfitted_too(act):
-    def guided(model, env, obs, actions, active, scalars):
+    def guided(self, model, env, obs, actions, active, scalars):
         return Refined(jnp.where(active[:, None], -actions, actions), active.astype(jnp.int32))
 
     return guided
 
 
-def always(model, *_):
-    return model.replace(fitted=jnp.array(True))
-
-
-def never(model, *_):
-    return model.replace(fitted=jnp.array(False))
+def marked(fitted):
+    return result(lambda model: model.replace(fitted=jnp.array(fitted)))
 
 
 BROKEN = {
-    "another name": (altered(name=lambda _: "other"), "its bundle is called 'other'"),
-    "a fitted start": (altered(init=result(always)), "`init` returns a fitted model"),
-    "no model": (altered(init=result(lambda model, key: model.params)), "`init` returns a dict"),
     "a long answer": (altered(form=answering(lambda h, told: (jnp.tile(h, 2), told))), "an answer has shape (2,)"),
     "a nameless form": (altered(form=lambda form: form._replace(name="A form")), "lacks a name in lower case"),
     "a number for told": (altered(form=answering(lambda h, told: (h, 1.0 * told))), "`answered` is no bool"),
-    "a flat target": (altered(target=result(lambda target, *_: target.sum())), "`target` of one label has shape ()"),
-    "no fit": (altered(fit=result(never)), "`fit` of valid labels returns an unfitted model"),
-    "a fit of nothing": (altered(fit=result(always)), "`fit` without a valid label returns a fitted model"),
-    "another model": (
-        altered(fit=result(lambda model, *_: model.replace(params={}))),
-        "`fit` returns a model of other fields or shapes",
-    ),
+    "a flat target": (altered(target=result(lambda target: target.sum())), "`target` of one label has shape ()"),
+    "no fit": (altered(fit=marked(False)), "`fit` of valid labels returns an unfitted model"),
+    "a fit of nothing": (altered(fit=marked(True)), "`fit` without a valid label returns a fitted model"),
+    "another model": (altered(fit=result(lambda model: model.replace(params={}))), "a model of other fields or shapes"),
     "a branch": (altered(act=in_python), "`act` under jit fails"),
     "all rows": (altered(act=everywhere), "`act` changes rows that are not active"),
     "an unfitted guide": (altered(act=unfitted_too), "`act` of an unfitted model changes actions"),
     "no directions": (
-        altered(act=result(lambda refined, *_: refined._replace(actions=2.0 * refined.actions))),
+        altered(act=result(lambda refined: refined._replace(actions=2.0 * refined.actions))),
         "an action that `act` returns is no action of the space",
     ),
     "no count": (
-        altered(act=result(lambda refined, *_: refined._replace(passes=1.0 * refined.passes))),
+        altered(act=result(lambda refined: refined._replace(passes=1.0 * refined.passes))),
         "`act` returns passes that are no count",
     ),
-    "a question of no action": (altered(question=result(lambda asked, *_: asked[:1])), "`question` returns shape (1,)"),
+    "a question of no action": (altered(question=result(lambda asked: asked[:1])), "`question` returns shape (1,)"),
 }
 
 

@@ -1,16 +1,16 @@
-"""What a correction hangs on besides situation and action: how far the action has been turned already.
+"""Relative feedback for adaptation: a correction that depends on how far the action has been turned already.
 
 Of a finished policy in a changed world much is wrong in the same way everywhere, and right once an action has been
 turned far enough from what the policy did. A few labels tell that, where no network of the situation can be learned
 from them. So a correction has two parts: one of the turn alone, a smoothing spline (Eilers, Marx, "Flexible smoothing
 with B-splines and penalties", Statistical Science 1996), and a network's, which sees the turn beside situation and
-action and is fitted to what the first part leaves. The network counts as much as held-out labels say that it should
+action and is fitted to what the spline leaves. The network counts as much as held-out labels say that it should
 (stacked regressions: Breiman, Machine Learning 1996): by nothing, where it predicts them no better.
 """
 
 from __future__ import annotations
 
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
 import jax.numpy as jnp
@@ -18,14 +18,13 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from cuelearner_jax.actions import Actions
-from cuelearner_jax.config import GuideScalars, GuideSizes
-from cuelearner_jax.environment import Spaces
-from cuelearner_jax.feedback.forms import AnswerForm
-from cuelearner_jax.guides.bundle import Guidance, TargetFunction
+from cuelearner_jax.config import GuideScalars
+from cuelearner_jax.feedback.answers import RELATIVE
+from cuelearner_jax.guides.base import Kind
 from cuelearner_jax.guides.fitting import fit_least_squares, held_out, lessons
-from cuelearner_jax.guides.model import residual_model
-from cuelearner_jax.guides.questions import about_refined
-from cuelearner_jax.guides.refining import Refined, refine
+from cuelearner_jax.guides.model import GuideModel, guide_model
+from cuelearner_jax.guides.refining import Refined
+from cuelearner_jax.guides.relative import Relative
 from cuelearner_jax.types import GuidanceModel, Label, Params
 
 KNOTS = 13  # evenly spaced, from the largest turn that was asked about on one side to that on the other
@@ -33,7 +32,7 @@ ROUGHNESS = 3.0  # of the spline: what a unit of its squared second differences 
 RIDGE = 0.3  # the same of its squared heights: what nothing was asked about is left alone
 
 
-class Part(struct.PyTreeNode):
+class Spline(struct.PyTreeNode):
     """A function of the turn: straight lines between knots, level beyond them."""
 
     heights: Float[Array, " knots"]  # in units of eps, counterclockwise
@@ -43,14 +42,9 @@ class Part(struct.PyTreeNode):
 class TwoParts(struct.PyTreeNode):
     """A correction's two parts, as the parameters of a model."""
 
-    part: Part
+    spline: Spline
     network: Params
     share: Float[Array, ""]  # by which the network counts, from 0 to 1
-
-
-def nothing(network: Params) -> TwoParts:
-    """Parameters of a model that corrects nothing."""
-    return TwoParts(Part(jnp.zeros(KNOTS), jnp.ones(())), network, jnp.zeros(()))
 
 
 def turned(
@@ -66,12 +60,12 @@ def _hats(turns: Float[Array, " n"], reach: Float[Array, ""]) -> Float[Array, "n
     return jnp.maximum(0.0, 1.0 - jnp.abs(place[:, None] - jnp.arange(KNOTS)[None]))
 
 
-def height(part: Part, turns: Float[Array, " n"]) -> Float[Array, " n"]:
-    """The part's correction at each turn, in units of eps."""
-    return _hats(turns, part.reach) @ part.heights
+def height(spline: Spline, turns: Float[Array, " n"]) -> Float[Array, " n"]:
+    """The spline's correction at each turn, in units of eps."""
+    return _hats(turns, spline.reach) @ spline.heights
 
 
-def fitted(turns: Float[Array, " n"], wanted: Float[Array, " n"], valid: Bool[Array, " n"]) -> Part:
+def smoothed(turns: Float[Array, " n"], wanted: Float[Array, " n"], valid: Bool[Array, " n"]) -> Spline:
     """The spline with the least penalised squared error.
 
     Args:
@@ -83,7 +77,7 @@ def fitted(turns: Float[Array, " n"], wanted: Float[Array, " n"], valid: Bool[Ar
     hats = _hats(turns, reach) * valid[:, None]
     bends = jnp.diff(jnp.eye(KNOTS), n=2, axis=0)
     normal = hats.T @ hats + ROUGHNESS * bends.T @ bends + RIDGE * jnp.eye(KNOTS)
-    return Part(jnp.linalg.solve(normal, hats.T @ jnp.where(valid, wanted, 0.0)), reach)
+    return Spline(jnp.linalg.solve(normal, hats.T @ jnp.where(valid, wanted, 0.0)), reach)
 
 
 def vectors(
@@ -102,32 +96,42 @@ def share_of(
     return jnp.clip(product / jnp.where(size > 0, size, 1.0), 0, 1)
 
 
-def correcting(name: str, form: AnswerForm, target: TargetFunction, sizes: GuideSizes, spaces: Spaces) -> Guidance:
-    """The bundle of a kind that corrects actions and sees how far they have been turned; see `correcting.correcting`.
+class Offset(Relative):
+    """A guide that corrects actions by how far they have been turned; its labels keep what the policy did (`base`).
 
     Members of an ensemble disagree about actions as if they had not been turned.
     """
-    network, space = residual_model(sizes, spaces, beside=1), spaces.actions
 
-    def init(key: PRNGKeyArray) -> GuidanceModel:
-        return GuidanceModel(nothing(network.init(key)), jnp.array(False))
+    @cached_property
+    def network(self) -> GuideModel:
+        """The network, or ensemble, that sees the turn beside situation and action."""
+        return guide_model(self.sizes, self.spaces, beside=1)
 
-    def fit(key: PRNGKeyArray, env: Any, labels: Label, former: GuidanceModel, scalars: GuideScalars) -> GuidanceModel:
-        assert labels.base is not None  # `asking` keeps it for a guidance that has `onward`
-        eps, rows = scalars.radians("eps"), lessons(labels, target, scalars)
+    def init(self, key: PRNGKeyArray) -> GuidanceModel:
+        """A model that corrects nothing."""
+        spline = Spline(jnp.zeros(KNOTS), jnp.ones(()))
+        return GuidanceModel(TwoParts(spline, self.network.init(key), jnp.zeros(())), jnp.array(False))
+
+    def fit(
+        self, key: PRNGKeyArray, env: Any, labels: Label, former: GuidanceModel, scalars: GuideScalars
+    ) -> GuidanceModel:
+        """The spline of the training labels, then the network of what it leaves, then the network's share."""
+        assert labels.base is not None  # `asking` keeps it for a kind that `sees_base`
+        eps, rows, space = scalars.radians("eps"), lessons(labels, self.target, scalars), self.spaces.actions
         asked = space.retract(rows.action + rows.target)
         turns = turned(space, labels.base, rows.action, eps)
         training = rows.valid & ~held_out(len(rows.valid))
-        part = fitted(turns, turned(space, rows.action, asked, eps), training)
-        left = rows.target / eps - vectors(space, height(part, turns), rows.action, eps)
+        spline = smoothed(turns, turned(space, rows.action, asked, eps), training)
+        left = rows.target / eps - vectors(space, height(spline, turns), rows.action, eps)
         rows = rows.replace(action=jnp.concatenate([rows.action, turns[:, None]], -1), target=left)
-        predict = partial(network.predict, env)
-        model = fit_least_squares(key, rows, scalars, init=network.init, apply=predict, sizes=sizes)
+        predict = partial(self.network.predict, env)
+        model = fit_least_squares(key, rows, scalars, init=self.network.init, apply=predict, sizes=self.sizes)
         predicted = predict(model.params, rows.obs, rows.action)
         share = share_of(left, predicted, rows.valid & held_out(len(rows.valid)))
-        return GuidanceModel(TwoParts(part, model.params, share), model.fitted)
+        return GuidanceModel(TwoParts(spline, model.params, share), model.fitted)
 
     def onward(
+        self,
         model: GuidanceModel,
         env: Any,
         obs: Float[Array, "n obs"],
@@ -136,25 +140,19 @@ def correcting(name: str, form: AnswerForm, target: TargetFunction, sizes: Guide
         active: Bool[Array, " n"],
         scalars: GuideScalars,
     ) -> Refined:
-        eps, known = scalars.radians("eps"), model.params
+        """As `act`, of `actions` that were `first` before anything corrected them."""
+        eps, known, space = scalars.radians("eps"), model.params, self.spaces.actions
 
-        def residual(current: Float[Array, "n action"]) -> Float[Array, "n action"]:
+        def phi(current: Float[Array, "n action"]) -> Float[Array, "n action"]:
             turns = turned(space, first, current, eps)
             seen = jnp.concatenate([current, turns[:, None]], -1)
-            of_turn = vectors(space, height(known.part, turns), current, eps)
-            return eps * (of_turn + known.share * network.predict(env, known.network, obs, seen))
+            of_turn = vectors(space, height(known.spline, turns), current, eps)
+            return eps * (of_turn + known.share * self.network.predict(env, known.network, obs, seen))
 
-        return refine(
-            residual,
-            actions,
-            active & model.fitted,
-            space=space,
-            tau=scalars.radians("tau"),
-            tau_max=scalars.radians("tau_max"),
-            k_max=scalars.k_max,
-        )
+        return self.refined(phi, actions, active & model.fitted, scalars)
 
     def act(
+        self,
         model: GuidanceModel,
         env: Any,
         obs: Float[Array, "n obs"],
@@ -162,14 +160,29 @@ def correcting(name: str, form: AnswerForm, target: TargetFunction, sizes: Guide
         active: Bool[Array, " n"],
         scalars: GuideScalars,
     ) -> Refined:
-        return onward(model, env, obs, actions, actions, active, scalars)
+        """The refinement of a policy's own actions."""
+        return self.onward(model, env, obs, actions, actions, active, scalars)
+
+    def moved_on(
+        self, model: GuidanceModel, env: Any, labels: Label, active: Bool[Array, " n"], scalars: GuideScalars
+    ) -> Refined:
+        """The refinement of the actions that labels (n, ...) are about, from what the policy did there."""
+        assert labels.base is not None
+        return self.onward(model, env, labels.obs, labels.base, labels.action, active, scalars)
 
     def disagreement(
-        model: GuidanceModel, env: Any, obs: Float[Array, "n obs"], actions: Float[Array, "n action"]
+        self, model: GuidanceModel, env: Any, obs: Float[Array, "n obs"], actions: Float[Array, "n action"]
     ) -> Float[Array, " n"]:
-        assert network.disagreement is not None
+        """Variance of the members' corrections, summed over their entries."""
         seen = jnp.concatenate([actions, jnp.zeros((len(actions), 1))], -1)
-        return network.disagreement(model.replace(params=model.params.network), env, obs, seen)
+        return self.network.disagreement(env, model.params.network, obs, seen)
 
-    members = disagreement if network.disagreement else None
-    return Guidance(name, form, init, about_refined(act), target, fit, act, members, onward)
+
+KIND = Kind(
+    "offset",
+    "relative feedback for adaptation: corrections by how far an action was turned",
+    Offset,
+    form=RELATIVE,
+    colour="#6A3D9A",
+    sees_base=True,
+)

@@ -1,4 +1,4 @@
-"""Corrections that know how far an action has been turned: the spline, the network's share, and what they lead to."""
+"""The kind `offset`: corrections that know how far an action has been turned already."""
 
 import dataclasses
 
@@ -11,17 +11,18 @@ import pytest
 
 from cuelearner_jax import actions
 from cuelearner_jax.adaptation import program
-from cuelearner_jax.config import GuideSizes, RunConfig, Sizes, check
+from cuelearner_jax.config import GuideSizes
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.guides import registry, turning
+from cuelearner_jax.guides import offset, registry
 from cuelearner_jax.policies import policy_of
+from cuelearner_jax.runs.grid import Grid, check_grid
 from cuelearner_jax.types import Label
 
 ENV = probes.Window(half_width=jnp.deg2rad(jnp.array(6.0)))
 EXPERT = probes.Expert(ENV)
 SCALARS = dataclasses.replace(probes.SCALARS, eps_deg=5.0, tau_deg=0.25)
-SIZES = GuideSizes(feedback_layers=(8,), fit_steps=40, fit_batch_size=8, sees_turn=True)
-BUNDLE = registry.make("relative", SIZES, ENV)
+SIZES = GuideSizes(feedback_layers=(8,), fit_steps=40, fit_batch_size=8)
+BUNDLE = registry.make("offset", SIZES, ENV)
 MISS_DEG = 40.0
 
 
@@ -33,26 +34,26 @@ def missing(obs):
 BASE = policy_of(jax.jit(missing))
 
 
-def test_the_part_of_the_turn_ends_where_answers_change_their_sign():
+def test_the_spline_ends_where_answers_change_their_sign():
     turns = jnp.linspace(-10, 10, 81)
-    part = turning.fitted(turns, jnp.sign(4.0 - turns), jnp.ones(81, bool))
-    before, after, beyond = turning.height(part, jnp.array([3.0, 5.0, 25.0]))
+    spline = offset.smoothed(turns, jnp.sign(4.0 - turns), jnp.ones(81, bool))
+    before, after, beyond = offset.height(spline, jnp.array([3.0, 5.0, 25.0]))
     assert 0 < before < 1
     assert -1 < after < 0
-    assert float(beyond) == pytest.approx(float(part.heights[-1]))  # level where nothing was asked about
+    assert float(beyond) == pytest.approx(float(spline.heights[-1]))  # level where nothing was asked about
     # With half of the answers turned round it says nothing, and of no label it knows nothing.
     contrary = jnp.where(jnp.arange(81) % 2, 1.0, -1.0)
-    assert float(jnp.abs(turning.fitted(turns, contrary, jnp.ones(81, bool)).heights).max()) < 0.2
-    assert not turning.fitted(turns, contrary, jnp.zeros(81, bool)).heights.any()
+    assert float(jnp.abs(offset.smoothed(turns, contrary, jnp.ones(81, bool)).heights).max()) < 0.2
+    assert not offset.smoothed(turns, contrary, jnp.zeros(81, bool)).heights.any()
 
 
 def test_the_network_counts_as_much_as_held_out_labels_say():
     left = jnp.array([[1.0, 0.0], [0.0, 2.0], [9.0, 9.0]])
     valid = jnp.array([True, True, False])
     for factor, share in ((1.0, 1.0), (2.0, 0.5), (0.5, 1.0), (-1.0, 0.0), (0.0, 0.0)):
-        assert float(turning.share_of(left, factor * left, valid)) == pytest.approx(share)
+        assert float(offset.share_of(left, factor * left, valid)) == pytest.approx(share)
     # Half right: (1 * 1 + 2 * 0) / (1 * 1 + 1 * 1).
-    assert float(turning.share_of(left, jnp.array([[1.0, 0.0], [1.0, 0.0], [7.0, 7.0]]), valid)) == pytest.approx(0.5)
+    assert float(offset.share_of(left, jnp.array([[1.0, 0.0], [1.0, 0.0], [7.0, 7.0]]), valid)) == pytest.approx(0.5)
 
 
 def test_a_constant_miss_is_known_everywhere_from_forty_answers_a_fifth_of_them_wrong():
@@ -92,28 +93,23 @@ def test_what_the_base_did_is_kept_with_labels_and_told_again_for_labels_from_a_
     chex.assert_trees_all_close(given.guide.model, block.guide.model, atol=1e-5)
 
 
-def test_without_the_option_labels_keep_no_base():
+def test_labels_of_other_kinds_keep_no_base_and_training_refuses_this_one():
     lanes = program.product(1, (3,), (20,), (60.0,))
-    plain = registry.make("relative", dataclasses.replace(SIZES, sees_turn=False), ENV)
-    assert plain.onward is None
+    plain = registry.make("relative", SIZES, ENV)
     assert program.begin(plain, SIZES, ENV, lanes).guide.labels.base is None
+    with pytest.raises(UserError, match="adapt"):
+        check_grid(Grid(("relative", "offset"), (0,), (20,)))
+    assert "offset" not in registry.possible(ENV, taught=True)
 
 
-def test_training_and_kinds_that_do_not_correct_refuse_it():
-    with pytest.raises(UserError, match="for adaptation"):
-        check(RunConfig(None, Sizes(sees_turn=True)))
-    with pytest.raises(UserError, match=r"leave out --sizes.sees-turn"):
-        registry.make("demonstration", SIZES, ENV)
-
-
-def test_the_part_of_the_turn_learns_by_how_much_each_label_turns():
+def test_the_spline_learns_by_how_much_each_label_turns():
     obs = actions.evenly_spaced(20)
     base = missing(obs)
     asked = actions.rotate(base, jnp.deg2rad(jnp.linspace(-20.0, 20.0, 20)))
     labels = Label(obs, asked, jnp.ones((20, 1)), jnp.ones(20, bool), base)
     former, fit = BUNDLE.init(jax.random.key(0)), jax.jit(BUNDLE.fit)
     found = [
-        fit(jax.random.key(1), ENV, labels.replace(eps_deg=strengths), former, SCALARS).params.part
+        fit(jax.random.key(1), ENV, labels.replace(eps_deg=strengths), former, SCALARS).params.spline
         for strengths in (None, jnp.full(20, 5.0), jnp.full(20, 2.5))
     ]
     assert float(found[0].heights.max()) > 0.5  # in units of eps, which is 5 degrees

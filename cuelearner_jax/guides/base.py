@@ -1,0 +1,206 @@
+"""What a guide is: a base class of pure functions over an explicit model; and what the registry knows of its kind.
+
+What a teacher *said* (its answer, kept in labels) and what a network *predicts* of it (the target) are two things.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property, partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+from cuelearner_jax.config import GuideScalars, GuideSizes
+from cuelearner_jax.environment import Spaces
+from cuelearner_jax.feedback.forms import AnswerForm
+from cuelearner_jax.guides.fitting import Lesson, fit_least_squares, lessons
+from cuelearner_jax.guides.model import GuideModel, guide_model
+from cuelearner_jax.guides.refining import Refined, refine, within
+from cuelearner_jax.types import GuidanceModel, Label, Params
+
+NAME = re.compile(r"[a-z][a-z0-9_-]*")  # of kinds, also in files: neither a path nor a reference to code
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of guidance, before sizes and an environment are known."""
+
+    name: str  # of options, folders and columns
+    about: str  # in a few words
+    guide: type[Guide]
+    form: AnswerForm | None = None  # of the answers that it asks for; None: it never asks
+    needs: tuple[str, ...] = ()  # optional members of an environment without which it means nothing
+    title: str = ""  # in figures, if other than the name
+    colour: str | None = None  # in figures
+    config: type | None = None  # a frozen dataclass of the options that this kind alone has; None: it has none
+    sees_base: bool = False  # does it look at what a finished policy did? Then it serves adaptation alone
+
+    def __post_init__(self) -> None:
+        if not NAME.fullmatch(self.name):
+            raise ValueError(f"a guidance is called {self.name!r}: give lower-case letters, digits, - and _")
+
+    @property
+    def asks(self) -> bool:
+        """Whether it asks a teacher."""
+        return self.form is not None
+
+    def make(self, sizes: GuideSizes, spaces: Spaces, options: Any = None) -> Guide:
+        """The guide for an environment's spaces; `options`: a `config` (None: its defaults)."""
+        return self.guide(self, sizes, spaces, self.config() if options is None and self.config else options)
+
+
+@dataclass(frozen=True)
+class Guide:
+    """One kind of guidance for one lane: pure functions over an explicit model, chosen in Python before tracing.
+
+    A kind writes `act`, and `target` and `predict` where these differ. By default a network of situation and action,
+    or an ensemble of such, is fitted from scratch to all labels by least squares (paper, Eq. 3), and questions are
+    about what it would do (DAgger). Guides with equal settings are equal: a program is compiled once for them.
+    """
+
+    kind: Kind
+    sizes: GuideSizes
+    spaces: Spaces
+    options: Any = None  # a `Kind.config`
+
+    @property
+    def name(self) -> str:
+        """Name of its kind."""
+        return self.kind.name
+
+    @property
+    def form(self) -> AnswerForm | None:
+        """Form of the answers that it asks for; None: it never asks."""
+        return self.kind.form
+
+    @property
+    def asks(self) -> bool:
+        """Whether it asks a teacher."""
+        return self.kind.asks
+
+    @property
+    def answer_width(self) -> int:
+        """Entries of one answer; 0 where nothing is asked."""
+        return self.form.width if self.form else 0
+
+    @property
+    def has_members(self) -> bool:
+        """Whether its model is an ensemble, whose members can disagree."""
+        return self.asks and self.sizes.ensemble > 1
+
+    @cached_property
+    def network(self) -> GuideModel:
+        """The network, or ensemble, whose outputs are something to add to an action."""
+        return guide_model(self.sizes, self.spaces)
+
+    def target(self, label: Label, scalars: GuideScalars) -> Float[Array, " outputs"]:
+        """What the network is to predict of one label, here its answer; `scalars` have the label's own strength."""
+        return label.answer
+
+    def predict(
+        self, env: Any, params: Params, obs: Float[Array, "n obs"], actions: Float[Array, "n action"]
+    ) -> Float[Array, "n outputs"]:
+        """What is fitted to the targets."""
+        return self.network.predict(env, params, obs, actions)
+
+    def act(
+        self,
+        model: GuidanceModel,
+        env: Any,
+        obs: Float[Array, "n obs"],
+        actions: Float[Array, "n action"],
+        active: Bool[Array, " n"],
+        scalars: GuideScalars,
+    ) -> Refined:
+        """What to execute in place of a batch of actions.
+
+        Rows that are not active stay as they are, and so do all of them while a model that asks is not fitted.
+        """
+        raise NotImplementedError(f"{type(self).__name__} does not say how it acts: write `act`")
+
+    def init(self, key: PRNGKeyArray) -> GuidanceModel:
+        """An unfitted model."""
+        return GuidanceModel(self.network.init(key), jnp.array(False))
+
+    def lessons(self, labels: Label, scalars: GuideScalars) -> Lesson:
+        """Labels (slots, ...) with their targets."""
+        return lessons(labels, self.target, scalars)
+
+    def redrawn(self, key: PRNGKeyArray, batch: Lesson) -> Lesson:
+        """What to train on in place of a batch (n, ...) of lessons."""
+        return batch
+
+    def fit(
+        self, key: PRNGKeyArray, env: Any, labels: Label, former: GuidanceModel, scalars: GuideScalars
+    ) -> GuidanceModel:
+        """The model of labels (slots, ...); `former` is the one before, which fitting from scratch ignores."""
+        rows, predict = self.lessons(labels, scalars), partial(self.predict, env)
+        return fit_least_squares(
+            key, rows, scalars, init=self.network.init, apply=predict, sizes=self.sizes, redrawn=self.redrawn
+        )
+
+    def question(
+        self,
+        key: PRNGKeyArray,
+        model: GuidanceModel,
+        env: Any,
+        obs: Float[Array, " obs"],
+        base: Float[Array, " action"],
+        scalars: GuideScalars,
+    ) -> Float[Array, " action"]:
+        """The action to ask about: what the guide makes of `base`, in a share `refined_fraction` of all questions.
+
+        Source: DAgger (Ross, Gordon, Bagnell, 2011): what is asked about follows what will be met.
+        """
+        refines = jax.random.bernoulli(key, scalars.refined_fraction)
+        return self.act(model, env, obs[None], base[None], refines[None], scalars).actions[0]
+
+    def disagreement(
+        self, model: GuidanceModel, env: Any, obs: Float[Array, "n obs"], actions: Float[Array, "n action"]
+    ) -> Float[Array, " n"]:
+        """Variance of an ensemble's members, summed over their outputs."""
+        return self.network.disagreement(env, model.params, obs, actions)
+
+    def moved_on(
+        self, model: GuidanceModel, env: Any, labels: Label, active: Bool[Array, " n"], scalars: GuideScalars
+    ) -> Refined:
+        """What `act` makes of the actions that labels (n, ...) are about."""
+        return self.act(model, env, labels.obs, labels.action, active, scalars)
+
+    def act_within(
+        self,
+        bound: Float[Array, ""],
+        model: GuidanceModel,
+        env: Any,
+        obs: Float[Array, "n obs"],
+        actions: Float[Array, "n action"],
+        active: Bool[Array, " n"],
+        scalars: GuideScalars,
+    ) -> Refined:
+        """`act` that leads no farther than `bound` [rad] from the actions, whatever its kind does."""
+        moved = self.act(model, env, obs, actions, active, within(scalars, bound))
+        return moved._replace(actions=self.spaces.actions.clip(moved.actions, actions, bound))
+
+    def refined(
+        self,
+        residual: Callable[[Float[Array, "n action"]], Float[Array, "n action"]],
+        actions: Float[Array, "n action"],
+        active: Bool[Array, " n"],
+        scalars: GuideScalars,
+        k_max: Int[Array, ""] | int | None = None,
+    ) -> Refined:
+        """`refine` within the limits of the scalars; `k_max`: another number of passes."""
+        return refine(
+            residual,
+            actions,
+            active,
+            space=self.spaces.actions,
+            tau=scalars.radians("tau"),
+            tau_max=scalars.radians("tau_max"),
+            k_max=scalars.k_max if k_max is None else k_max,
+        )

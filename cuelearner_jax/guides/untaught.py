@@ -1,0 +1,60 @@
+"""The kinds that learn nothing and never ask: the agent alone, and the task's obvious action."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
+
+from cuelearner_jax.config import GuideScalars
+from cuelearner_jax.guides.base import Guide, Kind
+from cuelearner_jax.guides.refining import Refined, untouched
+from cuelearner_jax.types import GuidanceModel, Label
+
+
+class Untaught(Guide):
+    """A guide with an empty model; by itself no guidance, with which every other kind is compared."""
+
+    def init(self, key: PRNGKeyArray) -> GuidanceModel:
+        """Nothing."""
+        return GuidanceModel({}, jnp.array(False))
+
+    def fit(
+        self, key: PRNGKeyArray, env: Any, labels: Label, former: GuidanceModel, scalars: GuideScalars
+    ) -> GuidanceModel:
+        """The former model."""
+        return former
+
+    def act(
+        self,
+        model: GuidanceModel,
+        env: Any,
+        obs: Float[Array, "n obs"],
+        actions: Float[Array, "n action"],
+        active: Bool[Array, " n"],
+        scalars: GuideScalars,
+    ) -> Refined:
+        """Every action as it is."""
+        return untouched(actions)
+
+
+class Heuristic(Untaught):
+    """The environment's own obvious action."""
+
+    def act(
+        self,
+        model: GuidanceModel,
+        env: Any,
+        obs: Float[Array, "n obs"],
+        actions: Float[Array, "n action"],
+        active: Bool[Array, " n"],
+        scalars: GuideScalars,
+    ) -> Refined:
+        """The heuristic's action in active rows."""
+        return Refined(jnp.where(active[:, None], jax.vmap(env.heuristic)(obs), actions), active.astype(jnp.int32))
+
+
+NONE = Kind("none", "the agent alone", Untaught, title="no guidance", colour="#4d4d4d")
+HEURISTIC = Kind("heuristic", "the task's obvious action", Heuristic, needs=("heuristic",), colour="#D55E00")
