@@ -12,7 +12,7 @@ compiled program: side by side on an accelerator, one by one on a CPU (`devices.
     policy = adapted(guidance, sizes, env, scalars, bases, block)    # a block for `evaluate.evaluate_lanes`
 
 `bases` is a policy whose leaves that are `BY_LANE` in its `axes` have a row for each base (`side_by_side` stacks single
-policies), or `policies.Common(policy)` where there is but one. `guidance` is a bundle of `guidance.registry.make`,
+policies), or `policies.Common(policy)` where there is but one. `guidance` is a guide of `guides.registry.make`,
 `sizes` those it was made with, `env` the changed world. `judging.judge` then keeps what is no worse than the base.
 """
 
@@ -174,7 +174,7 @@ def ask_round(
     A lane that has its budget stays as it is.
 
     Args:
-        guidance: the bundle, which must ask.
+        guidance: the guide, which must ask.
         sizes: those it was made with.
         env: the changed world.
         teacher: of that world.

@@ -184,7 +184,7 @@ def made(values: Told, arrays: Any, env: Any, code: Any = None) -> Any:
 
 
 def _guidance(values: Told, env: Any) -> Any:
-    """The bundle of a guided policy. Raises UserError if its kind is not known here."""
+    """The guide of a guided policy. Raises UserError if its kind is not known here."""
     name = values["guidance"]
     if guidances.registered(name) is None:
         raise UserError(
