@@ -78,7 +78,7 @@ def _answered(laws: Laws, guide: Guide, form: AnswerForm, env: Any, states: Any,
         answers.shape == (ROWS, form.width), f"an answer has shape {answers.shape[1:]}: its form says ({form.width},)"
     )
     laws.hold(answered.shape == (ROWS,) and answered.dtype == bool, "`answered` is no bool: say whether it answered")
-    labels = Label(obs, actions, answers, answered)
+    labels = Label(obs, actions, answers, answered, base=actions if guide.kind.sees_base else None)
     with laws.attempted("`target` under vmap", "it gets one Label and GuideScalars, and returns a vector"):
         targets = jax.vmap(lambda label: guide.target(label, GuideScalars()))(labels)
     laws.hold(
