@@ -69,6 +69,7 @@ FAULTS: dict[str, Options] = {
     "biased": {"scalars.teacher-bias-deg": 2.5},
 }
 LEAD = 0.5  # a shot: guided episodes that earn that much more than own ones have their whole share
+SURE: Options = {"scalars.aim-doubt": 1_000.0}  # recorded with `scalars.aim-share` 0.8: commit 5f07753 can repeat it
 WAYS: dict[str, Options] = {
     "nearest": {"scalars.answer": "nearest"},
     "instalments": {"schedule.ask-at": (0, 100_000, 200_000), "scalars.ask-bound-deg": 20.0},
@@ -152,6 +153,20 @@ def variations(world: str, options: Options, minutes: int) -> list[Piece]:
     return pieces
 
 
+def longer(world: str, options: Options, minutes: int) -> list[Piece]:
+    """Guided to the end, in as many episodes as it pays, by the rule of `intent` that earns most by itself."""
+    options = {
+        **options,
+        **FRAME,
+        "sizes.pace": True,
+        "scalars.pace-lead": 0.0,
+        "schedule.guidance-until": 1_000_000,
+        **SURE,
+    }
+    serves = "a better guide for longer"
+    return [Piece(world, "longer", "intent", ("intent",), (500, 1_000), 16, options, minutes, serves)]
+
+
 def raw(world: str, options: Options, minutes: int) -> list[Piece]:
     """What networks on raw coordinates make of it."""
     options, serves = {**options, **RAW}, "the frame against raw coordinates"
@@ -175,10 +190,12 @@ PIECES = (
     *again("regulation", REGULATION, 8),
     *curves("regulation", REGULATION, 16),
     *variations("regulation", REGULATION, 16),
+    *longer("regulation", REGULATION, 10),
     *raw("regulation", REGULATION, 16),
     *budgets("easy", EASY, 8),
     *curves("easy", EASY, 8),
     *variations("easy", EASY, 8),
+    *longer("easy", EASY, 8),
     *raw("easy", EASY, 8),
     *full_length(26),
 )

@@ -52,6 +52,7 @@ def test_every_piece_has_settings_that_can_be(study, scale, modules):
         names = {name.partition(".")[0]: set() for name in left.settings}
         for name in left.settings:
             names[name.partition(".")[0]].add(name.partition(".")[2])
+        assert names.pop("guidance", set()) <= {""}, piece.path
         groups |= {"scalars": type(bench.config.scalars), "task": bench.task.config}
         for group, fields in names.items():
             assert fields <= {field.name for field in dataclasses.fields(groups[group])}, piece.path
