@@ -17,7 +17,7 @@ from cuelearner_envs.billiards.teacher import LocalSearchTeacher, NearbyTeacher,
 from cuelearner_jax.config import RunConfig, Scalars, Schedule, Sizes
 from cuelearner_jax.environment import Environment
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.task import Body, Pictures, Preset, Scenario, Task
+from cuelearner_jax.task import PAPERS_FIT, Body, Pictures, Preset, Scenario, Task
 from cuelearner_jax.teachers import stored
 from cuelearner_jax.types import Teacher
 
@@ -134,19 +134,33 @@ POOLTOOL = Body(
     environment=_foreign,
 )
 
+# How the adapted agents of docs/results/adaptation.md were corrected: a teacher that plays its shots in the changed
+# world means the good shot nearest to the agent's own, and a guide sees how far a shot has been turned.
+NEAREST: dict[str, Any] = {"answer": "nearest", "nearest_aim_deg": 0.1, "feedback_learning_rate": 3e-4}
+RECIPE: dict[str, Any] = {"eps_deg": 0.1, "guidance": "offset", "sizes": PAPERS_FIT}
+
 # The worlds of the paper's section on adaptation after training.
 SCENARIOS = {
     "turned_strike": Scenario(
-        "every strike is turned by 0.8 degrees", {"action_turn_deg": 0.8}, bound_deg=1.0, eps_deg=0.1
+        "every strike is turned by 0.8 degrees",
+        {"action_turn_deg": 0.8, "teacher": LOCAL_SEARCH},
+        bound_deg=1.0,
+        scalars={**NEAREST, "nearest_share": 0.9},
+        **RECIPE,
     ),
     "shifted_balls": Scenario(
         "balls are seen 7.1 mm to the right of and above their places",
-        {"observation_bias": (0.0071, 0.0071)},
+        {"observation_bias": (0.0071, 0.0071), "teacher": LOCAL_SEARCH},
         bound_deg=0.3,
-        eps_deg=0.1,
+        scalars={**NEAREST, "nearest_share": 0.9},
+        **RECIPE,
     ),
     "tilted_table": Scenario(
-        "the table is tilted: balls are drawn along y", {"acceleration": (0.0, 0.005)}, bound_deg=0.3, eps_deg=0.1
+        "the table is tilted: balls are drawn along y",
+        {"acceleration": (0.0, 0.005), "teacher": LOCAL_SEARCH},
+        bound_deg=0.3,
+        scalars={**NEAREST, "nearest_share": 0.6},
+        **RECIPE,
     ),
 }
 

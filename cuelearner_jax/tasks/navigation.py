@@ -15,7 +15,7 @@ from cuelearner_envs.navigation.roadmap import make_sided_teacher
 from cuelearner_envs.navigation.roadmap import make_teacher as make_road_map
 from cuelearner_jax.config import RunConfig, Scalars, Schedule, Sizes
 from cuelearner_jax.environment import Environment
-from cuelearner_jax.task import Body, Pictures, Preset, Scenario, Task
+from cuelearner_jax.task import PAPERS_FIT, Body, Pictures, Preset, Scenario, Task
 from cuelearner_jax.types import Teacher
 
 NAVIGATION_SIZES = Sizes(
@@ -109,6 +109,7 @@ ANYMAL = _anymal()
 # the ways that the lidar sees, the likeliest of which is always gone; questions far apart, in rounds of fifty.
 BY_WAYS: dict[str, Any] = {
     "guidance": "intent",
+    "eps_deg": 20.0,
     "sizes": {"ensemble": 5, "labels_per_round": 50, "question_every": 10, "aim_layers": (64, 64)},
     "scalars": {"aim_doubt": 1000.0},
 }
@@ -123,7 +124,7 @@ SCENARIOS = {
         guidance="relative",
         judge_by="success",
         judge_bounds=(0.5, 0.25),  # which brought back most, see docs/results/adaptation.md
-        sizes={"frame": "action"},
+        sizes={"frame": "action", **PAPERS_FIT},
     ),
     "rooms": Scenario(
         "rooms, doorways and thin obstacles",
@@ -141,7 +142,7 @@ SCENARIOS = {
             {"style": "corridor", "preferred_side": side},
             bound_deg=180.0,
             judge_by=f"passed_{side}",
-            **BY_WAYS,
+            **{**BY_WAYS, "sizes": {**BY_WAYS["sizes"], **PAPERS_FIT}},
         )
         for side in ("left", "right")
     },

