@@ -42,14 +42,6 @@ class NotFinite(Exception):
     status = 1
 
 
-class JobsFailed(Exception):
-    """Not every piece came to its end: a line on each that did not, and how to go on."""
-
-    def __init__(self, message: str, status: int) -> None:
-        super().__init__(message)
-        self.status = status  # that a command ends with
-
-
 def no_space(error: BaseException | None) -> bool:
     """Does an exception, or what it came from, say that the disk is full? TensorStore says so in words alone."""
     if error is None:

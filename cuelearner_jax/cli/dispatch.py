@@ -1,7 +1,7 @@
 """The command `cuelearner`: calls the file of a command, turns errors into one line and an exit status.
 
 Exit status: 0 done; 2 bad input, nothing changed; 130 stopped by Ctrl-C, 143 by SIGTERM, 129 by SIGHUP, everything
-saved; 1 the disk is full or a job failed, everything up to the last checkpoint saved, or what was trained is not
+saved; 1 the disk is full, everything up to the last checkpoint saved, or what was trained is not
 finite, all else saved; 141 nobody reads the output any more (of progress and messages on standard error nobody has to).
 """
 
@@ -20,7 +20,7 @@ os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
 
 # What loads JAX, and takes seconds, is imported where a command needs it: `--version` and `--help` wait for nothing.
 from cuelearner_jax import __version__
-from cuelearner_jax.errors import JobsFailed, NotFinite, UserError, blamed, closest
+from cuelearner_jax.errors import NotFinite, UserError, blamed, closest
 from cuelearner_jax.signals import Interrupted
 
 HELP = ("-h", "--help")
@@ -42,7 +42,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except UserError as error:
         _tell(f"error: {error}")
         return 2
-    except (Interrupted, JobsFailed, NotFinite) as error:
+    except (Interrupted, NotFinite) as error:
         _tell(str(error))
         return error.status
     except BrokenPipeError:  # whoever read our output has gone, as `head` does

@@ -30,9 +30,9 @@ class Sweep(Training[TaskT], Generic[TaskT]):
     shard: str | None = None
     """Only piece i of n, as i/n: its share of the seeds, in a folder of its own below --out. Goes on by itself where it
     was interrupted."""
-    cluster: Literal["slurm", "local"] | None = None
-    """Run the sweep as jobs, one a piece: slurm submits them as a job array and returns, local runs them on this
-    machine and waits. The same command again goes on with the pieces that are not finished. Needs submitit."""
+    cluster: Literal["slurm"] | None = None
+    """Submit the sweep to Slurm as a job array, one job a piece, and return. The same command again goes on with the
+    pieces that are not finished. Needs submitit."""
     shards: int | None = None
     """With --cluster: number of pieces, and so of jobs."""
     job: Job = field(default_factory=Job)
@@ -62,7 +62,8 @@ def run(arguments: list[str]) -> None:
         def plan(shard: Shard) -> Plan:
             return planned(asked.order(task, grid, shard))
 
-        submission.submit(asked.cluster, asked.shards, asked.job, asked.out, arguments, plan, out.print)
+        assert asked.shards  # `submission.check`
+        submission.submit(asked.shards, asked.job, asked.out, arguments, plan, out.print)
         return
     shard = Shard.parse(asked.shard) if asked.shard else None
     sweep.run(asked.order(task, grid, shard))

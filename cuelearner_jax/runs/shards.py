@@ -78,11 +78,10 @@ class Shard(NamedTuple):
         shard, seeds = cls(described["index"], described["count"]), described["seeds"]
         if not all(type(number) is int for number in shard) or not 1 <= shard.index <= shard.count <= MOST_PIECES:
             raise ValueError(f"{shard} is no piece")
-        if seeds is not None:  # pieces of before did not say
-            if not isinstance(seeds, list) or not all(type(seed) is int for seed in seeds):
-                raise TypeError(f"{seeds} are no seeds")
-            if shard.count > len(seeds):
-                raise ValueError(f"{len(seeds)} seeds do not make {shard.count} pieces")
+        if not isinstance(seeds, list) or not all(type(seed) is int for seed in seeds):
+            raise TypeError(f"{seeds} are no seeds")
+        if shard.count > len(seeds):
+            raise ValueError(f"{len(seeds)} seeds do not make {shard.count} pieces")
         return shard
 
     def seeds(self, seeds: tuple[int, ...]) -> tuple[int, ...]:

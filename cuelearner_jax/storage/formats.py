@@ -1,4 +1,4 @@
-"""Format numbers of the files that outlive the program that wrote them, and the one way in which older ones are read.
+"""Format numbers of the files that outlive the program that wrote them, of which only the current ones are read.
 
 | kind      | file                   | values                 |
 |-----------|------------------------|------------------------|
@@ -8,9 +8,8 @@
 | `policy`  | `policy.json`          | its contents           |
 | `due`     | `due.json` of a run    | its contents           |
 
-A file tells its number under `format`; one without a number is of format 0. A change of what is written raises the
-number here and adds a step that leads there from the number before; readers know the current format only. A format
-without a step is refused.
+A file tells its number under `format`. A change of what is written raises the number here, and the files of the
+repository are rewritten by a script; readers know the current format only.
 
 A JSON file carries a digest of its values, and is not read if they are others: a changed bit is no configuration.
 """
@@ -18,7 +17,6 @@ A JSON file carries a digest of its values, and is not read if they are others: 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -27,9 +25,8 @@ from cuelearner_jax.errors import UserError
 from cuelearner_jax.storage.whole import replacing, unreadable
 
 DIGEST = "digest"  # the name under which a JSON file holds the digest of its other values
-FORMATS = {"config": 2, "labels": 3, "teacher": 3, "policy": 2, "due": 2}
+FORMATS = {"config": 1, "labels": 1, "teacher": 1, "policy": 1, "due": 1}
 LARGEST = 1 << 26  # bytes of a JSON file
-SEALED_SINCE = 2  # the format from which on a JSON file must carry a digest
 REMEDIES = {  # what a message says of a damaged file, after its path
     "config": "is damaged or of another program: restore it, or start anew with --overwrite",
     "labels": "is not a label file of cuelearner, or it is damaged: restore it, or write it anew",
@@ -51,22 +48,22 @@ def read(kind: str, path: Path) -> Values:
     """A JSON file in the current format of its kind, without its digest.
 
     Raises:
-        UserError: it cannot be read, is damaged, was changed since it was written, or is newer than this program.
+        UserError: it cannot be read, is damaged, was changed since it was written, or is of another format.
     """
     try:
         if (size := path.stat().st_size) > LARGEST:
             raise damaged(kind, path, f"{size:,} bytes, more than any such file has")
         values = json.loads(path.read_text(encoding="utf-8"))
         if isinstance(values, dict):
-            number, told = values.get("format", 0), values.pop(DIGEST, None)
-            sealed = isinstance(number, int) and number >= SEALED_SINCE
-            if (sealed or told is not None) and told != configuration.digest(values):
+            told = values.pop(DIGEST, None)
+            if values.get("format") == FORMATS[kind] and told != configuration.digest(values):
                 raise damaged(kind, path)
     except OSError as error:
         raise unreadable(path, error) from error
     except (ValueError, RecursionError) as error:
         raise damaged(kind, path) from error
-    return upgrade(kind, values, path)
+    check(kind, values, path)
+    return values
 
 
 def write(kind: str, path: Path, values: Values) -> None:
@@ -76,70 +73,13 @@ def write(kind: str, path: Path, values: Values) -> None:
         file.write(json.dumps({**values, DIGEST: configuration.digest(values)}, indent=1) + "\n")
 
 
-def upgrade(kind: str, values: Any, path: Path) -> Values:
-    """The values of a file of any format in the current one; those given are left as they are.
-
-    Args:
-        kind: a key of `FORMATS`.
-        values: what the file holds.
-        path: the file, for messages.
-
-    Raises:
-        UserError: the file was written by a newer program, or makes no sense.
-    """
-    number = values.get("format", 0) if isinstance(values, dict) else None
-    if not isinstance(number, int) or isinstance(number, bool) or number < 0:
+def check(kind: str, values: Any, path: Path) -> None:
+    """Raises UserError unless what a file holds is of the current format of its kind (a key of `FORMATS`)."""
+    number = values.get("format") if isinstance(values, dict) else None
+    if not isinstance(number, int) or isinstance(number, bool):
         raise damaged(kind, path)
-    if number > FORMATS[kind]:
+    if number != FORMATS[kind]:
         raise UserError(
-            f"{path} was written by a newer cuelearner: update, or use the one that wrote it "
-            f"(its format is {number}, this program knows up to {FORMATS[kind]})"
+            f"{path} is of format {number}, this program reads format {FORMATS[kind]}: use the cuelearner that wrote "
+            "it, or make it anew with this one"
         )
-    for before in range(number, FORMATS[kind]):
-        if (kind, before) not in STEPS:
-            raise UserError(f"{path} is of format {number}, which had no checksums and is not read: write it anew")
-        try:
-            values = {**STEPS[kind, before](values), "format": before + 1}
-        except UserError as error:
-            raise UserError(f"{path}: {error}") from error
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
-            raise damaged(kind, path) from error
-    return values
-
-
-def _only_numbered(values: Values) -> Values:
-    """The first number changed nothing else."""
-    return values
-
-
-def _pieces_with_seeds(values: Values) -> Values:
-    """A piece of a sweep told its number and the count; now the seeds of all pieces too, which are not known here."""
-    if "shard" not in values:
-        return values
-    index, count = values["shard"]
-    return {**values, "shard": {"index": index, "count": count, "seeds": None}}
-
-
-def _seen_in_another_order(values: Values) -> Values:
-    """What a teacher's network takes stood ball by ball; now what hangs on the direction stands apart."""
-    raise UserError(
-        "the teacher was trained by an earlier cuelearner, whose networks saw the table in another order: train it "
-        "anew with `python experiments/train_teacher.py`"
-    )
-
-
-def _never_written(values: Values) -> Values:
-    """Policy folders began with a format whose files carry digests."""
-    raise ValueError("no program wrote this format")
-
-
-STEPS: dict[tuple[str, int], Callable[[Values], Values]] = {
-    ("config", 0): _only_numbered,
-    ("config", 1): _pieces_with_seeds,
-    ("labels", 2): _only_numbered,  # since then labels may be of several strengths
-    ("teacher", 0): _only_numbered,
-    ("teacher", 1): _only_numbered,
-    ("teacher", 2): _seen_in_another_order,
-    ("policy", 0): _never_written,
-    ("policy", 1): _never_written,
-}

@@ -372,7 +372,7 @@ def _told(path: Path) -> tuple[pa.Table, dict[str, Any] | None]:
         if head is None and table.num_rows:
             raise ValueError("it does not say what it holds")
         if head is not None:
-            head = formats.upgrade("labels", head, path)
+            formats.check("labels", head, path)
             check_head(head)
             check_rows(table, head)
         return table, head

@@ -1,19 +1,16 @@
-"""Sweeps as jobs: on this machine, and on a Slurm whose commands write down what they are asked."""
+"""Sweeps as jobs of a Slurm whose commands write down what they are asked."""
 
 import os
-import re
 import signal
 import subprocess
 import sys
-import threading
 import time
 from pathlib import Path
 
 import pytest
-from small_runs import SMALL, listing
+from small_runs import SMALL
 
 from cuelearner_jax.cli import main
-from cuelearner_jax.errors import UserError
 from cuelearner_jax.runs import cluster
 from cuelearner_jax.runs.shards import Shard
 from cuelearner_jax.storage import results
@@ -21,7 +18,6 @@ from cuelearner_jax.storage import results
 ENTRY = [str(Path(sys.executable).with_name("cuelearner"))]
 SWEEP = ["sweep", "billiards", "--preset", "quickstart", *SMALL, "--schedule.total-steps", "800", "--guidance", "none"]
 SWEEP += ["--seeds", "2", "--first-seed", "7"]
-LOCAL = [*SWEEP, "--cluster", "local", "--shards", "2"]
 SLURM = [*SWEEP, "--cluster", "slurm", "--shards", "2"]
 
 SBATCH = """#!/bin/sh
@@ -82,81 +78,6 @@ def begun(out, shard, step=200):
     return file.exists() and f'"step": {step}' in file.read_text()
 
 
-def command_of(out, shard):
-    """The process that runs a piece, as its job's log says."""
-    logs = "".join(path.read_text() for path in sorted(out.glob("jobs/*/*.out")))
-    return int(re.findall(rf"process (\d+): .*--shard {shard}/2\n", logs)[0])
-
-
-def halted(process):
-    """Has a stopped process come to rest, with all of its threads? A signal takes a moment, and writers go on in it."""
-    states = [stat.read_text().rpartition(")")[2].split()[0] for stat in Path(f"/proc/{process}/task").glob("*/stat")]
-    return set(states) == {"T"}
-
-
-@pytest.mark.long
-def test_submitted_twice_then_one_killed_then_submitted_again_gives_what_one_process_gives(whole, tmp_path, capsys):
-    out = tmp_path / "run"
-    command = [*LOCAL, "--out", str(out)]
-    first = subprocess.Popen([*ENTRY, *command], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    until(lambda: begun(out, 1) and begun(out, 2), first)
-    processes = [command_of(out, shard) for shard in (1, 2)]
-    for process in processes:
-        os.kill(process, signal.SIGSTOP)  # both live, and hold their folders
-    until(lambda: all(map(halted, processes)))
-    before = listing(out)
-    assert main(command) == 2
-    told = capsys.readouterr().err.splitlines()
-    assert len(told) == 1
-    for shard, process in enumerate(processes, 1):
-        assert f"{shard}/2 by process {process} on " in told[0]
-    assert listing(out) == before
-    os.kill(processes[0], signal.SIGKILL)
-    os.kill(processes[1], signal.SIGCONT)
-    told = first.communicate(timeout=120)[1].splitlines()
-    assert first.returncode == 1
-    assert "piece 1/2: error: the process was killed by SIGKILL" in told
-    assert "1 of 2 pieces failed" in told[-1]
-    assert main(command) == 0
-    told = capsys.readouterr()
-    assert "1 of 2 pieces were finished before" in told.out
-    assert "1 done" in told.err
-    assert rows(out) == whole
-    commands = results.read([out])["command"].to_pylist()
-    assert {command.rpartition(" ")[2] for command in commands} == {"1/2", "2/2"}
-    assert all(command.startswith("cuelearner sweep billiards") for command in commands)
-    assert main(["report", str(out), "--out", str(tmp_path / "report")]) == 0
-    assert "not begun" not in (tmp_path / "report" / "report.md").read_text()
-    submissions = list((out / "jobs").iterdir())
-    assert main(command) == 0
-    assert "2 of 2 pieces were finished before" in capsys.readouterr().out
-    assert list((out / "jobs").iterdir()) == submissions
-
-
-@pytest.mark.long
-def test_ctrl_c_stops_the_jobs_of_this_machine_and_loses_nothing(whole, tmp_path, capsys):
-    out = tmp_path / "run"
-    options = ["--schedule.checkpoint-every", "800", "--out", str(out)]
-    folder = out / "shard-1-of-1" / "none"
-
-    def press():
-        until(lambda: results.last_step(folder) > 0)
-        os.kill(os.getpid(), signal.SIGINT)
-
-    user = threading.Thread(target=press)
-    user.start()
-    assert main([*SWEEP, *options, "--cluster", "local", "--shards", "1"]) == 130
-    user.join()
-    told = capsys.readouterr().err
-    assert "piece 1/1: stopped at step" in told
-    assert "go on with the same command" in told.splitlines()[-1]
-    stopped = {row["step"] for row in rows(out)}
-    assert max(stopped) < 800
-    assert max(stopped) in {int(path.name) for path in (folder / "checkpoints").iterdir() if path.name.isdigit()}
-    assert main([*SWEEP, *options, "--shard", "1/1"]) == 0
-    assert rows(out) == whole
-
-
 @pytest.mark.long
 def test_slurm_gets_an_array_and_a_job_told_to_end_goes_on_when_started_again(whole, slurm, tmp_path, capsys):
     out = tmp_path / "run"
@@ -194,17 +115,16 @@ def test_slurm_gets_an_array_and_a_job_told_to_end_goes_on_when_started_again(wh
 
 
 REFUSED = [
-    ([*LOCAL, "--shard", "1/2"], "give one of the two"),
-    ([*LOCAL, "--overwrite"], "would delete its own work"),
-    ([*SWEEP, "--cluster", "local"], "--shards of at least 1"),
-    ([*SWEEP, "--cluster", "local", "--shards", "0"], "it is 0"),
-    ([*SWEEP, "--cluster", "local", "--shards", "3"], "2 seeds do not make 3 pieces"),
+    ([*SLURM, "--shard", "1/2"], "give one of the two"),
+    ([*SLURM, "--overwrite"], "would delete its own work"),
+    ([*SWEEP, "--cluster", "slurm"], "--shards of at least 1"),
+    ([*SWEEP, "--cluster", "slurm", "--shards", "0"], "it is 0"),
+    ([*SWEEP, "--cluster", "slurm", "--shards", "3"], "2 seeds do not make 3 pieces"),
     ([*SWEEP, "--cluster", "lsf", "--shards", "2"], "'slurm'"),
     ([*SWEEP, "--shards", "2"], "belong to --cluster"),
     ([*SWEEP, "--job.gpus", "2"], "belong to --cluster"),
-    ([*LOCAL, "--job.partition", "gpus"], "--job.partition is for --cluster slurm"),
-    ([*LOCAL, "--job.at-once", "-1"], "--job.at-once is -1"),
-    ([*LOCAL, "--scalars.eps-deg", "0"], "scalars.eps_deg is 0"),
+    ([*SLURM, "--job.at-once", "-1"], "--job.at-once is -1"),
+    ([*SLURM, "--scalars.eps-deg", "0"], "scalars.eps_deg is 0"),
     ([*SLURM, "--job.slurm", "qos"], "give KEY=VALUE"),
     ([*SLURM, "--job.slurm", "array=0-9"], "cannot set 'array'"),
     ([*SLURM, "--job.minutes", "2"], "give less than the 120 s"),
@@ -221,7 +141,7 @@ def test_what_cannot_be_submitted_is_refused(refused, tmp_path, monkeypatch, com
 
 def test_without_submitit_the_extra_is_named(refused, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "submitit", None)
-    refused([*LOCAL, "--out", tmp_path / "run"], "install the extra `cluster`", tmp_path)
+    refused([*SLURM, "--out", tmp_path / "run"], "install the extra `cluster`", tmp_path)
     assert not (tmp_path / "run").exists()
 
 
@@ -233,10 +153,10 @@ def test_what_slurm_refuses_leaves_nothing_behind(refused, slurm, tmp_path):
 
 def test_a_folder_of_another_cut_is_refused(refused, tmp_path):
     (tmp_path / "run" / "shard-1-of-3").mkdir(parents=True)
-    refused([*LOCAL, "--out", tmp_path / "run"], "shard-1-of-3 is a piece of another cut", tmp_path)
+    refused([*SLURM, "--out", tmp_path / "run"], "shard-1-of-3 is a piece of another cut", tmp_path)
     (tmp_path / "whole").mkdir()
     (tmp_path / "whole" / "config.json").write_text("{}")
-    refused([*LOCAL, "--out", tmp_path / "whole"], "not cut into pieces", tmp_path)
+    refused([*SLURM, "--out", tmp_path / "whole"], "not cut into pieces", tmp_path)
 
 
 def test_a_piece_gets_the_sweeps_options_alone():
@@ -244,14 +164,3 @@ def test_a_piece_gets_the_sweeps_options_alone():
     given += ["--labels", "10", "20", "--job.at-once=1", "--out", "runs/a"]
     kept = ("sweep", "billiards", "--seeds", "4", "--labels", "10", "20", "--out", "runs/a", "--shard", "2/2")
     assert cluster.piece_arguments(given, Shard(2, 2)) == kept
-
-
-def test_jobs_of_this_machine_get_graphics_cards_of_their_own(tmp_path, monkeypatch):
-    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "2,3,5,7")
-    pieces = {Shard(index, 5): ("sweep",) for index in range(1, 6)}
-    assert cluster.LocalJobs(pieces, tmp_path, cluster.Job(gpus=2))._free == [[2, 3], [5, 7]]
-    assert cluster.LocalJobs(pieces, tmp_path, cluster.Job(gpus=1, at_once=3))._free == [[2], [3], [5]]
-    cluster.check("local", cluster.Job(gpus=2, at_once=2))
-    for job in (cluster.Job(gpus=2, at_once=3), cluster.Job(gpus=5)):
-        with pytest.raises(UserError, match=r"there are 4"):
-            cluster.check("local", job)

@@ -82,7 +82,7 @@ def test_bad_arguments_are_refused(refused, tmp_path, command, says):
 
 WITH_OUT = [
     QUICK,
-    [*QUICK, "--cluster", "local", "--shards", "2"],
+    [*QUICK, "--cluster", "slurm", "--shards", "2"],
     ["train", "billiards"],
     ["evaluate", "billiards"],
     ["render", "billiards"],

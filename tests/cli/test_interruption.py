@@ -67,7 +67,9 @@ def test_kill_loses_one_stretch_at_most_and_resume_goes_on(tmp_path, uninterrupt
     assert saved[-1] == STEPS
 
 
-@pytest.mark.parametrize(("seconds", "number"), [(0.3, signal.SIGTERM), (6.0, signal.SIGINT)])
+@pytest.mark.parametrize(
+    ("seconds", "number"), [pytest.param(0.3, signal.SIGTERM, marks=pytest.mark.long), (6.0, signal.SIGINT)]
+)
 def test_an_evaluation_ends_at_once_in_one_line(seconds, number):
     """While modules are loaded, and while something is compiled or computed."""
     begun = "import sys; from cuelearner_jax.cli import main; print('begun', flush=True); sys.exit(main())"

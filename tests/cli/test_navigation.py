@@ -27,7 +27,6 @@ def walked(tmp_path_factory) -> Path:
     return folder
 
 
-@pytest.mark.long
 def test_every_evaluation_accounts_for_all_its_episodes(walked):
     rows = results.read(walked / "relative").to_pylist()
     assert [row["step"] for row in rows] == [0, 0, 100, 100, 200, 200]
@@ -74,6 +73,7 @@ def test_an_evaluation_is_of_whole_episodes(walked, refused, tmp_path, capsys):
     refused([*cut, "--out", tmp_path / "cut"], "an episode lasts up to 21: give --schedule.eval-steps 210", tmp_path)
 
 
+@pytest.mark.long
 def test_a_report_of_successes(walked, tmp_path):
     out = tmp_path / "report"
     assert main(["report", str(walked), "--metric", "success", "--out", str(out)]) == 0
@@ -81,6 +81,7 @@ def test_a_report_of_successes(walked, tmp_path):
     assert "success" in (out / "report.md").read_text()
 
 
+@pytest.mark.long
 def test_an_episode_is_filmed(walked, tmp_path):
     command = ["render", str(walked), "--policy", "agent", "--guidance", "relative", "--steps", "6"]
     assert main([*command, "--out", str(tmp_path)]) == 0

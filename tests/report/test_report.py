@@ -1,7 +1,6 @@
 """Reports: a known difference is found and shown, what is missing is said, and nothing is overwritten unasked."""
 
 import csv
-import json
 import re
 from collections.abc import Sequence
 from typing import Any
@@ -13,9 +12,14 @@ from matplotlib.image import imread
 
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.report.document import report
-from cuelearner_jax.storage import results
+from cuelearner_jax.storage import formats, results
 
 STEPS = np.arange(0, 101, 10)
+
+
+def planned(folder, **values):
+    """What a run is to do."""
+    formats.write("config", folder / "config.json", values)
 
 
 def write(folder, guidance, level, labels=0, *, seeds: Sequence[int] = range(8), steps=STEPS, **constants: Any):
@@ -27,7 +31,7 @@ def write(folder, guidance, level, labels=0, *, seeds: Sequence[int] = range(8),
         for step in steps:
             reward = (step > 30) * level + rng.uniform(-0.02, 0.02, len(seeds))
             writer.append(step=step, split="validation", seed=np.array(seeds), labels=labels, reward=reward, wall_s=1.0)
-    (folder / "config.json").write_text(json.dumps({"total_steps": int(STEPS[-1])}))
+    planned(folder, total_steps=int(STEPS[-1]))
 
 
 def summary(out):
@@ -128,11 +132,11 @@ def test_says_what_is_missing(runs, tmp_path):
     write(runs / "scalar-b", "scalar", 0.2, 100, seeds=[2], steps=STEPS)
     write(runs / "heuristic", "heuristic", 0.2, seeds=[0], config_hash="1e")
     (runs / "planned").mkdir()
-    (runs / "planned" / "config.json").write_text("{}")
+    planned(runs / "planned")
     write(runs / "sweep" / "demonstration", "demonstration", 0.2, 100, steps=STEPS[:9])
     (runs / "sweep" / "demonstration" / "config.json").unlink()
     grid = {"guidance": ["none", "demonstration"]}
-    (runs / "sweep" / "config.json").write_text(json.dumps({"total_steps": 100, "grid": grid}))
+    planned(runs / "sweep", total_steps=100, grid=grid)
     text = report(runs, tmp_path / "report").read_text()
     missing = text.split("## Missing")[1].split("## Where")[0]
     assert "scalar-a: at step 50 of 100 (50%)" in missing
@@ -157,7 +161,7 @@ def test_a_configuration_that_cannot_be_read_is_said_and_nothing_is_called_compl
 
     whole = {name: (runs / name / "config.json").read_bytes() for name in ("unguided", "relative-100", "relative-500")}
     (runs / "unguided" / "config.json").write_bytes(whole["unguided"][:7])
-    (runs / "relative-100" / "config.json").write_text('{"total_steps": "all", "grid": []}')
+    planned(runs / "relative-100", total_steps="all", grid=[])
     (runs / "relative-500" / "config.json").unlink()
     found = missing("one")
     assert "complete" not in found
@@ -171,7 +175,7 @@ def test_a_configuration_that_cannot_be_read_is_said_and_nothing_is_called_compl
 
 def test_seeds_and_budgets_of_the_plan_without_results_are_named(runs, tmp_path):
     grid = {"guidance": ["none", "relative"], "seeds": list(range(10)), "labels": [100, 700]}
-    (runs / "config.json").write_text(json.dumps({"total_steps": 100, "grid": grid}))
+    planned(runs, total_steps=100, grid=grid)
     missing = report(runs, tmp_path / "report").read_text().split("## Missing")[1].split("## Where")[0]
     for kind in grid["guidance"]:
         assert f"no results of {kind} guidance with the seeds 8, 9" in missing
@@ -179,13 +183,12 @@ def test_seeds_and_budgets_of_the_plan_without_results_are_named(runs, tmp_path)
     assert "none guidance with the label" not in missing
 
 
-def test_a_million_pieces_are_named_as_a_range_and_a_billion_make_no_sense(runs, tmp_path):
-    described = json.loads((runs / "unguided" / "config.json").read_text())
-    (runs / "unguided" / "config.json").write_text(json.dumps({**described, "shard": [3, 10**6]}))
-    (runs / "relative-100" / "config.json").write_text(json.dumps({**described, "shard": [5, 10**6]}))
-    (runs / "relative-500" / "config.json").write_text(json.dumps({**described, "shard": [1, 10**9]}))
+def test_pieces_are_named_as_a_range_and_a_billion_make_no_sense(runs, tmp_path):
+    for name, index, count in (("unguided", 3, 1000), ("relative-100", 5, 1000), ("relative-500", 1, 10**9)):
+        shard = {"index": index, "count": count, "seeds": list(range(1000))}
+        planned(runs / name, total_steps=100, shard=shard)
     missing = report(runs, tmp_path / "report").read_text().split("## Missing")[1].split("## Where")[0]
-    assert "shards not begun, of 1000000: 1 to 2, 4, 6 to 1000000" in missing
+    assert "shards not begun, of 1000: 1 to 2, 4, 6 to 1000" in missing
     assert "relative-500/config.json is damaged" in missing
 
 

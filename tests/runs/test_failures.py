@@ -120,7 +120,7 @@ def test_status_one_and_one_line(ended, capsys, monkeypatch):
 def test_a_sweep_in_pieces_that_were_finished_before_says_it_too(ended):
     plan = SimpleNamespace(finished=True, order=order(ended[0]))
     with pytest.raises(NotFinite) as raised:
-        submission.submit("local", 1, Job(), ended[0], [], lambda shard: cast(Plan, plan), lambda line: None)
+        submission.submit(1, Job(), ended[0], [], lambda shard: cast(Plan, plan), lambda line: None)
     assert str(raised.value) == ended[3]
 
 

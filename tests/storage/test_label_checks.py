@@ -13,7 +13,7 @@ from cuelearner_jax.storage import table as tables
 from cuelearner_jax.storage.label_files import JSONL, PARQUET, SCHEMA
 
 HEAD = {
-    "format": 3,
+    "format": 1,
     "task": {"name": "window", "half_width_deg": 28.0},
     "answers": "relative",
     "eps_deg": 20.0,
@@ -29,7 +29,7 @@ ROWS = [
 ABSENT = object()
 HEADS = [
     ("format", ABSENT),
-    *(("format", value) for value in (0, 1, 4, 10**30, -1, True, 3.0, "3", None, [3], float("nan"))),
+    *(("format", value) for value in (0, 2, 10**30, -1, True, 1.0, "1", None, [1], float("nan"))),
     ("task", ABSENT),
     *(("task", value) for value in (None, "window", [], {}, {"name": None}, {"name": ["window"]}, 3)),
     ("answers", ABSENT),
@@ -133,7 +133,7 @@ RAW += [
     b"PAR1" + bytes(200) + b"\xff\xff\xff\x7fPAR1",
     b"PAR1" + b"\x1c" * 5000 + b"\x88\x13\0\0PAR1",
 ]
-RAW += [b"\x89PNG\r\n\x1a\n", b"PK\x03\x04", b"\xff\xfe\x00{", b'{"about": {"format": 3}}\n', b"seed,obs\n1,2\n"]
+RAW += [b"\x89PNG\r\n\x1a\n", b"PK\x03\x04", b"\xff\xfe\x00{", b'{"about": {"format": 1}}\n', b"seed,obs\n1,2\n"]
 
 
 @pytest.mark.parametrize("form", [JSONL, PARQUET])

@@ -9,8 +9,8 @@ import pyarrow.parquet as pq
 import pytest
 
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.storage import formats, lines
 from cuelearner_jax.storage import label_files as files
+from cuelearner_jax.storage import lines
 from cuelearner_jax.storage import table as tables
 from cuelearner_jax.storage.table import META
 
@@ -68,7 +68,7 @@ def test_only_labels_that_count_are_written(path):
 def test_what_the_numbers_mean_is_written_in_the_file(path):
     written(path)
     meta = json.loads(pq.read_schema(path).metadata[META])
-    assert meta["format"] == 3
+    assert meta["format"] == 1
     assert meta["conventions"]["angles"] == "radians, counterclockwise positive"
     assert set(meta["conventions"]) >= set(NAMES)
 
@@ -308,12 +308,3 @@ def test_labels_that_are_all_of_the_files_strength_have_none_of_their_own(path):
     assert file.strengths.tolist() == [EPS] * 20
     written(path, answers="demonstration", eps_deg=None, width=2)
     assert files.read(path).strengths is None
-
-
-def test_a_file_of_the_format_before_is_read_and_gone_on_with(tmp_path, monkeypatch):
-    monkeypatch.setitem(formats.FORMATS, "labels", 2)
-    labels = said(tmp_path, range(3))
-    monkeypatch.undo()
-    assert_holds(files.read(tmp_path), labels, 3)
-    said(tmp_path, range(3, 5))
-    assert_holds(files.read(tmp_path), labels, 5)

@@ -43,19 +43,6 @@ def test_saving_again_replaces_the_network(made, tmp_path):
     np.testing.assert_allclose(weights, 2 * jax.tree.leaves(made.params)[1], rtol=2e-3)
 
 
-def test_its_description_has_a_format_and_a_newer_one_is_refused(made, tmp_path):
-    stored.save(tmp_path, made, ABOUT)
-    current = formats.FORMATS["teacher"]
-    assert formats.read("teacher", tmp_path / "teacher.json") == {"format": current, **ABOUT}
-    assert stored.load(tmp_path, ENV, 0.0, 0.0).layers == (32, 32)
-    probes.edit_json(tmp_path / "teacher.json", lambda about: about.update(format=current + 1))
-    with pytest.raises(UserError, match="written by a newer cuelearner"):
-        stored.load(tmp_path, ENV, 0.0, 0.0)
-    probes.edit_json(tmp_path / "teacher.json", lambda about: about.pop("format"))
-    with pytest.raises(UserError, match=r"trained by an earlier cuelearner.*: train it anew"):
-        stored.load(tmp_path, ENV, 0.0, 0.0)
-
-
 def test_a_folder_without_a_teacher_is_refused(tmp_path):
     with pytest.raises(UserError, match="no teacher"):
         stored.load(tmp_path, ENV, 0.0, 0.0)

@@ -16,7 +16,7 @@ from cuelearner_envs.navigation.robot import Robot
 from cuelearner_envs.navigation.world import FAR_AWAY
 from cuelearner_envs.navigation.worlds import generate_many
 
-KEYS = 300
+KEYS = 100
 STYLES = ("clutter", "rooms", "corridor")
 EXTENTS = {"clutter": (20.0, 20.0), "rooms": (18.0, 14.0), "corridor": (20.0, 4.6)}
 REACH = 0.2 + 0.265  # of the body: its front disc's offset and radius [m]
@@ -26,7 +26,7 @@ GRID = 0.1  # between nodes [m]
 NEEDED = math.hypot(REACH, GRID / 2)
 
 
-# Runs 600 times: optimising it costs less than it saves.
+# Runs 300 times: optimising it costs less than it saves.
 OPTIMISED = {"xla_backend_optimization_level": 1}
 generate_one = jax.jit(generate, static_argnames=("style", "routes"), compiler_options=OPTIMISED)
 
