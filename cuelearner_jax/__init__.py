@@ -6,6 +6,7 @@
     teacher = cl.teacher_of(world)                          # who answers "more to the left", "already right", ...
     policy = cl.load_policy("docs/data/navigation_agent")   # policy(obs) -> action, of one or many observations
     better = cl.adapt(policy, world, teacher, labels=300)   # answers in rounds, a model of them, a policy again
+    cl.measure(better, world, episodes=200).metrics         # on validation episodes, by name
     better.save("policies/better")                          # a folder that load_policy and every command take
     cl.export_policy(better, "walker", world, "numpy")      # a file that runs without JAX, and its contract
     run = cl.train(world, teacher, "quickstart", seeds=8)   # what `cuelearner sweep` does, results in memory
@@ -19,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from cuelearner_jax.api.acting import CallablePolicy, load_policy
     from cuelearner_jax.api.adaptation import AdaptedPolicy, adapt
+    from cuelearner_jax.api.evaluation import measure
     from cuelearner_jax.api.exporting import export_policy, load_exported
     from cuelearner_jax.api.feedback import FeedbackModel, Labels, ask, fit_feedback, refine
     from cuelearner_jax.api.training import Run, train
@@ -44,6 +46,7 @@ _PLACES = {
     "load_exported": "api.exporting",
     "load_policy": "api.acting",
     "make": "api.worlds",
+    "measure": "api.evaluation",
     "refine": "api.feedback",
     "teacher_of": "api.worlds",
     "train": "api.training",
@@ -64,6 +67,7 @@ __all__ = [
     "load_exported",
     "load_policy",
     "make",
+    "measure",
     "refine",
     "teacher_of",
     "train",

@@ -168,6 +168,10 @@ class Task:
         """The name of the preset that holds where none is given: `default`, or the first."""
         return default if default in self.presets else next(iter(self.presets))
 
+    def start(self) -> RunConfig:
+        """The configuration that a policy is taken to be trained with where no folder says so."""
+        return self.presets[self.first_preset()].config if self.presets else RunConfig(self.config())
+
     def environment(self, config: Any, split: str = "training") -> Environment:
         """The world of a configuration with the first body in it, for the episodes of a split.
 

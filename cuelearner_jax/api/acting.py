@@ -103,6 +103,12 @@ def as_policy_in(given: Any, env: Any) -> Policy:
     return policy
 
 
+def source_of(policy: Any, world: World) -> trained.PolicySource:
+    """Where a policy comes from, for a study in a world: what it was trained with, or is taken to be trained with."""
+    config = getattr(policy, "trained", None) or world.task.start()
+    return trained.PolicySource(world.task, dataclasses.replace(config, task=world.config), None, Path(world.task.name))
+
+
 @user_code.told
 def load_policy(
     folder: str | Path,

@@ -16,7 +16,7 @@ import numpy as np
 from cuelearner_jax import user_code
 from cuelearner_jax.adaptation import program
 from cuelearner_jax.api import arguments
-from cuelearner_jax.api.acting import CallablePolicy, as_policy, as_policy_in
+from cuelearner_jax.api.acting import CallablePolicy, as_policy, as_policy_in, source_of
 from cuelearner_jax.api.feedback import Labels, diverged, given_settings, label_path, labels_of, rows_of
 from cuelearner_jax.api.worlds import World
 from cuelearner_jax.config import GuideSizes, RunConfig, Scalars
@@ -171,14 +171,12 @@ def adapt(
 
 def _source(policy: Any, world: Any) -> PolicySource:
     """Where a policy comes from: its task, and what it was trained with. Raises UserError for what is no world."""
-    trained = getattr(policy, "trained", None)
     if isinstance(world, World):
-        config = trained or study.start_of(world.task)
-        return PolicySource(world.task, dataclasses.replace(config, task=world.config), None, Path(world.task.name))
+        return source_of(policy, world)
     if isinstance(world, type) or not all(callable(getattr(world, name, None)) for name in ("reset", "step")):
         raise arguments.refused("world", world, "a world, as cl.make gives it, or an environment")
     task = Task("environment", "a bare environment", _Bare, (Body("own", "", lambda config, split: world),))
-    return PolicySource(task, trained or RunConfig(_Bare()), None, Path(task.name))
+    return PolicySource(task, getattr(policy, "trained", None) or RunConfig(_Bare()), None, Path(task.name))
 
 
 @dataclasses.dataclass(frozen=True)

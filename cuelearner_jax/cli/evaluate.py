@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic
 
@@ -12,11 +12,10 @@ from rich.table import Table
 from cuelearner_jax.cli.parsing import about, out, parse, source_of, world_of
 from cuelearner_jax.cli.shared_options import TaskT
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.runs import measured
-from cuelearner_jax.runs.measured import Measured
 from cuelearner_jax.runs.trained import POLICIES, PolicySource
 from cuelearner_jax.storage import policy_folders
-from cuelearner_jax.task import Task
+from cuelearner_jax.studies import evaluate
+from cuelearner_jax.studies.evaluate import Measured, Request
 from cuelearner_jax.tasks import registry
 from cuelearner_jax.terminal import console, progress_bars, watched_by
 
@@ -24,27 +23,13 @@ if TYPE_CHECKING:
     from cuelearner_jax.report.measurements import Difference
 
 
-@dataclass(frozen=True)
-class Evaluate(Generic[TaskT]):
+@dataclass(frozen=True, kw_only=True)
+class Evaluate(Request[TaskT], Generic[TaskT]):
     """Validate a run, an adapted policy, or a task's teacher, heuristic or chance; in any changed world."""
 
-    task: TaskT
-    policy: str = "agent"
-    """Who acts, see above."""
-    guidance: tuple[str, ...] = ()
-    """Only these kinds of guidance of the run (default: all)."""
-    episodes: int | None = None
-    """Whole episodes for each lane, where the task counts episodes (default: 100)."""
-    steps: int | None = None
-    """Instead: environment steps for each lane (default, where the task counts steps: 10,000)."""
-    envs: int | None = None
-    """Environments that share the steps (default: 100)."""
     robot: str | None = None
     """Another robot, see above (default: the task's own); with a folder, as anymal:FOLDER, one with your own walking
     policy."""
-    engine: str | None = None
-    """Other physics that the robot has; anymal: mujoco, for C MuJoCo at a finer step instead of MJX; first episodes
-    only."""
     scenario: str | None = None
     """The changed world of this name, see above; options of the task (--task.…) come on top of it."""
     compare: str | None = None
@@ -55,9 +40,6 @@ class Evaluate(Generic[TaskT]):
     policy folder that has some.)"""
 
 
-MOST_ENVS = 100_000  # that memory has room for
-MOST_STEPS = 1_000_000  # of an environment
-
 OPTIONS = {"evaluate": Evaluate}
 
 
@@ -65,19 +47,19 @@ def run(arguments: list[str]) -> None:
     """Runs the command. Raises UserError for what cannot be evaluated."""
     source, rest = source_of(arguments, "evaluate", Evaluate)
     kind = Evaluate[source.task.config]  # pyright: ignore[reportInvalidTypeArguments]
-    default = kind(world_of(source, rest), policy=source.default_policy)
+    default = kind(task=world_of(source, rest), policy=source.default_policy)
     asked = parse(kind, rest, f"evaluate {source.folder}", default, about(Evaluate, source.task, policies=True))
     source = source.on(asked.robot)
-    engine = source.task.engine(asked.engine)
+    source.task.engine(asked.engine)
     source.check(asked.policy, asked.task, guidance=asked.guidance)
-    envs, steps = _work(source.task, asked)
+    envs, steps = evaluate.amount(source.task, asked)
     if asked.out and asked.out.exists():
         raise UserError(f"{asked.out} exists: give another --out")
     other = _other(source, asked) if asked.compare is not None else None
     with progress_bars(shown=console.is_terminal) as bars:
         watch = watched_by(bars)
-        found = measured.evaluate(source, asked.task, asked.policy, asked.guidance, envs, steps, engine, watch)
-        others = measured.evaluate(*other, (), envs, steps, engine, watch) if other else []
+        found = evaluate.run(source, asked, watch)
+        others = evaluate.run(other[0], replace(asked, policy=other[1], guidance=()), watch) if other else []
     from cuelearner_jax.report import measurements  # loads SciPy
 
     compared = measurements.differences(found, others) if other else None
@@ -102,32 +84,8 @@ def run(arguments: list[str]) -> None:
         out.print(f"wrote {asked.out}")
 
 
-def _work(task: Task, asked: Evaluate[Any]) -> tuple[int, int]:
-    """Environments, and steps that they share. Raises UserError for what makes no sense or cuts episodes short."""
-    longest = None if task.longest is None else task.longest(asked.task)
-    if asked.episodes is not None:
-        if asked.steps is not None or asked.envs is not None:
-            raise UserError("--episodes says how many environments take how many steps: leave out --steps and --envs")
-        if longest is None:
-            raise UserError(f"{task.name} counts steps, not episodes: give --steps in place of --episodes")
-        if not 1 <= asked.episodes <= MOST_ENVS:
-            raise UserError(f"--episodes is {asked.episodes}: give a number from 1 to {MOST_ENVS:,}")
-        return asked.episodes, asked.episodes * longest
-    envs = 100 if asked.envs is None else asked.envs
-    if not 1 <= envs <= MOST_ENVS:
-        raise UserError(f"--envs is {envs}: give a number from 1 to {MOST_ENVS:,}")
-    default = 10_000 if longest is None else envs * longest
-    steps = default if asked.steps is None else asked.steps
-    if steps < 1 or steps % envs:
-        raise UserError(f"--steps is {steps}: give a positive multiple of --envs ({envs})")
-    if steps // envs > MOST_STEPS:
-        raise UserError(f"--steps is {steps}: give at most {MOST_STEPS:,} for each of the environments (--envs)")
-    task.check_whole(asked.task, envs, steps, "--envs", "--steps")
-    return envs, steps
-
-
-def _other(source: PolicySource, asked: Evaluate[Any]) -> tuple[PolicySource, Any, str]:
-    """The source, world and name of the policy to compare with. Raises UserError if it cannot be had in that world."""
+def _other(source: PolicySource, asked: Evaluate[Any]) -> tuple[PolicySource, str]:
+    """The source and the name of the policy to compare with. Raises UserError if it cannot be had in that world."""
     given = str(asked.compare)
     folder = Path(given)
     if given in POLICIES and not folder.exists():
@@ -144,7 +102,7 @@ def _other(source: PolicySource, asked: Evaluate[Any]) -> tuple[PolicySource, An
     if policy == asked.policy and other.folder.absolute() == source.folder.absolute():
         raise UserError(f"--compare is {given!r}, the policy that is evaluated: give another one")
     other.check(policy, asked.task)
-    return other, asked.task, policy
+    return other, policy
 
 
 def _measurements(found: list[Measured], title: str, episodes: str) -> Table:

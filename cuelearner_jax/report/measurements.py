@@ -14,10 +14,10 @@ from cuelearner_jax.config import to_json
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import mean_interval
 from cuelearner_jax.report.statistics import RESAMPLES, interquartile_mean, interval, resampled
-from cuelearner_jax.runs.measured import Measured
 from cuelearner_jax.runs.trained import POLICIES, PolicySource
 from cuelearner_jax.storage.provenance import provenance
 from cuelearner_jax.storage.whole import replacing
+from cuelearner_jax.studies.evaluate import Measured
 
 EPISODES = "episodes"  # what the interval of a single policy is over
 SEEDS = "seeds"

@@ -19,7 +19,7 @@ import numpy as np
 from cuelearner_jax import user_code
 from cuelearner_jax.adaptation import adapting, judging, program, stored
 from cuelearner_jax.adaptation.adapting import Adaptation, Adapted, Judging
-from cuelearner_jax.config import GuideSizes, RunConfig, Scalars, check_guide
+from cuelearner_jax.config import GuideSizes, Scalars, check_guide
 from cuelearner_jax.environment import Environment, spaces_of
 from cuelearner_jax.errors import UserError, closest
 from cuelearner_jax.evaluate import Tell, untold
@@ -122,11 +122,6 @@ class Outcome(NamedTuple):
         path = self.request.labels_from
         used = {"labels_from": f"{path.name} {label_files.digest(path)}" if path else None, "robot": self.request.robot}
         adapted.write(place, self.found, self.subject.source.task, self.request.task, self.origin, used)
-
-
-def start_of(task: Task) -> RunConfig:
-    """The configuration that a policy is taken to be trained with where no folder says so."""
-    return task.presets[task.first_preset()].config if task.presets else RunConfig(task.config())
 
 
 def suggested(

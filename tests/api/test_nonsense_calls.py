@@ -63,6 +63,10 @@ def adapted(policy=POLICY, world=WORLD, teacher=TEACHER, **others):
     return cl.adapt(policy, world, teacher, **others)
 
 
+def measured(policy=POLICY, world=WORLD, **others):
+    return cl.measure(policy, world, **others)
+
+
 def trained(world=WORLD, teacher=TEACHER, config=probes.CONFIG, **others):
     return cl.train(world, teacher, config, **{"progress": False, **others})
 
@@ -156,6 +160,14 @@ TABLE = {
         "judge_by": (*NO_NAMES, "luck"),
         "judge_episodes": (*NO_WHOLE, None, 0, 10**9),
         "judge_bounds": (3, "half", [0], [2], [NAN], [None], ["x"], [True], 0.5, [[0.5]]),
+    },
+    measured: {
+        "policy": NO_POLICIES,
+        "world": NO_WORLDS,
+        "steps": (*NO_WHOLE, 0, 30),
+        "envs": (*NO_WHOLE, 0, 3),
+        "episodes": (*NO_WHOLE, 0, 5),
+        "engine": (*NO_NAMES, "mujoco"),
     },
     asked: {
         "policy": NO_POLICIES,

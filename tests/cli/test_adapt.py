@@ -175,6 +175,9 @@ def test_python_adapts_as_the_command_does(home, tmp_path, world, options, setti
     assert (told[0]["judged"]["by"], told[0]["policy"]["scalars"]["k_max"]) == ("hit", 7 if not options else 50)
     files = [tmp_path / name / "labels.parquet" for name in ("command", "python")]
     chex.assert_trees_all_equal(*(label_files.read(file).labels for file in files))
+    (row,) = measured(tmp_path, tmp_path / "command", *own())  # and both measure alike
+    found = cl.measure(better, made, steps=2_000, envs=20).metrics
+    assert {name: values.tolist() for name, values in found.items()} == {name: row[name] for name in found}
 
 
 @pytest.mark.long

@@ -56,7 +56,7 @@ ARGUMENTS = [
     (["evaluate", "billiards", "--compare", "heuristic"], "the policy that is evaluated: give another one"),
     (["evaluate", "billiards", "--compare", "docs/data/navigation_agent"], "compare within one task"),
     (["evaluate", "billiards", "--compare", "agent"], "needs a trained run"),
-    (["evaluate", "billiards", "--steps", "150"], "multiple of --envs"),
+    (["evaluate", "billiards", "--steps", "150"], "multiple of envs"),
     (["evaluate", "billiards", "--scenario", "tilted_tabel"], "did you mean 'tilted_table'"),
     (["evaluate", "billiards", "--scenario"], "choose one of turned_strike, shifted_balls, tilted_table"),
     (["evaluate", "billiards", "--guidance", "none"], "--guidance chooses nothing here"),
@@ -67,7 +67,7 @@ ARGUMENTS = [
     (["render", "billiards", "--steps", "0"], "--steps is 0: give a number from 1 to 100,000"),
     (["render", "billiards", "--episode", "-1"], "--episode is -1: give a number from 0 to 4,294,967,295"),
     (["render", "billiards", "--episode", "5000000000"], "--episode is 5000000000: give a number from 0"),
-    (["evaluate", "billiards", "--envs", "1000000000"], "--envs is 1000000000: give a number from 1 to 100,000"),
+    (["evaluate", "billiards", "--envs", "1000000000"], "envs is 1000000000: give a number from 1 to 100,000"),
     (["evaluate", "billiards", "--steps", "100000000000"], "at most 1,000,000 for each of the environments"),
     (["evaluate", "billiards", "--task.table", "one_ball", "--policy", "teacher"], "--task.teacher search"),
 ]

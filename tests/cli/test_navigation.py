@@ -63,10 +63,10 @@ def test_an_evaluation_is_of_whole_episodes(walked, refused, tmp_path, capsys):
         assert row["finished"] == [1]
         assert sum(row[name][0] for name in OUTCOMES) == pytest.approx(1)
         assert row["timeout"][0] > 0.2  # chance gets nowhere in 4 s
-    short = "--steps is 1200 for 120 environments, 10 each, but an episode lasts up to 20: give --steps 2400"
+    short = "steps is 1200 for 120 environments, 10 each, but an episode lasts up to 20: give steps 2400"
     refused([*evaluate, "--steps", "1200", "--envs", "120"], short, tmp_path)
-    refused([*evaluate, "--steps", "10000", "--task.max-steps", "200"], "give --steps 20000", tmp_path)
-    refused([*evaluate, "--episodes", "12", "--envs", "12"], "leave out --steps and --envs", tmp_path)
+    refused([*evaluate, "--steps", "10000", "--task.max-steps", "200"], "give steps 20000", tmp_path)
+    refused([*evaluate, "--episodes", "12", "--envs", "12"], "leave out steps and envs", tmp_path)
     refused([*evaluate, "--episodes", "0"], "from 1 to 100,000", tmp_path)
     refused(["evaluate", "billiards", "--episodes", "3"], "billiards counts steps, not episodes", tmp_path)
     cut = ["sweep", "navigation", "--preset", "quickstart", *SMALL, "--task.max-steps", "21"]

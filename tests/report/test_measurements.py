@@ -7,7 +7,7 @@ from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import mean_interval
 from cuelearner_jax.report import measurements
 from cuelearner_jax.report.statistics import interval
-from cuelearner_jax.runs.measured import Measured
+from cuelearner_jax.studies.evaluate import Measured
 
 RANDOM = np.random.default_rng(5)
 EPISODES = 200

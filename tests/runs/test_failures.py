@@ -13,11 +13,12 @@ import pytest
 import cuelearner_jax as cl
 from cuelearner_jax.cli import dispatch
 from cuelearner_jax.errors import NotFinite, UserError
-from cuelearner_jax.runs import lanes, measured, submission, sweep, trained
+from cuelearner_jax.runs import lanes, submission, sweep, trained
 from cuelearner_jax.runs.cluster import Job
 from cuelearner_jax.runs.grid import Grid, load
 from cuelearner_jax.runs.order import Order, Plan
 from cuelearner_jax.storage import results
+from cuelearner_jax.studies import evaluate
 
 CONFIG = probes.config(
     sizes={"q_layers": (8, 8), "feedback_layers": (8,), "fit_steps": 20, "lanes_per_block": 3, "replay_capacity": 40},
@@ -97,7 +98,7 @@ def test_evaluation_leaves_it_out_and_says_so(ended, capsys):
     for folder in (sick, healthy):
         _, config, grid = load(folder, {TASK.name: TASK}.__getitem__)
         source = trained.PolicySource(TASK, config, grid, folder)
-        found += measured.evaluate(source, config.task, "agent", (), 10, 10)
+        found += evaluate.run(source, evaluate.Request(task=config.task, envs=10, steps=10))
         policies = source.load()[0].policies
         np.testing.assert_array_equal(policies["failed"], [False, folder == sick, False])
         assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(policies["params"]))
@@ -131,8 +132,9 @@ def test_diverging_from_the_command_line_and_from_python(tmp_path):
     with pytest.raises(NotFinite, match="3 of 3 lanes failed"):
         sweep.run(Order(TASK, wild, grid, tmp_path / "run"))
     _, config, grid = load(tmp_path / "run", {TASK.name: TASK}.__getitem__)
+    source = trained.PolicySource(TASK, config, grid, tmp_path / "run")
     with pytest.raises(UserError, match="all of these lanes failed"):
-        measured.evaluate(trained.PolicySource(TASK, config, grid, tmp_path / "run"), config.task, "agent", (), 10, 10)
+        evaluate.run(source, evaluate.Request(task=config.task, envs=10, steps=10))
     with pytest.warns(UserWarning, match=r"3 of 3 lanes failed, no longer finite .*: leave out the rows"):
         found = cl.train(
             cl.World(TASK, probes.WindowConfig()), None, wild, guidance=("none",), seeds=(3, 5, 8), progress=False

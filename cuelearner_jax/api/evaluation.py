@@ -1,0 +1,49 @@
+"""Evaluation from Python: what `cuelearner evaluate` measures, of any policy."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from cuelearner_jax import user_code
+from cuelearner_jax.api import arguments
+from cuelearner_jax.api.acting import as_policy_in, source_of
+from cuelearner_jax.api.worlds import World, a_world
+from cuelearner_jax.studies import evaluate as study
+from cuelearner_jax.studies.evaluate import Measured
+
+
+@user_code.told
+def measure(
+    policy: Any,
+    world: World,
+    *,
+    episodes: int | None = None,
+    steps: int | None = None,
+    envs: int | None = None,
+    engine: str | None = None,
+) -> Measured:
+    """Measure a policy on validation episodes of a world: the numbers of `cuelearner evaluate`.
+
+    Args:
+        policy: a policy, or any function of a batch of observations in NumPy.
+        world: where it acts.
+        episodes: whole episodes, where the task counts episodes (default: 100).
+        steps: instead: environment steps (default, where the task counts steps: 10,000).
+        envs: environments that share the steps (default: 100).
+        engine: other physics that the world's robot has (default: its own).
+
+    Returns:
+        `metrics`: a mean (1,) by name; `each`: the values (1, envs) of the environments by name.
+
+    Raises:
+        UserError: a policy that cannot act there, or amounts that make no sense.
+    """
+    source = source_of(policy, a_world("world", world))
+    own = as_policy_in(policy, world.env)
+    given: dict[str, Any] = {"episodes": episodes, "steps": steps, "envs": envs}
+    given = {name: arguments.whole(name, value, 1, study.MOST) for name, value in given.items() if value is not None}
+    if engine is not None:
+        arguments.text("engine", engine)
+    asked = study.Request(task=world.config, policy="agent", engine=engine, **given)
+    (found,) = study.run(source, asked, policy=own)
+    return found

@@ -1,0 +1,142 @@
+"""Evaluation as one request, which the command line and Python fill alike: policies on validation episodes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Generic, NamedTuple, TypeVar
+
+import jax
+import numpy as np
+
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.evaluate import Rolled, Tell, episodes, part_of, untold, watched, watched_lanes
+from cuelearner_jax.guides import registry as guidances
+from cuelearner_jax.policies import Common
+from cuelearner_jax.runs.trained import POLICIES, Parts, PolicySource, blocks_of
+from cuelearner_jax.task import Task
+
+TaskT = TypeVar("TaskT")
+
+MOST_ENVS = 100_000  # that memory has room for
+MOST_STEPS = 1_000_000  # of an environment
+MOST = MOST_ENVS * MOST_STEPS
+
+
+@dataclass(frozen=True, kw_only=True)
+class Request(Generic[TaskT]):
+    """What an evaluation is asked for."""
+
+    task: TaskT
+    policy: str = "agent"
+    """Who acts, see above."""
+    guidance: tuple[str, ...] = ()
+    """Only these kinds of guidance of the run (default: all)."""
+    episodes: int | None = None
+    """Whole episodes for each lane, where the task counts episodes (default: 100)."""
+    steps: int | None = None
+    """Instead: environment steps for each lane (default, where the task counts steps: 10,000)."""
+    envs: int | None = None
+    """Environments that share the steps (default: 100)."""
+    engine: str | None = None
+    """Other physics that the robot has; anymal: mujoco, for C MuJoCo at a finer step instead of MJX; first episodes
+    only."""
+
+
+class Measured(NamedTuple):
+    """A policy's metrics under one guidance and budget."""
+
+    guidance: str
+    labels: int
+    step: int  # of its training; 0: nothing was trained
+    seeds: np.ndarray  # (seeds,)
+    metrics: dict[str, np.ndarray]  # each (seeds,)
+    each: dict[str, np.ndarray]  # the same of each environment (seeds, envs), nan where its first episode goes on
+    bound_deg: float | None = None  # of a policy folder's lanes [deg]
+    is_shared: bool = False  # do all seeds have one policy?
+
+
+def amount(task: Task, asked: Request[Any]) -> tuple[int, int]:
+    """Return environments, and steps that they share. Raises UserError for nonsense, or what cuts episodes short."""
+    longest = None if task.longest is None else task.longest(asked.task)
+    if asked.episodes is not None:
+        if asked.steps is not None or asked.envs is not None:
+            raise UserError("episodes says how many environments take how many steps: leave out steps and envs")
+        if longest is None:
+            raise UserError(f"{task.name} counts steps, not episodes: give steps in place of episodes")
+        if not 1 <= asked.episodes <= MOST_ENVS:
+            raise UserError(f"episodes is {asked.episodes}: give a number from 1 to {MOST_ENVS:,}")
+        return asked.episodes, asked.episodes * longest
+    envs = 100 if asked.envs is None else asked.envs
+    if not 1 <= envs <= MOST_ENVS:
+        raise UserError(f"envs is {envs}: give a number from 1 to {MOST_ENVS:,}")
+    default = 10_000 if longest is None else envs * longest
+    steps = default if asked.steps is None else asked.steps
+    if steps < 1 or steps % envs:
+        raise UserError(f"steps is {steps}: give a positive multiple of envs ({envs})")
+    if steps // envs > MOST_STEPS:
+        raise UserError(f"steps is {steps}: give at most {MOST_STEPS:,} for each of the environments (envs)")
+    task.check_whole(asked.task, envs, steps, "envs", "steps")
+    return envs, steps
+
+
+def run(
+    source: PolicySource, asked: Request[Any], watch: Callable[[str], Tell] = lambda kind: untold, policy: Any = None
+) -> list[Measured]:
+    """Metrics of a policy on validation episodes of a world, for each guidance and budget.
+
+    Args:
+        source: where the policy comes from.
+        asked: the request, whose `task` is the world (a configuration).
+        watch: by kind of guidance, who is told how far its lanes are.
+        policy: a policy in place of one of the source's; None: none.
+
+    Raises:
+        UserError: what makes no sense, or cannot be had (`PolicySource.check` says more, and sooner).
+    """
+    task, world, name = source.task, asked.task, asked.policy
+    num_envs, steps = amount(task, asked)
+    engine, key = task.engine(asked.engine), episodes()
+    env = task.environment(world, "validation")
+    named = POLICIES[name]
+    teacher = task.make_teacher(world, env) if policy is None and named.taught else None
+    if policy is not None or not named.kept:
+        policy = named.make(Parts(source.config, env, teacher, None)) if policy is None else policy
+        tell = watch(name)
+        if engine:
+            means, each = _of_lanes([engine(policy, env, key, num_envs, steps, tell)])
+        else:
+            means, each = _repeated(watched(env, policy, key, num_envs, steps, tell), 1)
+        return [Measured("-", 0, 0, np.zeros(1, int), means, each)]
+    rows = []
+    for block in blocks_of(source, named, env, teacher, tuple(map(guidances.named, asked.guidance))):
+        tell, policy, count = watch(block.guidance), block.policy, len(block.seeds)
+        is_shared = isinstance(policy, Common)
+        if engine:
+            tells = [part_of(tell, lane, count) for lane in range(count)]
+            means, each = _of_lanes(
+                [engine(block.alone(lane), env, key, num_envs, steps, tells[lane]) for lane in range(count)]
+            )
+        elif is_shared:
+            means, each = _repeated(watched(env, policy.policy, key, num_envs, steps, tell), count)
+        else:
+            means, each, _ = watched_lanes(env, policy, key, num_envs, steps, tell)
+        variants = sorted(set(zip(block.bounds.tolist(), block.budgets.tolist(), strict=True)))
+        for bound, budget in variants:
+            own = (block.budgets == budget) & (block.bounds == bound)
+            mine, apart = ({name: np.asarray(of[name])[own] for name in of} for of in (means, each))
+            bounded = None if source.adapted is None else bound
+            rows.append(Measured(block.guidance, budget, block.step, block.seeds[own], mine, apart, bounded, is_shared))
+    return rows
+
+
+def _of_lanes(lanes: list[dict[str, Any]]) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """Means (lanes,) and values (lanes, envs) of what an engine gave for each lane."""
+    each = {name: np.stack([np.asarray(lane[name], float) for lane in lanes]) for name in lanes[0]}
+    return {name: values.mean(-1) for name, values in each.items()}, each
+
+
+def _repeated(rolled: Rolled, lanes: int) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """Means (lanes,) and values (lanes, envs) of a policy that all lanes share."""
+    means, each, _ = jax.tree.map(lambda leaf: np.repeat(np.asarray(leaf)[None], lanes, axis=0), rolled)
+    return means, each
