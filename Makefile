@@ -6,12 +6,13 @@ UV := $(BIN)/python -m uv
 PYTEST := $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 UV_VERSION := $(shell sed -n 's/^uv==\([0-9.]*\).*/\1/p' constraints.txt)
 
-.PHONY: help setup quickstart smoke test test-all test-quick fuzz lint format docs bench constraints clean
+.PHONY: help setup quickstart smoke test test-all test-quick durations fuzz lint format docs bench constraints clean
 help:
 	@echo "make quickstart   train, report and film the small billiards example (two to three minutes)"
 	@echo "make test         run the tests (15 to 20 minutes on 2 cores)"
 	@echo "make test-all     these, and those that only take long"
 	@echo "make test-quick   those of them that compile next to nothing (under 3 minutes)"
+	@echo "make durations    make test, and tests/durations.txt: the seconds of each file"
 	@echo "make smoke        one tiny sweep of every form of feedback and of every adaptation on both tasks (minutes on 2 cores)"
 	@echo "make fuzz         damaged folders and files by chance, CASES=2000 SEED=0 (hours on 2 cores)"
 	@echo "make lint         ruff and pyright"
@@ -56,6 +57,9 @@ test-all: $(VENV)/.tested
 
 test-quick: $(VENV)/.tested
 	$(PYTEST) -m "not slow and not long"
+
+durations: $(VENV)/.tested
+	$(PYTEST) -m "not long" --durations-to tests/durations.txt
 
 CASES ?= 2000
 SEED ?= 0

@@ -3,6 +3,8 @@
 import gc
 import os
 import signal
+import sys
+from collections import Counter
 from functools import cache
 from pathlib import Path
 
@@ -47,6 +49,30 @@ def pytest_collection():
     finally:
         gc.freeze()
         gc.enable()
+
+
+def pytest_addoption(parser):
+    """Adds what `make durations` asks for."""
+    parser.addoption("--durations-to", type=Path, help="write the seconds of each file of tests there")
+
+
+def pytest_terminal_summary(terminalreporter, exitstatus, config):
+    """Writes the seconds of each file of tests, with set-up, the longest first."""
+    path = config.getoption("--durations-to")
+    if path is None:
+        return
+    seconds, tests = Counter(), Counter()
+    for report in (report for reports in terminalreporter.stats.values() for report in reports):
+        if hasattr(report, "duration"):
+            file = report.nodeid.partition("::")[0]
+            seconds[file] += report.duration
+            tests[file] += report.when == "call"
+    versions = f"jax {jaxlib.version.__version__}, Python {sys.version.split()[0]}, {os.cpu_count()} cores"
+    head = (
+        f"# {sum(tests.values()):,} tests, {sum(seconds.values()):,.0f} s over all workers; {versions}; make durations"
+    )
+    lines = [f"{spent:8.1f} {tests[file]:5} {file}" for file, spent in seconds.most_common()]
+    path.write_text("\n".join([head, "# seconds tests file", *lines, ""]), encoding="utf-8")
 
 
 @pytest.hookimpl(tryfirst=True)

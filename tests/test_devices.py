@@ -89,6 +89,7 @@ def test_four_devices_learn_what_one_does(alone, shared):
     assert "on each of 4 devices" in shared[1]
 
 
+@pytest.mark.long
 def test_no_device_waits_for_another():
     assert on_four("communication")[0] == "4 []"
 

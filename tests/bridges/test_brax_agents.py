@@ -102,6 +102,7 @@ def test_an_episode_that_the_wrapper_cuts_is_truncated(wrap):
     assert column(states, lambda state: state.obs[:, 0]) == [1, 1, 1]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("wrap", WRAPS)
 @pytest.mark.parametrize("truncates", [False, True])
 def test_an_end_amid_repeated_actions_is_not_lost(wrap, truncates):
@@ -152,6 +153,7 @@ def test_the_sum_over_an_episode_is_its_outcome():
     assert (summed[2], summed[5]) == (luck[2], luck[5])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("wrap", WRAPS)
 def test_what_brax_learns_from_an_end(wrap):
     """Targets of brax's own advantage estimator: nothing follows a termination, and a truncation teaches nothing."""
@@ -174,6 +176,7 @@ def test_what_brax_learns_from_an_end(wrap):
     np.testing.assert_allclose(targets[True][:, 0], [0.5 + 0.5 * 5, 5, 0.5 + 0.5 * 5, 5])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("wrap", WRAPS)
 def test_brax_may_randomize_our_parameters(wrap):
     offsets = jnp.array([0.0, 1.5])

@@ -37,6 +37,7 @@ def test_a_sweep_says_its_memory_first_and_leaves_a_complete_folder(run_folder, 
     assert "MB a seed at rest" in capsys.readouterr().err
 
 
+@pytest.mark.long
 def test_the_same_seed_gives_the_same_rewards_in_another_run(run_folder, tmp_path):
     out = tmp_path / "one"
     command = ["train", "billiards", "--preset", "quickstart", *SMALL, "--seed", "2001", "--labels", "20"]
@@ -158,6 +159,7 @@ def test_render_makes_a_film_and_a_still(run_folder, tmp_path, film):
     assert filmed.stat().st_size > 1000
 
 
+@pytest.mark.long
 def test_render_makes_the_picture_of_a_question(run_folder, refused, tmp_path):
     command = ["render", str(run_folder), "--question", "--scenario", "turned_strike", "--out", str(tmp_path)]
     assert main(command) == 0
@@ -199,6 +201,7 @@ def test_the_task_may_be_named_by_an_option(run_folder, tmp_path):
     assert main(["evaluate", str(run_folder), *given]) == 0
 
 
+@pytest.mark.long
 def test_labels_of_a_run_train_another(run_folder, tmp_path):
     out = tmp_path / "again"
     command = ["sweep", "billiards", "--preset", "quickstart", *SMALL, "--seeds", "2", "--guidance", "relative"]
@@ -207,6 +210,7 @@ def test_labels_of_a_run_train_another(run_folder, tmp_path):
     assert len(results.read(out).to_pylist()) == 6
 
 
+@pytest.mark.long
 def test_tuning_episodes_are_others_and_stay_out_of_reports(run_folder, tmp_path, capsys):
     out = tmp_path / "tuned"
     command = ["train", "billiards", "--preset", "quickstart", *SMALL, "--guidance", "none", "--seed", "2000"]
@@ -225,6 +229,7 @@ def test_every_command_explains_itself(command, capsys):
     explained(command, *capsys.readouterr())
 
 
+@pytest.mark.long
 def test_the_installed_command_explains_itself():
     done = subprocess.run(
         [*ENTRY, "sweep", "billiards", "--help"], check=False, capture_output=True, text=True, timeout=120

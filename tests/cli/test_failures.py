@@ -137,6 +137,7 @@ def test_resume_with_other_options_names_them(refused, run_folder):
     refused(changed, "another scalars.eps_deg", run_folder)
 
 
+@pytest.mark.long
 def test_overwrite_deletes_an_earlier_run(run_folder, tmp_path):
     folder = tmp_path / "run"
     shutil.copytree(run_folder, folder)

@@ -151,6 +151,7 @@ def test_a_kind_that_a_run_names_is_never_imported(run_folder, refused, tmp_path
     assert heard == []
 
 
+@pytest.mark.long
 def test_no_string_of_a_run_is_imported(run_folder, tmp_path):
     folder = shutil.copytree(run_folder, tmp_path / "run", ignore=shutil.ignore_patterns("relative"))
     probes.edit_json(folder / "config.json", lambda values: values["grid"].update(guidance=["none"]))
@@ -198,6 +199,7 @@ def test_no_string_of_a_teacher_is_imported(tmp_path):
     assert taken_by(tmp_path / "teacher" / "teacher.json", read) == [("by",)]
 
 
+@pytest.mark.long
 def test_no_string_of_an_exported_decision_is_imported(tmp_path):
     folder, read = tmp_path / "numpy", cl.load_exported
     world = World(small_policies.TASK, probes.WindowConfig())

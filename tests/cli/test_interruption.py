@@ -40,9 +40,13 @@ def uninterrupted(tmp_path_factory):
     return rows(folder)
 
 
-def test_ctrl_c_and_sigterm_save_and_resume_goes_on_as_if_never_stopped(tmp_path, uninterrupted):
+STOPS = [(200, signal.SIGINT), (600, signal.SIGTERM, "--resume")]
+
+
+@pytest.mark.parametrize("stops", [STOPS[:1], pytest.param(STOPS, marks=pytest.mark.long)], ids=["once", "twice"])
+def test_ctrl_c_and_sigterm_save_and_resume_goes_on_as_if_never_stopped(tmp_path, uninterrupted, stops):
     folder = tmp_path / "run"
-    for step, number, *options in ((200, signal.SIGINT), (600, signal.SIGTERM, "--resume")):
+    for step, number, *options in stops:
         process = start_and_wait_for(folder, step, *options)
         process.send_signal(number)
         told = process.communicate(timeout=120)[1]

@@ -78,6 +78,7 @@ def test_pieces_at_other_steps_are_not_averaged(sweeps, pieces, measured):
     assert told == f"{pieces / 'shard-2-of-2'}: none guidance at step 100 of 200\n"
 
 
+@pytest.mark.long
 def test_a_lane_of_any_piece_is_drawn_and_called(sweeps, tmp_path):
     command = ["render", str(sweeps / "pieces"), "--seed", "9", "--steps", "1", "--question", "--out", str(tmp_path)]
     assert main(command) == 0
@@ -86,6 +87,7 @@ def test_a_lane_of_any_piece_is_drawn_and_called(sweeps, tmp_path):
     np.testing.assert_array_equal(whole, pieces)
 
 
+@pytest.mark.long
 def test_pieces_are_of_one_sweep_though_one_was_begun_before_a_field_existed(pieces, refused):
     """By the command line: evaluated together, and a piece that is finished is found so."""
     for group, name in (("sizes", "frame"), ("schedule", "ask_at"), ("scalars", "answer"), ("task", "mirrors")):

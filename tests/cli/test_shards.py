@@ -125,6 +125,7 @@ def test_a_full_disk_stops_a_piece_and_damages_nothing(whole, tmp_path, capsys, 
     assert rows(out) == whole
 
 
+@pytest.mark.long
 def test_a_table_that_the_disk_has_no_room_for_is_reported(tmp_path):
     # Every file but the shortest is too large for this process.
     script = "import resource, sys; resource.setrlimit(resource.RLIMIT_FSIZE, (3000, 3000));"

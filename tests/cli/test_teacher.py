@@ -23,6 +23,7 @@ def trained(tmp_path_factory):
     return folder
 
 
+@pytest.mark.long
 def test_a_tiny_teacher_is_trained(trained):
     told = json.loads((trained / "teacher.json").read_text())
     assert told["command"].startswith("python experiments/train_teacher.py billiards")
@@ -52,6 +53,7 @@ def test_it_teaches_and_is_known_by_its_contents(trained, refused, tmp_path):
     assert main(["evaluate", str(run), "--policy", "heuristic", *few]) == 0
 
 
+@pytest.mark.long
 def test_a_teacher_that_does_not_fit_is_refused(trained, refused, tmp_path):
     new = ["--out", tmp_path / "new"]
     refused([*RUN, "--task.teacher", tmp_path / "nowhere", *new], "give its folder (--task.teacher FOLDER)", tmp_path)

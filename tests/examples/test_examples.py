@@ -242,6 +242,7 @@ def test_the_skipper_makes_straight_for_the_buoy():
         assert x * line[0] + y * line[1] > 0
 
 
+@pytest.mark.long
 def test_policies_of_ones_own_reach_the_buoy(tmp_path, capsys):
     policy = importlib.import_module("examples.policy")
     found = policy.main([str(tmp_path)], steps=8_000)

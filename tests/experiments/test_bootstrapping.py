@@ -99,7 +99,9 @@ def options_known(piece):
     return own <= known and all(map(known_kind, piece.kinds))
 
 
-@pytest.mark.parametrize("scale", ["smoke", "cpu", "paper"])
+@pytest.mark.parametrize(
+    "scale", ["smoke", *(pytest.param(scale, marks=pytest.mark.long) for scale in ("cpu", "paper"))]
+)
 def test_every_piece_is_a_sweep_that_would_begin(experiment, scale, modules, monkeypatch, tmp_path):
     """The command line itself plans each: options exist, values are legal, counts divide each other."""
     if scale not in experiment.scales:
@@ -236,7 +238,13 @@ def said_of(mark, modules):
     return shown, page.section("\n".join([*lines, page.LAST]), seen.as_posix())
 
 
-@pytest.mark.parametrize("mark", ["regulation", "easy", "full", "clutter", "clutter-cpu"])
+MARKS = [
+    "easy",
+    *(pytest.param(mark, marks=pytest.mark.long) for mark in ("regulation", "full", "clutter", "clutter-cpu")),
+]
+
+
+@pytest.mark.parametrize("mark", MARKS)
 def test_the_page_says_what_the_recorded_runs_give_and_nothing_where_there_are_none(mark, modules):
     shown, given = said_of(mark, modules)
     assert shown.split("\n\nMissing:")[0] == given

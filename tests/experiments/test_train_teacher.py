@@ -97,6 +97,7 @@ def test_it_learns_to_win_nearly_always(trained):
     assert metrics[1]["loss"] < 0.5 * metrics[0]["loss"]
 
 
+@pytest.mark.long
 def test_its_values_are_chances_to_win_and_an_imperfect_aim_goes_to_the_middle(trained):
     made, best = trained[0], ENV.best(OBS)
     inside, outside = (jax.vmap(lambda obs, action: made.values(obs, action[None])[0])(OBS, s * best) for s in (1, -1))
@@ -107,6 +108,7 @@ def test_its_values_are_chances_to_win_and_an_imperfect_aim_goes_to_the_middle(t
     assert np.abs(error).max() < math.radians(12)
 
 
+@pytest.mark.long
 def test_tries_come_first_from_the_best_and_last_from_anywhere():
     training, state = Trainer(CONFIG), PROGRAM.init(ENV, jax.random.key(1))
     keys = jax.random.split(jax.random.key(2), 500)
@@ -119,6 +121,7 @@ def test_tries_come_first_from_the_best_and_last_from_anywhere():
     assert counts.min() > 120  # 167 each
 
 
+@pytest.mark.long
 def test_a_stopped_training_goes_on_to_the_same_teacher_and_mixes_with_nothing(begun, tmp_path):
     refused(begun, "--resume to go on")
     refused(begun, "another seed", resume=True, seed=1)

@@ -95,6 +95,7 @@ def test_it_learns_what_is_commanded(trained):
     assert np.median(errors) < 0.5 * before  # not each: so large a step size throws it back now and then
 
 
+@pytest.mark.long
 def test_it_says_how_it_went_and_what_made_it(trained):
     out, about, told = trained
     kept = json.loads((out / "policy.json").read_text())
@@ -110,6 +111,7 @@ def test_it_says_how_it_went_and_what_made_it(trained):
     assert about == {name: kept[name] for name in about}
 
 
+@pytest.mark.long
 def test_a_folder_in_use_is_left_alone(trained):
     out, _, _ = trained
     before = listing(out)

@@ -70,6 +70,7 @@ def test_a_known_difference_is_found(runs, tmp_path):
         assert line in text
 
 
+@pytest.mark.long
 def test_figures_show_something_and_repeat_byte_for_byte(runs, tmp_path):
     for out in ("one", "two"):
         report(runs, tmp_path / out)

@@ -170,6 +170,7 @@ def test_a_run_leaves_a_row_for_each_lane_and_evaluation(whole):
     assert int(state["clock"]["clock"].update) == 96
 
 
+@pytest.mark.long
 def test_a_run_begun_before_a_field_existed_goes_on_as_one_run(whole, tmp_path):
     out = shutil.copytree(whole, tmp_path / "run")
     probes.edit_json(out / "config.json", lambda told: [told["sizes"].pop("frame"), told["schedule"].pop("ask_at")])
@@ -201,11 +202,13 @@ def test_a_checkpoint_whose_lanes_had_another_state_is_refused_before_anything_i
     assert probes.files_of(out) == before
 
 
+@pytest.mark.long
 def test_the_same_command_gives_the_same_run(whole, tmp_path):
     run(tmp_path / "run")
     assert_same_run(tmp_path / "run", whole)
 
 
+@pytest.mark.long
 def test_stopped_and_killed_while_labelling(whole, tmp_path):
     out = tmp_path / "run"
     with stopping_at(3), pytest.raises(Interrupted, match="--resume"):
@@ -240,6 +243,7 @@ def test_stopped_and_killed_while_training(whole, tmp_path):
     assert_same_run(out, whole)
 
 
+@pytest.mark.long
 def test_killed_before_anything_was_saved(whole, tmp_path):
     out = tmp_path / "run"
     with killed_at(1, "_label"), pytest.raises(Killed):
@@ -269,6 +273,7 @@ def test_stopped_in_the_last_round_of_labels(whole, tmp_path):
     assert_same_run(out, whole)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("evaluating", [1, 60])  # before the first label, and after a stretch of steps
 def test_stopped_in_an_evaluation(whole, tmp_path, evaluating):
     """Twice: the stretch that waits for its evaluation is kept, and evaluated once the run goes on."""
@@ -292,6 +297,7 @@ def test_the_note_of_a_stretch_that_waits_is_of_its_step_and_whole(tmp_path):
             kept.read_due(tmp_path, 48, lanes=2)
 
 
+@pytest.mark.long
 def test_stopped_after_the_last_step(whole, tmp_path):
     out = tmp_path / "run"
     with stopping_at(6 + 6), pytest.raises(Interrupted):
@@ -306,6 +312,7 @@ def test_resuming_a_finished_run_changes_nothing(whole):
     assert probes.files_of(whole) == before
 
 
+@pytest.mark.long
 def test_a_torn_last_row_is_written_anew(stopped, whole, tmp_path):
     out = copied(stopped, tmp_path)
     with (out / "relative" / results.JSONL).open("a") as file:
@@ -435,6 +442,7 @@ def test_rows_that_were_lost_before_the_checkpoint_are_missed(stopped, tmp_path,
     refused(out, says)
 
 
+@pytest.mark.long
 def test_a_table_that_was_lost_is_missed_and_its_lanes_can_be_trained_anew(stopped, whole, tmp_path):
     out = copied(stopped, tmp_path)
     (out / "relative" / results.JSONL).unlink()
@@ -458,6 +466,7 @@ def test_a_finished_kind_is_looked_at_before_it_is_called_finished(whole, tmp_pa
     refused(out, "not a label file of cuelearner, or it is damaged")
 
 
+@pytest.mark.long
 def test_damaged_labels_of_a_run_that_goes_on_are_written_anew(stopped, whole, tmp_path):
     out = copied(stopped, tmp_path)
     (out / "relative" / label_files.PARQUET).write_bytes(b"PAR1")

@@ -64,6 +64,7 @@ def test_everything_comes_back_bit_by_bit(tmp_path, like):
     assert drawn == jax.random.uniform(state(3)["block"][1]["keys"][1])
 
 
+@pytest.mark.long
 def test_numbers_that_are_not_finite_come_back(tmp_path):
     odd = {"a": jnp.array([jnp.nan, jnp.inf, -jnp.inf, -0.0, 1e-42])}
     with checkpoints(tmp_path) as saved:
@@ -201,30 +202,30 @@ def other(change):
     return {"policy": like}
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
-        lambda item: item.update(weights=jax.ShapeDtypeStruct((3, 401), jnp.float32)),
-        lambda item: item.update(weights=jax.ShapeDtypeStruct((2, 400), jnp.float32)),
-        lambda item: item.update(weights=jax.ShapeDtypeStruct((1200,), jnp.float32)),
-        lambda item: item.update(more=jax.ShapeDtypeStruct((2,), jnp.float32)),
-        lambda item: item.pop("weights"),
-    ],
-    ids=["wider", "fewer lanes", "flat", "one more", "one fewer"],
-)
+OTHERS = {
+    "wider": lambda item: item.update(weights=jax.ShapeDtypeStruct((3, 401), jnp.float32)),
+    "fewer lanes": lambda item: item.update(weights=jax.ShapeDtypeStruct((2, 400), jnp.float32)),
+    "flat": lambda item: item.update(weights=jax.ShapeDtypeStruct((1200,), jnp.float32)),
+    "one more": lambda item: item.update(more=jax.ShapeDtypeStruct((2,), jnp.float32)),
+    "one fewer": lambda item: item.pop("weights"),
+}
+
+
+@pytest.mark.parametrize("change", ["wider", *(pytest.param(name, marks=pytest.mark.long) for name in [*OTHERS][1:])])
 def test_a_checkpoint_of_other_shapes_is_refused(tmp_path, change):
     save(tmp_path, 5)
     with pytest.raises(UserError, match="of another configuration, or of another version") as refused:
-        restore(tmp_path, other(change))
+        restore(tmp_path, other(OTHERS[change]))
     assert "delete" not in str(refused.value)  # nothing is wrong with it
     before = probes.files_of(tmp_path)
     with checkpoints(tmp_path, read_only=True) as saved:
         saved.compare({"policy": shapes(state())})
         with pytest.raises(UserError, match="of another configuration, or of another version"):
-            saved.compare(other(change))
+            saved.compare(other(OTHERS[change]))
     assert probes.files_of(tmp_path) == before
 
 
+@pytest.mark.long
 def test_what_a_refused_checkpoint_leaves_behind_is_silent(tmp_path, caplog, monkeypatch):
     save(tmp_path, 5)
     complaints = []
@@ -248,6 +249,7 @@ def test_what_complains_later_still_of_a_closed_event_loop_is_silent(tmp_path, m
     assert [str(complaint.exc_value) for complaint in complaints] == ["out of ink"]
 
 
+@pytest.mark.long
 def test_what_a_refused_write_leaves_behind_is_silent(tmp_path, monkeypatch, recwarn):
     async def fragment():
         pass

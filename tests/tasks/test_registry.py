@@ -50,6 +50,7 @@ def test_a_task_is_loaded_when_it_is_asked_for():
     assert "anymal" not in found
 
 
+@pytest.mark.long
 def test_a_report_loads_no_environment():
     code = "import cuelearner_jax.cli.dispatch, cuelearner_jax.cli.report, cuelearner_jax.report.document"
     assert loads(code) == "[]"

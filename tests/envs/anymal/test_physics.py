@@ -63,6 +63,7 @@ def in_c(state, action, number):
     return data
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("number", range(7), ids=SCENES[:7])
 def test_a_step_of_control_is_that_of_c_mujoco(scenes, stepped, number):
     data, body = in_c(*scenes, number), stepped.pipeline_state.body

@@ -319,6 +319,7 @@ def test_records_hold_the_path_of_every_shot_and_what_the_environment_paid():
             np.testing.assert_allclose(path.positions[0], paths[number - 1].positions[-1], atol=1e-6)
 
 
+@pytest.mark.long
 def test_a_recorded_policy_sees_the_state_and_its_strikes_are_turned():
     turned = make_environment(BilliardsConfig("one_ball", action_turn_deg=30.0))
 

@@ -268,6 +268,7 @@ def test_a_table_without_a_shipped_teacher_says_what_to_do():
         make_teacher(config, make_environment(config))
 
 
+@pytest.mark.long
 def test_the_nearest_good_shot_is_that_of_the_averaged_values(wins):
     """Against sums instead of Fourier transforms, from 40 degrees to the left of straight on."""
     spread, share = np.deg2rad(2.0), 0.6

@@ -62,6 +62,7 @@ def looker(image, strip):
 # --- records ---------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", [name for name in ENDS if name != "fall"])  # the simple robot does not fall
 def test_frames_follow_each_other_and_end_as_the_rewards_say(records, name):
     frames, rewards = records[name]
@@ -274,11 +275,13 @@ def test_gif_shows_each_step_and_then_the_end(records, tmp_path):
     assert pictures[-1][-1, -1].tolist() == [1, 1, 1]  # white stays white on a page
 
 
+@pytest.mark.long
 def test_gif_of_many_steps_is_small(records, tmp_path):
     drawing.animate(Robot(), records["timeout"][0], tmp_path / "film.gif")
     assert (tmp_path / "film.gif").stat().st_size < 20_000 * STEPS
 
 
+@pytest.mark.long
 @pytest.mark.filterwarnings("ignore:os.fork:RuntimeWarning")  # by the reader of this test
 def test_mp4_has_even_sides_and_every_picture(records, tmp_path):
     frames = records["timeout"][0][:10]  # an end after seven steps, then an episode without one

@@ -226,6 +226,7 @@ def test_a_way_is_the_straight_line_where_the_goal_is_in_view_and_else_leads_ove
     assert np.sum(kinds, axis=0).min() >= 10
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("index", WORLDS)
 def test_a_way_gets_shorter_by_what_is_walked_along_it(teacher, index):
     world = one(teacher.env.worlds, index)
@@ -283,6 +284,7 @@ def test_the_teacher_points_at_the_next_place_in_the_bodys_frame(teacher, index)
     np.testing.assert_allclose(answers[sees], np.asarray(toward)[sees], atol=1e-4)
 
 
+@pytest.mark.long
 def test_whoever_follows_the_teacher_arrives(teacher):
     measure = jax.jit(lambda teacher, key: evaluate.rollout(Taught(teacher), teacher.env, key, 24, 24 * 160))
     found = {name: float(value) for name, value in measure(teacher, jax.random.key(5)).items()}

@@ -93,6 +93,7 @@ def test_they_are_counted_for_a_quadruped_too():
         assert [name for name, value in sides.items() if value] == ["passed_right"]
 
 
+@pytest.mark.long
 def test_the_sides_of_an_episode_are_its_outcome():
     state, _ = TWO.reset(jax.random.key(0))
     for counts, names in [
