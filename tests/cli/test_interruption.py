@@ -103,6 +103,6 @@ def test_a_closed_standard_error_and_a_path_like_markup_disturb_no_sweep(tmp_pat
 
 
 def test_a_reader_that_has_gone_is_told_by_the_status():
-    script = ["bash", "-c", '"$@" | head -0; exit ${PIPESTATUS[0]}', "bash", *ENTRY, "sweep", "billiards", "--help"]
+    script = ["bash", "-c", '"$@" | head -0; exit ${PIPESTATUS[0]}', "bash", *ENTRY, "--help"]
     done = subprocess.run(script, capture_output=True, text=True, check=False, timeout=120)
     assert (done.returncode, done.stderr) == (141, "")
