@@ -23,11 +23,14 @@ from cuelearner_jax.errors import UserError, closest
 from cuelearner_jax.evaluate import SPLITS, one_lane
 from cuelearner_jax.guides import registry
 from cuelearner_jax.policies import Agent
-from cuelearner_jax.runs import failures, instalments
-from cuelearner_jax.runs.grid import LARGEST_SEED, Grid, check_grid
+from cuelearner_jax.runs import failures
+from cuelearner_jax.runs.grid import LARGEST_SEED
 from cuelearner_jax.runs.lanes import LaneGroup
 from cuelearner_jax.runs.memory_report import memory_report
+from cuelearner_jax.runs.order import checked
 from cuelearner_jax.runs.training import Training, mean_of_finite
+from cuelearner_jax.studies.train import suggested
+from cuelearner_jax.task import Preset
 from cuelearner_jax.terminal import progress_bars
 from cuelearner_jax.types import Teacher
 
@@ -77,8 +80,8 @@ def train(
     config: RunConfig | str = "quickstart",
     *,
     guidance: Sequence[str] = (),
-    labels: Sequence[int] = (100,),
-    seeds: int | Sequence[int] = 8,
+    labels: Sequence[int] | None = None,
+    seeds: int | Sequence[int] | None = None,
     split: str = "validation",
     progress: bool = True,
 ) -> Run:
@@ -90,9 +93,10 @@ def train(
         world: where.
         teacher: who answers; needed by kinds of guidance that ask.
         config: everything else, or the name of one of the task's presets; its world is the one given.
-        guidance: kinds of guidance (default: all that the world can have with what is given).
-        labels: label budgets.
-        seeds: their number (0, 1, ...), or the seeds.
+        guidance: kinds of guidance (default: those that the preset compares, or all that the world can have; without a
+            teacher those that ask none).
+        labels: label budgets (default: the preset's, or 100).
+        seeds: their number (0, 1, ...), or the seeds (default: the preset's, or 8).
         split: episodes of the evaluations: "validation", or "tuning" for choosing settings.
         progress: show progress bars on standard error.
 
@@ -103,20 +107,22 @@ def train(
     if teacher is not None:
         user_code.answers_in("teacher", arguments.teacher("teacher", teacher), world.env)
     guidance = [arguments.text("guidance", kind) for kind in arguments.several("guidance", guidance, "kinds")]
-    budgets = tuple(arguments.budget("labels", one) for one in arguments.several("labels", labels, "label budgets"))
     arguments.text("split", split, SPLITS)
     arguments.flag("progress", progress)
-    run_config = dataclasses.replace(_config(world, config), task=world.config)
-    configuration.check(run_config)
-    world.task.check_evaluations(run_config)
-    asked = guidance or registry.possible(world.env, taught=teacher is not None)
-    names = tuple(registry.resolve(kind).name for kind in asked)
-    grid = Grid(names, _seeds(seeds), budgets)
-    check_grid(grid)
-    instalments.check(run_config, grid)
+    preset = _preset(world, config)
+    run_config = preset.config
+    grid = suggested(world.task, preset, taught=teacher is not None)
+    if guidance:
+        grid = dataclasses.replace(grid, guidance=tuple(guidance))
+    if labels is not None:
+        budgets = [arguments.budget("labels", one) for one in arguments.several("labels", labels, "label budgets")]
+        grid = dataclasses.replace(grid, labels=tuple(budgets))
+    if seeds is not None:
+        grid = dataclasses.replace(grid, seeds=_seeds(seeds))
+    grid = checked(world.task, run_config, grid)
     mesh = lane_mesh()
     env = place(mesh, world.env, SHARED)
-    kinds = [registry.make(kind, run_config.sizes, env) for kind in names]
+    kinds = [registry.make(kind, run_config.sizes, env) for kind in grid.guidance]
     asking = [kind.name for kind in kinds if kind.asks]
     if asking and teacher is None:
         raise UserError(f"guidance {asking[0]!r} asks a teacher: give one, for instance teacher_of(world)")
@@ -152,18 +158,19 @@ def _seeds(seeds: int | Sequence[int]) -> tuple[int, ...]:
     return tuple(range(arguments.whole("seeds", seeds, 1, LARGEST_SEED)))
 
 
-def _config(world: World, config: RunConfig | str) -> RunConfig:
+def _preset(world: World, config: RunConfig | str) -> Preset:
+    """The preset of that name, or one of a configuration, in a world. Raises UserError if there is none."""
     if isinstance(config, RunConfig):
         groups = ("sizes", "scalars", "schedule")
-        return dataclasses.replace(
-            config, **{name: configuration.settled(getattr(config, name), name) for name in groups}
-        )
+        settled = {name: configuration.settled(getattr(config, name), name) for name in groups}
+        config = dataclasses.replace(config, task=world.config, **settled)
+        return Preset("your own", config, labels=(100,), seeds=8)
     presets = world.task.presets
     if not isinstance(config, str):
         raise arguments.refused("config", config, "a RunConfig, or the name of a preset")
     if config not in presets:
         raise UserError(f"config: unknown preset {config!r}{closest(config, presets)}")
-    return presets[config].config
+    return dataclasses.replace(presets[config], config=dataclasses.replace(presets[config].config, task=world.config))
 
 
 def _table(group: LaneGroup, row: dict[str, Any]) -> pa.Table:

@@ -18,7 +18,7 @@ from cuelearner_jax.api.acting import load_policy
 from cuelearner_jax.api.worlds import World
 from cuelearner_jax.cli import label_commands
 from cuelearner_jax.cli.parsing import PAPER, about, code_of, out, parse, preset_of, taken, task_of
-from cuelearner_jax.cli.shared_options import Flag, TaskT, asking_kind, preset_kinds
+from cuelearner_jax.cli.shared_options import Flag, TaskT
 from cuelearner_jax.config import GuideScalars, GuideSizes, RunConfig
 from cuelearner_jax.environment import offers
 from cuelearner_jax.errors import UserError
@@ -32,6 +32,7 @@ from cuelearner_jax.runs.grid import LARGEST_SEED
 from cuelearner_jax.runs.trained import PolicySource
 from cuelearner_jax.storage import label_files
 from cuelearner_jax.storage.folders import claimed
+from cuelearner_jax.studies.train import asking_kind, preset_kinds
 from cuelearner_jax.task import Task, shape_of
 from cuelearner_jax.tasks import registry
 from cuelearner_jax.terminal import Interrupted, console, interruptible

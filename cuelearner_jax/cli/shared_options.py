@@ -9,11 +9,10 @@ from typing import Annotated, Generic, TypeVar
 import tyro
 
 from cuelearner_jax.config import RunConfig
-from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.runs.grid import Grid
 from cuelearner_jax.runs.order import Order
 from cuelearner_jax.runs.shards import Shard
-from cuelearner_jax.task import Preset, Task, shape_of
+from cuelearner_jax.task import Task
 
 TaskT = TypeVar("TaskT")
 Flag = tyro.conf.FlagCreatePairsOff
@@ -56,14 +55,3 @@ class Training(Generic[TaskT]):
     def done(self) -> str:
         """What is told at the end."""
         return f"done: {self.out} (see it with: cuelearner report {self.out} --out {self.out}/report)"
-
-
-def preset_kinds(task: Task, preset: Preset) -> tuple[str, ...]:
-    """The kinds of guidance that a preset compares: those it names, or all that the task can have."""
-    return preset.guidance or guidances.possible(shape_of(task, preset.config.task), taught=task.teacher is not None)
-
-
-def asking_kind(kinds: tuple[str, ...]) -> str:
-    """The first of the kinds that asks a teacher, or else the first."""
-    asking = [kind for kind in kinds if guidances.resolve(kind).asks]
-    return (asking or list(kinds))[0]

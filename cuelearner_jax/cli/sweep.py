@@ -7,12 +7,13 @@ from pathlib import Path
 from typing import Generic, Literal
 
 from cuelearner_jax.cli.parsing import about, out, parse, preset_of, task_of
-from cuelearner_jax.cli.shared_options import TaskT, Training, preset_kinds
+from cuelearner_jax.cli.shared_options import TaskT, Training
 from cuelearner_jax.runs import submission, sweep
 from cuelearner_jax.runs.cluster import Job
 from cuelearner_jax.runs.grid import Grid, seeds_of
 from cuelearner_jax.runs.order import Plan, planned
 from cuelearner_jax.runs.shards import Shard
+from cuelearner_jax.studies.train import suggested
 
 
 @dataclass(frozen=True)
@@ -49,7 +50,7 @@ def run(arguments: list[str]) -> None:
     default = kind(
         preset.config,
         out=Path("runs") / f"{task.name}-{name}",
-        guidance=preset_kinds(task, preset),
+        guidance=suggested(task, preset).guidance,
         labels=preset.labels,
         seeds=preset.seeds,
         first_seed=preset.first_seed,

@@ -7,10 +7,11 @@ from pathlib import Path
 from typing import Generic
 
 from cuelearner_jax.cli.parsing import about, out, parse, preset_of, task_of
-from cuelearner_jax.cli.shared_options import TaskT, Training, asking_kind, preset_kinds
+from cuelearner_jax.cli.shared_options import TaskT, Training
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.runs import sweep
 from cuelearner_jax.runs.grid import LARGEST_SEED, Grid
+from cuelearner_jax.studies.train import asking_kind, preset_kinds
 
 
 @dataclass(frozen=True)

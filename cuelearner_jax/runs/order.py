@@ -63,13 +63,32 @@ class Plan:
         return sum(shares) / len(shares)
 
 
+def checked(task: Task, config: RunConfig, grid: Grid, given: bool = False) -> Grid:
+    """Return the grid with its kinds by their own names; code is loaded here.
+
+    Args:
+        task, config, grid: what is to be trained.
+        given: do labels come from a file?
+
+    Raises:
+        UserError: what makes no sense.
+    """
+    configuration.check(config)
+    grid = dataclasses.replace(grid, guidance=tuple(guidances.resolve(kind).name for kind in grid.guidance))
+    check_grid(grid)
+    instalments.check(config, grid, given=given)
+    task.check_evaluations(config)
+    env = shape_of(task, config.task)
+    for kind in grid.guidance:
+        guidances.make(kind, config.sizes, env)
+    return grid
+
+
 def planned(order: Order) -> Plan:
     """What `run` does with an order. Raises UserError for what it would refuse, but for too little memory."""
-    configuration.check(order.config)
     tracking.check(order.track)
-    names = tuple(guidances.resolve(kind).name for kind in order.grid.guidance)  # code is loaded here
-    order = dataclasses.replace(order, grid=dataclasses.replace(order.grid, guidance=names))
-    check_grid(order.grid)
+    given = order.labels_from is not None
+    order = dataclasses.replace(order, grid=checked(order.task, order.config, order.grid, given))
     piece, sweep = None, order.out
     if order.shard:
         piece = order.shard.described(order.grid.seeds)
@@ -77,11 +96,6 @@ def planned(order: Order) -> Plan:
         begun = not order.overwrite and (folder / CONFIG).is_file()
         grid = dataclasses.replace(order.grid, seeds=order.shard.seeds(order.grid.seeds))
         order = dataclasses.replace(order, grid=grid, out=folder, resume=order.resume or begun)
-    instalments.check(order.config, order.grid, given=order.labels_from is not None)
-    env = shape_of(order.task, order.config.task)
-    order.task.check_evaluations(order.config)
-    for kind in order.grid.guidance:
-        guidances.make(kind, order.config.sizes, env)
     config, labels = order.config, None
     if order.labels_from:
         labels = read_labels(order.labels_from, order.task, config.task, config.sizes, config.scalars, order.grid)
