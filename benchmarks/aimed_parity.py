@@ -20,8 +20,9 @@ from pymunk_table import FINE_STEP, USUAL_STEP, PymunkTable
 
 from cuelearner_envs.billiards import Table, simulate_many
 from cuelearner_envs.billiards.config import BilliardsConfig, make_environment
-from cuelearner_jax.actions import DIRECTIONS, to_angle
 from cuelearner_jax.evaluate import episodes
+from cuelearner_jax.spaces import DIRECTIONS
+from cuelearner_jax.spaces.directions import to_angle
 from cuelearner_jax.storage.provenance import provenance
 
 WORLDS = (BilliardsConfig("easy"), BilliardsConfig("regulation"))
@@ -35,7 +36,7 @@ def situations(env: Any, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray
         k_aim, k_env = jax.random.split(key)
         aims = env.aims(obs)
         number = jax.random.categorical(k_aim, jnp.where(aims.possible, 0.0, -jnp.inf))
-        action = jnp.where(aims.possible.any(), aims.actions[number], DIRECTIONS.uniform(k_aim, ()))
+        action = jnp.where(aims.possible.any(), aims.actions[number], DIRECTIONS.sample(k_aim, ()))
         after, step = env.step(k_env, state, action)
         return (after, step.obs), (state.positions, state.pocketed, to_angle(action), aims.possible.any())
 

@@ -25,7 +25,7 @@ from cuelearner_envs.anymal import policy
 from cuelearner_envs.anymal.environment import LeggedNavigation
 from cuelearner_envs.navigation.config import NavigationConfig
 from cuelearner_envs.navigation.config import make_environment as make_navigation
-from cuelearner_jax import actions
+from cuelearner_jax.spaces import directions
 from cuelearner_jax.storage.provenance import provenance
 
 RESULTS = Path(__file__).parent / "results" / "anymal_speed.json"
@@ -62,7 +62,7 @@ def rates(env: LeggedNavigation, see: Callable, robots: int, steps: int, rounds:
         def one(carry: tuple, key: jax.Array) -> tuple[tuple, None]:
             state, total = carry
             k_action, k_step = jax.random.split(key)
-            told = actions.uniform(k_action, (robots,))
+            told = directions.uniform(k_action, (robots,))
             state, done = jax.vmap(env.step)(jax.random.split(k_step, robots), state, told)
             return (state, total + jax.vmap(see)(done).sum()), None
 

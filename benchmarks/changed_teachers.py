@@ -21,8 +21,9 @@ import numpy as np
 
 from cuelearner_envs.billiards.config import BilliardsConfig, make_environment
 from cuelearner_envs.billiards.teacher import LocalSearchTeacher, SearchTeacher
-from cuelearner_jax.actions import distance, expected_values, to_angle
 from cuelearner_jax.evaluate import episodes
+from cuelearner_jax.spaces import DIRECTIONS
+from cuelearner_jax.spaces.directions import expected_values, to_angle
 from cuelearner_jax.storage.provenance import provenance
 from cuelearner_jax.tasks.billiards import SCENARIOS, make_teacher
 
@@ -81,7 +82,7 @@ def compare(name: str, table: Any, tables: int, aim_error_deg: float) -> dict[st
         found = worth[np.arange(tables), numbers]
         row[who] = {
             "of_the_best": float(found.sum() / worth.max(1).sum()),
-            "same_within_0.15_deg": float((np.rad2deg(np.asarray(distance(choice, best))) < 0.15).mean()),
+            "same_within_0.15_deg": float((np.rad2deg(np.asarray(DIRECTIONS.distance(choice, best))) < 0.15).mean()),
         }
     print(json.dumps(row), flush=True)
     return row

@@ -6,7 +6,7 @@
 JaxNav needs nothing beside what this project has; `--no-deps` leaves that as it is. It gets one agent, 270 beams over
 270 degrees and else its defaults: random maps of 11 m by 11 m, not checked for a way to the goal, lidar up to 6 m.
 "JaxNav, 20 m" has our halls' size and our lidar's range of 10 m. Ours: halls of 20 m by 20 m, 271 beams over 270
-degrees, routes that lead to the goal. Actions are random. All observations are held and added up, so that none is
+degrees, routes that lead to the goal. Space are random. All observations are held and added up, so that none is
 optimised away. "final_obs too" also holds what an episode's last step led to: a second scan, which training never asks
 for and JaxNav does not offer. Rounds are interleaved; figures are medians over rounds, compile time apart. Writes
 benchmarks/results/navigation_speed.json with --write.
@@ -33,7 +33,7 @@ import jax.numpy as jnp
 
 from cuelearner_envs.navigation.config import NavigationConfig, make_environment
 from cuelearner_envs.navigation.environment import Navigation
-from cuelearner_jax.actions import from_angle
+from cuelearner_jax.spaces.directions import from_angle
 from cuelearner_jax.storage.provenance import provenance
 
 RESULTS = Path(__file__).parent / "results" / "navigation_speed.json"

@@ -26,8 +26,6 @@ import scipy.stats
 from flax import struct
 
 import cuelearner_jax as cl
-from cuelearner_jax import actions as geometry
-from cuelearner_jax.actions import DIRECTIONS
 from cuelearner_jax.agents.choice import greedy_actions, values
 from cuelearner_jax.config import AgentSizes
 from cuelearner_jax.evaluate import episodes, rollout
@@ -37,6 +35,8 @@ from cuelearner_jax.runs import grid as runs
 from cuelearner_jax.runs.grid import Grid
 from cuelearner_jax.runs.kept import restore_policies
 from cuelearner_jax.runs.lanes import LaneGroup
+from cuelearner_jax.spaces import DIRECTIONS
+from cuelearner_jax.spaces import directions as geometry
 from cuelearner_jax.storage.provenance import provenance
 from cuelearner_jax.tasks import registry
 from cuelearner_jax.tasks.billiards import SHIPPED_TEACHERS

@@ -6,21 +6,20 @@ adaptation gives another base policy than uniform actions.
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray
 
-from cuelearner_jax import choosing, user_code
-from cuelearner_jax.actions import only_actions
+from cuelearner_jax import user_code
+from cuelearner_jax.choosing import chosen
 from cuelearner_jax.config import GuideScalars, GuideSizes, Scalars
 from cuelearner_jax.environment import Environment, actions_of
-from cuelearner_jax.feedback.answers import of_strength
 from cuelearner_jax.guides.base import Guide
 from cuelearner_jax.guides.refining import within
 from cuelearner_jax.policies import Policy, acted, best_actions, named
+from cuelearner_jax.spaces import DIRECTIONS
 from cuelearner_jax.types import GuideState, Label, Stream, Teacher
 
 ONE_BY_ONE = GuideSizes()  # questions as they come, of one strength: as a page asks them
@@ -55,26 +54,12 @@ def share(budget: int, instalment: int, instalments: int, sizes: GuideSizes) -> 
     return min(-(-rounds * (instalment + 1) // instalments) * sizes.labels_per_round, budget)
 
 
-def strength(
-    scalars: GuideScalars, position: Int[Array, "*positions"] | int, budget: Int[Array, ""] | int
-) -> Float[Array, "*positions"]:
-    """How strong label number `position` (from 0) of a budget is where labels fall [deg].
-
-    From `scalars.eps_deg` for the first to `scalars.eps_last_deg` for the last, by the same factor from one to the
-    next; the only one of a budget is as strong as a first.
-    """
-    through = jnp.clip(position / jnp.maximum(budget - 1, 1), 0.0, 1.0)
-    falling = scalars.eps_deg * (scalars.eps_last_deg / scalars.eps_deg) ** through
-    return jnp.where(through < 1, falling, scalars.eps_last_deg)
-
-
 def empty_labels(
     slots: int,
     obs_size: int,
     action_size: int,
     answer_width: int,
     with_base: bool = False,
-    with_eps: bool = False,
 ) -> Label:
     """`slots` rows of padding.
 
@@ -82,7 +67,6 @@ def empty_labels(
         slots: their number.
         obs_size, action_size, answer_width: entries of a row.
         with_base: is kept what was proposed before any correction?
-        with_eps: is kept how strong each answer is?
     """
     return Label(
         obs=jnp.zeros((slots, obs_size)),
@@ -90,20 +74,7 @@ def empty_labels(
         answer=jnp.zeros((slots, answer_width)),
         valid=jnp.zeros((slots,), bool),
         base=jnp.zeros((slots, action_size)) if with_base else None,
-        eps_deg=jnp.zeros((slots,)) if with_eps else None,
     )
-
-
-def as_kept(labels: Label, guide: GuideState, scalars: GuideScalars) -> Label:
-    """Labels (slots, ...) that were given elsewhere, with strengths if the guide keeps those.
-
-    Raises ValueError for labels with strengths of their own, of which the guide keeps none.
-    """
-    if guide.labels.eps_deg is None and labels.eps_deg is not None:
-        raise ValueError("these labels have strengths of their own: make the guide with sizes.eps_falls")
-    if guide.labels.eps_deg is None or labels.eps_deg is not None:
-        return labels
-    return labels.replace(eps_deg=jnp.full(labels.valid.shape, scalars.eps_deg, jnp.float32))
 
 
 def start(
@@ -120,7 +91,7 @@ def start(
     Raises ValueError if its questions are to be chosen and there is nothing to choose them by.
     """
     candidates = sizes.candidates
-    by_members = candidates > 1 and sizes.chosen_by == "members" and not sizes.ask_all
+    by_members = candidates > 1 and not sizes.ask_all
     if by_members and guidance.asks and not guidance.has_members:
         raise ValueError(f"guidance {guidance.name!r} has no members whose disagreement could choose its questions")
     state, obs = env.reset(k_env) if candidates == 1 else jax.vmap(env.reset)(jax.random.split(k_env, candidates))
@@ -130,9 +101,8 @@ def start(
             slots,
             env.obs_size,
             actions_of(env).size,
-            guidance.answer_width,
+            guidance.form.width(actions_of(env)) if guidance.form else 0,
             with_base=guidance.kind.sees_base,
-            with_eps=guidance.asks and sizes.eps_falls,
         ),
         budget=jnp.asarray(budget, jnp.int32),
         asked=jnp.zeros((), jnp.int32),
@@ -162,7 +132,8 @@ def question(
 ) -> Float[Array, "*candidates action"]:
     """The action to ask about in the guide's situation, or in each of its candidates.
 
-    `bound`: questions stay within it of what the base policy does [rad]; None: wherever the guidance leads.
+    `bound`: questions stay within it of what the base policy does, as `log` of the space counts; None: wherever the
+    guidance leads.
     """
     return _asked_of(guidance, env, scalars, guide, proposed(env, base, guide, keys), keys, bound)
 
@@ -178,7 +149,7 @@ def _asked_of(
 ) -> Float[Array, "*candidates action"]:
     """What is asked about where the base policy proposes `first`; see `question`."""
     if bound is not None:
-        scalars = within(scalars, bound)
+        scalars = within(actions_of(env), scalars, bound)
 
     def one(key: PRNGKeyArray, obs: Array, first: Array) -> Array:
         asked = guidance.question(key, guide.model, env, obs, first, scalars)
@@ -196,13 +167,12 @@ def record(
     answer: Float[Array, " answer"],
     answered: Bool[Array, ""] | bool,
     base: Float[Array, " action"] | None = None,
-    eps_deg: Float[Array, ""] | None = None,
 ) -> GuideState:
     """The guide with an answer in the row `position` of its labels; it counts within the budget alone.
 
-    `base`: what was proposed in place of the action, `eps_deg`: how strong the answer is [deg], if labels keep that.
+    `base`: what was proposed in place of the action, if labels keep that.
     """
-    label = Label(guide.obs, action, answer, jnp.asarray(answered) & (position < guide.budget), base, eps_deg)
+    label = Label(guide.obs, action, answer, jnp.asarray(answered) & (position < guide.budget), base)
     put = lambda rows, row: jax.lax.dynamic_update_index_in_dim(rows, row, position, 0)  # noqa: E731
     asked = jnp.minimum(position + 1, guide.budget)
     return guide.replace(labels=jax.tree.map(put, guide.labels, label), asked=asked)
@@ -243,17 +213,15 @@ def ask(
     lane_key: PRNGKeyArray,
     position: Int[Array, ""],
     bound: Float[Array, ""] | None = None,
-    sizes: GuideSizes = ONE_BY_ONE,
 ) -> GuideState:
     """Question number `position`, answered by a simulated teacher, recorded and acted on.
 
     Args:
         guidance, env, teacher, scalars, base: who asks whom about what.
-        guide: of `start` with the same `sizes`.
+        guide: where it stands.
         lane_key: of all questions.
         position: of this one, from 0.
         bound: see `question`.
-        sizes: who chooses among candidates.
 
     Raises:
         ValueError: the guidance asks nothing.
@@ -263,13 +231,9 @@ def ask(
     keys = question_keys(lane_key, position)
     proposals = proposed(env, base, guide, keys)
     actions = _asked_of(guidance, env, scalars, guide, proposals, keys, bound)
-    watches = sizes.candidates > 1 and sizes.chosen_by == "teacher"
-    away = choosing.parting(env, teacher, scalars, guide, actions) if watches else None
-    there, action, first = choosing.chosen(guidance, env, guide, actions, proposals, away)
-    eps_deg = None if guide.labels.eps_deg is None else strength(scalars, position, guide.budget)
-    strong = of_strength(scalars, eps_deg)
-    answer, answered = guidance.form.answer(keys.answer, env, teacher, there.env, there.obs, action, strong)
-    told = record(there, position, action, answer, answered, first if guidance.kind.sees_base else None, eps_deg)
+    there, action, first = chosen(guidance, env, guide, actions, proposals)
+    answer, answered = guidance.form.answer(keys.answer, env, teacher, there.env, there.obs, action, scalars)
+    told = record(there, position, action, answer, answered, first if guidance.kind.sees_base else None)
     return proceed(env, told.replace(env=guide.env, obs=guide.obs), actions, keys)
 
 
@@ -295,15 +259,14 @@ def ask_all(
     proposals = proposed(env, base, guide, keys)
     actions = _asked_of(guidance, env, scalars, guide, proposals, keys, bound)
     positions = position + jnp.arange(count)
-    eps_deg = None if guide.labels.eps_deg is None else strength(scalars, positions, guide.budget)
 
-    def one(key: PRNGKeyArray, state: Any, obs: Array, action: Array, eps_deg: Array | None) -> tuple[Array, Array]:
-        return form.answer(key, env, teacher, state, obs, action, of_strength(scalars, eps_deg))
+    def one(key: PRNGKeyArray, state: Any, obs: Array, action: Array) -> tuple[Array, Array]:
+        return form.answer(key, env, teacher, state, obs, action, scalars)
 
     answer_keys = jax.random.split(keys.answer, count)
-    answers, answered = jax.vmap(one)(answer_keys, guide.env, guide.obs, actions, eps_deg)
+    answers, answered = jax.vmap(one)(answer_keys, guide.env, guide.obs, actions)
     first = proposals if guidance.kind.sees_base else None
-    rows = Label(guide.obs, actions, answers, answered & (positions < guide.budget), first, eps_deg)
+    rows = Label(guide.obs, actions, answers, answered & (positions < guide.budget), first)
     put = lambda known, new: jax.lax.dynamic_update_slice_in_dim(known, new, position, 0)  # noqa: E731
     asked = jnp.minimum(position + count, guide.budget)
     told = guide.replace(labels=jax.tree.map(put, guide.labels, rows), asked=asked)
@@ -322,9 +285,9 @@ def blame(
         states, obs = jax.tree.map(lambda leaf: leaf[None], (states, obs))
     if base is not None:
         assert key is not None
-        user_code.check_actions(only_actions(base.act(key, states, obs)), named(base))
+        user_code.check_actions(DIRECTIONS.only_actions(base.act(key, states, obs)), named(base))
     if teacher is not None:
-        given = only_actions(best_actions(teacher, states, obs))
+        given = DIRECTIONS.only_actions(best_actions(teacher, states, obs))
         user_code.check_actions(given, f"teacher {type(teacher).__name__}")
 
 
@@ -366,8 +329,7 @@ def label_round(
         bound: see `question`.
     """
     first, until = guide.asked, guide.budget if until is None else until
-    one_by_one = partial(ask, sizes=sizes)
-    asking, at_once = (ask_all, sizes.candidates) if sizes.ask_all else (one_by_one, 1)
+    asking, at_once = (ask_all, sizes.candidates) if sizes.ask_all else (ask, 1)
 
     def one(guide: GuideState, offset: Int[Array, ""]) -> tuple[GuideState, None]:
         asked = asking(guidance, env, teacher, scalars, base, guide, lane_key, first + offset, bound)
@@ -385,9 +347,5 @@ def label_round(
 def take_labels(
     guidance: Guide, env: Environment, scalars: GuideScalars, labels: Label, guide: GuideState, lane_key: Any
 ) -> GuideState:
-    """The guide with labels (slots, ...) that were given elsewhere, and a model fitted to them once.
-
-    Raises ValueError if they have strengths of their own and the guide keeps none.
-    """
-    labels = as_kept(labels, guide, scalars)
+    """The guide with labels (slots, ...) that were given elsewhere, and a model fitted to them once."""
     return fit(guidance, env, scalars, guide.replace(labels=labels, asked=guide.budget), lane_key)

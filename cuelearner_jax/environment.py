@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from cuelearner_jax.actions import DIRECTIONS, Actions
+from cuelearner_jax.spaces import DIRECTIONS, Space
 from cuelearner_jax.types import EnvState, Step
 
 
@@ -170,7 +170,7 @@ def offers(env: Any, name: str) -> bool:
     return getattr(env, name, None) is not None
 
 
-def actions_of(env: Any) -> Actions:
+def actions_of(env: Any) -> Space:
     """What an environment takes for actions: its `actions`, or directions in the plane."""
     return getattr(env, "actions", DIRECTIONS)
 
@@ -184,7 +184,7 @@ class Spaces(NamedTuple):
     """What networks have to know of an environment."""
 
     obs_size: int
-    actions: Actions
+    actions: Space
     features: tuple[int, int] | None = None  # entries of `Features.own` and `Features.turned`, if it offers any
     aims: int | None = None  # entries of one row of `Aims.features`, if it offers any
 

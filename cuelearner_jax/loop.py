@@ -199,7 +199,8 @@ class Lane(NamedTuple):
         """
         base, bound = Uniform(self.learner.actions), None
         if params is not None:
-            base, bound = Agent(params, self.sizes, self.learner.actions, env), scalars.radians("ask_bound")
+            base = Agent(params, self.sizes, self.learner.actions, env)
+            bound = self.learner.actions.from_unit(scalars.ask_bound_deg)
         guide = asking.label_round(
             self.guidance, self.sizes, env, teacher, scalars, base, state.guide, state.key, until, bound
         )
@@ -279,7 +280,7 @@ class Lane(NamedTuple):
         agent = state.agent
         base = jax.lax.cond(
             clock.step < schedule.random_steps,
-            lambda: self.learner.actions.uniform(key, (self.sizes.num_envs,)),
+            lambda: self.learner.actions.sample(key, (self.sizes.num_envs,)),
             lambda: self.turned(scalars, self.learner.greedy(env, agent), key),
         )
         return jax.lax.cond(
@@ -294,8 +295,9 @@ class Lane(NamedTuple):
         """Actions each turned by a normal angle; as they are where there is no noise."""
         if not self.noisy:
             return actions
-        turns = jax.random.normal(key, (actions.shape[0],))
-        return self.learner.actions.toward(actions, turns, scalars.radians("action_noise"))
+        space = self.learner.actions
+        changes = jax.random.normal(key, (actions.shape[0], len(space.cues)))
+        return space.toward(actions, changes, space.from_unit(scalars.action_noise_deg))
 
     def guide(
         self,
@@ -314,7 +316,8 @@ class Lane(NamedTuple):
         where = (state.guide.model, env, agent.obs, base, agent.guided, scalars)
         if len(schedule.ask_at) == 1:
             return guidance.act(*where)
-        bound = jnp.where(clock.step >= schedule.ask_at[1], scalars.radians("ask_bound"), jnp.pi)
+        ask_bound = self.learner.actions.from_unit(scalars.ask_bound_deg)
+        bound = jnp.where(clock.step >= schedule.ask_at[1], ask_bound, jnp.pi)
         return guidance.act_within(bound, *where)
 
 

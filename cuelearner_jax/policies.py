@@ -18,7 +18,6 @@ from flax import struct
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from cuelearner_jax import types, user_code
-from cuelearner_jax.actions import DIRECTIONS, Actions, only_actions, rotate
 from cuelearner_jax.agents.choice import greedy_actions
 from cuelearner_jax.config import AgentSizes, GuideScalars, GuideSizes
 from cuelearner_jax.devices import portions
@@ -27,6 +26,7 @@ from cuelearner_jax.errors import UserError, raised_by, shown
 from cuelearner_jax.feedback.answers import in_mind, relative_feedback
 from cuelearner_jax.guides.base import Guide
 from cuelearner_jax.guides.refining import refine
+from cuelearner_jax.spaces import DIRECTIONS, Space
 from cuelearner_jax.types import EnvState, GuidanceModel, Params, Teacher
 
 SHARED, BY_LANE = None, 0  # of a leaf: the same for all lanes, or one for each
@@ -47,7 +47,7 @@ class Agent(struct.PyTreeNode):
 
     params: Params
     sizes: AgentSizes = struct.field(pytree_node=False)
-    actions: Actions = struct.field(pytree_node=False, default=DIRECTIONS)
+    actions: Space = struct.field(pytree_node=False, default=DIRECTIONS)
     env: Any = None  # says how an observation looks from an action; nobody asks it in the raw frame
 
     def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
@@ -68,11 +68,11 @@ class Agent(struct.PyTreeNode):
 class Uniform(struct.PyTreeNode):
     """Uniform actions."""
 
-    actions: Actions = struct.field(pytree_node=False, default=DIRECTIONS)
+    actions: Space = struct.field(pytree_node=False, default=DIRECTIONS)
 
     def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
         """Drawn anew each time (paper, Eq. 6)."""
-        return self.actions.uniform(key, (obs.shape[0],))
+        return self.actions.sample(key, (obs.shape[0],))
 
     @property
     def axes(self) -> Uniform:
@@ -84,7 +84,7 @@ class NearAims(struct.PyTreeNode):
     """Actions near one of a situation's aims, each aim as likely; uniform ones where there is none."""
 
     env: Any  # offers aims
-    reach: Float[Array, ""] | float  # how far from the aim at most [rad]
+    reach: Float[Array, ""] | float  # how far from the aim at most, as `log` of the space counts
 
     def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
         """Drawn anew each time."""
@@ -92,11 +92,11 @@ class NearAims(struct.PyTreeNode):
 
     def _one(self, key: PRNGKeyArray, obs: Float[Array, " obs"]) -> Float[Array, " action"]:
         k_aim, k_turn, k_elsewhere = jax.random.split(key, 3)
-        aims = self.env.aims(obs)
+        space, aims = actions_of(self.env), self.env.aims(obs)
         index = jax.random.categorical(k_aim, jnp.where(aims.possible, 0.0, -jnp.inf))
-        turn = jax.random.uniform(k_turn, (), minval=-self.reach, maxval=self.reach)
-        elsewhere = actions_of(self.env).uniform(k_elsewhere, ())
-        return jnp.where(aims.possible.any(), rotate(aims.actions[index], turn), elsewhere)
+        change = jax.random.uniform(k_turn, (len(space.cues),), minval=-self.reach, maxval=self.reach)
+        elsewhere = space.sample(k_elsewhere)
+        return jnp.where(aims.possible.any(), space.exp(aims.actions[index], change), elsewhere)
 
     @property
     def axes(self) -> NearAims:
@@ -142,7 +142,7 @@ class Guided(struct.PyTreeNode):
     env: Any
     scalars: GuideScalars
     guidance: Guide = struct.field(pytree_node=False)
-    bound: Float[Array, ""] | None = None  # to the way from the base's actions [rad]; None: wherever guidance leads
+    bound: Float[Array, ""] | None = None  # to the way from the base's actions; None: wherever guidance leads
     sizes: GuideSizes | None = struct.field(pytree_node=False, default=None)  # of the guidance: needed to store it
 
     def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
@@ -181,23 +181,24 @@ class Corrected(struct.PyTreeNode):
     base: Any  # a policy
     teacher: Teacher
     scalars: GuideScalars
-    actions: Actions = struct.field(pytree_node=False, default=DIRECTIONS)
+    actions: Space = struct.field(pytree_node=False, default=DIRECTIONS)
 
     def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
         """The base's actions, told the way until they are right."""
-        first, eps = self.base.act(key, states, obs), self.scalars.radians("eps")
-        best = wanted_actions(self.teacher, states, obs, first, self.scalars)
+        space, first = self.actions, self.base.act(key, states, obs)
+        eps = space.from_unit(self.scalars.eps_deg)
+        best = wanted_actions(space, self.teacher, states, obs, first, self.scalars)
 
         def told(action: Array, best: Array) -> Array:
-            return self.actions.toward(action, relative_feedback(action, best, eps), eps) - action
+            return space.toward(action, relative_feedback(space, action, best, eps), eps) - action
 
         return refine(
             lambda current: jax.vmap(told)(current, best),
             first,
             jnp.ones(obs.shape[0], bool),
-            space=self.actions,
-            tau=self.scalars.radians("tau"),
-            tau_max=self.scalars.radians("tau_max"),
+            space=space,
+            tau=space.from_unit(self.scalars.tau_deg),
+            tau_max=space.from_unit(self.scalars.tau_max_deg),
             k_max=self.scalars.k_max,
         ).actions
 
@@ -210,13 +211,13 @@ class Corrected(struct.PyTreeNode):
 class Opaque(struct.PyTreeNode):
     """Any function of a batch of observations: of JAX arrays, or, `on_host`, of NumPy arrays in plain Python.
 
-    What it returns (n, 2) is made unit vectors. A function on the host is called back from compiled programs
-    (`jax.pure_callback`): it must give the same for the same observations.
+    What it returns (n, action) is retracted to the space: made unit vectors, held within bounds. A function on the host
+    is called back from compiled programs (`jax.pure_callback`): it must give the same for the same observations.
     """
 
     function: Callable[[Any], Any] = struct.field(pytree_node=False)
     on_host: bool = struct.field(pytree_node=False, default=False)
-    actions: Actions = struct.field(pytree_node=False, default=DIRECTIONS)
+    actions: Space = struct.field(pytree_node=False, default=DIRECTIONS)
 
     def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
         """What the function gives. Raises UserError if that has another shape."""
@@ -228,7 +229,7 @@ class Opaque(struct.PyTreeNode):
             chosen = jax.pure_callback(self._called_back, shape, obs, vmap_method="expand_dims")
         else:
             chosen = self._checked(self.function(obs), obs.shape[0], jnp.asarray)
-        return self.actions.retract(only_actions(chosen))
+        return self.actions.retract(self.actions.only_actions(chosen))
 
     def _called_back(self, obs: Any) -> np.ndarray:
         """The function's actions; NaN once it has failed, which `user_code` tells when the program is done."""
@@ -237,11 +238,11 @@ class Opaque(struct.PyTreeNode):
             return nothing
         try:
             chosen = self._called(np.asarray(obs))
-            usable = np.isfinite(chosen).all(-1) & (chosen != 0).any(-1)
+            usable = self.actions.usable(chosen, np)
             if not usable.all():
                 count = f"{(~usable).sum()} of {usable.size}"
                 raise UserError(
-                    f"{named(self)} gave no direction but zero or not finite numbers, in {count} situations"
+                    f"{named(self)} gave zero or not finite numbers in place of actions, in {count} situations"
                 )
             return chosen
         except UserError as error:
@@ -280,13 +281,13 @@ class Opaque(struct.PyTreeNode):
 
 
 def acted(
-    policy: types.Policy, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"], actions: Actions
+    policy: types.Policy, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"], actions: Space
 ) -> Float[Array, "n action"]:
     """A policy's actions, NaN in place of each that is none. Raises UserError if they have another shape."""
     chosen, wanted = jnp.asarray(policy.act(key, states, obs)), (obs.shape[0], actions.size)
     if chosen.shape != wanted:
         raise UserError(f"{named(policy)} returned actions of shape {chosen.shape}: return {wanted}")
-    return only_actions(chosen)
+    return actions.only_actions(chosen)
 
 
 def named(policy: Any) -> str:
@@ -326,6 +327,11 @@ def policy_of(given: Any) -> Any:
     raise UserError(f"{shown(given)} is no policy: give a function of observations (n, obs), or load one")
 
 
+def in_space(policy: Any, space: Space) -> Any:
+    """A policy with actions of a space, where it is a bare function, of which nobody said in which space it acts."""
+    return policy.replace(actions=space) if isinstance(policy, Opaque) else policy
+
+
 def _takes_nothing(given: Callable[..., Any]) -> bool:
     """Can it be called without arguments?"""
     try:
@@ -356,6 +362,7 @@ def best_actions(teacher: Teacher, states: EnvState, obs: Float[Array, "n obs"])
 
 
 def wanted_actions(
+    space: Space,
     teacher: Teacher,
     states: EnvState,
     obs: Float[Array, "n obs"],
@@ -366,9 +373,9 @@ def wanted_actions(
 
     `scalars` without such a field (`GuideScalars`) mean the best.
     """
-    if getattr(scalars, "answer", "best") == "best":
+    if getattr(scalars, "answer", "best") != "nearest":
         return best_actions(teacher, states, obs)
-    ask = lambda row: in_mind(teacher, row[0], row[1], row[2], scalars)  # noqa: E731
+    ask = lambda row: in_mind(space, teacher, row[0], row[1], row[2], scalars)  # noqa: E731
     return jax.lax.map(ask, (states, obs, actions), batch_size=min(len(obs), portions().states))
 
 

@@ -53,7 +53,7 @@ class ValuesDirections(Protocol):
     ) -> Float[Array, " action"]:
         """Of the actions worth at least a share of the best, averaged over an error of aim, the nearest to `action`.
 
-        `spread` is the standard deviation of the aim [rad]; see `actions.nearest_direction`.
+        `spread` is the standard deviation of the aim [rad]; see `spaces.directions.nearest_direction`.
         """
         ...
 
@@ -96,7 +96,6 @@ class Label(struct.PyTreeNode):
     answer: Float[Array, " answer"]  # in its form's words; relative: h in {-1, 0, +1}, see `guidance.answers`
     valid: Bool[Array, ""]  # False: padding, past this lane's budget, or no answer
     base: Float[Array, " action"] | None = None  # what was proposed before any correction; None: no model looks at it
-    eps_deg: Float[Array, ""] | None = None  # strength of the answer [deg]; None: that of the scalars (`eps_deg`)
 
 
 class GuidanceModel(struct.PyTreeNode):

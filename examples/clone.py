@@ -16,12 +16,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from cuelearner_jax.actions import evenly_spaced, rotate
 from cuelearner_jax.config import GuideScalars, Scalars
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.feedback.forms import AnswerForm
 from cuelearner_jax.guides.base import Guide, Kind
 from cuelearner_jax.guides.refining import Refined
+from cuelearner_jax.spaces.directions import evenly_spaced, rotate
 from cuelearner_jax.types import EnvState, GuidanceModel, Label, Params, Teacher
 
 POINTS = 8  # of the compass, counterclockwise from the x axis
@@ -40,16 +40,16 @@ def named(
 
     Of the faults in `scalars` it has those that mean something here: its bias and its silence.
     """
-    best = rotate(teacher.best_action(state, obs), scalars.radians("teacher_bias"))
+    best = rotate(teacher.best_action(state, obs), jnp.deg2rad(scalars.teacher_bias_deg))
     return jnp.argmax(evenly_spaced(POINTS) @ best)[None] * 1.0, ~jax.random.bernoulli(key, scalars.silence_probability)
 
 
 FORM = AnswerForm(
     name="compass",
-    width=1,
-    meaning="number of the point of the compass, of eight, counterclockwise from the x axis",
+    width=lambda space: 1,
+    meaning=lambda space: "number of the point of the compass, of eight, counterclockwise from the x axis",
     answer=named,
-    values=tuple(float(point) for point in range(POINTS)),
+    values=lambda space: tuple(map(float, range(POINTS))),
 )
 
 

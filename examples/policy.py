@@ -17,10 +17,10 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from cuelearner_jax.actions import retract
 from cuelearner_jax.evaluate import episodes, evaluate_policy
 from cuelearner_jax.policies import SHARED, Opaque, Policy, Taught, Teaching
 from cuelearner_jax.runs import filming
+from cuelearner_jax.spaces.directions import retract
 from cuelearner_jax.types import EnvState
 from examples.reach import TASK, Reach, ReachConfig
 

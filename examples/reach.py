@@ -30,9 +30,9 @@ from matplotlib.figure import Figure
 
 from cuelearner_envs import film, svg
 from cuelearner_envs.bounds import MOST_STEPS, check_number
-from cuelearner_jax.actions import from_angle, retract, rotate
 from cuelearner_jax.config import RunConfig, Scalars, Schedule, Sizes
 from cuelearner_jax.environment import Quantity, WholeObservations
+from cuelearner_jax.spaces.directions import from_angle, retract, rotate
 from cuelearner_jax.task import Body, Pictures, Preset, Scenario, Task
 from cuelearner_jax.types import Policy, Reel, Sketch, Step
 

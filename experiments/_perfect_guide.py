@@ -17,12 +17,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from cuelearner_envs.billiards.config import BilliardsConfig, make_environment
-from cuelearner_jax.actions import DIRECTIONS
 from cuelearner_jax.agents.choice import greedy_actions
 from cuelearner_jax.config import GuideScalars
 from cuelearner_jax.guides.base import Kind
 from cuelearner_jax.guides.refining import Refined
 from cuelearner_jax.guides.untaught import Untaught
+from cuelearner_jax.spaces import DIRECTIONS
 from cuelearner_jax.tasks.billiards import SEEN_FROM_THE_STRIKE, SHIPPED_TEACHERS
 from cuelearner_jax.teachers import stored
 from cuelearner_jax.teachers.learned import LearnedTeacher

@@ -31,7 +31,8 @@ class _Shown(Guide):
 
     def target(self, label: Label, scalars: GuideScalars) -> Float[Array, " action"]:
         """The needed correction, cut off at the bound."""
-        return self.spaces.actions.clip(label.answer, label.action, scalars.radians("tau_max")) - label.action
+        space = self.spaces.actions
+        return space.clip(label.answer, label.action, space.from_unit(scalars.tau_max_deg)) - label.action
 
 
 class Residual(_Shown, Relative):

@@ -19,11 +19,11 @@ import optax
 from flax import struct
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from cuelearner_jax import actions as geometry
 from cuelearner_jax.agents.learning import all_finite
 from cuelearner_jax.config import LARGEST, MOST_LAYERS
 from cuelearner_jax.environment import random_symmetries
 from cuelearner_jax.errors import UserError
+from cuelearner_jax.spaces import directions as geometry
 from cuelearner_jax.teachers.learned import LearnedTeacher, expected_reward, initial_params
 from cuelearner_jax.types import Params
 

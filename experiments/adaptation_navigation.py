@@ -73,29 +73,22 @@ LOOK_AHEAD = {"task.look_ahead": True}
 # The likeliest way is always gone: in doubt the base would act, which walks into walls.
 SURE: Mapping[str, Any] = {**EACH, **SPACED, "scalars.aim_doubt": 1000.0, "sizes.aim_layers": (64, 64)}
 MEMBERS, ACTIVE = {"sizes.ensemble": 5}, {"sizes.ensemble": 5, "sizes.candidates": 16, "sizes.question_every": 1}
-# Larger turns first; and a coach who watches 16 robots, and speaks where one does what is farthest from the way.
-FALLING = {"sizes.eps_falls": True, "scalars.eps_deg": 40.0, "scalars.eps_last_deg": 10.0}
-PARTING = {"sizes.candidates": 16, "sizes.chosen_by": "teacher", "sizes.question_every": 1}
 IN_ROOMS: dict[str, dict[str, Mapping[str, Any]]] = {
     "intent": {
         "members": {**SURE, **MEMBERS},
         "active": {**SURE, **ACTIVE},
         "look-ahead-only": {**SURE, **MEMBERS, **LOOK_AHEAD},
-        "contrary": {**SURE, **MEMBERS, "scalars.mistake_probability": 0.5},  # do labels matter at all?
+        "shuffled": {**SURE, **MEMBERS, "scalars.answer": "shuffled"},  # do labels matter at all?
         "doubting": {**SURE, **MEMBERS, "scalars.aim_doubt": 2.0},
         "small": {**SURE, **MEMBERS, "sizes.aim_layers": (32, 32)},
         "close": {**SURE, **MEMBERS, "sizes.question_every": 1},
         "eps-10": {**SURE, **MEMBERS, "scalars.eps_deg": 10.0},
         "eps-40": {**SURE, **MEMBERS, "scalars.eps_deg": 40.0},
-        "eps-falls": {**SURE, **MEMBERS, **FALLING},
-        "parting": {**SURE, **MEMBERS, **PARTING},
     },
     "relative": {
         "close": EACH,
         "spaced": {**EACH, **SPACED},
         "spaced-members": {**EACH, **SPACED, **MEMBERS},
-        "spaced-eps-falls": {**EACH, **SPACED, **FALLING},
-        "parting": {**EACH, **PARTING},
     },
 }
 BEST_IN_ROOMS = SIDED_INTENT = IN_ROOMS["intent"]["members"]

@@ -32,6 +32,7 @@ from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import episodes
 from cuelearner_jax.feedback.answers import relative_feedback
 from cuelearner_jax.policies import Agent, Taught, Teaching, best_actions
+from cuelearner_jax.spaces import DIRECTIONS
 from cuelearner_jax.storage.provenance import provenance
 from cuelearner_jax.tasks.billiards import SHIPPED_TEACHERS
 from cuelearner_jax.teachers import stored
@@ -125,7 +126,7 @@ def asked(base: Any, env: Any, scale: Scale, seed: int) -> cl.Labels:
 @jax.jit
 def _answered(base: Any, teacher: NearbyTeacher, key: Any, state: Any, obs: Any) -> tuple[Any, Any]:
     action = base.act(key, state, obs)
-    return action, relative_feedback(action, best_actions(teacher, state, obs), jnp.deg2rad(EPS_DEG))
+    return action, relative_feedback(DIRECTIONS, action, best_actions(teacher, state, obs), jnp.deg2rad(EPS_DEG))
 
 
 def adapted(base: Any, env: Any, scale: Scale, seed: int) -> Iterator[tuple[int, cl.AdaptedPolicy]]:

@@ -20,9 +20,9 @@ from flax import struct
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from cuelearner_envs.billiards.config import BilliardsConfig, make_environment
-from cuelearner_jax.actions import DIRECTIONS
 from cuelearner_jax.evaluate import SPLITS, episodes, evaluate_policy
 from cuelearner_jax.policies import SHARED, Heuristic, Uniform
+from cuelearner_jax.spaces import DIRECTIONS
 from cuelearner_jax.storage.provenance import provenance
 
 TABLES = ("easy", "regulation")
@@ -40,7 +40,7 @@ class AimAtRandom(struct.PyTreeNode):
             k_aim, k_any = jax.random.split(key)
             aims = self.env.aims(obs)
             chosen = jax.random.categorical(k_aim, jnp.where(aims.possible, 0.0, -jnp.inf))
-            return jnp.where(aims.possible.any(), aims.actions[chosen], DIRECTIONS.uniform(k_any, ()))
+            return jnp.where(aims.possible.any(), aims.actions[chosen], DIRECTIONS.sample(k_any, ()))
 
         return jax.vmap(one)(jax.random.split(key, obs.shape[0]), obs)
 

@@ -135,10 +135,6 @@ def variations(world: str, options: Options, minutes: int) -> list[Piece]:
         Piece(world, name, "relative", ("relative",), (500, 1_000), 8, {**options, **way}, minutes, "what is asked")
         for name, way in WAYS.items()
     ]
-    scored = {**options, "scalars.scalar-good": "scored"}
-    pieces.append(
-        Piece(world, "scored", "scalar", ("scalar",), (500, 1_000), 8, scored, minutes, "what is called good")
-    )
     paced: Options = {**options, "sizes.pace": True, "scalars.pace-lead": LEAD}
     random = {**paced, **FAULTS["random"]}
     any_lead: Options = {**paced, "scalars.pace-lead": 0.0}

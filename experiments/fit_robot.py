@@ -26,7 +26,7 @@ from cuelearner_envs.anymal.environment import make_environment
 from cuelearner_envs.anymal.judged import Course
 from cuelearner_envs.navigation.config import NavigationConfig
 from cuelearner_envs.navigation.robot import Motion, Robot, walk
-from cuelearner_jax.actions import difference, from_angle
+from cuelearner_jax.spaces.directions import difference, from_angle
 from cuelearner_jax.storage.provenance import provenance
 
 RESULTS = Path(__file__).parents[1] / "docs" / "data" / "anymal_fit.json"

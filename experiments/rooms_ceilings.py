@@ -32,12 +32,12 @@ from flax import struct
 from jaxtyping import Array, Float
 
 from cuelearner_envs.navigation.config import NavigationConfig
-from cuelearner_jax.actions import DIRECTIONS
 from cuelearner_jax.agents.networks import applied, residual_network
 from cuelearner_jax.environment import Aims, spaces_of
 from cuelearner_jax.evaluate import episodes, evaluate_policy, watched_lanes
 from cuelearner_jax.guides.intent import Weights
 from cuelearner_jax.policies import BY_LANE, SHARED, Taught, best_actions
+from cuelearner_jax.spaces import DIRECTIONS
 from cuelearner_jax.tasks import registry
 
 FROM_HERE_DEG = 5.0  # a way is as likely as it lies near what the road map does: standard deviation [deg]

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 
 from cuelearner_envs.billiards.config import BilliardsConfig, make_environment
 from cuelearner_envs.billiards.environment import Balls
-from cuelearner_jax import actions
+from cuelearner_jax.spaces import directions
 
 EASY = make_environment(BilliardsConfig("easy"))
 KEY = jax.random.key(0)
@@ -21,7 +21,7 @@ def balls(positions, pocketed=(False, False, False, False), shots=0):
 
 
 def toward(degrees):
-    return actions.from_angle(jnp.deg2rad(jnp.array(degrees, jnp.float32)))
+    return directions.from_angle(jnp.deg2rad(jnp.array(degrees, jnp.float32)))
 
 
 SCENE = balls([(-0.2, 0.0), (0.1, -0.1), (0.3, 0.1), (0.0, 0.1)])
@@ -33,10 +33,10 @@ def random_states():
     states, _ = reset_many(EASY, keys)
     for number in range(3):
         key = jax.random.fold_in(KEY, number)
-        states, _ = step_many(EASY, jax.random.split(key, BATCH), states, actions.uniform(key, (BATCH,)))
+        states, _ = step_many(EASY, jax.random.split(key, BATCH), states, directions.uniform(key, (BATCH,)))
     ball = jnp.arange(4)[None]
     taken = (jnp.arange(BATCH)[:, None] % 4 == ball) & (ball > 0)
     states = states.replace(pocketed=states.pocketed | taken)
     closest = jax.jit(jax.vmap(EASY.heuristic))(observe_many(EASY, states))
-    strikes = jnp.where(jnp.arange(BATCH)[:, None] % 8 < 4, closest, actions.uniform(jax.random.key(6), (BATCH,)))
+    strikes = jnp.where(jnp.arange(BATCH)[:, None] % 8 < 4, closest, directions.uniform(jax.random.key(6), (BATCH,)))
     return states, strikes

@@ -38,6 +38,7 @@ from cuelearner_jax.errors import UserError
 from cuelearner_jax.export import runner
 from cuelearner_jax.policies import Heuristic
 from cuelearner_jax.runs import kept
+from cuelearner_jax.spaces import DIRECTIONS
 from cuelearner_jax.storage import guides, label_files, results
 from cuelearner_jax.teachers import stored
 from cuelearner_jax.teachers.learned import LearnedTeacher, initial_params
@@ -78,7 +79,9 @@ def _decides(folder: Path) -> Any:
 
 
 def _labels(folder: Path) -> None:
-    with label_files.LabelWriter(folder, {"name": "window", "half_width_deg": 28.0}, "relative", 20.0) as writer:
+    with label_files.LabelWriter(
+        folder, {"name": "window", "half_width_deg": 28.0}, "relative", DIRECTIONS, 20.0
+    ) as writer:
         for item, obs in enumerate(SEEN):
             writer.append(**ROW, item=item, obs=obs, action=obs, answer=np.float32([item % 3 - 1]))
 
@@ -90,7 +93,7 @@ def _labels_in_parquet(folder: Path) -> None:
 
 def _labels_read(folder: Path) -> Any:
     file = label_files.read(folder)
-    return [file.task, file.answers, file.eps_deg, file.seeds, *jax.tree.leaves(file.labels), *(file.people or ())]
+    return [file.task, file.answers, file.eps, file.seeds, *jax.tree.leaves(file.labels), *(file.people or ())]
 
 
 def _teacher(folder: Path) -> None:

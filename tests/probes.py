@@ -14,11 +14,11 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from cuelearner_jax.actions import difference, evenly_spaced, from_angle, inward, rotate
 from cuelearner_jax.config import RunConfig, Scalars, Schedule, Sizes, digest
 from cuelearner_jax.environment import Aims, Features, Quantity, WholeObservations
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.loop import make_program
+from cuelearner_jax.spaces.directions import difference, evenly_spaced, from_angle, inward, rotate
 from cuelearner_jax.task import Body, Task
 from cuelearner_jax.types import Label, Step
 

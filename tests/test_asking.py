@@ -10,10 +10,11 @@ import numpy as np
 import probes
 import pytest
 
-from cuelearner_jax import actions, asking, loop
+from cuelearner_jax import asking, loop
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.loop import start_clock
 from cuelearner_jax.policies import Agent, Heuristic, Taught, Teaching, Uniform
+from cuelearner_jax.spaces import directions
 
 ENV, EXPERT = probes.Window(), probes.Expert(probes.Window())
 RELATIVE = guidances.make("relative", probes.SIZES, ENV)
@@ -75,13 +76,13 @@ def test_a_lanes_round_in_the_training_program_is_this_round_of_uniform_actions(
 def test_questions_are_about_what_the_base_policy_does():
     for base, turn in ((Heuristic(ENV), -1.0), (Taught(EXPERT), 0.6)):
         labels = label_round(ENV, EXPERT, probes.SCALARS, base, begun(), LANE_KEY).labels
-        np.testing.assert_allclose(actions.difference(labels.obs, labels.action)[:ROUND], turn, atol=1e-5)
+        np.testing.assert_allclose(directions.difference(labels.obs, labels.action)[:ROUND], turn, atol=1e-5)
         assert len(np.unique(np.asarray(labels.obs)[:ROUND], axis=0)) > 1
         # 1.6 rad short of the best direction, or right there.
         assert set(np.asarray(labels.answer)[:ROUND, 0]) == {1.0 if turn < 0 else 0.0}
     uniform = label_round(ENV, EXPERT, probes.SCALARS, Uniform(), begun(), LANE_KEY).labels
     keys = [asking.question_keys(LANE_KEY, position).base for position in range(ROUND)]
-    drawn = np.concatenate([actions.uniform(key, (1,)) for key in keys])
+    drawn = np.concatenate([directions.uniform(key, (1,)) for key in keys])
     np.testing.assert_allclose(uniform.action[:ROUND], drawn, atol=1e-6)
 
 
@@ -187,71 +188,6 @@ def test_labels_given_elsewhere_are_fitted_once():
     assert bool(taken.model.fitted)
 
 
-# Strengths that fall.
-
-FALLING = dataclasses.replace(probes.SIZES, eps_falls=True)
-FROM_40_TO_10 = dataclasses.replace(probes.SCALARS, eps_deg=40.0, eps_last_deg=10.0)
-
-
-def begun_falling(budget):
-    slots = asking.label_slots(budget, FALLING)
-    return asking.start(RELATIVE, ENV, slots, budget, jax.random.key(1), jax.random.key(2), FALLING)
-
-
-@pytest.mark.parametrize(
-    ("budget", "strengths"),
-    [
-        (3, [40.0, 20.0, 10.0]),
-        (5, [40.0, 28.284271, 20.0, 14.142136, 10.0]),
-        (2, [40.0, 10.0, 10.0]),  # what is past the budget is as strong as its last
-        (1, [40.0]),
-    ],
-)
-def test_strengths_fall_by_the_same_factor_from_the_first_label_of_a_budget_to_the_last(budget, strengths):
-    found = [asking.strength(FROM_40_TO_10, position, budget) for position in range(len(strengths))]
-    np.testing.assert_allclose(found, strengths, rtol=1e-6)
-    assert (found[0], found[budget - 1]) == (40.0, 10.0 if budget > 1 else 40.0)  # to the last bit
-    same = dataclasses.replace(FROM_40_TO_10, eps_last_deg=40.0)
-    assert {float(asking.strength(same, position, 7)) for position in range(7)} == {40.0}
-
-
-def test_a_teacher_answers_by_the_strength_of_each_label_which_the_label_keeps():
-    """8 degrees off: right for a label of more than 16 degrees, a turn for one of less, as from number 13 of 20 on."""
-    base, near = Heuristic(ENV), probes.Expert(probes.Window(offset=-1.0 - np.deg2rad(8.0)))
-    scalars = dataclasses.replace(FROM_40_TO_10, refined_fraction=0.0)
-    guide = begun_falling(20)
-    for _ in range(2):
-        guide = asking.label_round(RELATIVE, FALLING, ENV, near, scalars, base, guide, LANE_KEY)
-    np.testing.assert_allclose(guide.labels.eps_deg, 40.0 * 0.25 ** (np.arange(20) / 19), rtol=1e-5)
-    assert np.asarray(guide.labels.answer)[:, 0].tolist() == [0.0] * 13 + [-1.0] * 7
-    assert guide.labels.valid.all()
-
-
-def test_a_lanes_own_budget_says_how_strengths_fall_and_instalments_do_not():
-    ask = jax.jit(partial(asking.label_round, RELATIVE, FALLING))
-    several = [begun_falling(budget) for budget in (15, 2 * ROUND)]
-    for number in range(2):
-        several = [ask(ENV, EXPERT, FROM_40_TO_10, Uniform(), guide, LANE_KEY) for guide in several]
-        if number == 0:
-            assert int(several[0].labels.valid.sum()) == ROUND
-    for guide, budget in zip(several, (15, 2 * ROUND), strict=True):
-        strengths = np.asarray(guide.labels.eps_deg)[:budget]
-        np.testing.assert_allclose(strengths, np.geomspace(40.0, 10.0, budget), rtol=1e-5)
-    waited = begun_falling(2 * ROUND)
-    for until in (ROUND, ROUND, 2 * ROUND):
-        waited = ask(ENV, EXPERT, FROM_40_TO_10, Uniform(), waited, LANE_KEY, jnp.asarray(until))
-    chex.assert_trees_all_equal(waited, several[1])
-
-
-def test_labels_of_one_strength_are_taken_where_strengths_fall_and_not_the_other_way_round():
-    labels = label_round(ENV, EXPERT, probes.SCALARS, Uniform(), begun(), LANE_KEY).labels
-    taken = asking.as_kept(labels, begun_falling(2 * ROUND), probes.SCALARS)
-    assert taken.eps_deg.tolist() == [20.0] * 2 * ROUND
-    assert asking.as_kept(labels, begun(), probes.SCALARS) is labels
-    with pytest.raises(ValueError, match=r"make the guide with sizes\.eps_falls"):
-        asking.as_kept(taken, begun(), probes.SCALARS)
-
-
 # Instalments.
 
 
@@ -302,7 +238,7 @@ def test_later_questions_are_about_the_agents_greedy_actions_refined_within_the_
             assert labels.valid.tolist() == [True] * budget + [False] * (2 * ROUND - budget)  # never past the budget
             chex.assert_trees_all_equal(*(jax.tree.map(lambda leaf: leaf[:ROUND], one) for one in (labels, before)))
             greedy = Agent(probes.lane(params, lane), probes.SIZES).act(LANE_KEY, None, jnp.asarray(labels.obs[ROUND:]))
-            away = np.degrees(np.abs(actions.difference(greedy, labels.action[ROUND:])))
+            away = np.degrees(np.abs(directions.difference(greedy, labels.action[ROUND:])))
             assert away.max() <= 7.0 + 1e-3
             assert (away.max() > 1.0) == turned
         assert later.guide.asked.tolist() == [2 * ROUND, 15]
@@ -313,10 +249,10 @@ def test_guided_episodes_keep_to_the_bound_once_there_are_labels_about_the_agent
     lane = loop.make_lane(config, guidances.make("heuristic", config.sizes, ENV), ENV, 0)
     state = jax.tree.map(lambda leaf: leaf[0], probes.start(probes.window_program("heuristic"), [3], [0]))
     state = state.replace(agent=state.agent.replace(guided=jnp.array([True, True, False, True])))
-    base = actions.rotate(state.agent.obs, 0.5)  # 1.5 rad from the heuristic's
+    base = directions.rotate(state.agent.obs, 0.5)  # 1.5 rad from the heuristic's
     one = dataclasses.replace(config.schedule, ask_at=(0,))
     for schedule, step, away in ((config.schedule, 15, 1.5), (config.schedule, 16, np.deg2rad(9.0)), (one, 16, 1.5)):
         clock = start_clock().replace(step=jnp.asarray(step))
         found = lane.guide(ENV, config.scalars, schedule, clock, state, base)
-        turned = np.abs(actions.difference(base, found.actions))
+        turned = np.abs(directions.difference(base, found.actions))
         np.testing.assert_allclose(turned, [away, away, 0, away], atol=1e-5)

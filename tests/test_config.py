@@ -49,7 +49,6 @@ from cuelearner_jax.errors import UserError
         ("scalars", {"silence_probability": 2.0}, "scalars.silence_probability is 2.0"),
         ("scalars", {"refined_fraction": 1.1}, "scalars.refined_fraction is 1.1"),
         ("scalars", {"answer": "worst"}, "scalars.answer is 'worst': give best or nearest"),
-        ("scalars", {"scalar_good": ""}, "scalars.scalar_good is '': give near or scored"),
         ("scalars", {"nearest_share": 1.1}, "scalars.nearest_share is 1.1: give a number from 0 to 1"),
         ("scalars", {"nearest_aim_deg": -1.0}, "scalars.nearest_aim_deg is -1.0: give a number that is not negative"),
         ("scalars", {"scalar_within_deg": math.nan}, "scalars.scalar_within_deg is nan"),
@@ -78,12 +77,7 @@ from cuelearner_jax.errors import UserError
             "sizes.labels_per_round is 10: give a multiple of sizes.candidates",
         ),
         ("sizes", {"candidates": 8}, "sizes.candidates is 8: questions are chosen by the disagreement of members"),
-        ("sizes", {"candidates": 8}, "give a sizes.ensemble above 1 too, or sizes.chosen_by teacher"),
-        ("sizes", {"chosen_by": "teacher"}, "sizes.chosen_by is teacher and sizes.candidates is 1: give more"),
-        ("sizes", {"chosen_by": "coach", "candidates": 8}, "sizes.chosen_by is 'coach': give members or teacher"),
-        ("sizes", {"eps_falls": True}, "scalars.eps_last_deg is 0.0, to which sizes.eps_falls leads: give an angle"),
-        ("scalars", {"eps_last_deg": 5.0}, "scalars.eps_last_deg is 5.0, to which labels fall with sizes.eps_falls"),
-        ("scalars", {"eps_last_deg": -5.0}, "scalars.eps_last_deg is -5.0: give a number that is not negative"),
+        ("sizes", {"candidates": 8}, "give a sizes.ensemble above 1 too, or sizes.ask_all"),
         ("scalars", {"ask_bound_deg": 20.0}, "ask_bound_deg is 20.0, which bounds later instalments, and there is but"),
         ("scalars", {"ask_bound_deg": 0.0}, "scalars.ask_bound_deg is 0.0: give an angle"),
         ("schedule", {"ask_at": ()}, "schedule.ask_at is empty: give steps in ascending order, the first of them 0"),
@@ -107,13 +101,6 @@ def test_values_that_cannot_work_are_refused(group, values, message):
     assert "\n" not in str(error.value)
 
 
-def test_strengths_do_not_rise():
-    falling = probes.config(sizes={"eps_falls": True}, scalars={"eps_deg": 20.0, "eps_last_deg": 20.0})
-    config.check(falling)
-    with pytest.raises(UserError, match=r"above 0 and up to scalars\.eps_deg \(19\.0\)"):
-        config.check(dataclasses.replace(falling, scalars=dataclasses.replace(falling.scalars, eps_deg=19.0)))
-
-
 def test_defaults_and_probes_can_work():
     config.check(RunConfig(probes.WindowConfig()))
     config.check(probes.CONFIG)
@@ -125,13 +112,8 @@ def test_bootstraps_with_a_discount():
     assert probes.config(scalars={"discount": 0.1}).bootstraps
 
 
-def test_radians():
-    assert float(Scalars(eps_deg=90.0).radians("eps")) == pytest.approx(math.pi / 2)
-    assert float(Scalars(tau_max_deg=1.0).radians("tau_max")) == pytest.approx(math.pi / 180)
-
-
 def test_scalars_and_schedule_are_trees_of_their_numbers_and_sizes_are_not():
-    words = {"answer": "nearest", "scalar_good": "scored"}
+    words = {"answer": "nearest"}
     assert len(jax.tree.leaves(Scalars())) == len(dataclasses.fields(Scalars)) - len(words)
     for name, word in words.items():  # part of the program
         other = dataclasses.replace(Scalars(), **{name: word})

@@ -8,7 +8,6 @@ import numpy as np
 import probes
 import pytest
 
-from cuelearner_jax.actions import DIRECTIONS, difference, evenly_spaced, rotate
 from cuelearner_jax.bridges.brax import from_brax, to_brax
 from cuelearner_jax.environment import (
     Described,
@@ -20,6 +19,8 @@ from cuelearner_jax.environment import (
     spaces_of,
     symmetries_of,
 )
+from cuelearner_jax.spaces import DIRECTIONS
+from cuelearner_jax.spaces.directions import difference, evenly_spaced, rotate
 from cuelearner_jax.task import shape_of
 from cuelearner_jax.tasks import registry
 

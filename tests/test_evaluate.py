@@ -9,11 +9,11 @@ import probes
 import pytest
 
 from cuelearner_jax import evaluate
-from cuelearner_jax.actions import DIRECTIONS
 from cuelearner_jax.config import Schedule
 from cuelearner_jax.devices import lane_mesh
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.policies import Agent, Uniform
+from cuelearner_jax.spaces import DIRECTIONS
 
 LONGEST = 4
 KEY = jax.random.key(7)

@@ -13,7 +13,7 @@ METHOD, TASKS = "cuelearner_jax", "cuelearner_envs"
 ROWS = [
     ["errors", "signals"],
     ["user_code"],
-    ["types", "actions", "plugins"],
+    ["types", "spaces", "plugins"],
     ["environment"],
     ["config", "devices", "terminal"],
     ["storage"],
@@ -40,7 +40,7 @@ ROWS = [
     ["cli"],
 ]
 ROW = {room: number for number, row in enumerate(ROWS) for room in row}
-FOR_TASKS = {"errors", "types", "actions", "environment"}  # what a task may know of the method
+FOR_TASKS = {"errors", "types", "spaces", "environment"}  # what a task may know of the method
 KINDS = {
     "relative",
     "intent",

@@ -11,12 +11,13 @@ import numpy as np
 import probes
 import pytest
 
-from cuelearner_jax import actions, asking, evaluate, loop
+from cuelearner_jax import asking, evaluate, loop
 from cuelearner_jax.agents.learning import mirrored
 from cuelearner_jax.agents.networks import applied, q_network
 from cuelearner_jax.devices import lane_mesh
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.policies import Agent, Guided, Uniform
+from cuelearner_jax.spaces import directions
 from cuelearner_jax.types import Label, Transition
 
 ENV, EXPERT = probes.Window(), probes.Expert(probes.Window())
@@ -54,7 +55,7 @@ def test_the_agent_learns_a_bandit_by_itself():
     assert before[0] < 0.8
     assert metrics["loss"].shape == (1,)
     # The value of a direction is its chance to win: 1 inside the window and 0 outside.
-    obs = actions.evenly_spaced(4)
+    obs = directions.evenly_spaced(4)
     inside = jax.vmap(lambda obs: q(probes.lane(state.agent.params, 0), obs, ENV.best(obs))[0])(obs)
     outside = jax.vmap(lambda obs: q(probes.lane(state.agent.params, 0), obs, -ENV.best(obs))[0])(obs)
     np.testing.assert_allclose(inside, 1, atol=0.15)
@@ -89,7 +90,7 @@ def chain_values(truncates, schedule=CHAIN.schedule):
     assert state.agent.target_params is not None
     _, state, _ = chain_program().train(env, CHAIN.scalars, schedule, loop.start_clock(), state, 1000)
     params = probes.lane(state.agent.params, 0)
-    values = [np.asarray(q(params, env.observe(place), actions.evenly_spaced(4)))[:, 0] for place in (0, 1)]
+    values = [np.asarray(q(params, env.observe(place), directions.evenly_spaced(4)))[:, 0] for place in (0, 1)]
     return values, state
 
 
@@ -151,7 +152,7 @@ def test_first_uniform_then_guided_then_greedy():
     met, params = acted("heuristic", scalars=always)
     greedy = probes.greedy_actions(q, params, met["obs"])
     turned = np.asarray(ENV.heuristic(met["obs"]))
-    options = np.asarray(actions.evenly_spaced(probes.SIZES.directions))
+    options = np.asarray(directions.evenly_spaced(probes.SIZES.directions))
     among = np.abs(met["action"][:, None] - options).max(-1).min(-1)
     assert among[:8].min() > 1e-4  # a uniform direction is none of the sixteen
     np.testing.assert_allclose(met["action"][8:24], turned[8:24], atol=1e-6)
@@ -256,13 +257,13 @@ def test_the_first_labels_of_a_larger_budget_are_those_of_a_smaller():
 def test_questions_before_the_first_fit_are_uniform_and_later_ones_refined():
     program, seeds, budgets = probes.window_program("relative", LARGEST), [1, 2, 3, 4], [LARGEST] * 4
     refined = labelled(program, seeds, budgets)[1].guide.labels
-    error = np.abs(actions.difference(ENV.best(refined.obs), refined.action))
+    error = np.abs(directions.difference(ENV.best(refined.obs), refined.action))
     assert error[:, :10].mean() == pytest.approx(math.pi / 2, abs=0.4)  # standard deviation 0.14
     assert error[:, 30:].mean() < 0.6
     plain = dataclasses.replace(probes.SCALARS, refined_fraction=0.0)
     uniform = labelled(program, seeds, budgets, scalars=plain)[1].guide.labels
     np.testing.assert_array_equal(uniform.action[:, :10], refined.action[:, :10])
-    assert np.abs(actions.difference(ENV.best(uniform.obs), uniform.action))[:, 30:].mean() > 1.2
+    assert np.abs(directions.difference(ENV.best(uniform.obs), uniform.action))[:, 30:].mean() > 1.2
 
 
 def test_silent_teachers_use_up_the_budget():
@@ -492,10 +493,10 @@ def test_transitions_are_mirrored_as_a_whole():
     obs, action, following = jnp.array(rng.normal(size=(3, 64, 2)), jnp.float32)
     batch = Transition(obs, action, jnp.arange(64.0), jnp.ones(64), following)
     image = mirrored(jax.random.key(0), probes.Window(mirrors=True), batch)
-    quarters = np.round(np.asarray(actions.difference(obs, image.obs)) / (math.pi / 2)).astype(int) % 4
+    quarters = np.round(np.asarray(directions.difference(obs, image.obs)) / (math.pi / 2)).astype(int) % 4
     assert set(quarters) == {0, 1, 2, 3}
     for name in ("obs", "action", "next_obs"):
-        expected = actions.rotate(getattr(batch, name), jnp.array(quarters * math.pi / 2))
+        expected = directions.rotate(getattr(batch, name), jnp.array(quarters * math.pi / 2))
         np.testing.assert_allclose(getattr(image, name), expected, atol=1e-5)
     np.testing.assert_array_equal(image.reward, batch.reward)
     without = mirrored(jax.random.key(0), probes.Window(mirrors=True), batch.replace(next_obs=following[:, :0]))

@@ -10,7 +10,6 @@ import numpy as np
 import probes
 import pytest
 
-from cuelearner_jax import actions
 from cuelearner_jax.agents import choice
 from cuelearner_jax.agents.networks import applied, q_network
 from cuelearner_jax.devices import lane_mesh
@@ -31,11 +30,12 @@ from cuelearner_jax.policies import (
     Uniform,
     best_actions,
 )
+from cuelearner_jax.spaces import directions
 
 ENV, EXPERT = probes.Window(), probes.Expert(probes.Window())
-OBS = actions.evenly_spaced(40)
+OBS = directions.evenly_spaced(40)
 STATES = OBS  # the bandit's state is what it shows
-BEST = actions.rotate(OBS, 0.6)
+BEST = directions.rotate(OBS, 0.6)
 KEY = jax.random.key(5)
 Q = q_network(probes.SIZES.q_layers)
 AGENT = Agent(Q.init(jax.random.key(1), jnp.zeros(2), jnp.zeros(2)), probes.SIZES)
@@ -53,12 +53,12 @@ class Aiming:
     """Two aims, a quarter turn to each side of what is seen; none where that points down."""
 
     def aims(self, obs):
-        both = jnp.stack([actions.rotate(obs, turn) for turn in (jnp.pi / 2, -jnp.pi / 2)])
+        both = jnp.stack([directions.rotate(obs, turn) for turn in (jnp.pi / 2, -jnp.pi / 2)])
         return Aims(both, jnp.zeros((2, 1)), jnp.full(2, obs[1] >= 0))
 
 
 def test_actions_near_aims_are_near_each_of_them_and_anywhere_where_there_is_none():
-    turns = np.degrees(actions.difference(OBS, act(NearAims(Aiming(), 0.1))))
+    turns = np.degrees(directions.difference(OBS, act(NearAims(Aiming(), 0.1))))
     here = np.asarray(OBS[:, 1] >= 0)
     beside = np.abs(np.abs(turns[here]) - 90.0)
     assert 1.0 < beside.max() <= np.degrees(0.1) + 1e-3
@@ -94,7 +94,7 @@ def test_the_taught_policy_does_what_its_teacher_holds_for_best():
 
 
 def test_the_heuristic_is_the_environments():
-    np.testing.assert_allclose(act(Heuristic(ENV)), actions.rotate(OBS, -1.0), atol=1e-6)
+    np.testing.assert_allclose(act(Heuristic(ENV)), directions.rotate(OBS, -1.0), atol=1e-6)
 
 
 @pytest.mark.parametrize("base", [AGENT, Uniform(), Taught(EXPERT)], ids=["agent", "uniform", "taught"])
@@ -126,14 +126,14 @@ def test_under_relative_guidance_every_action_is_refined_once_the_model_is_fitte
 @pytest.mark.parametrize("eps_deg", [5.0, 20.0])
 def test_corrections_end_within_half_eps_of_the_teachers_best(base, eps_deg):
     scalars = dataclasses.replace(probes.SCALARS, eps_deg=eps_deg)
-    error = np.rad2deg(np.abs(actions.difference(BEST, act(Corrected(base, EXPERT, scalars)))))
+    error = np.rad2deg(np.abs(directions.difference(BEST, act(Corrected(base, EXPERT, scalars)))))
     assert error.max() <= eps_deg / 2 + 1e-2
-    assert np.rad2deg(np.abs(actions.difference(BEST, act(base)))).max() > eps_deg
+    assert np.rad2deg(np.abs(directions.difference(BEST, act(base)))).max() > eps_deg
 
 
 def test_corrections_keep_to_the_bound():
     scalars = dataclasses.replace(probes.SCALARS, tau_max_deg=30.0)
-    moved = actions.difference(act(Heuristic(ENV)), act(Corrected(Heuristic(ENV), EXPERT, scalars)))
+    moved = directions.difference(act(Heuristic(ENV)), act(Corrected(Heuristic(ENV), EXPERT, scalars)))
     np.testing.assert_allclose(np.rad2deg(moved), 30.0, atol=1e-2)  # 92 degrees short, so as far as allowed
 
 
@@ -155,7 +155,7 @@ def test_a_function_is_called_whatever_surrounds_it(name):
     policy = OPAQUE[name]
     called = turned(np.asarray(OBS))
     direct = called / np.linalg.norm(called, axis=-1, keepdims=True)
-    np.testing.assert_allclose(direct, actions.rotate(OBS, 0.5), atol=1e-6)
+    np.testing.assert_allclose(direct, directions.rotate(OBS, 0.5), atol=1e-6)
     np.testing.assert_allclose(act(policy), direct, atol=1e-6)
     compiled = jax.jit(lambda policy, obs: policy.act(KEY, obs, obs))
     np.testing.assert_allclose(compiled(policy, OBS), direct, atol=1e-6)
@@ -207,7 +207,7 @@ def test_a_finished_agent_teaches_what_it_does():
     # A policy that looks at the state sees it.
     np.testing.assert_allclose(act(Taught(Teaching(Taught(EXPERT)))), BEST, atol=1e-6)
     corrected = act(Corrected(Uniform(), teacher, probes.SCALARS))
-    assert np.rad2deg(np.abs(actions.difference(expected, corrected))).max() <= probes.SCALARS.eps_deg / 2 + 1e-2
+    assert np.rad2deg(np.abs(directions.difference(expected, corrected))).max() <= probes.SCALARS.eps_deg / 2 + 1e-2
 
 
 # Blocks of lanes.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import jax
@@ -14,23 +15,23 @@ from jax.sharding import Mesh
 from jaxtyping import Array
 
 from cuelearner_jax import user_code
-from cuelearner_jax.actions import DIRECTIONS
 from cuelearner_jax.adaptation import judging, program
 from cuelearner_jax.adaptation.judging import Judged
 from cuelearner_jax.adaptation.program import Adapting, Lanes
 from cuelearner_jax.config import GuideSizes, Scalars
 from cuelearner_jax.devices import BY_LANE, SHARED, lane_mesh, place
-from cuelearner_jax.environment import Environment
+from cuelearner_jax.environment import Environment, actions_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import Rolled, Tell, untold
 from cuelearner_jax.guides.base import Guide
 from cuelearner_jax.policies import Guided, Policy, named
+from cuelearner_jax.spaces import DIRECTIONS, Space
 from cuelearner_jax.types import Label, Teacher
 
 # Seconds a fit on a CPU. The paper's networks are `GuideSizes()`.
 SIZES = GuideSizes(feedback_layers=(128, 128), fit_steps=400, fit_batch_size=64)
 REACH_QUANTILE = 0.95  # of the distances between labelled actions and a policy's own: how far labels reach from it
-BOUND_DEG = 45.0  # where nobody says how far corrections may lead
+BOUND = 1 / 4  # of the space's reach (45 deg): where nobody says how far corrections may lead
 PASSES = 20  # of which one turn by eps: a pass that turns by less has settled
 
 
@@ -80,11 +81,12 @@ class Adapted:
         return program.adapted(of.guidance, of.sizes, env, of.scalars, of.bases, self.block)
 
 
-def check_angles(bounds_deg: Sequence[float], scalars: Scalars) -> str:
+def check_amounts(space: Space, bounds: Sequence[float], scalars: Scalars) -> str:
     """Whether bounds and the strength of labels go together.
 
     Args:
-        bounds_deg: of the lanes [deg].
+        space: of the actions, in whose unit the numbers are.
+        bounds: of the lanes.
         scalars: of refinement.
 
     Returns:
@@ -93,58 +95,59 @@ def check_angles(bounds_deg: Sequence[float], scalars: Scalars) -> str:
     Raises:
         UserError: what cannot be, or could teach nothing.
     """
-    eps, given = scalars.eps_deg, " ".join(f"{bound:g}" for bound in bounds_deg)
-    if not all(math.isfinite(bound) and 0 < bound <= 180 for bound in bounds_deg):
-        raise UserError(f"bound_deg is {given}: give an angle above 0 and up to 180")
-    if len(set(bounds_deg)) < len(bounds_deg):
+    eps, given = scalars.eps_deg, " ".join(f"{bound:g}" for bound in bounds)
+    if not all(math.isfinite(bound) and 0 < bound <= space.reach for bound in bounds):
+        raise UserError(f"bound_deg is {given}: give a number above 0 and up to {space.reach:g} ({space.unit})")
+    if len(set(bounds)) < len(bounds):
         raise UserError(f"bound_deg is {given}: give each bound once")
-    if eps > min(bounds_deg):
+    if eps > min(bounds):
         raise UserError(
-            f"labels of {eps:g} degrees say nothing within a bound of {min(bounds_deg):g}: give a smaller "
+            f"labels of {eps:g} {space.unit} say nothing within a bound of {min(bounds):g}: give a smaller "
             "scalars.eps_deg, about a tenth of the bound"
         )
     if scalars.tau_deg >= eps:
         raise UserError(
-            f"scalars.tau_deg is {scalars.tau_deg:g} and a pass turns an action by {eps:g}, after which refinement "
+            f"scalars.tau_deg is {scalars.tau_deg:g} and a pass moves an action by {eps:g}, after which refinement "
             f"would stop: give scalars.tau_deg {eps / PASSES:g}"
         )
-    if scalars.k_max * eps >= max(bounds_deg):
+    if scalars.k_max * eps >= max(bounds):
         return ""
     return (
-        f"{scalars.k_max} passes of {eps:g} degrees do not reach the bound of {max(bounds_deg):g}: "
-        f"scalars.k_max {math.ceil(max(bounds_deg) / eps)} would"
+        f"{scalars.k_max} passes of {eps:g} {space.unit} do not reach the bound of {max(bounds):g}: "
+        f"scalars.k_max {math.ceil(max(bounds) / eps)} would"
     )
 
 
-def reach(policy: Policy, obs: Any, action: Any) -> float:
-    """How far from a policy's own actions labels lie: the distance of 95% of them [deg].
+def reach(space: Space, policy: Policy, obs: Any, action: Any) -> float:
+    """How far from a policy's own actions labels lie: the distance of 95% of them, in the space's unit.
 
     Args:
+        space: of the actions.
         policy: the policy.
         obs: of the labels (labels, obs).
         action: asked about (labels, action).
     """
-    away = _distances(policy, jnp.asarray(obs), jnp.asarray(action))
+    away = _distances(space, policy, jnp.asarray(obs), jnp.asarray(action))
     user_code.check_actions(away, named(policy))
-    return float(np.degrees(np.quantile(np.asarray(away), REACH_QUANTILE)))
+    return float(space.to_unit(np.quantile(np.asarray(away), REACH_QUANTILE), np))
 
 
-@jax.jit
-def _distances(policy: Any, obs: Array, action: Array) -> Array:
-    return DIRECTIONS.distance(policy.act(jax.random.key(0), None, obs), action)
+@partial(jax.jit, static_argnames="space")
+def _distances(space: Space, policy: Any, obs: Array, action: Array) -> Array:
+    return space.distance(policy.act(jax.random.key(0), None, obs), action)
+
+
+def plain_scalars(space: Space) -> Scalars:
+    """Default scalars in a space's unit: as much of its reach as they are of a half turn."""
+    names = ("eps_deg", "tau_deg", "tau_max_deg", "scalar_within_deg", "nearest_aim_deg")
+    share = space.reach / DIRECTIONS.reach
+    return replace(Scalars(), **{name: getattr(Scalars, name) * share for name in names})
 
 
 def settling(scalars: Scalars, eps_deg: float | None) -> Scalars:
     """Scalars with answers of that strength (None: as they are), and a threshold that is small beside it."""
     eps = scalars.eps_deg if eps_deg is None else eps_deg
     return replace(scalars, eps_deg=eps, tau_deg=min(scalars.tau_deg, eps / PASSES))
-
-
-def falling(sizes: GuideSizes, scalars: Scalars, strengths: Any) -> tuple[GuideSizes, Scalars]:
-    """Sizes and scalars of lanes that take labels of these strengths (labels,) [deg]; None: of one, as they are."""
-    if strengths is None:
-        return sizes, scalars
-    return replace(sizes, eps_falls=True), replace(scalars, eps_last_deg=float(np.min(strengths)))
 
 
 def adapt(
@@ -225,7 +228,7 @@ class _Measuring:
         played = self._played(after) + (own if len(own) == 1 else own[work.lanes.base])
         block, after, more = self._narrowed(block, after)
         usable = ~np.asarray(block.failed) & np.asarray(block.guide.model.fitted)
-        within = judging.within_deg(block)
+        within = judging.within(actions_of(work.env), block)
         return judging.judged(how.by, work.lanes, bases, after, usable, within, played + more), block
 
     def _played(self, rolled: Rolled) -> np.ndarray:

@@ -22,9 +22,9 @@ from cuelearner_jax.devices import each_lane
 from cuelearner_jax.environment import Environment, actions_of
 from cuelearner_jax.errors import UserError, closest
 from cuelearner_jax.evaluate import Rolled, Tell, episodes, mean_interval, roll_lanes, untold, watched, watched_lanes
-from cuelearner_jax.feedback.answers import of_strength
 from cuelearner_jax.guides.base import Guide
 from cuelearner_jax.policies import Common, Policy
+from cuelearner_jax.spaces import Space, said
 from cuelearner_jax.types import Label
 
 HELD_OUT = 5  # every fifth label
@@ -40,7 +40,7 @@ class Judged(NamedTuple):
     before: np.ndarray  # (lanes,)
     after: np.ndarray  # (lanes,)
     used: np.ndarray  # (lanes,) bool: is the model used? Not if it is worth less than nothing, or not finite
-    within_deg: np.ndarray  # (lanes,) how far corrections then lead from the base's actions [deg]
+    within_deg: np.ndarray  # (lanes,) how far corrections then lead from the base's actions [the space's unit]
     # (lanes, 3) after less before and the ends of its 95% interval over episodes, paired; nan by labels
     difference: np.ndarray
     rewarded_steps: np.ndarray  # (lanes,) int: environment steps whose rewards or outcomes decided; 0 by labels
@@ -121,7 +121,7 @@ def judged(
 @partial(jax.jit, static_argnames=("guidance",))
 def _predicted(guidance: Guide, env: Any, scalars: Any, block: Adapting) -> tuple[Array, Array]:
     """Shares (lanes,) of held-out answers that are 0, and that a model of the others predicts."""
-    one_pass = dataclasses.replace(scalars, k_max=1, tau_max_deg=180.0)
+    one_pass = dataclasses.replace(scalars, k_max=1, tau_max_deg=actions_of(env).reach)
     space = actions_of(env)
 
     def one(lane: Adapting) -> tuple[Array, Array]:
@@ -134,9 +134,11 @@ def _predicted(guidance: Guide, env: Any, scalars: Any, block: Adapting) -> tupl
         return jnp.sum(zero, where=held) / count, jnp.where(held.any(), jnp.sum(right, where=held) / count, jnp.nan)
 
     def _right(labels: Label, moved: Float[Array, "n action"]) -> tuple[Array, Array]:
-        eps = of_strength(scalars, labels.eps_deg).radians("eps")  # of all labels, or of each
-        turn = space.sense(labels.action, moved) * space.distance(labels.action, moved) / eps
-        return jnp.round(jnp.clip(turn, -1, 1)) == labels.answer[:, 0], labels.answer[:, 0] == 0
+        """Shares (n,) of what was said of each label that the model says too, and that is "already right"."""
+        moves = space.log(labels.action, moved) / space.from_unit(scalars.eps_deg)
+        told = said(labels.answer)
+        share = lambda flags: jnp.mean(flags, -1, where=told)  # noqa: E731
+        return share(jnp.round(jnp.clip(moves, -1, 1)) == labels.answer), share(labels.answer == 0)
 
     return each_lane(one)(block)
 
@@ -161,12 +163,12 @@ def judged_by_labels(guidance: Guide, sizes: GuideSizes, env: Environment, scala
     zero, right = jax.device_get(_predicted(guidance, env, scalars, block))
     used = ~np.asarray(block.failed) & (right >= zero)
     unknown, none = np.full((len(used), 3), np.nan), np.zeros(len(used), int)
-    return Judged(LABELS, zero, right, used, within_deg(block), unknown, none)
+    return Judged(LABELS, zero, right, used, within(actions_of(env), block), unknown, none)
 
 
-def within_deg(block: Adapting) -> np.ndarray:
-    """The bounds (lanes,) of a block [deg]."""
-    return np.degrees(np.asarray(block.bound))
+def within(space: Space, block: Adapting) -> np.ndarray:
+    """The bounds (lanes,) of a block, in the unit of the space."""
+    return space.to_unit(np.asarray(block.bound), np)
 
 
 def check_bounds(shares: tuple[float, ...], by: str, named: str) -> None:

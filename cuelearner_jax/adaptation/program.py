@@ -35,7 +35,7 @@ from cuelearner_jax import asking
 from cuelearner_jax.agents.learning import all_finite
 from cuelearner_jax.config import GuideSizes, Scalars
 from cuelearner_jax.devices import BY_LANE, SHARED, each_lane, lane_mesh, over_lanes
-from cuelearner_jax.environment import Environment
+from cuelearner_jax.environment import Environment, actions_of
 from cuelearner_jax.evaluate import one_lane
 from cuelearner_jax.guides.base import Guide
 from cuelearner_jax.policies import Guided, Policy
@@ -121,7 +121,7 @@ def _begin(guidance: Guide, sizes: GuideSizes, slots: int, env: Any, columns: An
 def begin(guidance: Guide, sizes: GuideSizes, env: Environment, lanes: Lanes) -> Adapting:
     """Lanes that have asked nothing yet. Their number must divide among the devices of the mesh used later."""
     slots = rounds(lanes, sizes) * sizes.labels_per_round
-    bound = jnp.deg2rad(jnp.asarray(lanes.bound_deg))
+    bound = actions_of(env).from_unit(lanes.bound_deg)
     columns = (*(jnp.asarray(column) for column in (lanes.base, lanes.seed, lanes.budget)), bound)
     check_memory(sizes, jax.eval_shape(partial(_begin, guidance, sizes, slots), env, columns))
     return _begin(guidance, sizes, slots, env, columns)
@@ -202,7 +202,6 @@ def _take(
         def one(labels: Label, lane: Adapting) -> Adapting:
             if guidance.kind.sees_base:  # files do not keep what the base policy does: it tells again
                 labels = labels.replace(base=one_lane(bases, lane.base).act(lane.key, None, labels.obs))
-            labels = asking.as_kept(labels, lane.guide, scalars)
             guide = lane.guide.replace(labels=labels, asked=lane.guide.budget)
             last = (lane.guide.budget - 1) // sizes.labels_per_round  # the fit that follows the last round
             return _kept_finite(lane, asking.fit(guidance, env, scalars, guide, lane.key, last))

@@ -10,11 +10,11 @@ import jax.numpy as jnp
 from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
-from cuelearner_jax.actions import Actions
 from cuelearner_jax.agents import ddqn, view
 from cuelearner_jax.agents.networks import applied, q_network, widened
 from cuelearner_jax.config import AgentSizes
 from cuelearner_jax.devices import portions
+from cuelearner_jax.spaces import Space
 from cuelearner_jax.types import Params
 
 ALIGNED = 64  # layers computed in bfloat16 are filled up to multiples: 20% faster on an H200, whose rows want alignment
@@ -34,7 +34,7 @@ def looked_at(sizes: AgentSizes) -> int:
 
 
 def greedy_actions(
-    sizes: AgentSizes, actions: Actions, env: Any, params: Params, obs: Float[Array, "n obs"], members: int = 1
+    sizes: AgentSizes, actions: Space, env: Any, params: Params, obs: Float[Array, "n obs"], members: int = 1
 ) -> Float[Array, "n action"]:
     """The greedy actions of one agent, as its sizes have them searched: all of the set, or near the peaks.
 

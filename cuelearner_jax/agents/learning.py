@@ -10,13 +10,13 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from cuelearner_jax.actions import Actions
 from cuelearner_jax.agents import ddqn, view
 from cuelearner_jax.agents.choice import greedy_actions, values
 from cuelearner_jax.agents.networks import q_network
 from cuelearner_jax.agents.replay import RingBuffer, ring_buffer
 from cuelearner_jax.config import AgentScalars, AgentSizes, Schedule
 from cuelearner_jax.environment import Environment, actions_of, random_symmetries, spaces_of
+from cuelearner_jax.spaces import Space
 from cuelearner_jax.types import AgentState, Clock, Params, Step, StoredStep, Transition
 
 
@@ -25,7 +25,7 @@ class Learner(NamedTuple):
 
     sizes: AgentSizes
     bootstraps: bool  # do targets look at the next observation?
-    actions: Actions
+    actions: Space
     buffer: RingBuffer
 
     def optimizer(self, scalars: AgentScalars) -> optax.GradientTransformation:

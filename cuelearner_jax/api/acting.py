@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,23 +13,23 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from cuelearner_jax import user_code
-from cuelearner_jax.actions import DIRECTIONS
 from cuelearner_jax.api import arguments
 from cuelearner_jax.api.worlds import World, a_world
 from cuelearner_jax.config import RunConfig
-from cuelearner_jax.environment import Quantity
+from cuelearner_jax.environment import Quantity, actions_of
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.policies import Policy, acted, named
+from cuelearner_jax.policies import Policy, acted, in_space, named
 from cuelearner_jax.runs import trained
+from cuelearner_jax.spaces import DIRECTIONS, Space
 from cuelearner_jax.storage import whole
 from cuelearner_jax.task import Task, shape_of
 from cuelearner_jax.tasks import registry
 from cuelearner_jax.types import EnvState
 
 
-@jax.jit
-def _act(policy: Policy, key: PRNGKeyArray, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
-    return acted(policy, key, None, obs, DIRECTIONS)
+@partial(jax.jit, static_argnames="space")
+def _act(policy: Policy, key: PRNGKeyArray, obs: Float[Array, "n obs"], space: Space) -> Float[Array, "n action"]:
+    return acted(policy, key, None, obs, space)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,6 +43,7 @@ class CallablePolicy:
     observation: tuple[Quantity, ...] = ()  # what it expects to see; empty: not known
     asks: bool = False  # does it ask a teacher, who looks at the true state?
     trained: RunConfig | None = None  # with which configuration; None: no folder says so
+    actions: Space = DIRECTIONS  # in which it acts
 
     def __post_init__(self) -> None:
         """Raises UserError for a policy that is none, or a description of observations that is none."""
@@ -61,7 +63,7 @@ class CallablePolicy:
             key: for a policy that acts at random (default: always the same).
 
         Returns:
-            Unit vectors (2,) or (n, 2).
+            Actions (action,) or (n, action); of directions unit vectors.
 
         Raises:
             UserError: observations of another size, numbers that are not finite, or a policy that asks a teacher.
@@ -71,7 +73,8 @@ class CallablePolicy:
         rows = arguments.observations("obs", obs, sum(quantity.size for quantity in self.observation) or None)
         batch = rows[None] if rows.ndim == 1 else rows
         key = jax.random.key(0) if key is None else arguments.key("key", key)
-        chosen = np.array(_act(self.policy, key, jnp.asarray(batch)))  # a copy, which the caller may write in
+        # A copy, which the caller may write in.
+        chosen = np.array(_act(self.policy, key, jnp.asarray(batch), self.actions))
         user_code.check_actions(chosen, named(self.policy))
         return chosen[0] if rows.ndim == 1 else chosen
 
@@ -99,6 +102,7 @@ def as_policy_in(given: Any, env: Any) -> Policy:
     own = sum(quantity.size for quantity in getattr(env, "observation", ()))
     if seen and own and seen != own:
         raise UserError(f"the policy's observations have {seen} entries, this world's {own}: keep its structure")
+    policy = in_space(policy, actions_of(env))
     user_code.acts_in("policy", policy, env)
     return policy
 
@@ -144,7 +148,6 @@ def load_policy(
         if value is not None:
             arguments.text(argument, value, trained.POLICIES if argument == "policy" else ())
     labels = None if labels is None else arguments.budget("labels", labels, least=0)
-    bound_deg = None if bound_deg is None else arguments.angle("bound_deg", bound_deg)
     seed = None if seed is None else arguments.seed("seed", seed)
     code = None if base is None else as_policy(base, "base")
     if isinstance(task, str):
@@ -162,5 +165,7 @@ def load_policy(
     changed = world.config if world else source.config.task
     source.check(name, changed)
     env = known.environment(changed)
+    bound_deg = None if bound_deg is None else arguments.amount("bound_deg", bound_deg, actions_of(env))
     found = trained.one_policy(source, env, changed, name, guidance, labels, seed, bound_deg)
-    return CallablePolicy(found, shape_of(known, changed).observation, trained.POLICIES[name].taught, source.config)
+    observation = shape_of(known, changed).observation
+    return CallablePolicy(found, observation, trained.POLICIES[name].taught, source.config, actions_of(env))

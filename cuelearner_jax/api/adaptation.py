@@ -15,12 +15,13 @@ import numpy as np
 
 from cuelearner_jax import user_code
 from cuelearner_jax.adaptation import program
+from cuelearner_jax.adaptation.adapting import plain_scalars
 from cuelearner_jax.api import arguments
 from cuelearner_jax.api.acting import CallablePolicy, as_policy, as_policy_in, source_of
 from cuelearner_jax.api.feedback import Labels, diverged, given_settings, label_path, labels_of, rows_of
 from cuelearner_jax.api.worlds import World
 from cuelearner_jax.config import GuideSizes, RunConfig, Scalars
-from cuelearner_jax.environment import Environment
+from cuelearner_jax.environment import Environment, actions_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.policies import Opaque
 from cuelearner_jax.runs.adapted import alone
@@ -130,7 +131,9 @@ def adapt(
         UserError: settings that make no sense, or with which the fit diverges.
     """
     source = _source(policy, world)
-    sizes, scalars, eps_deg = given_settings(sizes, scalars, eps_deg)
+    env = world.env if isinstance(world, World) else world
+    space = actions_of(env)
+    sizes, scalars, eps_deg = given_settings(space, sizes, scalars, eps_deg)
     names = {"guidance": guidance, "judge_by": judge_by}
     names = {name: arguments.text(name, value) for name, value in names.items() if value is not None}
     count, file, rows = _given(labels, world)
@@ -140,7 +143,7 @@ def adapt(
     )
     asked = {
         "labels": None if count is None else (count,),
-        "bound_deg": None if bound_deg is None else (arguments.angle("bound_deg", bound_deg),),
+        "bound_deg": None if bound_deg is None else (arguments.amount("bound_deg", bound_deg, space),),
         "judge_bounds": None if judge_bounds is None else _shares(judge_bounds),
     }
     request = dataclasses.replace(
@@ -150,7 +153,6 @@ def adapt(
         judge_episodes=arguments.whole("judge_episodes", judge_episodes, 1, study.MOST_ENVS),
         **{name: value for name, value in asked.items() if value is not None},
     )
-    env = world.env if isinstance(world, World) else world
     own = as_policy_in(policy, env)
     if teacher is not None:
         user_code.answers_in("teacher", arguments.teacher("teacher", teacher), env)
@@ -166,7 +168,8 @@ def adapt(
     adapted = alone(outcome.found.policy(env), 0)
     named = _called(policy) if isinstance(world, World) else None
     trained = RunConfig(source.config.task)
-    return AdaptedPolicy(adapted, getattr(env, "observation", ()), trained=trained, outcome=outcome, named=named)
+    observation = getattr(env, "observation", ())
+    return AdaptedPolicy(adapted, observation, trained=trained, actions=space, outcome=outcome, named=named)
 
 
 def _source(policy: Any, world: Any) -> PolicySource:
@@ -176,7 +179,8 @@ def _source(policy: Any, world: Any) -> PolicySource:
     if isinstance(world, type) or not all(callable(getattr(world, name, None)) for name in ("reset", "step")):
         raise arguments.refused("world", world, "a world, as cl.make gives it, or an environment")
     task = Task("environment", "a bare environment", _Bare, (Body("own", "", lambda config, split: world),))
-    return PolicySource(task, getattr(policy, "trained", None) or RunConfig(_Bare()), None, Path(task.name))
+    config = getattr(policy, "trained", None) or RunConfig(_Bare(), scalars=plain_scalars(actions_of(world)))
+    return PolicySource(task, config, None, Path(task.name))
 
 
 @dataclasses.dataclass(frozen=True)

@@ -18,11 +18,11 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Float, PRNGKeyArray
 
-from cuelearner_jax.actions import Actions
 from cuelearner_jax.config import LARGEST_FLOAT, plain, settled
 from cuelearner_jax.errors import UserError, closest, shown
 from cuelearner_jax.policies import Policy, policy_of
 from cuelearner_jax.runs.grid import LARGEST_BUDGET, LARGEST_SEED
+from cuelearner_jax.spaces import Space
 from cuelearner_jax.types import Teacher
 
 LONGEST = 200  # characters of a name
@@ -77,9 +77,9 @@ def budget(name: str, value: Any, least: int = 1) -> int:
     return whole(name, value, least, LARGEST_BUDGET - 1)
 
 
-def angle(name: str, value: Any) -> float:
-    """An angle above 0 and up to 180 [deg]."""
-    return number(name, value, 180.0, "an angle above 0 and up to 180")
+def amount(name: str, value: Any, space: Space) -> float:
+    """A strength or a bound, above 0 and up to a space's reach, in the space's unit."""
+    return number(name, value, space.reach, f"a number above 0 and up to {space.reach:g} ({space.unit})")
 
 
 def number(name: str, value: Any, most: float, wanted: str) -> float:
@@ -159,13 +159,14 @@ def observations(name: str, value: Any, size: int | None) -> Float[np.ndarray, "
     return rows
 
 
-def action(name: str, value: Any, space: Actions) -> Any:
+def action(name: str, value: Any, space: Space) -> Any:
     """One action, which may be traced."""
     if isinstance(value, Tracer):
         return value
     found = numbers(name, value)
-    if found.shape != (space.size,) or not found.any():
-        raise refused(name, value, f"an action of shape ({space.size},), for instance [1.0, 0.0]")
+    if found.shape != (space.size,) or not space.usable(found, np):
+        example = np.asarray(space.spread(4))[0].round(2).tolist()
+        raise refused(name, value, f"an action of shape ({space.size},), for instance {example}")
     return found
 
 

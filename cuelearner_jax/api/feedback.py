@@ -20,20 +20,20 @@ import numpy as np
 from jaxtyping import Float
 
 from cuelearner_jax import user_code
-from cuelearner_jax.actions import DIRECTIONS
 from cuelearner_jax.adaptation import adapting, program
 from cuelearner_jax.agents.learning import all_finite
 from cuelearner_jax.api import arguments
 from cuelearner_jax.api.acting import CallablePolicy, as_policy, as_policy_in, entries_of
 from cuelearner_jax.api.worlds import World, a_world
 from cuelearner_jax.config import GuideSizes, Scalars, check_guide
-from cuelearner_jax.environment import Quantity, Spaces, spaces_of
+from cuelearner_jax.environment import Quantity, Spaces, actions_of, spaces_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.feedback import given
 from cuelearner_jax.feedback.answers import RELATIVE, check_teacher
 from cuelearner_jax.guides.base import Guide
 from cuelearner_jax.guides.relative import KIND
-from cuelearner_jax.policies import Common, Guided
+from cuelearner_jax.policies import Common, Guided, in_space
+from cuelearner_jax.spaces import DIRECTIONS, Space
 from cuelearner_jax.storage import label_files
 from cuelearner_jax.types import GuidanceModel, Label, Teacher
 
@@ -42,8 +42,10 @@ class Labels(NamedTuple):
     """Labels as arrays: what was seen, the action asked about, and the answer."""
 
     obs: Float[np.ndarray, "labels obs"]
-    action: Float[np.ndarray, "labels 2"]  # unit vectors
-    answer: Float[np.ndarray, "labels"]  # h: +1 counterclockwise ("more to the left"), 0 already right, -1 clockwise
+    action: Float[np.ndarray, "labels action"]  # directions: unit vectors
+    # h: of directions +1 counterclockwise ("more to the left"), 0 already right, -1 clockwise; (labels, cues) where a
+    # space has several cues, `spaces.UNSAID` for a cue of which nothing was said
+    answer: Float[np.ndarray, "labels *cues"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,6 +57,7 @@ class FeedbackModel:
     scalars: Scalars  # eps of the labels, and how actions are refined
     labels: Labels
     sizes: GuideSizes  # that the guidance was made with
+    space: Space = DIRECTIONS  # of the actions
     env: Any = None  # says how an observation looks from an action; nobody asks it in the raw frame
 
 
@@ -62,6 +65,7 @@ class FeedbackModel:
 def fit_feedback(
     labels: Labels | str | os.PathLike[str],
     *,
+    space: Space = DIRECTIONS,
     eps_deg: float | None = None,
     sizes: GuideSizes | None = None,
     scalars: Scalars | None = None,
@@ -71,7 +75,8 @@ def fit_feedback(
 
     Args:
         labels: arrays, or a label file (its first seed's).
-        eps_deg: strength of an answer [deg]; of arrays 5 if not given, of a file the file's, or of each label its own.
+        space: of the actions in arrays; a file says its own.
+        eps_deg: strength of an answer in the space's unit (default: of arrays 5 degrees, of a file the file's).
         sizes: of the network and its fitting (default: small ones, the paper's are `config.GuideSizes()`).
         scalars: of the fitting and of refinement.
         seed: of the network.
@@ -79,30 +84,31 @@ def fit_feedback(
     Raises:
         UserError: labels or settings that make no sense, or with which the fit diverges.
     """
-    seed, own_eps = arguments.seed("seed", seed), None
-    sizes, scalars, eps_deg = given_settings(sizes, scalars, eps_deg)
-    if not isinstance(labels, tuple):
-        labels = label_path(labels)
-        file = label_files.read(labels)
+    seed = arguments.seed("seed", seed)
+    file = None if isinstance(labels, tuple) else label_files.read(label_path(labels))
+    space = arguments.instance("space", space, Space, "a space of actions") if file is None else file.space
+    sizes, scalars, eps_deg = given_settings(space, sizes, scalars, eps_deg)
+    if file is not None:
         if file.answers != RELATIVE.name:
             raise UserError(f"{labels} holds {file.answers} answers: give a file of {RELATIVE.name} ones")
         given.check_file(file, None, RELATIVE, str(labels))
-        if eps_deg is not None and not math.isclose(eps_deg, file.eps_deg or 0.0, rel_tol=1e-6):
-            raise UserError(f"{labels} holds answers of {file.eps_deg:g} degrees: leave out eps_deg")
+        if eps_deg is not None and not math.isclose(eps_deg, file.eps or 0.0, rel_tol=1e-6):
+            raise UserError(f"{labels} holds answers of {file.eps:g} {file.space.unit}: leave out eps_deg")
         own = file.seeds == file.seeds[0]
-        eps_deg = file.eps_deg
+        eps_deg = file.eps
         rows = jax.tree.map(lambda leaf: np.asarray(leaf)[own], file.labels)
-        labels, own_eps = Labels(rows.obs, rows.action, rows.answer[:, 0]), rows.eps_deg
-    labels = _checked(labels, own_eps)
-    sizes, scalars = settings(sizes, scalars, eps_deg)
-    guidance = _relative(sizes, Spaces(labels.obs.shape[1], DIRECTIONS))
+        labels = labels_of(rows)
+    labels = _checked(labels, space)
+    sizes, scalars = settings(space, sizes, scalars, eps_deg)
+    guidance = _relative(sizes, Spaces(labels.obs.shape[1], space))
     valid = np.ones(len(labels.obs), bool)
-    rows = Label(*(jnp.asarray(part) for part in (labels.obs, labels.action, labels.answer[:, None], valid)))
-    rows = rows.replace(eps_deg=None if own_eps is None else jnp.asarray(own_eps))
+    answers = labels.answer.reshape(len(valid), -1)
+    rows = Label(*(jnp.asarray(part) for part in (labels.obs, labels.action, answers, valid)))
     k_init, k_fit = jax.random.split(jax.random.key(seed))
     program.check_memory(sizes, jax.eval_shape(guidance.init, k_init))
     fit = jax.jit(lambda key, rows, former, scalars: guidance.fit(key, None, rows, former, scalars))
-    return FeedbackModel(guidance, _finite(fit(k_fit, rows, guidance.init(k_init), scalars)), scalars, labels, sizes)
+    model = _finite(fit(k_fit, rows, guidance.init(k_init), scalars))
+    return FeedbackModel(guidance, model, scalars, labels, sizes, space)
 
 
 @user_code.told
@@ -112,7 +118,7 @@ def ask(
     teacher: Teacher,
     *,
     labels: int,
-    bound_deg: float = 45.0,
+    bound_deg: float | None = None,
     eps_deg: float | None = None,
     sizes: GuideSizes | None = None,
     scalars: Scalars | None = None,
@@ -125,8 +131,9 @@ def ask(
         world: where it acts.
         teacher: who answers.
         labels: number of questions.
-        bound_deg: refined actions that are asked about stay within this of the policy's own [deg].
-        eps_deg: strength of an answer [deg] (default: the scalars').
+        bound_deg: refined actions that are asked about stay within this of the policy's own, in the space's unit
+            (default: a quarter of its reach, 45 degrees).
+        eps_deg: strength of an answer in the space's unit (default: the scalars').
         sizes: of the network, its fitting, and the labels of a round.
         scalars: of the fitting, of refinement and of the teacher's faults.
         seed: of everything random.
@@ -137,13 +144,14 @@ def ask(
     as_policy(policy)
     labels, seed = arguments.budget("labels", labels), arguments.seed("seed", seed)
     a_world("world", world)
-    bound_deg = arguments.angle("bound_deg", bound_deg)
-    sizes, scalars = settings(*given_settings(sizes, scalars, eps_deg))
+    space = actions_of(world.env)
+    bound = adapting.BOUND * space.reach if bound_deg is None else arguments.amount("bound_deg", bound_deg, space)
+    sizes, scalars = settings(space, *given_settings(space, sizes, scalars, eps_deg))
     check_teacher(arguments.teacher("teacher", teacher), scalars)
-    adapting.check_angles([bound_deg], scalars)
+    adapting.check_amounts(space, [bound], scalars)
     env, guidance = world.env, _relative(sizes, spaces_of(world.env))
     user_code.answers_in("teacher", teacher, env)
-    lanes, base = program.product(1, (seed,), (labels,), (bound_deg,)), Common(as_policy_in(policy, env))
+    lanes, base = program.product(1, (seed,), (labels,), (bound,)), Common(as_policy_in(policy, env))
     block = program.begin(guidance, sizes, env, lanes)
     for _ in range(program.rounds(lanes, sizes)):
         block = program.ask_round(guidance, sizes, env, teacher, scalars, base, block)
@@ -151,13 +159,14 @@ def ask(
         program.blame(base, teacher, block)
         raise diverged()
     guide = jax.tree.map(lambda leaf: leaf[0], block.guide)
-    return FeedbackModel(guidance, guide.model, scalars, labels_of(guide.labels), sizes, env)
+    return FeedbackModel(guidance, guide.model, scalars, labels_of(guide.labels), sizes, space, env)
 
 
 def labels_of(rows: Label) -> Labels:
     """A lane's labels that count, as arrays."""
     given = jax.device_get(rows)
-    return Labels(*(np.asarray(part)[given.valid] for part in (given.obs, given.action, given.answer[:, 0])))
+    obs, action, answer = (np.asarray(part)[given.valid] for part in (given.obs, given.action, given.answer))
+    return Labels(obs, action, answer[:, 0] if answer.shape[1] == 1 else answer)
 
 
 @user_code.told
@@ -167,31 +176,33 @@ def refine(policy: Any, model: FeedbackModel, bound_deg: float | None = None) ->
     Args:
         policy: as for `ask`.
         model: from `ask` or `fit_feedback`.
-        bound_deg: how far refinement may lead from the policy's own actions [deg]. By default as far as the labels
-            reach: the distance within which 95% of the actions asked about lie from the policy's own, at least eps.
-            A larger one is a warning: there the model was shown nothing.
+        bound_deg: how far refinement may lead from the policy's own actions, in the space's unit. By default as far as
+            the labels reach: the distance within which 95% of the actions asked about lie from the policy's own, at
+            least eps. A larger one is a warning: there the model was shown nothing.
 
     Raises:
         UserError: a bound that is no positive angle.
     """
     base = as_policy(policy)
     arguments.instance("model", model, FeedbackModel, "a model, as cl.ask and cl.fit_feedback give it")
-    bound_deg = None if bound_deg is None else arguments.angle("bound_deg", bound_deg)
+    space = model.space
+    base = in_space(base, space)
+    bound_deg = None if bound_deg is None else arguments.amount("bound_deg", bound_deg, space)
     labels = _checked_model(model).labels
     width, seen = labels.obs.shape[1], entries_of(policy)
     if seen not in (0, width):
         raise UserError(f"model is of observations with {width} entries, the policy's have {seen}: give one of its own")
-    reach = max(adapting.reach(base, labels.obs, labels.action), model.scalars.eps_deg)
+    reach = max(adapting.reach(space, base, labels.obs, labels.action), model.scalars.eps_deg)
     if bound_deg is not None and bound_deg > reach * 1.05 and bound_deg > model.scalars.eps_deg:
         warnings.warn(
-            f"the labels lie within {reach:.1f} degrees of this policy's own actions, and refinement may lead up to "
-            f"{bound_deg:g} away, where the model was shown nothing and may make the policy worse: ask in rounds "
+            f"the labels lie within {reach:.3g} {space.unit} of this policy's own actions, and refinement may lead "
+            f"up to {bound_deg:g} away, where the model was shown nothing and may make the policy worse: ask in rounds "
             "(cuelearner_jax.ask), or leave out bound_deg",
             stacklevel=2,
         )
-    bound = jnp.deg2rad(jnp.float32(reach if bound_deg is None else bound_deg))
+    bound = space.from_unit(reach if bound_deg is None else bound_deg)
     guided = Guided(base, model.model, model.env, model.scalars, model.guidance, bound, model.sizes)
-    return CallablePolicy(guided, policy.observation if seen else (Quantity("observation", width, ""),))
+    return CallablePolicy(guided, policy.observation if seen else (Quantity("observation", width, ""),), actions=space)
 
 
 def _checked_model(model: FeedbackModel) -> FeedbackModel:
@@ -205,12 +216,14 @@ def _relative(sizes: GuideSizes, spaces: Spaces) -> Guide:
     return KIND.make(sizes, spaces)
 
 
-def given_settings(sizes: Any, scalars: Any, eps_deg: Any) -> tuple[GuideSizes | None, Scalars | None, float | None]:
+def given_settings(
+    space: Space, sizes: Any, scalars: Any, eps_deg: Any
+) -> tuple[GuideSizes | None, Scalars | None, float | None]:
     """These arguments as they are, each of them one of its kind or None. Raises UserError for the first that is not."""
     return (
         None if sizes is None else arguments.settings("sizes", sizes, GuideSizes),
         None if scalars is None else arguments.settings("scalars", scalars, Scalars),
-        None if eps_deg is None else arguments.angle("eps_deg", eps_deg),
+        None if eps_deg is None else arguments.amount("eps_deg", eps_deg, space),
     )
 
 
@@ -222,9 +235,11 @@ def label_path(labels: Any) -> Path:
     return path
 
 
-def settings(sizes: GuideSizes | None, scalars: Scalars | None, eps_deg: float | None) -> tuple[GuideSizes, Scalars]:
+def settings(
+    space: Space, sizes: GuideSizes | None, scalars: Scalars | None, eps_deg: float | None
+) -> tuple[GuideSizes, Scalars]:
     """Sizes and scalars, by default those of `adapting`. Raises UserError for what cannot work."""
-    sizes, scalars = sizes or adapting.SIZES, adapting.settling(scalars or Scalars(), eps_deg)
+    sizes, scalars = sizes or adapting.SIZES, adapting.settling(scalars or adapting.plain_scalars(space), eps_deg)
     check_guide(sizes, scalars)
     return sizes, scalars
 
@@ -240,19 +255,19 @@ def rows_of(labels: Any) -> Labels:
     if obs.ndim != 2 or not obs.size or action.shape[:1] != (len(obs),) or answer.shape[:1] != (len(obs),):
         raise UserError(
             f"labels have shapes {obs.shape}, {action.shape}, {answer.shape}: give observations (n, obs), "
-            "actions (n, 2) and answers (n,)"
+            "actions (n, action) and answers (n,), or (n, cues) where there are several"
         )
     return Labels(obs, action, answer)
 
 
-def _checked(labels: Any, own_eps: Any) -> Labels:
+def _checked(labels: Any, space: Space) -> Labels:
     """Labels that a model can be fitted to. Raises UserError for what makes no sense."""
     obs, action, answer = labels = rows_of(labels)
     if len(obs) < 2:
         raise UserError(f"{len(obs)} labels teach nothing: give more")
     answers = answer[:, None] if answer.ndim == 1 else answer
-    rows = Label(obs, action, answers, np.ones(len(obs), bool), None, own_eps)  # pyright: ignore[reportArgumentType]
-    given.check(rows, Spaces(obs.shape[1], DIRECTIONS), RELATIVE)
+    rows = Label(obs, action, answers, np.ones(len(obs), bool))  # pyright: ignore[reportArgumentType]
+    given.check(rows, Spaces(obs.shape[1], space), RELATIVE)
     return labels
 
 

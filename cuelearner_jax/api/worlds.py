@@ -11,12 +11,12 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from cuelearner_jax import user_code
-from cuelearner_jax.actions import Actions
 from cuelearner_jax.api import arguments
 from cuelearner_jax.config import settled
 from cuelearner_jax.environment import Environment, Quantity, actions_of
 from cuelearner_jax.evaluate import SPLITS
 from cuelearner_jax.policies import Teaching
+from cuelearner_jax.spaces import Space
 from cuelearner_jax.task import Task
 from cuelearner_jax.tasks import registry
 from cuelearner_jax.types import EnvState, Policy, Step, Teacher
@@ -53,7 +53,7 @@ class World:
         return self.env.observation
 
     @property
-    def actions(self) -> Actions:
+    def actions(self) -> Space:
         """The action space."""
         return actions_of(self.env)
 

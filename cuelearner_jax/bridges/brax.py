@@ -18,9 +18,9 @@ from brax.envs.wrappers import training
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from cuelearner_jax.actions import retract
 from cuelearner_jax.environment import Environment, Quantity, WholeObservations
 from cuelearner_jax.errors import UserError
+from cuelearner_jax.spaces.directions import retract
 from cuelearner_jax.types import EnvState, Step
 
 RawKey = Any  # uint32 words, which is what brax passes: the wrappers read a batch's shape from them

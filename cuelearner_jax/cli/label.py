@@ -20,7 +20,7 @@ from cuelearner_jax.cli import label_commands
 from cuelearner_jax.cli.parsing import PAPER, about, code_of, out, parse, preset_of, taken, task_of
 from cuelearner_jax.cli.shared_options import Flag, TaskT
 from cuelearner_jax.config import GuideScalars, GuideSizes, RunConfig
-from cuelearner_jax.environment import offers
+from cuelearner_jax.environment import actions_of, offers
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.guides.relative import KIND
@@ -169,16 +169,17 @@ def planned(
         raise UserError(f"--seed is {asked.seed}: give a number from 0 to {LARGEST_SEED - 1}")
     if not 0 <= asked.port < 65536:
         raise UserError(f"--port is {asked.port}: give a number from 0 to 65535")
-    if asked.bound_deg is not None and not 0 < asked.bound_deg <= 180:
-        raise UserError(f"--bound-deg is {asked.bound_deg:g}: give an angle above 0 and up to 180")
     if not asked.who.strip():
         raise UserError("--who is empty: give a name, or leave it out")
-    if merged.sizes.eps_falls:
-        raise UserError("--sizes.eps-falls is for simulated teachers, a page asks with one strength: leave it out")
     if merged.sizes.candidates > 1:
         raise UserError("--sizes.candidates is above 1, but a page asks in situations as they come: leave it out")
     robot, task = _robot(task, asked.robot), task.on(asked.robot)
     env = shape_of(task, asked.task)
+    space = actions_of(env)
+    if asked.bound_deg is not None and not 0 < asked.bound_deg <= space.reach:
+        raise UserError(
+            f"--bound-deg is {asked.bound_deg:g}: give a number above 0 and up to {space.reach:g} ({space.unit})"
+        )
     guidance = guidances.make(guidances.named(asked.guidance), merged.sizes, env)
     if guidance.kind.sees_base:
         raise UserError(f"guidance {guidance.name!r} is for `adapt --labels-from` alone: leave out --guidance here")
@@ -251,7 +252,7 @@ def _base(task: Task, asked: Label[Any], named: str | None, source: PolicySource
             return Base(uniform_in(env), UNIFORM)
         if not offers(env, "aims"):
             raise UserError(f"--questions is {NEAR_AIMS}, but {task.name} has no aims in this world: give {UNIFORM}")
-        reach = float(np.deg2rad(REACH * asked.scalars.eps_deg))
+        reach = float(actions_of(env).from_unit(REACH * asked.scalars.eps_deg))
         return Base(NearAims(task.environment(asked.task), reach), NEAR_AIMS)
     found = load_policy(source.folder, task=task, world=World(task, asked.task), **dataclasses.asdict(lane))
     if found.observation and tuple(found.observation) != tuple(env.observation):

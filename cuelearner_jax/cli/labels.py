@@ -97,17 +97,15 @@ def _inspect(asked: Inspect) -> None:
 def _told(path: Path, file: LabelFile, teacher: bool) -> dict[str, str]:
     """What is known of a file, by name."""
     world = ", ".join(f"{name} {value}" for name, value in file.task.items() if name not in ("name", "from"))
-    strength = "" if file.eps_deg is None else f", by {file.eps_deg:g} degrees"
-    if file.labels.eps_deg is not None:
-        strength = f", by {np.max(file.labels.eps_deg):g} to {np.min(file.labels.eps_deg):g} degrees"
+    strength = "" if file.eps is None else f", by {file.eps:g} {file.space.unit}"
     facts = {"task": f"{file.task.get('name')} ({world})", "answers": f"{file.answers}{strength}"}
     facts["labels"] = f"{len(file.seeds)}" + (
         f" of {len(np.unique(file.seeds))} seeds" if len(np.unique(file.seeds)) > 1 else ""
     )
     form = comparing.form_of(file)
     if form is not None and form.values is not None:
-        counts = Counter(np.asarray(file.labels.answer)[:, 0].tolist())
-        facts["of each answer"] = ", ".join(f"{value:g}: {counts.get(value, 0)}" for value in form.values)
+        counts = Counter(np.asarray(file.labels.answer).ravel().tolist())
+        facts["of each answer"] = ", ".join(f"{value:g}: {counts.get(value, 0)}" for value in form.values(file.space))
     if file.said:
         facts["not known"], facts["taken back"] = (str(file.said.get(name, 0)) for name in (UNSURE, UNDONE))
     if file.session:
@@ -190,7 +188,7 @@ def _flat(file: LabelFile) -> dict[str, list[Any]]:
     columns: dict[str, list[Any]] = {"seed": file.seeds.tolist()}
     if file.people is not None:
         columns |= {name: getattr(file.people, name).tolist() for name in file.people._fields}
-    columns["eps_deg"] = [None] * len(file.seeds) if file.strengths is None else file.strengths.tolist()
+    columns["eps"] = [file.eps] * len(file.seeds)
     layout = (file.session or {}).get("observation") or []
     names = [f"{part['name']}[{i}]" for part in layout for i in range(part["size"])]
     width = file.labels.obs.shape[1]

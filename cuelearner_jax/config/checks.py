@@ -180,16 +180,6 @@ def check_guide(sizes: GuideSizes, scalars: GuideScalars) -> None:
         raise UserError(
             f"scalars.eps_deg is {scalars.eps_deg}: a relative label is a turn of more than 0 and up to 180"
         )
-    if sizes.eps_falls and not 0 < scalars.eps_last_deg <= scalars.eps_deg:
-        raise UserError(
-            f"scalars.eps_last_deg is {scalars.eps_last_deg}, to which sizes.eps_falls leads: give an angle above 0 "
-            f"and up to scalars.eps_deg ({scalars.eps_deg})"
-        )
-    if scalars.eps_last_deg and not sizes.eps_falls:
-        raise UserError(
-            f"scalars.eps_last_deg is {scalars.eps_last_deg}, to which labels fall with sizes.eps_falls alone: add "
-            "that, or leave it out"
-        )
     if scalars.correction_replay < 1:
         raise UserError(f"scalars.correction_replay is {scalars.correction_replay}: give a positive number")
     if scalars.max_grad_norm <= 0:  # a zero gradient would be scaled by 0 / 0
@@ -200,17 +190,13 @@ def _check_choice(sizes: GuideSizes) -> None:
     """Of the situations to ask in."""
     if sizes.ask_all and sizes.candidates == 1:
         raise UserError("sizes.ask_all asks about every candidate: give sizes.candidates above 1 too, or leave it out")
-    if sizes.ask_all and sizes.chosen_by == "teacher":
-        raise UserError("sizes.ask_all leaves nothing to choose: leave out sizes.chosen_by")
     if sizes.ask_all:
         _check_multiple(sizes.labels_per_round, sizes.candidates, "sizes.labels_per_round", "sizes.candidates")
-    elif sizes.candidates > 1 and sizes.ensemble == 1 and sizes.chosen_by == "members":
+    elif sizes.candidates > 1 and sizes.ensemble == 1:
         raise UserError(
             f"sizes.candidates is {sizes.candidates}: questions are chosen by the disagreement of members, so give a "
-            "sizes.ensemble above 1 too, or sizes.chosen_by teacher, or sizes.ask_all"
+            "sizes.ensemble above 1 too, or sizes.ask_all"
         )
-    if sizes.candidates == 1 and sizes.chosen_by == "teacher":
-        raise UserError("sizes.chosen_by is teacher and sizes.candidates is 1: give more situations to choose among")
 
 
 def _check_positive(sizes: Any, names: tuple[str, ...]) -> None:

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from typing import Generic, Literal, TypeVar
 
 import jax
-import jax.numpy as jnp
 
 TaskT = TypeVar("TaskT")
 
@@ -85,19 +84,14 @@ class GuideSizes(_Seeing):
     ensemble: int = 1
     """Members of the guidance model, each fitted to all labels; it predicts their mean."""
     candidates: int = 1
-    """Situations among which each question is chosen (1: as they come)."""
-    chosen_by: Literal["members", "teacher"] = "members"
-    """Who chooses: the members of an ensemble, where they disagree most; or a simulated teacher that watches, where the
-    action asked about is farthest from what it would do."""
+    """Situations among which each question is chosen, where the members of an ensemble disagree most (1: as they
+    come)."""
     ask_all: bool = False
     """Is every candidate asked about, in place of one that is chosen? Simulated labels by the thousand are then soon
     asked for: a round takes its number of questions divided by `candidates` in steps."""
     question_every: int = 1
     """Steps from one question of a simulated teacher to the next (1: every situation is asked about): questions farther
     apart are of more different situations."""
-    eps_falls: bool = False
-    """Does the strength of relative labels fall from question to question of a budget, from scalars.eps_deg to
-    scalars.eps_last_deg? Larger turns first, smaller ones after."""
 
 
 @dataclass(frozen=True)
@@ -108,14 +102,6 @@ class Sizes(GuideSizes, AgentSizes):
     """Does the share of guided episodes follow whether they earn more than the agent's own?"""
     lanes_per_block: int = 0
     """Seeds trained in one block, side by side (0: all) on an accelerator, one by one (0: a block a core) on a CPU."""
-
-
-class _Degrees:
-    """Mixed into scalars of which some are angles in degrees."""
-
-    def radians(self, name: str) -> jax.Array:
-        """The field `name` + `_deg`, in radians; traced where the field is."""
-        return jnp.deg2rad(jnp.asarray(getattr(self, name + "_deg"), jnp.float32))
 
 
 @dataclass(frozen=True)
@@ -144,15 +130,13 @@ class AgentScalars(_Clipping):
 
 
 @dataclass(frozen=True)
-class GuideScalars(_Degrees, _Clipping):
+class GuideScalars(_Clipping):
     """Traced scalars of the guide: of fitting, of refining, and of what it asks about."""
 
     feedback_learning_rate: float = 1e-3
     """Adam's step size of the guidance model."""
     eps_deg: float = 5.0
     """Strength of one relative label: by how much the teacher turns an action [deg]."""
-    eps_last_deg: float = 0.0
-    """With sizes.eps_falls: strength of the last label of a budget, to which it falls geometrically [deg]."""
     tau_deg: float = 0.1
     """Refinement stops once a pass turns the action by less [deg]."""
     tau_max_deg: float = 180.0
@@ -175,7 +159,7 @@ class GuideScalars(_Degrees, _Clipping):
 
 
 @dataclass(frozen=True)
-class TeacherFaults(_Degrees):
+class TeacherFaults:
     """Scalars of a simulated teacher: what it answers about, and how it errs; traced, but for words."""
 
     answer: Literal["best", "nearest"] = "best"
@@ -184,10 +168,8 @@ class TeacherFaults(_Degrees):
     """Good is an action worth at least this share of the best one."""
     nearest_aim_deg: float = 1.0
     """Standard deviation of the error of aim over which that worth is averaged [deg]."""
-    scalar_good: Literal["near", "scored"] = "near"
-    """Scalar feedback calls good what lies near the action in mind, or what is rewarded at once as well."""
     scalar_within_deg: float = 5.0
-    """Scalar feedback: how near that is [deg]."""
+    """Scalar feedback calls good what lies so near the action in mind [deg]."""
     mistake_probability: float = 0.0
     """Teacher's fault: with this probability a turn is told the wrong way round, a demonstration errs on the other side
     of the action asked about, good is called bad and bad good."""

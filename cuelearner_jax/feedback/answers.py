@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-import dataclasses
-from typing import Any, TypeVar
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from cuelearner_jax import actions as geometry
-from cuelearner_jax.actions import DIRECTIONS
-from cuelearner_jax.config import GuideScalars, Scalars, TeacherFaults
+from cuelearner_jax.config import Scalars, TeacherFaults
+from cuelearner_jax.environment import actions_of
 from cuelearner_jax.errors import UserError, shown
 from cuelearner_jax.feedback.forms import AnswerForm
+from cuelearner_jax.spaces import UNSAID, Space
 from cuelearner_jax.types import EnvState, Teacher, ValuesDirections
-
-GuideScalarsT = TypeVar("GuideScalarsT", bound=GuideScalars)
 
 
 def check_teacher(teacher: Any, faults: TeacherFaults) -> None:
@@ -29,22 +26,32 @@ def check_teacher(teacher: Any, faults: TeacherFaults) -> None:
 
 
 def in_mind(
-    teacher: Teacher, state: EnvState, obs: Float[Array, " obs"], action: Float[Array, " action"], scalars: Scalars
+    space: Space,
+    teacher: Teacher,
+    state: EnvState,
+    obs: Float[Array, " obs"],
+    action: Float[Array, " action"],
+    scalars: Scalars,
 ) -> Float[Array, " action"]:
     """What a teacher would have done instead of an action, but for its bias: its best, or the nearest that is good.
 
     The second is the paper's Eq. 2 to the letter, whose answers follow a local gradient.
     """
-    if scalars.answer == "best":
-        return _taught(teacher, teacher.best_action(state, obs), action)
+    if scalars.answer != "nearest":
+        return _taught(space, teacher, teacher.best_action(state, obs), action)
     assert isinstance(teacher, ValuesDirections)  # see `check_teacher`
-    # One with a bias takes everything for turned by it: what it looks for lies round the action turned back.
-    seen = geometry.rotate(action, -scalars.radians("teacher_bias"))
-    spread = scalars.radians("nearest_aim")
-    return _taught(teacher, teacher.nearest_good(state, obs, seen, spread, scalars.nearest_share), action)
+    # One with a bias takes everything for changed by it: what it looks for lies round the action changed back.
+    seen = biased(space, action, -space.from_unit(scalars.teacher_bias_deg))
+    spread = space.from_unit(scalars.nearest_aim_deg)
+    return _taught(space, teacher, teacher.nearest_good(state, obs, seen, spread, scalars.nearest_share), action)
 
 
-def _taught(teacher: Any, given: Any, action: Float[Array, " action"]) -> Float[Array, " action"]:
+def biased(space: Space, action: Float[Array, " action"], bias: Float[Array, ""]) -> Float[Array, " action"]:
+    """Change an action by a constant error along every cue."""
+    return space.toward(action, jnp.ones(len(space.cues)), bias)
+
+
+def _taught(space: Space, teacher: Any, given: Any, action: Float[Array, " action"]) -> Float[Array, " action"]:
     """A teacher's action; NaN where it is none. Raises UserError if it has another shape than actions have."""
     wanted = f"give an action of shape {action.shape}, of real numbers"
     try:
@@ -55,26 +62,22 @@ def _taught(teacher: Any, given: Any, action: Float[Array, " action"]) -> Float[
         raise UserError(f"teacher {type(teacher).__name__} gave an action of shape {found.shape}: {wanted}")
     if not jnp.issubdtype(found.dtype, jnp.floating) and not jnp.issubdtype(found.dtype, jnp.integer):
         raise UserError(f"teacher {type(teacher).__name__} gave {found.dtype} numbers: {wanted}")
-    return geometry.only_actions(found.astype(action.dtype))
-
-
-def of_strength(scalars: GuideScalarsT, eps_deg: Float[Array, "*labels"] | None) -> GuideScalarsT:
-    """Scalars under which answers of that strength [deg] were given; None: of the scalars' own."""
-    return scalars if eps_deg is None else dataclasses.replace(scalars, eps_deg=eps_deg)
+    return space.only_actions(found.astype(action.dtype))
 
 
 def relative_feedback(
+    space: Space,
     action: Float[Array, " action"],
     best: Float[Array, " action"],
     eps: Float[Array, ""] | float,
     indifference: Float[Array, ""] | float = 0.0,
-) -> Float[Array, ""]:
-    """h in {-1, 0, +1}: which of the turns by -eps, 0, +eps [rad] brings `action` nearest to `best`.
+) -> Float[Array, " cues"]:
+    """h of each cue, in {-1, 0, +1}: which of the changes by -eps, 0, +eps brings `action` nearest to `best`.
 
-    0 ("already right") therefore means within eps / 2; `indifference` [rad] widens that.
+    0 ("already right") therefore means within eps / 2; `indifference` widens that. Both are as `space.log` counts.
     """
-    right = geometry.distance(action, best) <= jnp.maximum(eps / 2, indifference)
-    return jnp.where(right, 0.0, geometry.sense(action, best))
+    off = space.log(action, best)
+    return jnp.where(jnp.abs(off) <= jnp.maximum(eps / 2, indifference), 0.0, jnp.sign(off))
 
 
 def relative_answer(
@@ -85,20 +88,27 @@ def relative_answer(
     obs: Float[Array, " obs"],
     action: Float[Array, " action"],
     scalars: Scalars,
-) -> tuple[Float[Array, "1"], Bool[Array, ""]]:
+) -> tuple[Float[Array, " cues"], Bool[Array, ""]]:
     """h of a teacher with the faults of `scalars`, and whether it answered."""
-    h, answered = human_answer(key, action, in_mind(teacher, state, obs, action, scalars), scalars)
-    return h[None], answered
+    space = actions_of(env)
+    return human_answer(key, space, action, in_mind(space, teacher, state, obs, action, scalars), scalars)
 
 
 def human_answer(
-    key: PRNGKeyArray, action: Float[Array, " action"], best: Float[Array, " action"], scalars: Scalars
-) -> tuple[Float[Array, ""], Bool[Array, ""]]:
-    """The answer of somebody with the faults of `scalars` who would do `best`: (h, answered)."""
-    mistaken, answered = _slips(key, scalars)
-    believed = geometry.rotate(best, scalars.radians("teacher_bias"))
-    h = relative_feedback(action, believed, scalars.radians("eps"), scalars.radians("indifference"))
-    return jnp.where(mistaken, -h, h), answered
+    key: PRNGKeyArray, space: Space, action: Float[Array, " action"], best: Float[Array, " action"], scalars: Scalars
+) -> tuple[Float[Array, " cues"], Bool[Array, ""]]:
+    """The answer of somebody with the faults of `scalars` who would do `best`: (h of each cue, answered).
+
+    Mistakes and silence come upon each cue by itself; one of whose cues nothing is said did not answer.
+    """
+    mistaken, spoken = _slips(key, scalars, (len(space.cues),))
+    believed = biased(space, best, space.from_unit(scalars.teacher_bias_deg))
+    eps, indifference = space.from_unit(scalars.eps_deg), space.from_unit(scalars.indifference_deg)
+    h = relative_feedback(space, action, believed, eps, indifference)
+    h = jnp.where(mistaken, -h, h)
+    if len(space.cues) == 1:  # of one cue, nothing said is no answer
+        return h, spoken[0]
+    return jnp.where(spoken | ~jnp.isfinite(h), h, UNSAID), spoken.any()
 
 
 def demonstrated(
@@ -112,13 +122,14 @@ def demonstrated(
 ) -> tuple[Float[Array, " action"], Bool[Array, ""]]:
     """What a teacher with the faults of `scalars` shows in place of an action, and whether it shows anything.
 
-    One that is indifferent shows the action itself where that is near enough. A mistaken one turns it as far the other
-    way: the mirror image of what it meant to show.
+    One that is indifferent shows the action itself where that is near enough. A mistaken one changes it as far the
+    other way: the mirror image of what it meant to show.
     """
-    mistaken, answered = _slips(key, scalars)
-    wanted = geometry.rotate(in_mind(teacher, state, obs, action, scalars), scalars.radians("teacher_bias"))
-    right = geometry.distance(action, wanted) <= scalars.radians("indifference")
-    mirrored = geometry.rotate(action, -geometry.difference(action, wanted))
+    space, (mistaken, answered) = actions_of(env), _slips(key, scalars)
+    wanted = in_mind(space, teacher, state, obs, action, scalars)
+    wanted = biased(space, wanted, space.from_unit(scalars.teacher_bias_deg))
+    right = space.distance(action, wanted) <= space.from_unit(scalars.indifference_deg)
+    mirrored = space.exp(action, -space.log(action, wanted))
     return jnp.where(right, action, jnp.where(mistaken, mirrored, wanted)), answered
 
 
@@ -133,46 +144,56 @@ def scalar_answer(
 ) -> tuple[Float[Array, "1"], Bool[Array, ""]]:
     """1 for a good action and 0 for another, of a teacher with the faults of `scalars`; and whether it answered.
 
-    Good is an action within `scalar_within_deg` of what the teacher has in mind (paper, appendix), or, where
-    `scalar_good` says so, one that is rewarded at once as well (the paper's public code).
+    Good is an action within `scalar_within_deg` of what the teacher has in mind (paper, appendix).
     """
     mistaken, answered = _slips(key, scalars)
-    wanted = geometry.rotate(in_mind(teacher, state, obs, action, scalars), scalars.radians("teacher_bias"))
-    within = jnp.maximum(scalars.radians("scalar_within"), scalars.radians("indifference"))
-    good = geometry.distance(action, wanted) <= within
-    if scalars.scalar_good == "scored":
-        good |= env.step(jax.random.fold_in(key, 0), state, action)[1].reward > 0
+    space = actions_of(env)
+    wanted = in_mind(space, teacher, state, obs, action, scalars)
+    wanted = biased(space, wanted, space.from_unit(scalars.teacher_bias_deg))
+    within = jnp.maximum(space.from_unit(scalars.scalar_within_deg), space.from_unit(scalars.indifference_deg))
+    good = space.distance(action, wanted) <= within
     said = jnp.where(jnp.isfinite(wanted).all(), (good != mistaken).astype(jnp.float32), jnp.nan)
     return said[None], answered
 
 
-def _slips(key: PRNGKeyArray, scalars: Scalars) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
+def _slips(
+    key: PRNGKeyArray, scalars: Scalars, shape: tuple[int, ...] = ()
+) -> tuple[Bool[Array, "*shape"], Bool[Array, "*shape"]]:
     """Is the teacher mistaken this time, and does it answer?"""
     key_mistake, key_silence = jax.random.split(key)
-    mistaken = jax.random.bernoulli(key_mistake, scalars.mistake_probability)
-    silent = jax.random.bernoulli(key_silence, scalars.silence_probability)
+    mistaken = jax.random.bernoulli(key_mistake, scalars.mistake_probability, shape)
+    silent = jax.random.bernoulli(key_silence, scalars.silence_probability, shape)
     return mistaken, ~silent
+
+
+def _way(space: Space) -> str:
+    """What -1 and +1 mean, for a file and for messages."""
+    ways = [f"+1 {cue.words[0]}, -1 {cue.words[1]}" for cue in space.cues]
+    if len(ways) == 1:
+        return f"h: {ways[0]}, 0 already right, by eps"
+    each = "; ".join(f"{cue.name}: {way}" for cue, way in zip(space.cues, ways, strict=True))
+    return f"h of each cue ({each}), 0 already right, {UNSAID:g} not said, by eps"
 
 
 RELATIVE = AnswerForm(
     name="relative",
-    width=1,
-    meaning="h: +1 turn it counterclockwise, 0 already right, -1 turn it clockwise, by eps",
+    width=lambda space: len(space.cues),
+    meaning=_way,
     answer=relative_answer,
-    values=(-1.0, 0.0, 1.0),
+    values=lambda space: (-1.0, 0.0, 1.0) if len(space.cues) == 1 else (-1.0, 0.0, 1.0, UNSAID),
     by_eps=True,
 )
 DEMONSTRATION = AnswerForm(
     name="demonstration",
-    width=DIRECTIONS.size,
-    meaning="x, y of what to do instead, a unit vector",
+    width=lambda space: space.size,
+    meaning=lambda space: f"what to do instead, an action ({space.name})",
     answer=demonstrated,
     is_action=True,
 )
 SCALAR = AnswerForm(
     name="scalar",
-    width=1,
-    meaning="1 a good action, 0 another",
+    width=lambda space: 1,
+    meaning=lambda space: "1 a good action, 0 another",
     answer=scalar_answer,
-    values=(0.0, 1.0),
+    values=lambda space: (0.0, 1.0),
 )

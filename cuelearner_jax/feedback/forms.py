@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from cuelearner_jax.config import Scalars
+from cuelearner_jax.spaces import Space
 from cuelearner_jax.types import EnvState, Teacher
 
 
@@ -32,9 +34,9 @@ class AnswerForm(NamedTuple):
     """A form of answer. Label files are marked with its name; every guidance of the same form can use them."""
 
     name: str
-    width: int  # entries of an answer
-    meaning: str  # of an entry, in a few words
+    width: Callable[[Space], int]  # entries of an answer
+    meaning: Callable[[Space], str]  # of its entries, in a few words
     answer: AnswerFunction
-    values: tuple[float, ...] | None = None  # that an entry may have; None: any finite number
+    values: Callable[[Space], tuple[float, ...]] | None = None  # that an entry may have; None: any finite number
     is_action: bool = False  # is an answer an action itself?
-    by_eps: bool = False  # does it mean a turn by eps? Label files then say how much that was
+    by_eps: bool = False  # does it mean a change by eps? Label files then say how much that was

@@ -5,7 +5,6 @@ from __future__ import annotations
 import jax.numpy as jnp
 import numpy as np
 
-from cuelearner_jax.actions import DIRECTIONS
 from cuelearner_jax.environment import Spaces
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.feedback.forms import AnswerForm
@@ -20,16 +19,16 @@ def check_file(file: LabelFile, spaces: Spaces | None, form: AnswerForm | None, 
 
     Args:
         file: the labels.
-        spaces: of the environment; None: observations of any size, directions as actions.
+        spaces: of the environment; None: observations of any size, the file's own space of actions.
         form: of the answers; None: it is not known, and answers are only finite.
         named: what a message calls the file.
 
     Raises:
         UserError: as `check`, or the file does not say how strong its answers are.
     """
-    if form is not None and form.by_eps and file.eps_deg is None:
-        raise UserError(f"{named} does not say by how many degrees its {form.name} answers turn: write it anew")
-    check(file.labels, spaces or Spaces(file.labels.obs.shape[1], DIRECTIONS), form, named)
+    if form is not None and form.by_eps and file.eps is None:
+        raise UserError(f"{named} does not say how strong its {form.name} answers are: write it anew")
+    check(file.labels, spaces or Spaces(file.labels.obs.shape[1], file.space), form, named)
 
 
 def check(labels: Label, spaces: Spaces, form: AnswerForm | None, named: str = "the labels") -> None:
@@ -42,27 +41,24 @@ def check(labels: Label, spaces: Spaces, form: AnswerForm | None, named: str = "
         named: what a message calls them.
 
     Raises:
-        UserError: a shape is another, a number is not finite, an action is none, an answer is none of the form, a
-            strength is no angle.
+        UserError: a shape is another, a number is not finite, an action is none, an answer is none of the form.
     """
     rows = {"observations": labels.obs, "actions": labels.action, "answers": labels.answer}
-    width = labels.answer.shape[-1] if form is None else form.width
+    width = labels.answer.shape[-1] if form is None else form.width(spaces.actions)
     widths = {"observations": spaces.obs_size, "actions": spaces.actions.size, "answers": width}
     for name, values in rows.items():
         if values.ndim != 2 or values.shape[1] != widths[name]:
             raise UserError(f"{named}: {name} have the shape {values.shape}, (labels, {widths[name]}) is needed")
         _refuse(~np.isfinite(values), f"{named}: {name} hold numbers that are not finite", "leave these labels out")
-    own = np.ones(len(labels.obs)) if labels.eps_deg is None else np.asarray(labels.eps_deg)
-    _refuse(~((own > 0) & (own <= 180)), f"{named}: strengths are no angles above 0 and up to 180", "leave them out")
     for name in ("actions", "answers") if form is not None and form.is_action else ("actions",):
         action = np.asarray(rows[name])
-        # The one action space there is has unit vectors; retract leaves an action of any as it is.
         off = np.abs(np.asarray(spaces.actions.retract(jnp.asarray(action))) - action) > ACTION_ERROR
-        _refuse(off, f"{named}: {name} are no unit vectors", "divide each by its length")
+        _refuse(off, f"{named}: {name} are none of the space {spaces.actions.name!r}", "see its `retract`")
     if form is not None and form.values is not None:
-        values = ", ".join(f"{value:g}" for value in form.values)
-        wrong = ~np.isin(labels.answer, form.values)
-        _refuse(wrong, f"{named}: an answer is none of {values}", f"each means {form.meaning}")
+        known = form.values(spaces.actions)
+        values = ", ".join(f"{value:g}" for value in known)
+        wrong = ~np.isin(labels.answer, known)
+        _refuse(wrong, f"{named}: an answer is none of {values}", f"each means {form.meaning(spaces.actions)}")
 
 
 def _refuse(wrong: np.ndarray, reason: str, remedy: str) -> None:

@@ -84,11 +84,6 @@ class Guide:
         return self.kind.asks
 
     @property
-    def answer_width(self) -> int:
-        """Entries of one answer; 0 where nothing is asked."""
-        return self.form.width if self.form else 0
-
-    @property
     def has_members(self) -> bool:
         """Whether its model is an ensemble, whose members can disagree."""
         return self.asks and self.sizes.ensemble > 1
@@ -99,7 +94,7 @@ class Guide:
         return guide_model(self.sizes, self.spaces)
 
     def target(self, label: Label, scalars: GuideScalars) -> Float[Array, " outputs"]:
-        """What the network is to predict of one label, here its answer; `scalars` have the label's own strength."""
+        """What the network is to predict of one label, here its answer."""
         return label.answer
 
     def predict(
@@ -129,7 +124,8 @@ class Guide:
 
     def lessons(self, labels: Label, scalars: GuideScalars) -> Lesson:
         """Labels (slots, ...) with their targets."""
-        return lessons(labels, self.target, scalars)
+        space = self.spaces.actions if self.form is not None and self.form.by_eps else None
+        return lessons(labels, self.target, scalars, space)
 
     def redrawn(self, key: PRNGKeyArray, batch: Lesson) -> Lesson:
         """What to train on in place of a batch (n, ...) of lessons."""
@@ -182,9 +178,10 @@ class Guide:
         active: Bool[Array, " n"],
         scalars: GuideScalars,
     ) -> Refined:
-        """`act` that leads no farther than `bound` [rad] from the actions, whatever its kind does."""
-        moved = self.act(model, env, obs, actions, active, within(scalars, bound))
-        return moved._replace(actions=self.spaces.actions.clip(moved.actions, actions, bound))
+        """`act` that leads no farther than `bound` from the actions, whatever its kind does."""
+        space = self.spaces.actions
+        moved = self.act(model, env, obs, actions, active, within(space, scalars, bound))
+        return moved._replace(actions=space.clip(moved.actions, actions, bound))
 
     def refined(
         self,
@@ -195,12 +192,13 @@ class Guide:
         k_max: Int[Array, ""] | int | None = None,
     ) -> Refined:
         """`refine` within the limits of the scalars; `k_max`: another number of passes."""
+        space = self.spaces.actions
         return refine(
             residual,
             actions,
             active,
-            space=self.spaces.actions,
-            tau=scalars.radians("tau"),
-            tau_max=scalars.radians("tau_max"),
+            space=space,
+            tau=space.from_unit(scalars.tau_deg),
+            tau_max=space.from_unit(scalars.tau_max_deg),
             k_max=scalars.k_max if k_max is None else k_max,
         )

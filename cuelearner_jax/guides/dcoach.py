@@ -28,7 +28,7 @@ from cuelearner_jax.config import GuideScalars
 from cuelearner_jax.feedback.answers import RELATIVE
 from cuelearner_jax.guides.base import Kind
 from cuelearner_jax.guides.demonstration import Demonstration
-from cuelearner_jax.guides.fitting import Lesson, optimizer
+from cuelearner_jax.guides.fitting import Lesson, optimizer, squared
 from cuelearner_jax.guides.model import for_each
 from cuelearner_jax.guides.refining import Refined
 from cuelearner_jax.types import GuidanceModel, Label, Params
@@ -60,8 +60,9 @@ class DeepCoach(Demonstration):
         return GuidanceModel(for_each(self.sizes.ensemble, begin, key), jnp.array(False))
 
     def target(self, label: Label, scalars: GuideScalars) -> Float[Array, " action"]:
-        """The action turned by h * eps."""
-        return self.spaces.actions.toward(label.action, label.answer[0], scalars.radians("eps"))
+        """The action changed by h * eps along each cue."""
+        space = self.spaces.actions
+        return space.toward(label.action, label.answer, space.from_unit(scalars.eps_deg))
 
     def fit(
         self, key: PRNGKeyArray, env: Any, labels: Label, former: GuidanceModel, scalars: GuideScalars
@@ -72,8 +73,7 @@ class DeepCoach(Demonstration):
         count = rows.valid.sum()
 
         def loss(params: Params, batch: Lesson) -> Array:
-            error = self.member.predict(env, params, batch.obs, batch.action) - batch.target
-            return jnp.mean(jnp.sum(jnp.square(error), -1))
+            return jnp.mean(squared(batch, self.member.predict(env, params, batch.obs, batch.action)))
 
         def step(coached: Coached, numbers: Int[Array, " batch"], key: PRNGKeyArray) -> Coached:
             batch = self.redrawn(key, jax.tree.map(lambda leaf: leaf[order[numbers]], rows))

@@ -45,7 +45,7 @@ class Demonstration(Guide):
             return batch
         k_half, k_where = jax.random.split(key)
         half = jax.random.bernoulli(k_half, 0.5, (batch.action.shape[0], 1))
-        anywhere = self.spaces.actions.uniform(k_where, (batch.action.shape[0],))
+        anywhere = self.spaces.actions.sample(k_where, (batch.action.shape[0],))
         return batch.replace(action=jnp.where(half, anywhere, batch.action))
 
     def act(

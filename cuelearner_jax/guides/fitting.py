@@ -14,8 +14,8 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Key, PRNGKeyArray
 
 from cuelearner_jax.config import GuideScalars, GuideSizes
-from cuelearner_jax.feedback.answers import of_strength
 from cuelearner_jax.guides.model import fitted_members
+from cuelearner_jax.spaces import Space, said
 from cuelearner_jax.types import GuidanceModel, Label, Params
 
 VALIDATION_STRIDE = 5  # every fifth label is a validation label: the 80/20 split of the paper's public code
@@ -28,13 +28,32 @@ class Lesson(struct.PyTreeNode):
     action: Float[Array, " action"]
     target: Float[Array, " outputs"]
     valid: Bool[Array, ""]
+    said: Bool[Array, " cues"] | None = None  # the cues along which errors count; None: all of an error does
+    space: Space | None = struct.field(pytree_node=False, default=None)  # whose cues these are
 
 
-def lessons(labels: Label, target: Callable[[Label, GuideScalars], Array], scalars: GuideScalars) -> Lesson:
-    """Labels (slots, ...) with what their answers, each of its own strength, mean to a network."""
-    targets = jax.vmap(lambda label: target(label, of_strength(scalars, label.eps_deg)))(labels)
+def lessons(
+    labels: Label,
+    target: Callable[[Label, GuideScalars], Array],
+    scalars: GuideScalars,
+    space: Space | None = None,
+) -> Lesson:
+    """Labels (slots, ...) with what their answers mean to a network; `space`: of answers that may leave cues out."""
+    targets = jax.vmap(lambda label: target(label, scalars))(labels)
     # Rounded here, whatever is computed of them next: fused with that, their last bits would hang on the compiler.
-    return Lesson(labels.obs, labels.action, jax.lax.optimization_barrier(targets), labels.valid)
+    rows = Lesson(labels.obs, labels.action, jax.lax.optimization_barrier(targets), labels.valid)
+    if space is None or len(space.cues) == 1:
+        return rows
+    return rows.replace(said=said(labels.answer), space=space)
+
+
+def squared(rows: Lesson, predicted: Float[Array, "n outputs"]) -> Float[Array, " n"]:
+    """Squared errors of predictions; along the cues of which something was said, where a label leaves some out."""
+    off = predicted - rows.target
+    if rows.said is None:
+        return jnp.sum(jnp.square(off), -1)
+    assert rows.space is not None  # `lessons` gives both
+    return jnp.sum(jnp.square(jax.vmap(rows.space.along)(rows.action, off)), -1, where=rows.said)
 
 
 def optimizer(scalars: GuideScalars) -> optax.GradientTransformation:
@@ -78,7 +97,7 @@ def fit_least_squares(
     """
 
     def errors(params: Params, rows: Lesson) -> Float[Array, " n"]:
-        return jnp.sum(jnp.square(apply(params, rows.obs, rows.action) - rows.target), -1)
+        return squared(rows, apply(params, rows.obs, rows.action))
 
     return fit_model(key, rows, scalars, init=init, losses=errors, sizes=sizes, redrawn=redrawn)
 

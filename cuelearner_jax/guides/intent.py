@@ -21,17 +21,17 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from cuelearner_jax.actions import Actions
 from cuelearner_jax.config import GuideScalars
 from cuelearner_jax.environment import Aims
-from cuelearner_jax.feedback.answers import RELATIVE, of_strength
+from cuelearner_jax.feedback.answers import RELATIVE
 from cuelearner_jax.guides.base import Guide, Kind
 from cuelearner_jax.guides.fitting import fit_model
 from cuelearner_jax.guides.model import GuideModel, ensemble
 from cuelearner_jax.guides.refining import Refined
+from cuelearner_jax.spaces import Space, said
 from cuelearner_jax.types import GuidanceModel, Label, Params
 
-SPREAD_DEG = 1.0  # how far what a teacher means may lie from the aim that describes it
+SPREAD = 1 / 180  # of the space's reach: how far what a teacher means may lie from the aim that describes it
 ELSEWHERE = 360  # evenly spaced actions that stand for "it means none of these"
 SLIPS = 0.02  # share of answers that say nothing: any of the words
 WORDS = 3
@@ -65,34 +65,35 @@ class Evidence(struct.PyTreeNode):
 
 
 def likelihood(
-    space: Actions,
+    space: Space,
     action: Float[Array, " action"],
     goals: Float[Array, "goals action"],
-    h: Float[Array, ""],
+    h: Float[Array, " cues"],
     eps: Float[Array, ""],
 ) -> Float[Array, " goals"]:
     """Probability of the answer h about `action` from somebody who means each of the goals.
 
-    What is meant lies round the goal with a logistic error of `SPREAD_DEG`; within eps / 2 of the action it is right.
+    What is meant lies round the goal, along each cue by itself, with a logistic error of `SPREAD`; within eps / 2 of
+    the action it is right. A cue of which nothing was said tells nothing.
     """
-    offset = space.sense(action[None], goals) * space.distance(action[None], goals)
-    width = jnp.deg2rad(SPREAD_DEG)
+    offset, width = space.log(action[None], goals), space.from_unit(SPREAD * space.reach)
     above = jax.nn.sigmoid((offset - eps / 2) / width)
     below = jax.nn.sigmoid((-offset - eps / 2) / width)
-    return jnp.where(h > 0, above, jnp.where(h < 0, below, 1.0 - above - below))
+    each = jnp.where(h > 0, above, jnp.where(h < 0, below, 1.0 - above - below))
+    return each[..., 0] if len(space.cues) == 1 else jnp.prod(each, -1, where=said(h))
 
 
-def evidence_of(env: Any, space: Actions, label: Label, scalars: GuideScalars) -> Evidence:
-    """What a label says of the aims of its situation, by its own strength if it has one."""
+def evidence_of(env: Any, space: Space, label: Label, scalars: GuideScalars) -> Evidence:
+    """What a label says of the aims of its situation."""
     aims: Aims = env.aims(label.obs)
-    eps = of_strength(scalars, label.eps_deg).radians("eps")
-    of_aims = likelihood(space, label.action, aims.actions, label.answer[0], eps)
-    of_none = likelihood(space, label.action, space.spread(ELSEWHERE), label.answer[0], eps).mean(keepdims=True)
+    eps = space.from_unit(scalars.eps_deg)
+    of_aims = likelihood(space, label.action, aims.actions, label.answer, eps)
+    of_none = likelihood(space, label.action, space.spread(ELSEWHERE), label.answer, eps).mean(keepdims=True)
     return Evidence(aims.features, aims.possible, jnp.concatenate([of_aims, of_none]), label.valid)
 
 
 def followed(
-    space: Actions,
+    space: Space,
     share: Float[Array, " aims_and_none"],
     aims: Float[Array, "aims action"],
     action: Float[Array, " action"],
@@ -155,8 +156,7 @@ class Intent(Guide):
         goals, sure = jax.vmap(partial(followed, space), (0, 0, 0, None))(share, aims.actions, actions, scalars)
 
         def phi(current: Float[Array, "n action"]) -> Float[Array, "n action"]:
-            step = jnp.minimum(scalars.radians("eps"), space.distance(current, goals))
-            return space.toward(current, space.sense(current, goals), step) - current
+            return space.approach(current, goals, space.from_unit(scalars.eps_deg)) - current
 
         return self.refined(phi, actions, active & sure & model.fitted, scalars)
 

@@ -17,7 +17,6 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from cuelearner_jax.actions import Actions
 from cuelearner_jax.config import GuideScalars
 from cuelearner_jax.feedback.answers import RELATIVE
 from cuelearner_jax.guides.base import Kind
@@ -25,6 +24,7 @@ from cuelearner_jax.guides.fitting import fit_least_squares, held_out, lessons
 from cuelearner_jax.guides.model import GuideModel, guide_model
 from cuelearner_jax.guides.refining import Refined
 from cuelearner_jax.guides.relative import Relative
+from cuelearner_jax.spaces import Space
 from cuelearner_jax.types import GuidanceModel, Label, Params
 
 KNOTS = 13  # evenly spaced, from the largest turn that was asked about on one side to that on the other
@@ -48,10 +48,10 @@ class TwoParts(struct.PyTreeNode):
 
 
 def turned(
-    space: Actions, first: Float[Array, "n action"], actions: Float[Array, "n action"], eps: Float[Array, ""]
+    space: Space, first: Float[Array, "n action"], actions: Float[Array, "n action"], eps: Float[Array, ""]
 ) -> Float[Array, " n"]:
     """How far actions lie from what they were first, counterclockwise, in units of eps."""
-    return space.sense(first, actions) * space.distance(first, actions) / eps
+    return space.log(first, actions)[..., 0] / eps
 
 
 def _hats(turns: Float[Array, " n"], reach: Float[Array, ""]) -> Float[Array, "n knots"]:
@@ -81,10 +81,10 @@ def smoothed(turns: Float[Array, " n"], wanted: Float[Array, " n"], valid: Bool[
 
 
 def vectors(
-    space: Actions, heights: Float[Array, " n"], actions: Float[Array, "n action"], eps: Float[Array, ""]
+    space: Space, heights: Float[Array, " n"], actions: Float[Array, "n action"], eps: Float[Array, ""]
 ) -> Float[Array, "n action"]:
     """Corrections as vectors to be added to actions, in units of eps."""
-    return (space.toward(actions, heights, eps) - actions) / eps
+    return (space.toward(actions, heights[:, None], eps) - actions) / eps
 
 
 def share_of(
@@ -117,7 +117,8 @@ class Offset(Relative):
     ) -> GuidanceModel:
         """The spline of the training labels, then the network of what it leaves, then the network's share."""
         assert labels.base is not None  # `asking` keeps it for a kind that `sees_base`
-        eps, rows, space = scalars.radians("eps"), lessons(labels, self.target, scalars), self.spaces.actions
+        space, rows = self.spaces.actions, lessons(labels, self.target, scalars)
+        eps = space.from_unit(scalars.eps_deg)
         asked = space.retract(rows.action + rows.target)
         turns = turned(space, labels.base, rows.action, eps)
         training = rows.valid & ~held_out(len(rows.valid))
@@ -141,7 +142,8 @@ class Offset(Relative):
         scalars: GuideScalars,
     ) -> Refined:
         """As `act`, of `actions` that were `first` before anything corrected them."""
-        eps, known, space = scalars.radians("eps"), model.params, self.spaces.actions
+        space, known = self.spaces.actions, model.params
+        eps = space.from_unit(scalars.eps_deg)
 
         def phi(current: Float[Array, "n action"]) -> Float[Array, "n action"]:
             turns = turned(space, first, current, eps)

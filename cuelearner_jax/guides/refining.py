@@ -14,8 +14,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from cuelearner_jax.actions import Actions
 from cuelearner_jax.config import GuideScalars
+from cuelearner_jax.spaces import Space
 
 GuideScalarsT = TypeVar("GuideScalarsT", bound=GuideScalars)
 
@@ -32,9 +32,9 @@ def untouched(actions: Float[Array, "n action"]) -> Refined:
     return Refined(actions, jnp.zeros(actions.shape[0], jnp.int32))
 
 
-def within(scalars: GuideScalarsT, bound: Float[Array, ""]) -> GuideScalarsT:
-    """Scalars with which refinement stays within `bound` [rad] of the first action, or nearer where it did before."""
-    return dataclasses.replace(scalars, tau_max_deg=jnp.minimum(scalars.tau_max_deg, jnp.rad2deg(bound)))
+def within(space: Space, scalars: GuideScalarsT, bound: Float[Array, ""]) -> GuideScalarsT:
+    """Scalars with which refinement stays within `bound` of the first action, or nearer where it did before."""
+    return dataclasses.replace(scalars, tau_max_deg=jnp.minimum(scalars.tau_max_deg, space.to_unit(bound)))
 
 
 def refine(
@@ -42,7 +42,7 @@ def refine(
     first: Float[Array, "n action"],
     active: Bool[Array, " n"],
     *,
-    space: Actions,
+    space: Space,
     tau: Float[Array, ""] | float,
     tau_max: Float[Array, ""] | float,
     k_max: Int[Array, ""] | int,
@@ -54,8 +54,8 @@ def refine(
         first: a_0.
         active: rows to refine; the others come back untouched.
         space: the action space.
-        tau: a row stops once a pass moves it by less than this [rad].
-        tau_max: bound on the way from `first` [rad]; every iterate is clipped to it.
+        tau: a row stops once a pass moves it by less than this along every cue, as `space.log` counts.
+        tau_max: bound on the way from `first` along each cue; every iterate is clipped to it.
         k_max: largest number of passes.
     """
 

@@ -88,11 +88,6 @@ def make(name: str, sizes: GuideSizes, env: Any, options: Any = None) -> Guide:
     for need in kind.needs:
         if not offers(env, need):
             raise UserError(f"guidance {kind.name!r} needs an environment with `{need}`, which this task's has not")
-    if sizes.eps_falls and kind.form is not None and not kind.form.by_eps:
-        raise UserError(
-            f"guidance {kind.name!r} asks for {kind.form.name} answers, which have no strength that could fall: leave "
-            "out --sizes.eps-falls"
-        )
     return kind.make(sizes, spaces_of(env), options)
 
 

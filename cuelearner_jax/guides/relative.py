@@ -22,13 +22,14 @@ class Relative(Guide):
     """A guide that corrects actions until nothing moves."""
 
     def target(self, label: Label, scalars: GuideScalars) -> Float[Array, " action"]:
-        """Eq. 3's eps * h as a vector: the action turned by h * eps, less the action."""
-        return self.spaces.actions.toward(label.action, label.answer[0], scalars.radians("eps")) - label.action
+        """Eq. 3's eps * h as a vector: the action changed by h * eps along each cue, less the action."""
+        space = self.spaces.actions
+        return space.toward(label.action, label.answer, space.from_unit(scalars.eps_deg)) - label.action
 
     def lessons(self, labels: Label, scalars: GuideScalars) -> Lesson:
         """Labels (slots, ...) with their targets in units of eps."""
         rows = super().lessons(labels, scalars)
-        return rows.replace(target=rows.target / scalars.radians("eps"))
+        return rows.replace(target=rows.target / self.spaces.actions.from_unit(scalars.eps_deg))
 
     def act(
         self,
@@ -40,9 +41,10 @@ class Relative(Guide):
         scalars: GuideScalars,
     ) -> Refined:
         """Eq. 4: a <- a + phi(s, a), in active rows of a fitted model."""
+        eps = self.spaces.actions.from_unit(scalars.eps_deg)
 
         def phi(current: Float[Array, "n action"]) -> Float[Array, "n action"]:
-            return scalars.radians("eps") * self.predict(env, model.params, obs, current)
+            return eps * self.predict(env, model.params, obs, current)
 
         return self.refined(phi, actions, active & model.fitted, scalars)
 

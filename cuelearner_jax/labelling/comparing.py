@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
@@ -78,7 +79,7 @@ def with_teacher(
     situations = list(lived(env, keys_of(file.session["seed"]), [items[number] for number in range(len(items))]))
     if len(situations) <= len(items):
         raise UserError("the file's situations come out otherwise with this program: use the one that wrote it")
-    told = scalars if file.eps_deg is None else _with_eps(scalars, file.eps_deg)
+    told = scalars if file.eps is None else dataclasses.replace(scalars, eps_deg=file.eps)
 
     @jax.jit
     def one(env: Environment, teacher: Any, state: Any, obs: jax.Array, action: jax.Array) -> jax.Array:
@@ -89,28 +90,24 @@ def with_teacher(
     return agreement(form, env, np.asarray(file.labels.answer), theirs)
 
 
-def _with_eps(scalars: Scalars, eps_deg: float) -> Scalars:
-    return Scalars(**{**{name: getattr(scalars, name) for name in vars(scalars)}, "eps_deg": eps_deg})
-
-
 def between(one: LabelFile, other: LabelFile, env: Any) -> Agreement:
-    """How well two files agree on the questions that both answered: the same observation, action and strength.
+    """How well two files agree on the questions that both answered: the same observation and action.
 
-    Raises UserError if their answers are of two forms or strengths.
+    Raises UserError if their answers are of two forms, spaces or strengths.
     """
     form = form_of(one)
-    if form is None or (one.answers, one.eps_deg) != (other.answers, other.eps_deg):
+    if form is None or (one.answers, one.space, one.eps) != (other.answers, other.space, other.eps):
         raise UserError(f"the files hold {_called(one)} and {_called(other)} answers: give two of one form")
     theirs = _by_question(other)
     mine = _by_question(one)
     both = [question for question in mine if question in theirs]
-    width = form.width
+    width = form.width(one.space)
     pairs = np.array([(mine[question], theirs[question]) for question in both], np.float32).reshape(-1, 2, width)
     return agreement(form, env, pairs[:, 0], pairs[:, 1])
 
 
 def _called(file: LabelFile) -> str:
-    return file.answers if file.eps_deg is None else f"{file.answers} ({file.eps_deg:g} degrees)"
+    return file.answers if file.eps is None else f"{file.answers} ({file.eps:g} {file.space.unit})"
 
 
 def _by_question(file: LabelFile) -> dict[bytes, np.ndarray]:
@@ -118,9 +115,8 @@ def _by_question(file: LabelFile) -> dict[bytes, np.ndarray]:
 
 
 def _questions(file: LabelFile) -> Iterator[tuple[bytes, np.ndarray]]:
-    """What was asked, observation, action and strength, and what was said, label after label."""
-    strengths = np.zeros(len(file.seeds)) if file.strengths is None else file.strengths
-    columns = (file.labels.obs, file.labels.action, strengths.astype(np.float32), file.labels.answer)
+    """What was asked, observation and action, and what was said, label after label."""
+    columns = (file.labels.obs, file.labels.action, file.labels.answer)
     for *asked, answer in zip(*(np.asarray(column) for column in columns), strict=True):
         yield b"".join(part.tobytes() for part in asked), answer
 
@@ -128,17 +124,17 @@ def _questions(file: LabelFile) -> Iterator[tuple[bytes, np.ndarray]]:
 def merged(files: Iterable[LabelFile]) -> tuple[LabelFile, int]:
     """One set of labels of several files' sets, one after the other, and how many were left out as they were there.
 
-    A label is there already if one of an earlier file has its observation, action, answer and strength, and the person
-    and the time where both tell them.
+    A label is there already if one of an earlier file has its observation, action and answer, and the person and the
+    time where both tell them.
 
-    Raises UserError if they differ in task, world or form, or a file holds several sets.
+    Raises UserError if they differ in task, world, form or strength, or a file holds several sets.
     """
     files = list(files)
     first = files[0]
     for file in files:
         if len(np.unique(file.seeds)) > 1:
             raise UserError("a file holds the labels of several seeds, which belong apart: merge files of one set each")
-        for name in ("task", "answers", "eps_deg"):
+        for name in ("task", "answers", "space", "eps"):
             if getattr(file, name) != getattr(first, name):
                 raise UserError(
                     f"the files differ in {name} ({getattr(first, name)}, {getattr(file, name)}): merge alike ones"
@@ -147,9 +143,7 @@ def merged(files: Iterable[LabelFile]) -> tuple[LabelFile, int]:
         raise UserError("the files' observations differ in size: merge files of one world")
     new = _new(files)
     files = [_rows(file, kept) for file, kept in zip(files, new, strict=True)]
-    differ = any(file.labels.eps_deg is not None for file in files)
-    sets = [file.labels.replace(eps_deg=np.float32(file.strengths)) if differ else file.labels for file in files]
-    labels = jax.tree.map(lambda *leaves: np.concatenate(leaves), *sets)
+    labels = jax.tree.map(lambda *leaves: np.concatenate(leaves), *(file.labels for file in files))
     told = [file.people for file in files if file.people is not None]
     people = None
     if len(told) == len(files):
@@ -157,7 +151,7 @@ def merged(files: Iterable[LabelFile]) -> tuple[LabelFile, int]:
         people = label_files.People(np.arange(len(parts[0])), *parts[1:])
     seeds = np.zeros(len(labels.valid), np.int64)
     left_out = sum(int((~kept).sum()) for kept in new)
-    return LabelFile(first.task, first.answers, first.eps_deg, seeds, labels, people), left_out
+    return LabelFile(first.task, first.answers, first.space, first.eps, seeds, labels, people), left_out
 
 
 def _new(files: list[LabelFile]) -> list[np.ndarray]:

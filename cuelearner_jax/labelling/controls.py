@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cuelearner_jax.feedback.forms import AnswerForm
+from cuelearner_jax.spaces import DIRECTIONS
 
 
 class Control(NamedTuple):
@@ -46,13 +47,13 @@ def answers(form: AnswerForm) -> tuple[Control, ...]:
         return LEFT, AS_IT_IS, RIGHT
     if form.values is None:
         return ()
-    if set(form.values) == {0.0, 1.0}:
+    if set(form.values(DIRECTIONS)) == {0.0, 1.0}:
         no = Control("no", "no", ("ArrowLeft", "n", "N"), "←", (0.0,))
         yes = Control("yes", "yes", ("ArrowRight", "y", "Y"), "→", (1.0,))
         return no, yes
     return tuple(
         Control(f"value-{place}", f"{value:g}", (str(place),), str(place), (value,))
-        for place, value in enumerate(form.values, start=1)
+        for place, value in enumerate(form.values(DIRECTIONS), start=1)
     )
 
 
@@ -68,7 +69,11 @@ def question(form: AnswerForm) -> str:
         return "Which way should the middle arrow turn?"
     if form.is_action:
         return "Point at what to do instead: click there."
-    return "Is the arrow good?" if set(form.values or ()) == {0.0, 1.0} else f"Your answer? ({form.meaning})"
+    return (
+        "Is the arrow good?"
+        if set(form.values(DIRECTIONS) if form.values else ()) == {0.0, 1.0}
+        else f"Your answer? ({form.meaning(DIRECTIONS)})"
+    )
 
 
 def help_lines(form: AnswerForm) -> list[str]:

@@ -50,7 +50,7 @@ class Plan:
     labels: int  # answers that are wanted
     seed: int = 0
     who: str = "anonymous"
-    bound_deg: float | None = None  # questions stay within this of the base's actions [deg]; None: anywhere
+    bound_deg: float | None = None  # of questions' way from the base's actions, in the space's unit; None: anywhere
     robot: str = ""  # its body and what that walks by, where it is not the task's own
     again: tuple[np.ndarray, ...] = ()  # actions that another session of this seed asked about: they are asked again
     again_of: str = ""  # digest of its file
@@ -67,8 +67,8 @@ class Plan:
         return {"name": self.task.name, **to_json(self.config.task)}
 
     @property
-    def eps_deg(self) -> float | None:
-        """Strength of an answer [deg], where the form has one."""
+    def eps(self) -> float | None:
+        """Strength of an answer in the space's unit, where the form has one."""
         return self.config.scalars.eps_deg if self.form.by_eps else None
 
     def session(self, env: Any) -> dict[str, Any]:
@@ -79,7 +79,7 @@ class Plan:
             "guidance": self.guidance.name,
             "base": self.base.name,
             "base_digest": self.base.digest,
-            "bound_deg": self.bound_deg,
+            "bound": self.bound_deg,
             **({"robot": self.robot} if self.robot else {}),
             **({"again_of": self.again_of} if self.again else {}),
             "observation": layout,

@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from cuelearner_jax import asking, user_code
+from cuelearner_jax.environment import actions_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.labelling import controls
 from cuelearner_jax.labelling.learner import Fitted, Learner
@@ -93,7 +94,8 @@ class Session:
             raise UserError(f"{plan.task.name} has no sketches to label by: give its body's Pictures `sketch`")
         self.plan = plan
         shape = shape_of(plan.task, plan.config.task)
-        named = plan.world, plan.form.name, plan.eps_deg, plan.form.meaning, plan.session(shape)
+        space = actions_of(shape)
+        named = plan.world, plan.form.name, space, plan.eps, plan.form.meaning(space), plan.session(shape)
         self._writer = label_files.LabelWriter(folder, *named, written_by=provenance())
         tell("making the world")
         self.env = plan.task.environment(plan.config.task)
@@ -103,7 +105,7 @@ class Session:
         start = asking.start(plan.guidance, self.env, slots, plan.labels, self._keys.model, self._keys.start)
         tell("preparing the model")
         self._learner = Learner(plan, self.env, self._programs, start, self._keys.session)
-        self._bound = None if plan.bound_deg is None else jnp.deg2rad(jnp.asarray(plan.bound_deg, jnp.float32))
+        self._bound = None if plan.bound_deg is None else space.from_unit(plan.bound_deg)
         self._acting = threading.Lock()  # one answer at a time; whoever waits for an item holds no other lock
         self._lock = threading.RLock()
         self._ahead = ThreadPoolExecutor(1, thread_name_prefix="ahead")  # the one thread that makes items

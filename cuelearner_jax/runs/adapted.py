@@ -14,6 +14,7 @@ from cuelearner_jax import config as configuration
 from cuelearner_jax.adaptation import stored
 from cuelearner_jax.adaptation.adapting import Adapted
 from cuelearner_jax.adaptation.program import Lanes
+from cuelearner_jax.environment import actions_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import one_lane
 from cuelearner_jax.feedback.forms import AnswerForm
@@ -218,7 +219,7 @@ def _write_labels(folder: Path, adapted: Adapted, task: Task, world: Any) -> Non
     of = adapted.asked
     form: AnswerForm | None = of.guidance.form
     assert form is not None
-    told = {"name": task.name, **configuration.to_json(world)}
+    told, space = {"name": task.name, **configuration.to_json(world)}, actions_of(of.env)
     rows: Label = adapted.labels
     largest = of.lanes.budget == of.lanes.budget.max()
     for bound in np.unique(of.lanes.bound_deg):
@@ -226,7 +227,7 @@ def _write_labels(folder: Path, adapted: Adapted, task: Task, world: Any) -> Non
         eps = of.scalars.eps_deg if form.by_eps else None
         sets = jax.tree.map(lambda leaf, own=own: leaf[own], rows)
         file = folder / labels_name(of.lanes, float(bound))
-        label_files.write(file, told, form.name, eps, of.lanes.seed[own], sets, form.meaning)
+        label_files.write(file, told, form.name, space, eps, of.lanes.seed[own], sets, form.meaning(space))
 
 
 def _write_curve(folder: Path, name: str, adapted: Adapted, task: Task) -> None:

@@ -11,11 +11,11 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from cuelearner_jax import user_code
-from cuelearner_jax.actions import Actions
 from cuelearner_jax.environment import Environment, actions_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import episodes
 from cuelearner_jax.policies import Policy, acted, named
+from cuelearner_jax.spaces import Space
 from cuelearner_jax.task import Pictures
 from cuelearner_jax.types import EnvState
 
@@ -94,7 +94,7 @@ def question(pictures: Pictures, env: Environment, policy: Policy, episode: int,
 class _Watched:
     """A policy that takes note of whether it gave actions; films are drawn inside compiled programs."""
 
-    def __init__(self, policy: Policy, actions: Actions) -> None:
+    def __init__(self, policy: Policy, actions: Space) -> None:
         self.policy, self.sound = policy, []
         self._actions = actions
 

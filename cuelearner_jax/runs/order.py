@@ -8,8 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from cuelearner_jax import config as configuration
 from cuelearner_jax.asking import label_slots
 from cuelearner_jax.config import GuideSizes, RunConfig, Scalars
@@ -145,16 +143,10 @@ def read_labels(
                 "give fitting labels"
             )
         given.check_file(file, spaces_of(env), guidance.form, str(path))
-    if file.eps_deg is not None and not math.isclose(file.eps_deg, scalars.eps_deg, rel_tol=1e-6):
+    if file.eps is not None and not math.isclose(file.eps, scalars.eps_deg, rel_tol=1e-6):
         raise UserError(
-            f"{path} holds labels of {file.eps_deg:g} degrees, the run's are of {scalars.eps_deg:g}: "
-            f"give --scalars.eps-deg {file.eps_deg:g}, or other labels"
-        )
-    if file.labels.eps_deg is not None and not sizes.eps_falls:
-        last = float(np.min(file.labels.eps_deg))
-        raise UserError(
-            f"{path} holds labels of strengths down to {last:g} degrees: give --sizes.eps-falls --scalars.eps-last-deg "
-            f"{last:g}, or other labels"
+            f"{path} holds labels of {file.eps:g} {file.space.unit}, the run's are of {scalars.eps_deg:g}: "
+            f"give --scalars.eps-deg {file.eps:g}, or other labels"
         )
     for guidance in asking:
         seeds, budgets = grid.lanes(guidance)

@@ -11,7 +11,7 @@ import numpy as np
 from rich.progress import Progress, TaskID
 
 from cuelearner_jax import config as configuration
-from cuelearner_jax.environment import Environment
+from cuelearner_jax.environment import Environment, actions_of
 from cuelearner_jax.runs.failures import LISTED, variant_name
 from cuelearner_jax.runs.grid import config_hash
 from cuelearner_jax.runs.kept import items, read_due, restore_blocks, write_due
@@ -192,7 +192,9 @@ class Runner:
         task = {"name": self.order.task.name, **configuration.to_json(config.task)}
         seeds, labels = self.training.labels()
         eps = config.scalars.eps_deg if form.by_eps else None
-        label_files.write(self.folder / label_files.PARQUET, task, form.name, eps, seeds, labels, form.meaning)
+        space = actions_of(self.group.env)
+        told = form.name, space, eps, seeds, labels, form.meaning(space)
+        label_files.write(self.folder / label_files.PARQUET, task, *told)
 
     def _train(self, saved: Checkpoints, writer: results.ResultsWriter, tracker: tracking.Tracker | None) -> None:
         now, schedule = self.training, self.group.config.schedule

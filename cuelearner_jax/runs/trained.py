@@ -44,7 +44,7 @@ class Parts(NamedTuple):
         """A policy under the lanes' guidance; of the agents' `own` actions it is bounded as in the guided episodes."""
         assert self.lanes is not None
         bounded = own and len(self.config.schedule.ask_at) > 1
-        bound = self.config.scalars.radians("ask_bound") if bounded else None
+        bound = actions_of(self.env).from_unit(self.config.scalars.ask_bound_deg) if bounded else None
         return Guided(base, self.lanes.policies["guidance"], self.env, self.config.scalars, self.lanes.guidance, bound)
 
     def corrected(self, base: Policy) -> Corrected:

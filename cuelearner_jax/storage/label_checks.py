@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
+from cuelearner_jax import spaces
+
 ANSWERED, UNSURE, UNDONE = SAID = ("answer", "unsure", "undone")  # an answer, "don't know", taken back
 ROW = ("obs", "action", "answer")  # columns of lists
 PEOPLE = ("item", "said", "seconds", "who", "when")  # columns of rows that a person gave
@@ -16,13 +18,14 @@ SESSION = ("guidance", "base", "base_digest", "robot", "again_of")  # what is te
 
 def check_head(head: dict[str, Any]) -> None:
     """Raises ValueError, with the reason, unless a file says of itself what labels need."""
-    task, eps = head.get("task"), head.get("eps_deg", "absent")
+    task, eps = head.get("task"), head.get("eps", "absent")
     if not isinstance(task, dict) or not isinstance(task.get("name"), str):
         raise ValueError("it does not name its task")
     if not isinstance(head.get("answers"), str):
         raise ValueError("it does not name the form of its answers")
-    if eps is not None and not (_is_number(eps) and 0 < eps <= 180):
-        raise ValueError("its eps_deg is no angle above 0 and up to 180")
+    space = spaces.from_json(head.get("space") or {})
+    if eps is not None and not (_is_number(eps) and 0 < eps <= space.reach):
+        raise ValueError(f"its eps is no number above 0 and up to {space.reach:g} ({space.unit})")
     session = head.get("session")
     if session is None:
         return
@@ -30,9 +33,9 @@ def check_head(head: dict[str, Any]) -> None:
         raise ValueError("its session has no seed")
     if not all(isinstance(session.get(name, ""), str) for name in SESSION):
         raise ValueError(f"one of {', '.join(SESSION)} of its session is no text")
-    bound, layout = session.get("bound_deg"), session.get("observation", [])
-    if bound is not None and not (_is_number(bound) and 0 < bound <= 180):
-        raise ValueError("the bound_deg of its session is no angle above 0 and up to 180")
+    bound, layout = session.get("bound"), session.get("observation", [])
+    if bound is not None and not (_is_number(bound) and 0 < bound <= space.reach):
+        raise ValueError(f"the bound of its session is no number above 0 and up to {space.reach:g} ({space.unit})")
     if not isinstance(layout, list) or not all(_is_part(part) for part in layout):
         raise ValueError("the observation of its session is no list of names and sizes")
 

@@ -12,13 +12,13 @@ of a run. `write` writes a whole file; `LabelWriter` one row at a time, each of 
 | answer  | list of floats | what the teacher said; the file names the form of it; absent where nothing was said  |
 | item    | int            | people: number of the question, from 0                                               |
 | said    | string         | people: one of `SAID`; of several rows of one item the last one holds                |
-| eps_deg | float          | strength of the answer [deg]: of people as the file's own; else where it falls       |
 | seconds | float          | people: from the question on the screen to the answer [s]                            |
 | who     | string         | people: a name                                                                       |
 | when    | string         | people: time of the answer, ISO 8601 in UTC                                          |
 
-Rows of simulated teachers have the first four columns, and strengths where these differ. A row is never changed: what
-is taken back stays, and a later row of the same item says so. Readers give the labels that stand.
+Rows of simulated teachers have the first four columns. A row is never changed: what is taken back stays, and a later
+row of the same item says so. Readers give the labels that stand. The head names the space of the actions, with the
+names, words and unit of its cues, and the strength of all answers in that unit.
 """
 
 from __future__ import annotations
@@ -32,7 +32,9 @@ import jax
 import numpy as np
 import pyarrow as pa
 
+from cuelearner_jax import spaces
 from cuelearner_jax.errors import UserError
+from cuelearner_jax.spaces import Space
 from cuelearner_jax.storage import formats
 from cuelearner_jax.storage import table as tables
 from cuelearner_jax.storage.label_checks import ANSWERED, PEOPLE, ROW, SAID, check_head, check_rows
@@ -51,12 +53,11 @@ JSONL, PARQUET = SCHEMA.jsonl, SCHEMA.parquet
 LISTED = 20  # seeds that a message names
 CONVENTIONS = {
     "obs": "the task's observation at the question",
-    "action": "unit vector asked about",
+    "action": "asked about, of the space that `space` describes",
     "answer": "what the teacher said of the action, in the form that `answers` names",
-    "eps_deg": "strength of an answer [deg], null where the form has none; a row that tells its own has that",
-    "angles": "radians, counterclockwise positive",
+    "eps": "strength of an answer in the unit of the space's cues, null where the form has none",
 }
-TOLD = ("format", "task", "answers", "eps_deg", "session")  # what must be the same for labels to share a file
+TOLD = ("format", "task", "answers", "eps", "space", "session")  # what must be the same for labels to share a file
 
 
 class People(NamedTuple):
@@ -73,20 +74,13 @@ class LabelFile(NamedTuple):
 
     task: dict[str, Any]  # {"name": ..., configuration of the task}
     answers: str  # name of the form of the answers, see `guidance.answers`
-    eps_deg: float | None  # strength of an answer [deg], where it falls of the first; None where the form has none
+    space: Space  # of the actions
+    eps: float | None  # strength of an answer, in the space's unit; None where the form has none
     seeds: np.ndarray  # (labels,)
     labels: Label  # rows (labels, ...), in the order they were given; those that stand
     people: People | None = None  # None: a simulated teacher's, or of several people's merged with such
     session: dict[str, Any] | None = None  # how a page asked, see `labelling.session`
     said: dict[str, int] | None = None  # rows of each kind (`SAID`), those that no longer stand included
-
-    @property
-    def strengths(self) -> np.ndarray | None:
-        """Of each label [deg], (labels,); None where the form has none."""
-        own = self.labels.eps_deg
-        if own is None and self.eps_deg is not None:
-            return np.full(len(self.seeds), self.eps_deg)
-        return None if own is None else np.asarray(own)
 
 
 class LabelWriter(tables.TableWriter):
@@ -101,7 +95,8 @@ class LabelWriter(tables.TableWriter):
         folder: Path,
         task: dict[str, Any],
         answers: str,
-        eps_deg: float | None,
+        space: Space,
+        eps: float | None,
         meaning: str = "",
         session: dict[str, Any] | None = None,
         **told: Any,
@@ -112,7 +107,8 @@ class LabelWriter(tables.TableWriter):
             folder: where the file lies.
             task: {"name": ..., configuration of the task}.
             answers: form of the answers.
-            eps_deg: strength of an answer [deg]; None where the form has none.
+            space: of the actions.
+            eps: strength of an answer, in the space's unit; None where the form has none.
             meaning: of an answer's numbers, written into the file.
             session: what else must be the same for labels to share a file.
             told: what else a new file says of itself, such as the versions that wrote it.
@@ -120,10 +116,9 @@ class LabelWriter(tables.TableWriter):
         Raises:
             UserError: the folder holds labels of something else, or they cannot be read; nothing has been changed.
         """
-        about = {**_about(task, answers, eps_deg, meaning), **({} if session is None else {"session": session})}
+        about = {**_about(task, answers, space, eps, meaning), **({} if session is None else {"session": session})}
         there = found_in(folder)
         self._widths: dict[str, int] = {}
-        self._eps = about["eps_deg"]
         if there is not None:
             table, before = _told(there)
             if before is not None:
@@ -160,8 +155,7 @@ class LabelWriter(tables.TableWriter):
             raise ValueError(f"a person's row has the columns {', '.join(PEOPLE)}, and said one of {', '.join(SAID)}")
         if person and (answer is not None) != (person["said"] == ANSWERED):
             raise ValueError(f"a row that says {person['said']!r} has {'no' if answer is None else 'an'} answer")
-        strength = {"eps_deg": self._eps} if person and self._eps is not None else {}
-        super().append(seed=int(seed), **columns, **person, **strength)
+        super().append(seed=int(seed), **columns, **person)
 
 
 def found_in(place: Path) -> Path | None:
@@ -189,7 +183,8 @@ def write(
     path: Path,
     task: dict[str, Any],
     answers: str,
-    eps_deg: float | None,
+    space: Space,
+    eps: float | None,
     seeds: np.ndarray,
     labels: Label,
     meaning: str = "",
@@ -200,7 +195,8 @@ def write(
         path: where to.
         task: {"name": ..., configuration of the task}.
         answers: form of the answers.
-        eps_deg: strength of an answer [deg], where it falls of the first; None where the form has none.
+        space: of the actions.
+        eps: strength of an answer, in the space's unit; None where the form has none.
         seeds: of the lanes, (lanes,).
         labels: (lanes, slots, ...).
         meaning: of an answer's numbers, written into the file.
@@ -211,9 +207,7 @@ def write(
     columns = {"seed": pa.array(seed.astype(np.int64))}
     for name in ROW:
         columns[name] = pa.array(list(getattr(rows, name)), SCHEMA.type(name))
-    if rows.eps_deg is not None:
-        columns["eps_deg"] = pa.array(rows.eps_deg.astype(np.float64))
-    tables.write(path, pa.table(columns), SCHEMA, about=_about(task, answers, eps_deg, meaning))
+    tables.write(path, pa.table(columns), SCHEMA, about=_about(task, answers, space, eps, meaning))
 
 
 def write_file(path: Path, file: LabelFile, **told: Any) -> None:
@@ -227,9 +221,7 @@ def write_file(path: Path, file: LabelFile, **told: Any) -> None:
     if file.people is not None:
         person = {**file.people._asdict(), "said": [ANSWERED] * len(file.seeds)}
         columns |= {name: pa.array(list(person[name]), SCHEMA.type(name)) for name in PEOPLE}
-    if file.strengths is not None and (file.people is not None or file.labels.eps_deg is not None):
-        columns["eps_deg"] = pa.array(file.strengths.astype(np.float64))
-    about = _about(file.task, file.answers, file.eps_deg, "")
+    about = _about(file.task, file.answers, file.space, file.eps, "")
     session = {} if file.session is None else {"session": file.session}
     tables.write(path, pa.table(columns), SCHEMA, about={**about, **session, **told}, fresh=True)
 
@@ -251,23 +243,15 @@ def read(path: Path) -> LabelFile:
     table = _standing(table)
     if not table.num_rows:
         raise UserError(f"{path} holds no labels: collect some first")
-    columns, eps = {name: _array(table[name], name) for name in table.column_names}, head["eps_deg"]
-    own = _differing(columns.get("eps_deg"), eps)
+    columns, eps = {name: _array(table[name], name) for name in table.column_names}, head["eps"]
     rows = {name: columns[name] for name in ROW}
-    labels = Label(**rows, valid=np.ones(table.num_rows, bool), eps_deg=own)  # pyright: ignore[reportArgumentType]
-    named = dict(head["task"]), head["answers"], None if eps is None else float(eps), columns["seed"], labels
+    labels = Label(**rows, valid=np.ones(table.num_rows, bool))  # pyright: ignore[reportArgumentType]
+    space = spaces.from_json(head["space"])
+    named = dict(head["task"]), head["answers"], space, None if eps is None else float(eps), columns["seed"], labels
     people = None
     if "item" in columns and not (columns["item"] < 0).any():
         people = People(*(columns[name] for name in People._fields))
     return LabelFile(*named, people, head.get("session"), said)
-
-
-def _differing(told: np.ndarray | None, eps_deg: float | None) -> np.ndarray | None:
-    """Strengths (labels,) [deg] that rows tell, NaN for the file's own; None: all are of that, or the form has none."""
-    if told is None or eps_deg is None:
-        return None
-    own = np.where(np.isnan(told), np.float32(eps_deg), told)
-    return None if (own == np.float32(eps_deg)).all() else own
 
 
 def _standing(table: pa.Table) -> pa.Table:
@@ -331,13 +315,14 @@ def _listed(seeds: np.ndarray) -> str:
     return ", ".join(map(str, seeds[:LISTED])) + (" and others" if len(seeds) > LISTED else "")
 
 
-def _about(task: dict[str, Any], answers: str, eps_deg: float | None, meaning: str) -> dict[str, Any]:
+def _about(task: dict[str, Any], answers: str, space: Space, eps: float | None, meaning: str) -> dict[str, Any]:
     """What a file of labels says of itself."""
     return {
         "format": formats.FORMATS["labels"],
         "task": task,
         "answers": answers,
-        "eps_deg": None if eps_deg is None else float(eps_deg),
+        "space": space.to_json(),
+        "eps": None if eps is None else float(eps),
         "conventions": {**CONVENTIONS, **({"answer": meaning} if meaning else {})},
     }
 

@@ -20,7 +20,7 @@ from cuelearner_jax import user_code
 from cuelearner_jax.adaptation import adapting, judging, program, stored
 from cuelearner_jax.adaptation.adapting import Adaptation, Adapted, Judging
 from cuelearner_jax.config import GuideSizes, Scalars, check_guide
-from cuelearner_jax.environment import Environment, spaces_of
+from cuelearner_jax.environment import Environment, actions_of, spaces_of
 from cuelearner_jax.errors import UserError, closest
 from cuelearner_jax.evaluate import Tell, untold
 from cuelearner_jax.feedback import given
@@ -28,11 +28,12 @@ from cuelearner_jax.feedback.answers import check_teacher
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.guides.base import Guide
 from cuelearner_jax.guides.relative import KIND
-from cuelearner_jax.policies import Common
+from cuelearner_jax.policies import Common, in_space
 from cuelearner_jax.runs import adapted, trained
 from cuelearner_jax.runs.grid import Grid, check_grid, seeds_of
 from cuelearner_jax.runs.order import read_labels
 from cuelearner_jax.runs.trained import PolicySource
+from cuelearner_jax.spaces import Space
 from cuelearner_jax.storage import label_files
 from cuelearner_jax.storage.whole import Place
 from cuelearner_jax.task import Scenario, Task
@@ -70,7 +71,7 @@ class Request(Generic[TaskT]):
     """Label budgets (with --labels-from by default all that the file has)."""
     bound_deg: tuple[float, ...] = ()
     """How far corrections may lead from the policy's own actions, one or more bounds [deg] (default: the scenario's, as
-    far as the labels of a file reach, or else 45)."""
+    far as the labels of a file reach, or else a quarter of the space's reach, 45)."""
     seeds: int = 1
     """Number of seeds; not with several base policies, of which each is adapted with its own."""
     first_seed: int = 0
@@ -153,19 +154,17 @@ def suggested(
         rules = replace(rules, guidance=None, sizes={}, scalars={})  # which are for the suggested kind
     if judge_by == judging.LABELS:
         rules = replace(rules, judge_bounds=())  # which are tried on episodes
-    strengths, labels = None, Request.labels
+    labels = Request.labels
     if labels_from is not None:
         file = label_files.read(labels_from)
-        eps_deg, strengths = file.eps_deg if eps_deg is None else eps_deg, file.labels.eps_deg
+        eps_deg = file.eps if eps_deg is None else eps_deg
         labels = (int(np.unique(file.seeds, return_counts=True)[1].min()),)
     sizes = sizes or replace(adapting.SIZES, **{"frame": source.config.sizes.frame, **rules.sizes})
     if scalars is None:
-        of_run = replace(source.config.scalars, eps_last_deg=Scalars.eps_last_deg)  # of its own labels
         eps_deg = rules.eps_deg if eps_deg is None else eps_deg
-        scalars = replace(adapting.settling(of_run, eps_deg), **rules.scalars)
+        scalars = replace(adapting.settling(source.config.scalars, eps_deg), **rules.scalars)
     else:
         scalars = adapting.settling(scalars, eps_deg)
-    sizes, scalars = adapting.falling(sizes, scalars, strengths)
     return Request(
         task=rules.applied(source.config.task),
         labels=labels,
@@ -210,7 +209,7 @@ def run(
         raise UserError("several base policies are adapted each with its own seed: leave out --seeds and --first-seed")
     seeds = seeds_of(request.first_seed, request.seeds) if shared else seeds
     rows, request = _rows(subject, request, guidance, env, bases, seeds)
-    if note_of := adapting.check_angles(request.bound_deg, scalars):
+    if note_of := adapting.check_amounts(actions_of(env), request.bound_deg, scalars):
         note(note_of)
     each = program.one_each(seeds, request.labels, request.bound_deg)
     lanes = program.product(1, seeds, request.labels, request.bound_deg) if shared else each
@@ -234,8 +233,9 @@ def _bases(subject: Subject, request: Request, env: Any) -> tuple[Any, tuple[int
     if subject.policy is not None:
         if base != Base(policy=source.default_policy):
             raise UserError(f"--base.… chooses among the lanes of a folder, and {named} is none: leave it out")
-        user_code.acts_in(named or "policy", subject.policy, env)
-        return Common(subject.policy), (0,), {"code": named}
+        policy = in_space(subject.policy, actions_of(env))
+        user_code.acts_in(named or "policy", policy, env)
+        return Common(policy), (0,), {"code": named}
     chosen = {"base.guidance": base.guidance, "base.labels": base.labels, "base.seeds": base.seeds}
     source.check(base.policy, request.task, **chosen, **{"base.bound-deg": base.bound_deg})
     if trained.POLICIES[base.policy].taught:
@@ -257,7 +257,7 @@ def _rows(
 
     Raises UserError for labels that do not fit.
     """
-    task, path, rows = subject.source.task, request.labels_from, subject.rows
+    task, path, rows, space = subject.source.task, request.labels_from, subject.rows, actions_of(env)
     grid = Grid((guidance.name,), seeds, request.labels)
     check_grid(grid, adapts=True)
     file, form = None, guidance.form
@@ -268,16 +268,16 @@ def _rows(
         given.check(rows, spaces_of(env), form)
         request = replace(request, labels=(len(rows.obs),))
         eps = request.scalars.eps_deg if form.by_eps else None
-        file = label_files.LabelFile({}, form.name, eps, np.full(len(rows.obs), seeds[0]), rows)
-    bounds = request.bound_deg or (adapting.BOUND_DEG if file is None else _reach(bases, file, request.scalars),)
-    return file, replace(request, bound_deg=bounds)
+        file = label_files.LabelFile({}, form.name, space, eps, np.full(len(rows.obs), seeds[0]), rows)
+    widest = adapting.BOUND * space.reach if file is None else _reach(space, bases, file, request.scalars)
+    return file, replace(request, bound_deg=request.bound_deg or (widest,))
 
 
-def _reach(bases: Any, file: label_files.LabelFile, scalars: Scalars) -> float:
-    """How far labels reach from what the base policy does [deg]; at least eps."""
+def _reach(space: Space, bases: Any, file: label_files.LabelFile, scalars: Scalars) -> float:
+    """How far labels reach from what the base policy does, in the space's unit; at least eps."""
     if not isinstance(bases, Common):
         raise UserError("labels of several base policies reach differently far: give --bound-deg")
-    return max(adapting.reach(bases.policy, file.labels.obs, file.labels.action), scalars.eps_deg)
+    return max(adapting.reach(space, bases.policy, file.labels.obs, file.labels.action), scalars.eps_deg)
 
 
 def _judging(task: Task, request: Request, env: Environment) -> Judging:
@@ -314,6 +314,7 @@ def _steps(lanes: np.ndarray) -> str:
 def sentences(found: Adapted) -> list[str]:
     """What adaptation has led to, a line for each budget and bound."""
     lanes, judged, lines = found.asked.lanes, found.judged, []
+    unit = actions_of(found.asked.env).unit
     for bound, budget in sorted({*zip(lanes.bound_deg.tolist(), lanes.budget.tolist(), strict=True)}):
         own = (lanes.bound_deg == bound) & (lanes.budget == budget)
         before, after = (f"{float(np.mean(values[own])):.4g}" for values in (judged.before, judged.after))
@@ -322,9 +323,9 @@ def sentences(found: Adapted) -> list[str]:
         else:
             worth, worse = f"{judged.by} on tuning episodes {before} before, {after} after", "worse than before"
             worth += f" ({_difference(judged.difference[own])}; {_steps(judged.rewarded_steps[own])})"
-        lines.append(f"{budget} labels within {bound:g} degrees: {worth}")
+        lines.append(f"{budget} labels within {bound:g} {unit}: {worth}")
         if narrowed := sorted({*judged.within_deg[own & judged.used].round(3).tolist()} - {round(bound, 3)}):
-            lines[-1] += f", used within {' or '.join(f'{angle:g}' for angle in narrowed)} degrees"
+            lines[-1] += f", used within {' or '.join(f'{angle:g}' for angle in narrowed)} {unit}"
         left = lanes.seed[own & ~judged.used]
         if len(left):
             which = f"seed {left[0]}" if len(left) == 1 else f"{len(left)} of {int(own.sum())} seeds"

@@ -8,9 +8,9 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from cuelearner_jax import actions as geometry
 from cuelearner_jax.agents.networks import applied, q_network
 from cuelearner_jax.agents.view import seen
+from cuelearner_jax.spaces import directions as geometry
 from cuelearner_jax.types import Params
 
 

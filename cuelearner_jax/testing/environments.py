@@ -80,7 +80,7 @@ def _check_names(laws: Laws, env: Environment) -> None:
 def _check_shapes(laws: Laws, env: Environment) -> None:
     """Shapes and types, from traces alone."""
     space, key = actions_of(env), jax.random.key(0)
-    shape = jax.eval_shape(lambda: space.uniform(key, (3,))).shape
+    shape = jax.eval_shape(lambda: space.sample(key, (3,))).shape
     laws.hold(shape == (3, space.size), f"its actions' `uniform` gives shape {shape} for 3 actions of {space.size}")
     mend = "what depends on traced values must be jax.numpy, with jnp.where and lax.cond in place of if"
     with laws.attempted("tracing `reset`", mend):
@@ -149,7 +149,7 @@ def _program(env: Environment, key: PRNGKeyArray) -> tuple[str, list[bytes]]:
 
     def both(env: Any, key: PRNGKeyArray) -> Any:
         state, obs = env.reset(key)
-        return env.step(key, state, actions_of(env).uniform(key, ())), obs
+        return env.step(key, state, actions_of(env).sample(key, ())), obs
 
     closed = jax.make_jaxpr(both)(env, key)
     text = re.sub(r"0x[0-9a-f]+", "", str(closed.jaxpr))  # where functions lie in memory
@@ -167,7 +167,7 @@ def _walk(env: Any, key: PRNGKeyArray, steps: int) -> Walk:
     def one(carry: tuple, number: Array) -> tuple[tuple, tuple]:
         state, obs = carry
         k_act, k_step = jax.random.split(jax.random.fold_in(k_walk, number))
-        action, memory = actions_of(env).uniform(k_act, ()), env.remember(state, obs)
+        action, memory = actions_of(env).sample(k_act, ()), env.remember(state, obs)
         after, step = env.step(k_step, state, action)
         recalled = env.recall(memory), env.recall_next(memory, action, step.aftermath)
         return (after, step.obs), (state, obs, action, k_step, *recalled, after, step)

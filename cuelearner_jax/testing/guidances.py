@@ -52,7 +52,7 @@ def check_guidance(kind: Kind, env: Environment, sizes: GuideSizes = SMALL, tole
         guide = kind.make(sizes, spaces_of(env))
         model = guide.init(key := jax.random.key(0))
     states, obs = jax.vmap(env.reset)(jax.random.split(key, ROWS))
-    actions = actions_of(env).uniform(key, (ROWS,))
+    actions = actions_of(env).sample(key, (ROWS,))
     fitted = model
     if guide.form is not None:
         fitted = _fitted(laws, guide, env, model, _answered(laws, guide, guide.form, env, states, obs, actions))
@@ -64,19 +64,18 @@ def check_guidance(kind: Kind, env: Environment, sizes: GuideSizes = SMALL, tole
 
 def _answered(laws: Laws, guide: Guide, form: AnswerForm, env: Any, states: Any, obs: Array, actions: Array) -> Label:
     """Labels (rows, ...) by a simulated teacher."""
-    named = re.fullmatch(r"[a-z][a-z0-9_-]*", form.name) and form.meaning
+    space = actions_of(env)
+    named, width = re.fullmatch(r"[a-z][a-z0-9_-]*", form.name) and form.meaning(space), form.width(space)
     laws.hold(named, f"its form {form.name!r} lacks a name in lower case or a meaning: label files tell both")
-    laws.hold(form.width > 0, f"answers of its form have {form.width} entries: give a positive width")
-    teacher = Steady(actions_of(env).spread(8)[3])
+    laws.hold(width > 0, f"answers of its form have {width} entries: give a positive width")
+    teacher = Steady(space.spread(8)[3])
 
     def each(key: Array, state: Any, obs: Array, action: Array) -> tuple[Array, Array]:
         return form.answer(key, env, teacher, state, obs, action, Scalars())
 
     with laws.attempted("its form's `answer`", "it returns (answer, answered), in jax.numpy"):
         answers, answered = jax.jit(jax.vmap(each))(jax.random.split(jax.random.key(1), ROWS), states, obs, actions)
-    laws.hold(
-        answers.shape == (ROWS, form.width), f"an answer has shape {answers.shape[1:]}: its form says ({form.width},)"
-    )
+    laws.hold(answers.shape == (ROWS, width), f"an answer has shape {answers.shape[1:]}: its form says ({width},)")
     laws.hold(answered.shape == (ROWS,) and answered.dtype == bool, "`answered` is no bool: say whether it answered")
     labels = Label(obs, actions, answers, answered, base=actions if guide.kind.sees_base else None)
     with laws.attempted("`target` under vmap", "it gets one Label and GuideScalars, and returns a vector"):

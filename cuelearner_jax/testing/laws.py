@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from cuelearner_jax.actions import Actions
+from cuelearner_jax.spaces import Space
 
 
 class Laws:
@@ -45,7 +45,7 @@ class Laws:
             for a, b in ((_numbers(a), _numbers(b)) for a, b in pairs)
         )
 
-    def actions(self, space: Actions, actions: Any, called: str) -> None:
+    def actions(self, space: Space, actions: Any, called: str) -> None:
         """Raises AssertionError unless rows (..., size) are actions of a space."""
         shape = np.shape(actions)
         self.hold(

@@ -91,7 +91,7 @@ def _check_longest(laws: Laws, task: Task, config: Any) -> None:
     """Where episodes have outcomes, evaluations must know how long to wait for them."""
     env = task.environment(config)
     state, _ = jax.eval_shape(env.reset, jax.random.key(0))
-    action = jax.eval_shape(lambda: actions_of(env).uniform(jax.random.key(0), ()))
+    action = jax.eval_shape(lambda: actions_of(env).sample(jax.random.key(0), ()))
     outcomes = sorted(jax.eval_shape(env.step, jax.random.key(0), state, action)[1].outcome)
     laws.hold(
         not outcomes or task.longest is not None,

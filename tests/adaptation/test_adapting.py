@@ -11,7 +11,6 @@ import probes
 import pytest
 from flax import struct
 
-from cuelearner_jax import actions
 from cuelearner_jax.adaptation import adapting, judging, program
 from cuelearner_jax.adaptation.adapting import Adaptation, Judging
 from cuelearner_jax.adaptation.program import Lanes
@@ -21,7 +20,7 @@ from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import one_lane
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.policies import BY_LANE, Common, Opaque, policy_of
-from cuelearner_jax.storage import label_files
+from cuelearner_jax.spaces import DIRECTIONS, directions
 from cuelearner_jax.types import Label
 
 HALF = 6.0  # half the width of the winning window [deg]
@@ -30,7 +29,7 @@ EXPERT = probes.Expert(ENV)
 SIZES = GuideSizes(feedback_layers=(32, 32), fit_steps=200, fit_batch_size=32)
 SCALARS = dataclasses.replace(probes.SCALARS, eps_deg=5.0, tau_deg=0.25)
 RELATIVE = guidances.make("relative", SIZES, ENV)
-OBS = actions.evenly_spaced(4)
+OBS = directions.evenly_spaced(4)
 SHIFTS = (-25.0, 40.0)  # by which the base policies miss the best direction [deg]
 MESH = lane_mesh(jax.local_devices()[:1])
 JUDGING = Judging(ENV, num_envs=20, steps=200)
@@ -42,7 +41,7 @@ class Shifted(struct.PyTreeNode):
     shift: jax.Array
 
     def act(self, key, states, obs):
-        return actions.rotate(obs, 0.6 + jnp.deg2rad(self.shift))
+        return directions.rotate(obs, 0.6 + jnp.deg2rad(self.shift))
 
     @property
     def axes(self):
@@ -69,7 +68,9 @@ def degrees(turn):
 
 def errors(policy, lane):
     """How far a lane's actions lie from the best ones, over all observations [deg]."""
-    return degrees(actions.distance(one_lane(policy, lane).act(jax.random.key(0), None, OBS), actions.rotate(OBS, 0.6)))
+    return degrees(
+        DIRECTIONS.distance(one_lane(policy, lane).act(jax.random.key(0), None, OBS), directions.rotate(OBS, 0.6))
+    )
 
 
 def test_lanes_are_every_combination_or_one_each():
@@ -99,12 +100,12 @@ def test_the_bound_is_never_exceeded():
     for lane, bound in enumerate(LANES.bound_deg):
         base = Shifted(jnp.array(SHIFTS[LANES.base[lane]]))
         own = base.act(None, None, OBS)
-        moved = degrees(actions.distance(own, one_lane(policy, lane).act(jax.random.key(0), None, OBS)))
+        moved = degrees(DIRECTIONS.distance(own, one_lane(policy, lane).act(jax.random.key(0), None, OBS)))
         assert moved.max() <= bound + 1e-3
         if bound == 10:  # too near to be right: as far as it may go
             np.testing.assert_allclose(moved, bound, atol=0.5)
         rows = jax.tree.map(lambda leaf, lane=lane: leaf[lane][labels.valid[lane]], labels)
-        away = degrees(actions.distance(base.act(None, None, rows.obs), rows.action))
+        away = degrees(DIRECTIONS.distance(base.act(None, None, rows.obs), rows.action))
         assert away.max() <= bound + 1e-3
         assert away[:10].max() < 1e-3  # the first round is about its own actions
         assert away[10:].max() > 4.0  # later ones about refined ones
@@ -113,10 +114,10 @@ def test_the_bound_is_never_exceeded():
         guide=found().block.guide.replace(model=jax.tree.map(_blown, found().block.guide.model))
     )
     policy = program.adapted(RELATIVE, SIZES, ENV, SCALARS, BASES, wild)
-    everywhere = actions.evenly_spaced(100)
+    everywhere = directions.evenly_spaced(100)
     for lane, bound in enumerate(LANES.bound_deg):
         own = Shifted(jnp.array(SHIFTS[LANES.base[lane]])).act(None, None, everywhere)
-        moved = actions.distance(own, one_lane(policy, lane).act(jax.random.key(0), None, everywhere))
+        moved = DIRECTIONS.distance(own, one_lane(policy, lane).act(jax.random.key(0), None, everywhere))
         assert degrees(moved).max() <= bound + 1e-3
         assert degrees(moved).max() > bound / 2
 
@@ -261,50 +262,3 @@ def test_defaults_go_together():
         adapting.check_angles([45.0], scalars)
     assert "scalars.k_max 1800 would" in adapting.check_angles([180.0], adapting.settling(SCALARS, 0.1))
     assert judging.metrics_of(ENV) == ("reward", "hit")
-
-
-# Labels of several strengths.
-
-FALLING = dataclasses.replace(SCALARS, eps_deg=20.0, eps_last_deg=4.0)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize(
-    ("kind", "more"),
-    [("relative", {}), ("offset", {}), ("intent", {"aim_layers": (8,)})],
-    ids=["relative", "offset", "intent"],
-)
-def test_a_file_of_falling_strengths_leads_where_asking_did(tmp_path, kind, more):
-    env = probes.Aimed(half_width=jnp.deg2rad(jnp.array(HALF)))
-    sizes = dataclasses.replace(SIZES, eps_falls=True, fit_steps=60, **more)
-    bundle = guidances.make(kind, sizes, env)
-    lanes = program.one_each((3, 4), (25,), (60.0,))
-    how = dataclasses.replace(JUDGING, env=None, by="labels")
-    of = Adaptation(bundle, sizes, FALLING, env, BASES, lanes, how)
-    first = adapting.adapt(of, probes.Expert(env), mesh=MESH)
-    np.testing.assert_allclose(first.labels.eps_deg[:, :25], np.tile(np.geomspace(20, 4, 25), (2, 1)), rtol=1e-5)
-    path = tmp_path / "labels.parquet"
-    label_files.write(path, {"name": "window"}, "relative", 20.0, lanes.seed, first.labels)
-    slots = program.rounds(lanes, sizes) * sizes.labels_per_round
-    rows = label_files.for_lanes(label_files.read(path), lanes.seed, lanes.budget, slots)
-    given = adapting.adapt(of, labels=rows, mesh=MESH)
-    chex.assert_trees_all_equal(given.block.guide.model, first.block.guide.model)
-    np.testing.assert_array_equal(given.judged.after, first.judged.after)
-    alike = adapting.adapt(of, labels=rows.replace(eps_deg=None), mesh=MESH)  # all of 20 degrees: another model
-    with pytest.raises(AssertionError):
-        chex.assert_trees_all_equal(alike.block.guide.model, first.block.guide.model)
-
-
-def test_a_finer_label_is_predicted_by_a_finer_turn():
-    """A quarter of eps told everywhere: the model turns by that, which is the whole of what such a label asks for."""
-    how, sizes = dataclasses.replace(JUDGING, env=None, by="labels"), dataclasses.replace(SIZES, eps_falls=True)
-    bundle = guidances.make("relative", sizes, ENV)
-    base, lanes = Common(Shifted(jnp.array(-25.0))), program.product(1, (0,), (40,), (30.0,))
-    scalars = dataclasses.replace(FALLING, eps_last_deg=5.0)
-    of = Adaptation(bundle, sizes, scalars, ENV, base, lanes, how)
-    rows = own_labels(-25.0, 40)
-    fine = adapting.adapt(of, labels=rows.replace(eps_deg=np.full((1, 40), 5.0, np.float32)), mesh=MESH)
-    assert (fine.judged.after[0], fine.judged.used[0]) == (1.0, True)
-    once = dataclasses.replace(scalars, k_max=1)
-    policy = program.adapted(bundle, sizes, ENV, once, base, fine.block)
-    assert errors(policy, 0).mean() == pytest.approx(20.0, abs=1.5)

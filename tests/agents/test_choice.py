@@ -10,12 +10,13 @@ import pytest
 from probes import CONFIG, SIZES
 
 from cuelearner_jax import config as configuration
-from cuelearner_jax.actions import DIRECTIONS, evenly_spaced, from_angle
 from cuelearner_jax.agents import choice as search
 from cuelearner_jax.agents import ddqn
 from cuelearner_jax.agents.networks import applied, q_network, widened
 from cuelearner_jax.devices import Portions
 from cuelearner_jax.errors import UserError
+from cuelearner_jax.spaces import DIRECTIONS
+from cuelearner_jax.spaces.directions import evenly_spaced, from_angle
 
 LAYERS = (24, 24, 17)
 FULL = dataclasses.replace(SIZES, q_layers=LAYERS, directions=360, coarse_directions=0)

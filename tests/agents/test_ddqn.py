@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from cuelearner_jax.actions import evenly_spaced
 from cuelearner_jax.agents import ddqn
+from cuelearner_jax.spaces.directions import evenly_spaced
 from cuelearner_jax.types import Transition
 
 DIRECTIONS = evenly_spaced(4)  # east, north, west, south

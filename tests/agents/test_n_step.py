@@ -11,7 +11,6 @@ import probes
 import pytest
 
 from cuelearner_jax import loop
-from cuelearner_jax.actions import evenly_spaced
 from cuelearner_jax.agents import ddqn
 from cuelearner_jax.agents.learning import learner
 from cuelearner_jax.agents.networks import MLP, Joined, applied, q_network
@@ -19,6 +18,7 @@ from cuelearner_jax.agents.replay import Following
 from cuelearner_jax.config import Scalars, check
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides import registry as guidances
+from cuelearner_jax.spaces.directions import evenly_spaced
 from cuelearner_jax.types import StoredStep, Transition
 
 HALF = 0.5  # the discount factor of everything worked out by hand

@@ -8,8 +8,6 @@ import numpy as np
 import probes
 import pytest
 
-from cuelearner_jax import actions as geometry
-from cuelearner_jax.actions import DIRECTIONS
 from cuelearner_jax.agents import view
 from cuelearner_jax.agents.choice import greedy_actions, values
 from cuelearner_jax.agents.networks import q_network
@@ -17,6 +15,8 @@ from cuelearner_jax.config import Sizes
 from cuelearner_jax.environment import Features, spaces_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides.model import guide_model
+from cuelearner_jax.spaces import DIRECTIONS
+from cuelearner_jax.spaces import directions as geometry
 
 ENV = probes.Window()
 OBS = geometry.from_angle(jnp.array([0.3, -2.0, 1.1]))

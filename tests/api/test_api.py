@@ -16,6 +16,7 @@ from cuelearner_jax.policies import Agent, Uniform
 from cuelearner_jax.runs import sweep
 from cuelearner_jax.runs.grid import Grid
 from cuelearner_jax.runs.order import Order
+from cuelearner_jax.spaces import DIRECTIONS
 from cuelearner_jax.storage import label_files, results
 from cuelearner_jax.types import Label
 
@@ -128,7 +129,7 @@ def test_rounds_find_the_best_action_and_warn_of_nothing():
 def test_a_label_file_gives_what_its_arrays_give(tmp_path):
     labels = own_labels()
     rows = Label(labels.obs[None], labels.action[None], labels.answer[None, :, None], np.ones((1, 200), bool))
-    label_files.write(tmp_path / "labels.parquet", {"name": "window"}, "relative", 5.0, np.array([4]), rows)
+    label_files.write(tmp_path / "labels.parquet", {"name": "window"}, "relative", DIRECTIONS, 5.0, np.array([4]), rows)
     of_file = cl.fit_feedback(tmp_path / "labels.parquet", sizes=SIZES, scalars=SCALARS)
     of_arrays = cl.fit_feedback(labels, eps_deg=5.0, sizes=SIZES, scalars=SCALARS)
     for one, other in zip(jax.tree.leaves(of_file.model), jax.tree.leaves(of_arrays.model), strict=True):
@@ -137,7 +138,7 @@ def test_a_label_file_gives_what_its_arrays_give(tmp_path):
         cl.fit_feedback(tmp_path / "labels.parquet", eps_deg=7.0)
     # Labels of two fifths of that turn by two fifths of that, and a file of them by all of its own.
     rows = rows.replace(eps_deg=np.full((1, 200), 2.0, np.float32))
-    label_files.write(tmp_path / "finer.parquet", {"name": "window"}, "relative", 5.0, np.array([4]), rows)
+    label_files.write(tmp_path / "finer.parquet", {"name": "window"}, "relative", DIRECTIONS, 5.0, np.array([4]), rows)
     finer = cl.fit_feedback(tmp_path / "finer.parquet", sizes=SIZES, scalars=dataclasses.replace(SCALARS, k_max=1))
     assert errors(cl.refine(policy, finer)) == pytest.approx(ERROR - 2.0, abs=0.3)
 

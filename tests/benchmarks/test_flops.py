@@ -8,11 +8,11 @@ import jax.numpy as jnp
 import pytest
 from _flops import forward, forward_and_backward, step_operations
 
-from cuelearner_jax.actions import DIRECTIONS
 from cuelearner_jax.agents import ddqn
 from cuelearner_jax.agents.networks import applied, q_network
 from cuelearner_jax.config import Sizes
 from cuelearner_jax.environment import Spaces
+from cuelearner_jax.spaces import DIRECTIONS
 from cuelearner_jax.tasks.billiards import BILLIARDS
 from cuelearner_jax.types import Transition
 

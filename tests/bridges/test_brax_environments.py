@@ -11,11 +11,11 @@ from brax import envs
 from brax.envs.wrappers import training
 
 from cuelearner_jax import loop
-from cuelearner_jax.actions import evenly_spaced
 from cuelearner_jax.bridges.brax import from_brax, to_brax
 from cuelearner_jax.environment import Environment, offers, symmetries_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides import registry as guidances
+from cuelearner_jax.spaces.directions import evenly_spaced
 
 
 class Field(envs.Env):

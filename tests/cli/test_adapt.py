@@ -1,6 +1,5 @@
 """Policies adapted on the command line: a run's, code's and adapted ones, in folders that every command takes."""
 
-import dataclasses
 import importlib
 import json
 import re
@@ -192,41 +191,6 @@ def test_labels_lie_beside_and_lead_to_the_same_policy(adapted, tmp_path):
     assert len(models) == 2
     chex.assert_trees_all_equal(*models)
     assert (tmp_path / "again" / "labels.parquet").exists()
-
-
-@pytest.mark.long
-def test_a_file_of_falling_strengths_says_so_by_itself(home, tmp_path, refused):
-    command = ["adapt", "own_turned:straight", *TASK, "--scenario", "aslant", *FIT, "--judge-episodes", "20"]
-    command += ["--labels", "35"]
-    falls = ["--scalars.eps-deg", "10", "--sizes.eps-falls", "--scalars.eps-last-deg", "2.5"]
-    assert main([*command, *falls, "--out", str(tmp_path / "asked")]) == 0
-    file = tmp_path / "asked" / "labels.parquet"
-    np.testing.assert_allclose(label_files.read(file).labels.eps_deg, np.geomspace(10, 2.5, 35), rtol=1e-5)
-    from_file = [*command, "--labels-from", str(file)]
-    assert main([*from_file, "--out", str(tmp_path / "again")]) == 0
-    code = importlib.import_module("own_turned").straight
-    world = cl.World(registry.resolve("own_turned:TASK"), registry.resolve("own_turned:TASK").config(offset_deg=-20.0))
-    given = [cl.load_policy(tmp_path / name, task="own_turned:TASK", base=code) for name in ("asked", "again")]
-    chex.assert_trees_all_equal(*(policy.policy.model for policy in given))
-    scalars = given[0].policy.scalars
-    sizes = dataclasses.replace(given[0].policy.sizes, eps_falls=False)
-    python = cl.adapt(
-        code,
-        world,
-        labels=file,
-        sizes=sizes,
-        scalars=dataclasses.replace(scalars, eps_last_deg=0.0),
-        judge_episodes=20,
-        bound_deg=45.0,
-    )
-    chex.assert_trees_all_equal(python.policy.model, given[0].policy.model)
-    new = ["--out", str(tmp_path / "new")]
-    refused([*from_file, "--sizes.no-eps-falls", *new], "eps_last_deg is 2.5, to which labels fall", tmp_path)
-    refused([*command, "--sizes.eps-falls", *new], "scalars.eps_last_deg is 0.0, to which", tmp_path)
-    refused([*command, "--sizes.chosen-by", "teacher", *new], "sizes.candidates is 1: give more", tmp_path)
-    coached = ["--sizes.chosen-by", "teacher", "--sizes.candidates", "4"]
-    assert main([*command, *coached, *new]) == 0
-    assert len(label_files.read(tmp_path / "new" / "labels.parquet").seeds) == 35
 
 
 def defaults_of(capsys, *options):

@@ -73,10 +73,7 @@ def test_the_page_is_served_to_who_knows_its_address_until_ctrl_c(tmp_path, refu
         (["--labels", "0"], "--labels is 0: give a number from 1"),
         (["--guidance", "heuristic"], "guidance 'heuristic' asks for no labels: give --guidance relative or"),
         (["--sizes.candidates", "3", "--sizes.ensemble", "2"], "--sizes.candidates is above 1"),
-        (["--sizes.candidates", "3", "--sizes.chosen-by", "teacher"], "--sizes.candidates is above 1"),
-        (["--sizes.chosen-by", "teacher"], "sizes.candidates is 1: give more"),
-        (["--sizes.eps-falls", "--scalars.eps-last-deg", "1"], "a page asks with one strength: leave it out"),
-        (["--bound-deg", "0"], "--bound-deg is 0: give an angle"),
+        (["--bound-deg", "0"], "--bound-deg is 0: give a number above 0 and up to 180"),
         (["--port", "70000"], "--port is 70000: give a number"),
         (["--base.seed", "1"], "--base.… chooses in a folder, and none is given"),
         (["--who", " "], "--who is empty"),
@@ -190,31 +187,13 @@ def test_labels_are_merged_and_exported(labelled, tmp_path, refused, capsys):
     np.testing.assert_allclose([float(row["obs[1]"]) for row in rows], file.labels.obs[:, 1], rtol=1e-6)
     assert [float(row["answer[0]"]) for row in rows] == file.labels.answer[:, 0].tolist()
     one, two = label_files.read(labelled / "two"), label_files.read(whole)
-    assert (two.session, two.task, two.eps_deg) == (one.session, one.task, one.eps_deg)
+    assert (two.session, two.task, two.eps) == (one.session, one.task, one.eps)
     np.testing.assert_array_equal(one.labels.answer, two.labels.answer)
     refused(["labels", "merge", labelled / "one", "--out", both], "both.parquet exists: give another --out", tmp_path)
     refused(["labels", "export", both, labelled / "one", "--out", "x.csv"], "takes one label file", tmp_path)
     refused(["labels", "export", both, "--out", tmp_path / "x.txt"], "ends in .csv or .parquet", tmp_path)
     refused(["labels", "inspect", both, "--teacher"], "cannot be had again", tmp_path)
     refused(["labels", "mend"], "unknown command 'labels mend'", tmp_path)
-
-
-def test_labels_of_several_strengths_keep_them(labelled, tmp_path, capsys):
-    page = label_files.read(labelled / "one")
-    strengths = np.linspace(40.0, 10.0, 12, dtype=np.float32)
-    own = page._replace(labels=page.labels.replace(eps_deg=strengths, answer=-page.labels.answer), people=None)
-    falling, both, flat = tmp_path / "falling.parquet", tmp_path / "both.parquet", tmp_path / "both.csv"
-    label_files.write_file(falling, own)
-    assert main(["labels", "inspect", str(falling)]) == 0
-    assert "by 40 to 10 degrees" in capsys.readouterr().out
-    assert main(["labels", "merge", str(falling), str(labelled / "two"), "--out", str(both)]) == 0
-    np.testing.assert_array_equal(label_files.read(both).labels.eps_deg, [*strengths, *[20.0] * 12])
-    assert main(["labels", "export", str(both), "--out", str(flat)]) == 0
-    rows = list(csv.DictReader(flat.open()))
-    np.testing.assert_allclose([float(row["eps_deg"]) for row in rows], [*strengths, *[20.0] * 12], rtol=1e-6)
-    # The same question is one of the same strength.
-    assert main(["labels", "inspect", str(labelled / "one"), str(falling)]) == 0
-    assert "no labels to compare" in capsys.readouterr().out
 
 
 def test_runs_take_a_pages_folder(labelled, tmp_path):

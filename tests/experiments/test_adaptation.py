@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cuelearner_jax.adaptation.adapting import check_angles
+from cuelearner_jax.adaptation.adapting import check_amounts
 from cuelearner_jax.config import GuideSizes, RunConfig, Schedule, Sizes, check, check_guide
 from cuelearner_jax.feedback.answers import check_teacher
 from cuelearner_jax.runs.trained import PolicySource
@@ -322,7 +322,7 @@ def pooltool(modules):
 
 
 def test_the_study_on_pooltools_table_has_settings_that_can_be(pooltool):
-    assert check_angles([pooltool.BOUND_DEG], pooltool.SCALARS) == ""
+    assert check_amounts(DIRECTIONS, [pooltool.BOUND_DEG], pooltool.SCALARS) == ""
     for scale in pooltool.SCALES.values():
         check_guide(scale.sizes, pooltool.SCALARS)
         assert list(scale.labels) == sorted(scale.labels)

@@ -19,13 +19,14 @@ from _efficiency_document import efficiency_lines
 
 from cuelearner_envs.billiards.config import BilliardsConfig, make_environment
 from cuelearner_envs.billiards.teacher import Transferred
-from cuelearner_jax.actions import DIRECTIONS, evenly_spaced
 from cuelearner_jax.cli import main
 from cuelearner_jax.config import GuideScalars, GuideSizes, Scalars, Schedule, Sizes
 from cuelearner_jax.guides import registry
 from cuelearner_jax.report.variants import read_groups, variants_of
 from cuelearner_jax.runs import sweep
 from cuelearner_jax.runs.order import planned
+from cuelearner_jax.spaces import DIRECTIONS
+from cuelearner_jax.spaces.directions import evenly_spaced
 from cuelearner_jax.tasks.billiards import make_teacher
 
 FOLDER = Path(__file__).parents[2] / "experiments"
@@ -135,7 +136,7 @@ def test_a_perfect_guide_does_what_the_tables_teacher_holds_for_best(modules, ta
     kind, env = registry.resolve(f"_perfect_guide:{table.upper()}"), make_environment(BilliardsConfig(table))
     guidance = registry.make(kind.name, GuideSizes(), env)
     _, obs = jax.vmap(env.reset)(jax.random.split(jax.random.key(3), 12))
-    base = DIRECTIONS.uniform(jax.random.key(4), (12,))
+    base = DIRECTIONS.sample(jax.random.key(4), (12,))
     active = jnp.arange(12) < 10
     found = guidance.act(guidance.init(jax.random.key(0)), env, obs, base, active, GuideScalars()).actions
     np.testing.assert_array_equal(found[10:], base[10:])

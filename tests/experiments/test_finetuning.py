@@ -7,10 +7,11 @@ import probes
 import pytest
 from _finetuning import FineTuning, every
 
-from cuelearner_jax import actions, evaluate
+from cuelearner_jax import evaluate
 from cuelearner_jax.agents.networks import q_network
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.policies import Agent
+from cuelearner_jax.spaces import directions
 
 CONFIG = probes.config(schedule={"learn_after": 32, "total_steps": 4800})
 STEPS, NOISE_DEG = 400, 10.0
@@ -61,7 +62,7 @@ def test_actions_are_turned_by_the_noise_and_no_step_is_uniform(tuned, agents):
         stored = probes.stored(tuned[0].block.state, lane, 3 * STEPS)
         one = Agent(jax.tree.map(lambda leaf, n=base: leaf[n], agents.params), CONFIG.sizes)
         greedy = one.act(jax.random.key(0), None, jnp.asarray(stored["obs"]))
-        turns = np.rad2deg(actions.difference(greedy, jnp.asarray(stored["action"])))
+        turns = np.rad2deg(directions.difference(greedy, jnp.asarray(stored["action"])))
         if lane < 2:
             np.testing.assert_array_equal(stored["action"], greedy)
         else:

@@ -8,12 +8,12 @@ import probes
 import pytest
 from flax import struct
 
-from cuelearner_jax import actions
 from cuelearner_jax.adaptation import program
 from cuelearner_jax.config import GuideSizes, Scalars
 from cuelearner_jax.environment import spaces_of
 from cuelearner_jax.guides.fitting import lessons
 from cuelearner_jax.policies import Common
+from cuelearner_jax.spaces import DIRECTIONS, directions
 from cuelearner_jax.types import Label
 
 TURN_DEG, BOUND_DEG = 8.0, 12.0
@@ -21,7 +21,7 @@ ENV = probes.Window(offset=0.6 + np.deg2rad(TURN_DEG))
 SIZES = GuideSizes(feedback_layers=(32, 32), labels_per_round=10, fit_steps=300, fit_batch_size=32)
 SCALARS = Scalars(eps_deg=BOUND_DEG, tau_max_deg=BOUND_DEG, k_max=10, feedback_learning_rate=5e-3, max_grad_norm=10.0)
 GUIDANCE = residual.KIND.make(SIZES, spaces_of(ENV))
-OBS = actions.evenly_spaced(4)
+OBS = directions.evenly_spaced(4)
 
 
 @struct.dataclass
@@ -58,16 +58,16 @@ def test_a_constant_shift_is_recovered(adapted):
     _, policy = adapted
     for lane in range(2):
         done = lane_of(policy, lane).act(jax.random.key(0), None, OBS)
-        off = np.rad2deg(actions.distance(done, jax.vmap(ENV.best)(OBS)))
+        off = np.rad2deg(DIRECTIONS.distance(done, jax.vmap(ENV.best)(OBS)))
         assert off.max() < TURN_DEG / 4
 
 
 def test_targets_are_the_needed_corrections_cut_off():
     """From the direction x to 5 and to 90 degrees counterclockwise, at 12 degrees and in units of these."""
-    shown = actions.from_angle(jnp.deg2rad(jnp.array([5.0, 90.0])))
+    shown = directions.from_angle(jnp.deg2rad(jnp.array([5.0, 90.0])))
     x = jnp.tile(jnp.array([[1.0, 0.0]]), (2, 1))
     rows = lessons(Label(OBS[:2], x, shown, jnp.ones(2, bool)), GUIDANCE.target, SCALARS)
-    wanted = actions.from_angle(jnp.deg2rad(jnp.array([5.0, 12.0]))) - x
+    wanted = directions.from_angle(jnp.deg2rad(jnp.array([5.0, 12.0]))) - x
     np.testing.assert_allclose(rows.target, wanted, atol=1e-6)
 
 

@@ -15,17 +15,17 @@ import pytest
 import train_teacher
 from _teacher_program import TeacherConfig, Trainer, check_config, finished, make_program
 
-from cuelearner_jax import actions
 from cuelearner_jax.config import to_json
 from cuelearner_jax.errors import NotFinite, UserError
 from cuelearner_jax.evaluate import rollout
 from cuelearner_jax.policies import Taught
+from cuelearner_jax.spaces import directions
 from cuelearner_jax.storage.folders import LOCK
 from cuelearner_jax.teachers import stored
 from cuelearner_jax.terminal import Interrupted
 
 TASK, WORLD = probes.make_task(), probes.WindowConfig()
-ENV, OBS = probes.Window(mirrors=True), actions.evenly_spaced(4)
+ENV, OBS = probes.Window(mirrors=True), directions.evenly_spaced(4)
 CONFIG = TeacherConfig(
     layers=(32, 32),
     tables=32,
@@ -104,7 +104,7 @@ def test_its_values_are_chances_to_win_and_an_imperfect_aim_goes_to_the_middle(t
     np.testing.assert_allclose(inside, 1, atol=0.15)
     np.testing.assert_allclose(outside, 0, atol=0.15)
     careful = made.replace(aim_error=0.3)
-    error = [float(actions.difference(ENV.best(obs), careful.best_action(None, obs))) for obs in OBS]
+    error = [float(directions.difference(ENV.best(obs), careful.best_action(None, obs))) for obs in OBS]
     assert np.abs(error).max() < math.radians(12)
 
 
@@ -114,10 +114,10 @@ def test_tries_come_first_from_the_best_and_last_from_anywhere():
     keys = jax.random.split(jax.random.key(2), 500)
     tried = jax.jit(jax.vmap(lambda key: training.propose(ENV, state.params, OBS[0], key)))(keys)
     np.testing.assert_allclose(jnp.linalg.norm(tried, axis=-1), 1, atol=1e-5)
-    best_value = training.value(ENV, state.params, OBS[0], actions.evenly_spaced(3600)).max()
+    best_value = training.value(ENV, state.params, OBS[0], directions.evenly_spaced(3600)).max()
     first = training.value(ENV, state.params, OBS[0], tried[:, 0])
     assert float((best_value - first).max()) < 0.1  # as fine as the search is
-    counts, _ = np.histogram(actions.to_angle(tried[:, -2:]).ravel(), bins=6, range=(-math.pi, math.pi))
+    counts, _ = np.histogram(directions.to_angle(tried[:, -2:]).ravel(), bins=6, range=(-math.pi, math.pi))
     assert counts.min() > 120  # 167 each
 
 

@@ -9,17 +9,18 @@ import numpy as np
 import probes
 import pytest
 
-from cuelearner_jax import actions, asking, choosing
+from cuelearner_jax import asking
 from cuelearner_jax.environment import spaces_of
 from cuelearner_jax.guides import registry
 from cuelearner_jax.guides.model import ensemble
 from cuelearner_jax.guides.relative import KIND, Relative
 from cuelearner_jax.policies import Uniform
+from cuelearner_jax.spaces import DIRECTIONS, directions
 from cuelearner_jax.types import Label
 
 ENV = probes.Aimed()
-OBS = actions.evenly_spaced(5)
-BASE = actions.rotate(OBS, 0.3)
+OBS = directions.evenly_spaced(5)
+BASE = directions.rotate(OBS, 0.3)
 ONE = dataclasses.replace(probes.SIZES, feedback_layers=(8,), fit_steps=20)
 FOUR = dataclasses.replace(ONE, ensemble=4)
 CHOOSING = dataclasses.replace(FOUR, candidates=6)
@@ -102,7 +103,7 @@ def test_the_candidate_is_asked_about_on_which_members_disagree_most_and_all_wal
         after = asking.ask(told, ENV, expert, probes.SCALARS, Uniform(), asked, key, jnp.asarray(0))
         np.testing.assert_array_equal(after.labels.obs[0], asked.obs[index])
         np.testing.assert_array_equal(after.labels.action[0], proposed[index])
-        error = actions.difference(proposed[index], ENV.best(asked.obs[index]))
+        error = directions.difference(proposed[index], ENV.best(asked.obs[index]))
         h = 0.0 if abs(float(error)) <= np.deg2rad(10) else float(np.sign(error))
         assert after.labels.answer[0].tolist() == [h]
         assert after.labels.valid.sum() == 1
@@ -129,7 +130,7 @@ def test_rounds_of_chosen_questions_fill_the_budget_and_fit_each_member_from_num
 def test_members_of_deep_coach_are_corrected_each_as_one_alone_is_from_its_own_numbers():
     single, several = (registry.make("dcoach", sizes, ENV) for sizes in (ONE, dataclasses.replace(ONE, ensemble=2)))
     obs, asked = OBS[:4], BASE[:4]
-    labels = Label(obs, asked, actions.sense(asked, jax.vmap(ENV.best)(obs))[:, None], jnp.arange(4) < 3)
+    labels = Label(obs, asked, DIRECTIONS.sense(asked, jax.vmap(ENV.best)(obs)), jnp.arange(4) < 3)
     fit = lambda bundle, key, former: jax.jit(bundle.fit)(key, ENV, labels, former, probes.SCALARS)  # noqa: E731
     former, key = several.init(jax.random.key(5)), jax.random.key(6)
     assert several.disagreement(former, ENV, OBS, BASE).min() > 1e-6
@@ -153,7 +154,7 @@ def test_every_candidate_is_asked_about_at_once_within_the_budget():
     after = asking.ask_all(single, ENV, expert, probes.SCALARS, Uniform(), guide, key, jnp.asarray(12))
     np.testing.assert_array_equal(after.labels.obs[12:18], guide.obs)
     np.testing.assert_array_equal(after.labels.action[12:18], proposed)
-    errors = jax.vmap(actions.difference)(proposed, jax.vmap(ENV.best)(guide.obs))
+    errors = jax.vmap(directions.difference)(proposed, jax.vmap(ENV.best)(guide.obs))
     h = np.where(np.abs(errors) <= np.deg2rad(10), 0.0, np.sign(errors))
     assert set(h) >= {-1.0, 1.0}
     np.testing.assert_array_equal(after.labels.answer[12:18, 0], h)
@@ -165,77 +166,3 @@ def test_every_candidate_is_asked_about_at_once_within_the_budget():
     assert np.asarray(guide.labels.valid).tolist() == [True] * 21 + [False] * 3
     assert (int(guide.asked), bool(guide.model.fitted)) == (21, True)
     assert len(np.unique(np.asarray(guide.labels.action)[:21], axis=0)) == 21
-
-
-# Where the policy and the teacher part.
-
-WATCHED = dataclasses.replace(ONE, candidates=4, chosen_by="teacher")
-
-
-@pytest.mark.parametrize(
-    ("off", "bias", "index"),
-    [
-        ([10.0, -50.0, 30.0, 49.0], 0.0, 1),
-        ([10.0, -50.0, 170.0, -179.0], 0.0, 3),
-        ([10.0, -50.0, 30.0, 49.0], 20.0, 1),  # 70 from what it takes for best, and 29
-        ([10.0, -50.0, 30.0, 49.0], -20.0, 3),  # 69, and 30
-        ([0.0, 0.0, 0.0, 0.0], 0.0, 0),
-    ],
-)
-def test_a_coach_speaks_where_the_action_is_farthest_from_its_own(off, bias, index):
-    bundle, expert = registry.make("relative", WATCHED, ENV), probes.Expert(ENV)
-    guide = begun(bundle, WATCHED)
-    obs = actions.evenly_spaced(4)
-    guide = guide.replace(env=obs, obs=obs)
-    asked = actions.rotate(jax.vmap(ENV.best)(obs), jnp.deg2rad(jnp.array(off)))
-    scalars = dataclasses.replace(probes.SCALARS, teacher_bias_deg=bias)
-    away = choosing.parting(ENV, expert, scalars, guide, asked)
-    apart = np.abs(np.array(off) - bias)
-    np.testing.assert_allclose(np.degrees(away), np.minimum(apart, 360 - apart), atol=1e-3)
-    first = actions.rotate(asked, 0.1)
-    for fitted in (False, True):  # it needs no model
-        known = guide.replace(model=guide.model.replace(fitted=jnp.array(fitted)))
-        there, action, proposed = choosing.chosen(bundle, ENV, known, asked, first, away)
-        np.testing.assert_array_equal(there.obs, obs[index])
-        np.testing.assert_array_equal(action, asked[index])
-        np.testing.assert_array_equal(proposed, first[index])
-
-
-def test_of_actions_as_far_from_its_own_the_first_is_asked_about():
-    bundle = registry.make("relative", WATCHED, ENV)
-    guide, asked = begun(bundle, WATCHED), actions.evenly_spaced(4)
-    there, _, _ = choosing.chosen(bundle, ENV, guide, asked, asked, jnp.array([0.1, 0.7, 0.7, 0.2]))
-    np.testing.assert_array_equal(there.obs, guide.obs[1])
-
-
-@pytest.mark.parametrize(("members", "fitted"), [(1, False), (1, True), (3, True)])
-def test_questions_that_a_coach_chooses_are_asked_from_the_first_on_and_all_candidates_walk_on(members, fitted):
-    sizes = dataclasses.replace(WATCHED, ensemble=members)
-    bundle, expert = made(AboutBase, sizes), probes.Expert(ENV)
-    guide, key = begun(bundle, sizes), jax.random.key(7)
-    guide = guide.replace(model=guide.model.replace(fitted=jnp.array(fitted)))
-    keys = asking.question_keys(key, 0)
-    proposed = Uniform().act(keys.base, guide.env, guide.obs)
-    off = np.abs(actions.difference(proposed, jax.vmap(ENV.best)(guide.obs)))
-    index = int(np.argmax(off))
-    assert index != 0
-    after = asking.ask(bundle, ENV, expert, probes.SCALARS, Uniform(), guide, key, jnp.asarray(0), sizes=sizes)
-    np.testing.assert_array_equal(after.labels.obs[0], guide.obs[index])
-    np.testing.assert_array_equal(after.labels.action[0], proposed[index])
-    assert abs(float(after.labels.answer[0, 0])) == 1.0
-    states, steps = jax.vmap(ENV.step)(jax.random.split(keys.env, 4), guide.env, proposed)
-    chex.assert_trees_all_equal((after.env, after.obs), (states, steps.obs))
-
-
-def test_rounds_of_a_coachs_questions_fill_the_budget_and_the_unguided_have_candidates_too():
-    bundle, expert, key = registry.make("relative", WATCHED, ENV), probes.Expert(ENV), jax.random.key(3)
-    guide = begun(bundle, WATCHED, budget=15)
-    one = jax.jit(lambda guide: asking.label_round(bundle, WATCHED, ENV, expert, probes.SCALARS, Uniform(), guide, key))
-    for _ in range(2):
-        guide = one(guide)
-    assert np.asarray(guide.labels.valid).tolist() == [True] * 15 + [False] * 5
-    off = np.abs(actions.difference(guide.labels.action, jax.vmap(ENV.best)(guide.labels.obs)))
-    assert off[:10].mean() > np.pi * 0.65  # of four uniform actions the farthest: 4/5 of pi on average
-    assert begun(registry.make("none", CHOOSING, ENV), CHOOSING).obs.shape == (6, 2)
-    with pytest.raises(ValueError, match="has no members whose disagreement"):
-        begun(bundle, dataclasses.replace(WATCHED, chosen_by="members"))

@@ -9,10 +9,10 @@ import numpy as np
 import probes
 import pytest
 
-from cuelearner_jax import actions
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.feedback.answers import RELATIVE
 from cuelearner_jax.guides import intent, registry
+from cuelearner_jax.spaces import DIRECTIONS, directions
 from cuelearner_jax.types import Label
 
 
@@ -26,8 +26,8 @@ class Aimless(probes.Aimed):
 
 ENV, SHUFFLED, AIMLESS = probes.Aimed(), Shuffled(), Aimless()
 SIZES = dataclasses.replace(probes.SIZES, aim_layers=(8,))
-OBS = actions.evenly_spaced(16)
-BASE = actions.rotate(OBS, jnp.linspace(-3.0, 3.0, 16))
+OBS = directions.evenly_spaced(16)
+BASE = directions.rotate(OBS, jnp.linspace(-3.0, 3.0, 16))
 EVERYWHERE = jnp.ones(16, bool)
 
 
@@ -36,7 +36,7 @@ def told(sizes):
     bundle = registry.make("intent", sizes, ENV)
     keys = jax.random.split(jax.random.key(3), 40)
     obs = jax.vmap(lambda key: ENV.reset(key)[1])(keys)
-    asked = actions.uniform(jax.random.key(4), (40,))
+    asked = directions.uniform(jax.random.key(4), (40,))
     tell = jax.vmap(lambda key, obs, a: RELATIVE.answer(key, ENV, probes.Expert(ENV), obs, obs, a, probes.SCALARS))
     answers, _ = tell(keys, obs, asked)
     labels = Label(obs, asked, answers, jnp.ones(40, bool))
@@ -55,10 +55,10 @@ def test_what_is_not_open_may_be_meant_and_is_not_followed(fitted):
     bundle, model = fitted
     scalars = dataclasses.replace(probes.SCALARS, aim_doubt=1e9, k_max=200)
     found = bundle.act(model, Shut(), OBS, BASE, EVERYWHERE, scalars).actions
-    second = actions.rotate(OBS, jnp.asarray(0.6))
+    second = directions.rotate(OBS, jnp.asarray(0.6))
     meant = bundle.act(model, ENV, OBS, BASE, EVERYWHERE, scalars).actions
-    np.testing.assert_allclose(actions.distance(meant, second), 0.0, atol=1e-3)
-    assert np.asarray(actions.distance(found, second)).min() > 0.5
+    np.testing.assert_allclose(DIRECTIONS.distance(meant, second), 0.0, atol=1e-3)
+    assert np.asarray(DIRECTIONS.distance(found, second)).min() > 0.5
 
 
 def test_who_reads_intent_needs_aims():
@@ -77,11 +77,9 @@ def acted(fitted, env, base=BASE, **scalars):
 
 
 def test_an_answer_makes_aims_on_its_side_likely():
-    goals = actions.from_angle(jnp.deg2rad(jnp.array([-90.0, 0.0, 9.0, 10.0, 90.0])))
-    action, eps = actions.from_angle(jnp.array(0.0)), jnp.deg2rad(20.0)
-    words = jnp.stack(
-        [intent.likelihood(actions.DIRECTIONS, action, goals, jnp.array(h), eps) for h in (-1.0, 0.0, 1.0)]
-    )
+    goals = directions.from_angle(jnp.deg2rad(jnp.array([-90.0, 0.0, 9.0, 10.0, 90.0])))
+    action, eps = directions.from_angle(jnp.array(0.0)), jnp.deg2rad(20.0)
+    words = jnp.stack([intent.likelihood(DIRECTIONS, action, goals, jnp.array([h]), eps) for h in (-1.0, 0.0, 1.0)])
     np.testing.assert_allclose(words.sum(0), 1.0, atol=1e-6)
     # Logistic: 1 / (1 + e) beyond an edge that lies one degree away; half on the edge, at eps / 2 = 10 degrees.
     np.testing.assert_allclose(words[2], [0.0, 0.0, 1.0 / (1.0 + math.e), 0.5, 1.0], atol=1e-4)
@@ -91,14 +89,14 @@ def test_an_answer_makes_aims_on_its_side_likely():
 def test_coarse_answers_lead_exactly_to_the_aim_that_is_meant(fitted):
     assert probes.SCALARS.eps_deg == 20.0
     refined = acted(fitted, ENV)
-    np.testing.assert_allclose(actions.difference(ENV.best(OBS), refined.actions), 0.0, atol=1e-5)
+    np.testing.assert_allclose(directions.difference(ENV.best(OBS), refined.actions), 0.0, atol=1e-5)
     # ceil(turn / eps) passes, and one that finds nothing left to do.
-    turns = np.degrees(np.abs(np.asarray(actions.difference(BASE, ENV.best(OBS)))))
+    turns = np.degrees(np.abs(np.asarray(directions.difference(BASE, ENV.best(OBS)))))
     assert (np.abs(np.asarray(refined.passes) - (np.ceil(turns / 20.0) + 1)) <= 1).all()
 
 
 def test_a_pass_goes_by_at_most_eps(fitted):
-    away = np.degrees(np.abs(np.asarray(actions.difference(BASE, acted(fitted, ENV, k_max=1).actions))))
+    away = np.degrees(np.abs(np.asarray(directions.difference(BASE, acted(fitted, ENV, k_max=1).actions))))
     assert away.max() == pytest.approx(20.0, abs=1e-3)
 
 
@@ -112,23 +110,23 @@ def test_without_a_possible_aim_actions_stay_as_they_are(fitted):
 
 
 def test_actions_stay_where_it_is_likelier_by_far_that_none_is_meant():
-    aims, scalars = actions.evenly_spaced(3), dataclasses.replace(probes.SCALARS, aim_doubt=2.0)
+    aims, scalars = directions.evenly_spaced(3), dataclasses.replace(probes.SCALARS, aim_doubt=2.0)
     for none, sure in ((math.log(3.9), True), (math.log(4.1), False)):
         share = jax.nn.softmax(jnp.array([0.0, math.log(2.0), -jnp.inf, none]))
-        goal, found = intent.followed(actions.DIRECTIONS, share, aims, aims[0], scalars)
+        goal, found = intent.followed(DIRECTIONS, share, aims, aims[0], scalars)
         np.testing.assert_array_equal(goal, aims[1])
         assert bool(found) == sure
     impossible = jnp.array([0.0, 0.0, 0.0, 1.0])
-    assert not intent.followed(actions.DIRECTIONS, impossible, aims, aims[0], scalars)[1]
+    assert not intent.followed(DIRECTIONS, impossible, aims, aims[0], scalars)[1]
 
 
 def test_of_aims_as_likely_as_the_likeliest_the_nearest_is_followed():
-    space, aims = actions.DIRECTIONS, actions.evenly_spaced(4)  # at 0, 90, 180 and 270 degrees
+    space, aims = DIRECTIONS, directions.evenly_spaced(4)  # at 0, 90, 180 and 270 degrees
     scalars = dataclasses.replace(probes.SCALARS, aim_doubt=100.0)
     # Probabilities 4 : 4 : 3.1 : 0, the last impossible; three quarters of all that none is meant.
     share = jnp.array([4.0, 4.0, 3.1, 0.0, 33.3]) / 44.4
     for degrees, aim in ((80.0, 1), (30.0, 0), (170.0, 1), (200.0, 1), (271.0, 0)):
-        found, sure = intent.followed(space, share, aims, actions.from_angle(jnp.deg2rad(degrees)), scalars)
+        found, sure = intent.followed(space, share, aims, directions.from_angle(jnp.deg2rad(degrees)), scalars)
         np.testing.assert_array_equal(found, aims[aim], err_msg=str(degrees))
         assert sure
 
@@ -144,7 +142,7 @@ def test_an_impossible_aim_has_no_weight(fitted):
 def test_members_weigh_aims_each_by_itself_and_their_mean_leads():
     bundle, model = told(dataclasses.replace(SIZES, ensemble=3))
     lead = acted((bundle, model), ENV).actions
-    np.testing.assert_allclose(actions.difference(ENV.best(OBS), lead), 0.0, atol=1e-5)
+    np.testing.assert_allclose(directions.difference(ENV.best(OBS), lead), 0.0, atol=1e-5)
     members = [jax.tree.map(lambda leaf, i=i: leaf[i], model.params) for i in range(3)]
     assert not np.array_equal(*(one["params"]["Dense_0"]["kernel"] for one in members[1:]))
     # One that believes in no aim does not decide for the others, however sure it is.
@@ -160,27 +158,17 @@ def test_members_weigh_aims_each_by_itself_and_their_mean_leads():
     np.testing.assert_array_equal(apart, bundle.disagreement(outvoted, ENV, OBS, OBS))  # whatever the action
 
 
-def test_what_an_answer_says_of_aims_hangs_on_its_own_strength():
+def test_what_an_answer_says_of_aims_depends_on_its_strength():
     """The second aim lies 10 degrees to the left: on the edge of what is right for a label of 20 degrees."""
-    obs, scalars = OBS[0], dataclasses.replace(probes.SCALARS, eps_deg=40.0)
-    asked = actions.rotate(ENV.best(obs), -jnp.deg2rad(10.0))
-    label = Label(obs, asked, jnp.array([1.0]), jnp.array(True), None, jnp.array(20.0))
-    of = lambda label: intent.evidence_of(ENV, actions.DIRECTIONS, label, scalars).likelihood  # noqa: E731
+    asked = directions.rotate(ENV.best(OBS[0]), -jnp.deg2rad(10.0))
+    label = Label(OBS[0], asked, jnp.array([1.0]), jnp.array(True))
+
+    def of(eps_deg):
+        scalars = dataclasses.replace(probes.SCALARS, eps_deg=eps_deg)
+        return intent.evidence_of(ENV, DIRECTIONS, label, scalars).likelihood
+
     # Logistic, of one degree: half at the edge of 10; e^-10 within that of 20; all but e^-8 beyond that of 2.
-    for strength, said in ((jnp.array(20.0), 0.5), (None, math.exp(-10)), (jnp.array(4.0), 1 - math.exp(-8))):
-        assert float(of(label.replace(eps_deg=strength))[1]) == pytest.approx(said, abs=2e-4 * (said > 0.1) + 1e-6)
-    everywhere = of(label.replace(eps_deg=jnp.array(20.0)))[-1], of(label.replace(eps_deg=jnp.array(40.0)))[-1]
+    for strength, said in ((20.0, 0.5), (40.0, math.exp(-10)), (4.0, 1 - math.exp(-8))):
+        assert float(of(strength)[1]) == pytest.approx(said, abs=2e-4 * (said > 0.1) + 1e-6)
+    everywhere = of(20.0)[-1], of(40.0)[-1]
     np.testing.assert_allclose(everywhere, [170 / 360, 160 / 360], atol=2e-3)  # degrees that are more to the left
-
-
-def test_a_model_is_fitted_to_what_answers_of_their_own_strengths_say():
-    """ "Already right", nine degrees off the aim: a coarse label means the aim, a fine one none of them."""
-    bundle, scalars = registry.make("intent", SIZES, ENV), dataclasses.replace(probes.SCALARS, eps_deg=4.0)
-    obs = jax.vmap(lambda key: ENV.reset(key)[1])(jax.random.split(jax.random.key(3), 40))
-    asked = actions.rotate(ENV.best(obs), -jnp.deg2rad(9.0))
-    fine = Label(obs, asked, jnp.zeros((40, 1)), jnp.ones(40, bool))
-    former, aims = bundle.init(jax.random.key(0)), ENV.aims(OBS[0])
-    for labels, low, high in ((fine.replace(eps_deg=jnp.full(40, 40.0)), 0.9, 1.0), (fine, 0.0, 0.1)):
-        model = bundle.fit(jax.random.key(1), ENV, labels, former, scalars)
-        weights = intent.Weights(SIZES.aim_layers).apply(model.params, aims.features, aims.possible)
-        assert low <= float(jax.nn.softmax(jnp.asarray(weights))[1]) <= high

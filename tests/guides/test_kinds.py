@@ -10,16 +10,16 @@ import numpy as np
 import probes
 import pytest
 
-from cuelearner_jax import actions, asking
-from cuelearner_jax.errors import UserError
+from cuelearner_jax import asking
 from cuelearner_jax.guides import registry
 from cuelearner_jax.policies import Uniform
+from cuelearner_jax.spaces import DIRECTIONS, directions
 from cuelearner_jax.types import Label
 
 ENV = probes.Window()
 SIZES = dataclasses.replace(probes.SIZES, guide_directions=36)
 SCALARS = dataclasses.replace(probes.SCALARS, scalar_within_deg=20.0)
-OBS = actions.evenly_spaced(4)
+OBS = directions.evenly_spaced(4)
 BEST = jax.vmap(ENV.best)(OBS)
 KEY = jax.random.key(3)
 
@@ -44,7 +44,7 @@ def taught(kind, rounds, scalars=SCALARS, frame="raw"):
 def errors(kind, model, base=BEST, scalars=SCALARS, frame="raw"):
     """Degrees from the best direction in each context, under guidance of base actions."""
     acted = compiled(kind, frame)[2](model, ENV, OBS, base, jnp.ones(4, bool), scalars).actions
-    return np.degrees(actions.distance(BEST, acted))
+    return np.degrees(DIRECTIONS.distance(BEST, acted))
 
 
 def labels(answers, obs, asked):
@@ -55,15 +55,15 @@ def labels(answers, obs, asked):
 def drawn(count):
     """Contexts and uniform actions."""
     k_context, k_action = jax.random.split(jax.random.key(7))
-    return OBS[jax.random.randint(k_context, (count,), 0, 4)], actions.uniform(k_action, (count,))
+    return OBS[jax.random.randint(k_context, (count,), 0, 4)], directions.uniform(k_action, (count,))
 
 
 @pytest.mark.parametrize(("frame", "rounds", "within"), [("raw", 3, 2), ("action", 6, 10)])
 def test_demonstrations_are_cloned_and_replace_whatever_the_agent_would_do(frame, rounds, within):
     guide = taught("demonstration", rounds, frame=frame)
-    for base in (BEST, -BEST, actions.rotate(BEST, 1.0)):
+    for base in (BEST, -BEST, directions.rotate(BEST, 1.0)):
         assert errors("demonstration", guide.model, base, frame=frame).max() < within
-    asked = np.degrees(actions.distance(jax.vmap(ENV.best)(guide.labels.obs), guide.labels.action))
+    asked = np.degrees(DIRECTIONS.distance(jax.vmap(ENV.best)(guide.labels.obs), guide.labels.action))
     assert asked[:10].max() > 60  # uniform
     assert np.median(asked[20:]) < 20  # about the policy itself, once there is one
     np.testing.assert_allclose(guide.labels.answer, jax.vmap(ENV.best)(guide.labels.obs), atol=1e-6)
@@ -79,7 +79,7 @@ def test_demonstrations_are_fitted_from_scratch_whatever_the_former_model():
 def test_the_argmax_of_scalar_labels_finds_a_planted_window():
     bundle, fit, _ = compiled("scalar")
     obs, asked = drawn(400)
-    good = actions.distance(jax.vmap(ENV.best)(obs), asked) < np.deg2rad(20)
+    good = DIRECTIONS.distance(jax.vmap(ENV.best)(obs), asked) < np.deg2rad(20)
     assert 0.05 < good.mean() < 0.16  # of uniform actions, one in nine
     model = fit(KEY, ENV, labels(good[:, None] * 1.0, obs, asked), bundle.init(KEY), SCALARS)
     assert errors("scalar", model).max() < 20
@@ -108,7 +108,7 @@ def test_a_share_of_the_scalar_questions_explores():
 def corrections(count):
     """Corrections toward the best direction about uniform actions."""
     obs, asked = drawn(count)
-    return labels(actions.sense(asked, jax.vmap(ENV.best)(obs))[:, None], obs, asked)
+    return labels(DIRECTIONS.sense(asked, jax.vmap(ENV.best)(obs)), obs, asked)
 
 
 def first(count, given):
@@ -149,7 +149,7 @@ def test_a_correction_moves_the_policy_its_way_by_eps():
         own = act(model, ENV, OBS, OBS, everywhere, scalars).actions
         obs, asked = jnp.tile(OBS[:1], (40, 1)), jnp.tile(own[:1], (40, 1))
         told = fit(KEY, ENV, labels(jnp.full((40, 1), h), obs, asked), model, scalars)
-        moved = actions.difference(own, act(told, ENV, OBS, OBS, everywhere, scalars).actions)[0]
+        moved = directions.difference(own, act(told, ENV, OBS, OBS, everywhere, scalars).actions)[0]
         assert np.degrees(moved) == pytest.approx(20 * h, abs=2)
 
 
@@ -157,16 +157,6 @@ def test_a_coached_policy_comes_nearer_to_what_its_coach_has_in_mind():
     guide = taught("dcoach", 20)
     assert int(guide.model.params.learned) == 200
     assert errors("dcoach", guide.model).max() < 25
-    asked = np.degrees(actions.distance(jax.vmap(ENV.best)(guide.labels.obs), guide.labels.action))
+    asked = np.degrees(DIRECTIONS.distance(jax.vmap(ENV.best)(guide.labels.obs), guide.labels.action))
     assert np.median(asked[:20]) > 60
     assert np.median(asked[-20:]) < 15
-
-
-@pytest.mark.parametrize("kind", ["demonstration", "scalar", "_residual:KIND"])
-def test_answers_that_mean_no_turn_have_no_strength_that_could_fall(kind):
-    falling = dataclasses.replace(SIZES, eps_falls=True)
-    with pytest.raises(UserError, match=r"answers, which have no strength .* leave out --sizes\.eps-falls") as refusal:
-        registry.make(registry.resolve(kind).name, falling, ENV)
-    assert "\n" not in str(refusal.value)
-    for other in ("none", "relative", "dcoach"):
-        assert registry.make(other, falling, ENV).name == other

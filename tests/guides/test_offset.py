@@ -9,13 +9,13 @@ import numpy as np
 import probes
 import pytest
 
-from cuelearner_jax import actions
 from cuelearner_jax.adaptation import program
 from cuelearner_jax.config import GuideSizes
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides import offset, registry
 from cuelearner_jax.policies import policy_of
 from cuelearner_jax.runs.grid import Grid, check_grid
+from cuelearner_jax.spaces import DIRECTIONS, directions
 from cuelearner_jax.types import Label
 
 ENV = probes.Window(half_width=jnp.deg2rad(jnp.array(6.0)))
@@ -28,7 +28,7 @@ MISS_DEG = 40.0
 
 def missing(obs):
     """Misses the best direction by a constant angle."""
-    return actions.rotate(obs, 0.6 + jnp.deg2rad(MISS_DEG))
+    return directions.rotate(obs, 0.6 + jnp.deg2rad(MISS_DEG))
 
 
 BASE = policy_of(jax.jit(missing))
@@ -61,22 +61,22 @@ def test_a_constant_miss_is_known_everywhere_from_forty_answers_a_fifth_of_them_
     obs = jax.vmap(lambda key: ENV.reset(key)[1])(keys)
     base = missing(obs)
     turn = jax.random.uniform(jax.random.key(4), (50,), minval=-60.0, maxval=60.0)
-    asked = actions.rotate(base, jnp.deg2rad(turn))
+    asked = directions.rotate(base, jnp.deg2rad(turn))
     right = jnp.where(turn < -MISS_DEG, 1.0, -1.0)
     answers = jnp.where(jnp.arange(50) % 5 == 2, -right, right)[:, None]
     labels = Label(obs, asked, answers, jnp.ones(50, bool), base)
     former = BUNDLE.init(jax.random.key(0))
     model = jax.jit(BUNDLE.fit)(jax.random.key(1), ENV, labels, former, SCALARS)
     assert 0.0 <= float(model.params.share) <= 1.0
-    everywhere = actions.evenly_spaced(24)
+    everywhere = directions.evenly_spaced(24)
     moved = BUNDLE.act(model, ENV, everywhere, missing(everywhere), jnp.ones(24, bool), SCALARS).actions
-    miss = np.degrees(np.asarray(actions.distance(moved, actions.rotate(everywhere, 0.6))))
+    miss = np.degrees(np.asarray(DIRECTIONS.distance(moved, directions.rotate(everywhere, 0.6))))
     assert miss.mean() < 2 * SCALARS.eps_deg  # of 40
     # One pass from an action that was turned already is not one from an action of the base's own.
-    there = jax.tree.map(lambda leaf: leaf[:4], labels.replace(action=actions.rotate(base, -jnp.deg2rad(60.0))))
+    there = jax.tree.map(lambda leaf: leaf[:4], labels.replace(action=directions.rotate(base, -jnp.deg2rad(60.0))))
     once = dataclasses.replace(SCALARS, k_max=1)
     back = BUNDLE.moved_on(model, ENV, there, jnp.ones(4, bool), once).actions
-    assert (np.asarray(actions.difference(there.action, back)) > 0).all()
+    assert (np.asarray(directions.difference(there.action, back)) > 0).all()
 
 
 def test_what_the_base_did_is_kept_with_labels_and_told_again_for_labels_from_a_file():
@@ -88,7 +88,9 @@ def test_what_the_base_did_is_kept_with_labels_and_told_again_for_labels_from_a_
         block = program.ask_round(BUNDLE, SIZES, ENV, EXPERT, SCALARS, bases, block)
     labels = block.guide.labels
     np.testing.assert_allclose(labels.base, missing(labels.obs), atol=1e-6)
-    assert float(actions.distance(labels.base, labels.action).max()) > jnp.deg2rad(4.0)  # refined ones were asked about
+    assert float(DIRECTIONS.distance(labels.base, labels.action).max()) > jnp.deg2rad(
+        4.0
+    )  # refined ones were asked about
     given = program.take_labels(BUNDLE, SIZES, ENV, SCALARS, bases, labels.replace(base=None), start)
     chex.assert_trees_all_close(given.guide.model, block.guide.model, atol=1e-5)
 
@@ -100,19 +102,3 @@ def test_labels_of_other_kinds_keep_no_base_and_training_refuses_this_one():
     with pytest.raises(UserError, match="adapt"):
         check_grid(Grid(("relative", "offset"), (0,), (20,)))
     assert "offset" not in registry.possible(ENV, taught=True)
-
-
-def test_the_spline_learns_by_how_much_each_label_turns():
-    obs = actions.evenly_spaced(20)
-    base = missing(obs)
-    asked = actions.rotate(base, jnp.deg2rad(jnp.linspace(-20.0, 20.0, 20)))
-    labels = Label(obs, asked, jnp.ones((20, 1)), jnp.ones(20, bool), base)
-    former, fit = BUNDLE.init(jax.random.key(0)), jax.jit(BUNDLE.fit)
-    found = [
-        fit(jax.random.key(1), ENV, labels.replace(eps_deg=strengths), former, SCALARS).params.spline
-        for strengths in (None, jnp.full(20, 5.0), jnp.full(20, 2.5))
-    ]
-    assert float(found[0].heights.max()) > 0.5  # in units of eps, which is 5 degrees
-    np.testing.assert_allclose(found[1].heights, found[0].heights, atol=1e-5)
-    np.testing.assert_allclose(found[2].heights, found[0].heights / 2, atol=1e-5)
-    np.testing.assert_array_equal(found[2].reach, found[0].reach)

@@ -7,9 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from cuelearner_jax import actions
-from cuelearner_jax.actions import DIRECTIONS
 from cuelearner_jax.guides.refining import refine, untouched
+from cuelearner_jax.spaces import DIRECTIONS, directions
 
 DEG = math.pi / 180
 ROWS = 256
@@ -124,19 +123,19 @@ def told(goal, eps):
     """What a perfect model of relative feedback answers: a turn by eps toward a goal that is not within eps / 2."""
 
     def residual(action):
-        error = actions.difference(action, goal)
+        error = directions.difference(action, goal)
         h = jnp.where(jnp.abs(error) <= eps / 2, 0.0, jnp.sign(error))
-        return actions.rotate(action, h * eps) - action
+        return directions.rotate(action, h * eps) - action
 
     return residual
 
 
 def refined_degrees(start, goal, eps, tau_max=180.0, k_max=50):
-    first = actions.from_angle(jnp.array(start) * DEG)
-    residual = told(actions.from_angle(jnp.array(goal * DEG)), eps * DEG)
+    first = directions.from_angle(jnp.array(start) * DEG)
+    residual = told(directions.from_angle(jnp.array(goal * DEG)), eps * DEG)
     active = jnp.ones(len(start), bool)
     result = refine(residual, first, active, space=DIRECTIONS, tau=0.1 * DEG, tau_max=tau_max * DEG, k_max=k_max)
-    return np.asarray(actions.to_angle(result.actions)) / DEG, result.passes.tolist()
+    return np.asarray(directions.to_angle(result.actions)) / DEG, result.passes.tolist()
 
 
 def test_a_perfect_model_of_feedback_by_hand():
@@ -172,8 +171,8 @@ def test_a_perfect_model_ends_within_half_eps_from_anywhere():
 
 
 def test_under_vmap_each_lane_has_its_own_number_of_passes():
-    goal = actions.from_angle(jnp.zeros(()))
-    first = actions.from_angle(jnp.array([[47.0], [3.0]]) * DEG)
+    goal = directions.from_angle(jnp.zeros(()))
+    first = directions.from_angle(jnp.array([[47.0], [3.0]]) * DEG)
 
     def one(start):
         active = jnp.ones(1, bool)

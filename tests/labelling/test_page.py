@@ -145,7 +145,7 @@ def test_other_forms_of_feedback_have_a_page_of_the_same_parts(opened, tmp_path,
     file = label_files.read(tmp_path / "labels")
     wanted = [-0.5, math.sqrt(0.75)] if kind == "demonstration" else [1.0]
     np.testing.assert_allclose(file.labels.answer, [wanted], atol=1e-6)
-    assert (file.answers, file.eps_deg) == (kind, None)
+    assert (file.answers, file.eps) == (kind, None)
     assert len(file.people.seconds) == 1
 
 

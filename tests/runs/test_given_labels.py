@@ -10,6 +10,7 @@ from cuelearner_jax.errors import UserError
 from cuelearner_jax.runs import sweep
 from cuelearner_jax.runs.grid import Grid
 from cuelearner_jax.runs.order import Order, read_labels
+from cuelearner_jax.spaces import DIRECTIONS
 from cuelearner_jax.storage import label_files
 
 TASK = {"name": "window", "half_width_deg": 28.0}
@@ -31,7 +32,7 @@ def written(path, task=None, answers="relative", eps_deg=EPS, obs_size=2, spoil=
         rows[spoil[0]][1, 7] = spoil[1]
     labels = probes.label_set(rows["obs"], rows["action"], rows["answer"], np.ones((2, 20), bool))
     labels = labels.replace(eps_deg=None if own is None else np.tile(np.float32(own), (2, 1)))
-    label_files.write(path, task or TASK, answers, eps_deg, np.array([4, 9]), labels)
+    label_files.write(path, task or TASK, answers, DIRECTIONS, eps_deg, np.array([4, 9]), labels)
 
 
 GRID = Grid(("none", "relative"), seeds=(4, 9), labels=(10, 15))
@@ -112,23 +113,6 @@ def test_labels_of_another_world_are_refused_but_for_what_they_do_not_depend_on(
         read_for(path)
 
 
-def test_labels_of_several_strengths_are_taken_where_strengths_fall(path):
-    written(path, own=np.linspace(EPS, EPS / 4, 20))
-    with pytest.raises(
-        UserError, match=r"down to 5 degrees: give --sizes\.eps-falls --scalars\.eps-last-deg 5, or"
-    ) as no:
-        read_for(path)
-    assert "\n" not in str(no.value)
-    falls = probes.config(sizes={"eps_falls": True}, scalars={"eps_last_deg": EPS / 4})
-    assert read_for(path, config=falls).labels.eps_deg.min() == EPS / 4
-    written(path)
-    assert read_for(path, config=falls).labels.eps_deg is None
-    for wrong in (0.0, 200.0, np.inf):
-        written(path, own=[EPS] * 19 + [wrong])
-        with pytest.raises(UserError, match="strengths are no angles above 0 and up to 180"):
-            read_for(path, config=falls)
-
-
 SMALL = {"q_layers": (4,), "feedback_layers": (4,), "fit_steps": 20, "lanes_per_block": 1, "guide_directions": 6}
 RUN = probes.config(sizes=SMALL, schedule={"total_steps": 16, "guidance_until": 16})
 
@@ -138,7 +122,7 @@ def test_demonstrations_are_written_and_taken_again_by_their_own_kind_alone(tmp_
     sweep.run(Order(task, RUN, grid, tmp_path / "asked"))
     path = tmp_path / "asked" / "demonstration" / "labels.parquet"
     file = label_files.read(path)
-    assert (file.answers, file.eps_deg, file.labels.answer.shape) == ("demonstration", None, (10, 2))
+    assert (file.answers, file.eps, file.labels.answer.shape) == ("demonstration", None, (10, 2))
     sweep.run(Order(task, RUN, grid, tmp_path / "given", labels_from=path))
     again = label_files.read(tmp_path / "given" / "demonstration" / "labels.parquet")
     np.testing.assert_array_equal(again.labels.answer, file.labels.answer)
@@ -147,27 +131,12 @@ def test_demonstrations_are_written_and_taken_again_by_their_own_kind_alone(tmp_
             read_for(path, Grid((other,), (4,), (10,)))
 
 
-@pytest.mark.long
-def test_a_run_with_falling_strengths_and_a_coach_leaves_a_file_that_is_taken_again(tmp_path):
-    sizes = {**SMALL, "eps_falls": True, "candidates": 3, "chosen_by": "teacher"}
-    config = dataclasses.replace(probes.config(sizes=sizes, scalars={"eps_last_deg": EPS / 4}), schedule=RUN.schedule)
-    grid, task = Grid(("none", "relative"), (4, 5), (15,)), probes.make_task()
-    sweep.run(Order(task, config, grid, tmp_path / "asked"))
-    path = tmp_path / "asked" / "relative" / "labels.parquet"
-    file = label_files.read(path)
-    np.testing.assert_allclose(file.labels.eps_deg, np.tile(np.geomspace(EPS, EPS / 4, 15), 2), rtol=1e-5)
-    sweep.run(Order(task, config, grid, tmp_path / "given", labels_from=path))
-    again = label_files.read(tmp_path / "given" / "relative" / "labels.parquet")
-    np.testing.assert_array_equal(again.labels.eps_deg, file.labels.eps_deg)
-    np.testing.assert_array_equal(again.labels.answer, file.labels.answer)
-
-
 def test_demonstrations_that_are_no_actions_are_refused(path):
     rng = np.random.default_rng(0)
     rows = rng.normal(size=(3, 1, 20, 2)).astype(np.float32)
     action = rows[1] / np.linalg.norm(rows[1], axis=-1, keepdims=True)
     labels = probes.label_set(rows[0], action, rows[2], np.ones((1, 20), bool))
-    label_files.write(path, TASK, "demonstration", None, np.array([4]), labels)
+    label_files.write(path, TASK, "demonstration", DIRECTIONS, None, np.array([4]), labels)
     with pytest.raises(UserError, match="answers are no unit vectors"):
         read_for(path, Grid(("demonstration",), (4,), (10,)))
 

@@ -1,6 +1,5 @@
 """Runs that were stopped or killed and resumed: bitwise the run that was left alone."""
 
-import dataclasses
 import shutil
 from contextlib import contextmanager
 from functools import cache
@@ -21,6 +20,7 @@ from cuelearner_jax.runs import kept, lanes, runner, sweep, training
 from cuelearner_jax.runs.grid import Grid, config_hash
 from cuelearner_jax.runs.kept import items
 from cuelearner_jax.runs.order import Order
+from cuelearner_jax.spaces import DIRECTIONS
 from cuelearner_jax.storage import formats, label_files, lines, results
 from cuelearner_jax.storage import table as tables
 from cuelearner_jax.storage.checkpoint import checkpoints
@@ -330,27 +330,6 @@ def test_a_block_filled_up_with_repeats_has_a_row_for_each_seed(whole, tmp_path)
     assert [row for row in table if row["seed"] != 7] == expected
 
 
-@pytest.mark.long
-def test_a_run_whose_labels_fall_and_whose_questions_a_coach_chooses_goes_on_as_one(tmp_path):
-    own = {**SMALL, "eps_falls": True, "candidates": 3, "chosen_by": "teacher"}
-    config = probes.config(
-        sizes=own,
-        scalars={"eps_last_deg": 5.0},
-        schedule={"total_steps": 32, "checkpoint_every": 32, "ask_at": (0, 16)},
-    )
-    orders = [Order(TASK, config, Grid(("relative",), (3, 5), (35,)), tmp_path / name / "run") for name in "ab"]
-    sweep.run(orders[0])
-    for stop in (3, 1):  # rounds, of which two are of the second instalment
-        with stopping_at(stop), pytest.raises(Interrupted):
-            sweep.run(dataclasses.replace(orders[1], resume=stop == 1))
-    sweep.run(dataclasses.replace(orders[1], resume=True))
-    mine, whole = (label_files.read(order.out / "relative" / "labels.parquet").labels for order in orders)
-    for name in ("obs", "action", "answer", "eps_deg"):
-        np.testing.assert_array_equal(getattr(mine, name), getattr(whole, name))
-    np.testing.assert_allclose(whole.eps_deg, np.tile(np.geomspace(20.0, 5.0, 35), 2), rtol=1e-5)
-    assert rows(orders[1].out) == rows(orders[0].out)
-
-
 # Labels from a file.
 
 
@@ -361,7 +340,7 @@ def test_labels_of_a_file_are_used_exactly(tmp_path):
     answer = rng.integers(-1, 2, size=(2, 60, 1)).astype(np.float32)
     given = probes.label_set(obs, action, answer, np.ones((2, 60), bool))
     path = tmp_path / "given.parquet"
-    label_files.write(path, {"name": "window"}, "relative", CONFIG.scalars.eps_deg, np.array([3, 5]), given)
+    label_files.write(path, {"name": "window"}, "relative", DIRECTIONS, CONFIG.scalars.eps_deg, np.array([3, 5]), given)
     grid = Grid(("relative",), seeds=(5, 3), labels=(35, 60))
     out = tmp_path / "run"
 

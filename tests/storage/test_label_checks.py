@@ -8,6 +8,7 @@ import pyarrow as pa
 import pytest
 
 from cuelearner_jax.cli import main
+from cuelearner_jax.spaces import DIRECTIONS
 from cuelearner_jax.storage import label_files, lines
 from cuelearner_jax.storage import table as tables
 from cuelearner_jax.storage.label_files import JSONL, PARQUET, SCHEMA
@@ -16,12 +17,13 @@ HEAD = {
     "format": 1,
     "task": {"name": "window", "half_width_deg": 28.0},
     "answers": "relative",
-    "eps_deg": 20.0,
+    "space": DIRECTIONS.to_json(),
+    "eps": 20.0,
     "session": {"seed": 0, "guidance": "relative", "base": "uniform", "observation": [{"name": "goal", "size": 2}]},
 }
 ROWS = [
     {
-        **{"seed": 0, "obs": [0.1, 0.2], "action": [0.0, 1.0], "answer": [answer], "eps_deg": 20.0},
+        **{"seed": 0, "obs": [0.1, 0.2], "action": [0.0, 1.0], "answer": [answer]},
         **{"item": item, "said": "answer", "seconds": 1.5, "who": "Ada", "when": "2026-01-01T00:00:00+00:00"},
     }
     for item, answer in enumerate([1.0, 0.0, -1.0])
@@ -34,14 +36,16 @@ HEADS = [
     *(("task", value) for value in (None, "window", [], {}, {"name": None}, {"name": ["window"]}, 3)),
     ("answers", ABSENT),
     *(("answers", value) for value in (None, 3, ["relative"], {})),
-    ("eps_deg", ABSENT),
-    *(("eps_deg", value) for value in (None, "20", 0, -20.0, 181, 1e400, float("nan"), True, [20.0])),
+    ("space", ABSENT),
+    *(("space", value) for value in (None, "plane", {}, {"name": "box", "cues": [], "low": [1], "high": [0]})),
+    ("eps", ABSENT),
+    *(("eps", value) for value in (None, "20", 0, -20.0, 181, 1e400, float("nan"), True, [20.0])),
     *(
         ("session", value)
         for value in ([], 3, "page", {}, {"seed": None}, {"seed": -1}, {"seed": True}, {"seed": 2**40})
     ),
     *(("session", {"seed": 0, name: 3}) for name in ("base", "robot", "observation")),
-    ("session", {"seed": 0, "bound_deg": "wide"}),
+    ("session", {"seed": 0, "bound": "wide"}),
     ("session", {"seed": 0, "observation": [{"name": "goal", "size": 10**9}]}),
     ("session", {"seed": 0, "observation": [{"name": "goal", "size": 2.0}]}),
     ("session", {"seed": 0, "observation": ["goal"]}),
@@ -53,7 +57,6 @@ FIELDS = [
     *(("obs", value) for value in (ABSENT, [0.1], [float("nan"), 0.0], [float("-inf"), 0.0], [])),
     *(("item", value) for value in (ABSENT, -1, 2**40)),
     *(("seconds", value) for value in (ABSENT, -1.0, float("nan"), float("inf"))),
-    *(("eps_deg", value) for value in (0.0, -20.0, 400.0)),
     *((name, ABSENT) for name in ("who", "when", "seed")),
     ("seed", -1),
 ]

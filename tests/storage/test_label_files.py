@@ -9,6 +9,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from cuelearner_jax.errors import UserError
+from cuelearner_jax.spaces import DIRECTIONS
 from cuelearner_jax.storage import label_files as files
 from cuelearner_jax.storage import lines
 from cuelearner_jax.storage import table as tables
@@ -32,7 +33,7 @@ def path(tmp_path):
 
 def written(path, seeds=(4, 9), task=None, answers="relative", eps_deg=EPS, **kinds):
     labels = label_sets(lanes=len(seeds), **kinds)
-    files.write(path, task or TASK, answers, eps_deg, np.array(seeds), labels)
+    files.write(path, task or TASK, answers, DIRECTIONS, eps_deg, np.array(seeds), labels)
     return labels
 
 
@@ -40,7 +41,7 @@ def test_labels_come_back_as_they_were(path):
     labels = written(path)
     file = files.read(path)
     assert file.task == TASK
-    assert (file.answers, file.eps_deg) == ("relative", EPS)
+    assert (file.answers, file.space, file.eps) == ("relative", DIRECTIONS, EPS)
     assert file.seeds.tolist() == [4] * 20 + [9] * 20
     for name in NAMES:
         whole = getattr(labels, name)
@@ -52,14 +53,14 @@ def test_labels_come_back_as_they_were(path):
 def test_answers_have_the_width_of_their_form_and_a_strength_if_it_has_one(path):
     labels = written(path, answers="demonstration", eps_deg=None, width=2)
     file = files.read(path)
-    assert (file.answers, file.eps_deg) == ("demonstration", None)
+    assert (file.answers, file.eps) == ("demonstration", None)
     np.testing.assert_array_equal(file.labels.answer, labels.answer.reshape(40, 2))
 
 
 def test_only_labels_that_count_are_written(path):
     labels = label_sets()
     labels = labels.replace(valid=np.arange(20)[None] < np.array([[3], [0]]))
-    files.write(path, TASK, "relative", EPS, np.array([4, 9]), labels)
+    files.write(path, TASK, "relative", DIRECTIONS, EPS, np.array([4, 9]), labels)
     file = files.read(path)
     assert file.seeds.tolist() == [4] * 3
     np.testing.assert_array_equal(file.labels.obs, labels.obs[0, :3])
@@ -69,7 +70,8 @@ def test_what_the_numbers_mean_is_written_in_the_file(path):
     written(path)
     meta = json.loads(pq.read_schema(path).metadata[META])
     assert meta["format"] == 1
-    assert meta["conventions"]["angles"] == "radians, counterclockwise positive"
+    assert (meta["space"]["name"], meta["space"]["cues"][0]["unit"], meta["eps"]) == ("directions", "degrees", EPS)
+    assert meta["space"]["cues"][0]["words"] == ["counterclockwise", "clockwise"]
     assert set(meta["conventions"]) >= set(NAMES)
 
 
@@ -123,7 +125,9 @@ def test_a_missing_file_is_refused(path):
 
 def test_a_file_without_labels_is_refused(path):
     labels = label_sets()
-    files.write(path, TASK, "relative", EPS, np.array([4, 9]), labels.replace(valid=np.zeros((2, 20), bool)))
+    files.write(
+        path, TASK, "relative", DIRECTIONS, EPS, np.array([4, 9]), labels.replace(valid=np.zeros((2, 20), bool))
+    )
     with pytest.raises(UserError, match="holds no labels"):
         files.read(path)
 
@@ -142,7 +146,7 @@ def test_damage_is_noticed_wherever_it_changes_anything(path):
             refusals += 1
             continue
         assert at > columns
-        assert (file.task, file.answers, file.eps_deg) == (TASK, "relative", EPS)
+        assert (file.task, file.answers, file.space, file.eps) == (TASK, "relative", DIRECTIONS, EPS)
         np.testing.assert_array_equal(file.labels.obs, labels.obs.reshape(40, 3))
     assert refusals > columns // 60
 
@@ -173,14 +177,14 @@ def test_text_and_foreign_tables_are_refused(path):
 def said(folder, numbers, answers="relative", eps_deg=EPS):
     """Appends some of the labels of `label_sets(1)`, by number."""
     labels = label_sets(lanes=1)
-    with files.LabelWriter(folder, TASK, answers, eps_deg) as writer:
+    with files.LabelWriter(folder, TASK, answers, DIRECTIONS, eps_deg) as writer:
         for index in numbers:
             writer.append(seed=7, **{name: getattr(labels, name)[0, index] for name in NAMES})
     return labels
 
 
 def assert_holds(file, labels, count):
-    assert (file.task, file.answers, file.eps_deg) == (TASK, "relative", EPS)
+    assert (file.task, file.answers, file.space, file.eps) == (TASK, "relative", DIRECTIONS, EPS)
     assert file.seeds.tolist() == [7] * count
     for name in NAMES:
         np.testing.assert_array_equal(getattr(file.labels, name), getattr(labels, name)[0, :count])
@@ -188,7 +192,7 @@ def assert_holds(file, labels, count):
 
 def test_each_label_can_be_read_before_the_writer_closes(tmp_path):
     labels = label_sets(lanes=1)
-    writer = files.LabelWriter(tmp_path, TASK, "relative", EPS)
+    writer = files.LabelWriter(tmp_path, TASK, "relative", DIRECTIONS, EPS)
     with pytest.raises(UserError, match="holds no labels"):
         files.read(tmp_path / files.JSONL)
     for index in range(3):
@@ -219,7 +223,7 @@ def test_a_finished_session_is_a_label_file_and_can_be_continued(tmp_path):
     assert files.finish(tmp_path) == tmp_path / files.PARQUET
     assert [entry.name for entry in tmp_path.iterdir()] == [files.PARQUET]
     assert_holds(files.read(tmp_path / files.PARQUET), labels, 20)
-    files.write(tmp_path / "whole.parquet", TASK, "relative", EPS, np.array([7]), labels)
+    files.write(tmp_path / "whole.parquet", TASK, "relative", DIRECTIONS, EPS, np.array([7]), labels)
     assert (tmp_path / "whole.parquet").read_bytes() == (tmp_path / files.PARQUET).read_bytes()
     said(tmp_path, [3])
     assert len(files.read(tmp_path / files.JSONL).seeds) == 21
@@ -230,7 +234,7 @@ def test_a_finished_session_is_a_label_file_and_can_be_continued(tmp_path):
     ("other", "named"),
     [
         ({"answers": "scalar"}, r"answers \(relative, asked for is scalar\)"),
-        ({"eps_deg": 5.0}, r"eps_deg \(20.0, asked for is 5.0\)"),
+        ({"eps_deg": 5.0}, r"eps \(20.0, asked for is 5.0\)"),
         ({"answers": "scalar", "eps_deg": None}, r"answers \(relative, asked for is scalar\)"),
     ],
 )
@@ -256,7 +260,7 @@ def test_foreign_files_are_not_continued(tmp_path):
 def test_a_label_that_could_not_be_read_is_not_written(tmp_path):
     labels = said(tmp_path, range(2))
     row = {name: getattr(labels, name)[0, 2] for name in NAMES}
-    with files.LabelWriter(tmp_path, TASK, "relative", EPS) as writer:
+    with files.LabelWriter(tmp_path, TASK, "relative", DIRECTIONS, EPS) as writer:
         for name, wrong, message in (
             ("obs", np.zeros(4), r"obs has the shape \(4,\), expected \(3,\)"),
             ("action", np.array(1.0), "action has the shape"),
@@ -274,37 +278,3 @@ def test_a_damaged_line_of_a_person_s_work_is_named(tmp_path):
     path.write_text("\n".join([*written[:2], written[2][:-9], *written[3:]]) + "\n")
     with pytest.raises(UserError, match=r"damaged: .*\(line 3: it has no checksum, so it, or a line before it"):
         files.read(path)
-
-
-# Strengths of their own.
-
-
-def falling(lanes=1):
-    labels = label_sets(lanes=lanes)
-    return labels.replace(eps_deg=np.geomspace(EPS, 3.3, lanes * 20, dtype=np.float32).reshape(lanes, 20))
-
-
-def test_strengths_come_back_to_the_last_bit_and_lanes_get_them_padded(path):
-    labels = falling(2)
-    labels = labels.replace(valid=np.arange(20) % 4 + np.zeros((2, 1)) < 3)
-    files.write(path, TASK, "relative", EPS, np.array([4, 9]), labels)
-    file = files.read(path)
-    assert file.eps_deg == EPS
-    assert file.labels.eps_deg.dtype == np.float32
-    np.testing.assert_array_equal(file.labels.eps_deg, labels.eps_deg[labels.valid])
-    np.testing.assert_array_equal(file.strengths, labels.eps_deg[labels.valid])
-    rows = files.for_lanes(file, np.array([9]), np.array([7]), 10)
-    np.testing.assert_array_equal(rows.eps_deg[0, :7], labels.eps_deg[1][labels.valid[1]][:7])
-    np.testing.assert_array_equal(rows.eps_deg[0, 7:], 0)
-    files.write_file(path.with_name("again.parquet"), file)
-    np.testing.assert_array_equal(files.read(path.with_name("again.parquet")).labels.eps_deg, file.labels.eps_deg)
-
-
-def test_labels_that_are_all_of_the_files_strength_have_none_of_their_own(path):
-    labels = falling().replace(eps_deg=np.full((1, 20), EPS, np.float32))
-    files.write(path, TASK, "relative", EPS, np.array([4]), labels)
-    file = files.read(path)
-    assert file.labels.eps_deg is None
-    assert file.strengths.tolist() == [EPS] * 20
-    written(path, answers="demonstration", eps_deg=None, width=2)
-    assert files.read(path).strengths is None

@@ -8,15 +8,15 @@ import numpy as np
 import probes
 import pytest
 
-from cuelearner_jax import actions
 from cuelearner_jax.errors import UserError
+from cuelearner_jax.spaces import directions
 from cuelearner_jax.storage import formats
 from cuelearner_jax.teachers import stored
 from cuelearner_jax.teachers.learned import LearnedTeacher, initial_params
 
 ENV = probes.Window(mirrors=True)
 ABOUT = {"config": {"layers": [32, 32], "directions": 72}}
-OBS = actions.evenly_spaced(4)
+OBS = directions.evenly_spaced(4)
 
 
 @pytest.fixture(scope="module")

@@ -7,8 +7,9 @@ import pytest
 from flax import struct
 from probes import Aimed, Chain, Window
 
-from cuelearner_jax.actions import DIRECTIONS, rotate
 from cuelearner_jax.environment import Features, Quantity, WholeObservations
+from cuelearner_jax.spaces import DIRECTIONS
+from cuelearner_jax.spaces.directions import rotate
 from cuelearner_jax.testing import check_environment
 
 
@@ -138,7 +139,7 @@ class Pointless(Aimed):
 
 
 class Loose(Window):
-    actions = DIRECTIONS._replace(uniform=lambda key, shape: 2.0 * DIRECTIONS.uniform(key, shape))
+    actions = DIRECTIONS._replace(uniform=lambda key, shape: 2.0 * DIRECTIONS.sample(key, shape))
 
 
 class Short(Window):

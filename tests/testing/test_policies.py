@@ -7,8 +7,9 @@ import pytest
 from flax import struct
 from probes import Expert, Window
 
-from cuelearner_jax.actions import DIRECTIONS, retract
 from cuelearner_jax.policies import SHARED, Heuristic, Opaque, Taught, Teaching, Uniform
+from cuelearner_jax.spaces import DIRECTIONS
+from cuelearner_jax.spaces.directions import retract
 from cuelearner_jax.testing import check_policy
 
 ENV = Window()
@@ -101,7 +102,7 @@ def test_a_policy_of_ones_own_keeps_them():
 
 
 def test_actions_that_are_drawn_need_not_keep_their_rows():
-    check_policy(altered(lambda key, actions: DIRECTIONS.uniform(key, (len(actions),))), ENV)
+    check_policy(altered(lambda key, actions: DIRECTIONS.sample(key, (len(actions),))), ENV)
 
 
 def test_hidden_random_numbers_are_found():

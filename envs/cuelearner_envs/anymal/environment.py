@@ -20,7 +20,7 @@ from cuelearner_envs.navigation.config import NavigationConfig
 from cuelearner_envs.navigation.config import make_environment as make_navigation
 from cuelearner_envs.navigation.environment import Navigation, latest_first
 from cuelearner_envs.navigation.lidar import scan_tilted
-from cuelearner_jax.actions import difference, from_angle, rotate
+from cuelearner_jax.spaces.directions import difference, from_angle, rotate
 
 Scalar = float | Float[Array, ""]
 SENSOR_NOISE = 0.02  # standard deviation of a scanner's own error [m]

@@ -15,7 +15,7 @@ from cuelearner_envs.anymal.environment import LeggedNavigation, LeggedWalker
 from cuelearner_envs.anymal.judge import Judge
 from cuelearner_envs.anymal.model import planar_pose
 from cuelearner_envs.navigation.environment import latest_first
-from cuelearner_jax.actions import rotate
+from cuelearner_jax.spaces.directions import rotate
 from cuelearner_jax.types import Policy
 
 

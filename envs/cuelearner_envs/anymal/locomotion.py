@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 from cuelearner_envs.anymal import model as robot
 from cuelearner_envs.anymal.physics import Body, Felt, Ground, control, standing
 from cuelearner_envs.anymal.policy import OBS, noisy, observe
-from cuelearner_jax.actions import from_angle
+from cuelearner_jax.spaces.directions import from_angle
 
 Scalar = float | Float[Array, ""]
 TOUCHING = 0.003  # lower than this a foot is on the floor [m]

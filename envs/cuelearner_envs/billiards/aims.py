@@ -14,8 +14,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from cuelearner_envs.billiards.impacts import TANGENT_PER_DISC
 from cuelearner_envs.billiards.table import Table, corner_gap, pockets
-from cuelearner_jax.actions import difference, retract, rotate
 from cuelearner_jax.environment import Aims
+from cuelearner_jax.spaces.directions import difference, retract, rotate
 
 THROWS = 8  # fixed-point steps for the line of centres: the throw hangs on the cut, and the cut on the line
 THINNEST = 0.15  # cosine of the thinnest cut that is tried

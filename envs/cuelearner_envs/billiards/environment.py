@@ -14,8 +14,8 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from cuelearner_envs.billiards.aims import aims_of
 from cuelearner_envs.billiards.physics import Shot, simulate
 from cuelearner_envs.billiards.table import Table, parking, rack
-from cuelearner_jax.actions import retract, rotate, to_angle
 from cuelearner_jax.environment import Aims, Features, Quantity, WholeObservations
+from cuelearner_jax.spaces.directions import retract, rotate, to_angle
 from cuelearner_jax.types import Step
 
 PLACEMENTS = 16  # places tried for a ball that must not touch another

@@ -7,7 +7,7 @@ from jaxtyping import PRNGKeyArray
 
 from cuelearner_envs.billiards.environment import Balls, Billiards
 from cuelearner_envs.billiards.physics import Trajectory, trace
-from cuelearner_jax.actions import to_angle
+from cuelearner_jax.spaces.directions import to_angle
 from cuelearner_jax.types import Policy
 
 

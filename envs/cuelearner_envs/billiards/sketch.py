@@ -15,7 +15,7 @@ from cuelearner_envs.billiards import drawing
 from cuelearner_envs.billiards.environment import Balls, Billiards
 from cuelearner_envs.billiards.physics import positions_at, trace
 from cuelearner_envs.billiards.table import Table, corner_gap, cushions, parking, pockets
-from cuelearner_jax.actions import to_angle
+from cuelearner_jax.spaces.directions import to_angle
 from cuelearner_jax.types import Reel, Sketch
 
 FRAMES = 90  # of a film

@@ -11,7 +11,7 @@ from flax import struct
 from jaxtyping import Array, Float, Int
 
 from cuelearner_envs.billiards.environment import Balls, Billiards
-from cuelearner_jax.actions import (
+from cuelearner_jax.spaces.directions import (
     ROUNDING,
     best_direction,
     evenly_spaced,

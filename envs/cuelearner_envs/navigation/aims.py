@@ -17,8 +17,8 @@ from cuelearner_envs.navigation.lidar import BEAM_ANGLES, BEAMS, MAX_RANGE
 from cuelearner_envs.navigation.look_ahead import EVERY, look_ahead
 from cuelearner_envs.navigation.world import FAR_AWAY
 from cuelearner_envs.navigation.worlds import FARTHEST
-from cuelearner_jax.actions import from_angle, rotate, to_angle
 from cuelearner_jax.environment import Aims
+from cuelearner_jax.spaces.directions import from_angle, rotate, to_angle
 
 WAYS = 72  # every 5 degrees
 RADII = (0.28, 0.42, 0.55)  # of the discs: the body's own, nearly its reach, what a road map keeps clear [m]

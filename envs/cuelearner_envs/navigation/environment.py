@@ -18,8 +18,8 @@ from cuelearner_envs.navigation.robot import Motion, Robot, collides, walk
 from cuelearner_envs.navigation.sides import heading, passed
 from cuelearner_envs.navigation.world import World
 from cuelearner_envs.navigation.worlds import FARTHEST
-from cuelearner_jax.actions import inward, retract, rotate, to_angle
 from cuelearner_jax.environment import Aims, Described, Features, Quantity
+from cuelearner_jax.spaces.directions import inward, retract, rotate, to_angle
 from cuelearner_jax.types import Step
 
 REMEMBERED = 3  # actions in the observation

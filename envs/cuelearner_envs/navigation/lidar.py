@@ -16,7 +16,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from cuelearner_envs.navigation.geometry import in_frame
 from cuelearner_envs.navigation.world import World
-from cuelearner_jax.actions import from_angle, rotate
+from cuelearner_jax.spaces.directions import from_angle, rotate
 
 BEAMS = 271
 FIELD_OF_VIEW = math.radians(270.0)

@@ -21,7 +21,7 @@ from cuelearner_envs.navigation.geometry import clearance, line_clearance
 from cuelearner_envs.navigation.robot import Robot
 from cuelearner_envs.navigation.sides import closed, heading
 from cuelearner_envs.navigation.world import World
-from cuelearner_jax.actions import from_angle, retract, rotate
+from cuelearner_jax.spaces.directions import from_angle, retract, rotate
 
 NODES = 160
 UNIFORM = 64  # candidates drawn anywhere

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float
 
 from cuelearner_envs.navigation.geometry import clearance
 from cuelearner_envs.navigation.world import World
-from cuelearner_jax.actions import from_angle, rotate, to_angle
+from cuelearner_jax.spaces.directions import from_angle, rotate, to_angle
 
 Scalar = float | Float[Array, ""]
 

@@ -18,7 +18,7 @@ from cuelearner_envs.navigation.environment import Navigation
 from cuelearner_envs.navigation.lidar import BEAM_ANGLES
 from cuelearner_envs.navigation.robot import Robot
 from cuelearner_envs.navigation.world import FAR_AWAY
-from cuelearner_jax.actions import rotate
+from cuelearner_jax.spaces.directions import rotate
 from cuelearner_jax.types import Reel, Sketch
 
 AHEAD, BEHIND, ASIDE = 9.0, 4.0, 6.5  # that is shown at least [m]

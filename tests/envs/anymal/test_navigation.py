@@ -18,8 +18,8 @@ from cuelearner_envs.navigation.config import NavigationConfig
 from cuelearner_envs.navigation.config import make_environment as make_simple
 from cuelearner_envs.navigation.lidar import scan, scan_tilted
 from cuelearner_envs.navigation.world import World
-from cuelearner_jax import actions
 from cuelearner_jax.policies import Heuristic
+from cuelearner_jax.spaces import directions
 
 WALKERS = 4
 CONFIG = NavigationConfig(worlds=8, max_steps=3)
@@ -82,9 +82,9 @@ def test_time_runs_out_without_a_termination(walked):
 def test_told_straight_ahead_it_walks_straight_ahead(walked):
     (before, _, after, _), _ = walked
     start, end = before.body.qpos[0], after.body.qpos[0]
-    ahead = actions.from_angle(robot.planar_pose(start)[2])
+    ahead = directions.from_angle(robot.planar_pose(start)[2])
     way = float(jnp.sum((end[:2] - start[:2]) * ahead))
-    aside = float(jnp.abs(jnp.sum((end[:2] - start[:2]) * actions.rotate(ahead, math.pi / 2))))
+    aside = float(jnp.abs(jnp.sum((end[:2] - start[:2]) * directions.rotate(ahead, math.pi / 2))))
     assert 0.15 < way < 0.42  # 0.4 s at up to 1 m/s, from rest
     assert aside < 0.1
 
@@ -121,7 +121,7 @@ def test_commands_lead_where_the_direction_points(env, walked):
     yaw = robot.planar_pose(body.qpos)[2]
     for turn, turning in ((0.0, 0.0), (0.15, 0.5), (1.0, 1.5), (-2.0, -1.5)):
         wanted = np.array([math.cos(turn), math.sin(turn), turning])
-        heading = actions.from_angle(yaw + turn)
+        heading = directions.from_angle(yaw + turn)
         np.testing.assert_allclose(env.command(body, jnp.asarray(wanted), heading), wanted, atol=1e-4)
         told = jnp.zeros(3)
         for _ in range(10):  # the steps of control of 0.2 s, in which the bounds allow 1.6 m/s and 4 rad/s
@@ -132,7 +132,7 @@ def test_commands_lead_where_the_direction_points(env, walked):
 def test_commands_change_no_faster_than_legs_can_follow(env, walked):
     body = jax.tree.map(lambda leaf: leaf[0], walked[0][0].body)
     yaw = robot.planar_pose(body.qpos)[2]
-    forward, back = jnp.array([1.0, 0.0, 1.5]), actions.from_angle(yaw + math.pi - 0.01)
+    forward, back = jnp.array([1.0, 0.0, 1.5]), directions.from_angle(yaw + math.pi - 0.01)
     np.testing.assert_allclose(env.command(body, forward, -back), forward.at[2].set(1.5 - 0.4), atol=0.02)
     np.testing.assert_allclose(env.command(body, -forward, back), [-1.0, 0.0, -1.5 + 0.4], atol=0.02)
     np.testing.assert_allclose(env.command(body, forward, back)[0], 1.0 - 8.0 * 0.02, atol=1e-3)

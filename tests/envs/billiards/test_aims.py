@@ -9,7 +9,7 @@ import pytest
 from cuelearner_envs.billiards.aims import aims_of, contact_for
 from cuelearner_envs.billiards.impacts import normal_impulse, tangential_impulse
 from cuelearner_envs.billiards.table import Table
-from cuelearner_jax import actions
+from cuelearner_jax.spaces import directions
 from cuelearner_jax.testing import check_environment
 
 REGULATION = Table.regulation()
@@ -41,21 +41,21 @@ def test_a_ball_straight_in_front_of_a_pocket_is_struck_straight():
 
 @pytest.mark.parametrize("turn", [0.0, 0.3, -0.7, 1.1])
 def test_a_target_leaves_along_its_way_by_the_impulses_of_an_impact(turn):
-    way = actions.from_angle(jnp.array(0.4 + turn))
+    way = directions.from_angle(jnp.array(0.4 + turn))
     contact = contact_for(REGULATION, jnp.array([-0.3, -0.1]), jnp.array([0.1, 0.05]), way)
-    tangent = actions.rotate(contact.normal, jnp.pi / 2)
+    tangent = directions.rotate(contact.normal, jnp.pi / 2)
     along, across = contact.strike @ contact.normal, contact.strike @ tangent
     push = normal_impulse(along, 0.0, 1.0, 2.0)
     drag = -tangential_impulse(across, push, REGULATION.friction, 2.0)
-    leaves = actions.retract(push * contact.normal + drag * tangent)
-    np.testing.assert_allclose(actions.difference(way, leaves), 0.0, atol=2e-4)
+    leaves = directions.retract(push * contact.normal + drag * tangent)
+    np.testing.assert_allclose(directions.difference(way, leaves), 0.0, atol=2e-4)
 
 
 def test_a_turned_situation_turns_the_strike():
-    cue, target, way = jnp.array([-0.3, -0.1]), jnp.array([0.1, 0.05]), actions.from_angle(jnp.array(0.9))
-    turned = [actions.rotate(vector, 1.3) for vector in (cue, target, way)]
+    cue, target, way = jnp.array([-0.3, -0.1]), jnp.array([0.1, 0.05]), directions.from_angle(jnp.array(0.9))
+    turned = [directions.rotate(vector, 1.3) for vector in (cue, target, way)]
     one, other = contact_for(REGULATION, cue, target, way), contact_for(REGULATION, *turned)
-    np.testing.assert_allclose(other.strike, actions.rotate(one.strike, 1.3), atol=1e-5)
+    np.testing.assert_allclose(other.strike, directions.rotate(one.strike, 1.3), atol=1e-5)
     np.testing.assert_allclose(other.cut, one.cut, atol=1e-5)
 
 

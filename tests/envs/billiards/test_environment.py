@@ -24,9 +24,9 @@ from cuelearner_envs.billiards.config import BilliardsConfig, make_environment
 from cuelearner_envs.billiards.environment import Billiards
 from cuelearner_envs.billiards.recording import record
 from cuelearner_envs.billiards.table import Table, rack
-from cuelearner_jax import actions
 from cuelearner_jax.environment import Environment
 from cuelearner_jax.policies import Heuristic
+from cuelearner_jax.spaces import directions
 
 TABLES: list[Literal["one_ball", "easy", "regulation"]] = ["one_ball", "easy", "regulation"]
 ONE = make_environment(BilliardsConfig("one_ball"))
@@ -129,7 +129,7 @@ def test_a_foul_takes_back_what_the_same_shot_pocketed():
     scene = balls([(0.28, 0.1), (0.355, 0.15), (-0.3, 0.1), (-0.3, -0.1)], (False, False, True, False))
     angle = jnp.deg2rad(58.8)  # 58.3 .. 59.3
     assert shoot(EASY.table, scene.positions, scene.pocketed, angle).pocketed.tolist() == [True, True, True, False]
-    after, result = step(EASY, KEY, scene, actions.from_angle(angle))
+    after, result = step(EASY, KEY, scene, directions.from_angle(angle))
     assert (float(result.metrics["foul"]), float(result.reward)) == (1, 0)
     assert after.pocketed.tolist() == [False, False, True, False]
     np.testing.assert_array_equal(after.positions[1:], scene.positions[1:])
@@ -311,7 +311,7 @@ def test_records_hold_the_path_of_every_shot_and_what_the_environment_paid():
     assert sum(rewards) > 0
     for number, (path, reward) in enumerate(zip(paths, rewards, strict=True)):
         state = balls(path.positions[0], tuple(path.pocketed[0].tolist()))
-        _, result = step(EASY, KEY, state, actions.retract(jnp.asarray(path.velocities[0, 0])))
+        _, result = step(EASY, KEY, state, directions.retract(jnp.asarray(path.velocities[0, 0])))
         assert float(result.reward) == reward
         fallen = path.pocketed[-1] & ~path.pocketed[0]
         assert reward == (0 if fallen[0] else fallen.sum())
@@ -325,10 +325,10 @@ def test_a_recorded_policy_sees_the_state_and_its_strikes_are_turned():
 
     def policy(key, states, obs):
         assert states.positions.shape == (1, 2, 2)
-        return actions.retract(states.positions[:, 1] - states.positions[:, 0])
+        return directions.retract(states.positions[:, 1] - states.positions[:, 0])
 
     paths, _ = record(turned, probes.Acting(policy), KEY, 2)
     for path in paths:
-        aim = actions.to_angle(jnp.asarray(path.positions[0, 1] - path.positions[0, 0]))
-        struck = actions.to_angle(jnp.asarray(path.velocities[0, 0]))
+        aim = directions.to_angle(jnp.asarray(path.positions[0, 1] - path.positions[0, 0]))
+        struck = directions.to_angle(jnp.asarray(path.velocities[0, 0]))
         assert float(struck - aim) == pytest.approx(np.deg2rad(30.0), abs=1e-5)

@@ -6,7 +6,7 @@ import numpy as np
 from billiards_scenes import BATCH, EASY, KEY, SCENE, balls, observe, observe_many, random_states, step_many, toward
 
 from cuelearner_envs.billiards.config import BilliardsConfig, make_environment
-from cuelearner_jax import actions
+from cuelearner_jax.spaces import directions
 
 MIRRORED = make_environment(BilliardsConfig("easy", mirrors=True))
 mirror = jax.jit(MIRRORED.mirror)
@@ -80,13 +80,13 @@ def test_features_give_the_balls_along_and_across_the_strike():
 
 
 def test_features_of_many_directions_are_those_of_each():
-    directions = actions.evenly_spaced(6).reshape(3, 2, 2)
+    chosen = directions.evenly_spaced(6).reshape(3, 2, 2)
     obs = observe(EASY, PLAYED)
-    many = features(obs, directions)
+    many = features(obs, chosen)
     assert many.own.shape == (2 + 3 * 3,)
     assert many.turned.shape == (3, 2, 6 + 3 * 3)
     for place in np.ndindex(3, 2):
-        np.testing.assert_allclose(many.turned[place], features(obs, directions[place]).turned, atol=1e-6)
+        np.testing.assert_allclose(many.turned[place], features(obs, chosen[place]).turned, atol=1e-6)
 
 
 def test_a_mirror_reverses_what_lies_across_and_keeps_what_lies_along():

@@ -10,10 +10,10 @@ from flax import struct
 
 from cuelearner_envs.billiards.config import BilliardsConfig, make_environment
 from cuelearner_envs.billiards.teacher import PROPOSALS, LocalSearchTeacher, NearbyTeacher, SearchTeacher, Transferred
-from cuelearner_jax import actions
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import episodes, rollout
 from cuelearner_jax.policies import Taught
+from cuelearner_jax.spaces import directions
 from cuelearner_jax.tasks.billiards import SCENARIOS, SHIPPED_TEACHERS, make_teacher
 from cuelearner_jax.teachers.learned import LearnedTeacher
 from cuelearner_jax.types import Teacher
@@ -26,14 +26,14 @@ best = jax.jit(lambda teacher, states, obs: jax.lax.map(lambda pair: teacher.bes
 play = jax.jit(lambda env, states, actions: jax.vmap(env.step, (None, 0, 0))(jax.random.key(0), states, actions)[1])
 
 
-def degrees(directions):
-    return np.rad2deg(np.asarray(actions.to_angle(directions)))
+def degrees(actions):
+    return np.rad2deg(np.asarray(directions.to_angle(actions)))
 
 
-def margins(wins, directions):
+def margins(wins, actions):
     """How many winning directions lie to the right and to the left of each of the directions chosen."""
     found = []
-    for row, index in zip(wins, np.round(degrees(directions) / 360 * DIRECTIONS).astype(int), strict=True):
+    for row, index in zip(wins, np.round(degrees(actions) / 360 * DIRECTIONS).astype(int), strict=True):
         assert row[index % DIRECTIONS]
         found.append([next(n for n in range(100) if not row[(index + s * n) % DIRECTIONS]) for s in (-1, 1)])
     return np.array(found)
@@ -58,12 +58,12 @@ def test_search_finds_a_winning_direction_where_few_win(chosen, wins):
 
 
 def test_rewards_are_those_of_the_directions_in_order(wins):
-    directions = actions.evenly_spaced(DIRECTIONS)
+    tries = directions.evenly_spaced(DIRECTIONS)
     for rack in (0, 1):
         hit, missed = np.flatnonzero(wins[rack])[:3], np.flatnonzero(~wins[rack])[::30][:47]
         tried = np.concatenate([hit, missed])
         state = jax.tree.map(lambda leaf, n=rack: jnp.repeat(leaf[n : n + 1], RACKS, axis=0), STATES)
-        np.testing.assert_array_equal(play(ONE, state, directions[tried]).reward, wins[rack][tried])
+        np.testing.assert_array_equal(play(ONE, state, tries[tried]).reward, wins[rack][tried])
 
 
 def test_a_habit_makes_the_teacher_consistent(chosen):
@@ -135,7 +135,7 @@ def test_a_learned_teacher_knows_of_a_turned_strike(easy):
     states, clean = easy
     env, teacher = learned(action_turn_deg=3.0)
     answers = best(teacher, states, jax.vmap(env.observe)(states))
-    np.testing.assert_allclose(answers, actions.rotate(clean, jnp.deg2rad(-3.0)), atol=1e-6)
+    np.testing.assert_allclose(answers, directions.rotate(clean, jnp.deg2rad(-3.0)), atol=1e-6)
     rewards = [play(learned()[0], states, clean).reward, play(env, states, answers).reward]
     np.testing.assert_array_equal(*rewards)
 
@@ -182,7 +182,7 @@ nearest = jax.jit(
 @pytest.mark.long
 def test_shots_near_proposals_are_as_good_as_all_of_them_in_every_changed_world(near):
     local, full, rewards, states, obs = near
-    worth = np.asarray(jax.vmap(actions.expected_values, (0, None))(rewards, full.aim_error))
+    worth = np.asarray(jax.vmap(directions.expected_values, (0, None))(rewards, full.aim_error))
     numbers = np.round(degrees(best(local, states, obs)) / 360 * PROPOSALS).astype(int) % PROPOSALS
     found = worth[np.arange(len(worth)), numbers]
     assert found.sum() > 0.95 * worth.max(1).sum()  # 0.99 measured
@@ -194,9 +194,9 @@ def test_shots_near_proposals_are_as_good_as_all_of_them_in_every_changed_world(
 def test_the_nearest_good_shot_is_looked_for_by_shots(near):
     """From half a degree beside the search's own best shot, which the network need not propose."""
     local, full, _, states, obs = near
-    asked = actions.rotate(best(full, states, obs), jnp.deg2rad(0.5))
+    asked = directions.rotate(best(full, states, obs), jnp.deg2rad(0.5))
     wanted = nearest(full, states, obs, asked)
-    off = np.abs(np.asarray(actions.difference(nearest(local, states, obs, asked), wanted)))
+    off = np.abs(np.asarray(directions.difference(nearest(local, states, obs, asked), wanted)))
     assert (off < 1e-4).mean() >= 0.75  # what is good is a share of the best, which either may miss
 
 
@@ -204,7 +204,7 @@ def test_where_no_shot_succeeds_the_networks_favourite_stays(near):
     """The cue ball stops before it reaches anything."""
     local, _, _, states, obs = near
     still = local.replace(env=local.env.replace(table=local.env.table.replace(strike_speed=0.06)))
-    wanted = actions.evenly_spaced(PROPOSALS)[favourites(still, states)]
+    wanted = directions.evenly_spaced(PROPOSALS)[favourites(still, states)]
     np.testing.assert_allclose(best(still, states, obs), wanted, atol=1e-6)
 
 
@@ -213,7 +213,7 @@ class Pointer:
     """Aims at the first target of what it is shown."""
 
     def best_action(self, state, obs):
-        return actions.retract(obs[3:5] - obs[:2])
+        return directions.retract(obs[3:5] - obs[:2])
 
 
 def test_a_teacher_of_a_changed_world_is_right_in_the_unchanged_one():
@@ -277,14 +277,14 @@ def test_the_nearest_good_shot_is_that_of_the_averaged_values(wins):
     kernel = np.exp(-0.5 * (apart / spread) ** 2)
     expected = np.stack([np.roll(kernel / kernel.sum(), n) for n in range(DIRECTIONS)], 1) @ wins[:4].T
     good = expected >= share * expected.max(0)
-    asked = actions.from_angle(jnp.deg2rad(40.0))
+    asked = directions.from_angle(jnp.deg2rad(40.0))
     way = np.abs(np.angle(np.exp(1j * (turn - np.deg2rad(40.0)))))
-    wanted = degrees(actions.from_angle(turn[np.argmin(np.where(good, way[:, None], np.inf), 0)]))
+    wanted = degrees(directions.from_angle(turn[np.argmin(np.where(good, way[:, None], np.inf), 0)]))
     few = jax.tree.map(lambda leaf: leaf[:4], (STATES, OBS))
     for world, turned in ((ONE, 0.0), (make_environment(BilliardsConfig("one_ball", action_turn_deg=3.0)), 3.0)):
         teacher = SearchTeacher(ONE, AIM, HABIT)
         teacher = Transferred(teacher, ONE, world) if turned else teacher
-        there = actions.rotate(asked, -np.deg2rad(turned))  # the strike that there is what `asked` is here
+        there = directions.rotate(asked, -np.deg2rad(turned))  # the strike that there is what `asked` is here
         near = jax.jit(jax.vmap(lambda state, obs, t=teacher, a=there: t.nearest_good(state, obs, a, spread, share)))
         np.testing.assert_allclose(degrees(near(*few)), wanted - turned, atol=0.01)
 
@@ -312,9 +312,9 @@ def nearby(states, obs, centres):
 @pytest.mark.parametrize("off_deg", [-1.5, 2.0])
 def test_a_teacher_of_what_is_near_points_to_the_middle_of_what_succeeds(chosen, off_deg):
     """Asked from beside a winning shot it finds its window, and tells the way there."""
-    beside = actions.rotate(chosen, jnp.deg2rad(off_deg))
+    beside = directions.rotate(chosen, jnp.deg2rad(off_deg))
     middle, nearest = nearby(STATES, OBS, beside)
-    turns = [np.rad2deg(np.asarray(actions.difference(beside, found))) for found in (middle, nearest)]
+    turns = [np.rad2deg(np.asarray(directions.difference(beside, found))) for found in (middle, nearest)]
     assert float(play(ONE, STATES, middle).reward.mean()) > 0.9
     assert (np.abs(turns[0]) <= 3.0 + 1e-3).all()
     assert (np.sign(turns[0]) == -np.sign(off_deg)).mean() > 0.8

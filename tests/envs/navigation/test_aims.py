@@ -10,7 +10,7 @@ from cuelearner_envs.navigation import World
 from cuelearner_envs.navigation.aims import ROOM, free_ways
 from cuelearner_envs.navigation.environment import Navigation
 from cuelearner_envs.navigation.lidar import BEAM_ANGLES
-from cuelearner_jax.actions import from_angle
+from cuelearner_jax.spaces.directions import from_angle
 
 WORLD = World(
     boxes=jnp.array([[6.1, 0, 0, 0.1, 4.2], [-6.1, 0, 0, 0.1, 4.2], [0, 4.1, 0, 6.2, 0.1], [0, -4.1, 0, 6.2, 0.1]]),

@@ -14,8 +14,8 @@ from cuelearner_envs.navigation.environment import Navigation
 from cuelearner_envs.navigation.lidar import Lidar
 from cuelearner_envs.navigation.robot import collides
 from cuelearner_envs.navigation.worlds import generate_many
-from cuelearner_jax import actions
 from cuelearner_jax.agents.learning import learner, stored_step
+from cuelearner_jax.spaces import directions
 
 KEY = jax.random.key(0)
 LEFT = jnp.array([0.0, 1.0])
@@ -93,7 +93,7 @@ def played(env, key):
     def advance(carry, number):
         states, obs = carry
         k_turn, k_step = jax.random.split(jax.random.fold_in(key, number))
-        action = actions.rotate(jax.vmap(env.heuristic)(obs), jax.random.normal(k_turn, (16,)))
+        action = directions.rotate(jax.vmap(env.heuristic)(obs), jax.random.normal(k_turn, (16,)))
         memory = jax.vmap(env.remember)(states, obs)
         following, result = jax.vmap(env.step)(jax.random.split(k_step, 16), states, action)
         return (following, result.obs), (states, obs, memory, action, result, following)

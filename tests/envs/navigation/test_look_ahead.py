@@ -14,7 +14,6 @@ from cuelearner_envs.navigation.lidar import BEAMS, scan
 from cuelearner_envs.navigation.look_ahead import LEAST, SHORT
 from cuelearner_envs.navigation.world import World
 from cuelearner_envs.navigation.worlds import FARTHEST
-from cuelearner_jax.actions import from_angle
 from cuelearner_jax.adaptation import stored
 from cuelearner_jax.adaptation.program import Lanes
 from cuelearner_jax.cli import main
@@ -23,6 +22,7 @@ from cuelearner_jax.environment import spaces_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.runs.adapted import AdaptedLanes
 from cuelearner_jax.runs.trained import PolicySource
+from cuelearner_jax.spaces.directions import from_angle
 from cuelearner_jax.task import shape_of
 from cuelearner_jax.tasks import registry
 

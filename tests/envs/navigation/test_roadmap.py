@@ -16,11 +16,11 @@ from cuelearner_envs.navigation.roadmap import BLOCKED, LINE_MARGIN, NODE_MARGIN
 from cuelearner_envs.navigation.world import FAR_AWAY
 from cuelearner_envs.navigation.worlds import generate_many
 from cuelearner_jax import evaluate
-from cuelearner_jax.actions import difference, from_angle
 from cuelearner_jax.config import Scalars, Sizes
 from cuelearner_jax.feedback.answers import human_answer, relative_answer
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.policies import Taught
+from cuelearner_jax.spaces.directions import difference, from_angle
 from cuelearner_jax.types import Label
 
 REACH = 0.465  # from the middle of the body to its farthest point [m]

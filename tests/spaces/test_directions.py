@@ -7,17 +7,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from cuelearner_jax import actions
+from cuelearner_jax.spaces import DIRECTIONS, directions
 
 DEG = math.pi / 180
 
 
 def direction(degrees):
-    return actions.from_angle(jnp.array(degrees * DEG))
+    return directions.from_angle(jnp.array(degrees * DEG))
 
 
 def degrees_of(action):
-    return float(actions.to_angle(action)) / DEG
+    return float(directions.to_angle(action)) / DEG
 
 
 def test_from_angle_and_back():
@@ -27,12 +27,12 @@ def test_from_angle_and_back():
 
 
 def test_rotate_is_counterclockwise():
-    np.testing.assert_allclose(actions.rotate(jnp.array([1.0, 0.0]), math.pi / 2), [0, 1], atol=1e-7)
-    np.testing.assert_allclose(actions.rotate(jnp.array([3.0, 4.0]), -math.pi / 2), [4, -3], atol=1e-6)
+    np.testing.assert_allclose(directions.rotate(jnp.array([1.0, 0.0]), math.pi / 2), [0, 1], atol=1e-7)
+    np.testing.assert_allclose(directions.rotate(jnp.array([3.0, 4.0]), -math.pi / 2), [4, -3], atol=1e-6)
 
 
 def test_rotate_has_leading_axes():
-    turned = actions.rotate(jnp.array([[1.0, 0.0], [0.0, 1.0]]), jnp.array([math.pi / 2, math.pi]))
+    turned = directions.rotate(jnp.array([[1.0, 0.0], [0.0, 1.0]]), jnp.array([math.pi / 2, math.pi]))
     np.testing.assert_allclose(turned, [[0, 1], [0, -1]], atol=1e-6)
 
 
@@ -41,43 +41,45 @@ def test_rotate_has_leading_axes():
     [(0, 30, 30), (30, 0, -30), (170, -170, 20), (-170, 170, -20), (90, -80, -170), (90, -100, 170), (45, 45, 0)],
 )
 def test_difference_is_signed_and_wraps(start, end, turn):
-    assert float(actions.difference(direction(start), direction(end))) / DEG == pytest.approx(turn, abs=1e-4)
+    assert float(directions.difference(direction(start), direction(end))) / DEG == pytest.approx(turn, abs=1e-4)
 
 
 def test_difference_of_opposite_directions_is_a_half_turn():
-    assert abs(float(actions.difference(jnp.array([1.0, 0.0]), jnp.array([-1.0, 0.0])))) == pytest.approx(math.pi)
+    assert abs(float(directions.difference(jnp.array([1.0, 0.0]), jnp.array([-1.0, 0.0])))) == pytest.approx(math.pi)
 
 
 def test_difference_undoes_rotate():
     rng = np.random.default_rng(0)
-    base = actions.from_angle(jnp.array(rng.uniform(-math.pi, math.pi, 200)))
+    base = directions.from_angle(jnp.array(rng.uniform(-math.pi, math.pi, 200)))
     turn = rng.uniform(-3.1, 3.1, 200)
-    np.testing.assert_allclose(actions.difference(base, actions.rotate(base, jnp.array(turn))), turn, atol=2e-6)
+    np.testing.assert_allclose(directions.difference(base, directions.rotate(base, jnp.array(turn))), turn, atol=2e-6)
 
 
 def test_retract_divides_by_the_length():
-    np.testing.assert_allclose(actions.retract(jnp.array([3.0, 4.0])), [0.6, 0.8], atol=1e-7)
-    np.testing.assert_allclose(actions.retract(jnp.array([[-1e-6, 0.0], [0.0, 500.0]])), [[-1, 0], [0, 1]], atol=1e-6)
+    np.testing.assert_allclose(directions.retract(jnp.array([3.0, 4.0])), [0.6, 0.8], atol=1e-7)
+    np.testing.assert_allclose(
+        directions.retract(jnp.array([[-1e-6, 0.0], [0.0, 500.0]])), [[-1, 0], [0, 1]], atol=1e-6
+    )
 
 
 @pytest.mark.parametrize("length", [2e-38, 1e-30, 1.0, 1e30, 3e38])
 def test_retract_takes_any_length(length):
-    np.testing.assert_allclose(actions.retract(jnp.array([0.0, -length])), [0.0, -1.0], atol=1e-6)
+    np.testing.assert_allclose(directions.retract(jnp.array([0.0, -length])), [0.0, -1.0], atol=1e-6)
 
 
 @pytest.mark.parametrize("vector", [[np.nan, 0.0], [0.0, np.nan], [np.inf, 0.0], [np.nan, np.nan]])
 def test_what_is_not_finite_is_no_direction(vector):
-    assert np.isnan(actions.retract(jnp.array(vector))).all()
-    assert np.isnan(actions.only_actions(jnp.array(vector))).all()
+    assert np.isnan(directions.retract(jnp.array(vector))).all()
+    assert np.isnan(DIRECTIONS.only_actions(jnp.array(vector))).all()
 
 
 def test_no_action_is_zero_and_actions_stay_as_they_are():
     given = np.float32([[0.0, 0.0], [0.6, -0.8], [1e30, 0.0]])
-    np.testing.assert_array_equal(actions.only_actions(given), [[np.nan, np.nan], *given[1:]])
+    np.testing.assert_array_equal(DIRECTIONS.only_actions(given), [[np.nan, np.nan], *given[1:]])
 
 
 def test_retract_of_zero_is_the_x_axis():
-    np.testing.assert_array_equal(actions.retract(jnp.zeros(2)), [1.0, 0.0])
+    np.testing.assert_array_equal(directions.retract(jnp.zeros(2)), [1.0, 0.0])
 
 
 @pytest.mark.parametrize(
@@ -93,23 +95,23 @@ def test_retract_of_zero_is_the_x_axis():
     ],
 )
 def test_clip_to_ball(action, base, radius, clipped):
-    result = actions.clip_to_ball(direction(action), direction(base), radius * DEG)
+    result = DIRECTIONS.clip(direction(action), direction(base), radius * DEG)
     assert degrees_of(result) == pytest.approx(clipped, abs=1e-4)
 
 
 @pytest.mark.parametrize("radius", [math.pi, 4.0, 100.0])
 def test_a_ball_of_half_a_turn_or_more_leaves_every_action_alone(radius):
-    base = actions.evenly_spaced(36)
+    base = directions.evenly_spaced(36)
     action = jnp.roll(base, 18, axis=0)  # opposite
-    np.testing.assert_array_equal(actions.clip_to_ball(action, base, radius), action)
+    np.testing.assert_array_equal(DIRECTIONS.clip(action, base, radius), action)
 
 
 def test_evenly_spaced_starts_along_x_and_goes_counterclockwise():
-    np.testing.assert_allclose(actions.evenly_spaced(4), [[1, 0], [0, 1], [-1, 0], [0, -1]], atol=1e-6)
+    np.testing.assert_allclose(directions.evenly_spaced(4), [[1, 0], [0, 1], [-1, 0], [0, -1]], atol=1e-6)
 
 
 def test_uniform_directions_are_units_that_cover_the_circle():
-    drawn = np.asarray(actions.uniform(jax.random.key(0), (40, 100)))
+    drawn = np.asarray(directions.uniform(jax.random.key(0), (40, 100)))
     assert drawn.shape == (40, 100, 2)
     np.testing.assert_allclose(np.linalg.norm(drawn, axis=-1), 1, atol=1e-6)
     counts, _ = np.histogram(np.arctan2(drawn[..., 1], drawn[..., 0]), bins=8, range=(-math.pi, math.pi))
@@ -118,7 +120,7 @@ def test_uniform_directions_are_units_that_cover_the_circle():
 
 
 def test_uniform_without_a_shape_is_one_direction():
-    assert actions.uniform(jax.random.key(0)).shape == (2,)
+    assert directions.uniform(jax.random.key(0)).shape == (2,)
 
 
 def windows(count, *intervals):
@@ -130,42 +132,42 @@ def windows(count, *intervals):
 
 
 def index_of(best, count):
-    return round(float(actions.to_angle(best)) / (2 * math.pi / count)) % count
+    return round(float(directions.to_angle(best)) / (2 * math.pi / count)) % count
 
 
 def test_the_best_direction_lies_in_the_wide_window_and_in_its_middle():
     values = windows(360, (50, 52), (200, 220))
-    best = actions.best_direction(values, 4 * DEG, 0.0)
+    best = directions.best_direction(values, 4 * DEG, 0.0)
     assert index_of(best, 360) == 210
 
 
 def test_a_narrow_higher_window_loses_to_a_wide_one_only_with_an_imperfect_aim():
     values = windows(360, (200, 220)).at[50].set(1.5)
-    assert index_of(actions.best_direction(values, 0.0, 0.0), 360) == 50
-    assert index_of(actions.best_direction(values, 4 * DEG, 0.0), 360) == 210
+    assert index_of(directions.best_direction(values, 0.0, 0.0), 360) == 50
+    assert index_of(directions.best_direction(values, 4 * DEG, 0.0), 360) == 210
 
 
 def test_a_window_over_the_wrap_has_its_middle_at_the_wrap():
     values = windows(360, (0, 10), (350, 359))
-    assert index_of(actions.best_direction(values, 4 * DEG, 0.0), 360) == 0
+    assert index_of(directions.best_direction(values, 4 * DEG, 0.0), 360) == 0
 
 
 @pytest.mark.parametrize("shift", [0, 7, 90])
 def test_habit_settles_exact_ties_by_the_smaller_turn_from_x(shift):
     values = windows(360, (20 + shift, 30 + shift), (150 + shift, 160 + shift), (240 + shift, 250 + shift))
-    assert index_of(actions.best_direction(values, 1 * DEG, 0.1), 360) == pytest.approx(25 + shift, abs=3)
+    assert index_of(directions.best_direction(values, 1 * DEG, 0.1), 360) == pytest.approx(25 + shift, abs=3)
 
 
 def test_habit_does_not_override_a_clear_difference():
     values = 0.5 * windows(360, (20, 30)) + windows(360, (300, 310))
-    assert 300 <= index_of(actions.best_direction(values, 1 * DEG, 0.1), 360) <= 310
+    assert 300 <= index_of(directions.best_direction(values, 1 * DEG, 0.1), 360) <= 310
 
 
 def test_no_spread_and_no_habit_is_a_plain_argmax():
     rng = np.random.default_rng(1)
     for count in (16, 45, 720):
         values = rng.permutation(count) / count
-        assert index_of(actions.best_direction(jnp.array(values), 0.0, 0.0), count) == np.argmax(values)
+        assert index_of(directions.best_direction(jnp.array(values), 0.0, 0.0), count) == np.argmax(values)
 
 
 def test_expected_value_is_that_of_a_gaussian_aim():
@@ -176,7 +178,7 @@ def test_expected_value_is_that_of_a_gaussian_aim():
     apart = np.abs(turn[:, None] - turn[None])
     kernel = np.exp(-0.5 * (np.minimum(apart, 2 * np.pi - apart) / spread) ** 2)
     expected = (kernel / kernel.sum(1, keepdims=True)) @ values * (1 - habit * turn / (2 * np.pi))
-    assert index_of(actions.best_direction(jnp.array(values), spread, habit), count) == np.argmax(expected)
+    assert index_of(directions.best_direction(jnp.array(values), spread, habit), count) == np.argmax(expected)
 
 
 @pytest.mark.parametrize(
@@ -194,18 +196,18 @@ def test_expected_value_is_that_of_a_gaussian_aim():
 )
 def test_the_nearest_good_direction_by_hand(share, action, nearest):
     values = windows(360, (10, 20)) + 0.7 * windows(360, (100, 102))
-    found = actions.nearest_direction(values, 0.0, share, actions.from_angle(action * DEG))
+    found = directions.nearest_direction(values, 0.0, share, directions.from_angle(action * DEG))
     assert index_of(found, 360) == nearest
 
 
 def test_worth_is_averaged_over_the_aim_before_it_is_called_good():
     values = windows(360, (10, 30)) + windows(360, (100, 100))  # one direction alone: nobody hits it
-    assert index_of(actions.nearest_direction(values, 0.0, 0.6, actions.from_angle(90 * DEG)), 360) == 100
-    assert index_of(actions.nearest_direction(values, 3 * DEG, 0.6, actions.from_angle(90 * DEG)), 360) == 29
+    assert index_of(directions.nearest_direction(values, 0.0, 0.6, directions.from_angle(90 * DEG)), 360) == 100
+    assert index_of(directions.nearest_direction(values, 3 * DEG, 0.6, directions.from_angle(90 * DEG)), 360) == 29
 
 
 @pytest.mark.parametrize("worth", [0.0, -1.0])
 def test_where_nothing_is_worth_anything_the_best_alone_is_good(worth):
     values = jnp.full(360, worth) - windows(360, (0, 49), (51, 359))
-    found = actions.nearest_direction(values, 0.0, 0.6, actions.from_angle(200 * DEG))
-    assert index_of(found, 360) == index_of(actions.best_direction(values, 0.0, 0.0), 360) == 50
+    found = directions.nearest_direction(values, 0.0, 0.6, directions.from_angle(200 * DEG))
+    assert index_of(found, 360) == index_of(directions.best_direction(values, 0.0, 0.0), 360) == 50

@@ -1,4 +1,4 @@
-"""The action space as a bundle of functions, and its one instance: directions in the plane, as unit vectors.
+"""Directions in the plane, as unit vectors: the space of the paper's tasks, and the geometry that tasks need.
 
 Source: paper, section IV-A. Angles are radians, counterclockwise positive. Every function works on any leading axes.
 Angles are wrapped with `atan2`, never with a modulo, so that the functions export to other runtimes unchanged.
@@ -7,13 +7,15 @@ Angles are wrapped with `atan2`, never with a modulo, so that the functions expo
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import NamedTuple
+from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
+
+from cuelearner_jax.spaces.space import Cue, Space
 
 SQUARABLE = 1e15  # an entry up to this, and down to its inverse, has a square in single precision
 ROUNDING = 1e-5  # of the largest of values that a Fourier transform averaged
@@ -21,20 +23,6 @@ ROUNDING = 1e-5  # of the largest of values that a Fourier transform averaged
 Direction = Float[Array, "... 2"]
 DirectionLike = Direction | Float[np.ndarray, "... 2"]  # what functions take; they give JAX's arrays
 Angle = Float[Array, "..."] | Float[np.ndarray, "..."] | float
-
-
-class Actions(NamedTuple):
-    """An action space. Every function works on any leading axes; actions have `size` entries on the last one."""
-
-    size: int
-    uniform: Callable[[PRNGKeyArray, tuple[int, ...]], Array]  # (key, shape) -> random actions (*shape, size)
-    spread: Callable[[int], Array]  # count -> actions (count, size), evenly spaced
-    retract: Callable[[Array], Array]  # any vector -> the nearest action
-    clip: Callable[[Array, Array, Angle], Array]  # (action, base, radius) -> the nearest action within it of base
-    distance: Callable[[Array, Array], Array]  # (action, other) -> how far apart they are
-    sense: Callable[[Array, Array], Array]  # (action, goal) -> h: -1, 0 or +1, the way from one to the other
-    toward: Callable[[Array, Array, Angle], Array]  # (action, h, step) -> the action moved by a step the way of h
-    outward: Callable[[Array, Array], Array]  # (vector as it looks from an action, action) -> the vector
 
 
 def from_angle(angle: Angle) -> Direction:
@@ -75,42 +63,7 @@ def retract(vector: DirectionLike) -> Direction:
     return jnp.where(length == 0, jnp.array([1.0, 0.0], vector.dtype), vector / jnp.where(length == 0, 1.0, length))
 
 
-def only_actions(vector: DirectionLike) -> Direction:
-    """Vectors as they are, but NaN in place of each that is no action: one that is not finite, or zero.
-
-    What comes from a user's code passes through here, so that a fault of that code shows and does not act.
-    """
-    usable = jnp.isfinite(vector).all(-1, keepdims=True) & (vector != 0).any(-1, keepdims=True)
-    return jnp.where(usable, vector, jnp.nan)
-
-
-def clip_to_ball(action: DirectionLike, base: DirectionLike, radius: Angle) -> Direction:
-    """The direction within `radius` [rad] of `base` that lies nearest to `action` (paper, Eq. 5).
-
-    On the unit circle the L2 ball of radius r round `base` is the arc of half-width 2 asin(r / 2), so the bound is an
-    angle. A radius of pi or more leaves every action as it is.
-    """
-    turn = difference(base, action)
-    inside = jnp.abs(turn) <= radius
-    return jnp.where(inside[..., None], action, rotate(base, jnp.clip(turn, -radius, radius)))
-
-
-def distance(action: DirectionLike, other: DirectionLike) -> Float[Array, "..."]:
-    """Angle between two directions, in [0, pi] [rad]."""
-    return jnp.abs(difference(action, other))
-
-
-def sense(action: DirectionLike, goal: DirectionLike) -> Float[Array, "..."]:
-    """h: +1 if `goal` lies counterclockwise of `action`, -1 if clockwise, 0 if it is the same."""
-    return jnp.sign(difference(action, goal))
-
-
-def toward(action: DirectionLike, h: Float[Array, "..."], step: Angle) -> Direction:
-    """`action` turned by h * step [rad]."""
-    return rotate(action, h * step)
-
-
-def outward(vector: Float[Array, "... 2"], action: DirectionLike) -> Float[Array, "... 2"]:
+def outward(vector: DirectionLike, action: DirectionLike) -> Float[Array, "... 2"]:
     """A vector given along and across (counterclockwise) a direction, in the frame in which the direction is given."""
     along, across = vector[..., 0], vector[..., 1]
     x, y = action[..., 0], action[..., 1]
@@ -132,17 +85,53 @@ def uniform(key: PRNGKeyArray, shape: tuple[int, ...] = ()) -> Direction:
     return from_angle(jax.random.uniform(key, shape, minval=-math.pi, maxval=math.pi))
 
 
-DIRECTIONS = Actions(
-    size=2,
-    uniform=uniform,
-    spread=evenly_spaced,
-    retract=retract,
-    clip=clip_to_ball,
-    distance=distance,
-    sense=sense,
-    toward=toward,
-    outward=outward,
-)
+@dataclass(frozen=True)
+class Directions(Space):
+    """Unit vectors in the plane. Their one cue is the turn: radians inside, degrees in options and files."""
+
+    name = "directions"
+    size = 2
+    cues = (Cue("turn", ("counterclockwise", "clockwise"), ("ArrowLeft", "ArrowRight"), "degrees"),)
+    reach = 180.0
+
+    def sample(self, key: PRNGKeyArray, shape: tuple[int, ...] = ()) -> Direction:
+        """Draw directions uniformly (paper, Eq. 6)."""
+        return uniform(key, shape)
+
+    def log(self, action: DirectionLike, other: DirectionLike) -> Float[Array, "... 1"]:
+        """Return the angle from one direction to another, in (-pi, pi] [rad]."""
+        return difference(action, other)[..., None]
+
+    def exp(self, action: DirectionLike, change: Float[Array, "... 1"]) -> Direction:
+        """Turn a direction counterclockwise [rad]."""
+        return rotate(action, jnp.asarray(change)[..., 0])
+
+    def retract(self, vector: DirectionLike) -> Direction:
+        """Return the vector divided by its length; see the function `retract`."""
+        return retract(vector)
+
+    def spread(self, count: int) -> Float[Array, "count 2"]:
+        """Return `evenly_spaced(count)`."""
+        return evenly_spaced(count)
+
+    def from_unit(self, amount: Any) -> Float[Array, "..."]:
+        """Convert degrees to radians."""
+        return jnp.deg2rad(jnp.asarray(amount, jnp.float32))
+
+    def to_unit(self, change: Any, xp: Any = jnp) -> Any:
+        """Convert radians to degrees."""
+        return xp.rad2deg(change)
+
+    def usable(self, vector: Any, xp: Any = jnp) -> Any:
+        """Return which vectors have a direction: those that are finite and not zero."""
+        return super().usable(vector, xp) & (vector != 0).any(-1)
+
+    def outward(self, vector: DirectionLike, action: DirectionLike) -> Float[Array, "... 2"]:
+        """Return a vector given along and across a direction in the frame in which the direction is given."""
+        return outward(vector, action)
+
+
+DIRECTIONS = Directions()
 
 
 def best_direction(
@@ -184,7 +173,7 @@ def nearest_direction(
     worth_it = expected >= (share - ROUNDING) * expected[best]
     good = jnp.where(expected[best] > 0, worth_it, jnp.arange(values.shape[0]) == best)
     options = evenly_spaced(values.shape[0])
-    return options[jnp.argmin(jnp.where(good, distance(options, action), jnp.inf))]
+    return options[jnp.argmin(jnp.where(good, DIRECTIONS.distance(options, action), jnp.inf))]
 
 
 def expected_values(values: Float[Array, " count"], spread: Float[Array, ""] | float) -> Float[Array, " count"]:

@@ -1,0 +1,102 @@
+"""Actions whose entries lie between two bounds, each entry a cue of its own."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.spaces.space import Cue, Space, Vectors, numbers
+
+SHARE = "shares"
+KEYS = ("qa", "ed", "rf", "tg", "yh", "uj", "ik", "ol")  # of the cues that a box is not given
+
+
+@dataclass(frozen=True)
+class Box(Space):
+    """Vectors between `low` and `high`. A change along a cue counts in shares of the cue's range, `high` less `low`.
+
+    Networks see actions as they are: choose units in which bounds are of the order of one.
+    """
+
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+    cues: tuple[Cue, ...] = ()  # one an entry; none given: "entry 1" and so on, "more" and "less"
+
+    name = "box"
+    reach = 1.0
+
+    def __post_init__(self) -> None:
+        """Raises UserError for bounds or cues that fit no box."""
+        low, high = numbers("low", self.low), numbers("high", self.high)
+        if len(low) != len(high) or any(b <= a for a, b in zip(low, high, strict=True)):
+            raise UserError(f"low is {low} and high is {high}: give as many of both, each high above its low")
+        cues = tuple(self.cues) or _plain_cues(len(low))
+        if len(cues) != len(low):
+            raise UserError(f"{len(cues)} cues for {len(low)} entries: give one cue an entry")
+        if wrong := [cue.name for cue in cues if cue.unit != SHARE]:
+            raise UserError(f"the cue {wrong[0]!r} of a box has the unit {cues[0].unit!r}: give {SHARE!r}")
+        for name, value in (("low", low), ("high", high), ("cues", cues)):
+            object.__setattr__(self, name, value)
+
+    @property
+    def size(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Entries of an action."""
+        return len(self.low)
+
+    @property
+    def _range(self) -> Float[np.ndarray, " action"]:
+        return np.asarray(self.high, np.float32) - np.asarray(self.low, np.float32)
+
+    def sample(self, key: PRNGKeyArray, shape: tuple[int, ...] = ()) -> Float[Array, "*shape action"]:
+        """Draw vectors uniformly between the bounds."""
+        return jnp.asarray(self.low) + self._range * jax.random.uniform(key, (*shape, self.size))
+
+    def log(self, action: Vectors, other: Vectors) -> Float[Array, "... cues"]:
+        """Return the difference in each entry, as a share of its range."""
+        return (jnp.asarray(other) - action) / self._range
+
+    def exp(self, action: Vectors, change: Float[Array, "... cues"]) -> Float[Array, "... action"]:
+        """Add shares of the ranges; the bounds hold."""
+        return self.retract(action + change * self._range)
+
+    def retract(self, vector: Vectors) -> Float[Array, "... action"]:
+        """Return the vector between the bounds that is nearest; NaN where an entry is not finite."""
+        bounded = jnp.clip(jnp.asarray(vector), jnp.asarray(self.low), jnp.asarray(self.high))
+        return jnp.where(jnp.isfinite(vector), bounded, jnp.nan)
+
+    def spread(self, count: int) -> Float[Array, "count action"]:
+        """Return `count` vectors that fill the box evenly and reach its bounds, the same ones each time.
+
+        An additive recurrence by powers of the generalised golden ratio (Roberts, "The unreasonable effectiveness of
+        quasirandom sequences", 2018); of one entry they are evenly spaced.
+        """
+        if count == 1:
+            return jnp.asarray(self.low)[None] + self._range / 2
+        ratio = 2.0
+        for _ in range(64):  # the root of x^(size + 1) = x + 1
+            ratio = (1 + ratio) ** (1 / (self.size + 1))
+        steps = ratio ** -np.arange(1.0, self.size + 1)
+        places = np.arange(count)[:, None] * steps % 1.0 if self.size > 1 else np.arange(float(count))[:, None]
+        places = (places - places.min(0)) / np.ptp(places, 0)
+        return jnp.asarray(self.low) + self._range * jnp.asarray(places, jnp.float32)
+
+    def to_json(self) -> dict[str, Any]:
+        """Describe the box with its bounds."""
+        return {**super().to_json(), "low": list(self.low), "high": list(self.high)}
+
+
+def _plain_cues(size: int) -> tuple[Cue, ...]:
+    if size > len(KEYS):
+        raise UserError(
+            f"a box of {size} entries has no cues of its own: give `cues`, one an entry, each with two keys"
+        )
+    return tuple(
+        Cue(f"entry {number}", ("more", "less"), (keys[0], keys[1]), SHARE)
+        for number, keys in enumerate(KEYS[:size], start=1)
+    )

@@ -1,0 +1,87 @@
+"""One of several actions, as a vector with a one at its place."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.spaces.space import Cue, Space, Vectors
+
+STEPS = "steps"
+
+
+@dataclass(frozen=True)
+class Choices(Space):
+    """One of `count` choices; an action is a vector (count,), 1 at the choice and 0 elsewhere.
+
+    With `order` a task says that choices stand in a row: `log` then counts the steps from one to another. Without,
+    there is no cue, nobody can ask for "more", and a bound holds nothing.
+    """
+
+    count: int
+    order: Cue | None = None  # whose unit is "steps"
+
+    name = "choices"
+
+    def __post_init__(self) -> None:
+        """Raises UserError for too few choices, or an order in another unit."""
+        if self.count < 2:
+            raise UserError(f"count is {self.count}: give at least two choices")
+        if self.order is not None and self.order.unit != STEPS:
+            raise UserError(f"the order of choices has the unit {self.order.unit!r}: give {STEPS!r}")
+
+    @property
+    def size(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Entries of an action."""
+        return self.count
+
+    @property
+    def cues(self) -> tuple[Cue, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """The order, if there is one."""
+        return () if self.order is None else (self.order,)
+
+    @property
+    def reach(self) -> float:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Steps from the first choice to the last."""
+        return float(self.count - 1)
+
+    def sample(self, key: PRNGKeyArray, shape: tuple[int, ...] = ()) -> Float[Array, "*shape action"]:
+        """Draw each choice as often."""
+        return jax.nn.one_hot(jax.random.randint(key, shape, 0, self.count), self.count)
+
+    def log(self, action: Vectors, other: Vectors) -> Float[Array, "... cues"]:
+        """Return the steps from one choice to the other; no entry where choices have no order."""
+        steps = jnp.argmax(jnp.asarray(other), -1) - jnp.argmax(jnp.asarray(action), -1)
+        return jnp.repeat(steps[..., None], len(self.cues), -1).astype(jnp.float32)
+
+    def exp(self, action: Vectors, change: Float[Array, "... cues"]) -> Float[Array, "... action"]:
+        """Go so many steps, rounded, and no farther than the ends of the row."""
+        if not self.cues:
+            return jnp.asarray(action)
+        place = jnp.round(jnp.argmax(jnp.asarray(action), -1) + jnp.asarray(change)[..., 0])
+        return jax.nn.one_hot(jnp.clip(place, 0, self.count - 1).astype(jnp.int32), self.count)
+
+    def retract(self, vector: Vectors) -> Float[Array, "... action"]:
+        """Return the choice with the largest entry; NaN where an entry is not finite."""
+        chosen = jax.nn.one_hot(jnp.argmax(jnp.asarray(vector), -1), self.count)
+        return jnp.where(jnp.isfinite(vector).all(-1, keepdims=True), chosen, jnp.nan)
+
+    def spread(self, count: int) -> Float[Array, "count action"]:
+        """Return all choices, whatever the number asked for."""
+        return jnp.eye(self.count)
+
+    def distance(self, action: Vectors, other: Vectors) -> Float[Array, "..."]:
+        """Return the steps between two choices; without an order 0 for the same, 1 for another."""
+        if self.cues:
+            return super().distance(action, other)
+        differ = jnp.argmax(jnp.asarray(action), -1) != jnp.argmax(jnp.asarray(other), -1)
+        return differ.astype(jnp.float32)
+
+    def to_json(self) -> dict[str, Any]:
+        """Describe the choices with their number."""
+        return {**super().to_json(), "count": self.count}

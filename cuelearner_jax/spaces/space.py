@@ -1,0 +1,154 @@
+"""What a space of actions is: its cues, and how far along each of them it is from one action to another.
+
+A space brings `sample`, `log`, `exp`, `retract` and `spread`; distances, bounds and steps follow here, for all spaces.
+`log` of two actions is how far to go, and `exp` goes: exp(a, log(a, b)) = b, as on any smooth space of actions.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
+
+from cuelearner_jax.errors import UserError
+
+Vectors = Float[Array, "... action"] | Float[np.ndarray, "... action"]  # what methods take; they give JAX's arrays
+Amount = Float[Array, "..."] | Float[np.ndarray, "..."] | float
+UNSAID = 2.0  # what a relative answer holds for a cue of which nothing was said
+
+
+@dataclass(frozen=True)
+class Cue:
+    """One way in which an action may change, in the words of a person who asks for the change."""
+
+    name: str
+    words: tuple[str, str]  # of a change by more, and by less: ("counterclockwise", "clockwise"), ("open", "close")
+    keys: tuple[str, str]  # for these words on the labelling page, as browsers call them (`KeyboardEvent.key`)
+    unit: str  # of a change in options and files: "degrees", "shares" (of the cue's range), "steps"
+
+
+class Space:
+    """A space of actions: frozen, hashable, compared by value, so that pytrees may hold one as a static field.
+
+    Every method works on any leading axes. An action has `size` entries on the last axis, a change `len(cues)`.
+    """
+
+    name: str  # in files
+    size: int  # entries of an action
+    cues: tuple[Cue, ...]  # none: nobody can say in which way an action should change
+    reach: float  # the largest change along a cue that means anything, in `unit`
+
+    def sample(self, key: PRNGKeyArray, shape: tuple[int, ...] = ()) -> Float[Array, "*shape action"]:
+        """Draw actions uniformly."""
+        raise NotImplementedError
+
+    def log(self, action: Vectors, other: Vectors) -> Float[Array, "... cues"]:
+        """Return how far it is from `action` to `other` along each cue."""
+        raise NotImplementedError
+
+    def exp(self, action: Vectors, change: Float[Array, "... cues"]) -> Float[Array, "... action"]:
+        """Change an action along its cues."""
+        raise NotImplementedError
+
+    def retract(self, vector: Vectors) -> Float[Array, "... action"]:
+        """Return the action nearest to a vector; NaN for one that is not finite."""
+        raise NotImplementedError
+
+    def spread(self, count: int) -> Float[Array, "count action"]:
+        """Return `count` actions, spread evenly."""
+        raise NotImplementedError
+
+    def to_json(self) -> dict[str, Any]:
+        """Describe the space for a file; see `spaces.from_json`."""
+        return {
+            "name": self.name,
+            "cues": [{"name": c.name, "words": list(c.words), "keys": list(c.keys), "unit": c.unit} for c in self.cues],
+        }
+
+    @property
+    def unit(self) -> str:
+        """Unit of eps, bounds and errors in options and files."""
+        return self.cues[0].unit if self.cues else "1"
+
+    def from_unit(self, amount: Any) -> Float[Array, "..."]:
+        """Convert an amount in `unit` to what `log` gives."""
+        return jnp.asarray(amount, jnp.float32)
+
+    def to_unit(self, change: Any, xp: Any = jnp) -> Any:
+        """Convert what `log` gives to `unit`; `xp`: NumPy or JAX's NumPy."""
+        return xp.asarray(change)
+
+    def usable(self, vector: Any, xp: Any = jnp) -> Any:
+        """Return which vectors (..., action) `retract` can make actions of, (...); `xp`: NumPy or JAX's NumPy."""
+        return xp.isfinite(vector).all(-1)
+
+    def only_actions(self, vector: Vectors) -> Float[Array, "... action"]:
+        """Return vectors as they are, NaN in place of each that is unusable.
+
+        What a user's code gives passes through here, so that a fault of that code shows and does not act.
+        """
+        return jnp.where(self.usable(vector)[..., None], vector, jnp.nan)
+
+    def outward(self, vector: Vectors, action: Vectors) -> Float[Array, "... action"]:
+        """Return a vector given in the frame of an action in the frame of the space."""
+        return jnp.asarray(vector)
+
+    def distance(self, action: Vectors, other: Vectors) -> Float[Array, "..."]:
+        """Return how far two actions are apart along the cue in which they differ most."""
+        apart = jnp.abs(self.log(action, other))
+        return apart[..., 0] if len(self.cues) == 1 else jnp.max(apart, -1, initial=0.0)
+
+    def sense(self, action: Vectors, goal: Vectors) -> Float[Array, "... cues"]:
+        """Return h of each cue: +1 where `goal` lies at more, -1 at less, 0 where it is the same."""
+        return jnp.sign(self.log(action, goal))
+
+    def toward(self, action: Vectors, h: Float[Array, "... cues"], step: Amount) -> Float[Array, "... action"]:
+        """Change an action by h steps along each cue; a cue of which nothing was said (`UNSAID`) stays."""
+        h = h if len(self.cues) == 1 else jnp.where(h == UNSAID, 0.0, h)  # of one cue, nothing said is no answer
+        return self.exp(action, h * _for_cues(step))
+
+    def approach(self, action: Vectors, goal: Vectors, most: Amount) -> Float[Array, "... action"]:
+        """Change an action toward `goal`, along each cue by `most` at most."""
+        most = _for_cues(most)
+        return self.exp(action, jnp.clip(self.log(action, goal), -most, most))
+
+    def clip(self, action: Vectors, base: Vectors, radius: Amount) -> Float[Array, "... action"]:
+        """Return the action within `radius` of `base` along each cue that lies nearest to `action` (paper, Eq. 5)."""
+        radius, change = _for_cues(radius), self.log(base, action)
+        inside = jnp.abs(change) <= radius
+        inside = inside if len(self.cues) == 1 else inside.all(-1, keepdims=True)
+        return jnp.where(inside, action, self.exp(base, jnp.clip(change, -radius, radius)))
+
+    def along(self, action: Float[Array, " action"], vector: Float[Array, " action"]) -> Float[Array, " cues"]:
+        """Return what a small vector added to an action changes along each cue: the derivative of `log`."""
+        return jax.jvp(lambda other: self.log(action, other), (action,), (vector,))[1]
+
+
+def _for_cues(amount: Amount) -> Array:
+    """An amount for each action as one that counts along every cue of it."""
+    amount = jnp.asarray(amount)
+    return amount[..., None] if amount.ndim else amount
+
+
+def said(answer: Float[Array, "... cues"]) -> Bool[Array, "... cues"]:
+    """Return of which cues a relative answer says something.
+
+    "Not said" is a finite number (`UNSAID`): NaN means that a teacher failed, JSON knows no NaN, and answers that hold
+    a NaN do not equal themselves.
+    """
+    return answer != UNSAID
+
+
+def numbers(name: str, given: Any) -> tuple[float, ...]:
+    """Return a row of finite numbers as a tuple. Raises UserError for anything else."""
+    try:
+        found = np.asarray(given, np.float32)
+    except (TypeError, ValueError):
+        found = np.empty(0)
+    if found.ndim != 1 or not found.size or not np.isfinite(found).all():
+        raise UserError(f"{name} is {given!r}: give a finite number for each entry of an action")
+    return tuple(map(float, found))
