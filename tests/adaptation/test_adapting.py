@@ -252,13 +252,13 @@ def test_what_is_a_policy():
 )
 def test_angles_that_do_not_go_together_are_refused(bounds, changes, says):
     with pytest.raises(UserError, match=says):
-        adapting.check_angles(bounds, dataclasses.replace(SCALARS, **changes))
+        adapting.check_amounts(DIRECTIONS, bounds, dataclasses.replace(SCALARS, **changes))
 
 
 def test_defaults_go_together():
     for eps in (0.1, 2.0, 20.0):
         scalars = adapting.settling(probes.SCALARS, eps)
         assert scalars.tau_deg <= eps / 20
-        adapting.check_angles([45.0], scalars)
-    assert "scalars.k_max 1800 would" in adapting.check_angles([180.0], adapting.settling(SCALARS, 0.1))
+        adapting.check_amounts(DIRECTIONS, [45.0], scalars)
+    assert "scalars.k_max 1800 would" in adapting.check_amounts(DIRECTIONS, [180.0], adapting.settling(SCALARS, 0.1))
     assert judging.metrics_of(ENV) == ("reward", "hit")

@@ -48,5 +48,5 @@ def test_a_teacher_corrects_toward_what_it_has_in_mind_within_the_bound(answer, 
 def test_scalars_without_a_teachers_part_mean_its_best():
     names = {field.name for field in dataclasses.fields(GuideScalars)}
     scalars = GuideScalars(**{name: getattr(probes.SCALARS, name) for name in names})
-    wanted = wanted_actions(TwoShots(), OBS, OBS, OBS, scalars)
+    wanted = wanted_actions(DIRECTIONS, TwoShots(), OBS, OBS, OBS, scalars)
     np.testing.assert_allclose(wanted, directions.rotate(OBS, jnp.pi / 2), atol=1e-6)

@@ -56,7 +56,7 @@ def test_an_error_of_exactly_half_eps_is_right():
 
 
 def test_opposite_directions_are_told_a_turn():
-    assert abs(float(relative_feedback(DIRECTIONS, direction(0), direction(180), jnp.array(0.1)))[0]) == 1
+    assert abs(float(relative_feedback(DIRECTIONS, direction(0), direction(180), jnp.array(0.1))[0])) == 1
 
 
 def test_indifference_widens_what_is_right_and_never_narrows_it():
