@@ -53,7 +53,8 @@ def check(labels: Label, spaces: Spaces, form: AnswerForm | None, named: str = "
     for name in ("actions", "answers") if form is not None and form.is_action else ("actions",):
         action = np.asarray(rows[name])
         off = np.abs(np.asarray(spaces.actions.retract(jnp.asarray(action))) - action) > ACTION_ERROR
-        _refuse(off, f"{named}: {name} are none of the space {spaces.actions.name!r}", "see its `retract`")
+        space = spaces.actions
+        _refuse(off, f"{named}: {name} are no {space.about}", f"the space {space.name} gives the nearest by `retract`")
     if form is not None and form.values is not None:
         known = form.values(spaces.actions)
         values = ", ".join(f"{value:g}" for value in known)

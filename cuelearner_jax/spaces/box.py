@@ -29,6 +29,7 @@ class Box(Space):
     cues: tuple[Cue, ...] = ()  # one an entry; none given: "entry 1" and so on, "more" and "less"
 
     name = "box"
+    about = "vectors between the bounds"
     reach = 1.0
 
     def __post_init__(self) -> None:

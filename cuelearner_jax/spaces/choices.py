@@ -27,6 +27,7 @@ class Choices(Space):
     order: Cue | None = None  # whose unit is "steps"
 
     name = "choices"
+    about = "vectors with a single 1 among zeros"
 
     def __post_init__(self) -> None:
         """Raises UserError for too few choices, or an order in another unit."""

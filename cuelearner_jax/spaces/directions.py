@@ -90,6 +90,7 @@ class Directions(Space):
     """Unit vectors in the plane. Their one cue is the turn: radians inside, degrees in options and files."""
 
     name = "directions"
+    about = "unit vectors"
     size = 2
     cues = (Cue("turn", ("counterclockwise", "clockwise"), ("ArrowLeft", "ArrowRight"), "degrees"),)
     reach = 180.0

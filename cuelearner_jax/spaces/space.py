@@ -38,6 +38,7 @@ class Space:
     """
 
     name: str  # in files
+    about: str  # what its actions are, in a few words
     size: int  # entries of an action
     cues: tuple[Cue, ...]  # none: nobody can say in which way an action should change
     reach: float  # the largest change along a cue that means anything, in `unit`

@@ -15,6 +15,7 @@ import cuelearner_jax as cl
 from cuelearner_jax.api import arguments
 from cuelearner_jax.config import GuideSizes, Scalars
 from cuelearner_jax.policies import Heuristic, Opaque
+from cuelearner_jax.spaces import DIRECTIONS
 
 TASK = dataclasses.replace(probes.make_task(), presets={})
 WORLD = cl.World(TASK, probes.WindowConfig())
@@ -69,7 +70,7 @@ def test_what_only_looks_like_an_array_is_refused(rows):
 
 @pytest.mark.parametrize("kind", [np.float16, np.float32, np.float64, np.longdouble, np.int8, jnp.float32, np.array])
 def test_a_number_of_numpy_or_jax_is_a_number(kind):
-    assert arguments.angle("bound_deg", kind(5)) == 5.0
+    assert arguments.amount("bound_deg", kind(5), DIRECTIONS) == 5.0
     assert arguments.settings("scalars", Scalars(eps_deg=kind(5)), Scalars).eps_deg == 5.0
     assert cl.World(TASK, probes.WindowConfig(kind(28))).config.half_width_deg == 28.0
 

@@ -22,7 +22,7 @@ def path(tmp_path):
     return tmp_path / "labels.parquet"
 
 
-def written(path, task=None, answers="relative", eps_deg=EPS, obs_size=2, spoil=None, own=None):
+def written(path, task=None, answers="relative", eps_deg=EPS, obs_size=2, spoil=None):
     rng = np.random.default_rng(0)
     draw = lambda size: rng.normal(size=(2, 20, size)).astype(np.float32)  # noqa: E731
     action = draw(2)
@@ -31,7 +31,6 @@ def written(path, task=None, answers="relative", eps_deg=EPS, obs_size=2, spoil=
     if spoil:
         rows[spoil[0]][1, 7] = spoil[1]
     labels = probes.label_set(rows["obs"], rows["action"], rows["answer"], np.ones((2, 20), bool))
-    labels = labels.replace(eps_deg=None if own is None else np.tile(np.float32(own), (2, 1)))
     label_files.write(path, task or TASK, answers, DIRECTIONS, eps_deg, np.array([4, 9]), labels)
 
 
