@@ -13,8 +13,8 @@ from typing import NamedTuple
 
 from cuelearner_jax.agents import view
 from cuelearner_jax.agents.choice import looked_at
-from cuelearner_jax.config import Sizes
 from cuelearner_jax.environment import Spaces
+from cuelearner_jax.run_config import RunConfig
 
 
 class Operations(NamedTuple):
@@ -30,21 +30,14 @@ class Operations(NamedTuple):
         return sum(self)
 
 
-def step_operations(sizes: Sizes, spaces: Spaces, bootstraps: bool) -> Operations:
-    """Operations of one environment step.
-
-    Args:
-        sizes: layers, directions, batch, n-step returns and gradient steps a step are taken from here.
-        spaces: of the environment.
-        bootstraps: whether targets look at the next observation.
-    """
-    widths = view.widths(sizes.frame, spaces)
-    rows = sizes.batch_size * (2 if sizes.n_step > 1 else 1) if bootstraps else 0
-    target = forward(sizes.q_layers, widths, sizes.target_directions) + forward(sizes.q_layers, widths, 1)
+def step_operations(config: RunConfig, spaces: Spaces) -> Operations:
+    """Operations of one environment step, of a run of double DQN in an environment with these spaces."""
+    own, widths = config.agent, view.widths(config.sizes.frame, spaces)
+    rows = own.batch_size * (2 if own.n_step > 1 else 1) if config.bootstraps else 0
     return Operations(
-        acting=forward(sizes.q_layers, widths, looked_at(sizes)),
-        gradient=sizes.updates_per_step * sizes.batch_size * forward_and_backward(sizes.q_layers, widths),
-        targets=sizes.updates_per_step * rows * target,
+        acting=forward(own.q_layers, widths, looked_at(own.directions, own.coarse_directions, own.peaks)),
+        gradient=own.batch_size * forward_and_backward(own.q_layers, widths),
+        targets=rows * (forward(own.q_layers, widths, own.target_directions) + forward(own.q_layers, widths, 1)),
     )
 
 

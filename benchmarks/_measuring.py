@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 from _flops import step_operations
 
-from cuelearner_jax.config import RunConfig
 from cuelearner_jax.environment import spaces_of
+from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs import speed
 from cuelearner_jax.task import Task
 from cuelearner_jax.types import Teacher
@@ -50,7 +50,7 @@ def measure(task: Task, config: RunConfig, seeds: int, seconds: float, mesh: Any
     row = speed.measure(config, lambda: task.environment(config.task), seeds, seconds, mesh)
     rate = matmul_rate(repeats=3) * (row["devices"] if jax.default_backend() != "cpu" else 1)
     spaces = spaces_of(task.environment(config.task))
-    flops = row["steps_a_second"] * step_operations(config.sizes, spaces, config.bootstraps).total
+    flops = row["steps_a_second"] * step_operations(config, spaces).total
     return {
         **row,
         "task": task.name,

@@ -33,7 +33,11 @@ def measure(task: str, preset: str, lanes: int, iterations: int, rounds: int) ->
     config = learning(found.presets[preset].config, guided=False)
     env = found.environment(config.task)
     framed = {
-        frame: dataclasses.replace(config, sizes=dataclasses.replace(config.sizes, frame=frame, replay_capacity=REPLAY))
+        frame: dataclasses.replace(
+            config,
+            sizes=dataclasses.replace(config.sizes, frame=frame),
+            agent=dataclasses.replace(config.agent, replay_capacity=REPLAY),
+        )
         for frame in FRAMES
     }
     runs = {frame: Timed(config, env, "none", lanes, 0) for frame, config in framed.items()}
@@ -44,7 +48,7 @@ def measure(task: str, preset: str, lanes: int, iterations: int, rounds: int) ->
     steps = iterations * config.sizes.num_envs
     raw, action = (1e3 * float(np.median(times[frame][1:])) / steps for frame in FRAMES)
     spaces = spaces_of(env)
-    counted = [step_operations(run.group.config.sizes, spaces, config.bootstraps).total for run in runs.values()]
+    counted = [step_operations(run.group.config, spaces).total for run in runs.values()]
     own, turned = view.widths("action", spaces)
     return {
         "task": task,

@@ -19,8 +19,8 @@ from typing import Any
 
 import jax
 
-from cuelearner_jax.config import RunConfig
 from cuelearner_jax.devices import lane_mesh
+from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs.memory_report import state_bytes
 from cuelearner_jax.runs.speed import Timed, learning
 from cuelearner_jax.storage.provenance import provenance
@@ -42,7 +42,7 @@ def measure(config: RunConfig, env: Any, seeds: int, devices: int, iterations: i
         "seeds": seeds,
         "ms_per_update": 1e3 * second,
         "steps_per_second": seeds / second,
-        "replay_gb": seeds * config.sizes.replay_capacity * row_bytes / 1e9,
+        "replay_gb": seeds * config.agent.replay_capacity * row_bytes / 1e9,
         "at_rest_gb": at_rest / 1e9,
         "peak_gb": stats.get("peak_bytes_in_use", 0) / 1e9,
     }
@@ -56,20 +56,16 @@ def main() -> None:
     parser.add_argument("--iterations", type=int, default=20, help="iterations of num_envs steps in a timed stretch")
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--worlds", type=int, default=256)
-    parser.add_argument("--target-dtype", choices=("float32", "bfloat16"), default="bfloat16")
     parser.add_argument("--layers", type=int, nargs="+", help="hidden layers (default: the paper's)")
     parser.add_argument("--write", action="store_true", help="write the JSON file")
     asked = parser.parse_args()
     if max(asked.devices) > jax.local_device_count():
         parser.error(f"--devices: there are {jax.local_device_count()}")
     config = NAVIGATION.presets["paper"].config
-    sizes = dataclasses.replace(config.sizes, target_dtype=asked.target_dtype)
-    if asked.layers:
-        sizes = dataclasses.replace(sizes, q_layers=tuple(asked.layers))
-    sizes = dataclasses.replace(sizes, lanes_per_block=max(asked.seeds) * max(asked.devices))
-    config = learning(
-        dataclasses.replace(config, task=dataclasses.replace(config.task, worlds=asked.worlds), sizes=sizes)
-    )
+    agent = dataclasses.replace(config.agent, q_layers=tuple(asked.layers)) if asked.layers else config.agent
+    sizes = dataclasses.replace(config.sizes, lanes_per_block=max(asked.seeds) * max(asked.devices))
+    world = dataclasses.replace(config.task, worlds=asked.worlds)
+    config = learning(dataclasses.replace(config, task=world, sizes=sizes, agent=agent))
     env = NAVIGATION.environment(config.task)
     rows = [
         measure(config, env, seeds * devices, devices, asked.iterations, asked.repeats)

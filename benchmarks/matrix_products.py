@@ -35,7 +35,7 @@ def main() -> None:
     asked = parser.parse_args()
     task = registry.find(asked.task)
     config = task.presets[asked.preset].config
-    config = dataclasses.replace(config, sizes=dataclasses.replace(config.sizes, replay_capacity=REPLAY))
+    config = dataclasses.replace(config, agent=dataclasses.replace(config.agent, replay_capacity=REPLAY))
     mesh, rows = devices.lane_mesh(jax.local_devices()[:1]), []
     print(f"{'lanes':>6}  " + "  ".join(f"{way + ' [ms]':>14}" for way in WAYS))
     for lanes in asked.lanes:

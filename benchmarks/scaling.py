@@ -27,8 +27,8 @@ from _measuring import Labelled, measure
 from matplotlib import ticker
 from matplotlib.figure import Figure
 
-from cuelearner_jax.config import RunConfig
 from cuelearner_jax.report.figures import OTHER_COLOURS, STYLE, save_figure
+from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs.speed import learning
 from cuelearner_jax.storage.provenance import provenance
 from cuelearner_jax.task import Task
@@ -59,8 +59,8 @@ def main() -> int:
         contents = json.loads(asked.out.read_text())
         if {name: contents.get(name) for name in setting} != setting:
             raise SystemExit(f"{asked.out} holds measurements of another setting: give another --out")
-    sizes = dataclasses.replace(preset.config.sizes, replay_capacity=min(REPLAY, preset.config.sizes.replay_capacity))
-    task, config = registry.find(asked.task), dataclasses.replace(preset.config, sizes=sizes)
+    agent = dataclasses.replace(preset.config.agent, replay_capacity=min(REPLAY, preset.config.agent.replay_capacity))
+    task, config = registry.find(asked.task), dataclasses.replace(preset.config, agent=agent)
     began = time.perf_counter()
     for axis, value in _points(asked, contents["rows"]):
         if asked.stop_after and time.perf_counter() - began > asked.stop_after:
@@ -116,15 +116,15 @@ def _points(asked: argparse.Namespace, rows: Sequence[dict[str, Any]]) -> list[t
 
 def _training(task: Task, config: RunConfig, asked: argparse.Namespace, axis: str, value: int) -> dict[str, Any]:
     """Figures of training with one thing changed."""
-    sizes, seeds = config.sizes, asked.base_seeds
+    agent, seeds = config.agent, asked.base_seeds
     if axis == "seeds":
         seeds = value
     elif axis == "directions":
-        sizes = dataclasses.replace(sizes, directions=value)
+        agent = dataclasses.replace(agent, directions=value)
     else:
-        layers = tuple(max(1, width * value // sizes.q_layers[0]) for width in sizes.q_layers)
-        sizes = dataclasses.replace(sizes, q_layers=layers)
-    return measure(task, dataclasses.replace(config, sizes=sizes), seeds, asked.seconds)
+        layers = tuple(max(1, width * value // agent.q_layers[0]) for width in agent.q_layers)
+        agent = dataclasses.replace(agent, q_layers=layers)
+    return measure(task, dataclasses.replace(config, agent=agent), seeds, asked.seconds)
 
 
 def _labels(task: Task, config: RunConfig, seeds: int, budget: int) -> dict[str, Any]:

@@ -26,8 +26,8 @@ import scipy.stats
 from flax import struct
 
 import cuelearner_jax as cl
-from cuelearner_jax.agents.choice import greedy_actions, values
-from cuelearner_jax.config import AgentSizes
+from cuelearner_jax.agents import ddqn
+from cuelearner_jax.environment import spaces_of
 from cuelearner_jax.evaluate import episodes, rollout
 from cuelearner_jax.guides import registry as guidance
 from cuelearner_jax.policies import BY_LANE, SHARED
@@ -35,7 +35,6 @@ from cuelearner_jax.runs import grid as runs
 from cuelearner_jax.runs.grid import Grid
 from cuelearner_jax.runs.kept import restore_policies
 from cuelearner_jax.runs.lanes import LaneGroup
-from cuelearner_jax.spaces import DIRECTIONS
 from cuelearner_jax.spaces import directions as geometry
 from cuelearner_jax.storage.provenance import provenance
 from cuelearner_jax.tasks import registry
@@ -50,15 +49,15 @@ TABLE = "regulation"  # of the shipped network
 
 
 class Searching(struct.PyTreeNode):
-    """An agent that searches as its sizes say, roughly or fully; a finished `policies.Agent` always searches fully."""
+    """An agent that searches as its options say, roughly or fully; a finished one always searches fully."""
 
     params: Any
-    sizes: AgentSizes = struct.field(pytree_node=False)
+    functions: ddqn.DoubleDQN = struct.field(pytree_node=False)
     env: Any
 
     def act(self, key: jax.Array, states: Any, obs: jax.Array) -> jax.Array:
         """The action with the largest value that the search finds."""
-        return greedy_actions(self.sizes, DIRECTIONS, self.env, self.params, obs)
+        return self.functions.explore(self.env, self.functions.options, self.params, obs, key)
 
     @property
     def axes(self) -> Any:
@@ -70,7 +69,7 @@ class Agents(NamedTuple):
     """The agents of one source."""
 
     env: Any  # of the validation episodes
-    sizes: AgentSizes
+    functions: Any  # a DoubleDQN
     params: Any  # leading axis: agents
     told: dict[str, Any]  # about them, for the record
 
@@ -80,8 +79,8 @@ def shipped() -> Agents:
     world = cl.make("billiards", table=TABLE)
     network = stored.load(SHIPPED_TEACHERS / TABLE, world.env, 0.0, 0.0)
     params = jax.tree.map(lambda leaf: leaf[None], network.params)
-    sizes = AgentSizes(frame="action", q_layers=network.layers)
-    return Agents(world.environment("validation"), sizes, params, {"network": TABLE})
+    functions = ddqn.Config(q_layers=network.layers).make("action", spaces_of(world.env))
+    return Agents(world.environment("validation"), functions, params, {"network": TABLE})
 
 
 def of_run(folder: Path) -> Agents:
@@ -91,7 +90,7 @@ def of_run(folder: Path) -> Agents:
     kind = guidance.make(grid.guidance[0], config.sizes, env)
     group = LaneGroup(config, env, kind, Grid((kind.name,), grid.seeds, grid.labels))
     policies, step = restore_policies(group, folder / kind.name)
-    return Agents(env, config.sizes, policies["params"], {"step": step, "seeds": list(grid.seeds)})
+    return Agents(env, config.agent_in(env), policies["params"], {"step": step, "seeds": list(grid.seeds)})
 
 
 def met(agent: Searching) -> jax.Array:
@@ -107,18 +106,18 @@ def met(agent: Searching) -> jax.Array:
     return jax.lax.scan(step, (state, obs), jax.random.split(jax.random.key(1), 5))[0][1]
 
 
-def compare(agents: Agents, way: AgentSizes, steps: int, precise: bool) -> dict[str, np.ndarray]:
+def compare(agents: Agents, way: ddqn.Config, steps: int, precise: bool) -> dict[str, np.ndarray]:
     """One way to search against the full one: NAMES, each (agents,), and "rewards" (agents, parts of the episodes)."""
     env, options = agents.env, geometry.evenly_spaced(way.directions)
-    full = dataclasses.replace(way, coarse_directions=0)
-    q = values(way, env)
+    searching = dataclasses.replace(agents.functions, options=way)
+    full = dataclasses.replace(searching, options=dataclasses.replace(way, coarse_directions=0))
 
     def one(params: Any) -> dict[str, jax.Array]:
         obs = met(Searching(params, full, env))
         with jax.default_matmul_precision("highest"):
-            found = jax.lax.map(lambda seen: q(params, seen, options)[:, 0], obs, batch_size=16)
+            found = jax.lax.map(lambda seen: full.value(env, params, seen, options), obs, batch_size=16)
         with jax.default_matmul_precision("highest" if precise else "default"):
-            agent = Searching(params, way, env)
+            agent = Searching(params, searching, env)
             chosen = agent.act(jax.random.key(0), None, obs)
             keys = jax.random.split(episodes(), ENVS)
             rewards = jax.lax.map(
@@ -142,9 +141,9 @@ def compare(agents: Agents, way: AgentSizes, steps: int, precise: bool) -> dict[
 
 
 def ways(
-    sizes: AgentSizes, coarse: list[int], peaks: list[int], dtypes: list[Any]
-) -> Iterator[tuple[str, AgentSizes, bool]]:
-    """(what the search is called, sizes, in full float32?), the full search first."""
+    sizes: ddqn.Config, coarse: list[int], peaks: list[int], dtypes: list[Any]
+) -> Iterator[tuple[str, ddqn.Config, bool]]:
+    """(what the search is called, options, in full float32?), the full search first."""
     full = dataclasses.replace(sizes, coarse_directions=0)
     yield "all, in full float32", full, True
     yield "all, as computed by default", full, False
@@ -177,7 +176,7 @@ def main() -> None:
     agents = shipped() if asked.of == SHIPPED else of_run(Path(asked.of))
     rows, best = [], None
     print(f"{'search':28s}  " + "  ".join(f"{name:>20}" for name in NAMES) + "  reward lost [95%]")
-    for name, way, precise in ways(agents.sizes, asked.coarse, asked.peaks, asked.dtypes):
+    for name, way, precise in ways(agents.functions.options, asked.coarse, asked.peaks, asked.dtypes):
         found = compare(agents, way, asked.steps, precise)
         best = found["rewards"] if best is None else best
         row = {"search": name, **{part: float(found[part].mean()) for part in NAMES}}

@@ -22,8 +22,10 @@ from _flops import step_operations
 from _measuring import matmul_rate
 from cartpole import CartPole
 
-from cuelearner_jax.config import RunConfig, Scalars, Schedule, Sizes
+from cuelearner_jax.agents import ddqn
+from cuelearner_jax.config import Scalars, Sizes
 from cuelearner_jax.environment import spaces_of
+from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs.speed import Timed, learning
 
 BATCH, ENVS, DIRECTIONS = 256, 8, 2
@@ -31,7 +33,7 @@ BATCH, ENVS, DIRECTIONS = 256, 8, 2
 
 def measure(config: RunConfig, env: CartPole, seeds: int, steps: int, rounds: int) -> dict[str, float]:
     """Medians over rounds of one number of seeds."""
-    operations = step_operations(config.sizes, spaces_of(env), config.bootstraps).total
+    operations = step_operations(config, spaces_of(env)).total
     timed, shares, rates, peaks = Timed(config, env, "none", seeds), [], [], []
     for round_ in range(rounds + 1):
         peak = matmul_rate()
@@ -61,17 +63,16 @@ def main() -> None:
     arguments = parser.parse_args()
 
     env = CartPole()
-    sizes = Sizes(
+    agent = ddqn.Config(
         directions=DIRECTIONS,
         target_directions=DIRECTIONS,
-        num_envs=ENVS,
         batch_size=BATCH,
         replay_capacity=10_000 // ENVS * ENVS,
         optimizer="adam",
-        lanes_per_block=arguments.lanes_per_block,
+        learning_rate=2.5e-4,
     )
-    scalars = Scalars(discount=0.99, learning_rate=2.5e-4, polyak=0.005)
-    config = learning(RunConfig(None, sizes, scalars, Schedule()))
+    sizes = Sizes(num_envs=ENVS, lanes_per_block=arguments.lanes_per_block)
+    config = learning(RunConfig(None, sizes, Scalars(discount=0.99), agent=agent))
     rows = [measure(config, env, seeds, arguments.steps, arguments.rounds) for seeds in arguments.seeds]
     print("seeds  steps/s (all)  GFLOP a step  matmul GFLOP/s  share of it")
     for row in rows:

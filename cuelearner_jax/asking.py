@@ -45,15 +45,6 @@ def label_slots(budget: int, sizes: GuideSizes) -> int:
     return -(-budget // sizes.labels_per_round) * sizes.labels_per_round
 
 
-def share(budget: int, instalment: int, instalments: int, sizes: GuideSizes) -> int:
-    """Labels that a lane of this budget has asked for once an instalment (from 0) is done.
-
-    Instalments are equal up to whole rounds, of which the earlier ones get the more; the last ends with the budget.
-    """
-    rounds = label_slots(budget, sizes) // sizes.labels_per_round
-    return min(-(-rounds * (instalment + 1) // instalments) * sizes.labels_per_round, budget)
-
-
 def empty_labels(
     slots: int,
     obs_size: int,
@@ -318,17 +309,13 @@ def label_round(
     base: Policy,
     guide: GuideState,
     lane_key: PRNGKeyArray,
-    until: Int[Array, ""] | None = None,
     bound: Float[Array, ""] | None = None,
 ) -> GuideState:
-    """As many questions as a round has, then a fit to all labels so far.
+    """As many questions as a round has, then a fit to all labels so far; a guide with its budget stays as it is.
 
-    Args:
-        until: labels at which this instalment ends (default: the budget); a guide that has asked for as many stays as
-            it is.
-        bound: see `question`.
+    `bound`: see `question`.
     """
-    first, until = guide.asked, guide.budget if until is None else until
+    first = guide.asked
     asking, at_once = (ask_all, sizes.candidates) if sizes.ask_all else (ask, 1)
 
     def one(guide: GuideState, offset: Int[Array, ""]) -> tuple[GuideState, None]:
@@ -341,7 +328,7 @@ def label_round(
 
     asked, _ = jax.lax.scan(one, guide, jnp.arange(0, sizes.labels_per_round, at_once))
     fitted = fit(guidance, env, scalars, asked, lane_key, first // sizes.labels_per_round)
-    return jax.tree.map(lambda new, old: jnp.where(first < until, new, old), fitted, guide)
+    return jax.tree.map(lambda new, old: jnp.where(first < guide.budget, new, old), fitted, guide)
 
 
 def take_labels(

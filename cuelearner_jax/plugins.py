@@ -6,7 +6,7 @@ import importlib
 import os
 import re
 import sys
-from typing import Any, TypeVar
+from typing import Any, Generic, TypeVar
 
 from cuelearner_jax.errors import UserError, closest
 
@@ -51,3 +51,43 @@ def load(reference: str, kind: type[T], called: str) -> T:
             f"{reference} is of type {type(found).__name__}: {called} is a {kind.__module__}.{kind.__name__}"
         )
     return found
+
+
+class PartRegistry(Generic[T]):
+    """Classes of options that make parts of one sort (agents, say), found by their `NAME` or as package.module:NAME."""
+
+    def __init__(self, sort: str, *built_in: type[T]) -> None:
+        """`sort`: what messages call such a part."""
+        self._sort, self._found = sort, {kind.NAME: kind for kind in built_in}  # pyright: ignore[reportAttributeAccessIssue]
+
+    @property
+    def known(self) -> tuple[type[T], ...]:
+        """The classes that can be named."""
+        return tuple(self._found.values())
+
+    def register(self, kind: type[T]) -> type[T]:
+        """Make a class known under its name. Raises UserError if another one has the name."""
+        name = kind.NAME  # pyright: ignore[reportAttributeAccessIssue]
+        if self._found.setdefault(name, kind) is not kind:
+            raise UserError(f"there is another {self._sort} called {name!r}: give yours another name")
+        return kind
+
+    def find(self, name: str) -> type[T]:
+        """The class of that name; no code is loaded that the name leads to. Raises UserError if there is none."""
+        if name not in self._found:
+            raise UserError(
+                f"unknown {self._sort} {name!r}{closest(name, self._found)} (your own is named as package.module:NAME)"
+            )
+        return self._found[name]
+
+    def resolve(self, text: str) -> type[T]:
+        """The class that a user names, by its name or as `package.module:NAME`, whose code is loaded.
+
+        Never call it with what a file says. Raises UserError if there is no such class.
+        """
+        if ":" not in text:
+            return self.find(text)
+        kind: Any = load(text, type, f"options of the {self._sort}")
+        if not hasattr(kind, "NAME") or not callable(getattr(kind, "make", None)):
+            raise UserError(f"{text} is no {self._sort}: give a class of options with NAME, ABOUT and make")
+        return self.register(kind)

@@ -6,7 +6,6 @@ A policy's `act` sees many environments at once. Its `axes` say which of its lea
 
 from __future__ import annotations
 
-import dataclasses
 import inspect
 from collections.abc import Callable
 from typing import Any, Protocol, runtime_checkable
@@ -18,8 +17,8 @@ from flax import struct
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from cuelearner_jax import types, user_code
-from cuelearner_jax.agents.choice import greedy_actions
-from cuelearner_jax.config import AgentSizes, GuideScalars, GuideSizes
+from cuelearner_jax.agents.protocol import AgentFunctions
+from cuelearner_jax.config import GuideScalars, GuideSizes
 from cuelearner_jax.devices import portions
 from cuelearner_jax.environment import actions_of
 from cuelearner_jax.errors import UserError, raised_by, shown
@@ -43,21 +42,15 @@ class Policy(types.Policy, Protocol):
 
 
 class Agent(struct.PyTreeNode):
-    """The greedy choice of an action-value network."""
+    """A finished agent."""
 
     params: Params
-    sizes: AgentSizes = struct.field(pytree_node=False)
-    actions: Space = struct.field(pytree_node=False, default=DIRECTIONS)
+    functions: AgentFunctions = struct.field(pytree_node=False)
     env: Any = None  # says how an observation looks from an action; nobody asks it in the raw frame
 
     def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
-        """The action with the largest value of all in the set.
-
-        The rough first look (`sizes.coarse_directions`) is for play while learning alone: where values are sharp it
-        misses peaks, which costs a finished agent reward (`benchmarks/search_agreement.py`).
-        """
-        whole = dataclasses.replace(self.sizes, coarse_directions=0)
-        return greedy_actions(whole, self.actions, self.env, self.params, obs)
+        """What it does once it has learned."""
+        return self.functions.act(self.env, self.params, obs, key)
 
     @property
     def axes(self) -> Agent:

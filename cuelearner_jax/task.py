@@ -12,9 +12,10 @@ from typing import Any, NamedTuple
 import jax
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from cuelearner_jax.config import GuideSizes, RunConfig, Scalars, check_types
+from cuelearner_jax.config import GuideSizes, Scalars, check_types
 from cuelearner_jax.environment import Environment
 from cuelearner_jax.errors import UserError, closest, shown
+from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.storage.room import check_room
 from cuelearner_jax.types import EnvState, Reel, Sketch, Teacher
 

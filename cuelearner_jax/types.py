@@ -117,35 +117,13 @@ class GuideState(struct.PyTreeNode):
 
 
 class AgentState(struct.PyTreeNode):
-    """The agent's part of a lane: its networks, what it has lived through, and where it stands."""
+    """The agent's part of a lane: what it learns, what it has met, and where it stands."""
 
-    params: Params
-    target_params: Params  # None where nothing bootstraps (discount 0)
-    opt_state: Any
+    params: Params  # with which it acts
+    training: Any  # what learning keeps beside them, such as a target network and the optimiser's state
     replay: Float[Array, "capacity width"]
     env: EnvState  # leading axis: num_envs
     obs: Float[Array, "num_envs obs"]
-    guided: Bool[Array, " num_envs"]  # is the running episode a guided one?
-
-
-class ArmSums(struct.PyTreeNode):
-    """Fading sums over the episodes of two arms, own and guided; an episode earned `gain` in `size`, see `pace`."""
-
-    episodes: Float[Array, "2"]
-    gain: Float[Array, "2"]
-    size: Float[Array, "2"]
-    gain_gain: Float[Array, "2"]
-    gain_size: Float[Array, "2"]
-    size_size: Float[Array, "2"]
-
-
-class Pace(struct.PyTreeNode):
-    """What guided and own episodes have earned, and how far the running ones are; see `guidance.pace`."""
-
-    gain: Float[Array, " num_envs"]  # of the running episode so far
-    steps: Float[Array, " num_envs"]  # of the running episode so far
-    whole: Bool[Array, " num_envs"]  # has it been its arm's from its first step on?
-    sums: ArmSums
 
 
 class TrainState(struct.PyTreeNode):
@@ -153,9 +131,9 @@ class TrainState(struct.PyTreeNode):
 
     agent: AgentState
     guide: GuideState
+    arbiter: Any  # in which environments the guide's action is executed; see `arbiters.protocol`
     key: PRNGKeyArray
     failed: Bool[Array, ""]  # did a loss, a gradient or a parameter stop being finite? It stays as it was before then
-    pace: Pace | None = None  # None where the share of guided episodes is fixed
 
 
 class Sketch(NamedTuple):

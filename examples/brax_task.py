@@ -19,8 +19,11 @@ from brax import envs
 from jaxtyping import Array, Float
 
 from cuelearner_envs.bounds import MOST_STEPS, check_number
+from cuelearner_jax.agents import ddqn
+from cuelearner_jax.arbiters import paced
 from cuelearner_jax.bridges.brax import BraxTask, from_brax
-from cuelearner_jax.config import RunConfig, Scalars, Schedule, Sizes
+from cuelearner_jax.config import Scalars, Schedule, Sizes
+from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.task import Body, Preset, Task
 
 
@@ -62,17 +65,8 @@ TASK = Task(
             "small networks: a minute or two on two CPU cores",
             RunConfig(
                 PendulumConfig(),
-                Sizes(
-                    q_layers=(64, 64),
-                    directions=12,
-                    target_directions=12,
-                    num_envs=10,
-                    batch_size=64,
-                    replay_capacity=20_000,
-                    optimizer="adam",
-                    pace=True,
-                ),
-                Scalars(learning_rate=0.003, discount=0.95, max_grad_norm=10.0, polyak=0.05),
+                Sizes(num_envs=10),
+                Scalars(discount=0.95, max_grad_norm=10.0),
                 Schedule(
                     total_steps=4_000,
                     random_steps=500,
@@ -83,6 +77,17 @@ TASK = Task(
                     eval_envs=10,
                     checkpoint_every=2_000,
                 ),
+                ddqn.Config(
+                    q_layers=(64, 64),
+                    directions=12,
+                    target_directions=12,
+                    batch_size=64,
+                    replay_capacity=20_000,
+                    optimizer="adam",
+                    learning_rate=0.003,
+                    polyak=0.05,
+                ),
+                paced.Config(),
             ),
             seeds=2,
         )

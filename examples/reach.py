@@ -30,8 +30,11 @@ from matplotlib.figure import Figure
 
 from cuelearner_envs import film, svg
 from cuelearner_envs.bounds import MOST_STEPS, check_number
-from cuelearner_jax.config import RunConfig, Scalars, Schedule, Sizes
+from cuelearner_jax.agents import ddqn
+from cuelearner_jax.arbiters import paced
+from cuelearner_jax.config import Scalars, Schedule, Sizes
 from cuelearner_jax.environment import Quantity, WholeObservations
+from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.spaces.directions import from_angle, retract, rotate
 from cuelearner_jax.task import Body, Pictures, Preset, Scenario, Task
 from cuelearner_jax.types import Policy, Reel, Sketch, Step
@@ -324,27 +327,8 @@ TASK = Task(
             "guided and unguided, four seeds: seconds on two CPU cores",
             RunConfig(
                 ReachConfig(mirrors=True),
-                Sizes(
-                    q_layers=(64, 64),
-                    feedback_layers=(64, 64),
-                    directions=36,
-                    target_directions=12,
-                    num_envs=10,
-                    batch_size=64,
-                    replay_capacity=20_000,
-                    optimizer="adam",
-                    fit_steps=600,
-                    fit_batch_size=64,
-                    pace=True,
-                ),
-                Scalars(
-                    learning_rate=0.003,
-                    feedback_learning_rate=0.005,
-                    discount=0.9,
-                    max_grad_norm=10.0,
-                    polyak=0.05,
-                    eps_deg=40.0,
-                ),
+                Sizes(feedback_layers=(64, 64), num_envs=10, fit_steps=600, fit_batch_size=64),
+                Scalars(feedback_learning_rate=0.005, discount=0.9, max_grad_norm=10.0, eps_deg=40.0),
                 Schedule(
                     total_steps=3_000,
                     random_steps=200,
@@ -355,6 +339,17 @@ TASK = Task(
                     eval_envs=200,
                     checkpoint_every=1_500,
                 ),
+                ddqn.Config(
+                    q_layers=(64, 64),
+                    directions=36,
+                    target_directions=12,
+                    batch_size=64,
+                    replay_capacity=20_000,
+                    optimizer="adam",
+                    learning_rate=0.003,
+                    polyak=0.05,
+                ),
+                paced.Config(),
             ),
             guidance=("none", "relative"),
             labels=(100,),

@@ -22,12 +22,13 @@ from _pieces import chosen, listed
 
 from cuelearner_jax.adaptation import adapting, program
 from cuelearner_jax.cli import main as cuelearner
-from cuelearner_jax.config import GuideSizes, RunConfig
+from cuelearner_jax.config import GuideSizes
 from cuelearner_jax.environment import actions_of, spaces_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import episodes, one_lane, watched_lanes
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.policies import Agent, Corrected
+from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs.trained import PolicySource, several
 from cuelearner_jax.storage import table as tables
 from cuelearner_jax.storage.provenance import provenance
@@ -52,7 +53,7 @@ SMALL: Mapping[str, Any] = {  # what every method has at the scale smoke
     "sizes.labels_per_round": 5,
     "sizes.fit_steps": 20,
     "sizes.fit_batch_size": 5,
-    "sizes.replay_capacity": 400,
+    "agent.replay_capacity": 400,
     "schedule.learn_after": 20,
 }
 MODEST: Mapping[str, Any] = {  # models that 2 cores fit in seconds, as `cuelearner adapt` has them
@@ -226,6 +227,7 @@ def fine_tuned(bench: Bench) -> Iterator[Row]:
         bench.config,
         task=bench.world,
         sizes=bench.set("sizes.", bench.config.sizes),
+        agent=bench.set("agent.", bench.config.agent),
         scalars=bench.set("scalars.", bench.config.scalars),
         schedule=bench.set("schedule.", dataclasses.replace(bench.config.schedule, learn_after=1_000)),
     )

@@ -17,22 +17,24 @@ import dataclasses
 from collections.abc import Sequence
 from functools import partial
 from itertools import product
-from typing import Any, NamedTuple
+from typing import Annotated, Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PRNGKeyArray
 
-from cuelearner_jax.config import RunConfig, Scalars, Schedule, check
+from cuelearner_jax.agents import ddqn
+from cuelearner_jax.config import Bounds, Frame, part
 from cuelearner_jax.devices import compiler_options, each_lane, each_lane_in_place
-from cuelearner_jax.environment import Environment, actions_of
+from cuelearner_jax.environment import Environment, Spaces
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.guides.untaught import NONE
 from cuelearner_jax.loop import Lane, make_lane, start_clock
 from cuelearner_jax.policies import Agent
+from cuelearner_jax.run_config import RunConfig, Settings, check
 from cuelearner_jax.types import Clock, TrainState
 
 
@@ -63,27 +65,59 @@ class Tuned(struct.PyTreeNode):
     noise_deg: Float[Array, ""]  # [deg]
 
 
+@part
+class Noisy(ddqn.Config):
+    """Options of an agent whose actions are turned at random while it learns."""
+
+    NAME: ClassVar[str] = "ddqn-noisy"
+    ABOUT: ClassVar[str] = "double DQN whose actions are turned at random while it learns"
+
+    noise_deg: Annotated[float, Bounds(0)] = 0.0
+    """Standard deviation of the random turn of every action [deg]."""
+
+    def make(self, frame: Frame, spaces: Spaces, bootstraps: bool = False) -> NoisyDQN:
+        """The agent for an environment's spaces."""
+        return NoisyDQN(self, frame, spaces, bootstraps)
+
+
+class NoisyDQN(ddqn.DoubleDQN):
+    """Double DQN whose actions are turned at random while it learns."""
+
+    def explore(
+        self, env: Any, options: Noisy, params: Any, obs: Float[Array, "n obs"], key: PRNGKeyArray
+    ) -> Float[Array, "n action"]:
+        """The greedy action, turned by a normal angle."""
+        greedy = super().explore(env, options, params, obs, key)
+        turns = jax.random.normal(key, (len(obs),))
+        return self.spaces.actions.toward(greedy, turns, jnp.deg2rad(options.noise_deg))
+
+
 @partial(jax.jit, static_argnames=("lane",))
 def _begin(lane: Lane, env: Any, params: Any, columns: Any) -> Tuned:
     def one(base: Array, seed: Array, rate: Array, noise: Array) -> Tuned:
         own = jax.tree.map(lambda leaf: leaf[base], params)
-        return Tuned(lane.init(env, jax.random.key(seed), 0, own), rate, noise)
+        state = lane.init(env, jax.random.key(seed), 0)
+        training = state.agent.training
+        follows = None if training.target_params is None else jax.tree.map(jnp.copy, own)
+        agent = state.agent.replace(params=own, training=training.replace(target_params=follows))
+        return Tuned(state.replace(agent=agent), rate, noise)
 
     return each_lane(one)(*columns)
 
 
 def _stretch(
-    lane: Lane, env: Any, scalars: Scalars, schedule: Schedule, clock: Clock, block: Tuned, iterations: int
+    lane: Lane, env: Any, settings: Settings, clock: Clock, block: Tuned, iterations: int
 ) -> tuple[Tuned, Clock, Float[Array, " lanes"]]:
     """So many iterations of all lanes: (block, clock, mean reward of each lane's own steps)."""
 
     def one(tuned: Tuned) -> tuple[Tuned, Clock, Array]:
-        own = dataclasses.replace(scalars, learning_rate=tuned.learning_rate, action_noise_deg=tuned.noise_deg)
+        agent = dataclasses.replace(settings.agent, learning_rate=tuned.learning_rate, noise_deg=tuned.noise_deg)
+        own = settings._replace(agent=agent)
 
         def iteration(carry: tuple[Clock, TrainState], _: None) -> tuple[tuple[Clock, TrainState], Array]:
             clock, state = carry
-            state, metrics = lane.iterate(env, own, schedule, clock, state)
-            return (lane.advance(clock, schedule), state), metrics["reward"]
+            state, metrics = lane.iterate(env, own, clock, state)
+            return (lane.advance(clock, own.schedule), state), metrics["reward"]
 
         (after, trained), rewards = jax.lax.scan(iteration, (clock, tuned.state), length=iterations)
         return tuned.replace(state=lane.kept_finite(trained, tuned.state)), after, rewards.mean()
@@ -109,10 +143,9 @@ class FineTuning:
         """
         if min(lanes.noise_deg) < 0 or min(lanes.learning_rate) < 0:
             raise UserError("step sizes and noises of fine-tuning must not be negative")
-        noise = float(max(lanes.noise_deg))  # decides whether there is any
-        scalars = dataclasses.replace(config.scalars, action_noise_deg=noise)
-        schedule = dataclasses.replace(config.schedule, random_steps=0, guidance_until=0, ask_at=(0,))
-        self.config = dataclasses.replace(config, scalars=scalars, schedule=schedule)
+        schedule = dataclasses.replace(config.schedule, random_steps=0, guidance_until=0)
+        agent = Noisy(**vars(config.agent))
+        self.config = dataclasses.replace(config, agent=agent, schedule=schedule)
         check(self.config)
         self.env, self.lanes, self.clock = env, lanes, start_clock()
         self._lane = make_lane(self.config, guidances.make(NONE.name, config.sizes, env), env, 0)
@@ -143,12 +176,11 @@ class FineTuning:
         together = self.config.sizes.num_envs
         if steps < 1 or steps % together:
             raise UserError(f"{steps} steps of {together} environments: give a multiple of sizes.num_envs ({together})")
-        config = self.config
         self.block, self.clock, rewards = self._train(
-            self._lane, self.env, config.scalars, config.schedule, self.clock, self.block, steps // together
+            self._lane, self.env, self.config.settings, self.clock, self.block, steps // together
         )
         return np.asarray(rewards)
 
     def policy(self, env: Any) -> Agent:
         """The agents as they are, a block, in a world."""
-        return Agent(self.block.state.agent.params, self.config.sizes, actions_of(env), env)
+        return Agent(self.block.state.agent.params, self.config.agent_in(env), env)

@@ -17,13 +17,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from cuelearner_envs.billiards.config import BilliardsConfig, make_environment
-from cuelearner_jax.agents.choice import greedy_actions
 from cuelearner_jax.config import GuideScalars
+from cuelearner_jax.environment import spaces_of
 from cuelearner_jax.guides.base import Kind
 from cuelearner_jax.guides.refining import Refined
 from cuelearner_jax.guides.untaught import Untaught
-from cuelearner_jax.spaces import DIRECTIONS
-from cuelearner_jax.tasks.billiards import SEEN_FROM_THE_STRIKE, SHIPPED_TEACHERS
+from cuelearner_jax.tasks.billiards import AGENT, SHIPPED_TEACHERS
 from cuelearner_jax.teachers import stored
 from cuelearner_jax.teachers.learned import LearnedTeacher
 from cuelearner_jax.types import GuidanceModel
@@ -51,8 +50,9 @@ class Perfect(Untaught):
     ) -> Refined:
         """Its best action in active rows; searched near the peaks, as agents search theirs: it is asked often."""
         told = teacher(self.name.removeprefix("perfect-"))
-        sizes = replace(SEEN_FROM_THE_STRIKE, q_layers=told.layers, directions=told.directions)
-        best = greedy_actions(sizes, DIRECTIONS, env, told.params, obs)
+        agent = replace(AGENT, q_layers=told.layers, directions=told.directions)
+        functions = agent.make("action", spaces_of(env))
+        best = functions.explore(env, agent, told.params, obs, jax.random.key(0))  # draws nothing
         return Refined(jnp.where(active[:, None], best, actions), active.astype(jnp.int32))
 
 

@@ -76,7 +76,7 @@ def scaled(piece: Piece, scale: Scale) -> Piece | None:
 
 
 def option(name: str, value: object) -> list[str]:
-    """An option as it is typed: `--sizes.no-pace` for a flag that is off."""
+    """An option as it is typed: `--no-…` for a flag that is off."""
     if isinstance(value, bool):
         group, _, flag = name.rpartition(".")
         return [f"--{group}.{flag if value else f'no-{flag}'}"]

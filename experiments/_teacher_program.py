@@ -19,7 +19,7 @@ import optax
 from flax import struct
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from cuelearner_jax.agents.learning import all_finite
+from cuelearner_jax.agents.networks import all_finite
 from cuelearner_jax.config import LARGEST, MOST_LAYERS
 from cuelearner_jax.environment import random_symmetries
 from cuelearner_jax.errors import UserError

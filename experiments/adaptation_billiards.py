@@ -32,7 +32,7 @@ ASKED: Mapping[str, Any] = {
     "scalars.nearest_share": 0.9,
 }
 TURN: Mapping[str, Any] = {"guidance": "offset"}  # recorded as `sizes.sees_turn`
-LEARNING: Mapping[str, Any] = {"task.teacher": "local_search", "sizes.num_envs": 10, "sizes.replay_capacity": 100_000}
+LEARNING: Mapping[str, Any] = {"task.teacher": "local_search", "sizes.num_envs": 10, "agent.replay_capacity": 100_000}
 STEPS, EVERY = 60_000, 10_000
 # As chosen on tuning episodes, see docs/results/adaptation.md.
 SLOW: Mapping[str, Any] = {"scalars.feedback_learning_rate": 3e-4}

@@ -28,7 +28,7 @@ TURN: Mapping[str, Any] = {**FRAME, "guidance": "offset"}  # recorded as `sizes.
 ROOMY: Mapping[str, Any] = {**FRAME, "scalars.eps_deg": 20.0}  # in rooms small turns lead nowhere
 SIDED: Mapping[str, Any] = {**TURN, "scalars.eps_deg": 20.0}
 NARROWER = (0.5, 0.25)  # shares of a bound that are tried on tuning episodes
-LEARNING: Mapping[str, Any] = {"sizes.num_envs": 10, "sizes.replay_capacity": 50_000}
+LEARNING: Mapping[str, Any] = {"sizes.num_envs": 10, "agent.replay_capacity": 50_000}
 # As chosen by tuning/turned_lidar/finetuning: a tenth of the step size of training.
 RATES, NOISES_DEG, STEPS, EVERY = (0.0001,), (0.0,), 20_000, 5_000
 

@@ -27,7 +27,9 @@ import scipy.stats
 
 import cuelearner_jax as cl
 from cuelearner_envs.billiards.teacher import NearbyTeacher
-from cuelearner_jax.config import AgentSizes, GuideSizes, Scalars
+from cuelearner_jax.agents import ddqn
+from cuelearner_jax.config import GuideSizes, Scalars
+from cuelearner_jax.environment import spaces_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import episodes
 from cuelearner_jax.feedback.answers import relative_feedback
@@ -71,8 +73,8 @@ def shipped() -> Agent:
     """The shipped teacher's network as an agent: every direction's expected reward, and the largest is taken."""
     own = cl.make("billiards", table=TABLE).env
     network = stored.load(SHIPPED_TEACHERS / TABLE, own, 0.0, 0.0)
-    sizes = AgentSizes(frame="action", q_layers=network.layers)
-    return Agent(network.params, sizes, env=own)
+    functions = ddqn.Config(q_layers=network.layers).make("action", spaces_of(own))
+    return Agent(network.params, functions, own)
 
 
 @partial(jax.jit, static_argnames="racks")

@@ -98,12 +98,14 @@ def main() -> int:
             parser.error(f"{asked.write} is of another agent or fit: leave out --resume")
         rows = before["rows"]
 
+    functions = config.agent_in(registry.find("navigation").environment(config.task))
+
     @partial(jax.jit, static_argnames="count")
     def in_jax(env: Any, params: Any, count: int) -> Any:
-        return rollout(Agent(params, config.sizes), env, episodes(), count, count * 200)
+        return rollout(Agent(params, functions), env, episodes(), count, count * 200)
 
     def in_c(env: Any, count: int) -> Any:
-        return judged(Agent(params, config.sizes), env, episodes(), count, count * 200)
+        return judged(Agent(params, functions), env, episodes(), count, count * 200)
 
     def tell(style: str, name: str, count: int, measure: Callable[[], dict[str, Any]]) -> None:
         known = {(row["style"], row["robot"], row["episodes"]) for row in rows}

@@ -22,20 +22,20 @@ ASKING = ("relative", "intent", "demonstration", "scalar", "dcoach")
 
 REGULATION: Options = {
     "preset": "paper",
-    "sizes.replay-capacity": 1_000_000,  # all steps: as many as the preset's
+    "agent.replay-capacity": 1_000_000,  # all steps: as many as the preset's
     "schedule.total-steps": 1_000_000,
     "schedule.guidance-until": 500_000,
     "schedule.eval-every": 50_000,
     "schedule.checkpoint-every": 250_000,
 }
 # How far agents get alone, whom the others are measured against.
-ALONE: Options = {"sizes.replay-capacity": 2_000_000, "schedule.total-steps": 2_000_000}
+ALONE: Options = {"agent.replay-capacity": 2_000_000, "schedule.total-steps": 2_000_000}
 EASY: Options = {
     "preset": "easy",
-    "sizes.directions": 3600,  # searched as the paper's preset does it, in half of the time
-    "sizes.coarse-directions": 360,
-    "sizes.coarse-dtype": "bfloat16",
-    "sizes.peaks": 4,
+    "agent.directions": 3600,  # searched as the paper's preset does it, in half of the time
+    "agent.coarse-directions": 360,
+    "agent.coarse-dtype": "bfloat16",
+    "agent.peaks": 4,
     "schedule.total-steps": 1_000_000,
     "schedule.guidance-until": 500_000,
     "schedule.eval-every": 50_000,
@@ -47,8 +47,8 @@ FULL: Options = {
     "schedule.eval-every": 100_000,
     "schedule.checkpoint-every": 10_000_000,
 }
-RAW: Options = {"sizes.frame": "raw", "sizes.pace": False}  # said whatever the presets say
-FRAME: Options = {"sizes.frame": "action", "sizes.pace": False}
+RAW: Options = {"sizes.frame": "raw", "arbiter": "episodes"}  # said whatever the presets say
+FRAME: Options = {"sizes.frame": "action", "arbiter": "episodes"}
 # To the step to which areas under the curve are taken, a little past the end of guidance.
 GUIDED: Options = {"schedule.total-steps": 550_000, "schedule.checkpoint-every": 550_000}
 # A tenth of the labels a round, asked in as many situations at once as keep that within minutes.
@@ -72,7 +72,6 @@ LEAD = 0.5  # a shot: guided episodes that earn that much more than own ones hav
 SURE: Options = {"scalars.aim-doubt": 1_000.0}  # recorded with `scalars.aim-share` 0.8: commit 5f07753 can repeat it
 WAYS: dict[str, Options] = {
     "nearest": {"scalars.answer": "nearest"},
-    "instalments": {"schedule.ask-at": (0, 100_000, 200_000), "scalars.ask-bound-deg": 20.0},
     "ensemble": {"sizes.ensemble": 5},
     "active": {"sizes.ensemble": 5, "sizes.candidates": 16},
 }
@@ -135,9 +134,9 @@ def variations(world: str, options: Options, minutes: int) -> list[Piece]:
         Piece(world, name, "relative", ("relative",), (500, 1_000), 8, {**options, **way}, minutes, "what is asked")
         for name, way in WAYS.items()
     ]
-    paced: Options = {**options, "sizes.pace": True, "scalars.pace-lead": LEAD}
+    paced: Options = {**options, "arbiter": "paced", "arbiter.lead": LEAD}
     random = {**paced, **FAULTS["random"]}
-    any_lead: Options = {**paced, "scalars.pace-lead": 0.0}
+    any_lead: Options = {**paced, "arbiter.lead": 0.0}
     serves = "guidance never costs"
     pieces += [
         Piece(world, "paced-any-lead", "heuristic", ("heuristic",), (), 8, any_lead, minutes // 2, serves),
@@ -154,8 +153,8 @@ def longer(world: str, options: Options, minutes: int) -> list[Piece]:
     options = {
         **options,
         **FRAME,
-        "sizes.pace": True,
-        "scalars.pace-lead": 0.0,
+        "arbiter": "paced",
+        "arbiter.lead": 0.0,
         "schedule.guidance-until": 1_000_000,
         **SURE,
     }
@@ -202,12 +201,12 @@ SCALES = {
         seeds=2,
         labels={25: 5, 500: 10, 10_000: 15},
         options={
-            "sizes.q-layers": 16,
+            "agent.q-layers": 16,
             "sizes.feedback-layers": 16,
-            "sizes.directions": 36,
-            "sizes.coarse-directions": 0,
+            "agent.directions": 36,
+            "agent.coarse-directions": 0,
             "sizes.num-envs": 10,
-            "sizes.replay-capacity": 200,
+            "agent.replay-capacity": 200,
             "sizes.labels-per-round": 5,
             "sizes.fit-steps": 20,
             "sizes.fit-batch-size": 10,
@@ -222,20 +221,19 @@ SCALES = {
             "schedule.eval-envs": 10,
             "schedule.checkpoint-every": 200,
         },
-        instead={"schedule.ask-at": (0, 100), "sizes.candidates": 5, "schedule.guide-eval-every": 5},
+        instead={"sizes.candidates": 5, "schedule.guide-eval-every": 5},
     ),
     "quick": Scale(
         "minutes a piece on an accelerator, to see where it goes",
         seeds=4,
         labels={100: 100, 500: 500, 1_000: 1_000, 10_000: 10_000},
         options={
-            "sizes.replay-capacity": 200_000,
+            "agent.replay-capacity": 200_000,
             "schedule.total-steps": 200_000,
             "schedule.guidance-until": 100_000,
             "schedule.eval-every": 20_000,
             "schedule.checkpoint-every": 100_000,
         },
-        instead={"schedule.ask-at": (0, 20_000, 40_000)},
     ),
     "paper": Scale("what is reported", reported=True),
 }

@@ -21,7 +21,7 @@ SCHEDULE = {
     "checkpoint-every": 100_000,
 }
 # As recorded, whatever the preset has become: raw coordinates, all directions searched.
-RAW = ["--sizes.frame", "raw", "--sizes.directions", "720", "--sizes.coarse-directions", "0"]
+RAW = ["--sizes.frame", "raw", "--agent.directions", "720", "--agent.coarse-directions", "0"]
 LABELS = ["--guidance", "none", "relative", "heuristic", "--labels", "500", "1000"]
 VARIANTS = {"plain": [*RAW, *LABELS], "mirrors": [*RAW, *LABELS, "--task.mirrors"]}
 
@@ -46,7 +46,7 @@ def main() -> int:
             "easy",
             "--seeds",
             "8",
-            "--sizes.no-pace",  # as what docs/results.md tells was made
+            "--arbiter episodes",  # as what docs/results.md tells was made
             *VARIANTS[name],
             *schedule,
             "--out",

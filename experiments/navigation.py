@@ -42,13 +42,13 @@ EVALUATIONS = {  # name: policy, style, episodes
 }
 
 
-def commands(out: Path, piece: str, dtype: str, resume: bool, extra: list[str]) -> list[list[str]]:
+def commands(out: Path, piece: str, resume: bool, extra: list[str]) -> list[list[str]]:
     """The command lines of one piece, in their order."""
     run = out / piece
     guidance, labels = PIECES[piece]
     options = [text for pair in {"--guidance": guidance, "--labels": labels, **SWEEP}.items() for text in pair]
     going_on = ["--resume"] if resume and (run / "config.json").exists() else []
-    made = [["sweep", "navigation", *options, "--sizes.target-dtype", dtype, "--out", str(run), *extra, *going_on]]
+    made = [["sweep", "navigation", *options, "--out", str(run), *extra, *going_on]]
     for name, (policy, style, episodes) in EVALUATIONS.items():
         measured = out / "evaluations" / f"{piece}-{name}.json"
         if not measured.exists() and (policy == "agent" or guidance != "none"):
@@ -65,9 +65,8 @@ def main() -> int:
     parser.add_argument("--out", type=Path, default=Path("runs/navigation"))
     parser.add_argument("--pieces", nargs="+", choices=PIECES, default=list(PIECES), help="these alone")
     parser.add_argument("--resume", action="store_true", help="go on with pieces that were begun, leave finished ones")
-    parser.add_argument("--dtype", choices=("float32", "bfloat16"), default="float32", help="of the targets' argmax")
     arguments, extra = parser.parse_known_args()
-    how = arguments.dtype, arguments.resume, extra
+    how = arguments.resume, extra
     asked = [line for piece in arguments.pieces for line in commands(arguments.out, piece, *how)]
     if arguments.pieces == list(PIECES):
         runs = [str(arguments.out / piece) for piece in PIECES]

@@ -23,7 +23,6 @@ SEEDS, VARIED_SEEDS = 16, 8
 
 HALLS: Options = {
     "preset": "paper",
-    "sizes.target-dtype": "bfloat16",
     "schedule.total-steps": 100_000,
     "schedule.guidance-until": 100_000,
     "schedule.eval-every": 10_000,
@@ -33,8 +32,8 @@ HALLS: Options = {
 }
 # Long enough for what is compared over the first 40,000 steps alone.
 HALF: Options = {"schedule.total-steps": 50_000, "schedule.guidance-until": 50_000}
-RAW: Options = {"sizes.frame": "raw", "sizes.pace": False}  # said whatever the presets say
-FRAME: Options = {"sizes.frame": "action", "sizes.pace": False}
+RAW: Options = {"sizes.frame": "raw", "arbiter": "episodes"}  # said whatever the presets say
+FRAME: Options = {"sizes.frame": "action", "arbiter": "episodes"}
 LEAD = 10.0  # a return: guided episodes that earn that much more than own ones have their whole share
 FAULTS: dict[str, Options] = {
     "flipped-05": {"scalars.mistake-probability": 0.05},
@@ -48,6 +47,7 @@ FAULTS: dict[str, Options] = {
 # Given on the labelling page by a script that sees the page alone, and errs (docs/labels.md).
 PAGE = Path(__file__).parents[1] / "docs/data/labelling/navigation/labels.parquet"
 WAYS: dict[str, Options] = {
+    # Labels in three instalments, the later ones about the agent's own actions: commit 5f07753 can repeat it.
     "instalments": {"schedule.ask-at": (0, 20_000, 40_000), "scalars.ask-bound-deg": 60.0},
     "ensemble": {"sizes.ensemble": 5},
     "active": {"sizes.ensemble": 5, "sizes.candidates": 16},
@@ -82,7 +82,7 @@ def variations(minutes: int) -> list[Piece]:
         Piece("clutter", name, "relative", relative, (100, 500), seeds, {**options, **way}, minutes, "what is asked")
         for name, way in WAYS.items()
     ]
-    paced: Options = {**options, "sizes.pace": True, "scalars.pace-lead": LEAD}
+    paced: Options = {**options, "arbiter": "paced", "arbiter.lead": LEAD}
     given: Options = {**options, "labels-from": PAGE}
     serves = "labels given on the page"
     pieces.append(Piece("clutter", "page", "relative", relative, (450, 500), seeds, given, brief, serves))
@@ -106,13 +106,12 @@ SCALES = {
         options={
             "task.worlds": 2,
             "task.max-steps": 20,
-            "sizes.q-layers": 16,
+            "agent.q-layers": 16,
             "sizes.feedback-layers": 16,
-            "sizes.directions": 12,
-            "sizes.target-directions": 6,
-            "sizes.target-dtype": "float32",
-            "sizes.n-step": 3,
-            "sizes.replay-capacity": 200,
+            "agent.directions": 12,
+            "agent.target-directions": 6,
+            "agent.n-step": 3,
+            "agent.replay-capacity": 200,
             "sizes.labels-per-round": 5,
             "sizes.fit-steps": 20,
             "sizes.fit-batch-size": 10,
@@ -126,23 +125,21 @@ SCALES = {
             "schedule.eval-steps": 100,
             "schedule.checkpoint-every": 200,
         },
-        instead={"schedule.ask-at": (0, 100)},
     ),
     "cpu": Scale(
         "ten minutes a piece on one core, 45 for five models: the networks of the preset quickstart, 12,000 steps",
         seeds=8,
         labels={100: 100, 500: 500},
         options={
-            "sizes.q-layers": (128, 128),
+            "agent.q-layers": (128, 128),
             "sizes.feedback-layers": (128, 128),
-            "sizes.directions": 36,
-            "sizes.target-directions": 12,
-            "sizes.target-dtype": "float32",
-            "sizes.batch-size": 64,
-            "sizes.replay-capacity": 50_000,
+            "agent.directions": 36,
+            "agent.target-directions": 12,
+            "agent.batch-size": 64,
+            "agent.replay-capacity": 50_000,
             "sizes.fit-steps": 400,
             "sizes.fit-batch-size": 64,
-            "scalars.learning-rate": 0.003,
+            "agent.learning-rate": 0.003,
             "schedule.total-steps": 12_000,
             "schedule.guidance-until": 12_000,
             "schedule.eval-every": 2_000,
@@ -150,7 +147,6 @@ SCALES = {
             "schedule.eval-steps": 6_000,
             "schedule.checkpoint-every": 12_000,
         },
-        instead={"schedule.ask-at": (0, 4_000, 8_000)},
         reported=True,
     ),
     "quick": Scale(
@@ -163,7 +159,6 @@ SCALES = {
             "schedule.eval-every": 5_000,
             "schedule.checkpoint-every": 50_000,
         },
-        instead={"schedule.ask-at": (0, 5_000, 10_000)},
     ),
     "paper": Scale("what is reported", reported=True),
 }

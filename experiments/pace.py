@@ -2,11 +2,12 @@
 
     python experiments/pace.py --out FOLDER
 
-The preset `quickstart` of the task `billiards` on tuning episodes and seeds, unguided and under three guides, each in a
-fixed half of the episodes and paced: 100 relative labels, 100 labels of which every turn is told the wrong way round
-half of the time, and the closest ball. Prints the mean over the learning curve, its difference from the same
-seeds unguided, and the share of guided steps. Options that are not listed here are given to every sweep, for instance
---scalars.pace-window 100. Called again, it goes on where it was interrupted.
+The preset `quickstart` of the task `billiards` on tuning episodes and seeds, unguided and under three guides: 100
+relative labels, 100 labels of which every turn is told the wrong way round half of the time, and the closest ball. Each
+guides a fixed half of the episodes, paced by any lead, and paced by the preset's lead. Prints the mean over the
+learning curve, its difference from the same seeds unguided, and the share of guided steps. Options that are not listed
+here are given to every sweep, for instance --schedule.total-steps 6000. Called again, it goes on where it was
+interrupted.
 """
 
 from __future__ import annotations
@@ -25,10 +26,15 @@ GUIDES = {
     "relative, answers at random": ["--guidance", "relative", "--scalars.mistake-probability", "0.5"],
     "heuristic": ["--guidance", "heuristic"],
 }
+HOW = {
+    "half": ["--arbiter", "episodes"],
+    "paced, any lead": ["--arbiter", "paced", "--arbiter.lead", "0"],
+    "paced": ["--arbiter", "paced"],
+}
 VARIANTS = {
     "none": ["--guidance", "none"],
-    **{f"{guide}, {how}": [*options, f"--sizes.{flag}"] for guide, options in GUIDES.items()
-       for how, flag in (("half", "no-pace"), ("paced", "pace"))},
+    **{f"{guide}, {how}": [*options, *how_options] for guide, options in GUIDES.items()
+       for how, how_options in HOW.items()},
 }  # fmt: skip
 
 

@@ -25,7 +25,7 @@ import tyro
 from jaxtyping import PRNGKeyArray
 
 from cuelearner_jax import config as configuration
-from cuelearner_jax.agents.learning import all_finite
+from cuelearner_jax.agents.networks import all_finite
 from cuelearner_jax.bridges.brax import supply_device_put_replicated
 from cuelearner_jax.errors import NotFinite, UserError
 from cuelearner_jax.storage.folders import claimed, in_use
@@ -113,7 +113,7 @@ LARGEST_ROBOTS = 1 << 20  # each keeps some kilobytes of physics
 
 def check(config: Training) -> None:
     """Raises UserError for values that cannot work."""
-    configuration.check_whole(config, "train")
+    configuration.check_part(config, "train")
     for name in ("robots", "measured_robots"):
         if getattr(config, name) > LARGEST_ROBOTS:
             raise UserError(f"train.{name} is {getattr(config, name)}: give at most {LARGEST_ROBOTS}")

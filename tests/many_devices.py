@@ -20,9 +20,10 @@ from cuelearner_jax.runs.order import Order
 from cuelearner_jax.terminal import Interrupted
 
 CONFIG = probes.config(
-    sizes={"q_layers": (16,), "feedback_layers": (16,), "fit_steps": 100, "replay_capacity": 40},
+    sizes={"feedback_layers": (16,), "fit_steps": 100},
     scalars={"discount": 0.5},
     schedule={"total_steps": 64, "guidance_until": 48, "eval_every": 16, "checkpoint_every": 32},
+    agent={"q_layers": (16,), "replay_capacity": 40},
 )
 GRID = Grid(("relative",), seeds=(3, 5, 8), labels=(15, 30))  # 6 lanes, which do not divide among 4
 

@@ -14,10 +14,12 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from cuelearner_jax.config import RunConfig, Scalars, Schedule, Sizes, digest
+from cuelearner_jax.agents import ddqn
+from cuelearner_jax.config import Scalars, Schedule, Sizes, digest
 from cuelearner_jax.environment import Aims, Features, Quantity, WholeObservations
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.loop import make_program
+from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.spaces.directions import difference, evenly_spaced, from_angle, inward, rotate
 from cuelearner_jax.task import Body, Task
 from cuelearner_jax.types import Label, Step
@@ -139,20 +141,17 @@ def make_task(name="window"):
     return Task(name, "the bandit", WindowConfig, (body,), teacher=lambda config, env: Expert(env))
 
 
-SIZES = Sizes(
+SIZES = Sizes(feedback_layers=(32, 32), num_envs=4, labels_per_round=10, fit_steps=200, fit_batch_size=32)
+SCALARS = Scalars(max_grad_norm=10.0, eps_deg=20.0, tau_deg=1.0, feedback_learning_rate=5e-3)
+AGENT = ddqn.Config(
     q_layers=(32, 32),
-    feedback_layers=(32, 32),
     directions=16,
     target_directions=16,
-    num_envs=4,
     batch_size=32,
     replay_capacity=4000,
     optimizer="adam",
-    labels_per_round=10,
-    fit_steps=200,
-    fit_batch_size=32,
+    learning_rate=3e-3,
 )
-SCALARS = Scalars(learning_rate=3e-3, max_grad_norm=10.0, eps_deg=20.0, tau_deg=1.0, feedback_learning_rate=5e-3)
 SCHEDULE = Schedule(
     total_steps=48,
     random_steps=8,
@@ -163,17 +162,15 @@ SCHEDULE = Schedule(
     eval_envs=10,
     checkpoint_every=16,
 )
-CONFIG = RunConfig(WindowConfig(), SIZES, SCALARS, SCHEDULE)
+CONFIG = RunConfig(WindowConfig(), SIZES, SCALARS, SCHEDULE, AGENT)
+SETTINGS = CONFIG.settings
+FUNCTIONS = CONFIG.agent_in(Window())  # of the agent, on the bandit
 
 
-def config(sizes=None, scalars=None, schedule=None):
-    """`CONFIG` with other values."""
-    return RunConfig(
-        WindowConfig(),
-        dataclasses.replace(SIZES, **(sizes or {})),
-        dataclasses.replace(SCALARS, **(scalars or {})),
-        dataclasses.replace(SCHEDULE, **(schedule or {})),
-    )
+def config(arbiter=None, **groups):
+    """`CONFIG` with other values in its groups, and with another arbiter."""
+    changed = {name: dataclasses.replace(getattr(CONFIG, name), **values) for name, values in groups.items()}
+    return dataclasses.replace(CONFIG, arbiter=arbiter or CONFIG.arbiter, **changed)
 
 
 @cache
@@ -197,9 +194,9 @@ def stored(state, lane, steps):
     return {name: rows[:, columns] for name, columns in names.items()}
 
 
-def greedy_actions(q, params, obs, sizes=SIZES):
+def greedy_actions(q, params, obs, directions=AGENT.directions):
     """The argmax of one lane's values over the agent's directions, for observations (n, 2)."""
-    options = evenly_spaced(sizes.directions)
+    options = evenly_spaced(directions)
     values = jax.vmap(lambda one: q(params, one, options)[:, 0])(jnp.asarray(obs))
     return np.asarray(options[jnp.argmax(values, -1)])
 

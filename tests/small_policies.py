@@ -3,17 +3,13 @@
 import dataclasses
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import probes
 
 from cuelearner_jax.adaptation import program
 from cuelearner_jax.adaptation.adapting import Adaptation, Adapted, Judging
 from cuelearner_jax.adaptation.judging import Judged
-from cuelearner_jax.agents import view
-from cuelearner_jax.agents.networks import q_network
 from cuelearner_jax.config import GuideSizes
-from cuelearner_jax.environment import spaces_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.policies import Agent, Common
@@ -35,9 +31,8 @@ def find(name):
 
 def agent():
     """An untrained agent."""
-    widths = view.widths(probes.SIZES.frame, spaces_of(ENV))
-    params = q_network(probes.SIZES.q_layers).init(jax.random.key(4), *map(jnp.zeros, widths))
-    return Agent(params, probes.SIZES, env=ENV)
+    functions = probes.CONFIG.agent_in(ENV)
+    return Agent(functions.init(jax.random.key(4))[0], functions, ENV)
 
 
 def write(folder, overwrite=False, origin="run"):

@@ -9,7 +9,7 @@ import pytest
 from cuelearner_jax.runs import sweep
 
 SMALL = [
-    *("--sizes.q-layers", "16", "--sizes.feedback-layers", "16", "--sizes.directions", "36"),
+    *("--agent.q-layers", "16", "--sizes.feedback-layers", "16", "--agent.directions", "36"),
     *("--sizes.fit-steps", "20", "--task.search-directions", "90"),
     # However many seeds a test takes, its programs are those of one lane, which the compilation cache then has.
     *("--sizes.lanes-per-block", "1"),

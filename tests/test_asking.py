@@ -10,10 +10,10 @@ import numpy as np
 import probes
 import pytest
 
-from cuelearner_jax import asking, loop
+from cuelearner_jax import asking
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.loop import start_clock
-from cuelearner_jax.policies import Agent, Heuristic, Taught, Teaching, Uniform
+from cuelearner_jax.policies import Heuristic, Taught, Teaching, Uniform
 from cuelearner_jax.spaces import directions
 
 ENV, EXPERT = probes.Window(), probes.Expert(probes.Window())
@@ -186,73 +186,3 @@ def test_labels_given_elsewhere_are_fitted_once():
     given = begun().replace(labels=labels, asked=begun().budget)
     chex.assert_trees_all_equal(taken, fit(ENV, probes.SCALARS, given, LANE_KEY))
     assert bool(taken.model.fitted)
-
-
-# Instalments.
-
-
-def test_instalments_are_equal_up_to_whole_rounds_and_end_with_the_budget():
-    shares = lambda budget, count: [asking.share(budget, i, count, probes.SIZES) for i in range(count)]  # noqa: E731
-    assert shares(100, 1) == [100]
-    assert shares(35, 1) == [35]
-    assert shares(100, 2) == [50, 100]
-    assert shares(100, 4) == [30, 50, 80, 100]
-    assert shares(25, 2) == [20, 25]
-    for budget in range(21, 200):
-        found = np.diff([0, *shares(budget, 3)])
-        assert found.sum() == budget
-        assert found.min() > 0
-        rounds = -(-found // ROUND)
-        assert rounds.max() - rounds.min() <= 1
-
-
-def test_a_guide_asks_until_its_instalment_is_done_and_then_waits():
-    guide = begun(budget=2 * ROUND)
-    one = label_round(ENV, EXPERT, probes.SCALARS, Uniform(), guide, LANE_KEY, jnp.asarray(ROUND))
-    waited = label_round(ENV, EXPERT, probes.SCALARS, Uniform(), one, LANE_KEY, jnp.asarray(ROUND))
-    chex.assert_trees_all_equal(waited, one)
-    assert int(one.asked) == int(one.labels.valid.sum()) == ROUND
-    # What it has waited for changes nothing: it goes on as if it had asked all at once.
-    done = label_round(ENV, EXPERT, probes.SCALARS, Uniform(), waited, LANE_KEY, jnp.asarray(2 * ROUND))
-    at_once = guide
-    for _ in range(2):
-        at_once = label_round(ENV, EXPERT, probes.SCALARS, Uniform(), at_once, LANE_KEY, jnp.asarray(2 * ROUND))
-    chex.assert_trees_all_equal(done, at_once)
-    assert int(done.asked) == 2 * ROUND
-
-
-def test_later_questions_are_about_the_agents_greedy_actions_refined_within_the_bound():
-    program = probes.window_program("relative", 2 * ROUND)
-    clock, state = start_clock(), probes.start(program, [3, 4], [2 * ROUND, 15])
-    clock, state = program.label_round(ENV, EXPERT, probes.SCALARS, clock, state, jnp.array([ROUND, ROUND]))
-    assert np.asarray(state.guide.labels.valid).sum(1).tolist() == [ROUND, ROUND]
-    first = jax.tree.map(np.asarray, state.guide.labels)
-    bounded = dataclasses.replace(probes.SCALARS, ask_bound_deg=7.0)
-    plain = dataclasses.replace(bounded, refined_fraction=0.0)
-    params = jax.tree.map(jnp.copy, state.agent.params)
-    for scalars, turned in ((plain, False), (bounded, True)):
-        kept = jax.tree.map(jnp.copy, state)
-        _, later = program.label_round(ENV, EXPERT, scalars, clock, kept, state.guide.budget, own=True)
-        for lane, budget in enumerate((2 * ROUND, 15)):
-            labels, before = probes.lane(later.guide.labels, lane), probes.lane(first, lane)
-            assert labels.valid.tolist() == [True] * budget + [False] * (2 * ROUND - budget)  # never past the budget
-            chex.assert_trees_all_equal(*(jax.tree.map(lambda leaf: leaf[:ROUND], one) for one in (labels, before)))
-            greedy = Agent(probes.lane(params, lane), probes.SIZES).act(LANE_KEY, None, jnp.asarray(labels.obs[ROUND:]))
-            away = np.degrees(np.abs(directions.difference(greedy, labels.action[ROUND:])))
-            assert away.max() <= 7.0 + 1e-3
-            assert (away.max() > 1.0) == turned
-        assert later.guide.asked.tolist() == [2 * ROUND, 15]
-
-
-def test_guided_episodes_keep_to_the_bound_once_there_are_labels_about_the_agents_own_actions():
-    config = probes.config(scalars={"ask_bound_deg": 9.0}, schedule={"ask_at": (0, 16)})
-    lane = loop.make_lane(config, guidances.make("heuristic", config.sizes, ENV), ENV, 0)
-    state = jax.tree.map(lambda leaf: leaf[0], probes.start(probes.window_program("heuristic"), [3], [0]))
-    state = state.replace(agent=state.agent.replace(guided=jnp.array([True, True, False, True])))
-    base = directions.rotate(state.agent.obs, 0.5)  # 1.5 rad from the heuristic's
-    one = dataclasses.replace(config.schedule, ask_at=(0,))
-    for schedule, step, away in ((config.schedule, 15, 1.5), (config.schedule, 16, np.deg2rad(9.0)), (one, 16, 1.5)):
-        clock = start_clock().replace(step=jnp.asarray(step))
-        found = lane.guide(ENV, config.scalars, schedule, clock, state, base)
-        turned = np.abs(directions.difference(base, found.actions))
-        np.testing.assert_allclose(turned, [away, away, 0, away], atol=1e-5)

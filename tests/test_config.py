@@ -8,20 +8,22 @@ import jax
 import probes
 import pytest
 
-from cuelearner_jax import config
-from cuelearner_jax.config import RunConfig, Scalars, Schedule, Sizes
+from cuelearner_jax import config, run_config
+from cuelearner_jax.agents import ddqn
+from cuelearner_jax.arbiters import episodes, paced
+from cuelearner_jax.config import Scalars, Schedule, Sizes, static
 from cuelearner_jax.errors import UserError
+from cuelearner_jax.run_config import RunConfig
 
 
 @pytest.mark.parametrize(
     ("group", "values", "message"),
     [
-        ("sizes", {"directions": 0}, "sizes.directions is 0"),
-        ("sizes", {"target_directions": -1}, "sizes.target_directions is -1"),
+        ("agent", {"directions": 0}, "agent.directions is 0"),
+        ("agent", {"target_directions": -1}, "agent.target_directions is -1"),
         ("sizes", {"num_envs": 0}, "sizes.num_envs is 0"),
-        ("sizes", {"batch_size": 0}, "sizes.batch_size is 0"),
-        ("sizes", {"replay_capacity": 0}, "sizes.replay_capacity is 0"),
-        ("sizes", {"updates_per_step": 0}, "sizes.updates_per_step is 0"),
+        ("agent", {"batch_size": 0}, "agent.batch_size is 0"),
+        ("agent", {"replay_capacity": 0}, "agent.replay_capacity is 0"),
         ("sizes", {"labels_per_round": 0}, "sizes.labels_per_round is 0"),
         ("sizes", {"fit_steps": 0}, "sizes.fit_steps is 0"),
         ("sizes", {"fit_batch_size": 0}, "sizes.fit_batch_size is 0"),
@@ -29,12 +31,12 @@ from cuelearner_jax.errors import UserError
         ("sizes", {"guide_directions": 0}, "sizes.guide_directions is 0"),
         ("sizes", {"replay_steps": 0}, "sizes.replay_steps is 0"),
         ("sizes", {"lanes_per_block": -1}, "sizes.lanes_per_block is -1"),
-        ("sizes", {"q_layers": ()}, "at least one layer"),
+        ("agent", {"q_layers": ()}, "at least one layer"),
         ("sizes", {"feedback_layers": ()}, "at least one layer"),
-        ("sizes", {"q_layers": (32, 0)}, "positive width"),
-        ("sizes", {"replay_capacity": 4001}, "sizes.replay_capacity is 4001: give a multiple of sizes.num_envs"),
+        ("agent", {"q_layers": (32, 0)}, "positive width"),
+        ("agent", {"replay_capacity": 4001}, "agent.replay_capacity is 4001: give a multiple of sizes.num_envs"),
         ("sizes", {"fit_steps": 210}, "sizes.fit_steps is 210: give a multiple of sizes.validate_every"),
-        ("scalars", {"learning_rate": -0.1}, "scalars.learning_rate is -0.1"),
+        ("agent", {"learning_rate": -0.1}, "agent.learning_rate is -0.1"),
         ("scalars", {"max_grad_norm": -1.0}, "scalars.max_grad_norm is -1.0"),
         ("scalars", {"k_max": -1}, "scalars.k_max is -1"),
         ("scalars", {"tau_deg": -1.0}, "scalars.tau_deg is -1.0"),
@@ -42,9 +44,6 @@ from cuelearner_jax.errors import UserError
         ("scalars", {"eps_deg": 181.0}, "scalars.eps_deg is 181.0"),
         ("scalars", {"discount": 1.0}, "scalars.discount is 1.0"),
         ("scalars", {"discount": -0.5}, "scalars.discount is -0.5"),
-        ("scalars", {"guided_probability": 1.5}, "scalars.guided_probability is 1.5: give a number from 0 to 1"),
-        ("scalars", {"pace_window": 0.5}, "scalars.pace_window is 0.5: give at least 1 episode"),
-        ("scalars", {"pace_floor": 0.6}, "scalars.pace_floor is 0.6: give at most 0.5"),
         ("scalars", {"mistake_probability": -0.1}, "scalars.mistake_probability is -0.1"),
         ("scalars", {"silence_probability": 2.0}, "scalars.silence_probability is 2.0"),
         ("scalars", {"refined_fraction": 1.1}, "scalars.refined_fraction is 1.1"),
@@ -54,8 +53,8 @@ from cuelearner_jax.errors import UserError
         ("scalars", {"scalar_within_deg": math.nan}, "scalars.scalar_within_deg is nan"),
         ("scalars", {"explored_fraction": 1.5}, "scalars.explored_fraction is 1.5: give a number from 0 to 1"),
         ("scalars", {"correction_replay": 0}, "scalars.correction_replay is 0: give a positive number"),
-        ("scalars", {"polyak": 1.5}, "scalars.polyak is 1.5: give a number from 0 to 1"),
-        ("scalars", {"learning_rate": math.nan}, "scalars.learning_rate is nan: give a finite number"),
+        ("agent", {"polyak": 1.5}, "agent.polyak is 1.5: give a number from 0 to 1"),
+        ("agent", {"learning_rate": math.nan}, "agent.learning_rate is nan: give a finite number"),
         ("scalars", {"teacher_bias_deg": -math.inf}, "scalars.teacher_bias_deg is -inf: give a finite number"),
         ("scalars", {"max_grad_norm": 0.0}, "scalars.max_grad_norm is 0.0: give a positive number"),
         ("schedule", {"total_steps": 0}, "schedule.total_steps is 0"),
@@ -63,7 +62,7 @@ from cuelearner_jax.errors import UserError
         ("schedule", {"eval_steps": 0}, "schedule.eval_steps is 0"),
         ("schedule", {"eval_envs": 0}, "schedule.eval_envs is 0"),
         ("schedule", {"checkpoint_every": 0}, "schedule.checkpoint_every is 0"),
-        ("schedule", {"target_every": 0}, "schedule.target_every is 0"),
+        ("agent", {"target_every": 0}, "agent.target_every is 0"),
         ("schedule", {"eval_every": 18}, "schedule.eval_every is 18: give a multiple of sizes.num_envs"),
         ("schedule", {"total_steps": 50}, "schedule.total_steps is 50: give a multiple of schedule.eval_every"),
         ("schedule", {"checkpoint_every": 24}, "schedule.checkpoint_every is 24: give a multiple"),
@@ -78,33 +77,43 @@ from cuelearner_jax.errors import UserError
         ),
         ("sizes", {"candidates": 8}, "sizes.candidates is 8: questions are chosen by the disagreement of members"),
         ("sizes", {"candidates": 8}, "give a sizes.ensemble above 1 too, or sizes.ask_all"),
-        ("scalars", {"ask_bound_deg": 20.0}, "ask_bound_deg is 20.0, which bounds later instalments, and there is but"),
-        ("scalars", {"ask_bound_deg": 0.0}, "scalars.ask_bound_deg is 0.0: give an angle"),
-        ("schedule", {"ask_at": ()}, "schedule.ask_at is empty: give steps in ascending order, the first of them 0"),
-        ("schedule", {"ask_at": (16,)}, "schedule.ask_at is 16: give steps in ascending order, the first of them 0"),
-        ("schedule", {"ask_at": (0, 16, 16)}, "schedule.ask_at is 0 16 16: give steps in ascending order"),
-        ("schedule", {"ask_at": (0, 10)}, "schedule.ask_at is 10: give a multiple of schedule.eval_every (16)"),
-        ("schedule", {"ask_at": (0, 32)}, "schedule.ask_at is 0 32: give steps below schedule.guidance_until (24)"),
-        (
-            "schedule",
-            {"ask_at": (0, 48), "guidance_until": 100},
-            "schedule.ask_at is 0 48: give steps below schedule.total_steps (48)",
-        ),
         ("schedule", {"guide_eval_every": -10}, "schedule.guide_eval_every is -10"),
         ("schedule", {"guide_eval_every": 15}, "schedule.guide_eval_every is 15: give a multiple of sizes.labels"),
     ],
 )
 def test_values_that_cannot_work_are_refused(group, values, message):
     with pytest.raises(UserError) as error:
-        config.check(probes.config(**{group: values}))
+        run_config.check(probes.config(**{group: values}))
     assert message in str(error.value)
     assert "\n" not in str(error.value)
 
 
+def test_options_of_a_part_are_checked_under_its_name():
+    with pytest.raises(UserError, match=r"arbiter\.probability is 1\.5: give a number from 0 to 1"):
+        run_config.check(probes.config(arbiter=episodes.Config(1.5)))
+    with pytest.raises(UserError, match=r"arbiter\.lead is -1"):
+        run_config.check(probes.config(arbiter=paced.Config(lead=-1.0)))
+
+
+def test_a_part_is_a_tree_of_its_floats_and_the_rest_is_its_structure():
+    assert jax.tree.leaves(ddqn.Config(learning_rate=0.5, n_step_weight=0.25, polyak=0.125)) == [0.5, 0.25, 0.125]
+    assert hash(static(ddqn.Config(learning_rate=0.5))) == hash(static(ddqn.Config()))
+    assert static(ddqn.Config(n_step=2)) != static(ddqn.Config())
+
+
+def test_a_run_s_options_come_back_from_json_with_their_parts():
+    asked = dataclasses.replace(probes.CONFIG, arbiter=paced.Config(lead=0.5))
+    told = json.loads(json.dumps(run_config.to_json(asked)))
+    assert (told["agent"]["name"], told["arbiter"]["name"]) == ("ddqn", "paced")
+    assert run_config.from_json(asked.task, told) == asked
+    with pytest.raises(UserError, match="unknown agent 'sac'"):
+        run_config.from_json(asked.task, {**told, "agent": {"name": "sac"}})
+
+
 def test_defaults_and_probes_can_work():
-    config.check(RunConfig(probes.WindowConfig()))
-    config.check(probes.CONFIG)
-    config.check(probes.config(scalars={"teacher_bias_deg": -3.0, "eps_deg": 180.0, "k_max": 0}))
+    run_config.check(RunConfig(probes.WindowConfig()))
+    run_config.check(probes.CONFIG)
+    run_config.check(probes.config(scalars={"teacher_bias_deg": -3.0, "eps_deg": 180.0, "k_max": 0}))
 
 
 def test_bootstraps_with_a_discount():
@@ -135,11 +144,8 @@ def test_other_scalars_and_schedules_compile_nothing_again(group):
     assert float(total(group)) == pytest.approx(before)
     numbers = {name: value for name, value in dataclasses.asdict(group).items() if not isinstance(value, str)}
     for name, value in numbers.items():
-        several = isinstance(value, tuple)  # of which the number is fixed
-        (first, *rest) = value if several else (value,)
-        other = 2 * first + type(first)(1000)
-        changed = dataclasses.replace(group, **{name: (other, *rest) if several else other})
-        assert float(total(changed)) == pytest.approx(before + first + 1000)
+        changed = dataclasses.replace(group, **{name: 2 * value + type(value)(1000)})
+        assert float(total(changed)) == pytest.approx(before + value + 1000)
     assert len(traced) == 1
     assert type(traced[0]) is type(group)
 
@@ -152,7 +158,7 @@ def test_the_digest_does_not_change_from_version_to_version():
 def test_the_digest_depends_on_values_and_not_on_order():
     values = config.to_json(probes.SIZES)
     assert config.digest(values) == config.digest(dict(reversed(values.items())))
-    assert config.digest(values) != config.digest(values | {"directions": 17})
+    assert config.digest(values) != config.digest(values | {"num_envs": 17})
     assert len(config.digest(values)) == 12
 
 

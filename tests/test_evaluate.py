@@ -13,7 +13,6 @@ from cuelearner_jax.config import Schedule
 from cuelearner_jax.devices import lane_mesh
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.policies import Agent, Uniform
-from cuelearner_jax.spaces import DIRECTIONS
 
 LONGEST = 4
 KEY = jax.random.key(7)
@@ -80,7 +79,7 @@ def test_lanes_in_stretches_are_bitwise_those_in_one(monkeypatch, at_once):
     """Three lanes, one, two or all at a time."""
     monkeypatch.setattr(evaluate, "portions", lambda: Portions(at_once))
     program = probes.window_program("none")
-    agents = Agent(probes.start(program, [0, 1, 2], [0, 0, 0]).agent.params, probes.SIZES, DIRECTIONS)
+    agents = Agent(probes.start(program, [0, 1, 2], [0, 0, 0]).agent.params, probes.FUNCTIONS)
     told = []
     watched = evaluate.watched_lanes(ENV, agents, KEY, 10, 120, lambda *given: told.append(given))
     mesh = lane_mesh(jax.local_devices()[:1])

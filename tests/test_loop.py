@@ -12,8 +12,9 @@ import probes
 import pytest
 
 from cuelearner_jax import asking, evaluate, loop
-from cuelearner_jax.agents.learning import mirrored
 from cuelearner_jax.agents.networks import applied, q_network
+from cuelearner_jax.agents.replay import mirrored
+from cuelearner_jax.arbiters import episodes
 from cuelearner_jax.devices import lane_mesh
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.policies import Agent, Guided, Uniform
@@ -23,22 +24,27 @@ from cuelearner_jax.types import Label, Transition
 ENV, EXPERT = probes.Window(), probes.Expert(probes.Window())
 MESH = lane_mesh()
 DEG = math.pi / 180
-q = applied(q_network(probes.SIZES.q_layers))
+q = applied(q_network(probes.AGENT.q_layers))
 
 
 LARGEST = 60  # labels of the largest budget
 STRETCH = 12  # iterations of one call, always the same: another number compiles again
 
 
-def replaced(**values):
-    return dataclasses.replace(probes.SCHEDULE, **values)
+def replaced(probability=0.5, learning_rate=probes.AGENT.learning_rate, **schedule):
+    """The settings of `probes.CONFIG` with others."""
+    return probes.SETTINGS._replace(
+        schedule=dataclasses.replace(probes.SCHEDULE, **schedule),
+        arbiter=episodes.Config(probability),
+        agent=dataclasses.replace(probes.AGENT, learning_rate=learning_rate),
+    )
 
 
-def run(program, scalars, schedule, clock, state, stretches=1):
+def run(program, settings, clock, state, stretches=1):
     """Trains for some stretches; the metrics of the last one."""
     metrics = {}
     for _ in range(stretches):
-        clock, state, metrics = program.train(ENV, scalars, schedule, clock, state, STRETCH)
+        clock, state, metrics = program.train(ENV, settings, clock, state, STRETCH)
     return clock, state, metrics
 
 
@@ -49,8 +55,8 @@ def test_the_agent_learns_a_bandit_by_itself():
     program = probes.window_program("none")
     state = probes.start(program, [0], [0])
     before = reward_of(state.agent.params)
-    schedule = replaced(random_steps=400, learn_after=32)
-    _, state, metrics = run(program, probes.SCALARS, schedule, loop.start_clock(), state, stretches=34)
+    settings = replaced(random_steps=400, learn_after=32)
+    _, state, metrics = run(program, settings, loop.start_clock(), state, stretches=34)
     assert reward_of(state.agent.params)[0] == 1.0
     assert before[0] < 0.8
     assert metrics["loss"].shape == (1,)
@@ -64,7 +70,7 @@ def test_the_agent_learns_a_bandit_by_itself():
 
 def reward_of(params):
     key = jax.random.key(7)
-    agents = Agent(params, probes.SIZES)
+    agents = Agent(params, probes.FUNCTIONS)
     measured = evaluate.evaluate_lanes(ENV, agents, key, mesh=MESH, num_envs=40, steps=80)
     np.testing.assert_array_equal(measured["reward"], measured["hit"])
     return np.asarray(measured["reward"])
@@ -72,8 +78,9 @@ def reward_of(params):
 
 CHAIN = probes.config(
     sizes={"num_envs": 2},
-    scalars={"discount": 0.5, "polyak": 0.05, "learning_rate": 5e-3},
-    schedule={"random_steps": 2000, "learn_after": 50, "target_every": 1},
+    scalars={"discount": 0.5},
+    schedule={"random_steps": 2000, "learn_after": 50},
+    agent={"polyak": 0.05, "learning_rate": 0.005, "target_every": 1},
 )
 
 
@@ -83,12 +90,13 @@ def chain_program():
     return loop.make_program(CHAIN, guidances.make("heuristic", CHAIN.sizes, env), env, 0)
 
 
-def chain_values(truncates, schedule=CHAIN.schedule):
+def chain_values(truncates, polyak=CHAIN.agent.polyak):
     """Learned values at both places of east, north, west and south; and the state."""
     env = probes.Chain(jnp.array(truncates))
     state = probes.start(chain_program(), [3], [0], env)
-    assert state.agent.target_params is not None
-    _, state, _ = chain_program().train(env, CHAIN.scalars, schedule, loop.start_clock(), state, 1000)
+    assert state.agent.training.target_params is not None
+    settings = CHAIN.settings._replace(agent=dataclasses.replace(CHAIN.agent, polyak=polyak))
+    _, state, _ = chain_program().train(env, settings, loop.start_clock(), state, 1000)
     params = probes.lane(state.agent.params, 0)
     values = [np.asarray(q(params, env.observe(place), directions.evenly_spaced(4)))[:, 0] for place in (0, 1)]
     return values, state
@@ -109,14 +117,14 @@ def test_values_of_a_chain_that_is_truncated():
     np.testing.assert_allclose(start, [1.0, 1.5, 1.0, 0.5], atol=0.1)
 
 
-def test_the_target_network_follows_every_so_many_updates():
-    _, never = chain_values(False, dataclasses.replace(CHAIN.schedule, target_every=10**6))
+def test_the_target_network_follows_at_its_rate():
+    _, never = chain_values(False, polyak=0.0)
     fresh = probes.start(chain_program(), [3], [0], probes.Chain(jnp.array(False)))
-    before, after = (jax.tree.leaves(state.agent.target_params) for state in (fresh, never))
+    before, after = (jax.tree.leaves(state.agent.training.target_params) for state in (fresh, never))
     for one, other in zip(after, before, strict=True):
         np.testing.assert_array_equal(one, other)
     _, always = chain_values(False)
-    assert np.abs(jax.tree.leaves(always.agent.target_params)[1] - before[1]).max() > 1e-3
+    assert np.abs(jax.tree.leaves(always.agent.training.target_params)[1] - before[1]).max() > 1e-3
 
 
 def test_replay_keeps_what_each_step_led_to():
@@ -136,23 +144,22 @@ def test_replay_keeps_what_each_step_led_to():
 # Who acts when.
 
 
-def acted(kind, scalars=probes.SCALARS, stretches=1, **schedule):
+def acted(kind, probability=0.5, stretches=1, **schedule):
     """What one lane's environments met and did, and its parameters; nothing is learned."""
     program = probes.window_program(kind, LARGEST if kind == "relative" else 0)
     state = probes.start(program, [0], [0])
-    schedule = replaced(learn_after=10**9, **schedule)
-    clock, state, _ = run(program, scalars, schedule, loop.start_clock(), state, stretches)
+    settings = replaced(probability, learn_after=10**9, **schedule)
+    clock, state, _ = run(program, settings, loop.start_clock(), state, stretches)
     assert int(clock.step) == 48 * stretches
     assert int(clock.update) == 0
     return probes.stored(state, 0, 48 * stretches), probes.lane(state.agent.params, 0)
 
 
 def test_first_uniform_then_guided_then_greedy():
-    always = dataclasses.replace(probes.SCALARS, guided_probability=1.0)
-    met, params = acted("heuristic", scalars=always)
+    met, params = acted("heuristic", probability=1.0)
     greedy = probes.greedy_actions(q, params, met["obs"])
     turned = np.asarray(ENV.heuristic(met["obs"]))
-    options = np.asarray(directions.evenly_spaced(probes.SIZES.directions))
+    options = np.asarray(directions.evenly_spaced(probes.AGENT.directions))
     among = np.abs(met["action"][:, None] - options).max(-1).min(-1)
     assert among[:8].min() > 1e-4  # a uniform direction is none of the sixteen
     np.testing.assert_allclose(met["action"][8:24], turned[8:24], atol=1e-6)
@@ -161,17 +168,17 @@ def test_first_uniform_then_guided_then_greedy():
 
 
 def test_guided_with_probability_zero_is_greedy_after_the_random_steps():
-    met, params = acted("heuristic", scalars=dataclasses.replace(probes.SCALARS, guided_probability=0.0))
+    met, params = acted("heuristic", probability=0.0)
     np.testing.assert_array_equal(met["action"][8:], probes.greedy_actions(q, params, met["obs"])[8:])
 
 
 def test_none_is_greedy_whatever_the_probability():
-    met, params = acted("none", scalars=dataclasses.replace(probes.SCALARS, guided_probability=1.0))
+    met, params = acted("none", probability=1.0)
     np.testing.assert_array_equal(met["action"][8:], probes.greedy_actions(q, params, met["obs"])[8:])
 
 
 def test_guidance_that_is_not_fitted_leaves_the_greedy_actions():
-    met, params = acted("relative", scalars=dataclasses.replace(probes.SCALARS, guided_probability=1.0))
+    met, params = acted("relative", probability=1.0)
     np.testing.assert_array_equal(met["action"][8:], probes.greedy_actions(q, params, met["obs"])[8:])
 
 
@@ -186,8 +193,9 @@ def test_about_half_of_the_episodes_are_guided():
 def test_an_episode_is_guided_as_a_whole():
     env = probes.Chain(jnp.array(False))
     state = probes.start(chain_program(), [0], [0], env)
-    schedule = replaced(random_steps=2, learn_after=10**9, guidance_until=2000)
-    _, state, _ = chain_program().train(env, CHAIN.scalars, schedule, loop.start_clock(), state, 1000)
+    schedule = dataclasses.replace(CHAIN.schedule, random_steps=2, learn_after=10**9, guidance_until=2000)
+    settings = CHAIN.settings._replace(schedule=schedule)
+    _, state, _ = chain_program().train(env, settings, loop.start_clock(), state, 1000)
     met = probes.stored(state, 0, 2000)
     turned = np.abs(met["action"] - np.asarray(env.heuristic(None))).max(-1) < 1e-6
     by_episode = turned.reshape(-1, 2, 2)[1:]  # (episodes, its two steps, environments)
@@ -200,7 +208,7 @@ def test_learning_begins_after_learn_after(learn_after, updates):
     program = probes.window_program("none")
     state = probes.start(program, [0], [0])
     before = probes.lane(state.agent.params, 0)
-    clock, state, _ = run(program, probes.SCALARS, replaced(learn_after=learn_after), loop.start_clock(), state)
+    clock, state, _ = run(program, replaced(learn_after=learn_after), loop.start_clock(), state)
     assert int(clock.update) == updates  # one for each of four environments, from the iteration that reaches the step
     same = [
         np.array_equal(*pair)
@@ -330,7 +338,7 @@ def test_labels_given_elsewhere_replace_those_asked_for_and_the_earlier_model_is
 def trained(program, seeds, budgets):
     """Labels, then training through random, guided and greedy steps with gradient steps."""
     clock, state = labelled(program, seeds, budgets, -(-max(budgets) // 10))
-    _, state, metrics = run(program, probes.SCALARS, probes.SCHEDULE, clock, state)
+    _, state, metrics = run(program, probes.SETTINGS, clock, state)
     return state, metrics
 
 
@@ -398,7 +406,7 @@ def assert_same_lane(state, lane, alone):
         np.testing.assert_allclose(rows, rows_alone, atol=1e-4)
     assert_close(together.agent.params, single.agent.params, atol=1e-4)
     assert_close(together.guide.model, single.guide.model, atol=1e-3)
-    for part in (lambda one: one.key, lambda one: one.agent.guided, lambda one: one.guide.obs):
+    for part in (lambda one: one.key, lambda one: one.arbiter, lambda one: one.guide.obs):
         assert_equal(part(together), part(single))
 
 
@@ -412,8 +420,8 @@ def test_a_lane_that_diverges_stays_at_its_last_finite_state_and_touches_no_othe
     before = jax.tree.map(jnp.copy, state.agent.params)
     poisoned = jax.tree.map(lambda leaf: leaf * wrong.reshape(4, *[1] * (leaf.ndim - 1)), before)
     sick = jax.tree.map(jnp.copy, state.replace(agent=state.agent.replace(params=poisoned)))
-    _, healthy, _ = run(program, probes.SCALARS, probes.SCHEDULE, clock, state, stretches=2)
-    _, after, metrics = run(program, probes.SCALARS, probes.SCHEDULE, clock, sick, stretches=2)
+    _, healthy, _ = run(program, probes.SETTINGS, clock, state, stretches=2)
+    _, after, metrics = run(program, probes.SETTINGS, clock, sick, stretches=2)
     assert not healthy.failed.any()
     np.testing.assert_array_equal(after.failed, wrong > 1)
     np.testing.assert_array_equal(np.isfinite(metrics["loss"]), wrong == 1)
@@ -426,12 +434,12 @@ def test_a_step_beyond_all_numbers_is_taken_back():
     program = probes.window_program("none")
     state = probes.start(program, [0], [0])
     fresh = jax.tree.map(jnp.copy, state.agent)
-    huge = dataclasses.replace(probes.SCALARS, learning_rate=3e38)
-    schedule = replaced(learn_after=48)  # in the last iteration alone: nothing looks at its parameters after that
-    _, state, _ = run(program, huge, schedule, loop.start_clock(), state)
+    # In the last iteration alone: nothing looks at its parameters after that.
+    settings = replaced(learning_rate=3e38, learn_after=48)
+    _, state, _ = run(program, settings, loop.start_clock(), state)
     assert state.failed.all()
     assert_equal(state.agent.params, fresh.params)
-    assert_equal(state.agent.opt_state, fresh.opt_state)
+    assert_equal(state.agent.training, fresh.training)
 
 
 def test_a_fit_that_diverges_fails_the_lane_and_leaves_its_guide():
@@ -454,7 +462,7 @@ def test_one_stretch_of_steps_is_two_of_half_the_length():
     for iterations in ((STRETCH,), (STRETCH // 2, STRETCH // 2)):
         clock, state = loop.start_clock(), probes.start(program, [0], [0])
         for count in iterations:
-            clock, state, _ = program.train(ENV, probes.SCALARS, probes.SCHEDULE, clock, state, count)
+            clock, state, _ = program.train(ENV, probes.SETTINGS, clock, state, count)
         results.append(jax.tree.map(np.asarray, (clock, state.replace(key=jax.random.key_data(state.key)))))
     assert_equal(*results)
 
@@ -469,12 +477,11 @@ def test_other_scalars_schedules_worlds_and_times_compile_nothing(grid):
     clock, state = loop.start_clock(), probes.start(program, [7, 8, 9, 10], [1, 11, 33, LARGEST])
     for index in range(3):
         env = probes.Window(0.1 * index, 0.2 * index)
-        scalars = dataclasses.replace(
-            probes.SCALARS, learning_rate=0.01 * index, eps_deg=5.0 + index, k_max=10 + index, guided_probability=0.2
-        )
-        schedule = replaced(random_steps=index, learn_after=4 * index, guidance_until=20 + index)
+        scalars = dataclasses.replace(probes.SCALARS, eps_deg=5.0 + index, k_max=10 + index)
+        other = {"learning_rate": 0.01 * index, "random_steps": index, "learn_after": 4 * index}
+        settings = replaced(0.2, guidance_until=20 + index, **other)._replace(scalars=scalars)
         clock, state = program.label_round(env, probes.Expert(env), scalars, clock, state)
-        clock, state, _ = program.train(env, scalars, schedule, clock, state, STRETCH)
+        clock, state, _ = program.train(env, settings, clock, state, STRETCH)
     assert probes.compilations(*functions) == before
 
 
@@ -483,7 +490,7 @@ def test_evaluation_compiles_once_for_all_parameters_and_worlds():
     for index in range(3):
         params = probes.start(probes.window_program("none"), [index], [0]).agent.params
         env = probes.Window(0.1 * index, 0.6)
-        agents = Agent(params, probes.SIZES)
+        agents = Agent(params, probes.FUNCTIONS)
         evaluate.evaluate_lanes(env, agents, jax.random.key(index), mesh=MESH, num_envs=3, steps=6)
     assert probes.compilations(evaluate._evaluate) == [before + 1]
 

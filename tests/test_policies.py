@@ -10,7 +10,7 @@ import numpy as np
 import probes
 import pytest
 
-from cuelearner_jax.agents import choice
+from cuelearner_jax.agents import ddqn
 from cuelearner_jax.agents.networks import applied, q_network
 from cuelearner_jax.devices import lane_mesh
 from cuelearner_jax.environment import Aims
@@ -37,8 +37,8 @@ OBS = directions.evenly_spaced(40)
 STATES = OBS  # the bandit's state is what it shows
 BEST = directions.rotate(OBS, 0.6)
 KEY = jax.random.key(5)
-Q = q_network(probes.SIZES.q_layers)
-AGENT = Agent(Q.init(jax.random.key(1), jnp.zeros(2), jnp.zeros(2)), probes.SIZES)
+Q = q_network(probes.AGENT.q_layers)
+AGENT = Agent(Q.init(jax.random.key(1), jnp.zeros(2), jnp.zeros(2)), probes.FUNCTIONS)
 LANES, MESH = 3, lane_mesh()
 
 
@@ -74,9 +74,10 @@ def test_the_agent_takes_the_direction_of_the_largest_value():
 
 
 def test_an_agent_that_learned_with_a_rough_first_look_acts_by_all_of_the_set(monkeypatch):
-    rough = dataclasses.replace(probes.SIZES, coarse_directions=4, peaks=1)
-    monkeypatch.setattr(choice, "_near_peaks", lambda *_: pytest.fail("a finished agent looked roughly"))
-    np.testing.assert_array_equal(act(AGENT.replace(sizes=rough)), act(AGENT))
+    options = dataclasses.replace(probes.AGENT, coarse_directions=4, peaks=1)
+    rough = dataclasses.replace(probes.FUNCTIONS, options=options)
+    monkeypatch.setattr(ddqn, "best_near_peaks", lambda *_: pytest.fail("a finished agent looked roughly"))
+    np.testing.assert_array_equal(act(AGENT.replace(functions=rough)), act(AGENT))
 
 
 def test_uniform_actions_are_drawn_anew_with_each_key():
@@ -228,7 +229,7 @@ def guided(base):
 
 
 def agents():
-    return Agent(block().agent.params, probes.SIZES)
+    return Agent(block().agent.params, probes.FUNCTIONS)
 
 
 BLOCKS = {
@@ -259,4 +260,4 @@ def test_one_lane_has_its_own_leaves_and_what_all_share():
     chex.assert_trees_all_equal(one.model, jax.tree.map(lambda leaf: leaf[2], policy.model))
     chex.assert_trees_all_equal((one.env, one.scalars), (policy.env, policy.scalars))
     assert one.guidance is policy.guidance
-    assert one.base.sizes == policy.base.sizes
+    assert one.base.functions == policy.base.functions

@@ -8,8 +8,8 @@ import jax
 import probes
 import pytest
 
-from cuelearner_jax.config import RunConfig
 from cuelearner_jax.errors import UserError
+from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.task import Body, Preset, Scenario, shape_of
 
 PRESET = Preset("small", probes.CONFIG)

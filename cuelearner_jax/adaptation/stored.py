@@ -4,7 +4,7 @@ A policy is told as nested JSON values, each with the name of what acts under `p
 
 | policy      | other values                                                                     | arrays             |
 |-------------|----------------------------------------------------------------------------------|--------------------|
-| `agent`     | `sizes`, and `sees` where that is not the whole observation                      | `params`           |
+| `agent`     | `agent` (its options), `frame`                                                   | `params`           |
 | `heuristic` |                                                                                  |                    |
 | `uniform`   |                                                                                  |                    |
 | `guided`    | `guidance` (its kind), `sizes`, `scalars`, `bounded`, and `base`: another policy | `model`, `bound`   |
@@ -16,21 +16,22 @@ Code is never loaded because a file names it: whoever opens the policy gives it 
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+from typing import Any, get_args
 
 import jax
 import jax.numpy as jnp
 
 from cuelearner_jax import config as configuration
-from cuelearner_jax.agents import view
-from cuelearner_jax.agents.networks import q_network
-from cuelearner_jax.config import AgentSizes, GuideSizes, Scalars, check_agent, check_guide
-from cuelearner_jax.environment import actions_of, offers, spaces_of
+from cuelearner_jax.agents.protocol import AgentFunctions
+from cuelearner_jax.agents.registry import AGENTS
+from cuelearner_jax.config import Frame, GuideSizes, Scalars, check_guide, check_part
+from cuelearner_jax.environment import Spaces, offers, spaces_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.guides.base import NAME
 from cuelearner_jax.policies import Agent, Common, Corrected, Guided, Heuristic, Taught, uniform_in
 from cuelearner_jax.policies import Uniform as UniformPolicy
+from cuelearner_jax.run_config import part_from_json, part_to_json
 
 Told = dict[str, Any]
 KINDS = ("agent", "uniform", "heuristic", "guided", "code")
@@ -51,7 +52,8 @@ def told(policy: Any, named: str | None = None) -> Told:
     if isinstance(policy, Common):
         return told(policy.policy, named)
     if isinstance(policy, Agent):
-        return {"policy": "agent", "sizes": _part(AgentSizes, policy.sizes)}
+        own = {"agent": part_to_json(policy.functions.options), "frame": policy.functions.frame}
+        return {"policy": "agent", **own}
     if isinstance(policy, UniformPolicy):
         return {"policy": "uniform"}
     if isinstance(policy, Heuristic):
@@ -95,7 +97,9 @@ def check(values: Told, outermost: bool = True, depth: int = MOST_LAYERS) -> Non
     if kind not in (("guided",) if outermost else KINDS) or not depth:
         raise ValueError(f"{kind!r} is no policy here")
     if kind == "agent":
-        check_agent(configuration.from_json(AgentSizes, values["sizes"]))
+        check_part(part_from_json(AGENTS, values["agent"]), "agent")
+        if set(values) != {"policy", "agent", "frame"} or values["frame"] not in get_args(Frame):
+            raise ValueError(f"an agent is told by {sorted(values)}, in the frame {values.get('frame')!r}")
     if kind == "code" and not isinstance(values["named"], str):
         raise TypeError(f"code is named {values['named']!r}")
     if kind == "guided":
@@ -133,9 +137,7 @@ def shapes_of(values: Told, env: Any, rows: int | None = None) -> Any:
 
     def one(values: Told) -> Any:
         if values["policy"] == "agent":
-            sizes = configuration.from_json(AgentSizes, values["sizes"])
-            seen = [jnp.zeros(width) for width in view.widths(sizes.frame, spaces)]
-            return {"params": q_network(sizes.q_layers).init(jax.random.key(0), *seen)}
+            return {"params": _agent(values, spaces).init(jax.random.key(0))[0]}
         if values["policy"] == "guided":
             bound = {"bound": jnp.zeros(())} if values["bounded"] else {}
             return {"base": one(values["base"]), "model": _guidance(values, env).init(jax.random.key(0)), **bound}
@@ -161,8 +163,7 @@ def made(values: Told, arrays: Any, env: Any, code: Any = None) -> Any:
     """
     kind = values["policy"]
     if kind == "agent":
-        sizes = configuration.from_json(AgentSizes, values["sizes"])
-        return Agent(arrays["params"], sizes, actions_of(env), env)
+        return Agent(arrays["params"], _agent(values, spaces_of(env)), env)
     if kind == "uniform":
         return uniform_in(env)
     if kind == "heuristic":
@@ -181,6 +182,11 @@ def made(values: Told, arrays: Any, env: Any, code: Any = None) -> Any:
             )
         return code
     raise ValueError(f"{kind!r} is no policy")
+
+
+def _agent(values: Told, spaces: Spaces) -> AgentFunctions:
+    """The functions of an agent. Raises UserError if it is not known here."""
+    return part_from_json(AGENTS, values["agent"]).make(values["frame"], spaces)
 
 
 def _guidance(values: Told, env: Any) -> Any:

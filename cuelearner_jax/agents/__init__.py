@@ -1,1 +1,1 @@
-"""The agent: networks of action values, double DQN, replay, the greedy choice."""
+"""Agents: the protocol, double DQN, replay, networks."""

@@ -1,77 +1,63 @@
-"""The agent's choice: the action of its set with the largest value, for many observations at once."""
+"""The action of a set with the largest value, for many observations at once."""
 
 from __future__ import annotations
 
-from functools import partial
-from typing import Any
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
-from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
-from cuelearner_jax.agents import ddqn, view
-from cuelearner_jax.agents.networks import applied, q_network, widened
-from cuelearner_jax.config import AgentSizes
 from cuelearner_jax.devices import portions
-from cuelearner_jax.spaces import Space
-from cuelearner_jax.types import Params
-
-ALIGNED = 64  # layers computed in bfloat16 are filled up to multiples: 20% faster on an H200, whose rows want alignment
 
 
-def values(sizes: AgentSizes, env: Any, dtype: DTypeLike = jnp.float32) -> ddqn.ValueFunction:
-    """Q of an environment's observations and actions; `dtype` is that of the hidden layers' arithmetic."""
-    network = applied(q_network(sizes.q_layers, dtype))
-    return lambda params, obs, actions: network(params, *view.seen(sizes.frame, env, obs, actions))
-
-
-def looked_at(sizes: AgentSizes) -> int:
-    """Actions whose values one choice takes."""
-    if not sizes.coarse_directions:
-        return sizes.directions
-    return sizes.coarse_directions + sizes.peaks * (2 * sizes.directions // sizes.coarse_directions - 1)
-
-
-def greedy_actions(
-    sizes: AgentSizes, actions: Space, env: Any, params: Params, obs: Float[Array, "n obs"], members: int = 1
+def best_of(
+    value: Callable[[Array, Array], Array], options: Float[Array, "m action"], obs: Float[Array, "n obs"]
 ) -> Float[Array, "n action"]:
-    """The greedy actions of one agent, as its sizes have them searched: all of the set, or near the peaks.
+    """The best of a set of actions in each situation, a portion of the situations at a time.
 
-    `env` says how an observation looks from an action; in the raw frame nobody asks it. Of several `members` (leading
-    axis of `params`) it is the argmax of their mean value, over all of the set.
+    `value`: (observation (obs,), actions (m, action)) -> values (m,).
     """
-    if members > 1:
-        choose = partial(_of_mean, sizes, actions.spread(sizes.directions), env, params)
-        return jax.lax.map(choose, obs, batch_size=max(1, min(len(obs), portions().actions // sizes.directions)))
-    choose = partial(
-        _near_peaks if sizes.coarse_directions else _of_all, sizes, actions.spread(sizes.directions), env, params
-    )
-    return jax.lax.map(choose, obs, batch_size=max(1, min(len(obs), portions().actions // looked_at(sizes))))
+    return each_in_portions(lambda one: options[jnp.argmax(value(one, options))], obs, len(options))
 
 
-def _of_all(
-    sizes: AgentSizes, options: Float[Array, "m action"], env: Any, params: Params, obs: Float[Array, " obs"]
-) -> Float[Array, " action"]:
-    return ddqn.greedy(values(sizes, env), params, obs, options)
+def best_near_peaks(
+    value: Callable[[Array, Array], Array],
+    rough: Callable[[Array, Array], Array],
+    options: Float[Array, "m action"],
+    obs: Float[Array, "n obs"],
+    coarse: int,
+    peaks: int,
+) -> Float[Array, "n action"]:
+    """The choice that `best_of` makes, if the largest value lies next to one of the highest peaks of a first look.
+
+    Args:
+        value: see `best_of`.
+        rough: the same, as roughly as may be: it decides where to look only.
+        options: evenly spaced, the last beside the first.
+        obs: situations.
+        coarse: actions of the first look, evenly spaced among the options.
+        peaks: how many of its local maxima to look round, up to its neighbours.
+    """
+    stride = len(options) // coarse
+
+    def choose(one: Float[Array, " obs"]) -> Float[Array, " action"]:
+        first = rough(one, options[::stride])
+        summit = (first >= jnp.roll(first, 1)) & (first >= jnp.roll(first, -1))
+        _, highest = jax.lax.top_k(jnp.where(summit, first, -jnp.inf), peaks)
+        near = jnp.mod(highest[:, None] * stride + jnp.arange(1 - stride, stride)[None], len(options)).ravel()
+        return options[near][jnp.argmax(value(one, options[near]))]
+
+    return each_in_portions(choose, obs, looked_at(len(options), coarse, peaks))
 
 
-def _of_mean(
-    sizes: AgentSizes, options: Float[Array, "m action"], env: Any, params: Params, obs: Float[Array, " obs"]
-) -> Float[Array, " action"]:
-    def mean(params: Params, obs: Array, options: Array) -> Array:
-        return jax.vmap(values(sizes, env), in_axes=(0, None, None))(params, obs, options).mean(0)
-
-    return ddqn.greedy(mean, params, obs, options)
+def looked_at(options: int, coarse: int, peaks: int) -> int:
+    """Actions whose values one choice takes, of a set searched near the peaks of a first look (`coarse` 0: all)."""
+    return coarse + peaks * (2 * options // coarse - 1) if coarse else options
 
 
-def _near_peaks(
-    sizes: AgentSizes, options: Float[Array, "m action"], env: Any, params: Params, obs: Float[Array, " obs"]
-) -> Float[Array, " action"]:
-    rough, layers = params, sizes.q_layers
-    if sizes.coarse_dtype == "bfloat16":
-        rough, layers = widened(params, layers, ALIGNED)
-    look = applied(q_network(layers, jnp.dtype(sizes.coarse_dtype)))
-    first = options[:: sizes.directions // sizes.coarse_directions]
-    coarse = look(rough, *view.seen(sizes.frame, env, obs, first))[:, 0]
-    return ddqn.greedy_near_peaks(values(sizes, env), params, obs, options, coarse, sizes.peaks)
+def each_in_portions(
+    choose: Callable[[Array], Array], obs: Float[Array, "n obs"], looked: int
+) -> Float[Array, "n action"]:
+    """A choice in each situation, as many at once as values of `looked` actions each fit."""
+    return jax.lax.map(choose, obs, batch_size=max(1, min(len(obs), portions().actions // looked)))

@@ -1,121 +1,248 @@
-"""Double DQN over a finite set of actions: targets, loss and greedy choice, pure and unbatched.
+"""Double DQN over a finite set of actions; the action is an input of the network.
 
 Source: van Hasselt, Guez, Silver, "Deep reinforcement learning with double Q-learning", Eq. 4.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Annotated, Any, ClassVar, Literal
 
+import chex
 import jax
 import jax.numpy as jnp
 import optax
-from jaxtyping import Array, Bool, Float, Int
+from flax import struct
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
+from cuelearner_jax.agents import view
+from cuelearner_jax.agents.choice import best_near_peaks, best_of, looked_at
+from cuelearner_jax.agents.networks import applied, q_network, widened
+from cuelearner_jax.agents.replay import Memory
+from cuelearner_jax.config import POSITIVE, SHARE, Bounds, Frame, Layers, Scalars, Sizes, part
+from cuelearner_jax.environment import Spaces
+from cuelearner_jax.errors import UserError
 from cuelearner_jax.types import Params, Transition
 
-# (params, obs (..., obs), actions (..., action)) -> (..., 1)
-ValueFunction = Callable[[Params, jax.Array, jax.Array], jax.Array]
+ALIGNED = 64  # layers computed in bfloat16 are filled up to multiples: 20% faster on an H200, whose rows want alignment
 
 
-def greedy(
-    q: ValueFunction, params: Params, obs: Float[Array, " obs"], options: Float[Array, "n action"]
-) -> Float[Array, " action"]:
-    """The action of a set with the largest value."""
-    return options[jnp.argmax(q(params, obs, options)[:, 0])]
+@part
+class Config:
+    """Options of double DQN."""
+
+    NAME: ClassVar[str] = "ddqn"
+    ABOUT: ClassVar[str] = "double DQN over an evenly spaced set of actions"
+
+    q_layers: Layers = (400, 400, 400, 300, 300, 300)
+    """Hidden layers of the action-value network."""
+    directions: Annotated[int, POSITIVE] = 3600
+    """Directions over which the agent takes its argmax (3600: every 0.1 deg)."""
+    coarse_directions: Annotated[int, Bounds(0)] = 0
+    """Directions of a first look while learning, evenly spaced; the argmax over the set is then taken near its peaks
+    (0: over all of the set, as every finished policy takes it)."""
+    coarse_dtype: Literal["float32", "bfloat16"] = "float32"
+    """Arithmetic of the first look (bfloat16 is twice as fast on an accelerator); the choice is made in float32."""
+    peaks: Annotated[int, POSITIVE] = 8
+    """Peaks of the first look that are looked at closely."""
+    target_directions: Annotated[int, POSITIVE] = 720
+    """Directions of the argmax inside bootstrapped targets (unused at discount 0)."""
+    batch_size: Annotated[int, POSITIVE] = 100
+    """Transitions in a gradient step."""
+    replay_capacity: Annotated[int, POSITIVE] = 10_000_000
+    """Transitions kept (a multiple of num_envs)."""
+    optimizer: Literal["sgd", "adam"] = "sgd"
+    """Optimiser of the action-value network."""
+    learning_rate: Annotated[float, Bounds(0)] = 0.1
+    """Step size of the action-value network."""
+    n_step: Annotated[int, POSITIVE] = 1
+    """Steps of the n-step return that is averaged with the one-step return (1: the one-step return alone)."""
+    n_step_weight: Annotated[float, SHARE] = 0.5
+    """Share of the n-step return in a target; the rest is the one-step return."""
+    polyak: Annotated[float, SHARE] = 0.005
+    """Rate at which the target network follows."""
+    target_every: Annotated[int, POSITIVE] = 2
+    """Gradient steps between two moves of the target network."""
+
+    def make(self, frame: Frame, spaces: Spaces, bootstraps: bool = False) -> DoubleDQN:
+        """The agent for an environment's spaces. Raises UserError for a frame in which it cannot be seen."""
+        view.widths(frame, spaces)
+        return DoubleDQN(self, frame, spaces, bootstraps)
+
+    def check(self, sizes: Sizes, bootstraps: bool) -> None:
+        """Raises UserError for options that do not work together."""
+        if self.coarse_directions and (self.coarse_directions < 3 or self.directions % self.coarse_directions):
+            raise UserError(
+                f"agent.coarse_directions is {self.coarse_directions}: give a divisor of agent.directions "
+                f"({self.directions}) above 2, or 0 to look at all of them"
+            )
+        if self.coarse_directions and self.peaks > self.coarse_directions:
+            raise UserError(f"agent.peaks is {self.peaks}: give at most agent.coarse_directions")
+        if self.n_step * sizes.num_envs > self.replay_capacity:
+            raise UserError(
+                f"agent.n_step is {self.n_step}: give at most {self.replay_capacity // sizes.num_envs}, the steps of "
+                "an environment that agent.replay_capacity holds"
+            )
+        if self.n_step > 1 and not bootstraps:
+            raise UserError(f"agent.n_step is {self.n_step}: n-step returns need a scalars.discount above 0")
 
 
-def greedy_near_peaks(
-    q: ValueFunction,
-    params: Params,
-    obs: Float[Array, " obs"],
-    options: Float[Array, "n action"],
-    coarse: Float[Array, " coarse"],
-    peaks: int,
-) -> Float[Array, " action"]:
-    """The same choice as `greedy` makes, if the largest value lies next to one of the highest peaks of a first look.
+class DDQNState(struct.PyTreeNode):
+    """What learning keeps beside the parameters."""
 
-    Args:
-        options: evenly spaced, the last beside the first.
-        coarse: values of every (n / coarse)-th of them, computed as roughly as may be: they decide where to look only.
-        peaks: how many of its local maxima to look round, up to its neighbours.
-    """
-    stride = options.shape[0] // coarse.shape[0]
-    summit = (coarse >= jnp.roll(coarse, 1)) & (coarse >= jnp.roll(coarse, -1))
-    _, highest = jax.lax.top_k(jnp.where(summit, coarse, -jnp.inf), peaks)
-    near = jnp.mod(highest[:, None] * stride + jnp.arange(1 - stride, stride)[None], options.shape[0]).ravel()
-    return greedy(q, params, obs, options[near])
+    target_params: Params  # None where nothing bootstraps (discount 0)
+    opt_state: Any
+
+
+@dataclass(frozen=True)
+class DoubleDQN:
+    """The agent's functions (`protocol.AgentFunctions`)."""
+
+    options: Config
+    frame: Frame
+    spaces: Spaces
+    bootstraps: bool  # do targets look at the next observation?
+
+    @property
+    def described(self) -> dict[str, Any]:
+        """Its set of actions, and what the network sees."""
+        return {"directions": self.options.directions, "frame": self.frame}
+
+    def working(self, num_envs: int, portion: int) -> dict[str, int]:
+        """Activations of the widest passes: the argmax while acting, that inside targets, a batch with its gradient."""
+        own = self.options
+        looked = looked_at(own.directions, own.coarse_directions, own.peaks)
+        rows = {
+            "--agent.directions": min(num_envs * looked, max(portion, looked)),
+            "--agent.batch-size": 3 * own.batch_size * len(own.q_layers),
+        }
+        if self.bootstraps:
+            rows["--agent.target-directions"] = own.batch_size * own.target_directions * (2 if own.n_step > 1 else 1)
+        needed = {option: 4 * max(own.q_layers) * number for option, number in rows.items()}
+        return {**needed, "--agent.n-step": 8 * own.batch_size * own.n_step}
+
+    def init(self, key: PRNGKeyArray) -> tuple[Params, DDQNState]:
+        """Random parameters, the target network a copy of them."""
+        params = q_network(self.options.q_layers).init(key, *map(jnp.zeros, view.widths(self.frame, self.spaces)))
+        copy = jax.tree.map(jnp.copy, params) if self.bootstraps else None
+        return params, DDQNState(copy, optimizer(self.options.optimizer, 0.0, 0.0).init(params))
+
+    def act(self, env: Any, params: Params, obs: Float[Array, "n obs"], key: PRNGKeyArray) -> Float[Array, "n action"]:
+        """The action with the largest value of all in the set.
+
+        The rough first look (`coarse_directions`) is for play while learning alone: where values are sharp it misses
+        peaks, which costs a finished agent reward (`benchmarks/search_agreement.py`).
+        """
+        return best_of(partial(self.value, env, params), self._directions, obs)
+
+    def explore(
+        self, env: Any, options: Config, params: Params, obs: Float[Array, "n obs"], key: PRNGKeyArray
+    ) -> Float[Array, "n action"]:
+        """The greedy action, searched near the peaks of a first look where the options say so."""
+        own = self.options
+        if not own.coarse_directions:
+            return self.act(env, params, obs, key)
+        rough, layers = params, own.q_layers
+        if own.coarse_dtype == "bfloat16":
+            rough, layers = widened(params, layers, ALIGNED)
+        look = applied(q_network(layers, jnp.dtype(own.coarse_dtype)))
+        return best_near_peaks(
+            partial(self.value, env, params),
+            lambda one, actions: look(rough, *view.seen(self.frame, env, one, actions))[:, 0],
+            self._directions,
+            obs,
+            own.coarse_directions,
+            own.peaks,
+        )
+
+    def value(
+        self, env: Any, params: Params, obs: Float[Array, "*n obs"], actions: Float[Array, "*m action"]
+    ) -> Float[Array, "*m"]:
+        """Q of each action, in a situation each or all in one."""
+        network = applied(q_network(self.options.q_layers))
+        return network(params, *view.seen(self.frame, env, obs, actions))[..., 0]
+
+    def update(
+        self,
+        env: Any,
+        options: Config,
+        scalars: Scalars,
+        count: Int[Array, ""],
+        params: Params,
+        rest: DDQNState,
+        memory: Memory,
+        key: PRNGKeyArray,
+    ) -> tuple[Params, DDQNState, Float[Array, ""], Float[Array, ""]]:
+        """One gradient step (`protocol.AgentFunctions.update`)."""
+        own, target_params = self.options, rest.target_params
+        batches = memory.batches(key, own.batch_size, own.n_step, scalars.discount)
+        batch = batches[0]
+        targets = self.targets(env, options, scalars.discount, params, target_params, batches)
+
+        def loss_of(params: Params) -> Float[Array, ""]:
+            return loss(self.value(env, params, batch.obs, batch.action), targets)
+
+        value, gradient = jax.value_and_grad(loss_of)(params)
+        change, opt_state = optimizer(own.optimizer, options.learning_rate, scalars.max_grad_norm).update(
+            gradient, rest.opt_state, params
+        )
+        params = optax.apply_updates(params, change)
+        if self.bootstraps:
+            target_params = jax.lax.cond(
+                count % own.target_every == 0,
+                lambda: optax.incremental_update(params, target_params, options.polyak),
+                lambda: target_params,
+            )
+        return params, DDQNState(target_params, opt_state), value, optax.tree.norm(gradient)
+
+    def targets(
+        self,
+        env: Any,
+        options: Config,
+        discount: Float[Array, ""] | float,
+        params: Params,
+        target_params: Params,
+        batches: list[Transition],
+    ) -> Float[Array, " batch"]:
+        """What the values of a batch are fitted to: of one-step and, if there are, n-step transitions."""
+        if not self.bootstraps:
+            return batches[0].reward
+        actions = self.spaces.actions.spread(self.options.target_directions)
+
+        def one(item: Transition) -> Float[Array, ""]:
+            # The online network chooses, the target network values.
+            choice = actions[jnp.argmax(self.value(env, params, item.next_obs, actions))]
+            value = self.value(env, target_params, item.next_obs, choice)
+            return target(item.reward, discount * item.discount, value)
+
+        # One pass through the networks for both kinds of return: their weights are what has to be read.
+        joined = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *batches)
+        near, *far = jnp.split(jax.vmap(one)(joined), len(batches))
+        return near + options.n_step_weight * (far[0] - near) if far else near
+
+    @property
+    def _directions(self) -> Float[Array, "m action"]:
+        return self.spaces.actions.spread(self.options.directions)
 
 
 def target(
-    q: ValueFunction,
-    params: Params,
-    target_params: Params,
-    transition: Transition,
-    options: Float[Array, "n action"],
-    discount: Float[Array, ""] | float,
-    chooser: ValueFunction | None = None,
+    reward: Float[Array, ""], discount: Float[Array, ""] | float, next_value: Float[Array, ""]
 ) -> Float[Array, ""]:
-    """r + discount * Q'(s', argmax_a Q(s', a)): the online network chooses, the target network values.
-
-    `target_params` None means that nothing bootstraps (a discount of 0): the target is the reward. `chooser` computes
-    the values among which is chosen, where that is done less precisely than by `q`.
-    """
-    if target_params is None:
-        return transition.reward
-    choice = greedy(chooser or q, params, transition.next_obs, options)
-    value = q(target_params, transition.next_obs, choice)[0]
-    return transition.reward + discount * transition.discount * value
+    """r + discount * Q'(s', argmax_a Q(s', a)); `discount` is 0 after a termination."""
+    chex.assert_rank([reward, discount, next_value], 0)
+    return reward + discount * next_value
 
 
-def n_step_return(
-    rewards: Float[Array, " n"],
-    discounts: Float[Array, " n"],
-    ended: Float[Array, " n"],
-    known: Bool[Array, " n"],
-    discount: Float[Array, ""] | float,
-) -> tuple[Float[Array, ""], Float[Array, ""], Int[Array, ""]]:
-    """Discounted rewards of up to n steps of one episode (Sutton and Barto, "Reinforcement learning", Eq. 7.1).
-
-    The sum stops with the episode's last step, or with the last step that is known.
-
-    Args:
-        rewards, discounts, ended: of consecutive steps; `discounts` is 0 at termination, else 1.
-        known: which of them have been made already; the first is.
-        discount: discount factor.
-
-    Returns:
-        The sum; the factor of the value of the last step's next observation, short of one `discount`, as
-        `Transition.discount` has it; the last step's index.
-    """
-    before_end = jnp.cumprod(jnp.concatenate([jnp.ones(1), 1.0 - ended[:-1]]))
-    counts = before_end * known
-    powers = jnp.power(jnp.asarray(discount, rewards.dtype), jnp.arange(rewards.shape[0]))
-    last = counts.sum().astype(jnp.int32) - 1
-    return jnp.sum(counts * powers * rewards), powers[last] * discounts[last], last
-
-
-def loss(
-    q: ValueFunction, params: Params, transitions: Transition, targets: Float[Array, " batch"]
-) -> Float[Array, ""]:
-    """Mean squared error of the values of the actions taken, over a batch."""
-    values = q(params, transitions.obs, transitions.action)[..., 0]
+def loss(values: Float[Array, " batch"], targets: Float[Array, " batch"]) -> Float[Array, ""]:
+    """Mean squared error of the values of the actions taken."""
+    chex.assert_rank([values, targets], 1)
     return jnp.mean(jnp.square(values - targets))
 
 
 def optimizer(
-    name: str, learning_rate: Float[Array, ""] | float, max_norm: Float[Array, ""] | float
+    name: Literal["sgd", "adam"], learning_rate: Float[Array, ""] | float, max_norm: Float[Array, ""] | float
 ) -> optax.GradientTransformation:
-    """Gradients clipped to a global norm, then SGD or Adam. Both scalars may be traced.
-
-    Raises ValueError for another name.
-    """
-    makers = {"sgd": optax.sgd, "adam": optax.adam}
-    if name not in makers:
-        raise ValueError(f"unknown optimizer {name!r}: choose one of {sorted(makers)}")
-    return optax.chain(optax.clip_by_global_norm(max_norm), makers[name](learning_rate))
-
-
-def polyak(params: Params, target_params: Params, rate: Float[Array, ""] | float) -> Params:
-    """The target network moved toward the online one by `rate`."""
-    return optax.incremental_update(params, target_params, rate)
+    """Gradients clipped to a global norm, then SGD or Adam. Both scalars may be traced."""
+    maker = {"sgd": optax.sgd, "adam": optax.adam}[name]
+    return optax.chain(optax.clip_by_global_norm(max_norm), maker(learning_rate))

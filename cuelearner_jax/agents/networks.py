@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from itertools import pairwise
+from typing import Any
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 from jax.typing import DTypeLike
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from cuelearner_jax.types import Params
 
@@ -68,6 +69,12 @@ def residual_network(layers: Sequence[int], outputs: int) -> MLP:
 def applied(network: MLP) -> Callable[[Params, jax.Array, jax.Array], jax.Array]:
     """A network as a function: (params, obs (..., obs), actions (..., action)) -> outputs (..., outputs)."""
     return lambda params, obs, actions: jnp.asarray(network.apply(params, obs, actions))
+
+
+def all_finite(tree: Any) -> Bool[Array, ""]:
+    """Is every number of a tree of arrays finite?"""
+    numbers = [leaf for leaf in jax.tree.leaves(tree) if jnp.issubdtype(leaf.dtype, jnp.floating)]
+    return jnp.stack([jnp.isfinite(leaf).all() for leaf in numbers] or [jnp.array(True)]).all()
 
 
 def widened(params: Params, layers: Sequence[int], multiple: int) -> tuple[Params, tuple[int, ...]]:

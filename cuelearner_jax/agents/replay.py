@@ -1,4 +1,4 @@
-"""One ring buffer: steps as packed float32 rows, so that sampling is a single gather.
+"""What has been met: steps as packed float32 rows of one ring buffer, so that sampling is a single gather.
 
 The write position follows from the shared step counter and is therefore no part of the (vmapped) state: under vmap the
 write stays one in-place slice update.
@@ -7,7 +7,8 @@ write stays one in-place slice update.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from functools import partial
+from typing import Any, NamedTuple
 
 import jax
 import jax.custom_batching
@@ -15,7 +16,8 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from cuelearner_jax.types import StoredStep
+from cuelearner_jax.environment import Environment, actions_of, random_symmetries
+from cuelearner_jax.types import Step, StoredStep, Transition
 
 
 class Following(NamedTuple):
@@ -98,3 +100,111 @@ def ring_buffer(example: StoredStep) -> RingBuffer:
         return Following(*jnp.moveaxis(found, -1, 0), known=further[None] <= newer[:, None])
 
     return RingBuffer(width, empty, add, draw, read, follow)
+
+
+class Memory(NamedTuple):
+    """What one lane has met, to draw from."""
+
+    env: Any  # rebuilds observations
+    buffer: RingBuffer
+    rows: Float[Array, "capacity width"]
+    filled: Int[Array, ""]  # rows written so far
+    num_envs: int
+    bootstraps: bool  # do transitions have a next observation?
+
+    def batches(
+        self, key: PRNGKeyArray, size: int, n_step: int = 1, discount: Float[Array, ""] | float = 0.0
+    ) -> list[Transition]:
+        """Uniformly drawn transitions (size,), each under a random symmetry of the environment.
+
+        With `n_step` above 1 a second batch follows: from the same steps on, up to so many of one episode as one.
+        """
+        k_sample, k_mirror = jax.random.split(key)
+        numbers = self.buffer.draw(k_sample, self.rows, self.filled, size)
+        found = [self.one_step(self.buffer.read(self.rows, numbers))]
+        if n_step > 1:
+            found.append(self.n_step(numbers, n_step, discount))
+        return [mirrored(k_mirror, self.env, batch) for batch in found]
+
+    def one_step(self, stored: StoredStep) -> Transition:
+        """Stored steps (batch, ...) as transitions, their observations rebuilt."""
+        if self.bootstraps:
+            next_obs = jax.vmap(self.env.recall_next)(stored.obs, stored.action, stored.aftermath)
+            discount = stored.discount[:, 0]
+        else:
+            next_obs, discount = jnp.zeros((stored.reward.shape[0], 0)), jnp.zeros_like(stored.reward)
+        return Transition(jax.vmap(self.env.recall)(stored.obs), stored.action, stored.reward, discount, next_obs)
+
+    def n_step(self, numbers: Int[Array, " batch"], n: int, discount: Float[Array, ""] | float) -> Transition:
+        """The transitions that begin at rows `numbers` and span up to n steps of one episode."""
+        after = self.buffer.follow(self.rows, self.filled, numbers, n, self.num_envs)
+        summed = jax.vmap(partial(n_step_return, discount=discount))
+        reward, factor, last = summed(after.rewards, after.discounts, after.ended, after.known)
+        first = self.buffer.read(self.rows, numbers)
+        end = self.buffer.read(self.rows, jnp.mod(numbers + last * self.num_envs, self.rows.shape[0]))
+        next_obs = jax.vmap(self.env.recall_next)(end.obs, end.action, end.aftermath)
+        return Transition(jax.vmap(self.env.recall)(first.obs), first.action, reward, factor, next_obs)
+
+
+def n_step_return(
+    rewards: Float[Array, " n"],
+    discounts: Float[Array, " n"],
+    ended: Float[Array, " n"],
+    known: Bool[Array, " n"],
+    discount: Float[Array, ""] | float,
+) -> tuple[Float[Array, ""], Float[Array, ""], Int[Array, ""]]:
+    """Discounted rewards of up to n steps of one episode (Sutton and Barto, "Reinforcement learning", Eq. 7.1).
+
+    The sum stops with the episode's last step, or with the last step that is known.
+
+    Args:
+        rewards, discounts, ended: of consecutive steps; `discounts` is 0 at termination, else 1.
+        known: which of them have been made already; the first is.
+        discount: discount factor.
+
+    Returns:
+        The sum; the factor of the value of the last step's next observation, short of one `discount`, as
+        `Transition.discount` has it; the last step's index.
+    """
+    before_end = jnp.cumprod(jnp.concatenate([jnp.ones(1), 1.0 - ended[:-1]]))
+    counts = before_end * known
+    powers = jnp.power(jnp.asarray(discount, rewards.dtype), jnp.arange(rewards.shape[0]))
+    last = counts.sum().astype(jnp.int32) - 1
+    return jnp.sum(counts * powers * rewards), powers[last] * discounts[last], last
+
+
+def buffer_for(env: Environment, bootstraps: bool) -> RingBuffer:
+    """The ring buffer of an environment's steps, of which shapes alone are looked at."""
+    size = actions_of(env).size
+
+    def one_step(env: Environment, key: PRNGKeyArray) -> StoredStep:
+        state, obs = env.reset(key)
+        action = jnp.zeros(size)
+        return stored_step(env.remember(state, obs), action, env.step(key, state, action)[1], bootstraps)
+
+    shapes = jax.eval_shape(one_step, env, jax.random.key(0))
+    return ring_buffer(jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes))
+
+
+def stored_step(
+    obs: Float[Array, " memory"], action: Float[Array, " action"], step: Step, bootstraps: bool
+) -> StoredStep:
+    """What replay keeps of one step from the remembered observation `obs`."""
+    kept = slice(None) if bootstraps else slice(0)
+    ended: Bool[Array, ""] = step.terminated | step.truncated
+    return StoredStep(
+        obs=obs,
+        action=action,
+        reward=step.reward,
+        discount=1.0 - step.terminated[None].astype(jnp.float32)[kept],
+        ended=ended[None].astype(jnp.float32)[kept],
+        aftermath=step.aftermath[kept],
+    )
+
+
+def mirrored(key: PRNGKeyArray, env: Environment, batch: Transition) -> Transition:
+    """Each transition of a batch under a random symmetry of the environment."""
+    image = random_symmetries(key, env, batch.reward.shape[0])
+    obs, action = image(batch.obs, batch.action)
+    next_obs = image(batch.next_obs, batch.action)[0] if batch.next_obs.shape[-1] else batch.next_obs
+    return batch.replace(obs=obs, action=action, next_obs=next_obs)

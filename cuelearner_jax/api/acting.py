@@ -15,10 +15,10 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from cuelearner_jax import user_code
 from cuelearner_jax.api import arguments
 from cuelearner_jax.api.worlds import World, a_world
-from cuelearner_jax.config import RunConfig
 from cuelearner_jax.environment import Quantity, actions_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.policies import Policy, acted, in_space, named
+from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs import trained
 from cuelearner_jax.spaces import DIRECTIONS, Space
 from cuelearner_jax.storage import whole

@@ -20,10 +20,11 @@ from cuelearner_jax.api import arguments
 from cuelearner_jax.api.acting import CallablePolicy, as_policy, as_policy_in, source_of
 from cuelearner_jax.api.feedback import Labels, diverged, given_settings, label_path, labels_of, rows_of
 from cuelearner_jax.api.worlds import World
-from cuelearner_jax.config import GuideSizes, RunConfig, Scalars
+from cuelearner_jax.config import GuideSizes, Scalars
 from cuelearner_jax.environment import Environment, actions_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.policies import Opaque
+from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs.adapted import alone
 from cuelearner_jax.runs.trained import PolicySource
 from cuelearner_jax.storage import label_files, policy_folders

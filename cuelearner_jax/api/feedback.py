@@ -21,7 +21,7 @@ from jaxtyping import Float
 
 from cuelearner_jax import user_code
 from cuelearner_jax.adaptation import adapting, program
-from cuelearner_jax.agents.learning import all_finite
+from cuelearner_jax.agents.networks import all_finite
 from cuelearner_jax.api import arguments
 from cuelearner_jax.api.acting import CallablePolicy, as_policy, as_policy_in, entries_of
 from cuelearner_jax.api.worlds import World, a_world

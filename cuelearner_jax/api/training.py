@@ -16,21 +16,17 @@ from cuelearner_jax import user_code
 from cuelearner_jax.api import arguments
 from cuelearner_jax.api.acting import CallablePolicy
 from cuelearner_jax.api.worlds import World, a_world
-from cuelearner_jax.config import RunConfig
 from cuelearner_jax.devices import SHARED, lane_mesh, place
-from cuelearner_jax.environment import actions_of
 from cuelearner_jax.errors import UserError, closest
 from cuelearner_jax.evaluate import SPLITS, one_lane
 from cuelearner_jax.guides import registry
 from cuelearner_jax.policies import Agent
+from cuelearner_jax.run_config import RunConfig, check
 from cuelearner_jax.runs import failures
-from cuelearner_jax.runs.grid import LARGEST_SEED
+from cuelearner_jax.runs.grid import LARGEST_SEED, Grid, check_grid
 from cuelearner_jax.runs.lanes import LaneGroup
 from cuelearner_jax.runs.memory_report import memory_report
-from cuelearner_jax.runs.order import checked
 from cuelearner_jax.runs.training import Training, mean_of_finite
-from cuelearner_jax.studies.train import suggested
-from cuelearner_jax.task import Preset
 from cuelearner_jax.terminal import progress_bars
 from cuelearner_jax.types import Teacher
 
@@ -69,7 +65,7 @@ class Run:
             raise UserError(f"no lane with seed {wanted} and {budget} labels was trained")
         params = [block.agent.params for block in training.blocks]
         joined = jax.tree.map(lambda *leaves: np.concatenate([np.asarray(leaf) for leaf in leaves]), *params)
-        agents = Agent(joined, self.config.sizes, actions_of(group.env), group.env)
+        agents = Agent(joined, self.config.agent_in(group.env), group.env)
         return CallablePolicy(one_lane(agents, int(found[0])), self.world.observation)
 
 
@@ -80,8 +76,8 @@ def train(
     config: RunConfig | str = "quickstart",
     *,
     guidance: Sequence[str] = (),
-    labels: Sequence[int] | None = None,
-    seeds: int | Sequence[int] | None = None,
+    labels: Sequence[int] = (100,),
+    seeds: int | Sequence[int] = 8,
     split: str = "validation",
     progress: bool = True,
 ) -> Run:
@@ -93,10 +89,9 @@ def train(
         world: where.
         teacher: who answers; needed by kinds of guidance that ask.
         config: everything else, or the name of one of the task's presets; its world is the one given.
-        guidance: kinds of guidance (default: those that the preset compares, or all that the world can have; without a
-            teacher those that ask none).
-        labels: label budgets (default: the preset's, or 100).
-        seeds: their number (0, 1, ...), or the seeds (default: the preset's, or 8).
+        guidance: kinds of guidance (default: all that the world can have with what is given).
+        labels: label budgets.
+        seeds: their number (0, 1, ...), or the seeds.
         split: episodes of the evaluations: "validation", or "tuning" for choosing settings.
         progress: show progress bars on standard error.
 
@@ -107,22 +102,19 @@ def train(
     if teacher is not None:
         user_code.answers_in("teacher", arguments.teacher("teacher", teacher), world.env)
     guidance = [arguments.text("guidance", kind) for kind in arguments.several("guidance", guidance, "kinds")]
+    budgets = tuple(arguments.budget("labels", one) for one in arguments.several("labels", labels, "label budgets"))
     arguments.text("split", split, SPLITS)
     arguments.flag("progress", progress)
-    preset = _preset(world, config)
-    run_config = preset.config
-    grid = suggested(world.task, preset, taught=teacher is not None)
-    if guidance:
-        grid = dataclasses.replace(grid, guidance=tuple(guidance))
-    if labels is not None:
-        budgets = [arguments.budget("labels", one) for one in arguments.several("labels", labels, "label budgets")]
-        grid = dataclasses.replace(grid, labels=tuple(budgets))
-    if seeds is not None:
-        grid = dataclasses.replace(grid, seeds=_seeds(seeds))
-    grid = checked(world.task, run_config, grid)
+    run_config = dataclasses.replace(_config(world, config), task=world.config)
+    check(run_config)
+    world.task.check_evaluations(run_config)
+    asked = guidance or registry.possible(world.env, taught=teacher is not None)
+    names = tuple(registry.resolve(kind).name for kind in asked)
+    grid = Grid(names, _seeds(seeds), budgets)
+    check_grid(grid)
     mesh = lane_mesh()
     env = place(mesh, world.env, SHARED)
-    kinds = [registry.make(kind, run_config.sizes, env) for kind in grid.guidance]
+    kinds = [run_config.guide_in(env, kind) for kind in names]
     asking = [kind.name for kind in kinds if kind.asks]
     if asking and teacher is None:
         raise UserError(f"guidance {asking[0]!r} asks a teacher: give one, for instance teacher_of(world)")
@@ -158,19 +150,18 @@ def _seeds(seeds: int | Sequence[int]) -> tuple[int, ...]:
     return tuple(range(arguments.whole("seeds", seeds, 1, LARGEST_SEED)))
 
 
-def _preset(world: World, config: RunConfig | str) -> Preset:
-    """The preset of that name, or one of a configuration, in a world. Raises UserError if there is none."""
+def _config(world: World, config: RunConfig | str) -> RunConfig:
     if isinstance(config, RunConfig):
-        groups = ("sizes", "scalars", "schedule")
-        settled = {name: configuration.settled(getattr(config, name), name) for name in groups}
-        config = dataclasses.replace(config, task=world.config, **settled)
-        return Preset("your own", config, labels=(100,), seeds=8)
+        groups = ("sizes", "scalars", "schedule", "agent", "arbiter")
+        return dataclasses.replace(
+            config, **{name: configuration.settled(getattr(config, name), name) for name in groups}
+        )
     presets = world.task.presets
     if not isinstance(config, str):
         raise arguments.refused("config", config, "a RunConfig, or the name of a preset")
     if config not in presets:
         raise UserError(f"config: unknown preset {config!r}{closest(config, presets)}")
-    return dataclasses.replace(presets[config], config=dataclasses.replace(presets[config].config, task=world.config))
+    return presets[config].config
 
 
 def _table(group: LaneGroup, row: dict[str, Any]) -> pa.Table:

@@ -1,4 +1,4 @@
-"""When to guide: the share of guided episodes follows what guided and own episodes have earned lately.
+"""The share of guided episodes follows what guided and own episodes have earned lately.
 
 A two-armed bandit whose arms change. Each arm (own, guided) keeps sums over its finished episodes, which fade with
 every episode of either arm (discounted UCB: Garivier and Moulines, "On upper-confidence bound policies for switching
@@ -7,7 +7,7 @@ probability that guidance is the better arm (Thompson sampling of the difference
 and cut: a draw means the unpaced share.
 
 An episode that earns a little more does not teach more: a weak guide costs an agent most of what it would have learned
-from episodes of its own (docs/results/bootstrapping.md). With `pace_lead` the share is proportional as well to what own
+from episodes of its own (docs/results/bootstrapping.md). With a `lead` the share is proportional as well to what own
 episodes are behind, up to that lead (regret matching: Hart and Mas-Colell, "A simple adaptive procedure leading to
 correlated equilibrium", 2000), so that a draw means the floor.
 
@@ -21,64 +21,105 @@ What an episode earned is a pair (gain, size), an arm's score the ratio of their
 
 from __future__ import annotations
 
+from typing import Annotated, ClassVar, NamedTuple
+
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from flax import struct
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from cuelearner_jax.config import Scalars
-from cuelearner_jax.types import ArmSums, Pace
+from cuelearner_jax.arbiters.episodes import redrawn
+from cuelearner_jax.arbiters.protocol import Outcome
+from cuelearner_jax.config import SHARE, Bounds, Scalars, part
 
+WINDOW = 200.0  # episodes, own and guided together, within which what they earned fades to 1/e
+FLOOR = 0.02  # least share of guided episodes, and of own ones, so that both go on being seen
 ENOUGH = 2.0  # episodes, after fading, without which an arm has no variance
 RESOLUTION = 1e-6  # relative, of sums in single precision: scores closer than that are equal
 TINY = 1e-30  # keeps 0 / 0 at 0
 
 
-def start(num_envs: int) -> Pace:
-    """Nothing seen yet, in environments at the start of their first episodes."""
-    nothing = jnp.zeros(2)
-    return Pace(
-        gain=jnp.zeros(num_envs),
-        steps=jnp.zeros(num_envs),
-        whole=jnp.ones(num_envs, bool),
-        sums=ArmSums(*[nothing] * 6),
-    )
+@part
+class Config:
+    """Options of pacing guided episodes."""
+
+    NAME: ClassVar[str] = "paced"
+    ABOUT: ClassVar[str] = "the share of guided episodes follows whether they earn more than the agent's own"
+
+    probability: Annotated[float, SHARE] = 0.5
+    """Probability that an episode is guided while both kinds are unknown, and at most."""
+    lead: Annotated[float, Bounds(0)] = 0.0
+    """What guided episodes must earn more than own ones to have their whole share; below it the share is proportional
+    (0: any lead will do)."""
+
+    def make(self, bootstraps: bool) -> Paced:
+        """The arbiter."""
+        return Paced(bootstraps)
 
 
-def follow(
-    pace: Pace,
-    scalars: Scalars,
-    bootstraps: bool,
-    reward: Float[Array, " num_envs"],
-    done: Bool[Array, " num_envs"],
-    guided: Bool[Array, " num_envs"],
-    counts: Bool[Array, ""],
-) -> Pace:
-    """The record after one step in every environment.
+class ArmSums(struct.PyTreeNode):
+    """Fading sums over the episodes of two arms, own and guided; an episode earned `gain` in `size`."""
 
-    Args:
-        pace: before it.
-        scalars: discount and window are taken from here.
-        bootstraps: do targets look at the next observation?
-        reward: of the step.
-        done: did the episode end with it?
-        guided: is the episode a guided one?
-        counts: False for steps that belong to neither arm; no episode with such a step is counted.
-    """
-    gain = pace.gain + (scalars.discount**pace.steps * reward if bootstraps else reward)
-    steps, whole = pace.steps + 1, pace.whole & counts
-    finished = done & whole
-    arms = jnp.stack([finished & ~guided, finished & guided]).astype(jnp.float32)  # (2, num_envs)
-    size = jnp.ones_like(steps) if bootstraps else steps
-    # Sums and not a matrix product, whose factors accelerators round.
-    earned = (jnp.ones_like(gain), gain, size, gain**2, gain * size, size**2)
-    new = ArmSums(*[(arms * each[None]).sum(-1) for each in earned])
-    fade = (1 - 1 / scalars.pace_window) ** finished.sum()
-    return Pace(
-        gain=jnp.where(done, 0, gain),
-        steps=jnp.where(done, 0, steps),
-        whole=whole | done,
-        sums=jax.tree.map(lambda old, added: fade * old + added, pace.sums, new),
-    )
+    episodes: Float[Array, "2"]
+    gain: Float[Array, "2"]
+    size: Float[Array, "2"]
+    gain_gain: Float[Array, "2"]
+    gain_size: Float[Array, "2"]
+    size_size: Float[Array, "2"]
+
+
+class Pace(struct.PyTreeNode):
+    """What guided and own episodes have earned, and how far the running ones are."""
+
+    guided: Bool[Array, " num_envs"]  # is the running episode a guided one?
+    gain: Float[Array, " num_envs"]  # of the running episode so far
+    steps: Float[Array, " num_envs"]  # of the running episode so far
+    whole: Bool[Array, " num_envs"]  # has it been its arm's from its first step on?
+    sums: ArmSums
+
+
+class Paced(NamedTuple):
+    """The arbiter's functions (`protocol.Arbiter`)."""
+
+    bootstraps: bool  # do targets look at the next observation?
+
+    def init(self, num_envs: int) -> Pace:
+        """Nothing seen yet."""
+        return Pace(
+            guided=jnp.zeros(num_envs, bool),
+            gain=jnp.zeros(num_envs),
+            steps=jnp.zeros(num_envs),
+            whole=jnp.ones(num_envs, bool),
+            sums=ArmSums(*[jnp.zeros(2)] * 6),
+        )
+
+    def guided(self, state: Pace) -> Bool[Array, " num_envs"]:
+        """The running episodes that are guided."""
+        return state.guided
+
+    def follow(self, state: Pace, options: Config, scalars: Scalars, outcome: Outcome, key: PRNGKeyArray) -> Pace:
+        """Adds finished episodes to their arms' sums, and draws for those that begin.
+
+        Steps outside the time of guidance belong to neither arm; no episode with such a step is counted.
+        """
+        reward, done = outcome.reward, outcome.done
+        gain = state.gain + (scalars.discount**state.steps * reward if self.bootstraps else reward)
+        steps, whole = state.steps + 1, state.whole & outcome.counts
+        finished = done & whole
+        arms = jnp.stack([finished & ~state.guided, finished & state.guided]).astype(jnp.float32)  # (2, num_envs)
+        size = jnp.ones_like(steps) if self.bootstraps else steps
+        # Sums and not a matrix product, whose factors accelerators round.
+        earned = (jnp.ones_like(gain), gain, size, gain**2, gain * size, size**2)
+        new = ArmSums(*[(arms * each[None]).sum(-1) for each in earned])
+        fade = (1 - 1 / jnp.float32(WINDOW)) ** finished.sum()
+        sums = jax.tree.map(lambda old, added: fade * old + added, state.sums, new)
+        return Pace(
+            guided=redrawn(key, state.guided, done, probability(sums, options)),
+            gain=jnp.where(done, 0, gain),
+            steps=jnp.where(done, 0, steps),
+            whole=whole | done,
+            sums=sums,
+        )
 
 
 def scores(sums: ArmSums) -> tuple[Float[Array, "2"], Float[Array, "2"]]:
@@ -93,13 +134,12 @@ def scores(sums: ArmSums) -> tuple[Float[Array, "2"], Float[Array, "2"]]:
     return ratio, jnp.maximum(residuals, 0) / jnp.maximum(size**2, TINY) / jnp.maximum(sums.episodes - 1, 1)
 
 
-def probability(pace: Pace, scalars: Scalars) -> Float[Array, ""]:
+def probability(sums: ArmSums, options: Config) -> Float[Array, ""]:
     """That the next episode is guided.
 
-    At most `guided_probability`, which is also what holds until both arms have been seen; at least `pace_floor` (but
-    never more than `guided_probability`), and as much below 1, so that both arms go on being seen.
+    At most the options' probability, which is also what holds until both arms have been seen; at least `FLOOR` (but
+    never more than that probability), and as much below 1, so that both arms go on being seen.
     """
-    sums = pace.sums
     (own, guided), variance = scores(sums)
     # A few episodes that went alike would be believed for certain: no arm varies less than both do on average.
     freedom = jnp.maximum(sums.episodes - 1, 0)
@@ -107,8 +147,9 @@ def probability(pace: Pace, scalars: Scalars) -> Float[Array, ""]:
     error = jnp.sqrt((jnp.maximum(variance, pooled) / jnp.maximum(sums.episodes, TINY)).sum())
     error = error + RESOLUTION * (jnp.abs(own) + jnp.abs(guided)) + TINY
     better = jax.scipy.stats.norm.cdf((guided - own) / error)
-    lead = jnp.clip((guided - own) / jnp.maximum(scalars.pace_lead, TINY), 0, 1)
-    worth = jnp.where(scalars.pace_lead > 0, lead, 1)
-    most = scalars.guided_probability
-    paced = jnp.clip(most * jnp.minimum(2 * better, 1) * worth, scalars.pace_floor, 1 - scalars.pace_floor)
+    lead = jnp.clip((guided - own) / jnp.maximum(options.lead, TINY), 0, 1)
+    worth = jnp.where(options.lead > 0, lead, 1)
+    most = options.probability
+    floor = jnp.float32(FLOOR)
+    paced = jnp.clip(most * jnp.minimum(2 * better, 1) * worth, floor, 1 - floor)
     return jnp.where((sums.episodes >= ENOUGH).all(), jnp.minimum(paced, most), most)

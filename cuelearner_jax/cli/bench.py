@@ -14,12 +14,11 @@ import jax
 import tyro
 from jax.sharding import Mesh
 
-from cuelearner_jax import config as configuration
 from cuelearner_jax.cli.parsing import out, parse, preset_of, task_of
-from cuelearner_jax.cli.shared_options import TaskT
-from cuelearner_jax.config import RunConfig
+from cuelearner_jax.cli.shared_options import RunT, as_kept, parts_of, preset_kinds
 from cuelearner_jax.devices import lane_mesh
 from cuelearner_jax.errors import UserError
+from cuelearner_jax.run_config import RunConfig, check
 from cuelearner_jax.runs import speed
 from cuelearner_jax.runs.grid import LARGEST_SEED
 from cuelearner_jax.runs.memory_report import memory_report
@@ -61,10 +60,10 @@ class Bench(Measuring):
 
 
 @dataclass(frozen=True)
-class BenchTask(Generic[TaskT]):
+class BenchTask(Generic[RunT]):
     """Measure one configuration."""
 
-    run: Annotated[RunConfig[TaskT], tyro.conf.arg(name="")]
+    run: Annotated[RunT, tyro.conf.arg(name="")]
     measuring: Annotated[Measuring, tyro.conf.arg(name="")] = field(default_factory=Measuring)
 
 
@@ -78,9 +77,10 @@ def run(arguments: list[str]) -> None:
     if named or (arguments and not arguments[0].startswith("-")):
         task, rest = task_of(arguments, "bench", Bench)
         name, preset, rest = preset_of(task, rest)
-        kind = BenchTask[task.config]  # pyright: ignore[reportInvalidTypeArguments]
-        given = parse(kind, rest, f"bench {task.name}", kind(preset.config))
-        asked, works = given.measuring, [(task, name, given.run)]
+        config, run_type, rest = parts_of(preset.config, rest, preset_kinds(task, preset))
+        kind = BenchTask[run_type]  # pyright: ignore[reportInvalidTypeArguments]
+        given = parse(kind, rest, f"bench {task.name}", kind(config))
+        asked, works = given.measuring, [(task, name, as_kept(given.run))]
     else:
         asked = parse(Bench, arguments, "bench")
         tasks = [registry.find(task) for task in registry.BUILT_IN]
@@ -126,7 +126,7 @@ def _check(asked: Measuring, works: list[tuple[Task, str, RunConfig]]) -> Mesh:
         raise UserError(f"{asked.out} exists: give another --out")
     mesh = lane_mesh(jax.local_devices()[: asked.devices or None])
     for task, preset, config in works:
-        configuration.check(config)
+        check(config)
         for seeds in asked.seeds:
             lanes = speed.lanes(config, shape_of(task, config.task), "none", seeds, mesh=mesh)
             console.print(f"{task.name} {preset}, {memory_report(lanes)}")

@@ -18,8 +18,8 @@ from cuelearner_jax.api.acting import load_policy
 from cuelearner_jax.api.worlds import World
 from cuelearner_jax.cli import label_commands
 from cuelearner_jax.cli.parsing import PAPER, about, code_of, out, parse, preset_of, taken, task_of
-from cuelearner_jax.cli.shared_options import Flag, TaskT
-from cuelearner_jax.config import GuideScalars, GuideSizes, RunConfig
+from cuelearner_jax.cli.shared_options import Flag, TaskT, asking_kind, preset_kinds
+from cuelearner_jax.config import GuideScalars, GuideSizes
 from cuelearner_jax.environment import actions_of, offers
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides import registry as guidances
@@ -28,11 +28,11 @@ from cuelearner_jax.labelling import controls
 from cuelearner_jax.labelling.plan import Base, Plan
 from cuelearner_jax.plugins import REFERENCE
 from cuelearner_jax.policies import NearAims, uniform_in
+from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs.grid import LARGEST_SEED
 from cuelearner_jax.runs.trained import PolicySource
 from cuelearner_jax.storage import label_files
 from cuelearner_jax.storage.folders import claimed
-from cuelearner_jax.studies.train import asking_kind, preset_kinds
 from cuelearner_jax.task import Task, shape_of
 from cuelearner_jax.tasks import registry
 from cuelearner_jax.terminal import Interrupted, console, interruptible
@@ -156,11 +156,11 @@ def planned(
     task: Task, config: RunConfig, asked: Label[Any], named: str | None, source: PolicySource | None = None
 ) -> Plan:
     """What is asked for. Raises UserError for what makes no sense."""
-    merged = RunConfig(
-        asked.task,
-        dataclasses.replace(config.sizes, **dataclasses.asdict(asked.sizes)),
-        dataclasses.replace(config.scalars, **dataclasses.asdict(asked.scalars)),
-        config.schedule,
+    merged = dataclasses.replace(
+        config,
+        task=asked.task,
+        sizes=dataclasses.replace(config.sizes, **dataclasses.asdict(asked.sizes)),
+        scalars=dataclasses.replace(config.scalars, **dataclasses.asdict(asked.scalars)),
     )
     configuration.check_guide(merged.sizes, merged.scalars)
     if not 1 <= asked.labels <= MOST_LABELS:

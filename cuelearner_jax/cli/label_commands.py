@@ -7,7 +7,8 @@ import shlex
 from pathlib import Path
 from typing import Any
 
-from cuelearner_jax.config import GuideScalars, GuideSizes, RunConfig
+from cuelearner_jax.config import GuideScalars, GuideSizes
+from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.task import Task
 
 

@@ -68,12 +68,30 @@ def parse(kind: Any, arguments: list[str], program: str, default: Any = None, ab
         told = re.split(r"For full helptext|Argument helptext", told)[0].strip()
         told = told.replace("Perhaps you meant:", "; perhaps you meant")
         told = re.sub(r"\s+", " ", told).replace(" ;", ";")[:400]
+        told += _moved(told, kind if default is None else default)
         raise UserError(f"{told}; see cuelearner {program} --help") from None
     for part in (asked, *vars(asked).values()):
         if isinstance(place := getattr(part, "out", None), Path):
             default = next(entry.default for entry in dataclasses.fields(part) if entry.name == "out")
             check_out(place, folder=default is not None)  # what may be left out is a file
     return asked
+
+
+def _moved(told: str, options: Any) -> str:
+    """Where an option of an unknown group is that another group has, as the end of a message."""
+    unknown = re.search(r"Unrecognized options: --[a-z_-]+\.([a-z0-9-]+)", told)
+    there = [name for name in _options(options) if unknown and name.endswith(f".{unknown[1]}")]
+    return f"; give --{' or --'.join(there)}" if there else ""
+
+
+def _options(group: Any, prefix: str = "") -> list[str]:
+    """The full names of options in groups."""
+    found = []
+    for entry in dataclasses.fields(group):
+        value, name = getattr(group, entry.name, None), entry.name.replace("_", "-")
+        own = prefix if entry.name in ("run", "kinds") else f"{prefix}{name}."
+        found += _options(value, own) if dataclasses.is_dataclass(value) else [f"{prefix}{name}"]
+    return found
 
 
 def _check_given(arguments: list[str]) -> None:

@@ -2,27 +2,31 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, make_dataclass, replace
+from itertools import takewhile
 from pathlib import Path
-from typing import Annotated, Generic, TypeVar
+from typing import Annotated, Any, Generic, TypeVar
 
 import tyro
 
-from cuelearner_jax.config import RunConfig
+from cuelearner_jax.cli.parsing import taken
+from cuelearner_jax.guides import registry as guidances
+from cuelearner_jax.run_config import PARTS, RunConfig
 from cuelearner_jax.runs.grid import Grid
 from cuelearner_jax.runs.order import Order
 from cuelearner_jax.runs.shards import Shard
-from cuelearner_jax.task import Task
+from cuelearner_jax.task import Preset, Task, shape_of
 
 TaskT = TypeVar("TaskT")
+RunT = TypeVar("RunT", bound=RunConfig)
 Flag = tyro.conf.FlagCreatePairsOff
 
 
 @dataclass(frozen=True)
-class Training(Generic[TaskT]):
+class Training(Generic[RunT]):
     """What train and sweep share."""
 
-    run: Annotated[RunConfig[TaskT], tyro.conf.arg(name="")]
+    run: Annotated[RunT, tyro.conf.arg(name="")]  # a RunConfig
     out: Path
     """Folder for results and checkpoints."""
     resume: Flag[bool] = False
@@ -40,7 +44,7 @@ class Training(Generic[TaskT]):
         """What is asked for, of a task and a grid."""
         return Order(
             task,
-            self.run,
+            as_kept(self.run),
             grid,
             self.out,
             resume=self.resume,
@@ -55,3 +59,56 @@ class Training(Generic[TaskT]):
     def done(self) -> str:
         """What is told at the end."""
         return f"done: {self.out} (see it with: cuelearner report {self.out} --out {self.out}/report)"
+
+
+def as_kept(run: RunConfig) -> RunConfig:
+    """A configuration of the command line with its options of kinds by name."""
+    return replace(run, kinds=vars(run.kinds))
+
+
+def parts_of(config: RunConfig, arguments: list[str], kinds: tuple[str, ...]) -> tuple[RunConfig, Any, list[str]]:
+    """The configuration with the agent and the arbiter that are asked for, and options of kinds that are in use.
+
+    Args:
+        config: a preset's; its own options of a part hold if the part is the same.
+        arguments: what was typed; --agent and --arbiter name parts.
+        kinds: of guidance, by name or as package.module:NAME, where --guidance names none.
+
+    Returns:
+        The configuration, its `kinds` a dataclass; its type, of which tyro makes options; the other arguments.
+
+    Raises:
+        UserError: a part that cannot be had.
+    """
+    for name, known in PARTS.items():
+        asked, arguments = taken(arguments, f"--{name}", ", ".join(kind.NAME for kind in known.known))
+        kind = type(getattr(config, name)) if asked is None else known.resolve(asked)
+        if kind is not type(getattr(config, name)):
+            config = replace(config, **{name: kind()})
+    used = [guidances.resolve(kind) for kind in named_kinds(arguments) or kinds]
+    own = [(kind.name, kind.config, config.kinds.get(kind.name) or kind.config()) for kind in used if kind.config]
+    options = make_dataclass("Kinds", [(name, kind, field(default=value)) for name, kind, value in own], frozen=True)
+    config = replace(config, kinds=options())
+    types = (type(config.task), type(config.agent), type(config.arbiter), options)
+    return config, RunConfig[types], arguments  # pyright: ignore[reportInvalidTypeArguments]
+
+
+def named_kinds(arguments: list[str]) -> tuple[str, ...]:
+    """The values of --guidance, as they are typed."""
+    for place, argument in enumerate(arguments):
+        if argument.startswith("--guidance="):
+            return (argument.partition("=")[2],)
+        if argument == "--guidance":
+            return tuple(takewhile(lambda word: not word.startswith("-"), arguments[place + 1 :]))
+    return ()
+
+
+def preset_kinds(task: Task, preset: Preset) -> tuple[str, ...]:
+    """The kinds of guidance that a preset compares: those it names, or all that the task can have."""
+    return preset.guidance or guidances.possible(shape_of(task, preset.config.task), taught=task.teacher is not None)
+
+
+def asking_kind(kinds: tuple[str, ...]) -> str:
+    """The first of the kinds that asks a teacher, or else the first."""
+    asking = [kind for kind in kinds if guidances.resolve(kind).asks]
+    return (asking or list(kinds))[0]

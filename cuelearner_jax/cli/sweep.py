@@ -7,17 +7,16 @@ from pathlib import Path
 from typing import Generic, Literal
 
 from cuelearner_jax.cli.parsing import about, out, parse, preset_of, task_of
-from cuelearner_jax.cli.shared_options import TaskT, Training
+from cuelearner_jax.cli.shared_options import RunT, Training, parts_of, preset_kinds
 from cuelearner_jax.runs import submission, sweep
 from cuelearner_jax.runs.cluster import Job
 from cuelearner_jax.runs.grid import Grid, seeds_of
 from cuelearner_jax.runs.order import Plan, planned
 from cuelearner_jax.runs.shards import Shard
-from cuelearner_jax.studies.train import suggested
 
 
 @dataclass(frozen=True)
-class Sweep(Training[TaskT], Generic[TaskT]):
+class Sweep(Training[RunT], Generic[RunT]):
     """Train seeds x label budgets x kinds of guidance in one process."""
 
     guidance: tuple[str, ...] = ()
@@ -46,11 +45,13 @@ def run(arguments: list[str]) -> None:
     """Runs the command. Raises what `sweep.run` and `submission.submit` raise."""
     task, rest = task_of(arguments, "sweep", Sweep)
     name, preset, rest = preset_of(task, rest)
-    kind = Sweep[task.config]  # pyright: ignore[reportInvalidTypeArguments]
+    kinds = preset_kinds(task, preset)
+    config, run_type, rest = parts_of(preset.config, rest, kinds)
+    kind = Sweep[run_type]  # pyright: ignore[reportInvalidTypeArguments]
     default = kind(
-        preset.config,
+        config,
         out=Path("runs") / f"{task.name}-{name}",
-        guidance=suggested(task, preset).guidance,
+        guidance=kinds,
         labels=preset.labels,
         seeds=preset.seeds,
         first_seed=preset.first_seed,

@@ -7,15 +7,20 @@ from pathlib import Path
 from typing import Generic
 
 from cuelearner_jax.cli.parsing import about, out, parse, preset_of, task_of
-from cuelearner_jax.cli.shared_options import TaskT, Training
+from cuelearner_jax.cli.shared_options import (
+    RunT,
+    Training,
+    asking_kind,
+    parts_of,
+    preset_kinds,
+)
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.runs import sweep
 from cuelearner_jax.runs.grid import LARGEST_SEED, Grid
-from cuelearner_jax.studies.train import asking_kind, preset_kinds
 
 
 @dataclass(frozen=True)
-class Train(Training[TaskT], Generic[TaskT]):
+class Train(Training[RunT], Generic[RunT]):
     """Train one seed under one kind of guidance."""
 
     guidance: str = ""
@@ -33,11 +38,13 @@ def run(arguments: list[str]) -> None:
     """Runs the command. Raises what `sweep.run` raises."""
     task, rest = task_of(arguments, "train", Train)
     name, preset, rest = preset_of(task, rest)
-    kind = Train[task.config]  # pyright: ignore[reportInvalidTypeArguments]
+    kinds = preset_kinds(task, preset)
+    config, run_type, rest = parts_of(preset.config, rest, kinds)
+    kind = Train[run_type]  # pyright: ignore[reportInvalidTypeArguments]
     default = kind(
-        preset.config,
+        config,
         out=Path("runs") / f"{task.name}-{name}",
-        guidance=asking_kind(preset_kinds(task, preset)),
+        guidance=asking_kind(kinds),
         labels=preset.labels[0],
     )
     asked = parse(kind, rest, f"train {task.name}", default, about(Train, task))

@@ -1,28 +1,28 @@
-"""Configuration of the method: its groups of values, what of them can work, and how they are kept."""
+"""Options that all parts share, how a part brings its own, what of them can work, and how they are kept."""
 
-from cuelearner_jax.config.checks import (
-    LARGEST,
-    LARGEST_FLOAT,
-    LARGEST_ROUND,
-    MOST_LAYERS,
-    check,
-    check_agent,
-    check_guide,
-    check_types,
-    check_whole,
-    settled,
-)
+from cuelearner_jax.config.checks import LARGEST_ROUND, check_guide, check_multiple
 from cuelearner_jax.config.groups import (
-    AgentScalars,
-    AgentSizes,
     Frame,
     GuideScalars,
     GuideSizes,
-    RunConfig,
     Scalars,
     Schedule,
     Sizes,
     TeacherFaults,
+)
+from cuelearner_jax.config.parts import (
+    LARGEST,
+    LARGEST_FLOAT,
+    MOST_LAYERS,
+    POSITIVE,
+    SHARE,
+    Bounds,
+    Layers,
+    check_part,
+    check_types,
+    part,
+    settled,
+    static,
 )
 from cuelearner_jax.config.plain import defaults, digest, from_json, plain, to_json
 
@@ -31,25 +31,27 @@ __all__ = [
     "LARGEST_FLOAT",
     "LARGEST_ROUND",
     "MOST_LAYERS",
-    "AgentScalars",
-    "AgentSizes",
+    "POSITIVE",
+    "SHARE",
+    "Bounds",
     "Frame",
     "GuideScalars",
     "GuideSizes",
-    "RunConfig",
+    "Layers",
     "Scalars",
     "Schedule",
     "Sizes",
     "TeacherFaults",
-    "check",
-    "check_agent",
     "check_guide",
+    "check_multiple",
+    "check_part",
     "check_types",
-    "check_whole",
     "defaults",
     "digest",
     "from_json",
+    "part",
     "plain",
     "settled",
+    "static",
     "to_json",
 ]

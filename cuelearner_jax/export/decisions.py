@@ -65,7 +65,7 @@ def _described(layer: Any) -> dict[str, Any]:
             "clip_radius_deg": min(float(scalars.tau_max_deg), bound),
         }
     if isinstance(layer, Agent):
-        return {"layer": "agent", "directions": layer.sizes.directions, "frame": layer.sizes.frame}
+        return {"layer": "agent", **layer.functions.described}
     return {"layer": type(layer).__name__.lower()}
 
 

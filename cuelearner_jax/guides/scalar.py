@@ -14,8 +14,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from cuelearner_jax.agents.choice import greedy_actions
-from cuelearner_jax.config import AgentSizes, GuideScalars
+from cuelearner_jax.agents.choice import best_of
+from cuelearner_jax.config import GuideScalars
 from cuelearner_jax.feedback.answers import SCALAR
 from cuelearner_jax.guides.base import Guide, Kind
 from cuelearner_jax.guides.model import GuideModel, guide_model
@@ -42,9 +42,8 @@ class Scalar(Guide):
     ) -> Refined:
         """The best of all actions in active rows of a fitted model."""
         guided = active & model.fitted
-        # The argmax is the agent's own, of a network of these layers in this frame.
-        searched = AgentSizes(self.sizes.frame, self.sizes.feedback_layers, self.sizes.guide_directions)
-        chosen = greedy_actions(searched, self.spaces.actions, env, model.params, obs, self.sizes.ensemble)
+        value = lambda obs, actions: self.network.predict(env, model.params, obs, actions)[:, 0]  # noqa: E731
+        chosen = best_of(value, self.spaces.actions.spread(self.sizes.guide_directions), obs)
         return Refined(jnp.where(guided[:, None], chosen, actions), guided.astype(jnp.int32))
 
     def question(

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PRNGKeyArray
 
-from cuelearner_jax.agents.learning import all_finite
+from cuelearner_jax.agents.networks import all_finite
 from cuelearner_jax.guides.fitting import held_out
 from cuelearner_jax.labelling.plan import Plan
 from cuelearner_jax.labelling.programs import Agreement, Programs, agreement

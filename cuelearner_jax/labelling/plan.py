@@ -9,10 +9,11 @@ from typing import Any
 import jax
 import numpy as np
 
-from cuelearner_jax.config import RunConfig, to_json
+from cuelearner_jax.config import to_json
 from cuelearner_jax.feedback.forms import AnswerForm
 from cuelearner_jax.guides.base import Guide
 from cuelearner_jax.policies import Policy
+from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.task import Task
 
 APART = ("env", "teacher")  # fields of policies that are the world's, which the file tells by itself

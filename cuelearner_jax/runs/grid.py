@@ -2,22 +2,27 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 
 from cuelearner_jax import config as configuration
-from cuelearner_jax.config import RunConfig, Scalars, Schedule, Sizes
+from cuelearner_jax import run_config
+from cuelearner_jax.agents import ddqn
+from cuelearner_jax.arbiters import episodes
+from cuelearner_jax.environment import Spaces
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import SPLITS
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.guides.base import NAME, Guide
 from cuelearner_jax.plugins import REFERENCE
+from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs.shards import Shard
+from cuelearner_jax.spaces import DIRECTIONS
 from cuelearner_jax.storage import formats, label_files
 from cuelearner_jax.storage.folders import CONFIG
 from cuelearner_jax.storage.room import check_room
@@ -89,9 +94,7 @@ def describe(
         "format": formats.FORMATS["config"],
         "task": {"name": task.name, **origin, **configuration.to_json(config.task)},
         **({"files": files} if (files := task.files(config.task)) else {}),
-        "sizes": configuration.to_json(config.sizes),
-        "scalars": configuration.to_json(config.scalars),
-        "schedule": configuration.to_json(config.schedule),
+        **run_config.to_json(config),
         "grid": {"guidance": list(grid.guidance), "seeds": list(grid.seeds), "labels": list(grid.labels)},
         "split": split,
         "labels_from": f"{labels_from.name} {label_files.digest(labels_from)}" if labels_from else None,
@@ -102,7 +105,7 @@ def describe(
 
 def defaults(task: Task) -> dict[str, Any]:
     """What a config.json means where it lacks a field that a task or the method got later: the field's default."""
-    groups = {"task": task.config, "sizes": Sizes, "scalars": Scalars, "schedule": Schedule}
+    groups = {"task": task.config, **run_config.GROUPS, "agent": ddqn.Config, "arbiter": episodes.Config}
     return {name: configuration.defaults(kind) for name, kind in groups.items()}
 
 
@@ -130,18 +133,13 @@ def load(folder: Path, find: Callable[[str], Task]) -> tuple[Task, RunConfig, Gr
     values = formats.read("config", path)
     try:
         task, world = world_of(values["task"], find, path)
-        config = RunConfig(
-            world,
-            configuration.from_json(Sizes, values["sizes"]),
-            configuration.from_json(Scalars, values["scalars"]),
-            configuration.from_json(Schedule, values["schedule"]),
-        )
+        config = run_config.from_json(world, values)
         grid = _grid(values["grid"])
         if "shard" in values:
             Shard.of(values["shard"])
         if values["split"] not in SPLITS or values["total_steps"] != config.schedule.total_steps:
             raise ValueError("what it says of its evaluations makes no sense")
-        configuration.check(config)
+        run_config.check(config)
         _check_room(path, config, grid)
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise formats.damaged("config", path) from error
@@ -149,14 +147,15 @@ def load(folder: Path, find: Callable[[str], Task]) -> tuple[Task, RunConfig, Gr
 
 
 def _check_room(path: Path, config: RunConfig, grid: Grid) -> None:
-    """Raises UserError if a run's networks, a search of actions, or an evaluation are more than memory holds."""
-    sizes, envs = config.sizes, config.schedule.eval_envs
-    layers, remedy = sizes.q_layers, "restore the file"
-    lanes, weights = len(grid.seeds) * max(1, len(grid.labels)), sum(layers) + math.prod(layers[:2])
-    check_room(f"{path} has {lanes:,} lanes of layers {layers}", 4 * weights * lanes, remedy)
-    told = f"{path} has {sizes.directions:,} sizes.directions"
-    check_room(told, 8 * max(layers) * sizes.directions, remedy)  # of a layer, before and after its activation
-    check_room(f"{path} has {envs:,} schedule.eval_envs", 8 * max(layers) * envs, remedy)
+    """Raises UserError if a run's lanes are more than memory holds: their networks at work, or an evaluation."""
+    lanes, spaces = len(grid.seeds) * max(1, len(grid.labels)), Spaces(1, DIRECTIONS, (1, 1))
+    agent = config.agent.make(config.sizes.frame, spaces, config.bootstraps)
+    weights = sum(leaf.size for leaf in jax.tree.leaves(jax.eval_shape(agent.init, jax.random.key(0))))
+    check_room(f"{path} has {lanes:,} lanes of {weights:,} weights", 4 * weights * lanes, "restore the file")
+    for option, floats in agent.working(1, 1).items():
+        check_room(f"{path} has too large {option}", 4 * floats, "restore the file")
+    envs = config.schedule.eval_envs
+    check_room(f"{path} has {envs:,} schedule.eval_envs", 4 * envs, "restore the file")
 
 
 def _grid(values: dict[str, Any]) -> Grid:

@@ -13,15 +13,15 @@ import numpy as np
 from jax.sharding import Mesh
 from jaxtyping import PRNGKeyArray
 
-from cuelearner_jax.config import RunConfig
+from cuelearner_jax.asking import label_slots
 from cuelearner_jax.devices import BY_LANE, lane_mesh, place
 from cuelearner_jax.environment import Environment
 from cuelearner_jax.evaluate import Tell, evaluate_lanes, untold, watched_lanes
 from cuelearner_jax.guides.base import Guide
 from cuelearner_jax.loop import Program, make_program
 from cuelearner_jax.policies import Policy
+from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs.grid import Grid
-from cuelearner_jax.runs.instalments import Instalments
 from cuelearner_jax.types import Clock, Label, Teacher, TrainState
 
 CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
@@ -43,14 +43,22 @@ class LaneGroup:
         )
 
     @property
-    def instalments(self) -> Instalments:
-        """When its lanes are asked for labels."""
-        return Instalments(self.budgets, self.config.sizes, self.config.schedule)
-
-    @property
     def rounds(self) -> int:
-        """Label rounds of all instalments."""
-        return self.instalments.rounds
+        """Label rounds of the largest budget."""
+        return label_slots(self.largest_budget, self.config.sizes) // self.config.sizes.labels_per_round
+
+    def asked(self, rounds: int) -> np.ndarray:
+        """Labels (lanes,) asked for after so many rounds."""
+        return np.minimum(self.budgets, rounds * self.config.sizes.labels_per_round)
+
+    def examined(self, rounds: int, before: int) -> np.ndarray:
+        """Whose guide (lanes,) is looked at after so many rounds, those since `before` having changed it.
+
+        At every multiple of `guide_eval_every` labels of its own, and at its last.
+        """
+        earlier, now, every = self.asked(before), self.asked(rounds), self.config.schedule.guide_eval_every
+        due = now == self.budgets
+        return (now > earlier) & (due | (now % every == 0) if every else due)
 
     def looks(self, rounds: int, given: bool) -> list[tuple[int, int, int]]:
         """(seed, budget, labels asked for) of each evaluation of a guide alone up to so many rounds.
@@ -60,8 +68,8 @@ class LaneGroup:
         made = [(0, rounds)] if given else [(number - 1, number) for number in range(1, rounds + 1)]
         found = []
         for before, after in made:
-            due = self.instalments.examined(after, before)
-            columns = (self.seeds, self.budgets, self.instalments.asked(after))
+            due = self.examined(after, before)
+            columns = (self.seeds, self.budgets, self.asked(after))
             found += zip(*(column[due].tolist() for column in columns), strict=True)
         return found
 
@@ -127,30 +135,15 @@ class LaneGroup:
         self, clock: Clock, blocks: list[TrainState], iterations: int
     ) -> tuple[Clock, list[TrainState], list[dict[str, jax.Array]]]:
         """So many iterations of all lanes, done when this returns: (clock, blocks, each block's means (lanes,))."""
-        config = self.config
-        done = self.each(
-            lambda block: self.program.train(self.env, config.scalars, config.schedule, clock, block, iterations),
-            blocks,
-        )
+        settings = self.config.settings
+        done = self.each(lambda block: self.program.train(self.env, settings, clock, block, iterations), blocks)
         after = jax.block_until_ready(done[0][0])
         return after, [block for _, block, _ in done], [measured for _, _, measured in done]
 
-    def label_round(
-        self, teacher: Teacher, clock: Clock, blocks: list[TrainState], instalment: int = 0
-    ) -> tuple[Clock, list[TrainState]]:
-        """One round of questions to a simulated teacher, and the fit that follows it.
-
-        Questions of an instalment after the first (0) are about the agents' own actions.
-        """
-        ends = self.instalments.shares(instalment)
-        shares = [place(self.mesh, jnp.asarray(ends[rows]), BY_LANE) for rows in self.cut]
-        done = self.each(
-            lambda block, until: self.program.label_round(
-                self.env, teacher, self.config.scalars, clock, block, until, own=instalment > 0
-            ),
-            blocks,
-            shares,
-        )
+    def label_round(self, teacher: Teacher, clock: Clock, blocks: list[TrainState]) -> tuple[Clock, list[TrainState]]:
+        """One round of questions to a simulated teacher, and the fit that follows it."""
+        scalars = self.config.scalars
+        done = self.each(lambda block: self.program.label_round(self.env, teacher, scalars, clock, block), blocks)
         return jax.block_until_ready(done[0][0]), [block for _, block in done]
 
     def take_labels(self, labels: list[Label], blocks: list[TrainState]) -> list[TrainState]:

@@ -7,9 +7,9 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from cuelearner_jax.agents.choice import looked_at
 from cuelearner_jax.asking import label_slots
 from cuelearner_jax.devices import portions
+from cuelearner_jax.environment import spaces_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides.registry import registered
 from cuelearner_jax.runs.lanes import LaneGroup
@@ -78,30 +78,21 @@ def _at_rest(block: TrainState, layers: _Guide) -> dict[str, int]:
     """What a block keeps [bytes], by the option that decides it."""
     agent, guide = block.agent, block.guide
     parts = {
-        "--sizes.replay-capacity": agent.replay,
+        "--agent.replay-capacity": agent.replay,
         "--labels": guide.labels,
-        "--sizes.num-envs": (agent.env, agent.obs, agent.guided),
+        "--sizes.num-envs": (agent.env, agent.obs, block.arbiter),
         "--sizes.candidates": (guide.env, guide.obs),
         layers.option: guide.model,
     }
     found = {option: state_bytes(part) for option, part in parts.items()}
-    return {**found, "--sizes.q-layers": state_bytes(block) - sum(found.values())}
+    return {**found, "the networks of --agent": state_bytes(block) - sum(found.values())}
 
 
 def _training(group: LaneGroup, block: TrainState, guide: _Guide) -> dict[str, int]:
     """What one lane takes beside that in each kind of work, of which one is done at a time [bytes], by option."""
     sizes, schedule = group.config.sizes, group.config.schedule
-    looked = looked_at(sizes)
-    # Activations of the widest pass: the argmax while acting, that inside targets, or a batch with its gradient.
-    rows = {
-        "--sizes.directions": min(sizes.num_envs * looked, max(portions().actions, looked)),
-        "--sizes.batch-size": 3 * sizes.batch_size * len(sizes.q_layers),
-    }
-    if group.config.bootstraps:
-        targets = sizes.batch_size * sizes.target_directions * (2 if sizes.n_step > 1 else 1)
-        rows["--sizes.target-directions"] = targets
-    needed = {option: 4 * FLOAT * _widest(group) * number for option, number in rows.items()}
-    needed["--sizes.n-step"] = 8 * FLOAT * sizes.batch_size * sizes.n_step
+    agent = group.config.agent.make(sizes.frame, spaces_of(group.env), group.config.bootstraps)
+    needed = {option: FLOAT * number for option, number in agent.working(sizes.num_envs, portions().actions).items()}
     needed["--schedule.eval-every"] = 3 * FLOAT * (schedule.eval_every // sizes.num_envs)
     if group.largest_budget:
         obs = state_bytes(block.guide.obs) // (block.key.shape[0] * sizes.candidates)
@@ -110,7 +101,7 @@ def _training(group: LaneGroup, block: TrainState, guide: _Guide) -> dict[str, i
         needed["--sizes.fit-steps"] = 2 * FLOAT * sizes.fit_steps
         slots = label_slots(group.largest_budget, sizes)
         valued = min(sizes.num_envs * sizes.guide_directions, max(portions().actions, sizes.guide_directions))
-        needed["--sizes.guide-directions"] = 4 * FLOAT * _widest(group) * valued * sizes.ensemble
+        needed["--sizes.guide-directions"] = 4 * FLOAT * max(sizes.feedback_layers) * valued * sizes.ensemble
         needed["--sizes.replay-steps"] = FLOAT * sizes.replay_steps * sizes.fit_batch_size
         widest = FLOAT * sizes.ensemble * guide.widest
         needed[guide.option] = 4 * widest * sizes.num_envs
@@ -125,12 +116,7 @@ def _evaluating(group: LaneGroup, block: TrainState, guide: _Guide) -> dict[str,
     schedule = group.config.schedule
     lanes = block.key.shape[0] * group.config.sizes.candidates
     situation = state_bytes((block.guide.env, block.guide.obs)) // lanes
-    widest = max(_widest(group), guide.widest)
     return {
-        "--schedule.eval-envs": schedule.eval_envs * (COPIES * situation + 2 * FLOAT * widest),
+        "--schedule.eval-envs": schedule.eval_envs * (COPIES * situation + 2 * FLOAT * guide.widest),
         "--schedule.eval-steps": METRICS * FLOAT * (schedule.eval_steps // schedule.eval_envs),
     }
-
-
-def _widest(group: LaneGroup) -> int:
-    return max(*group.config.sizes.q_layers, *group.config.sizes.feedback_layers)

@@ -11,10 +11,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from cuelearner_jax.config import RunConfig
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.guides.base import Guide
+from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs import shards
 from cuelearner_jax.runs.grid import Grid, defaults, load
 from cuelearner_jax.runs.kept import restore_policies
@@ -103,7 +102,7 @@ def lanes_of(task: Task, config: RunConfig, pieces: tuple[Piece, ...], kind: str
         if sweep and not (folder / kind / "checkpoints").is_dir():
             told.append(f"{folder}: no checkpoint of {kind} guidance, left out")
             continue
-        group = LaneGroup(config, env, guidances.make(kind, config.sizes, env), grid)
+        group = LaneGroup(config, env, config.guide_in(env, kind), grid)
         policies, step = restore_policies(group, folder / kind)
         found.setdefault(step, []).append(Lanes(group.guidance, group.seeds, group.budgets, policies, step))
         if step < config.schedule.total_steps:

@@ -9,13 +9,14 @@ from pathlib import Path
 from typing import Any
 
 from cuelearner_jax import config as configuration
+from cuelearner_jax import run_config
 from cuelearner_jax.asking import label_slots
-from cuelearner_jax.config import GuideSizes, RunConfig, Scalars
+from cuelearner_jax.config import GuideSizes, Scalars
 from cuelearner_jax.environment import spaces_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.feedback import given
 from cuelearner_jax.guides import registry as guidances
-from cuelearner_jax.runs import instalments
+from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs.grid import Grid, check_grid, defaults, describe
 from cuelearner_jax.runs.shards import Shard
 from cuelearner_jax.storage import formats, label_files, results, tracking
@@ -61,32 +62,13 @@ class Plan:
         return sum(shares) / len(shares)
 
 
-def checked(task: Task, config: RunConfig, grid: Grid, given: bool = False) -> Grid:
-    """Return the grid with its kinds by their own names; code is loaded here.
-
-    Args:
-        task, config, grid: what is to be trained.
-        given: do labels come from a file?
-
-    Raises:
-        UserError: what makes no sense.
-    """
-    configuration.check(config)
-    grid = dataclasses.replace(grid, guidance=tuple(guidances.resolve(kind).name for kind in grid.guidance))
-    check_grid(grid)
-    instalments.check(config, grid, given=given)
-    task.check_evaluations(config)
-    env = shape_of(task, config.task)
-    for kind in grid.guidance:
-        guidances.make(kind, config.sizes, env)
-    return grid
-
-
 def planned(order: Order) -> Plan:
     """What `run` does with an order. Raises UserError for what it would refuse, but for too little memory."""
+    run_config.check(order.config)
     tracking.check(order.track)
-    given = order.labels_from is not None
-    order = dataclasses.replace(order, grid=checked(order.task, order.config, order.grid, given))
+    names = tuple(guidances.resolve(kind).name for kind in order.grid.guidance)  # code is loaded here
+    order = dataclasses.replace(order, grid=dataclasses.replace(order.grid, guidance=names))
+    check_grid(order.grid)
     piece, sweep = None, order.out
     if order.shard:
         piece = order.shard.described(order.grid.seeds)
@@ -94,6 +76,10 @@ def planned(order: Order) -> Plan:
         begun = not order.overwrite and (folder / CONFIG).is_file()
         grid = dataclasses.replace(order.grid, seeds=order.shard.seeds(order.grid.seeds))
         order = dataclasses.replace(order, grid=grid, out=folder, resume=order.resume or begun)
+    env = shape_of(order.task, order.config.task)
+    order.task.check_evaluations(order.config)
+    for kind in order.grid.guidance:
+        order.config.guide_in(env, kind)
     config, labels = order.config, None
     if order.labels_from:
         labels = read_labels(order.labels_from, order.task, config.task, config.sizes, config.scalars, order.grid)

@@ -15,11 +15,10 @@ from typing import Any, TypeVar
 import jax
 from jax.sharding import Mesh
 
-from cuelearner_jax.config import RunConfig
 from cuelearner_jax.devices import SHARED, lane_mesh, place
 from cuelearner_jax.environment import Environment
-from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.loop import start_clock
+from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs.grid import Grid
 from cuelearner_jax.runs.lanes import LaneGroup
 from cuelearner_jax.runs.memory_report import state_bytes
@@ -49,7 +48,7 @@ class Timed:
 
 def lanes(config: RunConfig, env: Environment, kind: str, seeds: int, labels: int = 0, *, mesh: Mesh) -> LaneGroup:
     """The lanes of a measurement; `env` may be its shapes."""
-    made = guidances.make(kind, config.sizes, env)
+    made = config.guide_in(env, kind)
     return LaneGroup(config, env, made, Grid((kind,), tuple(range(seeds)), (labels,)), mesh)
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from cuelearner_jax.devices import SHARED, lane_mesh, place
 from cuelearner_jax.feedback.answers import check_teacher
-from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.runs import failures
 from cuelearner_jax.runs.grid import defaults
 from cuelearner_jax.runs.kept import check_standing
@@ -33,10 +32,10 @@ def run(order: Order) -> None:
     task, config = order.task, order.config
     mesh, shape = lane_mesh(), shape_of(task, config.task)
     for kind in order.grid.guidance:  # before anything is made that has a size
-        made = guidances.make(kind, config.sizes, shape)
+        made = config.guide_in(shape, kind)
         console.print(memory_report(LaneGroup(config, shape, made, order.grid)))
     env = place(mesh, task.environment(config.task), SHARED)
-    kinds = [guidances.make(kind, config.sizes, env) for kind in order.grid.guidance]
+    kinds = [config.guide_in(env, kind) for kind in order.grid.guidance]
     groups = [LaneGroup(config, env, kind, order.grid) for kind in kinds]
     asked = any(kind.asks for kind in kinds) and plan.labels is None
     teacher = place(mesh, task.make_teacher(config.task, env), SHARED) if asked else None

@@ -9,12 +9,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from cuelearner_jax.config import RunConfig
 from cuelearner_jax.environment import actions_of, offers, spaces_of
 from cuelearner_jax.errors import UserError, closest
 from cuelearner_jax.evaluate import one_lane
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.policies import Agent, Common, Corrected, Guided, Heuristic, Policy, Taught, uniform_in
+from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs.adapted import AdaptedLanes, alone, open_folder
 from cuelearner_jax.runs.failures import without_failed
 from cuelearner_jax.runs.grid import Grid
@@ -38,14 +38,12 @@ class Parts(NamedTuple):
     def agent(self) -> Agent:
         """The lanes' agents."""
         assert self.lanes is not None
-        return Agent(self.lanes.policies["params"], self.config.sizes, actions_of(self.env), self.env)
+        return Agent(self.lanes.policies["params"], self.config.agent_in(self.env), self.env)
 
-    def guided(self, base: Policy, own: bool = False) -> Guided:
-        """A policy under the lanes' guidance; of the agents' `own` actions it is bounded as in the guided episodes."""
+    def guided(self, base: Policy) -> Guided:
+        """A policy under the lanes' guidance."""
         assert self.lanes is not None
-        bounded = own and len(self.config.schedule.ask_at) > 1
-        bound = actions_of(self.env).from_unit(self.config.scalars.ask_bound_deg) if bounded else None
-        return Guided(base, self.lanes.policies["guidance"], self.env, self.config.scalars, self.lanes.guidance, bound)
+        return Guided(base, self.lanes.policies["guidance"], self.env, self.config.scalars, self.lanes.guidance)
 
     def corrected(self, base: Policy) -> Corrected:
         """A policy under the teacher's own corrections."""
@@ -82,7 +80,7 @@ def _folder_of(parts: Parts) -> AdaptedLanes:
 POLICIES: dict[str, Named] = {
     "agent": Named("the trained agent", lambda parts: parts.agent, trained=True),
     "guide": Named("guidance of uniform actions", lambda parts: parts.guided(uniform_in(parts.env)), trained=True),
-    "guided": Named("guidance of the agent's actions", lambda parts: parts.guided(parts.agent, own=True), trained=True),
+    "guided": Named("guidance of the agent's actions", lambda parts: parts.guided(parts.agent), trained=True),
     "corrected": Named(
         "the teacher's own feedback on the agent's actions",
         lambda parts: parts.corrected(parts.agent),

@@ -12,7 +12,7 @@ import numpy as np
 
 from cuelearner_jax.asking import blame, label_slots
 from cuelearner_jax.devices import SHARED, place
-from cuelearner_jax.environment import Environment, actions_of
+from cuelearner_jax.environment import Environment
 from cuelearner_jax.evaluate import Tell, episodes, untold
 from cuelearner_jax.loop import start_clock
 from cuelearner_jax.policies import Agent, Guided, Policy, uniform_in
@@ -70,9 +70,8 @@ class Training:
 
     @property
     def labelled(self) -> bool:
-        """Have the questions been asked that come before the next training step?"""
-        instalments = self.group.instalments
-        return not self.group.guidance.asks or self.round >= instalments.end(instalments.begun(self.step))
+        """Have all questions been asked?"""
+        return not self.group.guidance.asks or self.round >= self.group.rounds
 
     @property
     def done(self) -> bool:
@@ -85,11 +84,10 @@ class Training:
         return self.group.columns([{"failed": block.failed} for block in self.blocks])["failed"]
 
     def label_rounds(self, teacher: Teacher) -> Iterator[int]:
-        """Asks a simulated teacher for an instalment, a round at a time; gives the number of all rounds so far."""
-        instalment = self.group.instalments.begun(self.step)
+        """Asks a simulated teacher for all labels, a round at a time; gives the number of rounds so far."""
         while not self.labelled:
             started = time.perf_counter()
-            self.clock, self.blocks = self.group.label_round(teacher, self.clock, self.blocks, instalment)
+            self.clock, self.blocks = self.group.label_round(teacher, self.clock, self.blocks)
             self.wall += time.perf_counter() - started
             if self.failed.all():
                 blame(teacher, jax.tree.map(lambda leaf: leaf[0], self.blocks[0].guide))
@@ -111,14 +109,14 @@ class Training:
     def guides(self, before: int) -> dict[str, Any] | None:
         """The columns of an evaluation of the guides alone after the rounds since `before`, or None: none is due.
 
-        Scalars, or one entry for each lane whose guide is due, see `Instalments.examined`.
+        Scalars, or one entry for each lane whose guide is due, see `LaneGroup.examined`.
         """
         group, rounds = self.group, self.round
-        due = group.instalments.examined(rounds, before)
+        due = group.examined(rounds, before)
         if not due.any():
             return None
         own = {"round": rounds, "step": self.step, "wall_s": self.wall}
-        each = {"seed": group.seeds, "labels": group.budgets, "asked": group.instalments.asked(rounds)}
+        each = {"seed": group.seeds, "labels": group.budgets, "asked": group.asked(rounds)}
         each |= {"failed": self.failed.astype(float), **self.guide_alone()}
         return {**own, **{name: values[due] for name, values in each.items()}}
 
@@ -131,16 +129,12 @@ class Training:
         return group.seeds[largest], jax.tree.map(lambda leaf: leaf[largest], rows)
 
     def stretches(self) -> Iterator[dict[str, Any]]:
-        """Trains until labels are asked for again, or to the end.
-
-        Gives the columns of each evaluation: before the first step, then after every stretch.
-        """
+        """Trains to the end; gives the columns of each evaluation: before the first step, then after every stretch."""
         group, schedule = self.group, self.group.config.schedule
-        until = group.instalments.next_step(self.step)
         if self.step == 0:
             yield {**self.evaluation(), **self.guide_alone()}
         iterations = schedule.eval_every // group.config.sizes.num_envs
-        while self.step < until or self.due is not None:
+        while not self.done or self.due is not None:
             if self.due is None:
                 started = time.perf_counter()
                 self.clock, self.blocks, metrics = group.train(self.clock, self.blocks, iterations)
@@ -159,7 +153,7 @@ class Training:
 
     def _agent(self, lane: TrainState) -> Policy:
         """A block's agents, who look at the examined world."""
-        return Agent(lane.agent.params, self.group.config.sizes, actions_of(self.group.env), self.examined)
+        return Agent(lane.agent.params, self.group.config.agent_in(self.group.env), self.examined)
 
     def guide_alone(self) -> dict[str, np.ndarray]:
         """Metrics (lanes,) of uniform actions under guidance; for unguided lanes that is chance.

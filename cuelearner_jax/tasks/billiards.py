@@ -14,9 +14,12 @@ from cuelearner_envs import billiards
 from cuelearner_envs.billiards.config import BilliardsConfig, make_environment
 from cuelearner_envs.billiards.environment import Billiards
 from cuelearner_envs.billiards.teacher import LocalSearchTeacher, NearbyTeacher, SearchTeacher, Transferred
-from cuelearner_jax.config import RunConfig, Scalars, Schedule, Sizes
+from cuelearner_jax.agents import ddqn
+from cuelearner_jax.arbiters import paced
+from cuelearner_jax.config import Scalars, Schedule, Sizes
 from cuelearner_jax.environment import Environment
 from cuelearner_jax.errors import UserError
+from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.task import PAPERS_FIT, Body, Pictures, Preset, Scenario, Task
 from cuelearner_jax.teachers import stored
 from cuelearner_jax.types import Teacher
@@ -32,17 +35,11 @@ SLIGHT_TILT = 0.02  # up to which a learned teacher's proposals lie near good sh
 LOCAL_SEARCH = "local_search"
 
 
-# The paper's networks and search, seen from the strike and paced: what learns fastest here, see docs/results.
-SEEN_FROM_THE_STRIKE = Sizes(
-    frame="action",
-    num_envs=100,
-    coarse_directions=720,
-    coarse_dtype="bfloat16",
-    peaks=8,
-    replay_capacity=1_000_000,
-    pace=True,
-)
-LEAD = 0.5  # a guide that earns half a shot more than the agent has its whole share, a weaker one less
+# The paper's networks, searched as fast as they can be.
+AGENT = ddqn.Config(coarse_directions=720, coarse_dtype="bfloat16", peaks=8)
+# Seen from the strike and paced: what learns fastest here, see docs/results.
+SEEN_FROM_THE_STRIKE = Sizes(frame="action", num_envs=100)
+PACED = paced.Config(lead=0.5)  # a guide that earns half a shot more than the agent has its whole share, a weaker less
 
 
 def teacher_folder(config: BilliardsConfig) -> Path | None:
@@ -183,8 +180,9 @@ BILLIARDS = Task(
             RunConfig(
                 BilliardsConfig("regulation", teacher="learned", aim_error_deg=0.25),
                 # The reference alternates 1,000 steps with 1,000 gradient steps, this a hundred with a hundred.
-                Sizes(num_envs=100, coarse_directions=720, coarse_dtype="bfloat16", peaks=8),
+                Sizes(num_envs=100),
                 schedule=Schedule(guide_eval_every=50),
+                agent=AGENT,
             ),
             guidance=("none", "relative", "heuristic"),
             labels=(500, 1000),
@@ -194,15 +192,16 @@ BILLIARDS = Task(
             "the paper's table seen from the strike: its reward after 10 million steps within 2 million",
             RunConfig(
                 BilliardsConfig("regulation", teacher="learned", aim_error_deg=0.25),
-                dataclasses.replace(SEEN_FROM_THE_STRIKE, replay_capacity=2_000_000),
-                Scalars(pace_lead=LEAD),
-                Schedule(
+                SEEN_FROM_THE_STRIKE,
+                schedule=Schedule(
                     total_steps=2_000_000,
                     guidance_until=500_000,  # as measured to help
                     eval_every=50_000,
                     checkpoint_every=250_000,
                     guide_eval_every=50,
                 ),
+                agent=dataclasses.replace(AGENT, replay_capacity=2_000_000),
+                arbiter=PACED,
             ),
             guidance=("none", "intent", "relative"),
             labels=(100, 500),
@@ -213,8 +212,11 @@ BILLIARDS = Task(
             RunConfig(
                 BilliardsConfig("easy", teacher="learned"),
                 SEEN_FROM_THE_STRIKE,
-                Scalars(pace_lead=LEAD),
-                Schedule(total_steps=1_000_000, guidance_until=500_000, checkpoint_every=100_000, guide_eval_every=50),
+                schedule=Schedule(
+                    total_steps=1_000_000, guidance_until=500_000, checkpoint_every=100_000, guide_eval_every=50
+                ),
+                agent=dataclasses.replace(AGENT, replay_capacity=1_000_000),
+                arbiter=PACED,
             ),
             guidance=("none", "intent", "relative", "heuristic"),
             labels=(100, 500),
@@ -224,17 +226,8 @@ BILLIARDS = Task(
             "one ball, small networks, 3,000 steps a seed",
             RunConfig(
                 BilliardsConfig("one_ball"),
-                Sizes(
-                    q_layers=(128, 128),
-                    feedback_layers=(128, 128),
-                    directions=360,
-                    num_envs=10,
-                    replay_capacity=20_000,
-                    fit_steps=400,
-                    fit_batch_size=64,
-                    pace=True,
-                ),
-                Scalars(learning_rate=0.01, eps_deg=2.0, k_max=100),
+                Sizes(feedback_layers=(128, 128), num_envs=10, fit_steps=400, fit_batch_size=64),
+                Scalars(eps_deg=2.0, k_max=100),
                 Schedule(
                     total_steps=3_000,
                     random_steps=200,
@@ -245,6 +238,8 @@ BILLIARDS = Task(
                     eval_envs=50,
                     checkpoint_every=500,
                 ),
+                ddqn.Config(q_layers=(128, 128), directions=360, replay_capacity=20_000, learning_rate=0.01),
+                paced.Config(),
             ),
             guidance=("none", "relative"),
             labels=(100,),

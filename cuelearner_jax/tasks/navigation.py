@@ -13,24 +13,21 @@ import jax.numpy as jnp
 from cuelearner_envs.navigation.config import SIDES, NavigationConfig, make_environment
 from cuelearner_envs.navigation.roadmap import make_sided_teacher
 from cuelearner_envs.navigation.roadmap import make_teacher as make_road_map
-from cuelearner_jax.config import RunConfig, Scalars, Schedule, Sizes
+from cuelearner_jax.agents import ddqn
+from cuelearner_jax.arbiters import paced
+from cuelearner_jax.config import Scalars, Schedule, Sizes
 from cuelearner_jax.environment import Environment
+from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.task import PAPERS_FIT, Body, Pictures, Preset, Scenario, Task
 from cuelearner_jax.types import Teacher
 
-NAVIGATION_SIZES = Sizes(
-    directions=360,
-    target_directions=18,
-    n_step=30,
-    num_envs=10,
-    replay_capacity=100_000,
-    guide_directions=72,
-)
+NAVIGATION_SIZES = Sizes(num_envs=10, guide_directions=72)
 
-# The paper's step size, discount, eps, and what scalar feedback calls good. The bound on the gradient's norm (0.5) and
+# The paper's discount, eps, step size, and what scalar feedback calls good. The bound on the gradient's norm (0.5) and
 # the target network's rate (0.005) of its billiards code learn more slowly here, see docs/results.md.
-NAVIGATION_SCALARS = Scalars(
-    learning_rate=0.001, discount=0.995, eps_deg=20.0, scalar_within_deg=20.0, max_grad_norm=10.0, polyak=0.05
+NAVIGATION_SCALARS = Scalars(discount=0.995, eps_deg=20.0, scalar_within_deg=20.0, max_grad_norm=10.0)
+NAVIGATION_AGENT = ddqn.Config(
+    directions=360, target_directions=18, n_step=30, replay_capacity=100_000, learning_rate=0.001, polyak=0.05
 )
 
 
@@ -176,6 +173,7 @@ NAVIGATION = Task(
                     checkpoint_every=100_000,
                     guide_eval_every=50,
                 ),
+                NAVIGATION_AGENT,
             ),
             guidance=("none", "relative", "heuristic"),
             labels=(100, 350, 500),
@@ -186,19 +184,8 @@ NAVIGATION = Task(
             "few worlds, small networks, 6,000 steps a seed",
             RunConfig(
                 NavigationConfig(worlds=128),
-                dataclasses.replace(
-                    NAVIGATION_SIZES,
-                    q_layers=(128, 128),
-                    feedback_layers=(128, 128),
-                    directions=36,
-                    target_directions=12,
-                    batch_size=64,
-                    replay_capacity=50_000,
-                    fit_steps=400,
-                    fit_batch_size=64,
-                    pace=True,
-                ),
-                dataclasses.replace(NAVIGATION_SCALARS, learning_rate=0.003),
+                dataclasses.replace(NAVIGATION_SIZES, feedback_layers=(128, 128), fit_steps=400, fit_batch_size=64),
+                NAVIGATION_SCALARS,
                 Schedule(
                     total_steps=6_000,
                     random_steps=1_000,
@@ -209,6 +196,16 @@ NAVIGATION = Task(
                     eval_envs=50,
                     checkpoint_every=3_000,
                 ),
+                dataclasses.replace(
+                    NAVIGATION_AGENT,
+                    q_layers=(128, 128),
+                    directions=36,
+                    target_directions=12,
+                    batch_size=64,
+                    replay_capacity=50_000,
+                    learning_rate=0.003,
+                ),
+                paced.Config(),
             ),
             guidance=("none", "relative"),
             labels=(350,),

@@ -15,7 +15,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from cuelearner_jax.agents.learning import all_finite
+from cuelearner_jax.agents.networks import all_finite
 from cuelearner_jax.config import LARGEST, MOST_LAYERS, from_json, to_json
 from cuelearner_jax.errors import NotFinite, UserError
 from cuelearner_jax.storage import formats

@@ -7,12 +7,12 @@ from typing import Any
 
 import jax
 
-from cuelearner_jax.config import check
 from cuelearner_jax.environment import actions_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import SPLITS
 from cuelearner_jax.guides import registry
 from cuelearner_jax.policies import uniform_in
+from cuelearner_jax.run_config import check
 from cuelearner_jax.runs import filming
 from cuelearner_jax.runs.grid import Grid, check_grid
 from cuelearner_jax.task import Task, shape_of

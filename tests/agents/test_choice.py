@@ -6,20 +6,27 @@ import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
+import probes
 import pytest
-from probes import CONFIG, SIZES
 
-from cuelearner_jax import config as configuration
+from cuelearner_jax import run_config
 from cuelearner_jax.agents import choice as search
 from cuelearner_jax.agents import ddqn
 from cuelearner_jax.agents.networks import applied, q_network, widened
 from cuelearner_jax.devices import Portions
+from cuelearner_jax.environment import Spaces
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.spaces import DIRECTIONS
 from cuelearner_jax.spaces.directions import evenly_spaced, from_angle
 
 LAYERS = (24, 24, 17)
-FULL = dataclasses.replace(SIZES, q_layers=LAYERS, directions=360, coarse_directions=0)
+FULL = ddqn.Config(q_layers=LAYERS, directions=360)
+
+
+def chosen(options, params, obs):
+    """What an agent of five-number observations does while it learns."""
+    functions = options.make("raw", Spaces(5, DIRECTIONS))
+    return functions.explore(None, options, params, obs, jax.random.key(0))
 
 
 def agent(key=0, scale=3.0):
@@ -39,9 +46,8 @@ def bump(centre_deg, width_deg, height):
 
 
 def chosen_deg(q, peaks=2, coarse=36, n=360):
-    options = evenly_spaced(n)
-    rough = q(None, jnp.zeros(1), options[:: n // coarse])[:, 0]
-    x, y = ddqn.greedy_near_peaks(q, None, jnp.zeros(1), options, rough, peaks)
+    value = lambda obs, actions: q(None, obs, actions)[:, 0]  # noqa: E731
+    ((x, y),) = search.best_near_peaks(value, value, evenly_spaced(n), jnp.zeros((1, 1)), coarse, peaks)
     return float(jnp.rad2deg(jnp.arctan2(y, x)) % 360)
 
 
@@ -62,7 +68,7 @@ def test_the_higher_of_two_peaks_is_found_though_the_first_look_sees_it_lower():
 def test_the_quick_choice_of_a_network_is_the_full_one(coarse):
     obs = jax.random.normal(jax.random.key(1), (64, 5))
     quick = dataclasses.replace(FULL, coarse_directions=coarse, peaks=4)
-    fast, full = (search.greedy_actions(sizes, DIRECTIONS, None, agent(), obs) for sizes in (quick, FULL))
+    fast, full = (chosen(options, agent(), obs) for options in (quick, FULL))
     assert len(np.unique(np.asarray(full), axis=0)) > 5  # choices differ from state to state
     np.testing.assert_array_equal(fast, full)
 
@@ -70,10 +76,10 @@ def test_the_quick_choice_of_a_network_is_the_full_one(coarse):
 def test_a_first_look_in_bfloat16_gives_up_hardly_any_value():
     obs, params = jax.random.normal(jax.random.key(1), (64, 5)), agent()
     rough = dataclasses.replace(FULL, coarse_directions=60, coarse_dtype="bfloat16", peaks=4)
-    chosen = search.greedy_actions(rough, DIRECTIONS, None, params, obs)
+    found = chosen(rough, params, obs)
     q = applied(q_network(LAYERS))
     values = jax.vmap(lambda seen: q(params, seen, evenly_spaced(360))[:, 0])(obs)
-    taken = jax.vmap(lambda seen, action: q(params, seen, action)[0])(obs, chosen)
+    taken = jax.vmap(lambda seen, action: q(params, seen, action)[0])(obs, found)
     given_up = (values.max(1) - taken) / (values.max(1) - values.mean(1))
     assert float(given_up.max()) < 0.02
     assert float(jnp.mean(given_up == 0)) > 0.9
@@ -81,9 +87,9 @@ def test_a_first_look_in_bfloat16_gives_up_hardly_any_value():
 
 def test_actions_do_not_depend_on_how_many_states_are_searched_at_once(monkeypatch):
     obs = jax.random.normal(jax.random.key(2), (7, 5))
-    together = search.greedy_actions(FULL, DIRECTIONS, None, agent(), obs)
+    together = chosen(FULL, agent(), obs)
     monkeypatch.setattr(search, "portions", lambda: Portions(actions=360, agents=1, states=1))
-    np.testing.assert_allclose(search.greedy_actions(FULL, DIRECTIONS, None, agent(), obs), together, atol=1e-6)
+    np.testing.assert_allclose(chosen(FULL, agent(), obs), together, atol=1e-6)
 
 
 def test_units_that_fill_up_a_layer_add_exactly_nothing():
@@ -97,20 +103,19 @@ def test_units_that_fill_up_a_layer_add_exactly_nothing():
 
 
 def test_values_are_counted_as_they_are_taken():
-    assert search.looked_at(FULL) == 360
+    assert search.looked_at(360, 0, 8) == 360
     # 36 at first, then 4 peaks of 2 * 9 neighbours and themselves.
-    assert search.looked_at(dataclasses.replace(FULL, coarse_directions=36, peaks=4)) == 36 + 4 * 19
+    assert search.looked_at(360, 36, 4) == 36 + 4 * 19
 
 
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        ({"coarse_directions": 7}, "sizes.coarse_directions is 7: give a divisor of sizes.directions"),
-        ({"coarse_directions": 4, "peaks": 5}, "sizes.peaks is 5: give at most"),
-        ({"peaks": 0}, "sizes.peaks is 0"),
+        ({"coarse_directions": 7}, "agent.coarse_directions is 7: give a divisor of agent.directions"),
+        ({"coarse_directions": 4, "peaks": 5}, "agent.peaks is 5: give at most"),
+        ({"peaks": 0}, "agent.peaks is 0"),
     ],
 )
 def test_a_search_that_cannot_work_is_refused(change, says):
-    sizes = dataclasses.replace(SIZES, directions=16, **change)
     with pytest.raises(UserError, match=says):
-        configuration.check(dataclasses.replace(CONFIG, sizes=sizes))
+        run_config.check(probes.config(agent={"directions": 16, **change}))

@@ -5,65 +5,56 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import probes
 import pytest
+from jaxtyping import TypeCheckError
 
 from cuelearner_jax.agents import ddqn
-from cuelearner_jax.spaces.directions import evenly_spaced
+from cuelearner_jax.environment import spaces_of
 from cuelearner_jax.types import Transition
 
-DIRECTIONS = evenly_spaced(4)  # east, north, west, south
+OPTIONS = ddqn.Config(q_layers=(2,), directions=4, target_directions=4)  # east, north, west, south
+AGENT = OPTIONS.make("raw", spaces_of(probes.Window()), bootstraps=True)
 
 
-def linear(params, obs, actions):
-    """A value that is linear in the action: w . a, times the observation's first entry."""
-    value = (actions @ params)[..., None]
-    return value * jnp.broadcast_to(obs[..., :1], value.shape)
+def linear(east, north):
+    """Parameters of a network whose value is east * max(a_x, 0) + north * max(a_y, 0), whatever the observation."""
+    first = jnp.concatenate([jnp.zeros((2, 2)), jnp.eye(2)])
+    last = {"kernel": jnp.array([[east], [north]]), "bias": jnp.zeros(1)}
+    return {"params": {"Dense_0": {"kernel": first, "bias": jnp.zeros(2)}, "Dense_1": last}}
 
 
-ONLINE, TARGET = jnp.array([1.0, 0.5]), jnp.array([0.2, 5.0])  # online prefers east, target north
+ONLINE, TARGET = linear(1.0, 0.5), linear(0.2, 5.0)  # online prefers east, target north
 
 
-def transition(reward=1.0, discount=1.0):
-    return Transition(jnp.array([9.0]), jnp.array([0.0, 1.0]), jnp.array(reward), jnp.array(discount), jnp.array([2.0]))
+def targets(discount, agent=AGENT):
+    """Of two steps that earned 1, of which the second ended the episode."""
+    batch = Transition(jnp.ones((2, 2)), jnp.ones((2, 2)), jnp.ones(2), jnp.array([1.0, 0.0]), jnp.ones((2, 2)))
+    return agent.targets(None, OPTIONS, discount, ONLINE, TARGET, [batch])
 
 
-def test_greedy_is_the_argmax_over_the_directions():
-    np.testing.assert_allclose(ddqn.greedy(linear, ONLINE, jnp.array([1.0]), DIRECTIONS), [1, 0], atol=1e-6)
-    np.testing.assert_allclose(ddqn.greedy(linear, ONLINE, jnp.array([-1.0]), DIRECTIONS), [-1, 0], atol=1e-6)
-    np.testing.assert_allclose(ddqn.greedy(linear, TARGET, jnp.array([1.0]), DIRECTIONS), [0, 1], atol=1e-6)
+def test_a_finished_agent_takes_the_argmax_over_its_directions():
+    for params, best in ((ONLINE, [1, 0]), (TARGET, [0, 1]), (linear(-1.0, 2.0), [0, 1])):
+        np.testing.assert_allclose(AGENT.act(None, params, jnp.ones((1, 2)), jax.random.key(0)), [best], atol=1e-6)
 
 
 def test_the_online_network_chooses_and_the_target_network_values():
-    target = ddqn.target(linear, ONLINE, TARGET, transition(), DIRECTIONS, 0.5)
-    # East by the online values, worth 0.2 * 2 to the target network. Its own maximum would give 1 + 0.5 * 10,
-    # the online network's value 1 + 0.5 * 2.
-    assert float(target) == pytest.approx(1 + 0.5 * 0.4)
+    # East by the online values, worth 0.2 to the target network. Its own maximum would give 1 + 0.5 * 5, the online
+    # network's value 1 + 0.5 * 1. Nothing follows the termination.
+    np.testing.assert_allclose(targets(0.5), [1 + 0.5 * 0.2, 1.0])
 
 
-def test_nothing_follows_a_termination():
-    assert float(ddqn.target(linear, ONLINE, TARGET, transition(discount=0.0), DIRECTIONS, 0.5)) == 1.0
+def test_where_nothing_bootstraps_the_target_is_the_reward():
+    np.testing.assert_array_equal(targets(0.0, OPTIONS.make("raw", spaces_of(probes.Window()))), [1.0, 1.0])
 
 
-def test_without_a_target_network_the_target_is_the_reward():
-    stored = transition(reward=0.7).replace(next_obs=jnp.zeros(0))
-    assert float(ddqn.target(linear, ONLINE, None, stored, DIRECTIONS, 0.0)) == pytest.approx(0.7)
+def test_numbers_of_another_rank_are_refused():
+    with pytest.raises((AssertionError, TypeCheckError)):
+        ddqn.target(jnp.ones(2), jnp.ones(2), jnp.ones(2))
 
 
 def test_loss_is_the_mean_squared_error_of_the_actions_taken():
-    batch = Transition(
-        obs=jnp.array([[1.0], [2.0]]),
-        action=jnp.array([[1.0, 0.0], [0.0, 1.0]]),
-        reward=jnp.zeros(2),
-        discount=jnp.zeros(2),
-        next_obs=jnp.zeros((2, 0)),
-    )
-    # Values 1.0 and 2 * 0.5 = 1.0 against 0.4 and 3.0.
-    assert float(ddqn.loss(linear, ONLINE, batch, jnp.array([0.4, 3.0]))) == pytest.approx((0.36 + 4.0) / 2)
-
-
-def test_polyak_moves_the_target_by_the_rate():
-    moved = ddqn.polyak({"w": jnp.array([1.0, 2.0])}, {"w": jnp.array([0.0, 4.0])}, 0.25)
-    np.testing.assert_allclose(moved["w"], [0.25, 3.5])
+    assert float(ddqn.loss(jnp.array([1.0, 1.0]), jnp.array([0.4, 3.0]))) == pytest.approx((0.36 + 4.0) / 2)
 
 
 def change_by(optimizer, gradient, params) -> Any:
@@ -97,8 +88,3 @@ def test_learning_rate_and_norm_may_be_traced(name):
     traced = jax.jit(change)
     np.testing.assert_allclose(traced(0.1, 0.5), change(0.1, 0.5), rtol=1e-5)
     np.testing.assert_allclose(traced(0.2, 0.5), 2 * traced(0.1, 0.5), rtol=1e-5)
-
-
-def test_an_unknown_optimizer_is_named():
-    with pytest.raises(ValueError, match="rmsprop"):
-        ddqn.optimizer("rmsprop", 0.1, 1.0)

@@ -11,19 +11,18 @@ import probes
 import pytest
 
 from cuelearner_jax import loop
-from cuelearner_jax.agents import ddqn
-from cuelearner_jax.agents.learning import learner
 from cuelearner_jax.agents.networks import MLP, Joined, applied, q_network
-from cuelearner_jax.agents.replay import Following
-from cuelearner_jax.config import Scalars, check
+from cuelearner_jax.agents.replay import Following, Memory, buffer_for, n_step_return
+from cuelearner_jax.environment import spaces_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides import registry as guidances
+from cuelearner_jax.run_config import check
 from cuelearner_jax.spaces.directions import evenly_spaced
 from cuelearner_jax.types import StoredStep, Transition
 
 HALF = 0.5  # the discount factor of everything worked out by hand
 
-summed = jax.jit(ddqn.n_step_return)
+summed = jax.jit(n_step_return)
 
 
 def window(rewards=(1.0, 2.0, 4.0), discounts=(1, 1, 1), ended=(0, 0, 0), known=(True, True, True)):
@@ -43,10 +42,6 @@ def returned(following, discount=HALF):
 
 def test_a_whole_window_sums_its_discounted_rewards_and_the_value_after_it_is_discounted_thrice():
     assert returned(window()) == (1 + 2 / 2 + 4 / 4, 1 / 4, 2)
-    # One further discount is the target's: 3 + 0.5 * 0.25 * 8.
-    item = Transition(jnp.zeros(1), jnp.zeros(2), jnp.array(3.0), jnp.array(0.25), jnp.zeros(1))
-    eight = lambda params, obs, actions: jnp.full((*actions.shape[:-1], 1), 8.0)  # noqa: E731
-    assert float(ddqn.target(eight, {}, {}, item, evenly_spaced(4), HALF)) == 4.0
 
 
 def test_a_window_of_one_step_is_the_one_step_transition():
@@ -80,10 +75,10 @@ def test_steps_that_have_not_been_made_yet_shorten_the_window():
 # Out of the ring buffer.
 
 ENVS, CAPACITY, WINDOW = 3, 24, 4
-SIZES = dataclasses.replace(probes.SIZES, n_step=WINDOW, num_envs=ENVS, replay_capacity=CAPACITY)
+OPTIONS = probes.AGENT
 CHAIN = probes.Chain(jnp.array(False))
-AGENT = learner(SIZES, True, CHAIN)
-BUFFER = AGENT.buffer
+AGENT = OPTIONS.make("raw", spaces_of(CHAIN), bootstraps=True)
+BUFFER = buffer_for(CHAIN, bootstraps=True)
 
 
 def course(count):
@@ -113,7 +108,9 @@ def stored(count):
     return rows
 
 
-n_step = jax.jit(lambda rows, filled, numbers, scalars: AGENT.n_step(CHAIN, rows, filled, numbers, scalars))
+@jax.jit
+def n_step(rows, filled, numbers, discount):
+    return Memory(CHAIN, BUFFER, rows, filled, ENVS, bootstraps=True).n_step(numbers, WINDOW, discount)
 
 
 @pytest.mark.parametrize("count", [5, 8, 13, 16])  # not yet full, just full, in the second turn, at its end
@@ -123,7 +120,7 @@ def test_transitions_out_of_the_ring_buffer_are_those_of_a_walk_along_each_envir
     begins = [(index, env) for index in kept for env in range(ENVS)]
     numbers = jnp.array([(index * ENVS + env) % CAPACITY for index, env in begins])
     numbers = jnp.resize(numbers, (CAPACITY,))  # one shape, one compilation
-    found = n_step(stored(count), jnp.array(count * ENVS), numbers, Scalars(discount=0.9))
+    found = n_step(stored(count), jnp.array(count * ENVS), numbers, 0.9)
     cuts = set()
     for row, (index, env) in enumerate(begins):
         total, factor, place = 0.0, 1.0, index
@@ -147,9 +144,11 @@ def test_transitions_out_of_the_ring_buffer_are_those_of_a_walk_along_each_envir
 
 def constant(value):
     """Parameters of a value function that is `value` everywhere."""
-    params = jax.tree.map(jnp.zeros_like, q_network(SIZES.q_layers).init(jax.random.key(0), jnp.zeros(2), jnp.zeros(2)))
-    layer = params["params"][f"Dense_{len(SIZES.q_layers)}"]
-    return {"params": {**params["params"], f"Dense_{len(SIZES.q_layers)}": {**layer, "bias": jnp.array([value])}}}
+    params = jax.tree.map(
+        jnp.zeros_like, q_network(OPTIONS.q_layers).init(jax.random.key(0), jnp.zeros(2), jnp.zeros(2))
+    )
+    layer = params["params"][f"Dense_{len(OPTIONS.q_layers)}"]
+    return {"params": {**params["params"], f"Dense_{len(OPTIONS.q_layers)}": {**layer, "bias": jnp.array([value])}}}
 
 
 @pytest.mark.parametrize(("weight", "expected"), [(0.0, [5.0, 2.0]), (1.0, [4.0, 3.0]), (0.25, [4.75, 2.25])])
@@ -162,21 +161,19 @@ def test_the_target_lies_between_that_of_one_step_and_that_of_many_by_the_weight
     # Value 8 to the target network, which is what counts, and -3 to the online one. One step: 1 + 0.5 * 8 and a
     # termination with 2; three steps: 3 + 0.5 * 0.25 * 8 and 3 with a termination.
     near, far = batch([1.0, 2.0], [1.0, 0.0]), batch([3.0, 3.0], [0.25, 0.0])
-    scalars = Scalars(discount=HALF, n_step_weight=weight)
-    np.testing.assert_allclose(
-        AGENT.targets(probes.Window(), constant(-3.0), constant(8.0), [near, far], scalars), expected, rtol=1e-6
-    )
-    np.testing.assert_allclose(
-        AGENT.targets(probes.Window(), constant(-3.0), constant(8.0), [near], scalars), [5.0, 2.0], rtol=1e-6
-    )
+    options = dataclasses.replace(OPTIONS, n_step_weight=weight)
+    known = (None, options, HALF, constant(-3.0), constant(8.0))
+    np.testing.assert_allclose(AGENT.targets(*known, [near, far]), expected, rtol=1e-6)
+    np.testing.assert_allclose(AGENT.targets(*known, [near]), [5.0, 2.0], rtol=1e-6)
 
 
 # The whole loop.
 
 LOOP = probes.config(
-    sizes={"num_envs": 2, "n_step": 3},
-    scalars={"discount": HALF, "polyak": 0.05, "learning_rate": 5e-3},
-    schedule={"random_steps": 2000, "learn_after": 50, "target_every": 1},
+    sizes={"num_envs": 2},
+    scalars={"discount": HALF},
+    schedule={"random_steps": 2000, "learn_after": 50},
+    agent={"n_step": 3, "polyak": 0.05, "learning_rate": 0.005, "target_every": 1},
 )
 
 
@@ -185,14 +182,13 @@ def program():
     return loop.make_program(LOOP, guidances.make("none", LOOP.sizes, CHAIN), CHAIN, 0)
 
 
-def learned(truncates, weight, **schedule):
+def learned(truncates, weight, polyak=LOOP.agent.polyak):
     """Values at both places of east, north, west and south, learned from uniform actions."""
     env = probes.Chain(jnp.array(truncates))
-    scalars = dataclasses.replace(LOOP.scalars, n_step_weight=weight)
-    schedule = dataclasses.replace(LOOP.schedule, **schedule)
+    agent = dataclasses.replace(LOOP.agent, n_step_weight=weight, polyak=polyak)
     state = probes.start(program(), [3], [0], env)
-    _, state, _ = program().train(env, scalars, schedule, loop.start_clock(), state, 1000)
-    q, params = applied(q_network(LOOP.sizes.q_layers)), probes.lane(state.agent.params, 0)
+    _, state, _ = program().train(env, LOOP.settings._replace(agent=agent), loop.start_clock(), state, 1000)
+    q, params = applied(q_network(LOOP.agent.q_layers)), probes.lane(state.agent.params, 0)
     return [np.asarray(q(params, env.observe(place), evenly_spaced(4)))[:, 0] for place in (0, 1)]
 
 
@@ -215,29 +211,29 @@ def test_values_of_a_chain_that_is_truncated(weight):
 
 
 def test_windows_that_reach_the_end_need_no_target_network():
-    start, end = learned(False, 1.0, target_every=10**6)
+    start, end = learned(False, 1.0, polyak=0.0)
     np.testing.assert_allclose(end, [1, 0, -1, 0], atol=0.08)
     np.testing.assert_allclose(start, [0, 0.5, 0, -0.5], atol=0.1)
 
 
-def test_other_weights_and_schedules_compiled_nothing():
-    learned(False, 0.3, target_every=7)
+def test_other_weights_and_rates_compiled_nothing():
+    learned(False, 0.3, polyak=0.01)
     assert probes.compilations(program().train) == [1]
 
 
 @pytest.mark.parametrize(
-    ("sizes", "scalars", "words"),
+    ("agent", "discount", "words"),
     [
-        ({"n_step": 0}, {"discount": 0.5}, "sizes.n_step is 0"),
-        ({"n_step": 2}, {"discount": 0.0}, "sizes.n_step is 2"),
-        ({"n_step": 2}, {"discount": 0.5, "n_step_weight": 1.5}, "scalars.n_step_weight is 1.5"),
-        ({"n_step": 2}, {"discount": 0.5, "n_step_weight": -0.1}, "scalars.n_step_weight is -0.1"),
+        ({"n_step": 0}, 0.5, "agent.n_step is 0"),
+        ({"n_step": 2}, 0.0, "agent.n_step is 2"),
+        ({"n_step": 2, "n_step_weight": 1.5}, 0.5, "agent.n_step_weight is 1.5"),
+        ({"n_step": 2, "n_step_weight": -0.1}, 0.5, "agent.n_step_weight is -0.1"),
     ],
 )
-def test_impossible_windows_and_weights_are_refused(sizes, scalars, words):
+def test_impossible_windows_and_weights_are_refused(agent, discount, words):
     with pytest.raises(UserError, match=words):
-        check(probes.config(sizes, scalars))
-    check(probes.config({"n_step": 2}, {"discount": 0.5, "n_step_weight": 1.0}))
+        check(probes.config(agent=agent, scalars={"discount": discount}))
+    check(probes.config(agent={"n_step": 2, "n_step_weight": 1.0}, scalars={"discount": 0.5}))
 
 
 # The first layer, which many actions of one observation share.

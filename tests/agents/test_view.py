@@ -1,27 +1,22 @@
 """What networks see from an action: the same of situations that differ by a turn."""
 
-from functools import partial
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import probes
 import pytest
 
-from cuelearner_jax.agents import view
-from cuelearner_jax.agents.choice import greedy_actions, values
-from cuelearner_jax.agents.networks import q_network
-from cuelearner_jax.config import Sizes
+from cuelearner_jax.agents import ddqn, view
+from cuelearner_jax.config import GuideSizes
 from cuelearner_jax.environment import Features, spaces_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides.model import guide_model
-from cuelearner_jax.spaces import DIRECTIONS
 from cuelearner_jax.spaces import directions as geometry
 
 ENV = probes.Window()
 OBS = geometry.from_angle(jnp.array([0.3, -2.0, 1.1]))
 CHOSEN = geometry.from_angle(jnp.array([1.0, 0.5, -3.0]))
-SIZES = Sizes(frame="action", q_layers=(16, 16), feedback_layers=(16, 16), directions=72)
+SIZES = GuideSizes(frame="action", feedback_layers=(16, 16))
 
 
 class Turned(probes.Window):
@@ -67,15 +62,16 @@ def test_what_a_guide_says_turns_with_the_situation():
 
 @pytest.mark.parametrize("coarse", [0, 12])
 def test_the_greedy_choice_turns_with_the_situation(coarse):
-    env, sizes = Turned(), Sizes(frame="action", q_layers=(16,), directions=72, coarse_directions=coarse, peaks=12)
-    params = q_network(sizes.q_layers).init(jax.random.key(3), jnp.zeros(1), jnp.zeros(2))
-    choose = jax.jit(partial(greedy_actions, sizes, DIRECTIONS, env, params))
+    env, options = Turned(), ddqn.Config(q_layers=(16,), directions=72, coarse_directions=coarse, peaks=12)
+    agent = options.make("action", spaces_of(env))
+    params, _ = agent.init(jax.random.key(3))
+    choose = jax.jit(lambda obs: agent.explore(env, options, params, obs, jax.random.key(0)))
     turn = 7 * np.pi / 36  # as far as seven of the directions
     chosen = choose(OBS)
     np.testing.assert_allclose(choose(geometry.rotate(OBS, turn)), geometry.rotate(chosen, turn), atol=1e-5)
-    options = geometry.evenly_spaced(72)
-    best = jax.vmap(lambda obs: values(sizes, env)(params, obs, options)[:, 0].max())(OBS)
-    np.testing.assert_allclose(jax.vmap(partial(values(sizes, env), params))(OBS, chosen)[:, 0], best, atol=1e-6)
+    directions = geometry.evenly_spaced(72)
+    best = jax.vmap(lambda obs: agent.value(env, params, obs, directions).max())(OBS)
+    np.testing.assert_allclose(agent.value(env, params, OBS, chosen), best, atol=1e-6)
 
 
 def test_an_environment_without_features_is_refused_in_the_actions_frame():

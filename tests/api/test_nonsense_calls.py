@@ -191,10 +191,10 @@ TABLE = {
     trained: {
         "world": NO_WORLDS,
         "teacher": NO_TEACHERS,
-        "config": (None, 3, "quickstat", type(probes.CONFIG), {}, probes.config({"directions": 2.5})),
+        "config": (None, 3, "quickstat", type(probes.CONFIG), {}, probes.config(sizes={"num_envs": 2.5})),
         "guidance": ("none", 3, None, [None], ["telepathy"], [3], ["none", "none"], b"none", [""]),
-        "labels": (100, "many", *([bad] for bad in (*NO_WHOLE, None, 0, 2**40)), [5, 5]),
-        "seeds": (0, *NO_SEEDS, *([bad] for bad in (*NO_WHOLE, None)), [], [1, 1]),
+        "labels": (100, None, "many", *([bad] for bad in (*NO_WHOLE, None, 0, 2**40)), [5, 5]),
+        "seeds": (0, *NO_SEEDS, None, *([bad] for bad in (*NO_WHOLE, None)), [], [1, 1]),
         "split": (*NO_NAMES, None, "test"),
         "progress": (1, "yes", None, []),
     },

@@ -12,23 +12,26 @@ import pytest
 
 from cuelearner_jax import loop
 from cuelearner_jax.arbiters import paced as pace
+from cuelearner_jax.arbiters.protocol import Outcome
 from cuelearner_jax.config import Scalars
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.tasks import registry
-from cuelearner_jax.types import ArmSums
 
-LASTING = Scalars(pace_window=1e12)  # nothing fades
+HALF = pace.Config(lead=0.0)  # any lead will do
+FADE = 1 - 1 / pace.WINDOW  # of the sums, with each episode
 
 
 @partial(jax.jit, static_argnames="bootstraps")
-def followed(record, scalars, rewards, dones, guided, counts, bootstraps=False):
-    """The record after steps (steps, envs), and the probability after each."""
+def followed(discount, rewards, dones, guided, counts, bootstraps=False):
+    """The sums after steps (steps, 1) of one environment, each guided or not."""
+    arbiter, scalars = HALF.make(bootstraps), Scalars(discount=discount)
 
-    def step(record, row):
-        record = pace.follow(record, scalars, bootstraps, *row)
-        return record, pace.probability(record, scalars)
+    def step(state, row):
+        reward, done, arm, counted = row
+        state = state.replace(guided=arm)
+        return arbiter.follow(state, HALF, scalars, Outcome(reward, done, counted), jax.random.key(0)), None
 
-    return jax.lax.scan(step, record, (rewards, dones, guided, counts))
+    return jax.lax.scan(step, arbiter.init(1), (rewards, dones, guided, counts))[0].sums
 
 
 def episodes_of(rewards, lengths):
@@ -36,21 +39,19 @@ def episodes_of(rewards, lengths):
     return np.concatenate(rewards)[:, None], np.concatenate([np.arange(n) == n - 1 for n in lengths])[:, None]
 
 
-def seen(rewards, lengths, guided, scalars=LASTING, bootstraps=False):
-    """The record after episodes (their rewards, a list), each guided or not."""
+def seen(rewards, lengths, guided, discount=0.0):
+    """The sums after episodes (their rewards, a list), each guided or not, as if nothing had faded."""
     reward, done = episodes_of(rewards, lengths)
-    arm = np.repeat(guided, lengths)[:, None]
-    counts = np.ones(len(reward), bool)
-    record, shares = followed(pace.start(1), scalars, reward.astype(np.float32), done, arm, counts, bootstraps)
-    return record, np.asarray(shares)
+    arm, counts = np.repeat(guided, lengths)[:, None], np.ones(len(reward), bool)
+    return followed(discount, reward.astype(np.float32), done, arm, counts, bootstraps=discount > 0)
 
 
 def test_ratio_and_standard_error_by_hand():
-    # Own episodes earn 1 of 1, 0 of 2, 2 of 3 steps; guided ones 1 of 1 and 1 of 1.
-    rewards = [[1.0], [1.0], [0.0, 0.0], [1.0], [0.0, 1.0, 1.0]]
-    record, _ = seen(rewards, [1, 1, 2, 1, 3], [False, True, False, True, False])
-    ratio, variance = pace.scores(record.sums)
-    np.testing.assert_allclose(record.sums.episodes, [3, 2])
+    # Own episodes: 1 of 1, 0 of 2, 2 of 3 steps earn; guided ones 1 of 1 and 1 of 1.
+    own, guided = np.array([(1, 1), (0, 2), (2, 3)]).T, np.array([(1, 1), (1, 1)]).T
+    parts = [[len(arm[0]), gain.sum(), size.sum(), (gain**2).sum(), (gain * size).sum(), (size**2).sum()]
+             for arm in (own, guided) for gain, size in [arm]]  # fmt: skip
+    ratio, variance = pace.scores(pace.ArmSums(*map(jnp.asarray, np.array(parts, np.float32).T)))
     np.testing.assert_allclose(ratio, [0.5, 1.0], rtol=1e-6)  # 3 / 6, 2 / 2
     # Residuals 1 - 1/2, 0 - 1, 2 - 3/2: squares 1/4 + 1 + 1/4, over (3 - 1) and the square of the mean size 2.
     np.testing.assert_allclose(variance, [1.5 / 2 / 4, 0], atol=1e-6)
@@ -59,42 +60,45 @@ def test_ratio_and_standard_error_by_hand():
 def test_the_standard_error_is_that_of_a_bootstrap():
     rng = np.random.default_rng(0)
     lengths = rng.integers(1, 11, 400)
-    rewards = [rng.binomial(1, 0.1 + 0.05 * (n < 4), n).astype(float) for n in lengths]
-    record, _ = seen(rewards, lengths, [False] * 400)
-    ratio, variance = pace.scores(record.sums)
-    gain = np.array([sum(each) for each in rewards])
+    gain = np.array([rng.binomial(1, 0.1 + 0.05 * (n < 4), n).sum() for n in lengths]).astype(float)
+    own = (400, gain.sum(), lengths.sum(), (gain**2).sum(), (gain * lengths).sum(), (lengths**2).sum())
+    ratio, variance = pace.scores(pace.ArmSums(*(jnp.array([part, 0.0]) for part in map(float, own))))
     assert float(ratio[0]) == pytest.approx(gain.sum() / lengths.sum(), rel=1e-5)
     drawn = rng.integers(0, 400, (4000, 400))
     means = gain[drawn].sum(-1) / lengths[drawn].sum(-1)
     assert math.sqrt(variance[0] / 400) == pytest.approx(means.std(), rel=0.06)  # of 4,000 draws: 1.1%
 
 
-def test_with_a_discount_an_episode_earns_its_discounted_return_however_long():
-    scalars = dataclasses.replace(LASTING, discount=0.5)
-    rewards = [[0.0, 0.0, 1.0], [-1.0], [1.0, 1.0], [1.0]]  # returns 1/4, -1, 3/2, 1
-    record, _ = seen(rewards, [3, 1, 2, 1], [False, True, True, False], scalars, bootstraps=True)
-    np.testing.assert_allclose(record.sums.gain, [1.25, 0.5])
-    np.testing.assert_allclose(record.sums.size, [2, 2])
-    np.testing.assert_allclose(record.sums.gain_gain, [1 / 16 + 1, 1 + 9 / 4])
-
-
 def test_sums_fade_with_every_episode_of_either_arm():
-    record, _ = seen([[1.0]] * 3, [1] * 3, [False, True, True], Scalars(pace_window=4.0))
-    np.testing.assert_allclose(record.sums.episodes, [0.75**2, 0.75 + 1])
+    found = seen([[1.0]] * 3, [1] * 3, [False, True, True])
+    np.testing.assert_allclose(found.episodes, [FADE**2, FADE + 1], rtol=1e-6)
+
+
+def test_an_episode_earns_its_reward_and_its_steps():
+    found = seen([[1.0], [0.0, 1.0, 1.0]], [1, 3], [False, True])
+    np.testing.assert_allclose(found.gain, [FADE, 2], rtol=1e-6)
+    np.testing.assert_allclose(found.size, [FADE, 3], rtol=1e-6)
+
+
+def test_with_a_discount_an_episode_earns_its_discounted_return_however_long():
+    found = seen([[0.0, 0.0, 1.0], [1.0, 1.0]], [3, 2], [False, True], discount=0.5)
+    np.testing.assert_allclose(found.gain, [FADE / 4, 1.5], rtol=1e-6)
+    np.testing.assert_allclose(found.size, [FADE, 1], rtol=1e-6)
+    np.testing.assert_allclose(found.gain_gain, [FADE / 16, 9 / 4], rtol=1e-6)
 
 
 def test_episodes_with_a_step_that_does_not_count_are_left_out():
     reward, done = episodes_of([[1.0, 1.0], [1.0, 0.0], [0.0]], [2, 2, 1])
     counts = np.array([False, True, True, True, False])
-    record, _ = followed(pace.start(1), LASTING, reward, done, np.zeros((5, 1), bool), counts)
-    np.testing.assert_allclose(record.sums.episodes, [1, 0])
-    np.testing.assert_allclose(record.sums.gain, [1, 0])
+    found = followed(0.0, reward.astype(np.float32), done, np.zeros((5, 1), bool), counts)
+    np.testing.assert_allclose(found.episodes, [1, 0])
+    np.testing.assert_allclose(found.gain, [1, 0])
 
 
 def sums(own, guided):
     """Of (episodes, wins) of one step each."""
     episodes, wins = np.array([own, guided], np.float32).T
-    return ArmSums(*map(jnp.asarray, (episodes, wins, episodes, wins, wins, episodes)))
+    return pace.ArmSums(*map(jnp.asarray, (episodes, wins, episodes, wins, wins, episodes)))
 
 
 @pytest.mark.parametrize(
@@ -113,17 +117,17 @@ def sums(own, guided):
     ],
 )
 def test_the_share_of_known_sums(own, guided, most, expected):
-    record = pace.start(1).replace(sums=sums(own, guided))
-    found = pace.probability(record, Scalars(guided_probability=most))
+    known = sums(own, guided)
+    found = pace.probability(known, pace.Config(most, 0.0))
     assert float(found) == pytest.approx(expected, abs=1e-6)
 
 
 def test_the_share_is_twice_the_chance_that_guidance_is_better():
-    record = pace.start(1).replace(sums=sums((40, 20), (40, 16)))
+    known = sums((40, 20), (40, 16))
     # Variances of one episode 0.25 * 40 / 39 and 0.24 * 40 / 39, pooled 0.245 * 40 / 39 at least.
     error = math.sqrt((0.25 + 0.245) / 39)
     chance = 0.5 * (1 + math.erf(-0.1 / error / math.sqrt(2)))
-    assert float(pace.probability(record, Scalars())) == pytest.approx(0.5 * 2 * chance, rel=1e-4)
+    assert float(pace.probability(known, HALF)) == pytest.approx(0.5 * 2 * chance, rel=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -139,56 +143,55 @@ def test_the_share_is_twice_the_chance_that_guidance_is_better():
     ],
 )
 def test_with_a_lead_the_share_is_what_own_episodes_are_behind(own, guided, expected):
-    record = pace.start(1).replace(sums=sums(own, guided))
-    found = pace.probability(record, Scalars(pace_lead=0.5))
+    known = sums(own, guided)
+    found = pace.probability(known, pace.Config(lead=0.5))
     assert float(found) == pytest.approx(expected, abs=1e-5)
 
 
 def test_few_episodes_that_went_alike_are_not_believed_for_certain():
     # Three guided failures against own luck of 0.3: by their own variance (0) guidance were worse for certain.
-    record = pace.start(1).replace(sums=sums((200, 60), (3, 0)))
-    assert float(pace.probability(record, Scalars())) > 0.1
+    known = sums((200, 60), (3, 0))
+    assert float(pace.probability(known, HALF)) > 0.1
 
 
 @partial(jax.jit, static_argnames="episodes")
-def played(key, scalars, own, guided, episodes):
+def played(key, own, guided, episodes):
     """Bandit episodes in four environments, guided as paced: the share after each step. Chances (steps,) to win."""
+    arbiter = HALF.make(False)
 
     def step(carry, row):
-        record, arms, key = carry
+        state, key = carry
         key, k_win, k_arm = jax.random.split(key, 3)
-        won = jax.random.uniform(k_win, (4,)) < jnp.where(arms, row[1], row[0])
-        done = jnp.ones(4, bool)
-        record = pace.follow(record, scalars, False, won.astype(jnp.float32), done, arms, jnp.array(True))
-        share = pace.probability(record, scalars)
-        return (record, jax.random.bernoulli(k_arm, share, (4,)), key), share
+        won = jax.random.uniform(k_win, (4,)) < jnp.where(state.guided, row[1], row[0])
+        outcome = Outcome(won.astype(jnp.float32), jnp.ones(4, bool), jnp.array(True))
+        state = arbiter.follow(state, HALF, Scalars(), outcome, k_arm)
+        return (state, key), pace.probability(state.sums, HALF)
 
     chances = jnp.stack(jnp.broadcast_arrays(own, guided, jnp.zeros(episodes // 4))[:2], -1)
-    return jax.lax.scan(step, (pace.start(4), jnp.zeros(4, bool), key), chances)[1]
+    return jax.lax.scan(step, (arbiter.init(4), key), chances)[1]
 
 
 def test_a_guide_that_becomes_worse_half_way_is_followed_within_a_window():
-    scalars = Scalars(pace_window=200.0)
     half = jnp.arange(1000) >= 500  # steps of four episodes
     keys = jax.random.split(jax.random.key(0), 16)
-    turned = np.asarray(jax.vmap(lambda key: played(key, scalars, 0.5, jnp.where(half, 0.1, 0.9), 4000))(keys))
+    turned = np.asarray(jax.vmap(lambda key: played(key, 0.5, jnp.where(half, 0.1, 0.9), 4000))(keys))
     assert turned[:, 100:500].mean() == pytest.approx(0.5, abs=0.01)
     assert turned[:, 550:600].mean() < 0.25  # one window on, half of what the arm remembers is from before
     assert turned[:, 700:].mean() < 0.08
-    back = np.asarray(jax.vmap(lambda key: played(key, scalars, 0.5, jnp.where(half, 0.9, 0.1), 4000))(keys))
+    back = np.asarray(jax.vmap(lambda key: played(key, 0.5, jnp.where(half, 0.9, 0.1), 4000))(keys))
     assert back[:, 400:500].mean() < 0.08
     assert back[:, 650:].mean() > 0.4  # a guide that becomes better is tried, though seldom seen before
 
 
 def test_every_preset_is_paced_but_those_that_are_the_papers():
     offered = map(registry.find, registry.names())
-    found = {(task.name, name): preset.config.sizes.pace for task in offered for name, preset in task.presets.items()}
-    assert found == {named: named[1] != "paper" for named in found}
+    found = {(task.name, name): preset.config.arbiter.NAME for task in offered for name, preset in task.presets.items()}
+    assert found == {named: "episodes" if named[1] == "paper" else "paced" for named in found}
 
 
 # In the loop, on the bandit: the heuristic turns by -1 rad, and is right in a world of that offset alone.
 
-PACED = probes.config(sizes={"pace": True}, scalars={"pace_window": 100.0})
+PACED = probes.config(arbiter=HALF)
 SCHEDULE = dataclasses.replace(probes.SCHEDULE, learn_after=10**9, guidance_until=10**6)
 STRETCH = 100
 
@@ -203,28 +206,28 @@ def run(program, env, seeds, stretches, schedule=SCHEDULE, clock=None, state=Non
     clock = loop.start_clock() if clock is None else clock
     state = probes.start(program, seeds, [0] * len(seeds), env) if state is None else state
     for _ in range(stretches):
-        clock, state, metrics = program.train(env, PACED.scalars, schedule, clock, state, STRETCH)
+        clock, state, metrics = program.train(env, PACED.settings._replace(schedule=schedule), clock, state, STRETCH)
     return clock, state, metrics
 
 
 def test_a_guide_that_earns_nothing_goes_to_the_floor_and_one_that_always_wins_stays(program):
     wrong, right = probes.Window(half_width=1.5), probes.Window(offset=-1.0)  # the heuristic is off by 1.6 in the first
     _, state, metrics = run(program, wrong, [0, 1], 5)
-    own, guided = np.asarray(pace.scores(probes.lane(state.pace.sums, 0))[0])
+    own, guided = np.asarray(pace.scores(probes.lane(state.arbiter.sums, 0))[0])
     assert own > 0.1 > guided
     assert float(metrics["guided_share"][0]) < 0.1
     _, state, metrics = run(program, right, [0, 1], 5)
-    np.testing.assert_allclose(jax.vmap(pace.scores)(state.pace.sums)[0][:, 1], 1, atol=1e-6)
+    np.testing.assert_allclose(jax.vmap(pace.scores)(state.arbiter.sums)[0][:, 1], 1, atol=1e-6)
     np.testing.assert_allclose(metrics["guided_share"], 0.5, atol=0.08)  # standard deviation 0.025
 
 
 def test_after_the_cut_off_nothing_is_guided_nor_counted(program):
     right, short = probes.Window(offset=-1.0), dataclasses.replace(SCHEDULE, guidance_until=400)
     clock, state, _ = run(program, right, [0, 1], 1, short)
-    before = jax.tree.map(np.asarray, state.pace.sums)
+    before = jax.tree.map(np.asarray, state.arbiter.sums)
     _, state, metrics = run(program, right, [0, 1], 1, short, clock, state)
     assert float(metrics["guided_share"][0]) == 0
-    jax.tree.map(np.testing.assert_array_equal, before, jax.tree.map(np.asarray, state.pace.sums))
+    jax.tree.map(np.testing.assert_array_equal, before, jax.tree.map(np.asarray, state.arbiter.sums))
 
 
 def test_random_steps_are_no_arms(program):
@@ -232,8 +235,8 @@ def test_random_steps_are_no_arms(program):
     _, state, metrics = run(program, probes.Window(), [0, 1], 1, late)
     rewards, faded = probes.stored(state, 0, 400)["reward"].reshape(100, 4)[50:], 0.0
     for row in rewards:
-        faded = faded * 0.99**4 + row.sum()
-    assert float(state.pace.sums.gain[0].sum()) == pytest.approx(faded, rel=1e-4)
+        faded = faded * FADE**4 + row.sum()
+    assert float(state.arbiter.sums.gain[0].sum()) == pytest.approx(faded, rel=1e-4)
     assert 0 < float(metrics["guided_share"][0]) < 0.5
 
 
@@ -245,16 +248,3 @@ def test_lanes_beside_each_other_are_lanes_alone(program):
         jax.tree.leaves(probes.lane(beside, 1)), jax.tree.leaves(probes.lane(alone, 0)), strict=True
     ):
         np.testing.assert_array_equal(mine, yours)
-
-
-def test_without_pace_nothing_of_it_is_there_and_a_pace_without_a_choice_is_none_to_the_last_bit(program):
-    assert probes.start(probes.window_program("heuristic"), [0, 1], [0, 0]).pace is None
-    scalars = dataclasses.replace(PACED.scalars, pace_floor=0.5)
-    found = []
-    for one in (program, probes.window_program("heuristic")):
-        state = probes.start(one, [0, 1], [0, 0])
-        _, state, metrics = one.train(probes.Window(), scalars, SCHEDULE, loop.start_clock(), state, STRETCH)
-        assert ("guided_share" in metrics) == (one is program)
-        metrics.pop("guided_share", None)
-        found.append((probes.lane(state.replace(pace=None), 1), probes.lane(metrics, 1)))
-    jax.tree.map(np.testing.assert_array_equal, *found)

@@ -1,7 +1,6 @@
 """The operations that benchmarks count, by hand and by XLA."""
 
 import dataclasses
-from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -10,8 +9,8 @@ from _flops import forward, forward_and_backward, step_operations
 
 from cuelearner_jax.agents import ddqn
 from cuelearner_jax.agents.networks import applied, q_network
-from cuelearner_jax.config import Sizes
 from cuelearner_jax.environment import Spaces
+from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.spaces import DIRECTIONS
 from cuelearner_jax.tasks.billiards import BILLIARDS
 from cuelearner_jax.types import Transition
@@ -28,21 +27,24 @@ def test_operations_are_those_counted_by_hand():
     assert forward(LAYERS, WIDTHS, 5) == 2 * 640 + 5 * 2 * (128 + 3072 + 48)
     # Weights' gradients of all layers; inputs' of all but the first.
     assert forward_and_backward(LAYERS, WIDTHS) == 2 * 3888 + 2 * 3888 + 2 * 3120
-    sizes = Sizes(q_layers=LAYERS, directions=36, target_directions=12, batch_size=7, updates_per_step=2)
-    one_step = step_operations(sizes, SPACES, bootstraps=False)
-    assert one_step == (2 * 640 + 36 * 2 * 3248, 2 * 7 * (4 * 3888 + 2 * 3120), 0)
-    assert one_step.total == 235136 + 305088
+    agent = ddqn.Config(q_layers=LAYERS, directions=36, target_directions=12, batch_size=7)
+
+    def counted(discount, **changes):
+        changed = dataclasses.replace(agent, **changes)
+        return step_operations(RunConfig(None, scalars=Scalars(discount=discount), agent=changed), SPACES)
+
+    assert counted(0.0) == (2 * 640 + 36 * 2 * 3248, 7 * (4 * 3888 + 2 * 3120), 0)
+    assert counted(0.0).total == 235136 + 152544
     target = 2 * 640 + 12 * 2 * 3248 + 2 * 3888
-    assert step_operations(sizes, SPACES, bootstraps=True).targets == 2 * 7 * target
-    with_return = dataclasses.replace(sizes, n_step=30)
-    assert step_operations(with_return, SPACES, bootstraps=True).targets == 2 * 2 * 7 * target
-    assert step_operations(with_return, SPACES, bootstraps=False).targets == 0
+    assert counted(0.5).targets == 7 * target
+    assert counted(0.5, n_step=30).targets == 2 * 7 * target
+    assert counted(0.0, n_step=30).targets == 0
 
 
 def test_the_paper_s_argmax_costs_4_5_gflop_a_step():
     paper = BILLIARDS.presets["paper"].config
-    full = dataclasses.replace(paper.sizes, coarse_directions=0)
-    counted = step_operations(full, Spaces(12, DIRECTIONS), paper.bootstraps)
+    full = dataclasses.replace(paper, agent=dataclasses.replace(paper.agent, coarse_directions=0))
+    counted = step_operations(full, Spaces(12, DIRECTIONS))
     assert counted.acting == 2 * (12 * 400 + 3600 * (2 * 400 + 2 * 160_000 + 120_000 + 2 * 90_000 + 300))
     assert counted.targets == 0
 
@@ -53,15 +55,15 @@ def traced_operations(function, *arguments):
 
 
 def test_operations_are_those_that_xla_counts():
-    params = q_network(LAYERS).init(jax.random.key(0), jnp.zeros(OBS), jnp.zeros(2))
-    directions, batch = jnp.ones((72, 2)), 32
+    options = ddqn.Config(q_layers=LAYERS, directions=72, target_directions=72)
+    agent, batch = options.make("raw", SPACES, bootstraps=True), 32
+    params, _ = agent.init(jax.random.key(0))
     items = Transition(*(jnp.ones((batch, *shape)) for shape in ((OBS,), (2,), (), (), (OBS,))))
-    acting = traced_operations(lambda p, obs: ddqn.greedy(Q, p, obs, directions), params, jnp.ones(OBS))
+    acting = traced_operations(lambda p, obs: agent.act(None, p, obs, jax.random.key(0)), params, jnp.ones((1, OBS)))
     assert acting == pytest.approx(forward(LAYERS, WIDTHS, 72), rel=0.05)
-    loss = jax.value_and_grad(lambda p: ddqn.loss(Q, p, items, items.reward))
+    loss = jax.value_and_grad(lambda p: ddqn.loss(agent.value(None, p, items.obs, items.action), items.reward))
     gradient = traced_operations(loss, params)
     assert gradient == pytest.approx(batch * forward_and_backward(LAYERS, WIDTHS), rel=0.05)
     other = jax.tree.map(lambda leaf: leaf + 1, params)
-    target = partial(ddqn.target, Q, params, other, options=directions, discount=0.9)
-    targets = traced_operations(jax.vmap(target), items)
+    targets = traced_operations(lambda items: agent.targets(None, options, 0.9, params, other, [items]), items)
     assert targets == pytest.approx(batch * (forward(LAYERS, WIDTHS, 72) + forward(LAYERS, WIDTHS, 1)), rel=0.05)

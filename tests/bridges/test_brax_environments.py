@@ -134,7 +134,7 @@ def test_what_does_not_fit_is_refused_in_one_line(env, to_action, words):
 # Our loop on brax's.
 
 
-BOOTSTRAPPING = probes.config(scalars={"discount": 0.9}, schedule={"target_every": 2})
+BOOTSTRAPPING = probes.config(scalars={"discount": 0.9}, agent={"target_every": 2})
 
 
 @pytest.mark.long
@@ -148,7 +148,7 @@ def test_our_loop_learns_on_an_environment_of_brax(make):
     program = loop.make_program(BOOTSTRAPPING, guidances.make("none", probes.SIZES, env), env, 0)
     state = probes.start(program, [0], [0], env)
     fresh = probes.lane(state.agent.params, 0)
-    clock, state, metrics = program.train(env, probes.SCALARS, probes.SCHEDULE, loop.start_clock(), state, 12)
+    clock, state, metrics = program.train(env, BOOTSTRAPPING.settings, loop.start_clock(), state, 12)
     assert (int(clock.step), int(clock.update)) == (48, 48)
     assert np.isfinite(metrics["loss"]).all()
     assert np.isfinite(metrics["reward"]).all()

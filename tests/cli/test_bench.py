@@ -8,8 +8,8 @@ import pytest
 
 from cuelearner_jax.cli import bench, main
 
-SMALL = ["bench", "billiards", "--preset", "quickstart", "--seconds", "0.01", "--sizes.q-layers", "16"]
-SMALL += ["--sizes.directions", "36", "--sizes.replay-capacity", "1000"]
+SMALL = ["bench", "billiards", "--preset", "quickstart", "--seconds", "0.01", "--agent.q-layers", "16"]
+SMALL += ["--agent.directions", "36", "--agent.replay-capacity", "1000"]
 
 
 def test_it_prints_figures_and_writes_them_once(refused, tmp_path, capsys):
@@ -31,7 +31,7 @@ BAD = [
     ([*SMALL, "--seeds", "2", "2"], "different positive numbers"),
     ([*SMALL, "--seconds", "0"], "--seconds is 0.0"),
     ([*SMALL, "--devices", "9"], "--devices is 9: there are"),
-    ([*SMALL, "--sizes.replay-capacity", "1000000000000"], "counted in 32 bits"),
+    ([*SMALL, "--agent.replay-capacity", "1000000000000"], "counted in 32 bits"),
     (["bench", "billards"], "did you mean 'billiards'"),
     (["bench", "--seedz", "1"], "--seeds"),
 ]

@@ -23,18 +23,19 @@ ARGUMENTS = [
     ([*QUICK, "--labels", "0"], "teaches nothing"),
     ([*QUICK, "--labels", "10", "10"], "give each budget once"),
     ([*QUICK, "--seeds", "0"], "give --seeds"),
-    ([*QUICK, "--sizes.replay-capacity", "2000000000"], "lower --sizes.replay-capacity"),
-    ([*QUICK, "--sizes.replay-capacity", "1000000000000"], "give at most 2147483647"),
+    ([*QUICK, "--agent.replay-capacity", "2000000000"], "lower --agent.replay-capacity"),
+    ([*QUICK, "--agent.replay-capacity", "1000000000000"], "give at most 2147483647"),
     ([*QUICK, "--seeds", "100000000000000000000"], "seeds are numbers from 0 to 1000000"),
     ([*QUICK, "--first-seed", "1000001"], "seeds are numbers from 0 to 1000000"),
     ([*QUICK, "--labels", "3000000000", "--guidance", "relative"], "cannot be counted"),
     ([*QUICK, "--labels", "1000000000", "--guidance", "relative"], "lower --labels"),
     ([*QUICK, "--schedule.total-steps", "3000000000"], "give at most 2147483647"),
     (["train", "billiards", "--preset", "quickstart", "--seed", "-1"], "--seed is -1: give a number from 0"),
-    ([*QUICK, "--sizes.replay-capacity", "1001"], "give a multiple of sizes.num_envs"),
+    ([*QUICK, "--agent.replay-capacity", "1001"], "give a multiple of sizes.num_envs"),
+    ([*QUICK, "--agent.q-layers", "8"], "give --agent.q-layers"),
+    ([*QUICK, "--agent", "sac"], "unknown agent 'sac'"),
+    ([*QUICK, "--arbiter", "pacd"], "did you mean 'paced'"),
     ([*QUICK, "--schedule.total-steps", "150"], "give a multiple of schedule.eval_every"),
-    ([*QUICK, "--schedule.ask-at", "0", "150"], "schedule.ask_at is 150: give a multiple of schedule.eval_every"),
-    ([*QUICK, "--schedule.ask-at", "0", "100", "--labels", "10"], "10 labels are no 2 instalments of whole rounds"),
     ([*QUICK, "--sizes.candidates", "4"], "so give a sizes.ensemble above 1 too"),
     ([*QUICK, "--resume"], "nothing to resume"),
     ([*QUICK, "--resume", "--overwrite"], "give one of them"),
@@ -155,7 +156,7 @@ def test_a_run_that_diverges_ends_with_status_one_and_is_no_success_for_any_comm
         "none",
         "--seeds",
         "1",
-        "--scalars.learning-rate",
+        "--agent.learning-rate",
         "1e9",
         "--out",
         tmp_path / "wild",
@@ -195,7 +196,7 @@ def test_a_damaged_checkpoint_is_refused(refused, copy):
 
 
 def test_a_checkpoint_of_another_run_is_refused(refused, copy):
-    probes.edit_json(copy / "config.json", lambda values: values["sizes"].update(q_layers=[24]))
+    probes.edit_json(copy / "config.json", lambda values: values["agent"].update(q_layers=[24]))
     refused(["evaluate", copy, "--guidance", "none"], "expected (1, 24)", copy)
 
 

@@ -10,8 +10,8 @@ from cuelearner_jax.cli import main
 from cuelearner_jax.storage import results
 
 SMALL = [
-    *("--task.worlds", "8", "--task.max-steps", "20", "--sizes.q-layers", "16", "--sizes.feedback-layers", "16"),
-    *("--sizes.directions", "12", "--sizes.n-step", "3", "--sizes.fit-steps", "20", "--sizes.batch-size", "16"),
+    *("--task.worlds", "8", "--task.max-steps", "20", "--agent.q-layers", "16", "--sizes.feedback-layers", "16"),
+    *("--agent.directions", "12", "--agent.n-step", "3", "--sizes.fit-steps", "20", "--agent.batch-size", "16"),
     *("--schedule.total-steps", "200", "--schedule.eval-every", "100", "--schedule.checkpoint-every", "100"),
     *("--schedule.random-steps", "50", "--schedule.learn-after", "50", "--schedule.guidance-until", "200"),
     *("--schedule.eval-envs", "10", "--schedule.eval-steps", "200"),

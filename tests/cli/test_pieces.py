@@ -90,7 +90,7 @@ def test_a_lane_of_any_piece_is_drawn_and_called(sweeps, tmp_path):
 @pytest.mark.long
 def test_pieces_are_of_one_sweep_though_one_was_begun_before_a_field_existed(pieces, refused):
     """By the command line: evaluated together, and a piece that is finished is found so."""
-    for group, name in (("sizes", "frame"), ("schedule", "ask_at"), ("scalars", "answer"), ("task", "mirrors")):
+    for group, name in (("sizes", "frame"), ("agent", "polyak"), ("scalars", "answer"), ("task", "mirrors")):
         edit_json(pieces / "shard-2-of-2" / "config.json", lambda told, group=group, name=name: told[group].pop(name))
     assert main(["evaluate", str(pieces), "--steps", "20", "--envs", "20"]) == 0
     for piece in ("1/2", "2/2"):

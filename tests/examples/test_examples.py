@@ -24,7 +24,7 @@ from cuelearner_jax.testing import check_environment, check_guidance, check_poli
 
 ROOT = Path(__file__).resolve().parents[2]
 TINY = shlex.split("""
-    --sizes.q-layers 8 --sizes.feedback-layers 8 --sizes.directions 6 --sizes.target-directions 6 --sizes.fit-steps 20
+    --agent.q-layers 8 --sizes.feedback-layers 8 --agent.directions 6 --agent.target-directions 6 --sizes.fit-steps 20
     --sizes.labels-per-round 5 --schedule.total-steps 40 --schedule.random-steps 10 --schedule.learn-after 10
     --schedule.guidance-until 20 --schedule.eval-every 20 --schedule.eval-steps 160 --schedule.eval-envs 4
     --schedule.checkpoint-every 40

@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 
 from cuelearner_jax.adaptation.adapting import check_amounts
-from cuelearner_jax.config import GuideSizes, RunConfig, Schedule, Sizes, check, check_guide
+from cuelearner_jax.agents import ddqn
+from cuelearner_jax.config import GuideSizes, check_guide
 from cuelearner_jax.feedback.answers import check_teacher
+from cuelearner_jax.run_config import GROUPS, check
 from cuelearner_jax.runs.trained import PolicySource
 from cuelearner_jax.storage import table as tables
 from cuelearner_jax.studies.adapt import suggested
@@ -74,7 +76,7 @@ def test_a_scenario_holds_the_recipe_that_is_reported(name, path, modules):
 @pytest.mark.parametrize("scale", ["smoke", "paper"])
 def test_every_piece_has_settings_that_can_be(study, scale, modules):
     known = modules["_adaptation"]
-    groups = {"sizes": Sizes, "schedule": Schedule}
+    groups = {**GROUPS, "agent": ddqn.Config}
     for piece in study.pieces:
         left = known.scaled(piece, study.scales[scale])
         if left is None:
@@ -84,7 +86,7 @@ def test_every_piece_has_settings_that_can_be(study, scale, modules):
         for name in left.settings:
             names[name.partition(".")[0]].add(name.partition(".")[2])
         assert names.pop("guidance", set()) <= {""}, piece.path
-        groups |= {"scalars": type(bench.config.scalars), "task": bench.task.config}
+        groups["task"] = bench.task.config
         for group, fields in names.items():
             assert fields <= {field.name for field in dataclasses.fields(groups[group])}, piece.path
         if left.labels:
@@ -92,8 +94,8 @@ def test_every_piece_has_settings_that_can_be(study, scale, modules):
             check_guide(bench.set("sizes.", GuideSizes()), scalars)
             assert scalars.k_max * scalars.eps_deg >= left.bound_deg or "scalars.k_max" in left.settings
         if left.method == "finetuning":
-            sizes, schedule = bench.set("sizes.", bench.config.sizes), bench.config.schedule
-            check(RunConfig(bench.config.task, sizes, bench.config.scalars, schedule))
+            sizes, agent = bench.set("sizes.", bench.config.sizes), bench.set("agent.", bench.config.agent)
+            check(dataclasses.replace(bench.config, sizes=sizes, agent=agent))
             assert left.steps % left.every == left.every % sizes.num_envs == 0
             assert min(left.rates) > 0
 

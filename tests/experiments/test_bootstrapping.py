@@ -19,10 +19,13 @@ from _efficiency_document import efficiency_lines
 
 from cuelearner_envs.billiards.config import BilliardsConfig, make_environment
 from cuelearner_envs.billiards.teacher import Transferred
+from cuelearner_jax.agents import ddqn
+from cuelearner_jax.arbiters import paced
 from cuelearner_jax.cli import main
-from cuelearner_jax.config import GuideScalars, GuideSizes, Scalars, Schedule, Sizes
+from cuelearner_jax.config import GuideScalars, GuideSizes
 from cuelearner_jax.guides import registry
 from cuelearner_jax.report.variants import read_groups, variants_of
+from cuelearner_jax.run_config import GROUPS
 from cuelearner_jax.runs import sweep
 from cuelearner_jax.runs.order import planned
 from cuelearner_jax.spaces import DIRECTIONS
@@ -94,9 +97,9 @@ def known_kind(name):
 
 def options_known(piece):
     """Are a piece's options and kinds part of this version?"""
-    fields = {"sizes": Sizes, "scalars": Scalars, "schedule": Schedule}
+    fields = {**GROUPS, "agent": ddqn.Config, "arbiter": paced.Config}
     known = {f"{group}.{field.name}" for group, kind in fields.items() for field in dataclasses.fields(kind)}
-    own = {name.replace("-", "_") for name in piece.options if name.partition(".")[0] in fields}
+    own = {name.replace("-", "_") for name in piece.options if name.partition(".")[0] in fields and "." in name}
     return own <= known and all(map(known_kind, piece.kinds))
 
 
@@ -125,9 +128,9 @@ def test_every_piece_is_a_sweep_that_would_begin(experiment, scale, modules, mon
         assert order.out == tmp_path / piece.path
     assert len(orders) >= 2
     if scale == "paper":
-        sizes = {piece.run: order.config.sizes for piece, order in zip(different.values(), orders, strict=True)}
-        assert [sizes[run].frame for run in ("frame", "raw", "paced")] == ["action", "raw", "action"]
-        assert [sizes[run].pace for run in ("frame", "raw", "paced")] == [False, False, True]
+        found = {piece.run: order.config for piece, order in zip(different.values(), orders, strict=True)}
+        compared = [(found[run].sizes.frame, found[run].arbiter.NAME) for run in ("frame", "raw", "paced")]
+        assert compared == [("action", "episodes"), ("raw", "episodes"), ("action", "paced")]
 
 
 @pytest.mark.long
@@ -154,9 +157,9 @@ def test_scales_keep_what_they_say(modules):
     assert (quick.labels, quick.seeds) == ((100, 500, 1_000), 4)
     assert quick.options["sizes.frame"] == "action"
     assert pieces.scaled(many._replace(labels=(50,)), data.SCALES["quick"]) is None
-    later = next(piece for piece in data.PIECES if piece.run == "instalments")
-    assert pieces.scaled(later, data.SCALES["smoke"]).options["schedule.ask-at"] == (0, 100)
-    assert "schedule.ask-at" not in pieces.scaled(many, data.SCALES["smoke"]).options
+    active = next(piece for piece in data.PIECES if "sizes.candidates" in piece.options)
+    assert pieces.scaled(active, data.SCALES["smoke"]).options["sizes.candidates"] == 5
+    assert "sizes.candidates" not in pieces.scaled(many, data.SCALES["smoke"]).options
 
 
 def test_names_choose_pieces_and_folders_of_them(modules, capsys):

@@ -20,9 +20,9 @@ STEPS, NOISE_DEG = 400, 10.0
 @pytest.fixture(scope="module")
 def agents():
     """Two agents that know nothing."""
-    init = q_network(CONFIG.sizes.q_layers).init
+    init = q_network(CONFIG.agent.q_layers).init
     keys = jax.random.split(jax.random.key(5), 2)
-    return Agent(jax.vmap(lambda key: init(key, jnp.zeros(2), jnp.zeros(2)))(keys), CONFIG.sizes)
+    return Agent(jax.vmap(lambda key: init(key, jnp.zeros(2), jnp.zeros(2)))(keys), probes.FUNCTIONS)
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +60,7 @@ def test_a_step_size_of_zero_changes_nothing(tuned):
 def test_actions_are_turned_by_the_noise_and_no_step_is_uniform(tuned, agents):
     for lane, base in ((0, 0), (1, 1), (2, 0), (3, 1)):  # which act as their base throughout
         stored = probes.stored(tuned[0].block.state, lane, 3 * STEPS)
-        one = Agent(jax.tree.map(lambda leaf, n=base: leaf[n], agents.params), CONFIG.sizes)
+        one = Agent(jax.tree.map(lambda leaf, n=base: leaf[n], agents.params), probes.FUNCTIONS)
         greedy = one.act(jax.random.key(0), None, jnp.asarray(stored["obs"]))
         turns = np.rad2deg(directions.difference(greedy, jnp.asarray(stored["action"])))
         if lane < 2:

@@ -162,7 +162,7 @@ def test_training_that_dies_leaves_the_newest_policy(tmp_path):
         ({"layers": ()}, "give at least one layer"),
         ({"seconds": -1.0}, "can't be negative"),
         ({"layers": (0,)}, "positive width"),
-        ({"learning_rate": float("nan")}, "give finite numbers"),
+        ({"learning_rate": float("nan")}, "give a finite number"),
         ({"steps": 10**10}, "train.steps is 10000000000: give at most"),
         ({"robots": 10**9}, "train.robots is 1000000000: give at most"),
     ],

@@ -16,11 +16,9 @@ import jax.numpy as jnp
 import numpy as np
 import onnxruntime
 import pytest
-from probes import SCALARS, SIZES, Aimed, Expert, Window, WindowConfig, make_task
+from probes import AGENT, SCALARS, SIZES, Aimed, Expert, Window, WindowConfig, make_task
 
 import cuelearner_jax as cl
-from cuelearner_jax.agents import view
-from cuelearner_jax.agents.networks import q_network
 from cuelearner_jax.api.acting import CallablePolicy
 from cuelearner_jax.environment import Quantity, action_of, spaces_of
 from cuelearner_jax.errors import UserError
@@ -33,11 +31,9 @@ ANGLES = np.linspace(0.0, 6.0, 40)
 DRAWN = np.stack([np.cos(ANGLES), np.sin(ANGLES)], -1).astype(np.float32)
 
 
-def agent(**sizes):
-    sizes = dataclasses.replace(SIZES, directions=72, **sizes)
-    own, turned = view.widths(sizes.frame, spaces_of(ENV))
-    params = q_network(sizes.q_layers).init(jax.random.key(4), jnp.zeros(own), jnp.zeros(turned))
-    return Agent(params, sizes, env=ENV)
+def agent(frame="raw"):
+    functions = dataclasses.replace(AGENT, directions=72).make(frame, spaces_of(ENV))
+    return Agent(functions.init(jax.random.key(4))[0], functions, ENV)
 
 
 def guided(kind, bound_deg=None, base=None, **sizes):

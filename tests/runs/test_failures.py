@@ -21,8 +21,9 @@ from cuelearner_jax.storage import results
 from cuelearner_jax.studies import evaluate
 
 CONFIG = probes.config(
-    sizes={"q_layers": (8, 8), "feedback_layers": (8,), "fit_steps": 20, "lanes_per_block": 3, "replay_capacity": 40},
+    sizes={"feedback_layers": (8,), "fit_steps": 20, "lanes_per_block": 3},
     schedule={"total_steps": 48, "eval_every": 16, "checkpoint_every": 16, "eval_steps": 10},
+    agent={"q_layers": (8, 8), "replay_capacity": 40},
 )
 GRID = Grid(("none",), seeds=(3, 5, 8), labels=())
 TASK = probes.make_task()
@@ -127,7 +128,7 @@ def test_a_sweep_in_pieces_that_were_finished_before_says_it_too(ended):
 
 def test_diverging_from_the_command_line_and_from_python(tmp_path):
     """Every lane, by a learning rate as a user would give it."""
-    wild = dataclasses.replace(CONFIG, scalars=dataclasses.replace(CONFIG.scalars, learning_rate=1e9))
+    wild = dataclasses.replace(CONFIG, agent=dataclasses.replace(CONFIG.agent, learning_rate=1e9))
     grid = Grid(("none",), seeds=(3, 5, 8), labels=())
     with pytest.raises(NotFinite, match="3 of 3 lanes failed"):
         sweep.run(Order(TASK, wild, grid, tmp_path / "run"))

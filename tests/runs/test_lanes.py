@@ -6,7 +6,7 @@ import chex
 import jax
 import numpy as np
 import pytest
-from probes import CONFIG, SIZES, Window, compilations
+from probes import CONFIG, Window, compilations, config
 
 from cuelearner_jax.devices import SHARED, compiler_options, place
 from cuelearner_jax.errors import UserError
@@ -17,8 +17,8 @@ from cuelearner_jax.runs.grid import Grid
 from cuelearner_jax.runs.memory_report import memory_report
 
 
-def group_of(seeds, kind="none", **sizes):
-    config = dataclasses.replace(CONFIG, sizes=dataclasses.replace(SIZES, **sizes))
+def group_of(seeds, kind="none", config=CONFIG, **sizes):
+    config = dataclasses.replace(config, sizes=dataclasses.replace(config.sizes, **sizes))
     env = Window()
     made = guidance.make(kind, config.sizes, env)
     return lanes.LaneGroup(config, env, made, Grid((kind,), tuple(range(seeds)), (10, 20)))
@@ -59,7 +59,7 @@ def test_lanes_are_seeds_for_each_budget_where_labels_are_asked_for():
 def test_memory_is_told_before_and_too_much_is_refused():
     assert "3 lanes" in memory_report(group_of(3))
     with pytest.raises(UserError, match="are free: "):
-        memory_report(group_of(3, replay_capacity=2 * 10**9))
+        memory_report(group_of(3, config=config(agent={"replay_capacity": 2 * 10**9})))
 
 
 def test_blocks_of_another_cut_are_cut_anew(monkeypatch):
@@ -72,9 +72,9 @@ def test_blocks_of_another_cut_are_cut_anew(monkeypatch):
 
 
 def test_training_is_compiled_once():
-    group, config = group_of(1), CONFIG
+    group = group_of(1)
     clock = place(group.mesh, start_clock(), SHARED)
     (state,) = group.start()
     for _ in range(2):
-        clock, state, _ = group.program.train(Window(), config.scalars, config.schedule, clock, state, 4)
+        clock, state, _ = group.program.train(Window(), CONFIG.settings, clock, state, 4)
     assert compilations(group.program.train) == [1]

@@ -8,10 +8,11 @@ import probes
 import pytest
 from probes import Aimed, Window
 
-from cuelearner_jax import config as configuration
-from cuelearner_jax.config import LARGEST, RunConfig, Scalars, Schedule, Sizes
+from cuelearner_jax import run_config
+from cuelearner_jax.config import LARGEST, Scalars, Schedule, Sizes
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides import registry
+from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs import memory_report
 from cuelearner_jax.runs.grid import Grid, check_grid
 from cuelearner_jax.runs.lanes import LaneGroup
@@ -34,7 +35,7 @@ def memory(monkeypatch):
 
 def report(config: RunConfig, kind: str, labels: int = 20) -> str:
     """What a sweep looks at before it makes anything."""
-    configuration.check(config)
+    run_config.check(config)
     grid = Grid((kind,), (0, 1), (labels,))
     check_grid(grid)
     env = jax.eval_shape(Aimed)
@@ -47,7 +48,7 @@ def test_any_whole_number_is_refused_or_fits(group, name):
     # Others that must be multiples of the field, or it of them, are no reason to refuse.
     wide = {"sizes": {"num_envs": 1, "validate_every": 1}, "schedule": {"eval_every": 1, "eval_envs": 1}}
     tall = {"eval_envs": {"eval_steps": LARGEST}, "eval_every": {"total_steps": LARGEST, "checkpoint_every": LARGEST}}
-    tall["validate_every"], tall["num_envs"] = {"fit_steps": LARGEST}, {"replay_capacity": LARGEST}
+    tall["validate_every"], tall["num_envs"] = {"fit_steps": LARGEST}, {}
     for value in VALUES:
         parts = {part: dataclasses.asdict(getattr(base, part)) | wide.get(part, {}) for part in ("sizes", "schedule")}
         for other in tall.get(name, {}):
@@ -71,13 +72,13 @@ def test_any_whole_number_is_refused_or_fits(group, name):
 
 LARGE = [
     ("sizes", {"fit_batch_size": 10**9}, "--sizes.fit-batch-size"),
-    ("sizes", {"batch_size": 10**9}, "--sizes.batch-size"),
-    ("sizes", {"directions": 10**9}, "--sizes.directions"),
+    ("agent", {"batch_size": 10**9}, "--agent.batch-size"),
+    ("agent", {"directions": 10**9}, "--agent.directions"),
     ("sizes", {"labels_per_round": 10**9}, "--labels"),
-    ("sizes", {"q_layers": (10**6, 10**6)}, "--sizes.q-layers"),
+    ("agent", {"q_layers": (10**6, 10**6)}, "the networks of --agent"),
     ("sizes", {"feedback_layers": (10**6, 10**6)}, "--sizes.feedback-layers"),
     ("sizes", {"fit_steps": 2 * 10**9}, "--sizes.fit-steps"),
-    ("sizes", {"replay_capacity": 2 * 10**9}, "--sizes.replay-capacity"),
+    ("agent", {"replay_capacity": 2 * 10**9}, "--agent.replay-capacity"),
     ("schedule", {"eval_envs": 10**9, "eval_steps": 10**9}, "--schedule.eval-envs"),
     ("schedule", {"eval_steps": 2 * 10**9, "eval_envs": 1}, "--schedule.eval-steps"),
 ]
@@ -104,9 +105,9 @@ def test_a_guide_of_aims_takes_memory_for_each_of_them():
 
 
 def test_fewer_lanes_are_advised_where_some_would_fit():
-    config, env = probes.config(sizes={"replay_capacity": 10**8}), jax.eval_shape(Window)
+    config, env = probes.config(agent={"replay_capacity": 10**8}), jax.eval_shape(Window)
     group = LaneGroup(config, env, registry.make("none", config.sizes, env), Grid(("none",), tuple(range(20)), ()))
-    with pytest.raises(UserError, match=r"at most 7 at once, or lower --sizes\.replay-capacity"):
+    with pytest.raises(UserError, match=r"at most 7 at once, or lower --agent\.replay-capacity"):
         memory_report.memory_report(group)
 
 

@@ -12,6 +12,7 @@ import pyarrow.parquet as pq
 import pytest
 from small_runs import stopping_at
 
+from cuelearner_jax.arbiters import paced
 from cuelearner_jax.asking import label_slots
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides import registry as guidances
@@ -29,10 +30,13 @@ from cuelearner_jax.terminal import Interrupted
 
 # Bootstraps and is paced, so that target network, next observations, Adam's moments and what each arm has earned are in
 # the checkpoint as well.
-SMALL = {"q_layers": (16,), "feedback_layers": (16,), "lanes_per_block": 2, "fit_steps": 100, "replay_capacity": 40}
+SMALL = {"feedback_layers": (16,), "lanes_per_block": 2, "fit_steps": 100}
+SMALL_AGENT = {"q_layers": (16,), "replay_capacity": 40}
 CONFIG = probes.config(
-    sizes={**SMALL, "pace": True},
-    scalars={"discount": 0.5, "silence_probability": 0.05, "pace_window": 10.0},
+    sizes=SMALL,
+    scalars={"discount": 0.5, "silence_probability": 0.05},
+    agent=SMALL_AGENT,
+    arbiter=paced.Config(lead=0.0),
     schedule={"total_steps": 96, "guidance_until": 64, "eval_every": 16, "checkpoint_every": 32},
 )
 GRID = Grid(("relative", "none"), seeds=(3, 5), labels=(35, 60))  # 6 rounds; 4 lanes in 2 blocks of 2
@@ -163,8 +167,8 @@ def test_a_run_leaves_a_row_for_each_lane_and_evaluation(whole):
     assert {row["config_hash"] for row in table} == {table[0]["config_hash"]}
     state, number = kept_by(whole)["relative"]
     assert number == 6 + 96
-    assert state["rest"][0].agent.target_params is not None
-    assert (state["rest"][0].pace.sums.episodes > 0).all()
+    assert state["rest"][0].agent.training.target_params is not None
+    assert (state["rest"][0].arbiter.sums.episodes > 0).all()
     assert len({row["train_guided_share"] for row in table if row["guidance"] == "relative" and row["step"] == 48}) > 1
     assert all(row["train_guided_share"] == 0 for row in table if row["guidance"] == "none" and row["step"])
     assert int(state["clock"]["clock"].update) == 96
@@ -173,7 +177,7 @@ def test_a_run_leaves_a_row_for_each_lane_and_evaluation(whole):
 @pytest.mark.long
 def test_a_run_begun_before_a_field_existed_goes_on_as_one_run(whole, tmp_path):
     out = shutil.copytree(whole, tmp_path / "run")
-    probes.edit_json(out / "config.json", lambda told: [told["sizes"].pop("frame"), told["schedule"].pop("ask_at")])
+    probes.edit_json(out / "config.json", lambda told: [told["sizes"].pop("frame"), told["agent"].pop("polyak")])
     shutil.rmtree(out / "none")
     before = {row["config_hash"] for row in rows(out)}
     run(out, resume=True)
@@ -191,7 +195,7 @@ def test_a_checkpoint_whose_lanes_had_another_state_is_refused_before_anything_i
 
     def of_a_newer_program(blocks, clock, wall):
         made = of_now(blocks, clock, wall)
-        return {**made, "rest": [block.replace(pace=(block.pace, block.failed)) for block in made["rest"]]}
+        return {**made, "rest": [block.replace(arbiter=(block.arbiter, block.failed)) for block in made["rest"]]}
 
     monkeypatch.setattr(kept, "items", of_a_newer_program)
     with pytest.raises(

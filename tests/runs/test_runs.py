@@ -10,13 +10,14 @@ import probes
 import pytest
 
 from cuelearner_jax import config as configuration
+from cuelearner_jax import run_config
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.runs import grid as runs
 from cuelearner_jax.runs import sweep
 from cuelearner_jax.runs.grid import Grid
 from cuelearner_jax.runs.order import Order
-from cuelearner_jax.storage import formats, results, room
+from cuelearner_jax.storage import formats, room
 from cuelearner_jax.storage.folders import check_folder, prepare_folder
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -49,20 +50,20 @@ def out(tmp_path):
 
 
 def test_a_run_comes_back_from_its_description(out):
-    config = probes.config(sizes={"q_layers": (8, 4)}, scalars={"eps_deg": 7.5}, schedule={"random_steps": 4})
+    config = probes.config(scalars={"eps_deg": 7.5}, schedule={"random_steps": 4}, agent={"q_layers": (8, 4)})
     prepare_folder(out, described(config), clean=True)
     task, found, grid = runs.load(out, find)
     assert task is TASK
     assert found == config
-    assert isinstance(found.sizes.q_layers, tuple)
+    assert isinstance(found.agent.q_layers, tuple)
     assert grid == GRID
 
 
 @pytest.mark.parametrize(
     ("name", "config", "grid", "options"),
     [
-        ("sizes.directions", probes.config(sizes={"directions": 32}), GRID, {}),
-        ("sizes.q_layers", probes.config(sizes={"q_layers": (32,)}), GRID, {}),
+        ("agent.directions", probes.config(agent={"directions": 32}), GRID, {}),
+        ("agent.q_layers", probes.config(agent={"q_layers": (32,)}), GRID, {}),
         ("scalars.eps_deg", probes.config(scalars={"eps_deg": 6.0}), GRID, {}),
         ("schedule.guidance_until", probes.config(schedule={"guidance_until": 32}), GRID, {}),
         ("grid.seeds", probes.CONFIG, Grid(("none", "relative"), (4, 8), (10, 15)), {}),
@@ -88,7 +89,7 @@ def test_a_run_described_before_a_field_existed_had_its_default(out):
     probes.edit_json(out / "config.json", at_defaults)
     told = formats.read("config", out / "config.json")
     assert "frame" not in told["sizes"]
-    assert "ask_at" not in told["schedule"]
+    assert "polyak" not in told["agent"]
     assert told["task"] == {"name": TASK.name}
     check_folder(out, described(), resume=True, overwrite=False, defaults=runs.defaults(TASK))
     assert runs.load(out, find)[1] == probes.CONFIG
@@ -97,13 +98,12 @@ def test_a_run_described_before_a_field_existed_had_its_default(out):
         check_folder(out, other, resume=True, overwrite=False, defaults=runs.defaults(TASK))
 
 
-@pytest.mark.parametrize("folder", ["quickstart", "billiards_paper/shard-1-of-3", "navigation/relative-500"])
-def test_the_hash_of_a_configuration_is_that_of_its_recorded_results(folder):
-    recorded = ROOT / "docs" / "data" / folder
-    values = formats.read("config", recorded / "config.json")
-    hashes = set(results.read(recorded)["config_hash"].to_pylist())
-    assert hashes == {runs.config_hash(values)} == {runs.config_hash({**values, "format": 7})}
-    assert runs.config_hash({**values, "split": "other"}) not in hashes
+def test_the_hash_of_a_configuration_depends_on_what_a_lane_learns_from_alone():
+    values = described()
+    found = runs.config_hash(values)
+    assert runs.config_hash({**values, "format": 2, "grid": {}, "shard": [1, 2]}) == found
+    assert runs.config_hash({**values, "split": "other"}) != found
+    assert runs.config_hash({**values, "agent": {**values["agent"], "polyak": 0.5}}) != found
 
 
 def test_a_run_of_another_format_is_not_loaded(out):
@@ -176,7 +176,7 @@ def test_nonsense_in_a_description_is_refused_wherever_it_stands(out):
                 assert "\n" not in str(error)
                 continue
             taken.append((way, junk))
-            configuration.check(config)
+            run_config.check(config)
             assert all(isinstance(kind, str) for kind in grid.guidance)
             assert all(isinstance(number, int) for number in (*grid.seeds, *grid.labels))
     assert {way for way, junk in taken if isinstance(junk, str)} <= {
@@ -242,9 +242,9 @@ def test_lanes_are_seeds_times_budgets_and_one_a_seed_without_labels():
         (probes.CONFIG, GRID, {}, "not empty"),
         (probes.CONFIG, GRID, {"resume": True, "overwrite": True}, "give one of them"),
         (probes.config(scalars={"k_max": 3}), GRID, {"resume": True}, r"another scalars\.k_max"),
-        (probes.config(sizes={"batch_size": 0}), GRID, {"overwrite": True}, r"sizes\.batch_size is 0"),
+        (probes.config(agent={"batch_size": 0}), GRID, {"overwrite": True}, r"agent\.batch_size is 0"),
         (probes.CONFIG, Grid(("none",), (), ()), {"overwrite": True}, "seeds must be"),
-        (probes.config(sizes={"replay_capacity": 2 * 10**9}), GRID, {"overwrite": True}, "are free"),
+        (probes.config(agent={"replay_capacity": 2 * 10**9}), GRID, {"overwrite": True}, "are free"),
     ],
 )
 def test_a_refused_run_changes_nothing(out, config, grid, options, message):
@@ -268,10 +268,10 @@ def test_a_missing_teacher_is_said_before_anything_is_deleted(out):
 @pytest.mark.parametrize(
     ("group", "values", "says"),
     [
-        ("grid", {"seeds": list(range(200_000))}, "has [0-9,]*00,000 lanes of layers"),
-        ("sizes", {"directions": 2**31 - 1}, "has 2,147,483,647 sizes.directions"),
+        ("grid", {"seeds": list(range(200_000))}, "has [0-9,]*00,000 lanes of [0-9,]* weights"),
+        ("agent", {"directions": 2**31 - 1}, "has too large --agent.directions"),
         ("schedule", {"eval_envs": 2**30, "eval_steps": 2**30}, "has 1,073,741,824 schedule.eval_envs"),
-        ("sizes", {"q_layers": [2**30, 2**30]}, "lanes of layers .1073741824, 1073741824., which needs"),
+        ("agent", {"q_layers": [2**30, 2**30]}, "lanes of [0-9,]* weights, which needs"),
     ],
 )
 def test_a_run_that_would_eat_the_machine_is_refused_before_anything_is_made(out, group, values, says, monkeypatch):

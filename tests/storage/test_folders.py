@@ -14,7 +14,7 @@ from cuelearner_jax.storage.formats import FORMATS
 DESCRIBED = {
     "format": FORMATS["config"],
     "task": {"name": "window", "half_width_deg": 28.0},
-    "sizes": {"directions": 16, "batch_size": 32, "q_layers": [32, 32]},
+    "agent": {"directions": 16, "batch_size": 32, "q_layers": [32, 32]},
     "scalars": {"eps_deg": 20.0, "k_max": 50},
     "grid": {"guidance": ["none", "relative"], "seeds": [4, 9]},
     "split": "tuning",
@@ -78,8 +78,8 @@ def test_overwriting_never_deletes_what_is_no_run(tmp_path):
 @pytest.mark.parametrize(
     ("name", "other"),
     [
-        ("sizes.directions", described(sizes={"directions": 32})),
-        ("sizes.q_layers", described(sizes={"q_layers": [32]})),
+        ("agent.directions", described(agent={"directions": 32})),
+        ("agent.q_layers", described(agent={"q_layers": [32]})),
         ("scalars.eps_deg", described(scalars={"eps_deg": 6.0})),
         ("grid.seeds", described(grid={"seeds": [4, 8]})),
         ("split", described(split="validation")),
@@ -92,24 +92,24 @@ def test_resuming_with_another_option_names_it(out, name, other):
 
 
 def test_resuming_names_several_options_and_those_that_only_one_side_has(out):
-    other = described(sizes={"directions": 32, "batch_size": 8}, scalars={"k_max": 3})
-    refused(out, r"another scalars\.k_max, sizes\.batch_size, sizes\.directions: give", other, resume=True)
+    other = described(scalars={"k_max": 3}, agent={"directions": 32, "batch_size": 8})
+    refused(out, r"another agent\.batch_size, agent\.directions, scalars\.k_max: give", other, resume=True)
     refused(out, r"another scalars\.k_max: give", {**DESCRIBED, "scalars": {"eps_deg": 20.0}}, resume=True)
     refused(out, r"another scalars\.more: give", described(scalars={"more": 1}), resume=True)
 
 
 def test_what_a_description_does_not_say_counts_as_the_default():
-    defaults = {"scalars": {"answer": "best", "silence": 0.0}, "sizes": {"frame": "raw"}}
+    defaults = {"scalars": {"answer": "best", "silence": 0.0}, "agent": {"frame": "raw"}}
 
     def apart(before, now):
         forth, back = (sorted(folders.differences(*pair, defaults)) for pair in ((before, now), (now, before)))
         assert forth == back
         return forth
 
-    newer = described(scalars={"answer": "best", "silence": 0.0}, sizes={"frame": "raw"})
+    newer = described(scalars={"answer": "best", "silence": 0.0}, agent={"frame": "raw"})
     assert apart(DESCRIBED, newer) == []
-    assert apart(DESCRIBED, described(scalars={"answer": "nearest"}, sizes={"frame": "raw"})) == ["scalars.answer"]
-    assert apart(DESCRIBED, described(sizes={"frame": "action", "more": 1})) == ["sizes.frame", "sizes.more"]
+    assert apart(DESCRIBED, described(scalars={"answer": "nearest"}, agent={"frame": "raw"})) == ["scalars.answer"]
+    assert apart(DESCRIBED, described(agent={"frame": "action", "more": 1})) == ["agent.frame", "agent.more"]
     assert apart({"split": "tuning"}, {"split": "tuning", "sizes": {"frame": "raw"}}) == ["sizes"]
 
 

@@ -9,8 +9,8 @@ from pathlib import Path
 import probes
 import pytest
 
-from cuelearner_jax.config import RunConfig
 from cuelearner_jax.errors import UserError
+from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.tasks import registry
 
 OWN = "from probes import make_task\nTASK = make_task('{name}')\nNUMBER = 3\n"

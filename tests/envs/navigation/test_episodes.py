@@ -7,14 +7,13 @@ import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
-import probes
 import pytest
 
 from cuelearner_envs.navigation.environment import Navigation
 from cuelearner_envs.navigation.lidar import Lidar
 from cuelearner_envs.navigation.robot import collides
 from cuelearner_envs.navigation.worlds import generate_many
-from cuelearner_jax.agents.learning import learner, stored_step
+from cuelearner_jax.agents.replay import Memory, buffer_for, stored_step
 from cuelearner_jax.spaces import directions
 
 KEY = jax.random.key(0)
@@ -171,22 +170,22 @@ def test_a_faulty_reading_is_made_again_and_not_drawn_again(plays):
 
 def test_a_stored_transition_takes_80_bytes():
     for env in (worlds(), worlds().replace(lidar=FAULTS, mirrors=True)):
-        rows = learner(probes.SIZES, True, env).buffer.empty(10)
+        rows = buffer_for(env, bootstraps=True).empty(10)
         assert rows.nbytes / 10 <= 80
 
 
 @jax.jit
 def through(env, memory, action, result):
     """The last 320 of 960 steps as a ring buffer of that many rows gives them back, oldest first."""
-    agent = learner(probes.SIZES, True, env)
-    buffer, stored = agent.buffer, partial(stored_step, bootstraps=True)
+    buffer, stored = buffer_for(env, bootstraps=True), partial(stored_step, bootstraps=True)
 
     def add(rows, item):
         number, *parts = item
         return buffer.add(rows, number * 16, jax.vmap(stored)(*parts)), None
 
     rows, _ = jax.lax.scan(add, buffer.empty(320), (jnp.arange(60), memory, action, result))
-    return agent.one_step(env, buffer.read(rows, jnp.arange(320)))
+    memory = Memory(env, buffer, rows, jnp.int32(960), 16, bootstraps=True)
+    return memory.one_step(buffer.read(rows, jnp.arange(320)))
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -17,9 +17,10 @@ from cuelearner_envs.navigation.worlds import FARTHEST
 from cuelearner_jax.adaptation import stored
 from cuelearner_jax.adaptation.program import Lanes
 from cuelearner_jax.cli import main
-from cuelearner_jax.config import GuideSizes, RunConfig, to_json
+from cuelearner_jax.config import GuideSizes, to_json
 from cuelearner_jax.environment import spaces_of
 from cuelearner_jax.errors import UserError
+from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs.adapted import AdaptedLanes
 from cuelearner_jax.runs.trained import PolicySource
 from cuelearner_jax.spaces.directions import from_angle

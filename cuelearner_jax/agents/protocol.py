@@ -1,0 +1,114 @@
+"""What an agent is: pure functions of one lane, made from options (`config.parts`), for any space and environment.
+
+The options are a class with a `NAME`, a line `ABOUT` it, and `make`; `registry` finds them by name. An agent made from
+equal options for equal spaces is equal, so that a program compiled for one serves the other.
+"""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, Protocol, runtime_checkable
+
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+
+from cuelearner_jax.agents.replay import Memory
+from cuelearner_jax.config import Frame, Scalars, Sizes
+from cuelearner_jax.environment import Spaces
+from cuelearner_jax.types import Params
+
+
+@runtime_checkable
+class AgentFunctions(Protocol):
+    """An agent's functions; hashable, without arrays of its own."""
+
+    @property
+    def options(self) -> Any:
+        """What it was made from."""
+        ...
+
+    @property
+    def frame(self) -> Frame:
+        """What its networks see."""
+        ...
+
+    @property
+    def described(self) -> dict[str, Any]:
+        """What an export says of it, as JSON values."""
+        ...
+
+    def working(self, num_envs: int, portion: int) -> dict[str, int]:
+        """The floats that one lane takes beside its state in each kind of work, by the option that decides it.
+
+        `portion`: values of actions that are computed at once.
+        """
+        ...
+
+    def init(self, key: PRNGKeyArray) -> tuple[Params, Any]:
+        """Parameters that act, and whatever else learning keeps beside them."""
+        ...
+
+    def act(self, env: Any, params: Params, obs: Float[Array, "n obs"], key: PRNGKeyArray) -> Float[Array, "n action"]:
+        """Actions of the finished agent. `env` says how an observation looks from an action (`Sizes.frame`)."""
+        ...
+
+    def explore(
+        self, env: Any, options: Any, params: Params, obs: Float[Array, "n obs"], key: PRNGKeyArray
+    ) -> Float[Array, "n action"]:
+        """Actions while it learns; `options`: see `update`."""
+        ...
+
+    def value(
+        self, env: Any, params: Params, obs: Float[Array, "*n obs"], actions: Float[Array, "*m action"]
+    ) -> Float[Array, "*m"]:
+        """How much it expects of each action, in a situation each or all in one."""
+        ...
+
+    def update(
+        self,
+        env: Any,
+        options: Any,
+        scalars: Scalars,
+        count: Int[Array, ""],
+        params: Params,
+        rest: Any,
+        memory: Memory,
+        key: PRNGKeyArray,
+    ) -> tuple[Params, Any, Float[Array, ""], Float[Array, ""]]:
+        """One gradient step.
+
+        Args:
+            env: see `act`; its `recall` has made the memory's observations.
+            options: those that the agent was made from, their floats traced.
+            scalars: what all parts share, such as the discount factor.
+            count: gradient steps, this one included.
+            params, rest: as `init` gives them.
+            memory: the steps to learn from.
+            key: of this step.
+
+        Returns:
+            Parameters; the rest; the loss; the norm of the gradient.
+        """
+        ...
+
+
+@runtime_checkable
+class AgentOptions(Protocol):
+    """A class of options (`config.part`) that makes an agent."""
+
+    NAME: ClassVar[str]
+    ABOUT: ClassVar[str]
+
+    @property
+    def replay_capacity(self) -> int:
+        """Transitions kept, a multiple of `Sizes.num_envs`."""
+        ...
+
+    def make(self, frame: Frame, spaces: Spaces, bootstraps: bool = False) -> AgentFunctions:
+        """The agent for an environment's spaces; floats of the options may be None. `bootstraps`: is discount above 0?
+
+        Raises UserError for a frame in which the environment cannot be seen.
+        """
+        ...
+
+    def check(self, sizes: Sizes, bootstraps: bool) -> None:
+        """Raises UserError for options that do not work together; each is within its bounds."""
+        ...

@@ -1,0 +1,9 @@
+"""The agents that can be named; add one's own with `AGENTS.register`, or name it as package.module:NAME."""
+
+from __future__ import annotations
+
+from cuelearner_jax.agents import ddqn
+from cuelearner_jax.agents.protocol import AgentOptions
+from cuelearner_jax.plugins import PartRegistry
+
+AGENTS = PartRegistry[AgentOptions]("agent", ddqn.Config)

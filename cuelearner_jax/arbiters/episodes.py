@@ -1,0 +1,55 @@
+"""Whole episodes are guided, each with the same probability (paper: every second one)."""
+
+from __future__ import annotations
+
+from typing import Annotated, ClassVar, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
+
+from cuelearner_jax.arbiters.protocol import Outcome
+from cuelearner_jax.config import SHARE, Scalars, part
+
+
+@part
+class Config:
+    """Options of guiding whole episodes."""
+
+    NAME: ClassVar[str] = "episodes"
+    ABOUT: ClassVar[str] = "each episode is guided with the same probability"
+
+    probability: Annotated[float, SHARE] = 0.5
+    """Probability that an episode is guided."""
+
+    def make(self, bootstraps: bool) -> Episodes:
+        """The arbiter."""
+        return Episodes()
+
+
+class Episodes(NamedTuple):
+    """The arbiter's functions (`protocol.Arbiter`); its state says whether the running episodes are guided."""
+
+    def init(self, num_envs: int) -> Bool[Array, " num_envs"]:
+        """The first episodes, which begin with uniform actions, are the agent's own."""
+        return jnp.zeros(num_envs, bool)
+
+    def guided(self, state: Bool[Array, " num_envs"]) -> Bool[Array, " num_envs"]:
+        """The running episodes that are guided."""
+        return state
+
+    def follow(
+        self, state: Bool[Array, " num_envs"], options: Config, scalars: Scalars, outcome: Outcome, key: PRNGKeyArray
+    ) -> Bool[Array, " num_envs"]:
+        """Draws for the episodes that begin."""
+        return redrawn(key, state, outcome.done, options.probability)
+
+
+def redrawn(
+    key: PRNGKeyArray,
+    guided: Bool[Array, " num_envs"],
+    done: Bool[Array, " num_envs"],
+    probability: Float[Array, ""] | float,
+) -> Bool[Array, " num_envs"]:
+    """Whether episodes are guided, drawn anew where one is done."""
+    return jnp.where(done, jax.random.bernoulli(key, probability, done.shape), guided)

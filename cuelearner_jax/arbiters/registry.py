@@ -1,0 +1,9 @@
+"""The arbiters that can be named; add one's own with `ARBITERS.register`, or name it as package.module:NAME."""
+
+from __future__ import annotations
+
+from cuelearner_jax.arbiters import episodes, paced
+from cuelearner_jax.arbiters.protocol import ArbiterOptions
+from cuelearner_jax.plugins import PartRegistry
+
+ARBITERS = PartRegistry[ArbiterOptions]("arbiter", episodes.Config, paced.Config)

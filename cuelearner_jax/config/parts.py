@@ -1,0 +1,140 @@
+"""Options of a part (an agent, an arbiter, a kind of guidance): one frozen dataclass, bounds beside its fields.
+
+    @part
+    class Config:
+        layers: Layers = (64, 64)
+        \"\"\"Hidden layers.\"\"\"
+        learning_rate: Annotated[float, Bounds(0)] = 0.1
+        \"\"\"Step size.\"\"\"
+
+Floats are traced: another value costs no new compile. All other fields shape the program. The docstring below a field
+is its help on the command line.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Annotated, Any, NamedTuple, TypeVar, dataclass_transform, get_args, get_origin, get_type_hints
+
+import jax
+
+from cuelearner_jax.config.plain import fits, plain
+from cuelearner_jax.errors import UserError, closest, shown
+
+LARGEST = 2**31 - 1  # counters and indices are 32-bit integers
+LARGEST_FLOAT = 3.4028234e38  # scalars are computed in single precision
+MOST_LAYERS = 64  # each is compiled by itself
+
+PartT = TypeVar("PartT")
+
+
+class Bounds(NamedTuple):
+    """What numbers a field may hold; of a tuple each of its entries."""
+
+    least: float = -math.inf
+    most: float = math.inf
+    above: bool = False  # is `least` itself excluded?
+
+    def __contains__(self, number: object) -> bool:
+        """Whether a number may be held."""
+        assert isinstance(number, int | float)
+        return (number > self.least if self.above else number >= self.least) and number <= self.most
+
+    def __str__(self) -> str:
+        """What a message asks for."""
+        if math.isinf(self.most):
+            return "a positive number" if self.least or self.above else "a number that is not negative"
+        if self.above:
+            return f"a number above {self.least:g} and up to {self.most:g}"
+        return f"a number from {self.least:g} to {self.most:g}"
+
+
+POSITIVE = Bounds(1)  # of whole numbers
+SHARE = Bounds(0, 1)
+Layers = Annotated[tuple[int, ...], POSITIVE]  # hidden widths of a network
+
+
+@dataclass_transform(frozen_default=True)
+def part(kind: type[PartT]) -> type[PartT]:
+    """Make a class a frozen dataclass of options, and a pytree of its floats."""
+    made = dataclasses.dataclass(frozen=True)(kind)
+    register(made)
+    return made
+
+
+def register(kind: type, *traced_too: type) -> None:
+    """Register a dataclass as a pytree: floats (and fields of `traced_too`) are leaves, all others its structure."""
+    hints = get_type_hints(kind)
+    names = [field.name for field in dataclasses.fields(kind)]
+    traced = [name for name in names if hints[name] in (float, *traced_too)]
+    jax.tree_util.register_dataclass(kind, traced, [name for name in names if name not in traced])
+
+
+def static(options: PartT) -> PartT:
+    """The options with None in place of floats: what a program is compiled for."""
+    return jax.tree.map(lambda leaf: None, options)
+
+
+def check_types(group: Any, prefix: str, **changes: Any) -> dict[str, Any]:
+    """Values that fields of a configuration are to get, as they are kept: NumPy's numbers as Python's, lists as tuples.
+
+    Args:
+        group: a configuration, or its class.
+        prefix: what messages call it.
+        changes: the values by field (default: those that the configuration holds).
+
+    Raises:
+        UserError: no such field, or a value of another type than its field's.
+    """
+    fields = [field.name for field in dataclasses.fields(group) if field.init]
+    kinds = get_type_hints(group if isinstance(group, type) else type(group))
+    values = changes or {name: getattr(group, name) for name in fields}
+    kept = {}
+    for name, given in values.items():
+        if name not in fields:
+            raise UserError(f"{prefix} has no field {shown(name)}{closest(name, fields)}")
+        value = plain(given)
+        kind = kinds[name]
+        if not fits(value, kind):
+            words = " or ".join(map(str, get_args(kind))) if str(get_origin(kind)) == "typing.Literal" else ""
+            raise UserError(f"{prefix}.{name} is {shown(value)}: give {words or f'a value of type {_called(kind)}'}")
+        kept[name] = value
+    return kept
+
+
+def settled(group: PartT, prefix: str) -> PartT:
+    """A configuration with its values as they are kept. Raises UserError as `check_types`."""
+    kept = check_types(group, prefix)
+    changed = {name: value for name, value in kept.items() if value is not getattr(group, name)}
+    return dataclasses.replace(group, **changed) if changed else group  # pyright: ignore[reportArgumentType]
+
+
+def _called(kind: Any) -> str:
+    return kind.__name__ if isinstance(kind, type) and not get_args(kind) else str(kind)
+
+
+def check_part(group: Any, prefix: str) -> None:
+    """Raises UserError for the first value of a group that its field may not hold: of another type or out of bounds."""
+    check_types(group, prefix)
+    hints = get_type_hints(type(group), include_extras=True)
+    for field in dataclasses.fields(group):
+        value, name = getattr(group, field.name), f"{prefix}.{field.name}"
+        bounds = next((extra for extra in get_args(hints[field.name]) if isinstance(extra, Bounds)), None)
+        _check_range(value, name)
+        if bounds is None:
+            continue
+        if isinstance(value, tuple):
+            if not 1 <= len(value) <= MOST_LAYERS or not all(number in bounds for number in value):
+                raise UserError(f"{name}: give at least one layer of positive width, at most {MOST_LAYERS}")
+        elif value not in bounds:
+            raise UserError(f"{name} is {value}: give {bounds}")
+
+
+def _check_range(value: Any, name: str) -> None:
+    """Raises UserError for numbers that 32 bits do not hold."""
+    for number in value if isinstance(value, tuple) else (value,):
+        if isinstance(number, int) and abs(number) > LARGEST:
+            raise UserError(f"{name} is {number}: give at most {LARGEST}, which is counted in 32 bits")
+        if isinstance(number, float) and not abs(number) <= LARGEST_FLOAT:
+            raise UserError(f"{name} is {number}: give a finite number (in single precision)")

@@ -1,0 +1,132 @@
+"""Everything that determines a run but its lanes: options that all parts share, and those that each part brings."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Generic, NamedTuple, TypeVar
+
+from cuelearner_jax import config as configuration
+from cuelearner_jax.agents import ddqn
+from cuelearner_jax.agents.protocol import AgentFunctions, AgentOptions
+from cuelearner_jax.agents.registry import AGENTS
+from cuelearner_jax.arbiters import episodes
+from cuelearner_jax.arbiters.protocol import ArbiterOptions
+from cuelearner_jax.arbiters.registry import ARBITERS
+from cuelearner_jax.config import Scalars, Schedule, Sizes, check_guide, check_multiple, check_part
+from cuelearner_jax.environment import spaces_of
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.guides import registry as guidances
+from cuelearner_jax.guides.base import Guide
+from cuelearner_jax.plugins import PartRegistry
+
+TaskT = TypeVar("TaskT")
+AgentT = TypeVar("AgentT", bound=AgentOptions)
+ArbiterT = TypeVar("ArbiterT", bound=ArbiterOptions)
+KindsT = TypeVar("KindsT")
+
+GROUPS: Mapping[str, type] = {"sizes": Sizes, "scalars": Scalars, "schedule": Schedule}
+PARTS: Mapping[str, PartRegistry[Any]] = {"agent": AGENTS, "arbiter": ARBITERS}
+
+
+class Settings(NamedTuple):
+    """What a compiled program is given at each call: numbers that cost no new compile."""
+
+    scalars: Scalars
+    schedule: Schedule
+    agent: Any  # options of the agent
+    arbiter: Any  # options of the arbiter
+
+
+@dataclass(frozen=True)
+class RunConfig(Generic[TaskT, AgentT, ArbiterT, KindsT]):
+    """Everything that determines a run but its lanes (seeds, label budgets) and its kind of guidance."""
+
+    task: TaskT
+    sizes: Sizes = dataclasses.field(default_factory=Sizes)
+    scalars: Scalars = dataclasses.field(default_factory=Scalars)
+    schedule: Schedule = dataclasses.field(default_factory=Schedule)
+    agent: AgentT = dataclasses.field(default_factory=ddqn.Config)  # pyright: ignore[reportAssignmentType]
+    arbiter: ArbiterT = dataclasses.field(default_factory=episodes.Config)  # pyright: ignore[reportAssignmentType]
+    # Options of kinds by their names; a kind that is not there has its defaults.
+    kinds: KindsT = dataclasses.field(default_factory=dict)  # pyright: ignore[reportAssignmentType]
+
+    @property
+    def bootstraps(self) -> bool:
+        """Do targets look at the next observation?"""
+        return self.scalars.discount > 0
+
+    def agent_in(self, env: Any) -> AgentFunctions:
+        """The agent's functions for an environment. Raises UserError for a frame in which that cannot be seen."""
+        return self.agent.make(self.sizes.frame, spaces_of(env))
+
+    def guide_in(self, env: Any, kind: str) -> Guide:
+        """The guide of a kind for an environment. Raises UserError as `guides.registry.make`."""
+        return guidances.make(kind, self.sizes, env, self.kinds.get(kind))  # pyright: ignore[reportAttributeAccessIssue]
+
+    @property
+    def settings(self) -> Settings:
+        """What programs are given at each call."""
+        return Settings(self.scalars, self.schedule, self.agent, self.arbiter)
+
+
+def check(config: RunConfig) -> None:
+    """Raises UserError with one line for the first value that cannot work."""
+    sizes, schedule = config.sizes, config.schedule
+    check_part(schedule, "schedule")
+    check_guide(sizes, config.scalars)
+    check_part(config.agent, "agent")
+    check_part(config.arbiter, "arbiter")
+    for name, options in config.kinds.items():
+        check_part(options, name)
+    config.agent.check(sizes, config.bootstraps)
+    if config.scalars.discount >= 1:
+        raise UserError(f"scalars.discount is {config.scalars.discount}: give a number below 1")
+    check_multiple(config.agent.replay_capacity, sizes.num_envs, "agent.replay_capacity", "sizes.num_envs")
+    check_multiple(schedule.eval_every, sizes.num_envs, "schedule.eval_every", "sizes.num_envs")
+    check_multiple(schedule.total_steps, schedule.eval_every, "schedule.total_steps", "schedule.eval_every")
+    check_multiple(schedule.checkpoint_every, schedule.eval_every, "schedule.checkpoint_every", "schedule.eval_every")
+    check_multiple(schedule.eval_steps, schedule.eval_envs, "schedule.eval_steps", "schedule.eval_envs")
+    unit = sizes.labels_per_round
+    check_multiple(schedule.guide_eval_every, unit, "schedule.guide_eval_every", "sizes.labels_per_round")
+
+
+def to_json(config: RunConfig) -> dict[str, Any]:
+    """The options as plain JSON values, without the task's: a part's beside the name of the part."""
+    shared = {name: configuration.to_json(getattr(config, name)) for name in GROUPS}
+    parts = {name: part_to_json(getattr(config, name)) for name in PARTS}
+    return {**shared, **parts, "kinds": {name: configuration.to_json(own) for name, own in config.kinds.items()}}
+
+
+def from_json(task: Any, values: Mapping[str, Any]) -> RunConfig:
+    """The inverse of `to_json`; code that a file names is never loaded.
+
+    Raises:
+        UserError: an unknown field, or a part that is not known here.
+        TypeError, KeyError: the values make no sense.
+    """
+    shared = {name: configuration.from_json(kind, values[name]) for name, kind in GROUPS.items()}
+    parts = {name: part_from_json(known, values[name]) for name, known in PARTS.items()}
+    kinds = {name: kind_from_json(name, own) for name, own in values["kinds"].items()}
+    return RunConfig(task, **shared, **parts, kinds=kinds)
+
+
+def kind_from_json(name: str, values: Mapping[str, Any]) -> Any:
+    """Options of a kind of guidance. Raises as `from_json`, and UserError for a kind without options."""
+    kind = guidances.find(name)
+    if kind.config is None:
+        raise UserError(f"guidance {name!r} has no options: leave them out")
+    return configuration.from_json(kind.config, dict(values))
+
+
+def part_to_json(options: Any) -> dict[str, Any]:
+    """A part's options as plain JSON values beside its name."""
+    return {"name": options.NAME, **configuration.to_json(options)}
+
+
+def part_from_json(parts: PartRegistry[Any], values: Mapping[str, Any]) -> Any:
+    """The inverse of `part_to_json`. Raises as `from_json`."""
+    return configuration.from_json(
+        parts.find(values["name"]), {name: value for name, value in values.items() if name != "name"}
+    )
