@@ -63,7 +63,8 @@ class RunConfig(Generic[TaskT, AgentT, ArbiterT, KindsT]):
 
     def guide_in(self, env: Any, kind: str) -> Guide:
         """The guide of a kind for an environment. Raises UserError as `guides.registry.make`."""
-        return guidances.make(kind, self.sizes, env, self.kinds.get(kind))  # pyright: ignore[reportAttributeAccessIssue]
+        kinds: Any = self.kinds
+        return guidances.make(kind, self.sizes, env, kind_from_json(kind, kinds.get(kind)))
 
     @property
     def settings(self) -> Settings:
@@ -79,7 +80,8 @@ def check(config: RunConfig) -> None:
     check_part(config.agent, "agent")
     check_part(config.arbiter, "arbiter")
     for name, options in config.kinds.items():
-        check_part(options, name)
+        if not isinstance(own := kind_from_json(name, options), dict):  # of a kind that is not known here
+            check_part(own, name)
     config.agent.check(sizes, config.bootstraps)
     if config.scalars.discount >= 1:
         raise UserError(f"scalars.discount is {config.scalars.discount}: give a number below 1")
@@ -96,7 +98,7 @@ def to_json(config: RunConfig) -> dict[str, Any]:
     """The options as plain JSON values, without the task's: a part's beside the name of the part."""
     shared = {name: configuration.to_json(getattr(config, name)) for name in GROUPS}
     parts = {name: part_to_json(getattr(config, name)) for name in PARTS}
-    return {**shared, **parts, "kinds": {name: configuration.to_json(own) for name, own in config.kinds.items()}}
+    return {**shared, **parts, "kinds": {name: kind_to_json(own) for name, own in config.kinds.items()}}
 
 
 def from_json(task: Any, values: Mapping[str, Any]) -> RunConfig:
@@ -112,12 +114,24 @@ def from_json(task: Any, values: Mapping[str, Any]) -> RunConfig:
     return RunConfig(task, **shared, **parts, kinds=kinds)
 
 
-def kind_from_json(name: str, values: Mapping[str, Any]) -> Any:
-    """Options of a kind of guidance. Raises as `from_json`, and UserError for a kind without options."""
-    kind = guidances.find(name)
+def kind_to_json(options: Any) -> Any:
+    """Options of a kind of guidance as plain JSON values; None where there are none."""
+    return options if options is None or isinstance(options, dict) else configuration.to_json(options)
+
+
+def kind_from_json(name: str, values: Any) -> Any:
+    """The inverse of `kind_to_json`; of a kind from outside that is not known here the plain values.
+
+    Raises as `from_json`, and UserError for a value out of bounds or a kind without options.
+    """
+    kind = guidances.registered(name)
+    if not isinstance(values, dict) or kind is None:
+        return values
     if kind.config is None:
         raise UserError(f"guidance {name!r} has no options: leave them out")
-    return configuration.from_json(kind.config, dict(values))
+    options = configuration.from_json(kind.config, values)
+    check_part(options, name)
+    return options
 
 
 def part_to_json(options: Any) -> dict[str, Any]:

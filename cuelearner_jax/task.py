@@ -91,6 +91,7 @@ class Scenario:
     judge_bounds: tuple[float, ...] = ()  # shares of the bound within which it is tried as well
     sizes: dict[str, Any] = field(default_factory=dict)  # fields of `GuideSizes`
     scalars: dict[str, Any] = field(default_factory=dict)  # fields of `Scalars`
+    options: dict[str, Any] = field(default_factory=dict)  # of the kind of guidance: fields of its `Kind.config`
 
     def applied(self, config: Any) -> Any:
         """The configuration with the changes in it."""

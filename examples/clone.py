@@ -2,22 +2,21 @@
 
 Run in the folder above this one, with any task that has a teacher:
 
-    cuelearner sweep examples.reach:TASK --guidance none examples.clone:KIND --out runs/clone
+    cuelearner sweep examples.reach:TASK --guidance none examples.clone:KIND --clone.way 0.9 --out runs/clone
     cuelearner report runs/clone --out runs/clone/report --metric success
     cuelearner evaluate runs/clone --task examples.reach:TASK --guidance none examples.clone:KIND --policy guide
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from cuelearner_jax.config import GuideScalars, Scalars
-from cuelearner_jax.errors import UserError
+from cuelearner_jax.config.parts import Bounds, part
 from cuelearner_jax.feedback.forms import AnswerForm
 from cuelearner_jax.guides.base import Guide, Kind
 from cuelearner_jax.guides.refining import Refined
@@ -53,16 +52,12 @@ FORM = AnswerForm(
 )
 
 
-@dataclass(frozen=True)
-class Options:
-    """Options that this kind alone has."""
+@part
+class Config:
+    """Options that this kind alone has: `--clone.way 0.5`."""
 
-    way: float = 1.0
-    """Share of the way to the network's action that is gone, above 0 and up to 1."""
-
-    def __post_init__(self) -> None:
-        if not 0 < self.way <= 1:
-            raise UserError(f"clone.way is {self.way}: give a number above 0 and up to 1")
+    way: Annotated[float, Bounds(0, 1, above=True)] = 1.0
+    """Share of the way to the network's action that is gone."""
 
 
 class Clone(Guide):
@@ -92,5 +87,5 @@ class Clone(Guide):
 
 
 KIND = Kind(
-    "clone", "a network of the points that the teacher names", Clone, form=FORM, colour="#CC79A7", config=Options
+    "clone", "a network of the points that the teacher names", Clone, form=FORM, colour="#CC79A7", config=Config
 )

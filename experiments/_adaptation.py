@@ -190,7 +190,8 @@ def by_labels(kind: Any, bench: Bench) -> Iterator[Row]:
     piece, env = bench.piece, bench.env("training")
     sizes = bench.set("sizes.", GuideSizes(frame=bench.config.sizes.frame))
     scalars = bench.scalars()
-    guidance = kind.make(sizes, spaces_of(env))
+    options = bench.set(f"{kind.name}.", kind.config()) if kind.config else None
+    guidance = kind.make(sizes, spaces_of(env), options)
     lanes = program.product(len(bench.seeds), (SEED,), piece.labels, (piece.bound_deg,))
     envs = min(bench.envs, JUDGED)
     judge = adapting.Judging(bench.env("tuning"), envs, envs * bench.steps, piece.judge_by, bounds=piece.judge_bounds)

@@ -71,7 +71,7 @@ EACH: Mapping[str, Any] = {
 SPACED = {"sizes.question_every": 10}
 LOOK_AHEAD = {"task.look_ahead": True}
 # The likeliest way is always gone: in doubt the base would act, which walks into walls.
-SURE: Mapping[str, Any] = {**EACH, **SPACED, "scalars.aim_doubt": 1000.0, "sizes.aim_layers": (64, 64)}
+SURE: Mapping[str, Any] = {**EACH, **SPACED, "intent.aim_doubt": 1000.0, "intent.aim_layers": (64, 64)}
 MEMBERS, ACTIVE = {"sizes.ensemble": 5}, {"sizes.ensemble": 5, "sizes.candidates": 16, "sizes.question_every": 1}
 IN_ROOMS: dict[str, dict[str, Mapping[str, Any]]] = {
     "intent": {
@@ -79,8 +79,8 @@ IN_ROOMS: dict[str, dict[str, Mapping[str, Any]]] = {
         "active": {**SURE, **ACTIVE},
         "look-ahead-only": {**SURE, **MEMBERS, **LOOK_AHEAD},
         "shuffled": {**SURE, **MEMBERS, "scalars.answer": "shuffled"},  # do labels matter at all?
-        "doubting": {**SURE, **MEMBERS, "scalars.aim_doubt": 2.0},
-        "small": {**SURE, **MEMBERS, "sizes.aim_layers": (32, 32)},
+        "doubting": {**SURE, **MEMBERS, "intent.aim_doubt": 2.0},
+        "small": {**SURE, **MEMBERS, "intent.aim_layers": (32, 32)},
         "close": {**SURE, **MEMBERS, "sizes.question_every": 1},
         "eps-10": {**SURE, **MEMBERS, "scalars.eps_deg": 10.0},
         "eps-40": {**SURE, **MEMBERS, "scalars.eps_deg": 40.0},

@@ -69,7 +69,7 @@ FAULTS: dict[str, Options] = {
     "biased": {"scalars.teacher-bias-deg": 2.5},
 }
 LEAD = 0.5  # a shot: guided episodes that earn that much more than own ones have their whole share
-SURE: Options = {"scalars.aim-doubt": 1_000.0}  # recorded with `scalars.aim-share` 0.8: commit 5f07753 can repeat it
+SURE: Options = {"intent.aim-doubt": 1_000.0}  # recorded with `scalars.aim-share` 0.8: commit 5f07753 can repeat it
 WAYS: dict[str, Options] = {
     "nearest": {"scalars.answer": "nearest"},
     "ensemble": {"sizes.ensemble": 5},

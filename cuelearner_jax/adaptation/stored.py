@@ -31,7 +31,7 @@ from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.guides.base import NAME
 from cuelearner_jax.policies import Agent, Common, Corrected, Guided, Heuristic, Taught, uniform_in
 from cuelearner_jax.policies import Uniform as UniformPolicy
-from cuelearner_jax.run_config import part_from_json, part_to_json
+from cuelearner_jax.run_config import kind_from_json, kind_to_json, part_from_json, part_to_json
 
 Told = dict[str, Any]
 KINDS = ("agent", "uniform", "heuristic", "guided", "code")
@@ -67,6 +67,7 @@ def told(policy: Any, named: str | None = None) -> Told:
             "policy": "guided",
             "guidance": policy.guidance.name,
             "sizes": _part(GuideSizes, policy.sizes),
+            "options": kind_to_json(policy.guidance.options),
             "scalars": _part(Scalars, policy.scalars),
             "bounded": policy.bound is not None,
             "base": told(policy.base, named),
@@ -107,6 +108,7 @@ def check(values: Told, outermost: bool = True, depth: int = MOST_LAYERS) -> Non
         check_guide(sizes, scalars)
         if not NAME.fullmatch(values["guidance"]) or type(values["bounded"]) is not bool:
             raise ValueError(f"a guidance is called {values['guidance']!r}, and bounded {values['bounded']!r}")
+        kind_from_json(values["guidance"], values["options"])
         check(values["base"], outermost=False, depth=depth - 1)
 
 
@@ -197,4 +199,5 @@ def _guidance(values: Told, env: Any) -> Any:
             f"the policy is under a guidance from outside, {name!r}: name its code by --guidance package.module:NAME, "
             "if you trust that code"
         )
-    return guidances.make(name, configuration.from_json(GuideSizes, values["sizes"]), env)
+    sizes, options = configuration.from_json(GuideSizes, values["sizes"]), kind_from_json(name, values["options"])
+    return guidances.make(name, sizes, env, options)

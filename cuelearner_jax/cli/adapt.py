@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Generic
+from typing import Annotated, Any, Generic
 
 from cuelearner_jax.cli.parsing import about, code_of, out, parse, source_of, taken
-from cuelearner_jax.cli.shared_options import Flag, TaskT
+from cuelearner_jax.cli.shared_options import Flag, KindsT, TaskT, kinds_type, unprefixed
 from cuelearner_jax.errors import NotFinite, UserError
 from cuelearner_jax.plugins import REFERENCE
 from cuelearner_jax.runs.trained import PolicySource
@@ -18,7 +18,7 @@ from cuelearner_jax.terminal import console, progress_bars, watched_by
 
 
 @dataclass(frozen=True, kw_only=True)
-class Adapt(Request[TaskT], Generic[TaskT]):
+class Adapt(Request[TaskT, KindsT], Generic[TaskT, KindsT]):
     """Correct a finished policy (of a run folder or policy folder; or, with --task, package.module:NAME, any function
     of observations) by labels about what it does in a changed world."""
 
@@ -40,9 +40,15 @@ def run(arguments: list[str]) -> None:
     first = {name: taken(rest, f"--{name.replace('_', '-')}", wanted)[0] for name, wanted in FIRST.items()}
     file = Path(first["labels_from"]) if first["labels_from"] else None
     default = adapt.suggested(source, **{**first, "labels_from": file})
-    kind = Adapt[source.task.config]  # pyright: ignore[reportInvalidTypeArguments]
-    default = kind(**vars(default), out=Path("policies") / source.folder.name, base=Base(policy=source.default_policy))
+    kinds = kinds_type(default.kinds)
+    kind = Adapt[source.task.config, Annotated[kinds, unprefixed]]  # pyright: ignore[reportInvalidTypeArguments]
+    default = kind(
+        **{**vars(default), "kinds": kinds()},
+        out=Path("policies") / source.folder.name,
+        base=Base(policy=source.default_policy),
+    )
     asked = parse(kind, rest, f"adapt {source.folder}", default, about(Adapt, source.task, policies=True))
+    asked = replace(asked, kinds=vars(asked.kinds))
     subject = Subject(source.on(asked.robot), asked.base, code, named)
     with (
         policy_folders.place_of(asked.out, asked.overwrite) as place,

@@ -180,7 +180,7 @@ def planned(
         raise UserError(
             f"--bound-deg is {asked.bound_deg:g}: give a number above 0 and up to {space.reach:g} ({space.unit})"
         )
-    guidance = guidances.make(guidances.named(asked.guidance), merged.sizes, env)
+    guidance = merged.guide_in(env, guidances.named(asked.guidance))
     if guidance.kind.sees_base:
         raise UserError(f"guidance {guidance.name!r} is for `adapt --labels-from` alone: leave out --guidance here")
     if guidance.form is None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, make_dataclass, replace
 from itertools import takewhile
 from pathlib import Path
@@ -19,6 +20,7 @@ from cuelearner_jax.task import Preset, Task, shape_of
 
 TaskT = TypeVar("TaskT")
 RunT = TypeVar("RunT", bound=RunConfig)
+KindsT = TypeVar("KindsT")
 Flag = tyro.conf.FlagCreatePairsOff
 
 
@@ -86,11 +88,19 @@ def parts_of(config: RunConfig, arguments: list[str], kinds: tuple[str, ...]) ->
         if kind is not type(getattr(config, name)):
             config = replace(config, **{name: kind()})
     used = [guidances.resolve(kind) for kind in named_kinds(arguments) or kinds]
-    own = [(kind.name, kind.config, config.kinds.get(kind.name) or kind.config()) for kind in used if kind.config]
-    options = make_dataclass("Kinds", [(name, kind, field(default=value)) for name, kind, value in own], frozen=True)
+    options = kinds_type({one.name: config.kinds.get(one.name) or one.config() for one in used if one.config})
     config = replace(config, kinds=options())
-    types = (type(config.task), type(config.agent), type(config.arbiter), options)
+    types = (type(config.task), type(config.agent), type(config.arbiter), Annotated[options, unprefixed])
     return config, RunConfig[types], arguments  # pyright: ignore[reportInvalidTypeArguments]
+
+
+unprefixed = tyro.conf.arg(name="")  # options of kinds are `--KIND.…`
+
+
+def kinds_type(options: Mapping[str, Any]) -> type:
+    """The type whose fields are options of kinds, by their names; these are its defaults."""
+    fields = [(name, type(own), field(default=own)) for name, own in options.items()]
+    return make_dataclass("Kinds", fields, frozen=True)
 
 
 def named_kinds(arguments: list[str]) -> tuple[str, ...]:

@@ -25,8 +25,6 @@ class GuideSizes:
     a guide then says by how much to turn from there)."""
     feedback_layers: Layers = (400, 400, 300, 300)
     """Hidden layers of the guidance model."""
-    aim_layers: Layers = (32, 32)
-    """Hidden layers of a guidance model that weighs the task's aims: the same ones for every aim."""
     labels_per_round: Annotated[int, POSITIVE] = 10
     """New labels after which the guidance model is fitted again from scratch."""
     fit_steps: Annotated[int, POSITIVE] = 2000
@@ -35,10 +33,6 @@ class GuideSizes:
     """Labels in one step of a fit."""
     validate_every: Annotated[int, POSITIVE] = 20
     """Adam steps between two looks at the validation labels (every fifth label); the best parameters are kept."""
-    guide_directions: Annotated[int, POSITIVE] = 360
-    """Directions over which a guide that values actions takes its argmax."""
-    replay_steps: Annotated[int, POSITIVE] = 5
-    """Gradient steps on earlier corrections after each new one, of a guide that goes on learning (deep COACH)."""
     ensemble: Annotated[int, POSITIVE] = 1
     """Members of the guidance model, each fitted to all labels; it predicts their mean."""
     candidates: Annotated[int, POSITIVE] = 1
@@ -80,13 +74,6 @@ class GuideScalars:
     """Largest number of refinement passes."""
     refined_fraction: Annotated[float, SHARE] = 1.0
     """Share of the labels after the first fit asked about refined actions (DAgger); the rest about base actions."""
-    explored_fraction: Annotated[float, SHARE] = 0.25
-    """Share of the questions that a guide which values actions asks about base actions even so, to find good ones."""
-    correction_replay: Annotated[int, POSITIVE] = 50
-    """Newest corrections that a guide which goes on learning (deep COACH) keeps learning from."""
-    aim_doubt: Annotated[float, Bounds(0)] = 2.0
-    """A guide that reads intent leaves actions as they are where it is at least so many times likelier that no aim is
-    meant."""
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -54,6 +54,15 @@ class Kind:
         return self.guide(self, sizes, spaces, self.config() if options is None and self.config else options)
 
 
+class Footprint(NamedTuple):
+    """What a guide's network has for one situation, from which its memory is reckoned."""
+
+    option: str  # that decides its layers
+    layers: tuple[int, ...]  # units
+    inputs: int = 0  # beside the observation
+    searched: tuple[str, int] | None = None  # actions that the guide values at once, after the option that decides it
+
+
 @dataclass(frozen=True)
 class Guide:
     """One kind of guidance for one lane: pure functions over an explicit model, chosen in Python before tracing.
@@ -92,6 +101,10 @@ class Guide:
     def network(self) -> GuideModel:
         """The network, or ensemble, whose outputs are something to add to an action."""
         return guide_model(self.sizes, self.spaces)
+
+    def footprint(self, env: Any) -> Footprint:
+        """What memory its network takes; shapes in place of an environment's arrays will do."""
+        return Footprint("--sizes.feedback-layers", self.sizes.feedback_layers)
 
     def target(self, label: Label, scalars: GuideScalars) -> Float[Array, " outputs"]:
         """What the network is to predict of one label, here its answer."""

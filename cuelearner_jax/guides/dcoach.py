@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import dataclasses
 from functools import cached_property, partial
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
@@ -25,6 +25,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from cuelearner_jax.config import GuideScalars
+from cuelearner_jax.config.parts import POSITIVE, part
 from cuelearner_jax.feedback.answers import RELATIVE
 from cuelearner_jax.guides.base import Kind
 from cuelearner_jax.guides.demonstration import Demonstration
@@ -32,6 +33,16 @@ from cuelearner_jax.guides.fitting import Lesson, optimizer, squared
 from cuelearner_jax.guides.model import for_each
 from cuelearner_jax.guides.refining import Refined
 from cuelearner_jax.types import GuidanceModel, Label, Params
+
+
+@part
+class Config:
+    """Options of deep COACH."""
+
+    replay_steps: Annotated[int, POSITIVE] = 5
+    """Gradient steps on earlier corrections after each new one."""
+    correction_replay: Annotated[int, POSITIVE] = 50
+    """Newest corrections that the policy keeps learning from."""
 
 
 class Coached(struct.PyTreeNode):
@@ -44,6 +55,8 @@ class Coached(struct.PyTreeNode):
 
 class DeepCoach(Demonstration):
     """A policy that acts as a cloned one does, and is moved by each correction."""
+
+    options: Config
 
     @cached_property
     def member(self) -> DeepCoach:
@@ -83,7 +96,7 @@ class DeepCoach(Demonstration):
 
         def corrected(key: PRNGKeyArray, number: Int[Array, ""], coached: Coached) -> Coached:
             """By label `number` of those that count, and by a replay of the newest up to it."""
-            oldest = jnp.maximum(number + 1 - scalars.correction_replay, 0)
+            oldest = jnp.maximum(number + 1 - self.options.correction_replay, 0)
 
             def replay(coached: Coached, key: PRNGKeyArray) -> tuple[Coached, None]:
                 k_draw, k_see = jax.random.split(key)
@@ -92,7 +105,7 @@ class DeepCoach(Demonstration):
 
             k_new, k_replay = jax.random.split(jax.random.fold_in(key, number))
             coached = step(coached, number[None], k_new)
-            coached, _ = jax.lax.scan(replay, coached, jax.random.split(k_replay, self.sizes.replay_steps))
+            coached, _ = jax.lax.scan(replay, coached, jax.random.split(k_replay, self.options.replay_steps))
             return coached.replace(learned=number + 1)
 
         def taught(key: PRNGKeyArray, coached: Coached) -> Coached:
@@ -120,5 +133,11 @@ class DeepCoach(Demonstration):
 
 
 KIND = Kind(
-    "dcoach", "a policy moved by each correction", DeepCoach, form=RELATIVE, title="deep COACH", colour="#56B4E9"
+    "dcoach",
+    "a policy moved by each correction",
+    DeepCoach,
+    form=RELATIVE,
+    title="deep COACH",
+    colour="#56B4E9",
+    config=Config,
 )

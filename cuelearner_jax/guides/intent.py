@@ -13,7 +13,7 @@ the regulation table, and less on the easy one; agents did not learn faster from
 from __future__ import annotations
 
 from functools import cached_property, partial
-from typing import Any
+from typing import Annotated, Any
 
 import flax.linen as nn
 import jax
@@ -22,9 +22,10 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from cuelearner_jax.config import GuideScalars
+from cuelearner_jax.config.parts import Bounds, Layers, part
 from cuelearner_jax.environment import Aims
 from cuelearner_jax.feedback.answers import RELATIVE
-from cuelearner_jax.guides.base import Guide, Kind
+from cuelearner_jax.guides.base import Footprint, Guide, Kind
 from cuelearner_jax.guides.fitting import fit_model
 from cuelearner_jax.guides.model import GuideModel, ensemble
 from cuelearner_jax.guides.refining import Refined
@@ -35,6 +36,16 @@ SPREAD = 1 / 180  # of the space's reach: how far what a teacher means may lie f
 ELSEWHERE = 360  # evenly spaced actions that stand for "it means none of these"
 SLIPS = 0.02  # share of answers that say nothing: any of the words
 WORDS = 3
+
+
+@part
+class Config:
+    """Options of a guide that reads intent."""
+
+    aim_layers: Layers = (32, 32)
+    """Hidden layers of the network that weighs the task's aims: the same ones for every aim."""
+    aim_doubt: Annotated[float, Bounds(0)] = 2.0
+    """Actions stay as they are where it is at least so many times likelier that no aim is meant."""
 
 
 class Weights(nn.Module):
@@ -97,16 +108,18 @@ def followed(
     share: Float[Array, " aims_and_none"],
     aims: Float[Array, "aims action"],
     action: Float[Array, " action"],
-    scalars: GuideScalars,
+    doubt: float,
 ) -> tuple[Float[Array, " action"], Bool[Array, ""]]:
     """Of the aims as likely as the likeliest the nearest to an action, and whether it is likely enough at all."""
     most = share[:-1].max()
     goal = aims[jnp.argmin(jnp.where(share[:-1] >= most, space.distance(action[None], aims), jnp.inf))]
-    return goal, (most > 0.0) & (scalars.aim_doubt * most > share[-1])
+    return goal, (most > 0.0) & (doubt * most > share[-1])
 
 
 class Intent(Guide):
     """A guide that weighs the task's aims by what was answered and goes for the likeliest."""
+
+    options: Config
 
     @cached_property
     def network(self) -> GuideModel:
@@ -114,7 +127,7 @@ class Intent(Guide):
 
         Aims' features and which of them are possible stand where other kinds have observations and actions.
         """
-        weights, width = Weights(self.sizes.aim_layers), self.spaces.aims or 0
+        weights, width = Weights(self.options.aim_layers), self.spaces.aims or 0
 
         def init(key: PRNGKeyArray) -> Params:
             return weights.init(key, jnp.zeros((1, width)), jnp.ones(1, bool))
@@ -125,6 +138,14 @@ class Intent(Guide):
             return jax.nn.softmax(jnp.asarray(jax.vmap(weights.apply, (None, 0, 0))(params, features, possible)))
 
         return ensemble(self.sizes.ensemble, init, shares)
+
+    def footprint(self, env: Any) -> Footprint:
+        """Every aim goes through the layers."""
+        aims, features = jax.eval_shape(
+            lambda env, obs: env.aims(obs), env, jnp.zeros(self.spaces.obs_size)
+        ).features.shape
+        layers = tuple(aims * width for width in self.options.aim_layers)
+        return Footprint("--intent.aim-layers", layers, aims * features)
 
     def fit(
         self, key: PRNGKeyArray, env: Any, labels: Label, former: GuidanceModel, scalars: GuideScalars
@@ -153,7 +174,8 @@ class Intent(Guide):
         share = self.network.predict(env, model.params, aims.features, aims.possible)
         if aims.open is not None:
             share = share.at[:, :-1].multiply(aims.open)
-        goals, sure = jax.vmap(partial(followed, space), (0, 0, 0, None))(share, aims.actions, actions, scalars)
+        find = partial(followed, space, doubt=self.options.aim_doubt)
+        goals, sure = jax.vmap(find)(share, aims.actions, actions)
 
         def phi(current: Float[Array, "n action"]) -> Float[Array, "n action"]:
             return space.approach(current, goals, space.from_unit(scalars.eps_deg)) - current
@@ -169,5 +191,11 @@ class Intent(Guide):
 
 
 KIND = Kind(
-    "intent", "relative feedback about the task's aims", Intent, form=RELATIVE, needs=("aims",), colour="#CC79A7"
+    "intent",
+    "relative feedback about the task's aims",
+    Intent,
+    form=RELATIVE,
+    needs=("aims",),
+    colour="#CC79A7",
+    config=Config,
 )

@@ -70,8 +70,9 @@ def guide_model(sizes: GuideSizes, spaces: Spaces, outputs: int | None = None, b
         return network.init(key, jnp.zeros(own), jnp.zeros(turned + beside))
 
     def predict(
-        env: Any, params: Params, obs: Float[Array, "n obs"], actions: Float[Array, "n action"]
-    ) -> Float[Array, "n outputs"]:
+        env: Any, params: Params, obs: Float[Array, "*n obs"], actions: Float[Array, "m action"]
+    ) -> Float[Array, "m outputs"]:
+        """Of m situations with an action each, or of one with m actions."""
         bare, known = jnp.split(actions, [size], -1)
         of_obs, of_action = view.seen(sizes.frame, env, obs, bare)
         return applied(network)(params, of_obs, jnp.concatenate([of_action, known], -1) if beside else of_action)

@@ -8,7 +8,7 @@ alone may never see one: a share `explored_fraction` of the questions stays abou
 from __future__ import annotations
 
 from functools import cached_property
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
@@ -16,20 +16,38 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from cuelearner_jax.agents.choice import best_of
 from cuelearner_jax.config import GuideScalars
+from cuelearner_jax.config.parts import POSITIVE, SHARE, part
 from cuelearner_jax.feedback.answers import SCALAR
-from cuelearner_jax.guides.base import Guide, Kind
+from cuelearner_jax.guides.base import Footprint, Guide, Kind
 from cuelearner_jax.guides.model import GuideModel, guide_model
 from cuelearner_jax.guides.refining import Refined
 from cuelearner_jax.types import GuidanceModel
 
 
+@part
+class Config:
+    """Options of a guide that values actions."""
+
+    guide_directions: Annotated[int, POSITIVE] = 360
+    """Directions over which the guide takes its argmax."""
+    explored_fraction: Annotated[float, SHARE] = 0.25
+    """Share of the questions that are about base actions even so, to find good ones."""
+
+
 class Scalar(Guide):
     """A guide that values actions."""
+
+    options: Config
 
     @cached_property
     def network(self) -> GuideModel:
         """The network, or ensemble, whose output is whether an action is called good."""
         return guide_model(self.sizes, self.spaces, outputs=1)
+
+    def footprint(self, env: Any) -> Footprint:
+        """Beside the layers the actions among which the best is searched."""
+        searched = ("--scalar.guide-directions", self.options.guide_directions)
+        return super().footprint(env)._replace(searched=searched)
 
     def act(
         self,
@@ -43,7 +61,7 @@ class Scalar(Guide):
         """The best of all actions in active rows of a fitted model."""
         guided = active & model.fitted
         value = lambda obs, actions: self.network.predict(env, model.params, obs, actions)[:, 0]  # noqa: E731
-        chosen = best_of(value, self.spaces.actions.spread(self.sizes.guide_directions), obs)
+        chosen = best_of(value, self.spaces.actions.spread(self.options.guide_directions), obs)
         return Refined(jnp.where(guided[:, None], chosen, actions), guided.astype(jnp.int32))
 
     def question(
@@ -57,8 +75,15 @@ class Scalar(Guide):
     ) -> Float[Array, " action"]:
         """The base action in a share `explored_fraction` of all questions, the guide's own in the others."""
         k_explore, k_refined = jax.random.split(key)
-        explores = jax.random.bernoulli(k_explore, scalars.explored_fraction)
+        explores = jax.random.bernoulli(k_explore, self.options.explored_fraction)
         return jnp.where(explores, base, super().question(k_refined, model, env, obs, base, scalars))
 
 
-KIND = Kind("scalar", "a model of which actions the teacher calls good", Scalar, form=SCALAR, colour="#E69F00")
+KIND = Kind(
+    "scalar",
+    "a model of which actions the teacher calls good",
+    Scalar,
+    form=SCALAR,
+    colour="#E69F00",
+    config=Config,
+)

@@ -18,7 +18,7 @@ from cuelearner_jax.environment import Spaces
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import SPLITS
 from cuelearner_jax.guides import registry as guidances
-from cuelearner_jax.guides.base import NAME, Guide
+from cuelearner_jax.guides.base import NAME, Guide, Kind
 from cuelearner_jax.plugins import REFERENCE
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs.shards import Shard
@@ -40,7 +40,7 @@ class Grid:
     seeds: tuple[int, ...]
     labels: tuple[int, ...]
 
-    def lanes(self, guidance: Guide) -> tuple[np.ndarray, np.ndarray]:
+    def lanes(self, guidance: Guide | Kind) -> tuple[np.ndarray, np.ndarray]:
         """(seeds, budgets) of one kind's lanes, each (lanes,)."""
         budgets = self.labels if guidance.asks else (0,)
         pairs = [(seed, budget) for budget in budgets for seed in self.seeds]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import numpy as np
@@ -11,7 +11,7 @@ from cuelearner_jax.asking import label_slots
 from cuelearner_jax.devices import portions
 from cuelearner_jax.environment import spaces_of
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.guides.registry import registered
+from cuelearner_jax.guides.base import Footprint
 from cuelearner_jax.runs.lanes import LaneGroup
 from cuelearner_jax.storage.room import free_bytes
 from cuelearner_jax.types import TrainState
@@ -31,7 +31,7 @@ def memory_report(group: LaneGroup) -> str:
     block = group.shapes_of(group.cut[:1])[0]  # the blocks are alike
     count, width = group.cut.shape
     lanes, devices = len(group.seeds), group.mesh.size
-    guide = _guide(group, block)
+    guide = group.guidance.footprint(group.env)
     kept = {option: count * size // devices for option, size in _at_rest(block, guide).items()}
     examined = group.at_once if jax.default_backend() == "cpu" else min(group.at_once, portions().agents)
     worked = {option: size * group.at_once for option, size in _training(group, block, guide).items()}
@@ -54,27 +54,7 @@ def memory_report(group: LaneGroup) -> str:
     )
 
 
-class _Guide(NamedTuple):
-    """What a guide's network has for one situation."""
-
-    option: str  # of its layers
-    units: int  # in all layers
-    widest: int  # in one
-    inputs: int  # beside the observation
-
-
-def _guide(group: LaneGroup, block: TrainState) -> _Guide:
-    """A network of the situation, or one that weighs each of its aims."""
-    sizes, kind = group.config.sizes, registered(group.guidance.name)
-    if kind is None or "aims" not in kind.needs:
-        return _Guide("--sizes.feedback-layers", sum(sizes.feedback_layers), max(sizes.feedback_layers), 0)
-    obs = jax.ShapeDtypeStruct(block.guide.obs.shape[-1:], block.guide.obs.dtype)
-    aims, features = jax.eval_shape(lambda env, obs: env.aims(obs), group.env, obs).features.shape
-    layers = [aims * width for width in sizes.aim_layers]
-    return _Guide("--sizes.aim-layers", sum(layers), max(layers), aims * features)
-
-
-def _at_rest(block: TrainState, layers: _Guide) -> dict[str, int]:
+def _at_rest(block: TrainState, layers: Footprint) -> dict[str, int]:
     """What a block keeps [bytes], by the option that decides it."""
     agent, guide = block.agent, block.guide
     parts = {
@@ -88,7 +68,7 @@ def _at_rest(block: TrainState, layers: _Guide) -> dict[str, int]:
     return {**found, "the networks of --agent": state_bytes(block) - sum(found.values())}
 
 
-def _training(group: LaneGroup, block: TrainState, guide: _Guide) -> dict[str, int]:
+def _training(group: LaneGroup, block: TrainState, guide: Footprint) -> dict[str, int]:
     """What one lane takes beside that in each kind of work, of which one is done at a time [bytes], by option."""
     sizes, schedule = group.config.sizes, group.config.schedule
     agent = group.config.agent.make(sizes.frame, spaces_of(group.env), group.config.bootstraps)
@@ -97,13 +77,15 @@ def _training(group: LaneGroup, block: TrainState, guide: _Guide) -> dict[str, i
     if group.largest_budget:
         obs = state_bytes(block.guide.obs) // (block.key.shape[0] * sizes.candidates)
         seen = COPIES * (obs + FLOAT * guide.inputs)
-        needed["--sizes.fit-batch-size"] = sizes.ensemble * sizes.fit_batch_size * (3 * FLOAT * guide.units + seen)
+        needed["--sizes.fit-batch-size"] = (
+            sizes.ensemble * sizes.fit_batch_size * (3 * FLOAT * sum(guide.layers) + seen)
+        )
         needed["--sizes.fit-steps"] = 2 * FLOAT * sizes.fit_steps
         slots = label_slots(group.largest_budget, sizes)
-        valued = min(sizes.num_envs * sizes.guide_directions, max(portions().actions, sizes.guide_directions))
-        needed["--sizes.guide-directions"] = 4 * FLOAT * max(sizes.feedback_layers) * valued * sizes.ensemble
-        needed["--sizes.replay-steps"] = FLOAT * sizes.replay_steps * sizes.fit_batch_size
-        widest = FLOAT * sizes.ensemble * guide.widest
+        widest = FLOAT * sizes.ensemble * max(guide.layers)
+        if guide.searched:
+            option, count = guide.searched
+            needed[option] = 4 * widest * min(sizes.num_envs * count, max(portions().actions, count))
         needed[guide.option] = 4 * widest * sizes.num_envs
         needed["--labels and --sizes.labels-per-round"] = slots * (2 * widest + FLOAT * guide.inputs)
         situation = state_bytes((block.guide.env, block.guide.obs)) // block.key.shape[0]
@@ -111,12 +93,12 @@ def _training(group: LaneGroup, block: TrainState, guide: _Guide) -> dict[str, i
     return needed
 
 
-def _evaluating(group: LaneGroup, block: TrainState, guide: _Guide) -> dict[str, int]:
+def _evaluating(group: LaneGroup, block: TrainState, guide: Footprint) -> dict[str, int]:
     """The same of evaluations."""
     schedule = group.config.schedule
     lanes = block.key.shape[0] * group.config.sizes.candidates
     situation = state_bytes((block.guide.env, block.guide.obs)) // lanes
     return {
-        "--schedule.eval-envs": schedule.eval_envs * (COPIES * situation + 2 * FLOAT * guide.widest),
+        "--schedule.eval-envs": schedule.eval_envs * (COPIES * situation + 2 * FLOAT * max(guide.layers)),
         "--schedule.eval-steps": METRICS * FLOAT * (schedule.eval_steps // schedule.eval_envs),
     }

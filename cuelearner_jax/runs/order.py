@@ -116,7 +116,7 @@ def read_labels(
     file = label_files.read(path)
     env = shape_of(task, world)
     check_world(path, file.task, task, world)
-    made = [guidances.make(kind, sizes, env) for kind in grid.guidance]
+    made = [guidances.find(kind) for kind in grid.guidance]
     asking = [guidance for guidance in made if guidance.form is not None]
     if not asking:
         fitting = [kind.name for kind in guidances.known() if kind.form and kind.form.name == file.answers]

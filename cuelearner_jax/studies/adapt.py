@@ -19,7 +19,7 @@ import numpy as np
 from cuelearner_jax import user_code
 from cuelearner_jax.adaptation import adapting, judging, program, stored
 from cuelearner_jax.adaptation.adapting import Adaptation, Adapted, Judging
-from cuelearner_jax.config import GuideSizes, Scalars, check_guide
+from cuelearner_jax.config import GuideSizes, Scalars, check_guide, check_part
 from cuelearner_jax.environment import Environment, actions_of, spaces_of
 from cuelearner_jax.errors import UserError, closest
 from cuelearner_jax.evaluate import Tell, untold
@@ -41,6 +41,7 @@ from cuelearner_jax.terminal import console
 from cuelearner_jax.types import Label, Teacher
 
 TaskT = TypeVar("TaskT")
+KindsT = TypeVar("KindsT")
 
 MOST_ENVS = 100_000  # that memory has room for
 AS_IT_IS = Scenario("the world as it is", {})
@@ -63,7 +64,7 @@ class Base:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Request(Generic[TaskT]):
+class Request(Generic[TaskT, KindsT]):
     """What adaptation is asked for."""
 
     task: TaskT
@@ -97,6 +98,7 @@ class Request(Generic[TaskT]):
     tuning episodes."""
     sizes: GuideSizes = adapting.SIZES
     scalars: Scalars = field(default_factory=Scalars)
+    kinds: KindsT = field(default_factory=dict)  # pyright: ignore[reportAssignmentType]  # options by kind, as a run's
 
 
 class Subject(NamedTuple):
@@ -151,7 +153,7 @@ def suggested(
     """
     rules = source.task.scenario(scenario) if scenario else AS_IT_IS
     if guidance not in (None, rules.guidance):
-        rules = replace(rules, guidance=None, sizes={}, scalars={})  # which are for the suggested kind
+        rules = replace(rules, guidance=None, sizes={}, scalars={}, options={})  # which are for the suggested kind
     if judge_by == judging.LABELS:
         rules = replace(rules, judge_bounds=())  # which are tried on episodes
     labels = Request.labels
@@ -165,6 +167,8 @@ def suggested(
         scalars = replace(adapting.settling(source.config.scalars, eps_deg), **rules.scalars)
     else:
         scalars = adapting.settling(scalars, eps_deg)
+    kind = guidances.resolve(guidance or rules.guidance or Request.guidance)
+    own = source.config.kinds.get(kind.name) or (kind.config and kind.config())
     return Request(
         task=rules.applied(source.config.task),
         labels=labels,
@@ -176,6 +180,7 @@ def suggested(
         judge_bounds=rules.judge_bounds,
         sizes=sizes,
         scalars=scalars,
+        kinds={kind.name: replace(own, **rules.options)} if own else {},
     )
 
 
@@ -202,7 +207,9 @@ def run(
     if not kind.asks:
         raise UserError(f"guidance {kind.name!r} asks nothing that could be learned from: choose another kind")
     env = task.environment(request.task)
-    guidance = guidances.make(kind.name, sizes, env)
+    for name, options in request.kinds.items():
+        check_part(options, name)
+    guidance = guidances.make(kind.name, sizes, env, request.kinds.get(kind.name))
     bases, seeds, origin = _bases(subject, request, env)
     shared = isinstance(bases, Common)
     if not shared and (request.seeds, request.first_seed) != (1, 0):

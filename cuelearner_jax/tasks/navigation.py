@@ -17,11 +17,13 @@ from cuelearner_jax.agents import ddqn
 from cuelearner_jax.arbiters import paced
 from cuelearner_jax.config import Scalars, Schedule, Sizes
 from cuelearner_jax.environment import Environment
+from cuelearner_jax.guides import scalar
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.task import PAPERS_FIT, Body, Pictures, Preset, Scenario, Task
 from cuelearner_jax.types import Teacher
 
-NAVIGATION_SIZES = Sizes(num_envs=10, guide_directions=72)
+NAVIGATION_SIZES = Sizes(num_envs=10)
+NAVIGATION_KINDS = {"scalar": scalar.Config(guide_directions=72)}
 
 # The paper's discount, eps, step size, and what scalar feedback calls good. The bound on the gradient's norm (0.5) and
 # the target network's rate (0.005) of its billiards code learn more slowly here, see docs/results.md.
@@ -107,8 +109,8 @@ ANYMAL = _anymal()
 BY_WAYS: dict[str, Any] = {
     "guidance": "intent",
     "eps_deg": 20.0,
-    "sizes": {"ensemble": 5, "labels_per_round": 50, "question_every": 10, "aim_layers": (64, 64)},
-    "scalars": {"aim_doubt": 1000.0},
+    "sizes": {"ensemble": 5, "labels_per_round": 50, "question_every": 10},
+    "options": {"aim_layers": (64, 64), "aim_doubt": 1000.0},
 }
 
 # The worlds of the paper's section on adaptation after training.
@@ -174,6 +176,7 @@ NAVIGATION = Task(
                     guide_eval_every=50,
                 ),
                 NAVIGATION_AGENT,
+                kinds=NAVIGATION_KINDS,
             ),
             guidance=("none", "relative", "heuristic"),
             labels=(100, 350, 500),
@@ -206,6 +209,7 @@ NAVIGATION = Task(
                     learning_rate=0.003,
                 ),
                 paced.Config(),
+                NAVIGATION_KINDS,
             ),
             guidance=("none", "relative"),
             labels=(350,),

@@ -194,6 +194,7 @@ def test_a_run_goes_on_with_the_same_command(runs, home):
         assert main([*command, "--resume"]) == 0
     assert ((runs / "clone" / "config.json").read_text(), results.read(runs / "clone").num_rows) == (described, rows)
     assert json.loads(described)["grid"]["guidance"] == ["none", "clone"]
+    assert json.loads(described)["kinds"] == {"clone": {"way": 0.9}}
 
 
 def test_the_boats_page_shows_where_things_are_and_where_an_action_leads():

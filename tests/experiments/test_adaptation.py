@@ -13,6 +13,7 @@ from cuelearner_jax.adaptation.adapting import check_amounts
 from cuelearner_jax.agents import ddqn
 from cuelearner_jax.config import GuideSizes, check_guide
 from cuelearner_jax.feedback.answers import check_teacher
+from cuelearner_jax.guides import intent
 from cuelearner_jax.run_config import GROUPS, check
 from cuelearner_jax.runs.trained import PolicySource
 from cuelearner_jax.storage import table as tables
@@ -65,7 +66,8 @@ def test_a_scenario_holds_the_recipe_that_is_reported(name, path, modules):
     assert asked.judge_bounds == piece.judge_bounds
     assert asked.scalars == bench.scalars()
     sizes = bench.set("sizes.", GuideSizes(frame=asked.sizes.frame))
-    if asked.guidance == "intent":  # whose network is of `aim_layers`
+    if asked.guidance == "intent":  # whose network is of its own `aim_layers`
+        assert asked.kinds == {"intent": bench.set("intent.", intent.Config())}
         sizes = dataclasses.replace(sizes, frame=asked.sizes.frame, feedback_layers=asked.sizes.feedback_layers)
     assert asked.sizes == sizes
     own = {key.partition(".")[2]: value for key, value in piece.settings.items() if key.startswith("task.")}
@@ -86,7 +88,7 @@ def test_every_piece_has_settings_that_can_be(study, scale, modules):
         for name in left.settings:
             names[name.partition(".")[0]].add(name.partition(".")[2])
         assert names.pop("guidance", set()) <= {""}, piece.path
-        groups["task"] = bench.task.config
+        groups |= {"task": bench.task.config, "intent": intent.Config}
         for group, fields in names.items():
             assert fields <= {field.name for field in dataclasses.fields(groups[group])}, piece.path
         if left.labels:

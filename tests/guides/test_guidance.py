@@ -10,10 +10,13 @@ import numpy as np
 import probes
 import pytest
 
+from cuelearner_jax import run_config
 from cuelearner_jax.errors import UserError
+from cuelearner_jax.guides import intent
 from cuelearner_jax.guides import registry as guidance
 from cuelearner_jax.guides.base import Kind
 from cuelearner_jax.guides.untaught import NONE, Untaught
+from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.spaces import directions
 from cuelearner_jax.types import Label
 
@@ -241,6 +244,26 @@ def test_guides_of_the_same_settings_are_equal_and_hash_alike(kind):
         assert (same, hash(same)) == (one, hash(one))
     assert guidance.make(kind, dataclasses.replace(probes.SIZES, feedback_layers=(3,)), ENV) != one
     assert dataclasses.replace(one, options=1) != one
+
+
+def test_a_kind_brings_options_of_its_own_which_a_run_keeps():
+    own = intent.Config(aim_layers=(3,), aim_doubt=7.0)
+    values = run_config.to_json(RunConfig(None, kinds={"intent": own}))
+    known = run_config.from_json(None, values)
+    assert known.kinds == {"intent": own}
+    assert known.guide_in(probes.Aimed(), "intent").options == own
+    assert RunConfig(None).guide_in(probes.Aimed(), "intent").options == intent.Config()
+    elsewhere = run_config.from_json(
+        None, {**values, "kinds": {"from-outside": {"way": 0.5}}}
+    )  # its code is not loaded
+    assert run_config.to_json(elsewhere)["kinds"] == {"from-outside": {"way": 0.5}}
+    for name, wrong, says in (
+        ("intent", {"aim_doubt": -1.0}, "intent.aim_doubt"),
+        ("intent", {"doubt": 1.0}, "'doubt'"),
+        ("relative", {"aim_doubt": 1.0}, "no options"),
+    ):
+        with pytest.raises(UserError, match=says):
+            run_config.from_json(None, {**values, "kinds": {name: wrong}})
 
 
 def test_a_kind_is_refused_where_the_environment_lacks_what_it_needs(registered):

@@ -25,7 +25,7 @@ class Aimless(probes.Aimed):
 
 
 ENV, SHUFFLED, AIMLESS = probes.Aimed(), Shuffled(), Aimless()
-SIZES = dataclasses.replace(probes.SIZES, aim_layers=(8,))
+SIZES, OPTIONS = probes.SIZES, intent.Config(aim_layers=(8,))
 OBS = directions.evenly_spaced(16)
 BASE = directions.rotate(OBS, jnp.linspace(-3.0, 3.0, 16))
 EVERYWHERE = jnp.ones(16, bool)
@@ -33,7 +33,7 @@ EVERYWHERE = jnp.ones(16, bool)
 
 def told(sizes):
     """A bundle and its model of 40 of the expert's answers about random actions."""
-    bundle = registry.make("intent", sizes, ENV)
+    bundle = registry.make("intent", sizes, ENV, OPTIONS)
     keys = jax.random.split(jax.random.key(3), 40)
     obs = jax.vmap(lambda key: ENV.reset(key)[1])(keys)
     asked = directions.uniform(jax.random.key(4), (40,))
@@ -53,7 +53,8 @@ class Shut(probes.Aimed):
 
 def test_what_is_not_open_may_be_meant_and_is_not_followed(fitted):
     bundle, model = fitted
-    scalars = dataclasses.replace(probes.SCALARS, aim_doubt=1e9, k_max=200)
+    bundle = dataclasses.replace(bundle, options=dataclasses.replace(OPTIONS, aim_doubt=1e9))
+    scalars = dataclasses.replace(probes.SCALARS, k_max=200)
     found = bundle.act(model, Shut(), OBS, BASE, EVERYWHERE, scalars).actions
     second = directions.rotate(OBS, jnp.asarray(0.6))
     meant = bundle.act(model, ENV, OBS, BASE, EVERYWHERE, scalars).actions
@@ -110,30 +111,29 @@ def test_without_a_possible_aim_actions_stay_as_they_are(fitted):
 
 
 def test_actions_stay_where_it_is_likelier_by_far_that_none_is_meant():
-    aims, scalars = directions.evenly_spaced(3), dataclasses.replace(probes.SCALARS, aim_doubt=2.0)
+    aims = directions.evenly_spaced(3)
     for none, sure in ((math.log(3.9), True), (math.log(4.1), False)):
         share = jax.nn.softmax(jnp.array([0.0, math.log(2.0), -jnp.inf, none]))
-        goal, found = intent.followed(DIRECTIONS, share, aims, aims[0], scalars)
+        goal, found = intent.followed(DIRECTIONS, share, aims, aims[0], 2.0)
         np.testing.assert_array_equal(goal, aims[1])
         assert bool(found) == sure
     impossible = jnp.array([0.0, 0.0, 0.0, 1.0])
-    assert not intent.followed(DIRECTIONS, impossible, aims, aims[0], scalars)[1]
+    assert not intent.followed(DIRECTIONS, impossible, aims, aims[0], 2.0)[1]
 
 
 def test_of_aims_as_likely_as_the_likeliest_the_nearest_is_followed():
     space, aims = DIRECTIONS, directions.evenly_spaced(4)  # at 0, 90, 180 and 270 degrees
-    scalars = dataclasses.replace(probes.SCALARS, aim_doubt=100.0)
     # Probabilities 4 : 4 : 3.1 : 0, the last impossible; three quarters of all that none is meant.
     share = jnp.array([4.0, 4.0, 3.1, 0.0, 33.3]) / 44.4
     for degrees, aim in ((80.0, 1), (30.0, 0), (170.0, 1), (200.0, 1), (271.0, 0)):
-        found, sure = intent.followed(space, share, aims, directions.from_angle(jnp.deg2rad(degrees)), scalars)
+        found, sure = intent.followed(space, share, aims, directions.from_angle(jnp.deg2rad(degrees)), 100.0)
         np.testing.assert_array_equal(found, aims[aim], err_msg=str(degrees))
         assert sure
 
 
 def test_an_impossible_aim_has_no_weight(fitted):
     _, model = fitted
-    network, aims = intent.Weights(SIZES.aim_layers), ENV.aims(OBS[0])
+    network, aims = intent.Weights(OPTIONS.aim_layers), ENV.aims(OBS[0])
     weights = jax.nn.softmax(jnp.asarray(network.apply(model.params, aims.features, aims.possible)))
     assert weights[3] == 0.0
     assert weights[1] > 0.9
@@ -150,7 +150,7 @@ def test_members_weigh_aims_each_by_itself_and_their_mean_leads():
     members = [odd, *members[1:]]
     outvoted = model.replace(params=jax.tree.map(lambda *leaves: jnp.stack(leaves), *members))
     np.testing.assert_array_equal(acted((bundle, outvoted), ENV).actions, lead)
-    network, aims = intent.Weights(SIZES.aim_layers), ENV.aims(OBS[0])
+    network, aims = intent.Weights(OPTIONS.aim_layers), ENV.aims(OBS[0])
     shares = np.stack([jax.nn.softmax(network.apply(one, aims.features, aims.possible)) for one in members])
     apart = bundle.disagreement(outvoted, ENV, OBS, BASE)
     assert apart[0] > 10 * bundle.disagreement(model, ENV, OBS, BASE)[0]

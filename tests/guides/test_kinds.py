@@ -11,13 +11,14 @@ import probes
 import pytest
 
 from cuelearner_jax import asking
-from cuelearner_jax.guides import registry
+from cuelearner_jax.guides import dcoach, registry, scalar
 from cuelearner_jax.policies import Uniform
 from cuelearner_jax.spaces import DIRECTIONS, directions
 from cuelearner_jax.types import Label
 
 ENV = probes.Window()
-SIZES = dataclasses.replace(probes.SIZES, guide_directions=36)
+SIZES = probes.SIZES
+OPTIONS = {"scalar": scalar.Config(guide_directions=36)}
 SCALARS = dataclasses.replace(probes.SCALARS, scalar_within_deg=20.0)
 OBS = directions.evenly_spaced(4)
 BEST = jax.vmap(ENV.best)(OBS)
@@ -27,7 +28,7 @@ KEY = jax.random.key(3)
 @cache
 def compiled(kind, frame="raw"):
     """A kind's bundle, its `fit` and its `act`."""
-    bundle = registry.make(kind, dataclasses.replace(SIZES, frame=frame), ENV)
+    bundle = registry.make(kind, dataclasses.replace(SIZES, frame=frame), ENV, OPTIONS.get(kind))
     return bundle, jax.jit(bundle.fit), jax.jit(bundle.act)
 
 
@@ -97,10 +98,11 @@ def test_a_share_of_the_scalar_questions_explores():
     model = bundle.init(KEY).replace(fitted=jnp.array(True))
     own = compiled("scalar")[2](model, ENV, OBS[:1], BEST[:1], jnp.ones(1, bool), SCALARS).actions[0]
     keys = jax.random.split(KEY, 400)
-    ask = jax.jit(jax.vmap(lambda key, how: bundle.question(key, model, ENV, OBS[0], BEST[0], how), (0, None)))
-    for explored, refined in ((0.0, 1.0), (0.25, 1.0), (1.0, 1.0), (0.25, 0.5)):
-        scalars = dataclasses.replace(SCALARS, explored_fraction=explored, refined_fraction=refined)
-        found = ask(keys, scalars)
+    for explored, refined in ((0.0, 1.0), (1.0, 1.0), (0.25, 0.5)):
+        asks = dataclasses.replace(bundle, options=dataclasses.replace(bundle.options, explored_fraction=explored))
+        scalars = dataclasses.replace(SCALARS, refined_fraction=refined)
+        ask = jax.jit(jax.vmap(lambda key: asks.question(key, model, ENV, OBS[0], BEST[0], scalars)))  # noqa: B023
+        found = ask(keys)
         about_own = (np.abs(np.asarray(found) - np.asarray(own)).max(-1) < 1e-5).mean()
         assert about_own == pytest.approx((1 - explored) * refined, abs=0.08)  # standard deviation 0.025
 
@@ -141,9 +143,10 @@ def test_answers_that_are_missing_are_no_corrections():
 
 
 def test_a_correction_moves_the_policy_its_way_by_eps():
-    bundle, fit, act = compiled("dcoach")
+    bundle, _, act = compiled("dcoach")
+    fit = jax.jit(dataclasses.replace(bundle, options=dcoach.Config(correction_replay=1)).fit)
     model = bundle.init(KEY).replace(fitted=jnp.array(True))
-    scalars = dataclasses.replace(SCALARS, feedback_learning_rate=1e-2, correction_replay=1)
+    scalars = dataclasses.replace(SCALARS, feedback_learning_rate=1e-2)
     everywhere = jnp.ones(4, bool)
     for h in (1.0, -1.0, 0.0):
         own = act(model, ENV, OBS, OBS, everywhere, scalars).actions

@@ -112,7 +112,7 @@ def test_labels_of_another_world_are_refused_but_for_what_they_do_not_depend_on(
         read_for(path)
 
 
-SMALL = {"feedback_layers": (4,), "fit_steps": 20, "lanes_per_block": 1, "guide_directions": 6}
+SMALL = {"feedback_layers": (4,), "fit_steps": 20, "lanes_per_block": 1}
 RUN = probes.config(sizes=SMALL, schedule={"total_steps": 16, "guidance_until": 16}, agent={"q_layers": (4,)})
 
 

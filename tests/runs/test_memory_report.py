@@ -11,7 +11,7 @@ from probes import Aimed, Window
 from cuelearner_jax import run_config
 from cuelearner_jax.config import LARGEST, Scalars, Schedule, Sizes
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.guides import registry
+from cuelearner_jax.guides import intent, registry
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs import memory_report
 from cuelearner_jax.runs.grid import Grid, check_grid
@@ -39,7 +39,7 @@ def report(config: RunConfig, kind: str, labels: int = 20) -> str:
     grid = Grid((kind,), (0, 1), (labels,))
     check_grid(grid)
     env = jax.eval_shape(Aimed)
-    return memory_report.memory_report(LaneGroup(config, env, registry.make(kind, config.sizes, env), grid))
+    return memory_report.memory_report(LaneGroup(config, env, config.guide_in(env, kind), grid))
 
 
 @pytest.mark.parametrize(("group", "name"), FIELDS)
@@ -91,16 +91,18 @@ def test_what_takes_the_memory_is_named(group, values, option):
 
 
 def test_layers_that_a_guide_has_not_take_no_memory():
-    for own, kind in (("aim", "intent"), ("feedback", "relative")):
-        wide = {f"{own}_layers": (10**6, 10**6)}
-        with pytest.raises(UserError, match=f"lower --sizes.{own}-layers"):
-            report(probes.config(sizes=wide), kind)
-    assert report(probes.config(sizes={"aim_layers": (10**6, 10**6)}), "relative") == report(probes.CONFIG, "relative")
+    wide = (10**6, 10**6)
+    aims = dataclasses.replace(probes.CONFIG, kinds={"intent": intent.Config(aim_layers=wide)})
+    with pytest.raises(UserError, match=r"lower --intent\.aim-layers"):
+        report(aims, "intent")
+    with pytest.raises(UserError, match=r"lower --sizes\.feedback-layers"):
+        report(probes.config(sizes={"feedback_layers": wide}), "relative")
+    assert report(aims, "relative") == report(probes.CONFIG, "relative")
 
 
 def test_a_guide_of_aims_takes_memory_for_each_of_them():
     with pytest.raises(UserError, match="lower --labels"):
-        report(probes.config(sizes={"aim_layers": (1000,)}), "intent", labels=500_000)
+        report(dataclasses.replace(probes.CONFIG, kinds={"intent": intent.Config((1000,))}), "intent", labels=500_000)
     assert report(probes.config(sizes={"feedback_layers": (1000,)}), "relative", labels=500_000)
 
 

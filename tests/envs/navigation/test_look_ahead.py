@@ -187,8 +187,8 @@ def test_the_option_is_on_the_command_line(capsys):
 
 def kept(guidance, look_ahead):
     """A policy folder, as it is known without its arrays."""
-    sizes = to_json(GuideSizes(aim_layers=(8,)))
-    layer = {"policy": "guided", "guidance": guidance, "sizes": sizes, "bounded": True, "base": {"policy": "uniform"}}
+    own = {"sizes": to_json(GuideSizes()), "options": {"aim_layers": (8,), "aim_doubt": 2.0}}
+    layer = {"policy": "guided", "guidance": guidance, **own, "bounded": True, "base": {"policy": "uniform"}}
     adapted = AdaptedLanes(Path(), {"policy": layer}, Lanes(*(np.zeros(1),) * 4), np.ones(1, bool), None, None)
     config = RunConfig(world(look_ahead=look_ahead))
     return PolicySource(registry.find("navigation"), config, None, Path(), adapted=adapted)
