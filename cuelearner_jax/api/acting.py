@@ -126,7 +126,7 @@ def load_policy(
 
     Args:
         folder: of the run, or of a sweep in pieces; or the policy folder.
-        policy: "agent", "guided" or another that `cuelearner evaluate --help` lists (default: the trained agent, or the
+        policy: "agent", "guided" or another that `evaluate TASK --help` lists (default: the trained agent, or the
             adapted policy).
         guidance: kind of guidance of the lane (default: the run's last).
         labels: its label budget (default: the largest).

@@ -232,7 +232,7 @@ def test_a_file_of_falling_strengths_says_so_by_itself(home, tmp_path, refused):
 def defaults_of(capsys, *options):
     """What `adapt` would take, by the options of its help."""
     with pytest.raises(SystemExit) as status:
-        main(["adapt", "own_turned:straight", *TASK, *options, "--help"])
+        main(["adapt", "own_turned:straight", *TASK, *options, "--help-all"])
     assert status.value.code == 0
     shown = re.sub(r"[│\s]+", " ", capsys.readouterr().out)
     wanted = ("--guidance", "--judge-by", "--sizes.labels-per-round", "--scalars.k-max")
@@ -249,7 +249,7 @@ def test_a_scenario_says_how_unless_another_kind_is_asked_for(home, capsys):
 def test_a_scenario_says_which_bounds_are_tried_unless_labels_decide(home, capsys):
     for options, shown in (([], "(default: 0.5 0.25)"), (["--judge-by", "labels"], "(default: )")):
         with pytest.raises(SystemExit):
-            main(["adapt", "own_turned:straight", *TASK, "--scenario", "tried", *options, "--help"])
+            main(["adapt", "own_turned:straight", *TASK, "--scenario", "tried", *options, "--help-all"])
         told = re.sub(r"[│\s]+", " ", capsys.readouterr().out)
         assert shown in told[told.index("--judge-bounds") : told.index("--overwrite")]
 
