@@ -62,8 +62,8 @@ def test_asking_one_by_one_is_bitwise_a_round(base):
 
 
 def test_a_lanes_round_in_the_training_program_is_this_round_of_uniform_actions():
-    program = probes.window_program("relative", 2 * ROUND)
-    state = probes.start(program, [3], [2 * ROUND])
+    program = probes.window_program("relative")
+    state = probes.start(program, [3, 4, 5, 6], [2 * ROUND] * 4)
     guide, key = jax.tree.map(lambda leaf: jnp.copy(leaf[0]), (state.guide, state.key))
     clock = start_clock()
     for _ in range(2):
@@ -286,10 +286,10 @@ def test_a_guide_asks_until_its_instalment_is_done_and_then_waits():
 
 
 def test_later_questions_are_about_the_agents_greedy_actions_refined_within_the_bound():
-    program = probes.window_program("relative", 2 * ROUND)
-    clock, state = start_clock(), probes.start(program, [3, 4], [2 * ROUND, 15])
-    clock, state = program.label_round(ENV, EXPERT, probes.SCALARS, clock, state, jnp.array([ROUND, ROUND]))
-    assert np.asarray(state.guide.labels.valid).sum(1).tolist() == [ROUND, ROUND]
+    program = probes.window_program("relative")
+    clock, state = start_clock(), probes.start(program, [3, 4, 5, 6], [2 * ROUND, 15] * 2)
+    clock, state = program.label_round(ENV, EXPERT, probes.SCALARS, clock, state)
+    assert np.asarray(state.guide.labels.valid).sum(1).tolist() == [ROUND] * 4
     first = jax.tree.map(np.asarray, state.guide.labels)
     bounded = dataclasses.replace(probes.SCALARS, ask_bound_deg=7.0)
     plain = dataclasses.replace(bounded, refined_fraction=0.0)
@@ -299,13 +299,17 @@ def test_later_questions_are_about_the_agents_greedy_actions_refined_within_the_
         _, later = program.label_round(ENV, EXPERT, scalars, clock, kept, state.guide.budget, own=True)
         for lane, budget in enumerate((2 * ROUND, 15)):
             labels, before = probes.lane(later.guide.labels, lane), probes.lane(first, lane)
-            assert labels.valid.tolist() == [True] * budget + [False] * (2 * ROUND - budget)  # never past the budget
+            assert labels.valid.tolist() == [True] * budget + [False] * (
+                probes.LARGEST - budget
+            )  # never past the budget
             chex.assert_trees_all_equal(*(jax.tree.map(lambda leaf: leaf[:ROUND], one) for one in (labels, before)))
-            greedy = Agent(probes.lane(params, lane), probes.SIZES).act(LANE_KEY, None, jnp.asarray(labels.obs[ROUND:]))
-            away = np.degrees(np.abs(actions.difference(greedy, labels.action[ROUND:])))
+            greedy = Agent(probes.lane(params, lane), probes.SIZES).act(
+                LANE_KEY, None, jnp.asarray(labels.obs[ROUND : 2 * ROUND])
+            )
+            away = np.degrees(np.abs(actions.difference(greedy, labels.action[ROUND : 2 * ROUND])))
             assert away.max() <= 7.0 + 1e-3
             assert (away.max() > 1.0) == turned
-        assert later.guide.asked.tolist() == [2 * ROUND, 15]
+        assert later.guide.asked.tolist() == [2 * ROUND, 15] * 2
 
 
 def test_guided_episodes_keep_to_the_bound_once_there_are_labels_about_the_agents_own_actions():

@@ -39,7 +39,7 @@ BEST = actions.rotate(OBS, 0.6)
 KEY = jax.random.key(5)
 Q = q_network(probes.SIZES.q_layers)
 AGENT = Agent(Q.init(jax.random.key(1), jnp.zeros(2), jnp.zeros(2)), probes.SIZES)
-LANES, MESH = 3, lane_mesh()
+LANES, MESH = 4, lane_mesh()
 
 
 def act(policy, key=KEY, obs=OBS):
@@ -215,9 +215,9 @@ def test_a_finished_agent_teaches_what_it_does():
 
 @cache
 def block():
-    """Three lanes of one program, each with its own network and its own fitted model."""
-    program = probes.window_program("relative", 10)
-    state = probes.start(program, [0, 1, 2], [10] * LANES)
+    """Four lanes of one program, each with its own network and its own fitted model."""
+    program = probes.window_program("relative")
+    state = probes.start(program, [0, 1, 2, 3], [10] * LANES)
     _, state = program.label_round(ENV, EXPERT, probes.SCALARS, start_clock(), state)
     return state
 
