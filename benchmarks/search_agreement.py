@@ -31,12 +31,8 @@ from cuelearner_jax.actions import DIRECTIONS
 from cuelearner_jax.agents.choice import greedy_actions, values
 from cuelearner_jax.config import AgentSizes
 from cuelearner_jax.evaluate import episodes, rollout
-from cuelearner_jax.guides import registry as guidance
 from cuelearner_jax.policies import BY_LANE, SHARED
-from cuelearner_jax.runs import grid as runs
-from cuelearner_jax.runs.grid import Grid
-from cuelearner_jax.runs.kept import restore_policies
-from cuelearner_jax.runs.lanes import LaneGroup
+from cuelearner_jax.runs.trained import PolicySource
 from cuelearner_jax.storage.provenance import provenance
 from cuelearner_jax.tasks import registry
 from cuelearner_jax.tasks.billiards import SHIPPED_TEACHERS
@@ -86,12 +82,11 @@ def shipped() -> Agents:
 
 def of_run(folder: Path) -> Agents:
     """The agents of a run's first kind of guidance, as its newest checkpoint has them."""
-    task, config, grid = runs.load(folder, registry.find)
-    env = task.environment(config.task, "validation")
-    kind = guidance.make(grid.guidance[0], config.sizes, env)
-    group = LaneGroup(config, env, kind, Grid((kind.name,), grid.seeds, grid.labels))
-    policies, step = restore_policies(group, folder / kind.name)
-    return Agents(env, config.sizes, policies["params"], {"step": step, "seeds": list(grid.seeds)})
+    source = PolicySource.of_run(folder, registry.find)
+    assert source.grid is not None
+    config, lanes = source.config, source.load(source.grid.guidance[:1])[0]
+    env = source.task.environment(config.task, "validation")
+    return Agents(env, config.sizes, lanes.policies["params"], {"step": lanes.step, "seeds": lanes.seeds.tolist()})
 
 
 def met(agent: Searching) -> jax.Array:

@@ -48,7 +48,7 @@ class Agent(struct.PyTreeNode):
     params: Params
     sizes: AgentSizes = struct.field(pytree_node=False)
     actions: Actions = struct.field(pytree_node=False, default=DIRECTIONS)
-    env: Any = None  # says how an observation looks from an action; nobody asks it in the raw frame
+    view: Any = None  # says how an observation looks from an action; the raw frame needs none
 
     def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
         """The action with the largest value of all in the set.
@@ -57,12 +57,12 @@ class Agent(struct.PyTreeNode):
         misses peaks, which costs a finished agent reward (`benchmarks/search_agreement.py`).
         """
         whole = dataclasses.replace(self.sizes, coarse_directions=0)
-        return greedy_actions(whole, self.actions, self.env, self.params, obs)
+        return greedy_actions(whole, self.actions, self.view, self.params, obs)
 
     @property
     def axes(self) -> Agent:
         """Each lane has its own network."""
-        return self.replace(params=BY_LANE, env=SHARED)
+        return self.replace(params=BY_LANE, view=SHARED)
 
 
 class Uniform(struct.PyTreeNode):
@@ -83,7 +83,7 @@ class Uniform(struct.PyTreeNode):
 class NearAims(struct.PyTreeNode):
     """Actions near one of a situation's aims, each aim as likely; uniform ones where there is none."""
 
-    env: Any  # offers aims
+    view: Any  # offers aims
     reach: Float[Array, ""] | float  # how far from the aim at most [rad]
 
     def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
@@ -92,16 +92,16 @@ class NearAims(struct.PyTreeNode):
 
     def _one(self, key: PRNGKeyArray, obs: Float[Array, " obs"]) -> Float[Array, " action"]:
         k_aim, k_turn, k_elsewhere = jax.random.split(key, 3)
-        aims = self.env.aims(obs)
+        aims = self.view.aims(obs)
         index = jax.random.categorical(k_aim, jnp.where(aims.possible, 0.0, -jnp.inf))
         turn = jax.random.uniform(k_turn, (), minval=-self.reach, maxval=self.reach)
-        elsewhere = actions_of(self.env).uniform(k_elsewhere, ())
+        elsewhere = actions_of(self.view).uniform(k_elsewhere, ())
         return jnp.where(aims.possible.any(), rotate(aims.actions[index], turn), elsewhere)
 
     @property
     def axes(self) -> NearAims:
         """It is one for all lanes."""
-        return self.replace(env=SHARED, reach=SHARED)
+        return self.replace(view=SHARED, reach=SHARED)
 
 
 class Taught(struct.PyTreeNode):
@@ -122,16 +122,16 @@ class Taught(struct.PyTreeNode):
 class Heuristic(struct.PyTreeNode):
     """The environment's own obvious action."""
 
-    env: Any
+    view: Any
 
     def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
         """It needs no learning."""
-        return jax.vmap(self.env.heuristic)(obs)
+        return jax.vmap(self.view.heuristic)(obs)
 
     @property
     def axes(self) -> Heuristic:
         """One environment for all."""
-        return self.replace(env=SHARED)
+        return self.replace(view=SHARED)
 
 
 class Guided(struct.PyTreeNode):
@@ -139,7 +139,7 @@ class Guided(struct.PyTreeNode):
 
     base: Any  # a policy
     model: GuidanceModel
-    env: Any
+    view: Any
     scalars: GuideScalars
     guidance: Guide = struct.field(pytree_node=False)
     bound: Float[Array, ""] | None = None  # to the way from the base's actions [rad]; None: wherever guidance leads
@@ -148,7 +148,7 @@ class Guided(struct.PyTreeNode):
     def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
         """The base's actions as the guidance has them."""
         base = self.base.act(key, states, obs)
-        where = (self.model, self.env, obs, base, jnp.ones(obs.shape[0], bool), self.scalars)
+        where = (self.model, self.view, obs, base, jnp.ones(obs.shape[0], bool), self.scalars)
         if self.bound is None:
             return self.guidance.act(*where).actions
         return self.guidance.act_within(self.bound, *where).actions
@@ -157,7 +157,7 @@ class Guided(struct.PyTreeNode):
     def axes(self) -> Guided:
         """Each lane has its own base and model, and its own bound where there is more than one."""
         bound = SHARED if self.bound is None or jnp.ndim(self.bound) == 0 else BY_LANE
-        return self.replace(base=self.base.axes, model=BY_LANE, env=SHARED, scalars=SHARED, bound=bound)
+        return self.replace(base=self.base.axes, model=BY_LANE, view=SHARED, scalars=SHARED, bound=bound)
 
 
 class Common(struct.PyTreeNode):

@@ -171,7 +171,7 @@ class Bench(NamedTuple):
 
 def measured_as_they_are(bench: Bench) -> Iterator[Row]:
     """The base agents themselves."""
-    agents = bench.agents.replace(env=bench.env(bench.piece.split))
+    agents = bench.agents.replace(view=bench.env(bench.piece.split))
     yield {"base": bench.seeds, "labels": 0, "steps": 0, **bench.measured(agents)}
 
 
@@ -180,7 +180,7 @@ def corrected(bench: Bench) -> Iterator[Row]:
     env = bench.env(bench.piece.split)
     scalars = dataclasses.replace(bench.scalars(), tau_max_deg=bench.piece.bound_deg)
     teacher = bench.task.make_teacher(bench.world, env)
-    policy = Corrected(bench.agents.replace(env=env), teacher, scalars, actions_of(env))
+    policy = Corrected(bench.agents.replace(view=env), teacher, scalars, actions_of(env))
     yield {"base": bench.seeds, "labels": 0, "steps": 0, **bench.measured(policy)}
 
 
@@ -282,7 +282,7 @@ def opened(folder: Path, study: Study, piece: Piece, scale: Scale, out: Path) ->
     own = {name.partition(".")[2]: value for name, value in piece.settings.items() if name.startswith("task.")}
     world = dataclasses.replace(world, **own)
     env = environment(source.task.name, world, "training", piece.robot)
-    policies, seeds = several(source, env, world, "agent", None, None, source.grid.seeds[: piece.bases])
+    policies, seeds = several(source, world, "agent", None, None, source.grid.seeds[: piece.bases], env=env)
     agents = program.side_by_side(policies)
     if scale.directions:
         agents = agents.replace(

@@ -27,7 +27,7 @@ from jaxtyping import Array, Float
 
 from cuelearner_jax.config import RunConfig, Scalars, Schedule, check
 from cuelearner_jax.devices import compiler_options, each_lane, each_lane_in_place
-from cuelearner_jax.environment import Environment, actions_of
+from cuelearner_jax.environment import Environment, actions_of, view_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.guides.untaught import NONE
@@ -151,4 +151,4 @@ class FineTuning:
 
     def policy(self, env: Any) -> Agent:
         """The agents as they are, a block, in a world."""
-        return Agent(self.block.state.agent.params, self.config.sizes, actions_of(env), env)
+        return Agent(self.block.state.agent.params, self.config.sizes, actions_of(env), view_of(env))

@@ -71,7 +71,7 @@ def shipped() -> Agent:
     own = cl.make("billiards", table=TABLE).env
     network = stored.load(SHIPPED_TEACHERS / TABLE, own, 0.0, 0.0)
     sizes = AgentSizes(frame="action", q_layers=network.layers)
-    return Agent(network.params, sizes, env=own)
+    return Agent(network.params, sizes, view=own)
 
 
 @partial(jax.jit, static_argnames="racks")

@@ -37,7 +37,7 @@ def agent():
     """An untrained agent."""
     widths = view.widths(probes.SIZES.frame, spaces_of(ENV))
     params = q_network(probes.SIZES.q_layers).init(jax.random.key(4), *map(jnp.zeros, widths))
-    return Agent(params, probes.SIZES, env=ENV)
+    return Agent(params, probes.SIZES, view=ENV)
 
 
 def write(folder, overwrite=False, origin="run"):

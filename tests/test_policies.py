@@ -257,6 +257,6 @@ def test_one_lane_has_its_own_leaves_and_what_all_share():
     one = one_lane(policy, 2)
     chex.assert_trees_all_equal(one.base.params, jax.tree.map(lambda leaf: leaf[2], policy.base.params))
     chex.assert_trees_all_equal(one.model, jax.tree.map(lambda leaf: leaf[2], policy.model))
-    chex.assert_trees_all_equal((one.env, one.scalars), (policy.env, policy.scalars))
+    chex.assert_trees_all_equal((one.view, one.scalars), (policy.view, policy.scalars))
     assert one.guidance is policy.guidance
     assert one.base.sizes == policy.base.sizes

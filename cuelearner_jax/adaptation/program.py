@@ -35,7 +35,7 @@ from cuelearner_jax import asking
 from cuelearner_jax.agents.learning import all_finite
 from cuelearner_jax.config import GuideSizes, Scalars
 from cuelearner_jax.devices import BY_LANE, SHARED, each_lane, lane_mesh, over_lanes
-from cuelearner_jax.environment import Environment
+from cuelearner_jax.environment import Environment, view_of
 from cuelearner_jax.evaluate import one_lane
 from cuelearner_jax.guides.base import Guide
 from cuelearner_jax.policies import Guided, Policy
@@ -247,4 +247,4 @@ def adapted(
         env: how observations look from actions; nobody asks it in the raw frame.
     """
     base = one_lane(bases, block.base)  # a row a lane
-    return Guided(base, block.guide.model, env, scalars, guidance, block.bound, sizes)
+    return Guided(base, block.guide.model, view_of(env), scalars, guidance, block.bound, sizes)

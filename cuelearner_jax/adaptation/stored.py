@@ -22,8 +22,7 @@ import jax
 import jax.numpy as jnp
 
 from cuelearner_jax import config as configuration
-from cuelearner_jax.agents import view
-from cuelearner_jax.agents.networks import q_network
+from cuelearner_jax.agents.choice import fresh_params
 from cuelearner_jax.config import AgentSizes, GuideSizes, Scalars, check_agent, check_guide
 from cuelearner_jax.environment import actions_of, offers, spaces_of
 from cuelearner_jax.errors import UserError
@@ -134,8 +133,7 @@ def shapes_of(values: Told, env: Any, rows: int | None = None) -> Any:
     def one(values: Told) -> Any:
         if values["policy"] == "agent":
             sizes = configuration.from_json(AgentSizes, values["sizes"])
-            seen = [jnp.zeros(width) for width in view.widths(sizes.frame, spaces)]
-            return {"params": q_network(sizes.q_layers).init(jax.random.key(0), *seen)}
+            return {"params": fresh_params(sizes, spaces, jax.random.key(0))}
         if values["policy"] == "guided":
             bound = {"bound": jnp.zeros(())} if values["bounded"] else {}
             return {"base": one(values["base"]), "model": _guidance(values, env).init(jax.random.key(0)), **bound}

@@ -8,13 +8,14 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from jax.typing import DTypeLike
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from cuelearner_jax.actions import Actions
 from cuelearner_jax.agents import ddqn, view
 from cuelearner_jax.agents.networks import applied, q_network, widened
 from cuelearner_jax.config import AgentSizes
 from cuelearner_jax.devices import portions
+from cuelearner_jax.environment import Spaces
 from cuelearner_jax.types import Params
 
 ALIGNED = 64  # layers computed in bfloat16 are filled up to multiples: 20% faster on an H200, whose rows want alignment
@@ -24,6 +25,12 @@ def values(sizes: AgentSizes, env: Any, dtype: DTypeLike = jnp.float32) -> ddqn.
     """Q of an environment's observations and actions; `dtype` is that of the hidden layers' arithmetic."""
     network = applied(q_network(sizes.q_layers, dtype))
     return lambda params, obs, actions: network(params, *view.seen(sizes.frame, env, obs, actions))
+
+
+def fresh_params(sizes: AgentSizes, spaces: Spaces, key: PRNGKeyArray) -> Params:
+    """Random parameters of the action values."""
+    own, turned = view.widths(sizes.frame, spaces)
+    return q_network(sizes.q_layers).init(key, jnp.zeros(own), jnp.zeros(turned))
 
 
 def looked_at(sizes: AgentSizes) -> int:

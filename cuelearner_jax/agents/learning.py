@@ -12,8 +12,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from cuelearner_jax.actions import Actions
 from cuelearner_jax.agents import ddqn, view
-from cuelearner_jax.agents.choice import greedy_actions, values
-from cuelearner_jax.agents.networks import q_network
+from cuelearner_jax.agents.choice import fresh_params, greedy_actions, values
 from cuelearner_jax.agents.replay import RingBuffer, ring_buffer
 from cuelearner_jax.config import AgentScalars, AgentSizes, Schedule
 from cuelearner_jax.environment import Environment, actions_of, random_symmetries, spaces_of
@@ -34,8 +33,7 @@ class Learner(NamedTuple):
 
     def init(self, env: Environment, k_params: PRNGKeyArray, k_env: PRNGKeyArray) -> AgentState:
         """A fresh agent at the start of its environments' first episodes."""
-        own, turned = view.widths(self.sizes.frame, spaces_of(env))
-        params = q_network(self.sizes.q_layers).init(k_params, jnp.zeros(own), jnp.zeros(turned))
+        params = fresh_params(self.sizes, spaces_of(env), k_params)
         env_state, obs = jax.vmap(env.reset)(jax.random.split(k_env, self.sizes.num_envs))
         return AgentState(
             params=params,

@@ -161,6 +161,5 @@ def load_policy(
     known, name = source.task, policy or source.default_policy
     changed = world.config if world else source.config.task
     source.check(name, changed)
-    env = known.environment(changed)
-    found = trained.one_policy(source, env, changed, name, guidance, labels, seed, bound_deg)
+    found = trained.one_policy(source, changed, name, guidance, labels, seed, bound_deg)
     return CallablePolicy(found, shape_of(known, changed).observation, trained.POLICIES[name].taught, source.config)

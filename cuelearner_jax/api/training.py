@@ -18,7 +18,7 @@ from cuelearner_jax.api.acting import CallablePolicy
 from cuelearner_jax.api.worlds import World, a_world
 from cuelearner_jax.config import RunConfig
 from cuelearner_jax.devices import SHARED, lane_mesh, place
-from cuelearner_jax.environment import actions_of
+from cuelearner_jax.environment import actions_of, view_of
 from cuelearner_jax.errors import UserError, closest
 from cuelearner_jax.evaluate import SPLITS, one_lane
 from cuelearner_jax.guides import registry
@@ -69,7 +69,7 @@ class Run:
             raise UserError(f"no lane with seed {wanted} and {budget} labels was trained")
         params = [block.agent.params for block in training.blocks]
         joined = jax.tree.map(lambda *leaves: np.concatenate([np.asarray(leaf) for leaf in leaves]), *params)
-        agents = Agent(joined, self.config.sizes, actions_of(group.env), group.env)
+        agents = Agent(joined, self.config.sizes, actions_of(group.env), view_of(group.env))
         return CallablePolicy(one_lane(agents, int(found[0])), self.world.observation)
 
 

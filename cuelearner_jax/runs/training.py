@@ -12,7 +12,7 @@ import numpy as np
 
 from cuelearner_jax.asking import blame, label_slots
 from cuelearner_jax.devices import SHARED, place
-from cuelearner_jax.environment import Environment, actions_of
+from cuelearner_jax.environment import Environment, actions_of, view_of
 from cuelearner_jax.evaluate import Tell, episodes, untold
 from cuelearner_jax.loop import start_clock
 from cuelearner_jax.policies import Agent, Guided, Policy, uniform_in
@@ -159,7 +159,7 @@ class Training:
 
     def _agent(self, lane: TrainState) -> Policy:
         """A block's agents, who look at the examined world."""
-        return Agent(lane.agent.params, self.group.config.sizes, actions_of(self.group.env), self.examined)
+        return Agent(lane.agent.params, self.group.config.sizes, actions_of(self.group.env), view_of(self.examined))
 
     def guide_alone(self) -> dict[str, np.ndarray]:
         """Metrics (lanes,) of uniform actions under guidance; for unguided lanes that is chance.
@@ -174,7 +174,7 @@ class Training:
         group, base = self.group, uniform_in(self.group.env)
 
         def guide(lane: TrainState) -> Policy:
-            return Guided(base, lane.guide.model, self.examined, group.config.scalars, group.guidance)
+            return Guided(base, lane.guide.model, view_of(self.examined), group.config.scalars, group.guidance)
 
         return {f"guide_{name}": values for name, values in self._measured(guide).items()}
 

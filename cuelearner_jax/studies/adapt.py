@@ -243,7 +243,7 @@ def _bases(subject: Subject, request: Request, env: Any) -> tuple[Any, tuple[int
     if len(set(base.seeds)) < len(base.seeds):
         raise UserError("--base.seeds: give each seed once")
     policies, seeds = trained.several(
-        source, env, request.task, base.policy, base.guidance, base.labels, base.seeds, base.bound_deg
+        source, request.task, base.policy, base.guidance, base.labels, base.seeds, base.bound_deg, env
     )
     told = {name: value for name, value in dataclasses.asdict(base).items() if value not in (None, ())}
     origin = {"folder": source.folder.name, **told, "seeds": list(seeds), **({"code": named} if named else {})}

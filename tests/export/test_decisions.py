@@ -37,7 +37,7 @@ def agent(**sizes):
     sizes = dataclasses.replace(SIZES, directions=72, **sizes)
     own, turned = view.widths(sizes.frame, spaces_of(ENV))
     params = q_network(sizes.q_layers).init(jax.random.key(4), jnp.zeros(own), jnp.zeros(turned))
-    return Agent(params, sizes, env=ENV)
+    return Agent(params, sizes, view=ENV)
 
 
 def guided(kind, bound_deg=None, base=None, **sizes):
