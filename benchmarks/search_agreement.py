@@ -31,7 +31,7 @@ from cuelearner_jax.actions import DIRECTIONS
 from cuelearner_jax.agents.choice import greedy_actions, values
 from cuelearner_jax.config import AgentSizes
 from cuelearner_jax.evaluate import episodes, rollout
-from cuelearner_jax.policies import BY_LANE, SHARED
+from cuelearner_jax.policies import BY_LANE, SHARED, PolicyNode
 from cuelearner_jax.runs.trained import PolicySource
 from cuelearner_jax.storage.provenance import provenance
 from cuelearner_jax.tasks import registry
@@ -45,7 +45,7 @@ SHIPPED = "shipped"
 TABLE = "regulation"  # of the shipped network
 
 
-class Searching(struct.PyTreeNode):
+class Searching(PolicyNode):
     """An agent that searches as its sizes say, roughly or fully; a finished `policies.Agent` always searches fully."""
 
     params: Any

@@ -144,13 +144,6 @@ def _structure(policy: Policy) -> _Structure:
     return found
 
 
-def one_lane(policy: Policy, index: int | ArrayLike) -> Any:
-    """One lane's policy out of a block's; by several indices (lanes,), a block of these lanes."""
-    structure = _structure(policy)
-    each, shared = structure.take_apart(policy)
-    return structure.put_together([jnp.asarray(leaf)[index] for leaf in each], shared)
-
-
 def evaluate_lanes(
     env: Environment, policy: Policy, key: PRNGKeyArray, *, mesh: Mesh, num_envs: int, steps: int
 ) -> dict[str, Float[Array, " lanes"]]:

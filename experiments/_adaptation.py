@@ -25,7 +25,7 @@ from cuelearner_jax.cli import main as cuelearner
 from cuelearner_jax.config import GuideSizes, RunConfig
 from cuelearner_jax.environment import actions_of, spaces_of
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.evaluate import episodes, one_lane, watched_lanes
+from cuelearner_jax.evaluate import episodes, watched_lanes
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.policies import Agent, Corrected
 from cuelearner_jax.runs.trained import PolicySource, several
@@ -206,7 +206,7 @@ def by_labels(kind: Any, bench: Bench) -> Iterator[Row]:
     metrics = bench.measured(found.policy(shown))
     if piece.ways:
         last = len(bench.seeds) * (len(piece.labels) - 1)  # the first base with the largest budget
-        policies = {"before": one_lane(bench.agents, 0), "after": one_lane(found.policy(shown), last)}
+        policies = {"before": bench.agents.lane(0), "after": found.policy(shown).lane(last)}
         trajectories.write(bench.folder, shown, policies, piece.split, bench.steps)
     yield {"base": bench.seeds[lanes.base], "labels": lanes.budget, "steps": 0, **told, **metrics}
 

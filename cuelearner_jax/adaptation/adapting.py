@@ -24,7 +24,7 @@ from cuelearner_jax.environment import Environment
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import Rolled, Tell, untold
 from cuelearner_jax.guides.base import Guide
-from cuelearner_jax.policies import Guided, Policy, named
+from cuelearner_jax.policies import Guided, Policy, lanes_in, named
 from cuelearner_jax.types import Label, Teacher
 
 # Seconds a fit on a CPU. The paper's networks are `GuideSizes()`.
@@ -265,7 +265,7 @@ class _Measuring:
     def _measured(self, policy: Policy, what: str) -> Rolled:
         how = self.work.judging
         assert how.env is not None
-        mesh = self.mesh if not isinstance(policy, judging.Common) else None
+        mesh = None if lanes_in(policy) is None else self.mesh
         if policy is self.work.bases:
             mesh = None  # there may be another number of them
         return judging.measured(how.env, policy, how.num_envs, how.steps, how.split, mesh, self.watch(what))

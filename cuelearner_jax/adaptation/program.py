@@ -36,7 +36,6 @@ from cuelearner_jax.agents.learning import all_finite
 from cuelearner_jax.config import GuideSizes, Scalars
 from cuelearner_jax.devices import BY_LANE, SHARED, each_lane, lane_mesh, over_lanes
 from cuelearner_jax.environment import Environment, view_of
-from cuelearner_jax.evaluate import one_lane
 from cuelearner_jax.guides.base import Guide
 from cuelearner_jax.policies import Guided, Policy
 from cuelearner_jax.storage.room import check_room
@@ -148,7 +147,7 @@ def _ask_round(
 ) -> Adapting:
     def of_device(env: Any, teacher: Any, scalars: Any, bases: Any, block: Adapting) -> Adapting:
         def one(lane: Adapting) -> Adapting:
-            base = one_lane(bases, lane.base)
+            base = bases.lane(lane.base)
             guide = asking.label_round(
                 guidance, sizes, env, teacher, scalars, base, lane.guide, lane.key, bound=lane.bound
             )
@@ -201,7 +200,7 @@ def _take(
     def of_device(env: Any, scalars: Any, bases: Any, labels: Label, block: Adapting) -> Adapting:
         def one(labels: Label, lane: Adapting) -> Adapting:
             if guidance.kind.sees_base:  # files do not keep what the base policy does: it tells again
-                labels = labels.replace(base=one_lane(bases, lane.base).act(lane.key, None, labels.obs))
+                labels = labels.replace(base=bases.lane(lane.base).act(lane.key, None, labels.obs))
             labels = asking.as_kept(labels, lane.guide, scalars)
             guide = lane.guide.replace(labels=labels, asked=lane.guide.budget)
             last = (lane.guide.budget - 1) // sizes.labels_per_round  # the fit that follows the last round
@@ -234,7 +233,7 @@ def take_labels(
 def blame(bases: Policy, teacher: Teacher | None, block: Adapting) -> None:
     """Raises UserError if the first lane, which failed, did so for its policy or its teacher (see `asking.blame`)."""
     lane = jax.tree.map(lambda leaf: leaf[0], block)
-    asking.blame(teacher, lane.guide, one_lane(bases, lane.base), lane.key)
+    asking.blame(teacher, lane.guide, bases.lane(lane.base), lane.key)
 
 
 def adapted(
@@ -246,5 +245,5 @@ def adapted(
         guidance, sizes, scalars, bases, block: as for `ask_round`.
         env: how observations look from actions; nobody asks it in the raw frame.
     """
-    base = one_lane(bases, block.base)  # a row a lane
+    base = bases.lane(block.base)  # a row a lane
     return Guided(base, block.guide.model, view_of(env), scalars, guidance, block.bound, sizes)

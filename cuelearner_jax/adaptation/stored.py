@@ -1,21 +1,13 @@
 """Policies as plain values and arrays, and back.
 
-A policy is told as nested JSON values, each with the name of what acts under `policy`:
-
-| policy      | other values                                                                     | arrays             |
-|-------------|----------------------------------------------------------------------------------|--------------------|
-| `agent`     | `sizes`, and `sees` where that is not the whole observation                      | `params`           |
-| `heuristic` |                                                                                  |                    |
-| `uniform`   |                                                                                  |                    |
-| `guided`    | `guidance` (its kind), `sizes`, `scalars`, `bounded`, and `base`: another policy | `model`, `bound`   |
-| `code`      | `named`: package.module:NAME, or how Python calls it                             |                    |
+A policy's values are those of its `describe()`. Kept are an `agent` with its `params`, `guided` with its `model` and, if
+bounded, its `bound`, `uniform`, `heuristic`, and the name of `code`: package.module:NAME, or how Python calls it.
 
 Code is never loaded because a file names it: whoever opens the policy gives it again.
 """
 
 from __future__ import annotations
 
-import dataclasses
 from typing import Any
 
 import jax
@@ -24,12 +16,11 @@ import jax.numpy as jnp
 from cuelearner_jax import config as configuration
 from cuelearner_jax.agents.choice import fresh_params
 from cuelearner_jax.config import AgentSizes, GuideSizes, Scalars, check_agent, check_guide
-from cuelearner_jax.environment import actions_of, offers, spaces_of
+from cuelearner_jax.environment import actions_of, offers, spaces_of, view_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.guides.base import NAME
-from cuelearner_jax.policies import Agent, Common, Corrected, Guided, Heuristic, Taught, uniform_in
-from cuelearner_jax.policies import Uniform as UniformPolicy
+from cuelearner_jax.policies import Agent, Guided, Heuristic, describe, layers, uniform_in
 
 Told = dict[str, Any]
 KINDS = ("agent", "uniform", "heuristic", "guided", "code")
@@ -47,35 +38,17 @@ def told(policy: Any, named: str | None = None) -> Told:
     Raises:
         UserError: it asks a teacher, or is refined in a way that cannot be kept.
     """
-    if isinstance(policy, Common):
-        return told(policy.policy, named)
-    if isinstance(policy, Agent):
-        return {"policy": "agent", "sizes": _part(AgentSizes, policy.sizes)}
-    if isinstance(policy, UniformPolicy):
-        return {"policy": "uniform"}
-    if isinstance(policy, Heuristic):
-        return {"policy": "heuristic"}
-    if isinstance(policy, Taught | Corrected):
-        raise UserError("a policy that asks a teacher cannot be kept in a folder: give one that acts by itself")
-    if isinstance(policy, Guided):
-        if policy.sizes is None:
+    described = describe(policy)
+    for layer in layers(described):
+        if layer.get("asks"):
+            raise UserError("a policy that asks a teacher cannot be kept in a folder: give one that acts by itself")
+        if layer["policy"] not in KINDS:
+            raise UserError(f"a policy of kind {layer['policy']} cannot be kept in a folder: give another")
+        if layer["policy"] == "guided" and layer["sizes"] is None:
             raise UserError("a policy under a guidance of unknown sizes cannot be kept in a folder: give them as sizes")
-        return {
-            "policy": "guided",
-            "guidance": policy.guidance.name,
-            "sizes": _part(GuideSizes, policy.sizes),
-            "scalars": _part(Scalars, policy.scalars),
-            "bounded": policy.bound is not None,
-            "base": told(policy.base, named),
-        }
-    return {"policy": "code", "named": named or "code"}
-
-
-def _part(kind: type, values: Any) -> Told:
-    """The fields of a configuration class, of an instance of it or of one that has more."""
-    return configuration.to_json(
-        kind(**{field.name: getattr(values, field.name) for field in dataclasses.fields(kind)})
-    )
+        if layer["policy"] == "code":
+            layer["named"] = named or "code"
+    return described
 
 
 def check(values: Told, outermost: bool = True, depth: int = MOST_LAYERS) -> None:
@@ -107,11 +80,10 @@ def check(values: Told, outermost: bool = True, depth: int = MOST_LAYERS) -> Non
 
 def arrays_of(policy: Any) -> Any:
     """The arrays of a policy, or of a block of them."""
-    if isinstance(policy, Common):
-        return arrays_of(policy.policy)
-    if isinstance(policy, Agent):
+    kind, policy = describe(policy)["policy"], getattr(policy, "policy", policy)  # that `Common` holds
+    if kind == "agent":
         return {"params": policy.params}
-    if isinstance(policy, Guided):
+    if kind == "guided":
         bound = {} if policy.bound is None else {"bound": policy.bound}
         return {"base": arrays_of(policy.base), "model": policy.model, **bound}
     return {}
@@ -160,17 +132,17 @@ def made(values: Told, arrays: Any, env: Any, code: Any = None) -> Any:
     kind = values["policy"]
     if kind == "agent":
         sizes = configuration.from_json(AgentSizes, values["sizes"])
-        return Agent(arrays["params"], sizes, actions_of(env), env)
+        return Agent(arrays["params"], sizes, actions_of(env), view_of(env))
     if kind == "uniform":
         return uniform_in(env)
     if kind == "heuristic":
         if not offers(env, "heuristic"):
             raise UserError("the policy is the task's heuristic, and this world has none: choose another world")
-        return Heuristic(env)
+        return Heuristic(view_of(env))
     if kind == "guided":
         base = made(values["base"], arrays["base"], env, code)
         sizes, scalars = (configuration.from_json(of, values[part]) for of, part in PARTS)
-        return Guided(base, arrays["model"], env, scalars, _guidance(values, env), arrays.get("bound"), sizes)
+        return Guided(base, arrays["model"], view_of(env), scalars, _guidance(values, env), arrays.get("bound"), sizes)
     if kind == "code":
         if code is None:
             raise UserError(

@@ -20,7 +20,7 @@ from cuelearner_jax.config import RunConfig
 from cuelearner_jax.devices import SHARED, lane_mesh, place
 from cuelearner_jax.environment import actions_of, view_of
 from cuelearner_jax.errors import UserError, closest
-from cuelearner_jax.evaluate import SPLITS, one_lane
+from cuelearner_jax.evaluate import SPLITS
 from cuelearner_jax.guides import registry
 from cuelearner_jax.policies import Agent
 from cuelearner_jax.runs import failures
@@ -70,7 +70,7 @@ class Run:
         params = [block.agent.params for block in training.blocks]
         joined = jax.tree.map(lambda *leaves: np.concatenate([np.asarray(leaf) for leaf in leaves]), *params)
         agents = Agent(joined, self.config.sizes, actions_of(group.env), view_of(group.env))
-        return CallablePolicy(one_lane(agents, int(found[0])), self.world.observation)
+        return CallablePolicy(agents.lane(int(found[0])), self.world.observation)
 
 
 @user_code.told

@@ -24,9 +24,9 @@ from jaxtyping import Float
 from cuelearner_jax.environment import Quantity
 from cuelearner_jax.errors import UserError, closest
 from cuelearner_jax.export import runner
-from cuelearner_jax.export.decisions import TOLERANCE, clip_radius_deg, described, golden_cases
+from cuelearner_jax.export.decisions import TOLERANCE, golden_cases
 from cuelearner_jax.export.formats import FORMATS, traced
-from cuelearner_jax.policies import Policy
+from cuelearner_jax.policies import Policy, describe
 from cuelearner_jax.storage.provenance import provenance
 from cuelearner_jax.storage.whole import Place, is_used, place_of, replacing
 
@@ -93,6 +93,7 @@ def _made(
     golden = golden_cases(policy, drawn())
     cases = io.BytesIO()
     np.savez(cases, obs=golden.obs, actions=golden.actions)
+    values = describe(policy)
     files = {
         artefact.file: artefact.contents,
         runner.GOLDEN: cases.getvalue(),
@@ -109,10 +110,10 @@ def _made(
             "about": action.about,
             "dtype": "float32",
             "angle": ANGLE,
-            "clip_radius_deg": clip_radius_deg(policy),
+            "clip_radius_deg": values.get("clip_radius_deg"),
         },
         "batch": "observations (n, size), any n; every row is decided by itself",
-        "policy": described(policy),
+        "policy": values,
         "source": source,
         "golden": {
             "cases": len(golden.obs),

@@ -12,10 +12,9 @@ import numpy as np
 from cuelearner_jax.config import RunConfig
 from cuelearner_jax.environment import actions_of, offers, spaces_of, view_of
 from cuelearner_jax.errors import UserError, closest
-from cuelearner_jax.evaluate import one_lane
 from cuelearner_jax.guides import registry as guidances
-from cuelearner_jax.policies import Agent, Common, Corrected, Guided, Heuristic, Policy, Taught, uniform_in
-from cuelearner_jax.runs.adapted import AdaptedLanes, alone, open_folder
+from cuelearner_jax.policies import Agent, Corrected, Guided, Heuristic, Policy, Taught, uniform_in
+from cuelearner_jax.runs.adapted import AdaptedLanes, open_folder
 from cuelearner_jax.runs.failures import without_failed
 from cuelearner_jax.runs.grid import Grid
 from cuelearner_jax.runs.opened import Lanes, Piece, lanes_of, open_run
@@ -216,12 +215,6 @@ class Block(NamedTuple):
     policy: Any  # a block, or `Common`
     failed: np.ndarray  # (lanes,) bool
 
-    def alone(self, lane: int) -> Any:
-        """One lane's policy."""
-        if isinstance(self.policy, Guided):
-            return alone(self.policy, lane)
-        return self.policy.policy if isinstance(self.policy, Common) else one_lane(self.policy, lane)
-
 
 def blocks_of(
     source: PolicySource,
@@ -312,7 +305,7 @@ def several(
             if len(index):
                 if block.failed[index[0]]:
                     console.print(f"seed {seed} failed, no longer finite: this is its last finite state")
-                found.append(block.alone(int(index[0])))
+                found.append(block.policy.lane(int(index[0])))
                 break
         else:
             of = "run" if source.grid else "folder"

@@ -28,7 +28,7 @@ from cuelearner_jax.feedback.answers import check_teacher
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.guides.base import Guide
 from cuelearner_jax.guides.relative import KIND
-from cuelearner_jax.policies import Common
+from cuelearner_jax.policies import Common, lanes_in
 from cuelearner_jax.runs import adapted, trained
 from cuelearner_jax.runs.grid import Grid, check_grid, seeds_of
 from cuelearner_jax.runs.order import read_labels
@@ -205,7 +205,7 @@ def run(
     env = task.environment(request.task)
     guidance = guidances.make(kind.name, sizes, env)
     bases, seeds, origin = _bases(subject, request, env)
-    shared = isinstance(bases, Common)
+    shared = lanes_in(bases) is None
     if not shared and (request.seeds, request.first_seed) != (1, 0):
         raise UserError("several base policies are adapted each with its own seed: leave out --seeds and --first-seed")
     seeds = seeds_of(request.first_seed, request.seeds) if shared else seeds
@@ -275,7 +275,7 @@ def _rows(
 
 def _reach(bases: Any, file: label_files.LabelFile, scalars: Scalars) -> float:
     """How far labels reach from what the base policy does [deg]; at least eps."""
-    if not isinstance(bases, Common):
+    if lanes_in(bases) is not None:
         raise UserError("labels of several base policies reach differently far: give --bound-deg")
     return max(adapting.reach(bases.policy, file.labels.obs, file.labels.action), scalars.eps_deg)
 

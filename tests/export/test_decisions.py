@@ -26,7 +26,7 @@ from cuelearner_jax.environment import Quantity, action_of, spaces_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.export import contract, decisions, formats, onnx_graph, runner
 from cuelearner_jax.guides import registry as guidances
-from cuelearner_jax.policies import Agent, Corrected, Guided, Heuristic, Opaque, uniform_in
+from cuelearner_jax.policies import Agent, Corrected, Guided, Heuristic, Opaque, layers, uniform_in
 
 ENV = Aimed()
 ANGLES = np.linspace(0.0, 6.0, 40)
@@ -110,9 +110,9 @@ def test_the_contract_says_what_goes_in_and_what_comes_out(folder):
     assert told["action"]["angle"].startswith("atan2(action[1], action[0]) [rad]")
     assert "positive counterclockwise" in told["action"]["angle"]
     assert told["action"]["clip_radius_deg"] == pytest.approx(7.0)
-    outer, inner = told["policy"]
-    assert (outer["layer"], outer["guidance"], outer["most_passes"]) == ("guided", "relative", SCALARS.k_max)
-    assert (inner["layer"], inner["directions"], inner["frame"]) == ("agent", 72, "raw")
+    outer, inner = layers(told["policy"])
+    assert (outer["policy"], outer["guidance"], outer["scalars"]["k_max"]) == ("guided", "relative", SCALARS.k_max)
+    assert (inner["policy"], inner["sizes"]["directions"], inner["sizes"]["frame"]) == ("agent", 72, "raw")
     assert f"jax {jax.__version__}" in told["versions"]
     for name, recorded in told["files"].items():
         assert hashlib.sha256((folder / "numpy" / name).read_bytes()).hexdigest() == recorded
