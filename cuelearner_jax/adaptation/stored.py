@@ -1,7 +1,7 @@
 """Policies as plain values and arrays, and back.
 
-A policy's values are those of its `describe()`. Kept are an `agent` with its `params`, `guided` with its `model` and, if
-bounded, its `bound`, `uniform`, `heuristic`, and the name of `code`: package.module:NAME, or how Python calls it.
+A policy's values are those of its `describe()`. Kept are an `agent` with its `params`; `guided` with its `model` and,
+where there is one, its `bound`; `uniform`; `heuristic`; and the name of `code`, as package.module:NAME.
 
 Code is never loaded because a file names it: whoever opens the policy gives it again.
 """

@@ -3,7 +3,7 @@
 contract.json    what goes in and what comes out, with units; versions; digests of the other files and of itself
 decision.*       the decision
 golden.npz       observations (cases, obs) and the actions (cases, action) that JAX decided on
-decide.py        runs the decision; a copy of `runner`
+decide.py        runs the decision: `runner`, with `operations` in place of their import
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from jaxtyping import Float
 
 from cuelearner_jax.environment import Quantity
 from cuelearner_jax.errors import UserError, closest
-from cuelearner_jax.export import runner
+from cuelearner_jax.export import operations, runner
 from cuelearner_jax.export.decisions import TOLERANCE, golden_cases
 from cuelearner_jax.export.formats import FORMATS, traced
 from cuelearner_jax.policies import Policy, describe
@@ -97,7 +97,7 @@ def _made(
     files = {
         artefact.file: artefact.contents,
         runner.GOLDEN: cases.getvalue(),
-        "decide.py": Path(runner.__file__).read_bytes(),
+        "decide.py": decide_source(),
     }
     contract = {
         "version": runner.VERSION,
@@ -125,6 +125,13 @@ def _made(
         **provenance(),
     }
     return {**contract, "difference": _written(place, files, contract)}
+
+
+def decide_source() -> bytes:
+    """`runner` with the contents of `operations` in place of their import: one file that needs NumPy alone."""
+    own, other = (Path(module.__file__).read_text(encoding="utf-8") for module in (runner, operations))
+    imported = "from cuelearner_jax.export.operations import ContractError, compiled\n"
+    return own.replace(imported, other.partition("from __future__ import annotations\n\n")[2]).encode()
 
 
 def _slices(observation: Sequence[Quantity]) -> list[dict[str, Any]]:
