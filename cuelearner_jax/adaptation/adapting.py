@@ -24,7 +24,7 @@ from cuelearner_jax.environment import Environment
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import Rolled, Tell, untold
 from cuelearner_jax.guides.base import Guide
-from cuelearner_jax.policies import Guided, Policy, lanes_in, named
+from cuelearner_jax.policies import Guided, Policy, PolicyBlock, lanes_in, named
 from cuelearner_jax.types import Label, Teacher
 
 # Seconds a fit on a CPU. The paper's networks are `GuideSizes()`.
@@ -55,7 +55,7 @@ class Adaptation:
     sizes: GuideSizes  # that the guidance was made with
     scalars: Scalars
     env: Environment  # the changed world, in which is asked
-    bases: Policy  # a block of base policies, or `Common`
+    bases: PolicyBlock  # a block of base policies, or `Common`
     lanes: Lanes
     judging: Judging
 
@@ -262,7 +262,7 @@ class _Measuring:
         assert env is not None
         return program.adapted(work.guidance, work.sizes, env, work.scalars, work.bases, block)
 
-    def _measured(self, policy: Policy, what: str) -> Rolled:
+    def _measured(self, policy: PolicyBlock, what: str) -> Rolled:
         how = self.work.judging
         assert how.env is not None
         mesh = None if lanes_in(policy) is None else self.mesh

@@ -24,7 +24,7 @@ from cuelearner_jax.errors import UserError, closest
 from cuelearner_jax.evaluate import Rolled, Tell, episodes, mean_interval, roll_lanes, untold, watched, watched_lanes
 from cuelearner_jax.feedback.answers import of_strength
 from cuelearner_jax.guides.base import Guide
-from cuelearner_jax.policies import Policy, lanes_in
+from cuelearner_jax.policies import PolicyBlock, lanes_in
 from cuelearner_jax.types import Label
 
 HELD_OUT = 5  # every fifth label
@@ -66,7 +66,7 @@ def steps_played(env: Environment, by: str, rolled: Rolled, steps: int) -> np.nd
 
 def measured(
     env: Environment,
-    policy: Policy,
+    policy: PolicyBlock,
     num_envs: int,
     steps: int,
     split: str = "tuning",

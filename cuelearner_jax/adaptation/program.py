@@ -37,7 +37,7 @@ from cuelearner_jax.config import GuideSizes, Scalars
 from cuelearner_jax.devices import BY_LANE, SHARED, each_lane, lane_mesh, over_lanes
 from cuelearner_jax.environment import Environment, view_of
 from cuelearner_jax.guides.base import Guide
-from cuelearner_jax.policies import Guided, Policy
+from cuelearner_jax.policies import Guided, PolicyBlock
 from cuelearner_jax.storage.room import check_room
 from cuelearner_jax.types import GuideState, Label, Teacher
 
@@ -164,7 +164,7 @@ def ask_round(
     env: Environment,
     teacher: Teacher,
     scalars: Scalars,
-    bases: Policy,
+    bases: PolicyBlock,
     block: Adapting,
     mesh: Mesh | None = None,
 ) -> Adapting:
@@ -216,7 +216,7 @@ def take_labels(
     sizes: GuideSizes,
     env: Environment,
     scalars: Scalars,
-    bases: Policy,
+    bases: PolicyBlock,
     labels: Label,
     block: Adapting,
     mesh: Mesh | None = None,
@@ -230,14 +230,14 @@ def take_labels(
     return _take(guidance, sizes, mesh, env, scalars, bases, labels, block)
 
 
-def blame(bases: Policy, teacher: Teacher | None, block: Adapting) -> None:
+def blame(bases: PolicyBlock, teacher: Teacher | None, block: Adapting) -> None:
     """Raises UserError if the first lane, which failed, did so for its policy or its teacher (see `asking.blame`)."""
     lane = jax.tree.map(lambda leaf: leaf[0], block)
     asking.blame(teacher, lane.guide, bases.lane(lane.base), lane.key)
 
 
 def adapted(
-    guidance: Guide, sizes: GuideSizes, env: Environment, scalars: Scalars, bases: Policy, block: Adapting
+    guidance: Guide, sizes: GuideSizes, env: Environment, scalars: Scalars, bases: PolicyBlock, block: Adapting
 ) -> Guided:
     """Every lane's policy: its base's actions under its model, within its bound.
 

@@ -25,6 +25,7 @@ from cuelearner_jax.policies import Agent, Guided, Heuristic, describe, layers, 
 Told = dict[str, Any]
 KINDS = ("agent", "uniform", "heuristic", "guided", "code")
 PARTS = ((GuideSizes, "sizes"), (Scalars, "scalars"))  # of a guided policy's values
+DERIVED = ("clip_radius_deg", "fitted")  # of a description: the other values and the arrays say them already
 MOST_LAYERS = 16  # of a policy that was adapted again and again
 
 
@@ -48,6 +49,8 @@ def told(policy: Any, named: str | None = None) -> Told:
             raise UserError("a policy under a guidance of unknown sizes cannot be kept in a folder: give them as sizes")
         if layer["policy"] == "code":
             layer["named"] = named or "code"
+        for name in DERIVED:
+            layer.pop(name, None)
     return described
 
 

@@ -9,6 +9,7 @@ decide.py        runs the decision: `runner`, with `operations` in place of thei
 from __future__ import annotations
 
 import hashlib
+import inspect
 import io
 import itertools
 import json
@@ -129,7 +130,7 @@ def _made(
 
 def decide_source() -> bytes:
     """`runner` with the contents of `operations` in place of their import: one file that needs NumPy alone."""
-    own, other = (Path(module.__file__).read_text(encoding="utf-8") for module in (runner, operations))
+    own, other = (inspect.getsource(module) for module in (runner, operations))
     imported = "from cuelearner_jax.export.operations import ContractError, compiled\n"
     return own.replace(imported, other.partition("from __future__ import annotations\n\n")[2]).encode()
 

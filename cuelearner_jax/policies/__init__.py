@@ -18,8 +18,9 @@ from cuelearner_jax.policies.layers import (
     uniform_in,
     wanted_actions,
 )
-from cuelearner_jax.policies.node import BY_LANE, SHARED, Policy, PolicyNode, describe, lanes_in, layers
+from cuelearner_jax.policies.node import BY_LANE, SHARED, PolicyBlock, PolicyNode, describe, lanes_in, layers
 from cuelearner_jax.policies.opaque import Opaque, acted, named, policy_of
+from cuelearner_jax.types import Policy
 
 __all__ = [
     "BY_LANE",
@@ -32,6 +33,7 @@ __all__ = [
     "NearAims",
     "Opaque",
     "Policy",
+    "PolicyBlock",
     "PolicyNode",
     "Taught",
     "Teaching",

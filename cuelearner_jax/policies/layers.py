@@ -218,7 +218,9 @@ class Corrected(PolicyNode):
 
 def _part(kind: type, values: Any) -> dict[str, Any]:
     """The fields of a configuration class that an instance has, of it or of a class with more or fewer."""
-    own = {field.name: getattr(values, field.name) for field in dataclasses.fields(kind) if hasattr(values, field.name)}
+    plain = lambda value: value.item() if hasattr(value, "item") else value  # noqa: E731
+    names = [field.name for field in dataclasses.fields(kind) if hasattr(values, field.name)]
+    own = {name: plain(getattr(values, name)) for name in names}
     return {name: value for name, value in to_json(kind(**own)).items() if name in own}
 
 

@@ -17,8 +17,8 @@ SHARED, BY_LANE = None, 0  # of a leaf: the same for all lanes, or one for each
 
 
 @runtime_checkable
-class Policy(types.Policy, Protocol):
-    """A policy of which a block of lanes may have one each. Inherit `PolicyNode` for all but `act` and `axes`."""
+class PolicyBlock(types.Policy, Protocol):
+    """A policy of which a block of lanes may have one each, or such a block; `PolicyNode` has all but `act`."""
 
     @property
     def axes(self) -> Any:
@@ -66,7 +66,7 @@ def _lane(part: Any, axes: Any, index: int | ArrayLike) -> Any:
     return jax.tree.map(chosen, axes, part, is_leaf=lambda axis: axis is SHARED)
 
 
-def lanes_in(policy: Policy) -> int | None:
+def lanes_in(policy: PolicyBlock) -> int | None:
     """Lanes of a block; None where no leaf has a lane axis: one policy for all lanes."""
     count = lambda axis, own: [] if axis is SHARED else [len(leaf) for leaf in jax.tree.leaves(own)]  # noqa: E731
     found = jax.tree.leaves(jax.tree.map(count, policy.axes, policy, is_leaf=lambda axis: axis is SHARED))
@@ -74,7 +74,7 @@ def lanes_in(policy: Policy) -> int | None:
 
 
 def describe(policy: Any) -> dict[str, Any]:
-    """What a policy is, as `Policy.describe` says it; one that does not say so is code."""
+    """What a policy is, as `PolicyBlock.describe` says it; one that does not say so is code."""
     return policy.describe() if hasattr(policy, "describe") else PolicyNode.describe(policy)
 
 

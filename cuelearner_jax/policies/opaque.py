@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jaxtyping import Float, PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from cuelearner_jax import types, user_code
 from cuelearner_jax.actions import DIRECTIONS, Actions, only_actions

@@ -152,7 +152,8 @@ def write(
     block = adapted.policy(env)
     bases = of.bases
     rows = lanes_in(bases)
-    values = stored.told(replace(block, base=bases), origin.get("code"))
+    block = replace(block, base=bases)
+    values, arrays = stored.told(block, origin.get("code")), stored.arrays_of(block)
     lanes = of.lanes
     described = {
         "task": {"name": task.name, **({"from": task.origin} if task.origin else {}), **configuration.to_json(world)},
@@ -181,7 +182,6 @@ def write(
         "conventions": CONVENTIONS,
         **provenance(),
     }
-    arrays = {**stored.arrays_of(replace(block, base=Common(of.bases))), "base": stored.arrays_of(bases)}
     with place.writing() as folder:
         policy_folders.write(folder, described, arrays)
         _write_labels(folder, adapted, task, world)

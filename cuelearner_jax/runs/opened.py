@@ -119,7 +119,7 @@ def lanes_of(task: Task, config: RunConfig, pieces: tuple[Piece, ...], kind: str
     return [_joined(found[step]) for step in sorted(found, reverse=True)]
 
 
-def _acting(config: RunConfig, guidance: Guidance, env: Any, key: PRNGKeyArray) -> dict[str, Any]:
+def _acting(config: RunConfig, guidance: Guide, env: Any, key: PRNGKeyArray) -> dict[str, Any]:
     """What one lane acts with, before it learns."""
     return {"params": fresh_params(config.sizes, spaces_of(env), key), "guidance": guidance.init(key)}
 

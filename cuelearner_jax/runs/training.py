@@ -15,7 +15,7 @@ from cuelearner_jax.devices import SHARED, place
 from cuelearner_jax.environment import Environment, actions_of, view_of
 from cuelearner_jax.evaluate import Tell, episodes, untold
 from cuelearner_jax.loop import start_clock
-from cuelearner_jax.policies import Agent, Guided, Policy, uniform_in
+from cuelearner_jax.policies import Agent, Guided, PolicyBlock, uniform_in
 from cuelearner_jax.runs.lanes import LaneGroup
 from cuelearner_jax.storage import label_files
 from cuelearner_jax.types import Clock, Label, Teacher, TrainState
@@ -157,7 +157,7 @@ class Training:
         own["failed"] = self.failed.astype(float)
         return {**own, **self._measured(self._agent)}
 
-    def _agent(self, lane: TrainState) -> Policy:
+    def _agent(self, lane: TrainState) -> PolicyBlock:
         """A block's agents, who look at the examined world."""
         return Agent(lane.agent.params, self.group.config.sizes, actions_of(self.group.env), view_of(self.examined))
 
@@ -173,7 +173,7 @@ class Training:
     def _of_guides(self) -> dict[str, np.ndarray]:
         group, base = self.group, uniform_in(self.group.env)
 
-        def guide(lane: TrainState) -> Policy:
+        def guide(lane: TrainState) -> PolicyBlock:
             return Guided(base, lane.guide.model, view_of(self.examined), group.config.scalars, group.guidance)
 
         return {f"guide_{name}": values for name, values in self._measured(guide).items()}

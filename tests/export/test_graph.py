@@ -9,7 +9,7 @@ import onnxruntime
 import pytest
 from jax import lax
 
-from cuelearner_jax.export import onnx_graph, rules
+from cuelearner_jax.export import onnx_graph, operations, rules
 from cuelearner_jax.export.graph import trace
 
 SIZE = 12
