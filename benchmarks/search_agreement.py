@@ -29,12 +29,8 @@ import cuelearner_jax as cl
 from cuelearner_jax.agents import ddqn
 from cuelearner_jax.environment import spaces_of
 from cuelearner_jax.evaluate import episodes, rollout
-from cuelearner_jax.guides import registry as guidance
-from cuelearner_jax.policies import BY_LANE, SHARED
-from cuelearner_jax.runs import grid as runs
-from cuelearner_jax.runs.grid import Grid
-from cuelearner_jax.runs.kept import restore_policies
-from cuelearner_jax.runs.lanes import LaneGroup
+from cuelearner_jax.policies import BY_LANE, SHARED, PolicyNode
+from cuelearner_jax.runs.trained import PolicySource
 from cuelearner_jax.spaces import directions as geometry
 from cuelearner_jax.storage.provenance import provenance
 from cuelearner_jax.tasks import registry
@@ -48,7 +44,7 @@ SHIPPED = "shipped"
 TABLE = "regulation"  # of the shipped network
 
 
-class Searching(struct.PyTreeNode):
+class Searching(PolicyNode):
     """An agent that searches as its options say, roughly or fully; a finished one always searches fully."""
 
     params: Any
@@ -85,12 +81,12 @@ def shipped() -> Agents:
 
 def of_run(folder: Path) -> Agents:
     """The agents of a run's first kind of guidance, as its newest checkpoint has them."""
-    task, config, grid = runs.load(folder, registry.find)
-    env = task.environment(config.task, "validation")
-    kind = guidance.make(grid.guidance[0], config.sizes, env)
-    group = LaneGroup(config, env, kind, Grid((kind.name,), grid.seeds, grid.labels))
-    policies, step = restore_policies(group, folder / kind.name)
-    return Agents(env, config.agent_in(env), policies["params"], {"step": step, "seeds": list(grid.seeds)})
+    source = PolicySource.of_run(folder, registry.find)
+    assert source.grid is not None
+    config, lanes = source.config, source.load(source.grid.guidance[:1])[0]
+    env = source.task.environment(config.task, "validation")
+    about = {"step": lanes.step, "seeds": lanes.seeds.tolist()}
+    return Agents(env, config.agent_in(env), lanes.policies["params"], about)
 
 
 def met(agent: Searching) -> jax.Array:

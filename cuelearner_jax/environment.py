@@ -1,8 +1,8 @@
 """What an environment is to the method, what it may offer beyond that, and the symmetries of its data.
 
 An environment is a pytree: its parameters are traced, so a changed world needs no new compile. What every environment
-has stands in `Environment`. Optional are `heuristic`, `mirror` with `symmetries`, `features` and `actions`; ask by
-`offers`, `symmetries_of` and `actions_of`, never by the name of a task.
+has stands in `Environment`. Optional are `heuristic`, `mirror` with `symmetries`, `features`, `aims`, `view` and
+`actions`; ask by `offers`, `symmetries_of`, `view_of` and `actions_of`, never by the name of a task.
 """
 
 from __future__ import annotations
@@ -39,8 +39,11 @@ class Features(NamedTuple):
 
 
 @runtime_checkable
-class Environment(Protocol):
-    """One task. Inherit `WholeObservations` (or `Described`) for what can be derived."""
+class View(Protocol):
+    """What a policy looks at: the observation, and of the optional members `features`, `aims`, `heuristic`, `mirror`.
+
+    Every environment is one. An environment whose episodes need more than that (generated worlds, say) offers `view()`.
+    """
 
     @property
     def observation(self) -> tuple[Quantity, ...]:
@@ -51,6 +54,20 @@ class Environment(Protocol):
     def obs_size(self) -> int:
         """Number of entries of an observation: the sum of its slices."""
         ...
+
+
+@runtime_checkable
+class OffersView(Protocol):
+    """An environment with parts that no policy looks at."""
+
+    def view(self) -> View:
+        """The environment without these parts."""
+        ...
+
+
+@runtime_checkable
+class Environment(View, Protocol):
+    """One task. Inherit `WholeObservations` (or `Described`) for what can be derived."""
 
     def reset(self, key: PRNGKeyArray) -> tuple[EnvState, Float[Array, " obs"]]:
         """Starts an episode."""
@@ -168,6 +185,11 @@ class WholeObservations(Described):
 def offers(env: Any, name: str) -> bool:
     """Has an environment the optional member `name` (`heuristic`, `mirror`, `features`, `aims`)?"""
     return getattr(env, name, None) is not None
+
+
+def view_of(env: Any) -> Any:
+    """The view of an environment: what it offers as one, or the environment."""
+    return env.view() if offers(env, "view") else env
 
 
 def actions_of(env: Any) -> Space:

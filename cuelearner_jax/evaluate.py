@@ -19,7 +19,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from cuelearner_jax import user_code
 from cuelearner_jax.devices import BY_LANE, SHARED, over_lanes, portions
 from cuelearner_jax.environment import Environment, actions_of
-from cuelearner_jax.policies import Policy, acted, named
+from cuelearner_jax.policies import Policy, PolicyBlock, acted, named
 
 # Folded into the root key: episodes for reported figures only, and episodes for choosing settings.
 SPLITS = {"validation": 1_000_003, "tuning": 1_000_001}
@@ -131,7 +131,7 @@ class _Structure(NamedTuple):
         return jax.tree.unflatten(self.tree, [next(own if lane else common) for lane in self.by_lane])
 
 
-def _structure(policy: Policy) -> _Structure:
+def _structure(policy: PolicyBlock) -> _Structure:
     leaves, tree = jax.tree.flatten(policy)
     axes = jax.tree.map(
         lambda axis, part: jax.tree.map(lambda _: axis is not None, part),
@@ -144,15 +144,8 @@ def _structure(policy: Policy) -> _Structure:
     return found
 
 
-def one_lane(policy: Policy, index: int | ArrayLike) -> Any:
-    """One lane's policy out of a block's; by several indices (lanes,), a block of these lanes."""
-    structure = _structure(policy)
-    each, shared = structure.take_apart(policy)
-    return structure.put_together([jnp.asarray(leaf)[index] for leaf in each], shared)
-
-
 def evaluate_lanes(
-    env: Environment, policy: Policy, key: PRNGKeyArray, *, mesh: Mesh, num_envs: int, steps: int
+    env: Environment, policy: PolicyBlock, key: PRNGKeyArray, *, mesh: Mesh, num_envs: int, steps: int
 ) -> dict[str, Float[Array, " lanes"]]:
     """Validation of a block of lanes, all on the same episodes.
 
@@ -169,7 +162,9 @@ def evaluate_lanes(
     return roll_lanes(env, policy, key, mesh=mesh, num_envs=num_envs, steps=steps).means
 
 
-def roll_lanes(env: Environment, policy: Policy, key: PRNGKeyArray, *, mesh: Mesh, num_envs: int, steps: int) -> Rolled:
+def roll_lanes(
+    env: Environment, policy: PolicyBlock, key: PRNGKeyArray, *, mesh: Mesh, num_envs: int, steps: int
+) -> Rolled:
     """Like `evaluate_lanes`, with the values of each environment."""
     structure = _structure(policy)
     each, shared = structure.take_apart(policy)
@@ -244,7 +239,7 @@ def watched(
 
 
 def watched_lanes(
-    env: Environment, policy: Policy, key: PRNGKeyArray, num_envs: int, steps: int, tell: Tell = untold
+    env: Environment, policy: PolicyBlock, key: PRNGKeyArray, num_envs: int, steps: int, tell: Tell = untold
 ) -> Rolled:
     """Like `roll_lanes`, on one device in stretches: as many lanes at once as it takes well. Returns NumPy arrays."""
     structure = _structure(policy)

@@ -38,7 +38,7 @@ class Stopping(threading.Event):
     number: int = signal.SIGINT
 
 
-class _Late:
+class _LateSignal:
     """A second Ctrl-C of a process that does not listen, while something was being saved."""
 
     saving = 0
@@ -93,13 +93,13 @@ def interruptible(what: str = "this stretch of steps") -> Iterator[threading.Eve
 def saving() -> Iterator[None]:
     """What is done inside is done to its end, however often Ctrl-C is pressed."""
     with _saves:
-        _Late.saving += 1
+        _LateSignal.saving += 1
         try:
             yield
         finally:
-            _Late.saving -= 1
-    if _Late.pressed and not _Late.saving:
-        _Late.pressed = False
+            _LateSignal.saving -= 1
+    if _LateSignal.pressed and not _LateSignal.saving:
+        _LateSignal.pressed = False
         raise KeyboardInterrupt
 
 
@@ -151,8 +151,8 @@ def _stop_at_once(number: int) -> None:
             _say("saving first")
             _saves.acquire()
         _leave(number)
-    elif _Late.saving:
-        _Late.pressed = True
+    elif _LateSignal.saving:
+        _LateSignal.pressed = True
         _say("saving first")
     else:
         raise KeyboardInterrupt

@@ -13,7 +13,7 @@ import jax
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from cuelearner_jax.config import GuideSizes, Scalars, check_types
-from cuelearner_jax.environment import Environment
+from cuelearner_jax.environment import Environment, View, offers, view_of
 from cuelearner_jax.errors import UserError, closest, shown
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.storage.room import check_room
@@ -183,6 +183,13 @@ class Task:
         needed = COPIES * sum(math.prod(leaf.shape) * leaf.dtype.itemsize for leaf in leaves)
         check_room(f"the world of {self.name} is large", needed, "lower those of --task or of the file")
         return self.bodies[0].environment(config, split)
+
+    def view(self, config: Any) -> View:
+        """What policies look at in a configuration; worlds that no policy looks at are not generated."""
+        make = lambda: self.bodies[0].environment(config, "training")  # noqa: E731
+        if not offers(jax.eval_shape(make), "view"):
+            return self.environment(config)
+        return jax.jit(lambda: view_of(make()))()
 
     def make_teacher(self, config: Any, env: Environment) -> Teacher:
         """Who answers in a world. Raises UserError if the task has no teacher."""

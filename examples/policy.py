@@ -14,18 +14,17 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
-from flax import struct
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from cuelearner_jax.evaluate import episodes, evaluate_policy
-from cuelearner_jax.policies import SHARED, Opaque, Policy, Taught, Teaching
+from cuelearner_jax.policies import Opaque, Policy, PolicyNode, Taught, Teaching
 from cuelearner_jax.runs import filming
 from cuelearner_jax.spaces.directions import retract
 from cuelearner_jax.types import EnvState
 from examples.reach import TASK, Reach, ReachConfig
 
 
-class Leaning(struct.PyTreeNode):
+class Leaning(PolicyNode):
     """Heads for the buoy and leans into the wind. A pytree: another `lean` needs no new compile."""
 
     lean: Float[Array, ""] | float = 0.5  # [s]: how much of the wind is steered against
@@ -33,11 +32,6 @@ class Leaning(struct.PyTreeNode):
     def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n 4"]) -> Float[Array, "n 2"]:
         """Actions in n situations; a policy that draws uses `key`, one that is told more than agents are, `states`."""
         return retract(retract(obs[:, :2]) - self.lean * obs[:, 2:])
-
-    @property
-    def axes(self) -> Leaning:
-        """All lanes share it."""
-        return self.replace(lean=SHARED)
 
 
 def by_hand(obs: np.ndarray) -> np.ndarray:

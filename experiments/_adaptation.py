@@ -25,7 +25,7 @@ from cuelearner_jax.cli import main as cuelearner
 from cuelearner_jax.config import GuideSizes
 from cuelearner_jax.environment import actions_of, spaces_of
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.evaluate import episodes, one_lane, watched_lanes
+from cuelearner_jax.evaluate import episodes, watched_lanes
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.policies import Agent, Corrected
 from cuelearner_jax.run_config import RunConfig
@@ -172,7 +172,7 @@ class Bench(NamedTuple):
 
 def measured_as_they_are(bench: Bench) -> Iterator[Row]:
     """The base agents themselves."""
-    agents = bench.agents.replace(env=bench.env(bench.piece.split))
+    agents = bench.agents.replace(view=bench.env(bench.piece.split))
     yield {"base": bench.seeds, "labels": 0, "steps": 0, **bench.measured(agents)}
 
 
@@ -181,7 +181,7 @@ def corrected(bench: Bench) -> Iterator[Row]:
     env = bench.env(bench.piece.split)
     scalars = dataclasses.replace(bench.scalars(), tau_max_deg=bench.piece.bound_deg)
     teacher = bench.task.make_teacher(bench.world, env)
-    policy = Corrected(bench.agents.replace(env=env), teacher, scalars, actions_of(env))
+    policy = Corrected(bench.agents.replace(view=env), teacher, scalars, actions_of(env))
     yield {"base": bench.seeds, "labels": 0, "steps": 0, **bench.measured(policy)}
 
 
@@ -208,7 +208,7 @@ def by_labels(kind: Any, bench: Bench) -> Iterator[Row]:
     metrics = bench.measured(found.policy(shown))
     if piece.ways:
         last = len(bench.seeds) * (len(piece.labels) - 1)  # the first base with the largest budget
-        policies = {"before": one_lane(bench.agents, 0), "after": one_lane(found.policy(shown), last)}
+        policies = {"before": bench.agents.lane(0), "after": found.policy(shown).lane(last)}
         trajectories.write(bench.folder, shown, policies, piece.split, bench.steps)
     yield {"base": bench.seeds[lanes.base], "labels": lanes.budget, "steps": 0, **told, **metrics}
 
@@ -285,7 +285,7 @@ def opened(folder: Path, study: Study, piece: Piece, scale: Scale, out: Path) ->
     own = {name.partition(".")[2]: value for name, value in piece.settings.items() if name.startswith("task.")}
     world = dataclasses.replace(world, **own)
     env = environment(source.task.name, world, "training", piece.robot)
-    policies, seeds = several(source, env, world, "agent", None, None, source.grid.seeds[: piece.bases])
+    policies, seeds = several(source, world, "agent", None, None, source.grid.seeds[: piece.bases], env=env)
     agents = program.side_by_side(policies)
     if scale.directions:
         agents = agents.replace(

@@ -28,7 +28,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from cuelearner_jax.agents import ddqn
 from cuelearner_jax.config import Bounds, Frame, part
 from cuelearner_jax.devices import compiler_options, each_lane, each_lane_in_place
-from cuelearner_jax.environment import Environment, Spaces
+from cuelearner_jax.environment import Environment, Spaces, view_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.guides.untaught import NONE
@@ -183,4 +183,4 @@ class FineTuning:
 
     def policy(self, env: Any) -> Agent:
         """The agents as they are, a block, in a world."""
-        return Agent(self.block.state.agent.params, self.config.agent_in(env), env)
+        return Agent(self.block.state.agent.params, self.config.agent_in(env), view_of(env))

@@ -16,19 +16,18 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from flax import struct
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from cuelearner_envs.billiards.config import BilliardsConfig, make_environment
 from cuelearner_jax.evaluate import SPLITS, episodes, evaluate_policy
-from cuelearner_jax.policies import SHARED, Heuristic, Uniform
+from cuelearner_jax.policies import Heuristic, PolicyNode, Uniform
 from cuelearner_jax.spaces import DIRECTIONS
 from cuelearner_jax.storage.provenance import provenance
 
 TABLES = ("easy", "regulation")
 
 
-class AimAtRandom(struct.PyTreeNode):
+class AimAtRandom(PolicyNode):
     """One of the possible aims, each as likely; where there is none, any direction."""
 
     env: Any
@@ -43,11 +42,6 @@ class AimAtRandom(struct.PyTreeNode):
             return jnp.where(aims.possible.any(), aims.actions[chosen], DIRECTIONS.sample(k_any, ()))
 
         return jax.vmap(one)(jax.random.split(key, obs.shape[0]), obs)
-
-    @property
-    def axes(self) -> AimAtRandom:
-        """One environment for all."""
-        return self.replace(env=SHARED)
 
 
 def main() -> None:

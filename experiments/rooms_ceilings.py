@@ -36,7 +36,7 @@ from cuelearner_jax.agents.networks import applied, residual_network
 from cuelearner_jax.environment import Aims, spaces_of
 from cuelearner_jax.evaluate import episodes, evaluate_policy, watched_lanes
 from cuelearner_jax.guides.intent import Weights
-from cuelearner_jax.policies import BY_LANE, SHARED, Taught, best_actions
+from cuelearner_jax.policies import BY_LANE, SHARED, PolicyNode, Taught, best_actions
 from cuelearner_jax.spaces import DIRECTIONS
 from cuelearner_jax.tasks import registry
 
@@ -68,7 +68,7 @@ SCALES = {
 VARIANTS = ("network", "ways")
 
 
-class Clone(struct.PyTreeNode):
+class Clone(PolicyNode):
     """A network that does what a road map did: a direction, or the most likely of the ways."""
 
     params: Any

@@ -102,6 +102,25 @@ SLOW = (
 )
 
 
+# Files that train or call the same compiled programs: one process runs them one after the other, and compiles once.
+SHARING = {
+    **dict.fromkeys(("tests/test_loop.py", "tests/test_asking.py", "tests/test_policies.py"), "loop"),
+}
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config, log):
+    """Shares out the tests by file, those of `SHARING` by what they share."""
+    from xdist.scheduler import LoadFileScheduling
+
+    class ByProgram(LoadFileScheduling):
+        def _split_scope(self, nodeid):
+            file = super()._split_scope(nodeid)
+            return SHARING.get(file, file)
+
+    return ByProgram(config, log) if config.getoption("dist") == "loadfile" else None
+
+
 def pytest_collection_modifyitems(items):
     """Marks the tests of `SLOW`, and has them begin first: what is left for the end can be shared out evenly."""
     for item in items:

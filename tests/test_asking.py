@@ -63,8 +63,8 @@ def test_asking_one_by_one_is_bitwise_a_round(base):
 
 
 def test_a_lanes_round_in_the_training_program_is_this_round_of_uniform_actions():
-    program = probes.window_program("relative", 2 * ROUND)
-    state = probes.start(program, [3], [2 * ROUND])
+    program = probes.window_program("relative")
+    state = probes.start(program, [3, 4, 5, 6], [2 * ROUND] * 4)
     guide, key = jax.tree.map(lambda leaf: jnp.copy(leaf[0]), (state.guide, state.key))
     clock = start_clock()
     for _ in range(2):

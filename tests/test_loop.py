@@ -27,7 +27,7 @@ DEG = math.pi / 180
 q = applied(q_network(probes.AGENT.q_layers))
 
 
-LARGEST = 60  # labels of the largest budget
+LARGEST = probes.LARGEST
 STRETCH = 12  # iterations of one call, always the same: another number compiles again
 
 
@@ -146,7 +146,7 @@ def test_replay_keeps_what_each_step_led_to():
 
 def acted(kind, probability=0.5, stretches=1, **schedule):
     """What one lane's environments met and did, and its parameters; nothing is learned."""
-    program = probes.window_program(kind, LARGEST if kind == "relative" else 0)
+    program = probes.window_program(kind)
     state = probes.start(program, [0], [0])
     settings = replaced(probability, learn_after=10**9, **schedule)
     clock, state, _ = run(program, settings, loop.start_clock(), state, stretches)
@@ -232,7 +232,7 @@ def labelled(program, seeds, budgets, rounds=LARGEST // 10, scalars=probes.SCALA
 
 
 def test_labels_fill_each_lanes_budget_and_say_what_the_teacher_would():
-    clock, state = labelled(probes.window_program("relative", LARGEST), SEEDS, BUDGETS)
+    clock, state = labelled(probes.window_program("relative"), SEEDS, BUDGETS)
     assert int(clock.round) == 6
     labels = jax.tree.map(np.asarray, state.guide.labels)
     assert labels.obs.shape == (4, LARGEST, 2)
@@ -255,7 +255,7 @@ def test_labels_fill_each_lanes_budget_and_say_what_the_teacher_would():
 
 
 def test_the_first_labels_of_a_larger_budget_are_those_of_a_smaller():
-    _, state = labelled(probes.window_program("relative", LARGEST), SEEDS, BUDGETS)
+    _, state = labelled(probes.window_program("relative"), SEEDS, BUDGETS)
     for small, large in ((0, 2), (1, 3)):
         for name in PARTS:
             rows = np.asarray(getattr(state.guide.labels, name))
@@ -263,7 +263,7 @@ def test_the_first_labels_of_a_larger_budget_are_those_of_a_smaller():
 
 
 def test_questions_before_the_first_fit_are_uniform_and_later_ones_refined():
-    program, seeds, budgets = probes.window_program("relative", LARGEST), [1, 2, 3, 4], [LARGEST] * 4
+    program, seeds, budgets = probes.window_program("relative"), [1, 2, 3, 4], [LARGEST] * 4
     refined = labelled(program, seeds, budgets)[1].guide.labels
     error = np.abs(directions.difference(ENV.best(refined.obs), refined.action))
     assert error[:, :10].mean() == pytest.approx(math.pi / 2, abs=0.4)  # standard deviation 0.14
@@ -276,13 +276,13 @@ def test_questions_before_the_first_fit_are_uniform_and_later_ones_refined():
 
 def test_silent_teachers_use_up_the_budget():
     silent = dataclasses.replace(probes.SCALARS, silence_probability=1.0)
-    _, state = labelled(probes.window_program("relative", LARGEST), SEEDS, BUDGETS, scalars=silent)
+    _, state = labelled(probes.window_program("relative"), SEEDS, BUDGETS, scalars=silent)
     assert not state.guide.labels.valid.any()
     assert not state.guide.model.fitted.any()
 
 
 def test_a_lane_whose_budget_is_spent_stays_as_it_is():
-    program = probes.window_program("relative", LARGEST)
+    program = probes.window_program("relative")
     _, two = labelled(program, SEEDS, BUDGETS, 2)
     _, three = labelled(program, SEEDS, BUDGETS)
     assert_equal(probes.lane(two, 0), probes.lane(three, 0))
@@ -300,7 +300,7 @@ def assert_close(one, other, rtol=1e-4, atol=1e-5):
 
 
 def test_refined_uniform_actions_win_far_more_often_than_chance():
-    _, state = labelled(probes.window_program("relative", LARGEST), SEEDS, BUDGETS)
+    _, state = labelled(probes.window_program("relative"), SEEDS, BUDGETS)
     guidance = guidances.make("relative", probes.SIZES, ENV)
 
     def reward(model):
@@ -317,7 +317,7 @@ def test_refined_uniform_actions_win_far_more_often_than_chance():
 
 
 def test_labels_given_elsewhere_replace_those_asked_for_and_the_earlier_model_is_forgotten():
-    program = probes.window_program("relative", LARGEST)
+    program = probes.window_program("relative")
     _, asked = labelled(program, SEEDS, BUDGETS)
     labels = jax.tree.map(jnp.copy, asked.guide.labels)
     fresh = program.take_labels(ENV, probes.SCALARS, labels, probes.start(program, SEEDS, BUDGETS))
@@ -344,12 +344,12 @@ def trained(program, seeds, budgets):
 
 @pytest.fixture(scope="module")
 def grid():
-    return trained(probes.window_program("relative", LARGEST), SEEDS, BUDGETS)
+    return trained(probes.window_program("relative"), SEEDS, BUDGETS)
 
 
 def test_every_seed_differs(grid):
     state, _ = grid
-    fresh = probes.start(probes.window_program("relative", LARGEST), SEEDS, BUDGETS)
+    fresh = probes.start(probes.window_program("relative"), SEEDS, BUDGETS)
     for one, other in itertools.combinations([0, 1], 2):
         for tree in (fresh.agent.params, fresh.guide.model.params, state.agent.params, state.guide.model.params):
             mine, yours = jax.tree.leaves(probes.lane(tree, one)), jax.tree.leaves(probes.lane(tree, other))
@@ -359,7 +359,7 @@ def test_every_seed_differs(grid):
 
 
 def test_many_seeds_differ_pairwise():
-    program = probes.window_program("relative", LARGEST)
+    program = probes.window_program("relative")
     states = [probes.start(program, seeds, [LARGEST] * 4) for seeds in ([0, 1, 2, 3], [4, 5, 6, 7])]
     state = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *states)
     weights = np.asarray(jax.tree.leaves(state.agent.params)[1]).reshape(8, -1)
@@ -370,16 +370,25 @@ def test_many_seeds_differ_pairwise():
 
 def test_lanes_of_one_seed_start_alike_and_differ_by_their_budget(grid):
     state, _ = grid
-    fresh = probes.start(probes.window_program("relative", LARGEST), SEEDS, BUDGETS)
+    fresh = probes.start(probes.window_program("relative"), SEEDS, BUDGETS)
     assert_equal(probes.lane(fresh.agent.params, 0), probes.lane(fresh.agent.params, 2))
     assert not np.array_equal(
         jax.tree.leaves(state.guide.model.params)[1][0], jax.tree.leaves(state.guide.model.params)[1][2]
     )
 
 
+def test_a_lane_is_the_same_beside_any_others(grid):
+    state, metrics = grid
+    beside, measured = trained(probes.window_program("relative"), [5, 6, 7, SEEDS[3]], BUDGETS)
+    assert not np.array_equal(beside.agent.replay[0], state.agent.replay[0])
+    assert_equal(probes.lane(state, 3), probes.lane(beside, 3))  # to the last bit
+    assert_equal(probes.lane(metrics, 3), probes.lane(measured, 3))
+
+
+@pytest.mark.long
 def test_a_lane_alone_is_the_lane_beside_others(grid):
     state, metrics = grid
-    program = probes.window_program("relative", LARGEST)
+    program = probes.window_program("relative")
     alone, measured = trained(program, SEEDS[3:], BUDGETS[3:])
     assert_equal(probes.lane(state, 3), probes.lane(alone, 0))  # to the last bit
     assert_equal(probes.lane(metrics, 3), probes.lane(measured, 0))
@@ -388,7 +397,8 @@ def test_a_lane_alone_is_the_lane_beside_others(grid):
 @pytest.mark.long
 def test_the_smaller_budget_is_the_sweep_of_that_budget_alone(grid):
     state, _ = grid
-    small, _ = trained(probes.window_program("relative", 15), [2], [15])
+    guide = guidances.make("relative", probes.SIZES, ENV)
+    small, _ = trained(loop.make_program(probes.CONFIG, guide, ENV, 15), [2], [15])
     assert small.guide.labels.obs.shape[1] == 20
     assert_same_lane(state, 1, small)
 
@@ -414,7 +424,7 @@ def assert_same_lane(state, lane, alone):
 
 
 def test_a_lane_that_diverges_stays_at_its_last_finite_state_and_touches_no_other():
-    program = probes.window_program("relative", LARGEST)
+    program = probes.window_program("relative")
     clock, state = labelled(program, SEEDS, BUDGETS, 1)
     wrong = jnp.array([1.0, 1e30, 1.0, 1.0])  # squared it is beyond float32: so are the loss and the gradient's norm
     before = jax.tree.map(jnp.copy, state.agent.params)
@@ -443,7 +453,7 @@ def test_a_step_beyond_all_numbers_is_taken_back():
 
 
 def test_a_fit_that_diverges_fails_the_lane_and_leaves_its_guide():
-    program = probes.window_program("relative", LARGEST)
+    program = probes.window_program("relative")
     clock, state = labelled(program, SEEDS, BUDGETS, 1)
     guide = jax.tree.map(lambda leaf: np.asarray(probes.words(leaf)), state.guide)
     assert not state.failed.any()
@@ -471,7 +481,7 @@ def test_one_stretch_of_steps_is_two_of_half_the_length():
 
 
 def test_other_scalars_schedules_worlds_and_times_compile_nothing(grid):
-    program = probes.window_program("relative", LARGEST)
+    program = probes.window_program("relative")
     functions = (program.init, program.label_round, program.train)
     before = probes.compilations(*functions)
     clock, state = loop.start_clock(), probes.start(program, [7, 8, 9, 10], [1, 11, 33, LARGEST])
@@ -517,7 +527,7 @@ def test_label_slots_are_whole_rounds():
 
 
 def test_empty_label_sets_have_the_shape_of_the_largest_budget():
-    labels = probes.start(probes.window_program("relative", 15), [0], [15]).guide.labels
+    labels = probes.start(probes.window_program("relative"), SEEDS, [15] * 4).guide.labels
     assert isinstance(labels, Label)
-    assert (labels.obs.shape, labels.action.shape, labels.answer.shape) == ((1, 20, 2), (1, 20, 2), (1, 20, 1))
+    assert (labels.obs.shape, labels.action.shape, labels.answer.shape) == ((4, 60, 2), (4, 60, 2), (4, 60, 1))
     assert not labels.valid.any()

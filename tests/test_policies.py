@@ -1,6 +1,7 @@
 """Policies on the bandit, whose best direction is known; and blocks of them, a lane of which is itself."""
 
 import dataclasses
+import json
 from functools import cache
 
 import chex
@@ -15,11 +16,12 @@ from cuelearner_jax.agents.networks import applied, q_network
 from cuelearner_jax.devices import lane_mesh
 from cuelearner_jax.environment import Aims
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.evaluate import evaluate_lanes, evaluate_policy, one_lane, rollout
+from cuelearner_jax.evaluate import evaluate_lanes, evaluate_policy, rollout
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.loop import start_clock
 from cuelearner_jax.policies import (
     Agent,
+    Common,
     Corrected,
     Guided,
     Heuristic,
@@ -29,6 +31,9 @@ from cuelearner_jax.policies import (
     Teaching,
     Uniform,
     best_actions,
+    describe,
+    lanes_in,
+    layers,
 )
 from cuelearner_jax.spaces import directions
 
@@ -39,7 +44,7 @@ BEST = directions.rotate(OBS, 0.6)
 KEY = jax.random.key(5)
 Q = q_network(probes.AGENT.q_layers)
 AGENT = Agent(Q.init(jax.random.key(1), jnp.zeros(2), jnp.zeros(2)), probes.FUNCTIONS)
-LANES, MESH = 3, lane_mesh()
+LANES, MESH = 4, lane_mesh()
 
 
 def act(policy, key=KEY, obs=OBS):
@@ -216,9 +221,9 @@ def test_a_finished_agent_teaches_what_it_does():
 
 @cache
 def block():
-    """Three lanes of one program, each with its own network and its own fitted model."""
-    program = probes.window_program("relative", 10)
-    state = probes.start(program, [0, 1, 2], [10] * LANES)
+    """Four lanes of one program, each with its own network and its own fitted model."""
+    program = probes.window_program("relative")
+    state = probes.start(program, [0, 1, 2, 3], [10] * LANES)
     _, state = program.label_round(ENV, EXPERT, probes.SCALARS, start_clock(), state)
     return state
 
@@ -245,7 +250,7 @@ BLOCKS = {
 def test_a_block_is_evaluated_as_each_of_its_lanes(name):
     policy = BLOCKS[name]()
     together = evaluate_lanes(ENV, policy, KEY, mesh=MESH, num_envs=20, steps=400)
-    alone = [evaluate_policy(ENV, one_lane(policy, lane), KEY, 20, 400) for lane in range(LANES)]
+    alone = [evaluate_policy(ENV, policy.lane(lane), KEY, 20, 400) for lane in range(LANES)]
     assert together.keys() == alone[0].keys()
     for metric, values in together.items():
         assert values.shape == (LANES,)
@@ -255,9 +260,24 @@ def test_a_block_is_evaluated_as_each_of_its_lanes(name):
 
 def test_one_lane_has_its_own_leaves_and_what_all_share():
     policy = guided(agents())
-    one = one_lane(policy, 2)
+    one = policy.lane(2)
     chex.assert_trees_all_equal(one.base.params, jax.tree.map(lambda leaf: leaf[2], policy.base.params))
     chex.assert_trees_all_equal(one.model, jax.tree.map(lambda leaf: leaf[2], policy.model))
-    chex.assert_trees_all_equal((one.env, one.scalars), (policy.env, policy.scalars))
+    chex.assert_trees_all_equal((one.view, one.scalars), (policy.view, policy.scalars))
     assert one.guidance is policy.guidance
     assert one.base.functions == policy.base.functions
+    chex.assert_trees_all_equal(policy.lane(np.array([2, 0])).lane(0), one)
+    assert (lanes_in(policy), lanes_in(Common(policy)), lanes_in(Uniform())) == (LANES, None, None)
+    assert Common(one).lane(1) is one
+
+
+def test_every_policy_says_what_it_is():
+    told = guided(Common(agents())).describe()
+    assert [layer["policy"] for layer in layers(told)] == ["guided", "agent"]
+    assert (told["guidance"], told["bounded"]) == ("relative", False)
+    assert told["base"]["agent"]["q_layers"] == [32, 32]
+    assert json.loads(json.dumps(told)) == told
+    asking = Corrected(Taught(EXPERT), EXPERT, probes.SCALARS)
+    assert [layer["asks"] for layer in layers(asking.describe())] == [True, True]
+    assert describe(Opaque(np.sin)) == {"policy": "code", "named": "sin"}
+    assert describe(EXPERT) == {"policy": "code", "named": "Expert"}

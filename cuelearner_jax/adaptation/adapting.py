@@ -24,7 +24,7 @@ from cuelearner_jax.environment import Environment, actions_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import Rolled, Tell, untold
 from cuelearner_jax.guides.base import Guide
-from cuelearner_jax.policies import Guided, Policy, named
+from cuelearner_jax.policies import Guided, Policy, PolicyBlock, lanes_in, named
 from cuelearner_jax.spaces import DIRECTIONS, Space
 from cuelearner_jax.types import Label, Teacher
 
@@ -56,7 +56,7 @@ class Adaptation:
     sizes: GuideSizes  # that the guidance was made with
     scalars: Scalars
     env: Environment  # the changed world, in which is asked
-    bases: Policy  # a block of base policies, or `Common`
+    bases: PolicyBlock  # a block of base policies, or `Common`
     lanes: Lanes
     judging: Judging
 
@@ -265,10 +265,10 @@ class _Measuring:
         assert env is not None
         return program.adapted(work.guidance, work.sizes, env, work.scalars, work.bases, block)
 
-    def _measured(self, policy: Policy, what: str) -> Rolled:
+    def _measured(self, policy: PolicyBlock, what: str) -> Rolled:
         how = self.work.judging
         assert how.env is not None
-        mesh = self.mesh if not isinstance(policy, judging.Common) else None
+        mesh = None if lanes_in(policy) is None else self.mesh
         if policy is self.work.bases:
             mesh = None  # there may be another number of them
         return judging.measured(how.env, policy, how.num_envs, how.steps, how.split, mesh, self.watch(what))

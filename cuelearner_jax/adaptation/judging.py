@@ -23,7 +23,7 @@ from cuelearner_jax.environment import Environment, actions_of
 from cuelearner_jax.errors import UserError, closest
 from cuelearner_jax.evaluate import Rolled, Tell, episodes, mean_interval, roll_lanes, untold, watched, watched_lanes
 from cuelearner_jax.guides.base import Guide
-from cuelearner_jax.policies import Common, Policy
+from cuelearner_jax.policies import PolicyBlock, lanes_in
 from cuelearner_jax.spaces import Space, said
 from cuelearner_jax.types import Label
 
@@ -66,7 +66,7 @@ def steps_played(env: Environment, by: str, rolled: Rolled, steps: int) -> np.nd
 
 def measured(
     env: Environment,
-    policy: Policy,
+    policy: PolicyBlock,
     num_envs: int,
     steps: int,
     split: str = "tuning",
@@ -77,15 +77,15 @@ def measured(
 
     Args:
         env: the changed world, of that split.
-        policy: a block, or `Common`.
+        policy: a block, or one policy for all lanes.
         num_envs, steps: as `evaluate.rollout` has them.
         split: see `evaluate.SPLITS`.
         mesh: devices that share the lanes (default: one).
         tell: is told how far it is.
     """
     key = episodes(split)
-    if isinstance(policy, Common):
-        found = watched(env, policy.policy, key, num_envs, steps, tell)
+    if lanes_in(policy) is None:
+        found = watched(env, policy, key, num_envs, steps, tell)
         return jax.tree.map(lambda leaf: np.asarray(leaf)[None], found)
     if mesh is not None and mesh.size > 1:
         return jax.device_get(roll_lanes(env, policy, key, mesh=mesh, num_envs=num_envs, steps=steps))

@@ -35,10 +35,9 @@ from cuelearner_jax import asking
 from cuelearner_jax.agents.networks import all_finite
 from cuelearner_jax.config import GuideSizes, Scalars
 from cuelearner_jax.devices import BY_LANE, SHARED, each_lane, lane_mesh, over_lanes
-from cuelearner_jax.environment import Environment, actions_of
-from cuelearner_jax.evaluate import one_lane
+from cuelearner_jax.environment import Environment, actions_of, view_of
 from cuelearner_jax.guides.base import Guide
-from cuelearner_jax.policies import Guided, Policy
+from cuelearner_jax.policies import Guided, PolicyBlock
 from cuelearner_jax.storage.room import check_room
 from cuelearner_jax.types import GuideState, Label, Teacher
 
@@ -148,7 +147,7 @@ def _ask_round(
 ) -> Adapting:
     def of_device(env: Any, teacher: Any, scalars: Any, bases: Any, block: Adapting) -> Adapting:
         def one(lane: Adapting) -> Adapting:
-            base = one_lane(bases, lane.base)
+            base = bases.lane(lane.base)
             guide = asking.label_round(
                 guidance, sizes, env, teacher, scalars, base, lane.guide, lane.key, bound=lane.bound
             )
@@ -165,7 +164,7 @@ def ask_round(
     env: Environment,
     teacher: Teacher,
     scalars: Scalars,
-    bases: Policy,
+    bases: PolicyBlock,
     block: Adapting,
     mesh: Mesh | None = None,
 ) -> Adapting:
@@ -201,7 +200,7 @@ def _take(
     def of_device(env: Any, scalars: Any, bases: Any, labels: Label, block: Adapting) -> Adapting:
         def one(labels: Label, lane: Adapting) -> Adapting:
             if guidance.kind.sees_base:  # files do not keep what the base policy does: it tells again
-                labels = labels.replace(base=one_lane(bases, lane.base).act(lane.key, None, labels.obs))
+                labels = labels.replace(base=bases.lane(lane.base).act(lane.key, None, labels.obs))
             guide = lane.guide.replace(labels=labels, asked=lane.guide.budget)
             last = (lane.guide.budget - 1) // sizes.labels_per_round  # the fit that follows the last round
             return _kept_finite(lane, asking.fit(guidance, env, scalars, guide, lane.key, last))
@@ -216,7 +215,7 @@ def take_labels(
     sizes: GuideSizes,
     env: Environment,
     scalars: Scalars,
-    bases: Policy,
+    bases: PolicyBlock,
     labels: Label,
     block: Adapting,
     mesh: Mesh | None = None,
@@ -230,14 +229,14 @@ def take_labels(
     return _take(guidance, sizes, mesh, env, scalars, bases, labels, block)
 
 
-def blame(bases: Policy, teacher: Teacher | None, block: Adapting) -> None:
+def blame(bases: PolicyBlock, teacher: Teacher | None, block: Adapting) -> None:
     """Raises UserError if the first lane, which failed, did so for its policy or its teacher (see `asking.blame`)."""
     lane = jax.tree.map(lambda leaf: leaf[0], block)
-    asking.blame(teacher, lane.guide, one_lane(bases, lane.base), lane.key)
+    asking.blame(teacher, lane.guide, bases.lane(lane.base), lane.key)
 
 
 def adapted(
-    guidance: Guide, sizes: GuideSizes, env: Environment, scalars: Scalars, bases: Policy, block: Adapting
+    guidance: Guide, sizes: GuideSizes, env: Environment, scalars: Scalars, bases: PolicyBlock, block: Adapting
 ) -> Guided:
     """Every lane's policy: its base's actions under its model, within its bound.
 
@@ -245,5 +244,5 @@ def adapted(
         guidance, sizes, scalars, bases, block: as for `ask_round`.
         env: how observations look from actions; nobody asks it in the raw frame.
     """
-    base = one_lane(bases, block.base)  # a row a lane
-    return Guided(base, block.guide.model, env, scalars, guidance, block.bound, sizes)
+    base = bases.lane(block.base)  # a row a lane
+    return Guided(base, block.guide.model, view_of(env), scalars, guidance, block.bound, sizes)

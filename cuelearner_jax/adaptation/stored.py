@@ -1,21 +1,13 @@
 """Policies as plain values and arrays, and back.
 
-A policy is told as nested JSON values, each with the name of what acts under `policy`:
-
-| policy      | other values                                                                     | arrays             |
-|-------------|----------------------------------------------------------------------------------|--------------------|
-| `agent`     | `agent` (its options), `frame`                                                   | `params`           |
-| `heuristic` |                                                                                  |                    |
-| `uniform`   |                                                                                  |                    |
-| `guided`    | `guidance` (its kind), `sizes`, `scalars`, `bounded`, and `base`: another policy | `model`, `bound`   |
-| `code`      | `named`: package.module:NAME, or how Python calls it                             |                    |
+A policy's values are those of its `describe()`. Kept are an `agent` with its `params`; `guided` with its `model` and,
+where there is one, its `bound`; `uniform`; `heuristic`; and the name of `code`, as package.module:NAME.
 
 Code is never loaded because a file names it: whoever opens the policy gives it again.
 """
 
 from __future__ import annotations
 
-import dataclasses
 from typing import Any, get_args
 
 import jax
@@ -25,17 +17,17 @@ from cuelearner_jax import config as configuration
 from cuelearner_jax.agents.protocol import AgentFunctions
 from cuelearner_jax.agents.registry import AGENTS
 from cuelearner_jax.config import Frame, GuideSizes, Scalars, check_guide, check_part
-from cuelearner_jax.environment import Spaces, offers, spaces_of
+from cuelearner_jax.environment import Spaces, offers, spaces_of, view_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.guides.base import NAME
-from cuelearner_jax.policies import Agent, Common, Corrected, Guided, Heuristic, Taught, uniform_in
-from cuelearner_jax.policies import Uniform as UniformPolicy
-from cuelearner_jax.run_config import kind_from_json, kind_to_json, part_from_json, part_to_json
+from cuelearner_jax.policies import Agent, Guided, Heuristic, describe, layers, uniform_in
+from cuelearner_jax.run_config import kind_from_json, part_from_json
 
 Told = dict[str, Any]
 KINDS = ("agent", "uniform", "heuristic", "guided", "code")
 PARTS = ((GuideSizes, "sizes"), (Scalars, "scalars"))  # of a guided policy's values
+DERIVED = ("clip_radius_deg", "fitted")  # of a description: the other values and the arrays say them already
 MOST_LAYERS = 16  # of a policy that was adapted again and again
 
 
@@ -49,37 +41,19 @@ def told(policy: Any, named: str | None = None) -> Told:
     Raises:
         UserError: it asks a teacher, or is refined in a way that cannot be kept.
     """
-    if isinstance(policy, Common):
-        return told(policy.policy, named)
-    if isinstance(policy, Agent):
-        own = {"agent": part_to_json(policy.functions.options), "frame": policy.functions.frame}
-        return {"policy": "agent", **own}
-    if isinstance(policy, UniformPolicy):
-        return {"policy": "uniform"}
-    if isinstance(policy, Heuristic):
-        return {"policy": "heuristic"}
-    if isinstance(policy, Taught | Corrected):
-        raise UserError("a policy that asks a teacher cannot be kept in a folder: give one that acts by itself")
-    if isinstance(policy, Guided):
-        if policy.sizes is None:
+    described = describe(policy)
+    for layer in layers(described):
+        if layer.get("asks"):
+            raise UserError("a policy that asks a teacher cannot be kept in a folder: give one that acts by itself")
+        if layer["policy"] not in KINDS:
+            raise UserError(f"a policy of kind {layer['policy']} cannot be kept in a folder: give another")
+        if layer["policy"] == "guided" and layer["sizes"] is None:
             raise UserError("a policy under a guidance of unknown sizes cannot be kept in a folder: give them as sizes")
-        return {
-            "policy": "guided",
-            "guidance": policy.guidance.name,
-            "sizes": _part(GuideSizes, policy.sizes),
-            "options": kind_to_json(policy.guidance.options),
-            "scalars": _part(Scalars, policy.scalars),
-            "bounded": policy.bound is not None,
-            "base": told(policy.base, named),
-        }
-    return {"policy": "code", "named": named or "code"}
-
-
-def _part(kind: type, values: Any) -> Told:
-    """The fields of a configuration class, of an instance of it or of one that has more."""
-    return configuration.to_json(
-        kind(**{field.name: getattr(values, field.name) for field in dataclasses.fields(kind)})
-    )
+        if layer["policy"] == "code":
+            layer["named"] = named or "code"
+        for name in DERIVED:
+            layer.pop(name, None)
+    return described
 
 
 def check(values: Told, outermost: bool = True, depth: int = MOST_LAYERS) -> None:
@@ -114,11 +88,10 @@ def check(values: Told, outermost: bool = True, depth: int = MOST_LAYERS) -> Non
 
 def arrays_of(policy: Any) -> Any:
     """The arrays of a policy, or of a block of them."""
-    if isinstance(policy, Common):
-        return arrays_of(policy.policy)
-    if isinstance(policy, Agent):
+    kind, policy = describe(policy)["policy"], getattr(policy, "policy", policy)  # that `Common` holds
+    if kind == "agent":
         return {"params": policy.params}
-    if isinstance(policy, Guided):
+    if kind == "guided":
         bound = {} if policy.bound is None else {"bound": policy.bound}
         return {"base": arrays_of(policy.base), "model": policy.model, **bound}
     return {}
@@ -165,17 +138,17 @@ def made(values: Told, arrays: Any, env: Any, code: Any = None) -> Any:
     """
     kind = values["policy"]
     if kind == "agent":
-        return Agent(arrays["params"], _agent(values, spaces_of(env)), env)
+        return Agent(arrays["params"], _agent(values, spaces_of(env)), view_of(env))
     if kind == "uniform":
         return uniform_in(env)
     if kind == "heuristic":
         if not offers(env, "heuristic"):
             raise UserError("the policy is the task's heuristic, and this world has none: choose another world")
-        return Heuristic(env)
+        return Heuristic(view_of(env))
     if kind == "guided":
         base = made(values["base"], arrays["base"], env, code)
         sizes, scalars = (configuration.from_json(of, values[part]) for of, part in PARTS)
-        return Guided(base, arrays["model"], env, scalars, _guidance(values, env), arrays.get("bound"), sizes)
+        return Guided(base, arrays["model"], view_of(env), scalars, _guidance(values, env), arrays.get("bound"), sizes)
     if kind == "code":
         if code is None:
             raise UserError(

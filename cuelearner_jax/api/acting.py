@@ -130,7 +130,7 @@ def load_policy(
 
     Args:
         folder: of the run, or of a sweep in pieces; or the policy folder.
-        policy: "agent", "guided" or another that `cuelearner evaluate --help` lists (default: the trained agent, or the
+        policy: "agent", "guided" or another that `evaluate TASK --help` lists (default: the trained agent, or the
             adapted policy).
         guidance: kind of guidance of the lane (default: the run's last).
         labels: its label budget (default: the largest).
@@ -164,8 +164,7 @@ def load_policy(
     known, name = source.task, policy or source.default_policy
     changed = world.config if world else source.config.task
     source.check(name, changed)
-    env = known.environment(changed)
-    bound_deg = None if bound_deg is None else arguments.amount("bound_deg", bound_deg, actions_of(env))
-    found = trained.one_policy(source, env, changed, name, guidance, labels, seed, bound_deg)
-    observation = shape_of(known, changed).observation
-    return CallablePolicy(found, observation, trained.POLICIES[name].taught, source.config, actions_of(env))
+    shape = shape_of(known, changed)
+    bound_deg = None if bound_deg is None else arguments.amount("bound_deg", bound_deg, actions_of(shape))
+    found = trained.one_policy(source, changed, name, guidance, labels, seed, bound_deg)
+    return CallablePolicy(found, shape.observation, trained.POLICIES[name].taught, source.config, actions_of(shape))

@@ -23,9 +23,7 @@ from cuelearner_jax.api.worlds import World
 from cuelearner_jax.config import GuideSizes, Scalars
 from cuelearner_jax.environment import Environment, actions_of
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.policies import Opaque
 from cuelearner_jax.run_config import RunConfig
-from cuelearner_jax.runs.adapted import alone
 from cuelearner_jax.runs.trained import PolicySource
 from cuelearner_jax.storage import label_files, policy_folders
 from cuelearner_jax.studies import adapt as study
@@ -166,7 +164,7 @@ def adapt(
         raise diverged()
     if not outcome.found.judged.used.all():
         warnings.warn(study.sentences(outcome.found)[0], stacklevel=3)
-    adapted = alone(outcome.found.policy(env), 0)
+    adapted = outcome.found.policy(env).lane(0)
     named = _called(policy) if isinstance(world, World) else None
     trained = RunConfig(source.config.task)
     observation = getattr(env, "observation", ())
@@ -212,6 +210,6 @@ def _shares(given: Any) -> tuple[float, ...]:
 def _called(policy: Any) -> str:
     """How Python calls a policy."""
     inner = as_policy(policy)
-    inner = inner.function if isinstance(inner, Opaque) else inner
+    inner = getattr(inner, "function", inner)
     name = getattr(inner, "__qualname__", type(inner).__qualname__)
     return f"{getattr(inner, '__module__', type(inner).__module__)}:{name}"

@@ -26,7 +26,7 @@ from cuelearner_jax.api import arguments
 from cuelearner_jax.api.acting import CallablePolicy, as_policy, as_policy_in, entries_of
 from cuelearner_jax.api.worlds import World, a_world
 from cuelearner_jax.config import GuideSizes, Scalars, check_guide
-from cuelearner_jax.environment import Quantity, Spaces, actions_of, spaces_of
+from cuelearner_jax.environment import Quantity, Spaces, actions_of, spaces_of, view_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.feedback import given
 from cuelearner_jax.feedback.answers import RELATIVE, check_teacher
@@ -201,7 +201,7 @@ def refine(policy: Any, model: FeedbackModel, bound_deg: float | None = None) ->
             stacklevel=2,
         )
     bound = space.from_unit(reach if bound_deg is None else bound_deg)
-    guided = Guided(base, model.model, model.env, model.scalars, model.guidance, bound, model.sizes)
+    guided = Guided(base, model.model, view_of(model.env), model.scalars, model.guidance, bound, model.sizes)
     return CallablePolicy(guided, policy.observation if seen else (Quantity("observation", width, ""),), actions=space)
 
 

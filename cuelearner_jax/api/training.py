@@ -17,8 +17,9 @@ from cuelearner_jax.api import arguments
 from cuelearner_jax.api.acting import CallablePolicy
 from cuelearner_jax.api.worlds import World, a_world
 from cuelearner_jax.devices import SHARED, lane_mesh, place
+from cuelearner_jax.environment import view_of
 from cuelearner_jax.errors import UserError, closest
-from cuelearner_jax.evaluate import SPLITS, one_lane
+from cuelearner_jax.evaluate import SPLITS
 from cuelearner_jax.guides import registry
 from cuelearner_jax.policies import Agent
 from cuelearner_jax.run_config import RunConfig, check
@@ -65,8 +66,8 @@ class Run:
             raise UserError(f"no lane with seed {wanted} and {budget} labels was trained")
         params = [block.agent.params for block in training.blocks]
         joined = jax.tree.map(lambda *leaves: np.concatenate([np.asarray(leaf) for leaf in leaves]), *params)
-        agents = Agent(joined, self.config.agent_in(group.env), group.env)
-        return CallablePolicy(one_lane(agents, int(found[0])), self.world.observation)
+        agents = Agent(joined, self.config.agent_in(group.env), view_of(group.env))
+        return CallablePolicy(agents.lane(int(found[0])), self.world.observation)
 
 
 @user_code.told

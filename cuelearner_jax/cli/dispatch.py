@@ -23,7 +23,7 @@ from cuelearner_jax import __version__
 from cuelearner_jax.errors import NotFinite, UserError, blamed, closest
 from cuelearner_jax.signals import Interrupted
 
-HELP = ("-h", "--help")
+HELP, HELP_ALL = ("-h", "--help", "--help-all"), "--help-all"
 # Each is a file beside this one with `run(arguments)` and `OPTIONS`, the options of what it does by its full name.
 COMMANDS = (
     *("train", "sweep", "adapt", "evaluate", "report", "render", "label", "labels", "export"),

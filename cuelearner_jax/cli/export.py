@@ -64,7 +64,7 @@ def run(arguments: list[str]) -> None:
     contract.check_request(asked.format, asked.out)
     env = source.task.environment(asked.task)
     policy = trained.one_policy(
-        source, env, asked.task, asked.policy, asked.guidance, asked.labels, asked.seed, asked.bound_deg
+        source, asked.task, asked.policy, asked.guidance, asked.labels, asked.seed, asked.bound_deg, env
     )
     written = contract.write(
         policy,

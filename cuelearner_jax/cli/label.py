@@ -253,7 +253,7 @@ def _base(task: Task, asked: Label[Any], named: str | None, source: PolicySource
         if not offers(env, "aims"):
             raise UserError(f"--questions is {NEAR_AIMS}, but {task.name} has no aims in this world: give {UNIFORM}")
         reach = float(actions_of(env).from_unit(REACH * asked.scalars.eps_deg))
-        return Base(NearAims(task.environment(asked.task), reach), NEAR_AIMS)
+        return Base(NearAims(task.view(asked.task), reach), NEAR_AIMS)
     found = load_policy(source.folder, task=task, world=World(task, asked.task), **dataclasses.asdict(lane))
     if found.observation and tuple(found.observation) != tuple(env.observation):
         raise UserError(f"{source.folder} acts on other observations than this world has: give a policy of this world")

@@ -51,7 +51,7 @@ class Merge:
 
 
 @dataclass(frozen=True)
-class Export:
+class LabelsExport:
     """Labels as a plain table: a row a label, a column a number in CSV, lists in Parquet."""
 
     files: Files
@@ -60,7 +60,7 @@ class Export:
     """The new file, .csv or .parquet; one that is there is not replaced."""
 
 
-OPTIONS = {"labels inspect": Inspect, "labels merge": Merge, "labels export": Export}
+OPTIONS = {"labels inspect": Inspect, "labels merge": Merge, "labels export": LabelsExport}
 KINDS = {name.split()[1]: kind for name, kind in OPTIONS.items()}
 
 
@@ -165,7 +165,7 @@ def _merge(asked: Merge) -> None:
     out.print(f"wrote {len(file.seeds)} labels of {len(asked.files)} files to {asked.out}{twice}")
 
 
-def _export(asked: Export) -> None:
+def _export(asked: LabelsExport) -> None:
     if len(asked.files) != 1:
         raise UserError("export takes one label file: merge several first")
     place = asked.out

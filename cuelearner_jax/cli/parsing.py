@@ -10,6 +10,8 @@ import os
 import re
 import stat
 import tempfile
+import textwrap
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +19,7 @@ import tyro
 from rich.console import Console
 
 from cuelearner_jax import plugins
-from cuelearner_jax.cli.dispatch import HELP
+from cuelearner_jax.cli.dispatch import HELP, HELP_ALL
 from cuelearner_jax.errors import UserError, closest, no_space
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.policies import policy_of
@@ -55,11 +57,19 @@ def parse(kind: Any, arguments: list[str], program: str, default: Any = None, ab
         about: the text above the options (default: the docstring of the dataclass).
     """
     errors = io.StringIO()
-    keywords = {} if default is None else {"default": default}
+    keywords = {
+        "prog": f"cuelearner {program}",
+        "description": about,
+        **({} if default is None else {"default": default}),
+    }
     _check_given(arguments)
+    helped = [argument for argument in arguments if argument in HELP]
     try:
+        if helped and HELP_ALL not in helped:
+            print(_first_page(lambda: tyro.cli(kind, args=["--help"], **keywords), f"cuelearner {program}"))
+            raise SystemExit(0)
         with contextlib.redirect_stderr(errors):
-            asked = tyro.cli(kind, args=arguments, prog=f"cuelearner {program}", description=about, **keywords)
+            asked = tyro.cli(kind, args=["--help"] if helped else arguments, **keywords)
     except SystemExit as stop:
         if not stop.code:
             raise
@@ -92,6 +102,43 @@ def _options(group: Any, prefix: str = "") -> list[str]:
         own = prefix if entry.name in ("run", "kinds") else f"{prefix}{name}."
         found += _options(value, own) if dataclasses.is_dataclass(value) else [f"{prefix}{name}"]
     return found
+
+
+WIDE, NARROW = 118, 99  # columns of a first page, and those within which tyro's help is one column of options
+
+
+def _first_page(tell: Callable[[], Any], program: str) -> str:
+    """What one needs of a help page: what there is to choose from, and the command's own options, a line each.
+
+    Args:
+        tell: prints the whole page, by tyro.
+        program: the command.
+    """
+    whole, before = io.StringIO(), os.environ.get("COLUMNS")
+    os.environ["COLUMNS"] = str(NARROW)
+    try:
+        with contextlib.redirect_stdout(whole), contextlib.suppress(SystemExit):
+            tell()
+    finally:
+        os.environ.pop("COLUMNS") if before is None else os.environ.update(COLUMNS=before)
+    # A page that goes nowhere has boxes of plain characters: a title, a rule, and the options below it.
+    head, *boxes = re.split(r"^ (\S.*?) *\n -{9,} *\n", whole.getvalue(), flags=re.MULTILINE)
+    usage, about, *groups = head.strip().split("\n\n")
+    lines = [*usage.splitlines(), "", *textwrap.wrap(" ".join(about.split()), WIDE)]
+    for title, _, rows in (group.partition(":\n") for group in groups):
+        names = re.findall(r"^  (\S+)", rows, re.MULTILINE)
+        lines += textwrap.wrap(f"{title}: {', '.join(names)}", WIDE, subsequent_indent="  ")
+    others = []
+    for title, box in zip(boxes[::2], boxes[1::2], strict=True):
+        options = re.findall(r"^ {2}(\S.*?) *\n((?: {8}.*\n?)*)", box, re.MULTILINE)
+        if title in ("options", "positional arguments"):
+            told = [f"  {name}  {' '.join(text.split())}".rstrip() for name, text in options if "--help" not in name]
+            cut = (line if len(line) <= WIDE else f"{line[: WIDE - 4].rstrip()} ..." for line in told)
+            lines += ["", f"{title}:", *(line.replace("{None}|", "") for line in cut)]
+        else:
+            others.append(f"{title} ({sum(name.startswith('--') for name, _ in options)})")
+    whole_page = f"The whole page, with {', '.join(others) or 'all of each line'}: {program} {HELP_ALL}"
+    return "\n".join([*lines, "", *textwrap.wrap(whole_page, WIDE, break_on_hyphens=False)])
 
 
 def _check_given(arguments: list[str]) -> None:
@@ -153,7 +200,8 @@ def task_of(arguments: list[str], command: str, kind: type) -> tuple[Task, list[
     given, rest = _task_option(arguments)
     if given is None:
         if not rest or rest[0] in HELP:
-            print(f"usage: cuelearner {command} TASK [--preset NAME] [OPTIONS]\n\n{summary(kind)}\n\n{_tasks()}\n")
+            told = _tasks(HELP_ALL in rest)
+            print(f"usage: cuelearner {command} TASK [--preset NAME] [OPTIONS]\n\n{summary(kind)}\n\n{told}\n")
             print(f"options and their defaults: cuelearner {command} TASK --help")
             raise SystemExit(0 if arguments else 2)
         given, rest = rest[0], rest[1:]
@@ -186,7 +234,7 @@ def source_of(arguments: list[str], command: str, kind: type) -> tuple[PolicySou
     reference, rest = taken(rest, "--base", "package.module:NAME")
     code = None if reference is None else code_of(reference)
     if known is None and (not rest or rest[0] in HELP):
-        print(f"usage: cuelearner {command} FOLDER|TASK [OPTIONS]\n\n{summary(kind)}\n\n{_tasks()}\n")
+        print(f"usage: cuelearner {command} FOLDER|TASK [OPTIONS]\n\n{summary(kind)}\n\n{_tasks(HELP_ALL in rest)}\n")
         print(f"options and their defaults: cuelearner {command} {registry.names()[0]} --help")
         raise SystemExit(0 if arguments else 2)
     if rest and (known is None or not rest[0].startswith("-")):
@@ -256,8 +304,8 @@ def _of_folder(folder: Path, known: Task | None, code: Any) -> PolicySource:
     return source
 
 
-def _tasks() -> str:
-    """Every task with what there is to choose from."""
+def _tasks(whole: bool) -> str:
+    """Every task, a line each; the `whole` of it with what there is to choose from."""
     told = []
     for name in registry.names():
         try:
@@ -265,7 +313,7 @@ def _tasks() -> str:
         except UserError as error:  # of a package that is damaged: the others can still be named
             told.append(f"task {name}: {error}\n")
             continue
-        told.append(f"task {name}: {task.about}\n\n{_choices(task)}\n")
+        told.append(f"task {name}: {task.about}" + (f"\n\n{_choices(task)}\n" if whole else ""))
     return "\n".join([*told, "a task of your own: package.module:NAME, also as --task package.module:NAME"])
 
 

@@ -73,7 +73,7 @@ def run(arguments: list[str]) -> None:
     filming.check_free(*wanted, overwrite=asked.overwrite)
     env = source.task.environment(asked.task, "validation")
     policy = trained.one_policy(
-        source, env, asked.task, asked.policy, asked.guidance, asked.labels, asked.seed, asked.bound_deg
+        source, asked.task, asked.policy, asked.guidance, asked.labels, asked.seed, asked.bound_deg, env
     )
     if asked.question:
         filming.question(pictures, env, policy, asked.episode, files.question)

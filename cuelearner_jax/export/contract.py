@@ -3,12 +3,13 @@
 contract.json    what goes in and what comes out, with units; versions; digests of the other files and of itself
 decision.*       the decision
 golden.npz       observations (cases, obs) and the actions (cases, action) that JAX decided on
-decide.py        runs the decision; a copy of `runner`
+decide.py        runs the decision: `runner`, with `operations` in place of their import
 """
 
 from __future__ import annotations
 
 import hashlib
+import inspect
 import io
 import itertools
 import json
@@ -23,10 +24,10 @@ from jaxtyping import Float
 
 from cuelearner_jax.environment import Quantity
 from cuelearner_jax.errors import UserError, closest
-from cuelearner_jax.export import runner
-from cuelearner_jax.export.decisions import TOLERANCE, clip_radius_deg, described, golden_cases
+from cuelearner_jax.export import operations, runner
+from cuelearner_jax.export.decisions import TOLERANCE, golden_cases
 from cuelearner_jax.export.formats import FORMATS, traced
-from cuelearner_jax.policies import Policy
+from cuelearner_jax.policies import Policy, describe
 from cuelearner_jax.storage.provenance import provenance
 from cuelearner_jax.storage.whole import Place, is_used, place_of, replacing
 
@@ -93,10 +94,11 @@ def _made(
     golden = golden_cases(policy, drawn())
     cases = io.BytesIO()
     np.savez(cases, obs=golden.obs, actions=golden.actions)
+    values = describe(policy)
     files = {
         artefact.file: artefact.contents,
         runner.GOLDEN: cases.getvalue(),
-        "decide.py": Path(runner.__file__).read_bytes(),
+        "decide.py": decide_source(),
     }
     contract = {
         "version": runner.VERSION,
@@ -109,10 +111,10 @@ def _made(
             "about": action.about,
             "dtype": "float32",
             "angle": ANGLE,
-            "clip_radius_deg": clip_radius_deg(policy),
+            "clip_radius_deg": values.get("clip_radius_deg"),
         },
         "batch": "observations (n, size), any n; every row is decided by itself",
-        "policy": described(policy),
+        "policy": values,
         "source": source,
         "golden": {
             "cases": len(golden.obs),
@@ -124,6 +126,13 @@ def _made(
         **provenance(),
     }
     return {**contract, "difference": _written(place, files, contract)}
+
+
+def decide_source() -> bytes:
+    """`runner` with the contents of `operations` in place of their import: one file that needs NumPy alone."""
+    own, other = (inspect.getsource(module) for module in (runner, operations))
+    imported = "from cuelearner_jax.export.operations import ContractError, compiled\n"
+    return own.replace(imported, other.partition("from __future__ import annotations\n\n")[2]).encode()
 
 
 def _slices(observation: Sequence[Quantity]) -> list[dict[str, Any]]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from cuelearner_jax import user_code
 from cuelearner_jax.environment import Environment
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.policies import Agent, Common, Guided, Policy, named
+from cuelearner_jax.policies import Policy, describe, layers, named
 
 TOLERANCE = 1e-5  # by which an entry of an action may differ elsewhere
 NUDGE = 1e-6  # of an entry of an observation, as much as rounding may do
@@ -27,9 +27,8 @@ def decision_of(policy: Policy) -> Callable[[PRNGKeyArray, Array], Array]:
 
     Raises UserError for a policy that looks at more than observations.
     """
-    for layer in layers(policy):
-        if hasattr(layer, "teacher"):
-            raise UserError("this policy asks a teacher, who looks at the true state: export one that does not")
+    if any(layer.get("asks") for layer in layers(describe(policy))):
+        raise UserError("this policy asks a teacher, who looks at the true state: export one that does not")
     return lambda key, obs: policy.act(key, None, obs[None])[0]
 
 
@@ -37,41 +36,6 @@ def row_by_row(policy: Policy) -> Callable[[Float[Array, "n obs"]], Float[Array,
     """The decision about each of a batch: none hangs on the others, whatever their number."""
     decide = decision_of(policy)
     return lambda batch: jax.lax.map(lambda obs: decide(jax.random.key(0), obs), batch)
-
-
-def layers(policy: Any) -> Iterator[Any]:
-    """A policy, the one whose actions it changes, and so on."""
-    while policy is not None:
-        yield policy
-        policy = policy.policy if isinstance(policy, Common) else getattr(policy, "base", None)
-
-
-def described(policy: Policy) -> list[dict[str, Any]]:
-    """What a policy is made of, the last word first; angles in degrees."""
-    return [_described(layer) for layer in layers(policy)]
-
-
-def _described(layer: Any) -> dict[str, Any]:
-    if isinstance(layer, Guided):
-        scalars = layer.scalars
-        bound = 180.0 if layer.bound is None else float(np.rad2deg(layer.bound))
-        return {
-            "layer": "guided",
-            "guidance": layer.guidance.name,
-            "fitted": bool(np.all(layer.model.fitted)),
-            "eps_deg": float(scalars.eps_deg),
-            "tau_deg": float(scalars.tau_deg),
-            "most_passes": int(scalars.k_max),
-            "clip_radius_deg": min(float(scalars.tau_max_deg), bound),
-        }
-    if isinstance(layer, Agent):
-        return {"layer": "agent", **layer.functions.described}
-    return {"layer": type(layer).__name__.lower()}
-
-
-def clip_radius_deg(policy: Policy) -> float | None:
-    """How far the last layer may lead from the action below it [deg]; None: there is none, or no bound."""
-    return described(policy)[0].get("clip_radius_deg")
 
 
 def observations(env: Environment, policy: Policy, count: int = WALKERS * STEPS) -> Float[np.ndarray, "n obs"]:

@@ -1,8 +1,8 @@
 """A function of one observation as a graph of few plain operations, which NumPy and ONNX can run.
 
-JAX traces the function; its calls are inlined, whatever does not hang on the observation is computed once, and what is
-left becomes the operations that `runner.OPERATIONS` lists. All shapes are fixed, for it is one observation: a batch is
-decided row by row.
+JAX traces the function; its calls are inlined, whatever does not depend on the observation is computed once, and what
+is left becomes the operations that `operations.OPERATIONS` lists. All shapes are fixed, for it is one observation: a
+batch is decided row by row.
 """
 
 from __future__ import annotations

@@ -186,7 +186,7 @@ def _sliced(w: _Writer, x: str, start: list[int], stop: list[int], step: list[in
     return w.node("Slice", x, w.whole(start), w.whole(stop), w.whole(range(len(start))), w.whole(step))
 
 
-# By the names of `runner.OPERATIONS`: (writer, names of inputs, attributes) -> name of the output.
+# By the names of `operations.OPERATIONS`: (writer, names of inputs, attributes) -> name of the output.
 NODES: dict[str, Callable[..., str]] = {
     **{
         name.lower(): _plain(name)

@@ -1,4 +1,4 @@
-"""How each operation of JAX is said by those of `runner.OPERATIONS`: one rule a primitive, by its name."""
+"""How each operation of JAX is said by those of `operations.OPERATIONS`: one rule a primitive, by its name."""
 
 from __future__ import annotations
 

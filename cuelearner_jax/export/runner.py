@@ -1,4 +1,4 @@
-"""Runs a decision that `cuelearner export` wrote; a copy of this file lies beside every decision as `decide.py`.
+"""Runs a decision that `cuelearner export` wrote; lies beside every decision as `decide.py`, with `operations` in it.
 
     from decide import Decision
     decide = Decision("folder")        # verifies every file against the contract
@@ -12,16 +12,15 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
-import operator
 import threading
 import zipfile
-from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from cuelearner_jax.export.operations import ContractError, compiled
 
 CONTRACT, GOLDEN = "contract.json", "golden.npz"
 VERSION = 1  # of contracts and graphs
@@ -29,15 +28,7 @@ DIGEST = "digest"  # the name under which a contract holds the digest of its oth
 VECTORS = ("observation", "action")
 MOST = 1 << 20  # entries of an observation or an action, and golden cases
 LARGEST_CONTRACT, LARGEST_FILE = 1 << 26, 1 << 30  # bytes, unpacked
-LARGEST_ARRAY = 1 << 28  # entries that an operation makes of fewer
 LOOSEST = 1e-2  # tolerance that still says that two actions are one
-
-Values = dict[str, np.ndarray]
-Run = Callable[[Values], None]
-
-
-class ContractError(ValueError):
-    """A folder that holds no sound decision, or an observation that is not what its contract says. One line."""
 
 
 class Decision:
@@ -278,268 +269,4 @@ RUNNERS: dict[str, Callable[[Path, dict[str, Any]], Batch]] = {
     "numpy": _of_numpy,
     "onnx": _of_onnx,
     "stablehlo": _of_stablehlo,
-}
-
-
-def compiled(ops: list[list[Any]], kept: set[str] | None = None) -> Run:
-    """A graph's operations as one function, which adds their results to the values it is given.
-
-    Args:
-        ops: each [name, inputs, outputs, attributes]; see `OPERATIONS`, `SETTLED`, `_loop` and `_highest`.
-        kept: what is looked at afterwards; given, large results are written where they were in the call before.
-    """
-    steps: list[Run] = []
-    for name, inputs, outputs, attributes in ops if kept is None else _joined(ops, kept):
-        if name == "while":
-            steps.append(_loop(inputs, outputs, **attributes))
-        elif name == "top_k":
-            steps.append(_highest(inputs[0], *outputs, **attributes))
-        elif name in SETTLED:
-            steps.append(_step(SETTLED[name](**attributes), inputs, outputs[0]))
-        elif name not in OPERATIONS and name != "layer":
-            raise ContractError(f"this decision has an operation {name!r}, which this runner does not know: update it")
-        elif kept is not None and name in INTO:
-            steps.append(_into(INTO[name], inputs, outputs[0]))
-        else:
-            steps.append(_step(OPERATIONS[name], inputs, outputs[0]))
-
-    def run(values: Values) -> None:
-        for step in steps:
-            step(values)
-
-    return run
-
-
-def _step(function: Callable[..., Any], inputs: list[str], output: str) -> Run:
-    if len(inputs) == 1:
-        (only,) = inputs
-
-        def step(values: Values) -> None:
-            values[output] = function(values[only])
-    elif len(inputs) == 2:
-        one, other = inputs
-
-        def step(values: Values) -> None:
-            values[output] = function(values[one], values[other])
-    else:
-
-        def step(values: Values) -> None:
-            values[output] = function(*[values[name] for name in inputs])
-
-    return step
-
-
-def _joined(ops: list[list[Any]], kept: set[str]) -> list[list[Any]]:
-    """Bias, rectifier and the product that follows, where nothing else looks at what is between, as one operation."""
-    looks = Counter([*_looked_at(ops), *kept])
-    made = {output: op for op in ops for output in op[2]}
-
-    def before(name: str, wanted: str) -> list[list[Any]] | None:
-        """The operation that gives a value, last, and the reshapes that follow it."""
-        passed = []
-        while name in made and looks[name] == 1:
-            passed.append(made[name])
-            if made[name][0] == wanted:
-                return passed
-            if made[name][0] != "reshape":
-                break
-            name = made[name][1][0]
-        return None
-
-    gone, joined = set(), {}
-    for op in ops:
-        if op[0] != "matmul" or not (rectified := before(op[1][0], "max")):
-            continue
-        *inner, floor = rectified[-1][1]
-        if floor in made or not (added := before(inner[0], "add")):
-            continue
-        gone |= {id(each) for each in (*rectified, *added)}
-        joined[id(op)] = ["layer", [*added[-1][1], floor, op[1][1]], op[2], {}]
-    return [joined.get(id(op), op) for op in ops if id(op) not in gone]
-
-
-def _looked_at(ops: list[list[Any]]) -> Iterator[str]:
-    for name, inputs, _, attributes in ops:
-        yield from inputs
-        for part in ("test", "body") if name == "while" else ():
-            yield from attributes[part]["outputs"]
-            yield from _looked_at(attributes[part]["ops"])
-
-
-def _into(function: Callable[..., Any], inputs: list[str], output: str) -> Run:
-    """Writes into one array, call after call: new memory for large ones takes longer than the arithmetic."""
-    own: list[np.ndarray] = []
-
-    def step(values: Values) -> None:
-        given = [values[name] for name in inputs]
-        values[output] = function(*given, out=own[0]) if own else function(*given)
-        if not own and isinstance(values[output], np.ndarray):
-            own.append(values[output])
-
-    return step
-
-
-def _loop(
-    inputs: list[str],
-    outputs: list[str],
-    carried: list[str],
-    kinds: list[Any],
-    test: dict[str, Any],
-    body: dict[str, Any],
-) -> Run:
-    """Repeats `body` on the carried values (of these kinds and shapes) as long as `test` of them holds."""
-    look, work = compiled(test["ops"]), compiled(body["ops"])
-
-    def run(values: Values) -> None:
-        values.update(zip(carried, [values[name] for name in inputs], strict=True))
-        while True:
-            look(values)
-            if not values[test["outputs"][0]]:
-                break
-            work(values)
-            values.update(zip(carried, [values[name] for name in body["outputs"]], strict=True))
-        values.update(zip(outputs, [values[name] for name in carried], strict=True))
-
-    return run
-
-
-def _highest(given: str, largest: str, places: str, k: int) -> Run:
-    """The k largest along the last axis, of equal ones the first, and where they are."""
-
-    def run(values: Values) -> None:
-        x = values[given]
-        order = np.argsort(-x, axis=-1, kind="stable")[..., :k].astype(np.int32)
-        values[largest], values[places] = np.take_along_axis(x, order, -1), order
-
-    return run
-
-
-def _rounded(x: np.ndarray) -> np.ndarray:
-    """To the nearest number that bfloat16 has, ties to even; kept in single precision."""
-    bits = np.atleast_1d(x).view(np.uint32)
-    up = ((bits >> np.uint32(16)) & np.uint32(1)) + np.uint32(0x7FFF)
-    return ((bits + up) & np.uint32(0xFFFF0000)).view(np.float32).reshape(x.shape)
-
-
-def _layer(
-    one: np.ndarray, other: np.ndarray, floor: np.ndarray, weights: np.ndarray, out: np.ndarray | None = None
-) -> np.ndarray:
-    """max(one + other, floor) @ weights. Units of a large layer that no row turns on are left out: a third of them."""
-    row, rows = (one, other) if one.size < other.size else (other, one)
-    width = weights.shape[0]
-    fits = row.shape[-1:] == rows.shape[-1:] == (width,) and row.size == width and weights.ndim == 2
-    if not fits or rows.size < LARGE * width or floor.size != 1 or floor.item() != 0:
-        x = np.maximum(one + other, floor).reshape(*weights.shape[:-2], -1, weights.shape[-2])
-        return np.matmul(x, weights, out=out)
-    rows, row = rows.reshape(-1, width), row.reshape(width)
-    on = np.flatnonzero(rows.max(axis=0) + row > 0)
-    x = rows[:, on]
-    x += row[on]
-    return np.matmul(np.maximum(x, 0, out=x), weights[on], out=out)
-
-
-def _argument(function: Callable[..., Any]) -> Callable[..., Any]:
-    return lambda axis: lambda x: np.asarray(function(x, axis=axis), np.int32)
-
-
-def _reduction(function: np.ufunc) -> Callable[..., Any]:
-    return lambda axes: lambda x, axis=tuple(axes): function.reduce(x, axis, x.dtype)
-
-
-def _slices(start: list[int], stop: list[int], step: list[int]) -> Callable[..., Any]:
-    return operator.itemgetter(tuple(slice(*each) for each in zip(start, stop, step, strict=True)))
-
-
-def _spread(shape: list[int]) -> Callable[..., Any]:
-    _check_entries(math.prod(shape))
-    return lambda x: np.broadcast_to(x, shape)
-
-
-def _check_entries(count: int) -> None:
-    if count > LARGEST_ARRAY:
-        raise ContractError(f"this decision makes an array of {count:,} entries: export the policy anew")
-
-
-def _filling(low: list[int], high: list[int]) -> Callable[..., Any]:
-    _check_entries(max([*low, *high], default=0))
-    return lambda x, value: np.pad(x, list(zip(low, high, strict=True)), constant_values=value)
-
-
-def _quotient(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Rounded toward zero where both are whole."""
-    return np.asarray(np.trunc(np.true_divide(x, y)), x.dtype) if x.dtype.kind in "iu" else np.divide(x, y)
-
-
-ONE = np.float32(1)
-LARGE = 32  # rows
-
-# Of arrays in single precision, int32 or bool; all shapes are fixed. Elementwise ones take equal or broadcast shapes.
-OPERATIONS: dict[str, Callable[..., Any]] = {
-    "neg": np.negative,
-    "abs": np.abs,
-    "sign": np.sign,
-    "floor": np.floor,
-    "ceil": np.ceil,
-    "round": np.rint,  # halves to the even one
-    "exp": np.exp,
-    "log": np.log,
-    "log1p": np.log1p,
-    "expm1": np.expm1,
-    "sin": np.sin,
-    "cos": np.cos,
-    "tan": np.tan,
-    "tanh": np.tanh,
-    "atan": np.arctan,
-    "sqrt": np.sqrt,
-    "rsqrt": lambda x: ONE / np.sqrt(x),
-    "square": np.square,
-    "logistic": lambda x: ONE / (ONE + np.exp(-x)),
-    "is_finite": np.isfinite,
-    "not": np.logical_not,
-    "bfloat16": _rounded,
-    "add": np.add,
-    "sub": np.subtract,
-    "mul": np.multiply,
-    "div": _quotient,
-    "rem": np.fmod,
-    "pow": np.power,
-    "atan2": np.arctan2,
-    "max": np.maximum,
-    "min": np.minimum,
-    "and": np.logical_and,
-    "or": np.logical_or,
-    "xor": np.logical_xor,
-    "eq": np.equal,
-    "ne": np.not_equal,
-    "lt": np.less,
-    "le": np.less_equal,
-    "gt": np.greater,
-    "ge": np.greater_equal,
-    "select": np.where,  # (which, where true, where false)
-    "take": np.take,  # of x as one row
-    "matmul": np.matmul,
-}
-
-# Those that can write where they are told. A "layer" stands in no file: `_joined` makes it.
-INTO = {name: OPERATIONS[name] for name in ("add", "sub", "mul", "max", "min", "matmul")} | {"layer": _layer}
-
-# Those that have attributes, as what gives their function of the arrays: of small arrays, to settle what is to be done
-# is most of the work.
-SETTLED: dict[str, Callable[..., Callable[..., Any]]] = {
-    "cast": lambda dtype: operator.methodcaller("astype", dtype),
-    "reshape": lambda shape: operator.methodcaller("reshape", tuple(shape)),
-    "transpose": lambda axes: operator.methodcaller("transpose", tuple(axes)),
-    "broadcast": _spread,
-    "concatenate": lambda axis: lambda *parts: np.concatenate(parts, axis),
-    "slice": _slices,
-    "pad": _filling,
-    "sum": _reduction(np.add),
-    "prod": _reduction(np.multiply),
-    "largest": _reduction(np.maximum),
-    "smallest": _reduction(np.minimum),
-    "all": _reduction(np.logical_and),
-    "any": _reduction(np.logical_or),
-    "argmax": _argument(np.argmax),
-    "argmin": _argument(np.argmin),
-    "cumsum": lambda axis: lambda x: np.cumsum(x, axis, dtype=x.dtype),
 }

@@ -16,9 +16,8 @@ from cuelearner_jax.adaptation.adapting import Adapted
 from cuelearner_jax.adaptation.program import Lanes
 from cuelearner_jax.environment import actions_of
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.evaluate import one_lane
 from cuelearner_jax.feedback.forms import AnswerForm
-from cuelearner_jax.policies import Common, Guided
+from cuelearner_jax.policies import Common, Guided, lanes_in
 from cuelearner_jax.runs.grid import LARGEST_BUDGET, LARGEST_SEED, world_of
 from cuelearner_jax.storage import formats, guides, label_files, policy_folders
 from cuelearner_jax.storage.provenance import provenance
@@ -64,7 +63,7 @@ class AdaptedLanes:
         """A block of the lanes' policies. Raises UserError if it cannot be had."""
         values, arrays = self.values["policy"], self._arrays(env)
         base = stored.made(values["base"], arrays["base"], env, self.code)
-        base = Common(base) if self.rows is None else one_lane(base, self.lanes.base)
+        base = Common(base) if self.rows is None else base.lane(self.lanes.base)
         made = stored.made({**values, "base": {"policy": "uniform"}}, arrays, env)
         return replace(made, base=base)
 
@@ -80,12 +79,6 @@ class AdaptedLanes:
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise formats.damaged("policy", self.folder / policy_folders.POLICY) from error
         return policy_folders.read_arrays(self.folder, like, self.values)
-
-
-def alone(policy: Guided, lane: int) -> Guided:
-    """One lane's policy out of a block's, its base as it is."""
-    one = one_lane(policy, lane)
-    return replace(one, base=one.base.policy) if isinstance(one.base, Common) else one
 
 
 def open_folder(folder: Path, find: Callable[[str], Task], code: Any = None) -> tuple[Task, Any, AdaptedLanes]:
@@ -159,8 +152,9 @@ def write(
     env = shape_of(task, world)
     block = adapted.policy(env)
     bases = of.bases
-    rows = None if isinstance(bases, Common) else int(_rows(bases))
-    values = stored.told(replace(block, base=bases), origin.get("code"))
+    rows = lanes_in(bases)
+    block = replace(block, base=bases)
+    values, arrays = stored.told(block, origin.get("code")), stored.arrays_of(block)
     lanes = of.lanes
     described = {
         "task": {"name": task.name, **({"from": task.origin} if task.origin else {}), **configuration.to_json(world)},
@@ -189,19 +183,10 @@ def write(
         "conventions": CONVENTIONS,
         **provenance(),
     }
-    arrays = {**stored.arrays_of(replace(block, base=Common(of.bases))), "base": stored.arrays_of(bases)}
     with place.writing() as folder:
         policy_folders.write(folder, described, arrays)
         _write_labels(folder, adapted, task, world)
         _write_curve(folder, place.folder.name, adapted, task)
-
-
-def _rows(bases: Any) -> int:
-    """How many policies a block has; those that have nothing of their own are shared."""
-    leaves = jax.tree.leaves(stored.arrays_of(bases))
-    if not leaves:
-        raise UserError("base policies without arrays have no rows: share one among all lanes")
-    return leaves[0].shape[0]
 
 
 def _plain(values: np.ndarray) -> list[float | None]:

@@ -121,7 +121,7 @@ def piece_arguments(arguments: list[str], shard: Shard) -> tuple[str, ...]:
 
 
 @dataclass(frozen=True)
-class Piece:
+class PieceJob:
     """One job: a callable that submitit pickles, loads where the job runs, and calls."""
 
     arguments: tuple[str, ...]
@@ -228,7 +228,7 @@ def submit_to_slurm(pieces: dict[Shard, tuple[str, ...]], out: Path, job: Job) -
             **{name: value for name, value in given.items() if value is not None},
         )
         grace = job.notice_s - REQUEUE_S
-        calls = [Piece(arguments, os.getcwd(), grace) for arguments in pieces.values()]
+        calls = [PieceJob(arguments, os.getcwd(), grace) for arguments in pieces.values()]
         with contextlib.redirect_stderr(io.StringIO()):  # submitit prints what it then raises
             jobs = executor.submit_array(calls)
     except (submitit.core.utils.FailedJobError, submitit.core.utils.FailedSubmissionError, FileNotFoundError) as error:

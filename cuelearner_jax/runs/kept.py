@@ -37,6 +37,16 @@ def items(blocks: list[TrainState], clock: Clock, wall: float) -> dict[str, Any]
     }
 
 
+def _clock(saved: Checkpoints, lanes: int) -> tuple[dict[str, Any], int, int]:
+    """The item "clock", the number of blocks and the lanes of each. Raises UserError if there are fewer lanes."""
+    like = {"clock": jax.eval_shape(start_clock), "wall_s": np.float32(0), "cut": np.zeros(2, np.int32)}
+    clock = saved.restore({"clock": like})["clock"]
+    count, size = (int(number) for number in clock["cut"])
+    if size < 1 or count * size < lanes:
+        raise UserError(f"the checkpoint holds {count * size} lanes, the run has {lanes}: start it anew")
+    return clock, count, size
+
+
 def restore(group: LaneGroup, saved: Checkpoints, *names: str, whole: bool = False) -> dict[str, Any]:
     """Items of the newest checkpoint by name, "failed" and "clock". Blocks are cut as they were when it was written.
 
@@ -48,11 +58,7 @@ def restore(group: LaneGroup, saved: Checkpoints, *names: str, whole: bool = Fal
 
     Raises UserError if there is no readable checkpoint or it holds other lanes, or another state of them.
     """
-    shapes = items(group.shapes(), jax.eval_shape(start_clock), 0.0)
-    clock = saved.restore({"clock": shapes["clock"]})["clock"]
-    count, size = (int(number) for number in clock["cut"])
-    if size < 1 or count * size < len(group.seeds):
-        raise UserError(f"the checkpoint holds {count * size} lanes, the run has {len(group.seeds)}: start it anew")
+    clock, count, size = _clock(saved, len(group.seeds))
     cut = np.minimum(np.arange(count * size), len(group.seeds) - 1).reshape(count, size)
     shapes = items(group.shapes_of(cut), jax.eval_shape(start_clock), 0.0)
     if whole:
@@ -138,8 +144,13 @@ def _has_guides(folder: Path) -> bool:
     return any((folder / name).exists() for name in (guides.JSONL, guides.PARQUET))
 
 
-def restore_policies(group: LaneGroup, folder: Path) -> tuple[dict[str, Any], int]:
+def restore_policies(folder: Path, like: Any, lanes: int) -> tuple[dict[str, Any], int]:
     """What the lanes of a run's folder act with, and which have failed and stand at their last finite state.
+
+    Args:
+        folder: of one kind of guidance.
+        like: shapes of one lane's {"params": ..., "guidance": ...}.
+        lanes: their number.
 
     Returns:
         {"params": ..., "guidance": ..., "failed": ...}, leading axis: lanes; their step.
@@ -149,7 +160,9 @@ def restore_policies(group: LaneGroup, folder: Path) -> tuple[dict[str, Any], in
     if not (folder / "checkpoints").is_dir():
         raise UserError(f"no checkpoint in {folder}: train first, or give a run folder that has one")
     with checkpoints(folder / "checkpoints", read_only=True) as saved:
-        found = restore(group, saved, "policy")
+        clock, count, size = _clock(saved, lanes)
+        block = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct((size, *leaf.shape), leaf.dtype), like)
+        found = saved.restore({"policy": [block] * count, "failed": [jax.ShapeDtypeStruct((size,), bool)] * count})
     blocks = [{**policy, "failed": failed} for policy, failed in zip(found["policy"], found["failed"], strict=True)]
-    policies = jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[: len(group.seeds)], *blocks)
-    return policies, int(found["clock"]["clock"].step)
+    policies = jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[:lanes], *blocks)
+    return policies, int(clock["clock"].step)

@@ -19,7 +19,7 @@ from cuelearner_jax.environment import Environment
 from cuelearner_jax.evaluate import Tell, evaluate_lanes, untold, watched_lanes
 from cuelearner_jax.guides.base import Guide
 from cuelearner_jax.loop import Program, make_program
-from cuelearner_jax.policies import Policy
+from cuelearner_jax.policies import PolicyBlock
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs.grid import Grid
 from cuelearner_jax.types import Clock, Label, Teacher, TrainState
@@ -154,7 +154,7 @@ class LaneGroup:
 
     def evaluate(
         self,
-        policy_of: Callable[[TrainState], Policy],
+        policy_of: Callable[[TrainState], PolicyBlock],
         env: Environment,
         key: PRNGKeyArray,
         num_envs: int,

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PRNGKeyArray
 
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides.base import Guide
@@ -17,7 +18,6 @@ from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs import shards
 from cuelearner_jax.runs.grid import Grid, defaults, load
 from cuelearner_jax.runs.kept import restore_policies
-from cuelearner_jax.runs.lanes import LaneGroup
 from cuelearner_jax.storage import formats
 from cuelearner_jax.storage.folders import CONFIG, differences
 from cuelearner_jax.task import Task, shape_of
@@ -96,15 +96,17 @@ def lanes_of(task: Task, config: RunConfig, pieces: tuple[Piece, ...], kind: str
         UserError: no piece has a checkpoint, or one is damaged.
     """
     env = shape_of(task, config.task)
+    guidance = config.guide_in(env, kind)
+    like = jax.eval_shape(lambda key: _acting(config, guidance, env, key), jax.random.key(0))
     found: dict[int, list[Lanes]] = {}
     told = shards.missing([piece.folder / CONFIG for piece in pieces]) if sweep else []
     for folder, grid in pieces:
         if sweep and not (folder / kind / "checkpoints").is_dir():
             told.append(f"{folder}: no checkpoint of {kind} guidance, left out")
             continue
-        group = LaneGroup(config, env, config.guide_in(env, kind), grid)
-        policies, step = restore_policies(group, folder / kind)
-        found.setdefault(step, []).append(Lanes(group.guidance, group.seeds, group.budgets, policies, step))
+        seeds, budgets = grid.lanes(guidance)
+        policies, step = restore_policies(folder / kind, like, len(seeds))
+        found.setdefault(step, []).append(Lanes(guidance, seeds, budgets, policies, step))
         if step < config.schedule.total_steps:
             told.append(f"{folder}: {kind} guidance at step {step:,} of {config.schedule.total_steps:,}")
     for line in told:
@@ -112,6 +114,11 @@ def lanes_of(task: Task, config: RunConfig, pieces: tuple[Piece, ...], kind: str
     if not found:
         raise UserError(f"no piece has a checkpoint of {kind} guidance: train first, or choose another --guidance")
     return [_joined(found[step]) for step in sorted(found, reverse=True)]
+
+
+def _acting(config: RunConfig, guidance: Guide, env: Any, key: PRNGKeyArray) -> dict[str, Any]:
+    """What one lane acts with, before it learns."""
+    return {"params": config.agent_in(env).init(key)[0], "guidance": guidance.init(key)}
 
 
 def _joined(parts: list[Lanes]) -> Lanes:

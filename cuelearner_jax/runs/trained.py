@@ -9,13 +9,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from cuelearner_jax.environment import actions_of, offers, spaces_of
+from cuelearner_jax.environment import actions_of, offers, spaces_of, view_of
 from cuelearner_jax.errors import UserError, closest
-from cuelearner_jax.evaluate import one_lane
 from cuelearner_jax.guides import registry as guidances
-from cuelearner_jax.policies import Agent, Common, Corrected, Guided, Heuristic, Policy, Taught, uniform_in
+from cuelearner_jax.policies import Agent, Corrected, Guided, Heuristic, Policy, Taught, uniform_in
 from cuelearner_jax.run_config import RunConfig
-from cuelearner_jax.runs.adapted import AdaptedLanes, alone, open_folder
+from cuelearner_jax.runs.adapted import AdaptedLanes, open_folder
 from cuelearner_jax.runs.failures import without_failed
 from cuelearner_jax.runs.grid import Grid
 from cuelearner_jax.runs.opened import Lanes, Piece, lanes_of, open_run
@@ -29,7 +28,7 @@ class Parts(NamedTuple):
     """What a named policy may be made of: `lanes` of a run, `adapted` of a policy folder."""
 
     config: RunConfig
-    env: Any
+    view: Any  # of where it acts
     teacher: Teacher | None
     lanes: Lanes | None
     adapted: AdaptedLanes | None = None
@@ -38,17 +37,17 @@ class Parts(NamedTuple):
     def agent(self) -> Agent:
         """The lanes' agents."""
         assert self.lanes is not None
-        return Agent(self.lanes.policies["params"], self.config.agent_in(self.env), self.env)
+        return Agent(self.lanes.policies["params"], self.config.agent_in(self.view), self.view)
 
     def guided(self, base: Policy) -> Guided:
         """A policy under the lanes' guidance."""
         assert self.lanes is not None
-        return Guided(base, self.lanes.policies["guidance"], self.env, self.config.scalars, self.lanes.guidance)
+        return Guided(base, self.lanes.policies["guidance"], self.view, self.config.scalars, self.lanes.guidance)
 
     def corrected(self, base: Policy) -> Corrected:
         """A policy under the teacher's own corrections."""
         assert self.teacher is not None
-        return Corrected(base, self.teacher, self.config.scalars, actions_of(self.env))
+        return Corrected(base, self.teacher, self.config.scalars, actions_of(self.view))
 
     def taught(self) -> Taught:
         """The teacher itself."""
@@ -79,7 +78,7 @@ def _folder_of(parts: Parts) -> AdaptedLanes:
 
 POLICIES: dict[str, Named] = {
     "agent": Named("the trained agent", lambda parts: parts.agent, trained=True),
-    "guide": Named("guidance of uniform actions", lambda parts: parts.guided(uniform_in(parts.env)), trained=True),
+    "guide": Named("guidance of uniform actions", lambda parts: parts.guided(uniform_in(parts.view)), trained=True),
     "guided": Named("guidance of the agent's actions", lambda parts: parts.guided(parts.agent), trained=True),
     "corrected": Named(
         "the teacher's own feedback on the agent's actions",
@@ -87,11 +86,11 @@ POLICIES: dict[str, Named] = {
         trained=True,
         taught=True,
     ),
-    "adapted": Named("the adapted policy", lambda parts: _folder_of(parts).policy(parts.env), adapted=True),
-    "base": Named("the policy that was adapted", lambda parts: _folder_of(parts).base(parts.env), adapted=True),
+    "adapted": Named("the adapted policy", lambda parts: _folder_of(parts).policy(parts.view), adapted=True),
+    "base": Named("the policy that was adapted", lambda parts: _folder_of(parts).base(parts.view), adapted=True),
     "teacher": Named("the teacher", lambda parts: parts.taught(), taught=True),
-    "heuristic": Named("the task's obvious action", lambda parts: Heuristic(parts.env), needs=("heuristic",)),
-    "uniform": Named("chance", lambda parts: uniform_in(parts.env)),
+    "heuristic": Named("the task's obvious action", lambda parts: Heuristic(parts.view), needs=("heuristic",)),
+    "uniform": Named("chance", lambda parts: uniform_in(parts.view)),
 }
 
 
@@ -214,17 +213,11 @@ class Block(NamedTuple):
     policy: Any  # a block, or `Common`
     failed: np.ndarray  # (lanes,) bool
 
-    def alone(self, lane: int) -> Any:
-        """One lane's policy."""
-        if isinstance(self.policy, Guided):
-            return alone(self.policy, lane)
-        return self.policy.policy if isinstance(self.policy, Common) else one_lane(self.policy, lane)
-
 
 def blocks_of(
     source: PolicySource,
     named: Named,
-    env: Any,
+    view: Any,
     teacher: Teacher | None,
     kinds: tuple[str, ...],
     failed_too: bool = False,
@@ -235,12 +228,12 @@ def blocks_of(
         if kinds and kept.guidance not in kinds:
             raise UserError(f"{source.folder} is under {kept.guidance} guidance: leave out --guidance")
         columns = (kept.lanes.seed, kept.lanes.budget, kept.lanes.bound_deg)
-        policy = named.make(Parts(source.config, env, teacher, None, kept))
+        policy = named.make(Parts(source.config, view, teacher, None, kept))
         return [Block(kept.guidance, *columns, 0, policy, np.zeros(kept.lanes.number, bool))]
     loaded = source.load(kinds)
     blocks = []
     for lanes in loaded if failed_too else without_failed(loaded):
-        policy = named.make(Parts(source.config, env, teacher, lanes))
+        policy = named.make(Parts(source.config, view, teacher, lanes))
         columns = (lanes.seeds, lanes.budgets, np.zeros(len(lanes.seeds)))
         blocks.append(Block(lanes.guidance.name, *columns, lanes.step, policy, np.asarray(lanes.policies["failed"])))
     return blocks
@@ -248,28 +241,28 @@ def blocks_of(
 
 def one_policy(
     source: PolicySource,
-    env: Any,
     world: Any,
     name: str,
     kind: str | None,
     labels: int | None,
     seed: int | None,
     bound_deg: float | None = None,
+    env: Any = None,
 ) -> Any:
     """A single policy: of one lane of a folder, or of the task. Raises UserError if there is no such lane."""
     seeds = () if seed is None else (seed,)
-    return several(source, env, world, name, kind, labels, seeds, bound_deg)[0][0]
+    return several(source, world, name, kind, labels, seeds, bound_deg, env)[0][0]
 
 
 def several(
     source: PolicySource,
-    env: Any,
     world: Any,
     name: str,
     kind: str | None,
     labels: int | None,
     seeds: tuple[int, ...],
     bound_deg: float | None = None,
+    env: Any = None,
 ) -> tuple[list[Any], tuple[int, ...]]:
     """Single policies of lanes of a folder that differ by their seeds alone (none named: the first), and the seeds.
 
@@ -277,22 +270,26 @@ def several(
 
     Args:
         source: where they come from.
-        env, world: where they are to act.
+        world: where they are to act.
         name: of the policy.
         kind: of guidance (None: the run's last).
         labels: budget (None: the largest).
         seeds: of the lanes.
         bound_deg: of a policy folder's lanes (None: the largest).
+        env: of that world, which a teacher looks at (default: with its training episodes).
 
     Raises:
         UserError: there is no such lane.
     """
     named = POLICIES[name]
+    if named.taught and env is None:
+        env = source.task.environment(world)
     teacher = source.task.make_teacher(world, env) if named.taught else None
+    view = source.task.view(world) if env is None else view_of(env)
     if not named.kept:
-        return [named.make(Parts(source.config, env, teacher, None))], (0,)
+        return [named.make(Parts(source.config, view, teacher, None))], (0,)
     kinds = (guidances.named(kind),) if kind else (source.grid.guidance[-1],) if source.grid else ()
-    blocks = blocks_of(source, named, env, teacher, kinds, failed_too=True)
+    blocks = blocks_of(source, named, view, teacher, kinds, failed_too=True)
     known = {
         part: np.concatenate([getattr(block, part) for block in blocks]) for part in ("seeds", "budgets", "bounds")
     }
@@ -306,7 +303,7 @@ def several(
             if len(index):
                 if block.failed[index[0]]:
                     console.print(f"seed {seed} failed, no longer finite: this is its last finite state")
-                found.append(block.alone(int(index[0])))
+                found.append(block.policy.lane(int(index[0])))
                 break
         else:
             of = "run" if source.grid else "folder"

@@ -12,10 +12,10 @@ import numpy as np
 
 from cuelearner_jax.asking import blame, label_slots
 from cuelearner_jax.devices import SHARED, place
-from cuelearner_jax.environment import Environment
+from cuelearner_jax.environment import Environment, view_of
 from cuelearner_jax.evaluate import Tell, episodes, untold
 from cuelearner_jax.loop import start_clock
-from cuelearner_jax.policies import Agent, Guided, Policy, uniform_in
+from cuelearner_jax.policies import Agent, Guided, PolicyBlock, uniform_in
 from cuelearner_jax.runs.lanes import LaneGroup
 from cuelearner_jax.storage import label_files
 from cuelearner_jax.types import Clock, Label, Teacher, TrainState
@@ -151,9 +151,9 @@ class Training:
         own["failed"] = self.failed.astype(float)
         return {**own, **self._measured(self._agent)}
 
-    def _agent(self, lane: TrainState) -> Policy:
+    def _agent(self, lane: TrainState) -> PolicyBlock:
         """A block's agents, who look at the examined world."""
-        return Agent(lane.agent.params, self.group.config.agent_in(self.group.env), self.examined)
+        return Agent(lane.agent.params, self.group.config.agent_in(self.group.env), view_of(self.examined))
 
     def guide_alone(self) -> dict[str, np.ndarray]:
         """Metrics (lanes,) of uniform actions under guidance; for unguided lanes that is chance.
@@ -167,8 +167,8 @@ class Training:
     def _of_guides(self) -> dict[str, np.ndarray]:
         group, base = self.group, uniform_in(self.group.env)
 
-        def guide(lane: TrainState) -> Policy:
-            return Guided(base, lane.guide.model, self.examined, group.config.scalars, group.guidance)
+        def guide(lane: TrainState) -> PolicyBlock:
+            return Guided(base, lane.guide.model, view_of(self.examined), group.config.scalars, group.guidance)
 
         return {f"guide_{name}": values for name, values in self._measured(guide).items()}
 

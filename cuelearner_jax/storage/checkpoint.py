@@ -139,7 +139,7 @@ def _quiet() -> Iterator[None]:
             yield
     finally:
         log.disabled, sys.excepthook = silenced, uncaught
-        sys.unraisablehook = unraisable if isinstance(unraisable, _Late) else _Late(unraisable)
+        sys.unraisablehook = unraisable if isinstance(unraisable, _LateComplaints) else _LateComplaints(unraisable)
 
 
 def _settle() -> None:
@@ -148,7 +148,7 @@ def _settle() -> None:
     gc.collect()
 
 
-class _Late:
+class _LateComplaints:
     """A hook of the interpreter that passes over what the other reads or writes of one that failed complain of later.
 
     On a slow disk they outlast `_settle`, and find the event loop closed in which Orbax ran them all.

@@ -28,7 +28,7 @@ from cuelearner_jax.feedback.answers import check_teacher
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.guides.base import Guide
 from cuelearner_jax.guides.relative import KIND
-from cuelearner_jax.policies import Common, in_space
+from cuelearner_jax.policies import Common, in_space, lanes_in
 from cuelearner_jax.runs import adapted, trained
 from cuelearner_jax.runs.grid import Grid, check_grid, seeds_of
 from cuelearner_jax.runs.order import read_labels
@@ -211,7 +211,7 @@ def run(
         check_part(options, name)
     guidance = guidances.make(kind.name, sizes, env, request.kinds.get(kind.name))
     bases, seeds, origin = _bases(subject, request, env)
-    shared = isinstance(bases, Common)
+    shared = lanes_in(bases) is None
     if not shared and (request.seeds, request.first_seed) != (1, 0):
         raise UserError("several base policies are adapted each with its own seed: leave out --seeds and --first-seed")
     seeds = seeds_of(request.first_seed, request.seeds) if shared else seeds
@@ -250,7 +250,7 @@ def _bases(subject: Subject, request: Request, env: Any) -> tuple[Any, tuple[int
     if len(set(base.seeds)) < len(base.seeds):
         raise UserError("--base.seeds: give each seed once")
     policies, seeds = trained.several(
-        source, env, request.task, base.policy, base.guidance, base.labels, base.seeds, base.bound_deg
+        source, request.task, base.policy, base.guidance, base.labels, base.seeds, base.bound_deg, env
     )
     told = {name: value for name, value in dataclasses.asdict(base).items() if value not in (None, ())}
     origin = {"folder": source.folder.name, **told, "seeds": list(seeds), **({"code": named} if named else {})}
@@ -282,7 +282,7 @@ def _rows(
 
 def _reach(space: Space, bases: Any, file: label_files.LabelFile, scalars: Scalars) -> float:
     """How far labels reach from what the base policy does, in the space's unit; at least eps."""
-    if not isinstance(bases, Common):
+    if lanes_in(bases) is not None:
         raise UserError("labels of several base policies reach differently far: give --bound-deg")
     return max(adapting.reach(space, bases.policy, file.labels.obs, file.labels.action), scalars.eps_deg)
 

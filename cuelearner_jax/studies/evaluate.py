@@ -9,10 +9,11 @@ from typing import Any, Generic, NamedTuple, TypeVar
 import jax
 import numpy as np
 
+from cuelearner_jax.environment import view_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import Rolled, Tell, episodes, part_of, untold, watched, watched_lanes
 from cuelearner_jax.guides import registry as guidances
-from cuelearner_jax.policies import Common
+from cuelearner_jax.policies import lanes_in
 from cuelearner_jax.runs.trained import POLICIES, Parts, PolicySource, blocks_of
 from cuelearner_jax.task import Task
 
@@ -101,7 +102,7 @@ def run(
     named = POLICIES[name]
     teacher = task.make_teacher(world, env) if policy is None and named.taught else None
     if policy is not None or not named.kept:
-        policy = named.make(Parts(source.config, env, teacher, None)) if policy is None else policy
+        policy = named.make(Parts(source.config, view_of(env), teacher, None)) if policy is None else policy
         tell = watch(name)
         if engine:
             means, each = _of_lanes([engine(policy, env, key, num_envs, steps, tell)])
@@ -109,16 +110,16 @@ def run(
             means, each = _repeated(watched(env, policy, key, num_envs, steps, tell), 1)
         return [Measured("-", 0, 0, np.zeros(1, int), means, each)]
     rows = []
-    for block in blocks_of(source, named, env, teacher, tuple(map(guidances.named, asked.guidance))):
+    for block in blocks_of(source, named, view_of(env), teacher, tuple(map(guidances.named, asked.guidance))):
         tell, policy, count = watch(block.guidance), block.policy, len(block.seeds)
-        is_shared = isinstance(policy, Common)
+        is_shared = lanes_in(policy) is None
         if engine:
             tells = [part_of(tell, lane, count) for lane in range(count)]
             means, each = _of_lanes(
-                [engine(block.alone(lane), env, key, num_envs, steps, tells[lane]) for lane in range(count)]
+                [engine(policy.lane(lane), env, key, num_envs, steps, tells[lane]) for lane in range(count)]
             )
         elif is_shared:
-            means, each = _repeated(watched(env, policy.policy, key, num_envs, steps, tell), count)
+            means, each = _repeated(watched(env, policy, key, num_envs, steps, tell), count)
         else:
             means, each, _ = watched_lanes(env, policy, key, num_envs, steps, tell)
         variants = sorted(set(zip(block.bounds.tolist(), block.budgets.tolist(), strict=True)))

@@ -11,14 +11,14 @@ import numpy as np
 from jaxtyping import Array, PRNGKeyArray
 
 from cuelearner_jax.environment import Aims, Environment, Quantity, actions_of, offers, symmetries_of
-from cuelearner_jax.testing.laws import Laws, Traced, changed, pytree
+from cuelearner_jax.testing.laws import Laws, OnceTraced, changed, pytree
 from cuelearner_jax.types import Step
 
 COMPARED = 8  # steps of the roll-out that are taken again in one batch, and actions that features are asked about
 OWN_COLUMNS = {"reward", "finished"}  # of results: no metric or outcome may be called so
 
 
-class Walk(NamedTuple):
+class Trajectory(NamedTuple):
     """What a roll-out met; leading axis: steps."""
 
     obs: Array  # acted on
@@ -48,7 +48,7 @@ def check_environment(env: Any, steps: int = 64, key: PRNGKeyArray | None = None
     _check_names(laws, env)
     _check_shapes(laws, env)
     key = jax.random.key(0) if key is None else key
-    walked = Traced(lambda env, key: _walk(env, key, steps))
+    walked = OnceTraced(lambda env, key: _walk(env, key, steps))
     mend = "what depends on traced values must be jax.numpy, with jnp.where and lax.cond in place of if"
     with laws.attempted("a compiled roll-out", mend):
         walk = jax.device_get(walked(env, key))
@@ -160,7 +160,7 @@ def _is_key(value: Any) -> bool:
     return jnp.issubdtype(value.dtype, jax.dtypes.prng_key)
 
 
-def _walk(env: Any, key: PRNGKeyArray, steps: int) -> Walk:
+def _walk(env: Any, key: PRNGKeyArray, steps: int) -> Trajectory:
     """Everything that is computed of an environment, as one program."""
     k_reset, k_walk = jax.random.split(key)
 
@@ -177,7 +177,7 @@ def _walk(env: Any, key: PRNGKeyArray, steps: int) -> Walk:
     few = lambda tree: jax.tree.map(lambda leaf: leaf[:COMPARED], tree)  # noqa: E731
     batched = jax.vmap(env.step)(few(keys), few(states), few(actions))
     optional = _asked(env, obs, actions)
-    return Walk(obs, actions, recalled, recalled_next, taken, batched, few((afters, taken)), optional)
+    return Trajectory(obs, actions, recalled, recalled_next, taken, batched, few((afters, taken)), optional)
 
 
 def _asked(env: Any, obs: Array, actions: Array) -> dict[str, Any]:
@@ -208,7 +208,7 @@ def _asked(env: Any, obs: Array, actions: Array) -> dict[str, Any]:
     return found
 
 
-def _check_walk(laws: Laws, env: Environment, walk: Walk, steps: int) -> None:
+def _check_walk(laws: Laws, env: Environment, walk: Trajectory, steps: int) -> None:
     """Laws of the steps themselves."""
     step = walk.step
     laws.actions(actions_of(env), walk.actions, "what its actions' `uniform` draws")
@@ -248,7 +248,7 @@ def _check_walk(laws: Laws, env: Environment, walk: Walk, steps: int) -> None:
     )
 
 
-def _check_optional(laws: Laws, env: Environment, walk: Walk) -> None:
+def _check_optional(laws: Laws, env: Environment, walk: Trajectory) -> None:
     """Laws of the members that an environment may have."""
     if "heuristic" in walk.optional:
         laws.actions(actions_of(env), walk.optional["heuristic"], "what `heuristic` gives")
@@ -296,7 +296,7 @@ def _check_aims(laws: Laws, env: Environment, aims: Any) -> None:
     laws.hold(np.any(aims.possible), "no aim was possible in any step: mark those that are")
 
 
-def _check_mirrors(laws: Laws, walk: Walk, images: Any, other: Any, combined: Any, twice: Any) -> None:
+def _check_mirrors(laws: Laws, walk: Trajectory, images: Any, other: Any, combined: Any, twice: Any) -> None:
     """They are a group of linear isometries, 0 the identity."""
     obs, vectors = images
     same = np.shape(obs)[1:] == np.shape(walk.obs) and np.shape(vectors)[1:] == np.shape(walk.actions)

@@ -58,7 +58,7 @@ class Laws:
         )
 
 
-class Traced:
+class OnceTraced:
     """A function compiled by `jax.jit` that counts how often it was traced."""
 
     def __init__(self, function: Callable[..., Any]) -> None:

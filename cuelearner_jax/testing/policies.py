@@ -1,4 +1,4 @@
-"""The laws of a policy (`cuelearner_jax.policies.Policy`), held against it in one environment."""
+"""The laws of a policy (`cuelearner_jax.policies.PolicyBlock`), held against it in one environment."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from cuelearner_jax.environment import Environment, actions_of
-from cuelearner_jax.policies import BY_LANE, SHARED, Policy
-from cuelearner_jax.testing.laws import Laws, Traced, changed, pytree
+from cuelearner_jax.policies import BY_LANE, SHARED, PolicyBlock
+from cuelearner_jax.testing.laws import Laws, OnceTraced, changed, pytree
 
 ROWS = 9
 
 
-def check_policy(policy: Policy, env: Environment, tolerance: float = 1e-5) -> None:
+def check_policy(policy: PolicyBlock, env: Environment, tolerance: float = 1e-5) -> None:
     """Holds a policy against its laws.
 
     Args:
@@ -34,7 +34,7 @@ def check_policy(policy: Policy, env: Environment, tolerance: float = 1e-5) -> N
     _check_axes(laws, policy)
     keys = jax.random.split(jax.random.key(0), ROWS)
     states, obs = jax.vmap(env.reset)(keys)
-    act = Traced(lambda policy, key, states, obs: policy.act(key, states, obs))
+    act = OnceTraced(lambda policy, key, states, obs: policy.act(key, states, obs))
     with laws.attempted("`act` under jit", "it gets a key, states and observations (n, obs), all traced"):
         actions = act(policy, keys[0], states, obs)
         other = act(policy, keys[1], states, obs)

@@ -9,7 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 import probes
 import pytest
-from flax import struct
 
 from cuelearner_jax.adaptation import adapting, judging, program
 from cuelearner_jax.adaptation.adapting import Adaptation, Judging
@@ -17,9 +16,8 @@ from cuelearner_jax.adaptation.program import Lanes
 from cuelearner_jax.config import GuideSizes
 from cuelearner_jax.devices import lane_mesh
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.evaluate import one_lane
 from cuelearner_jax.guides import registry as guidances
-from cuelearner_jax.policies import BY_LANE, Common, Opaque, policy_of
+from cuelearner_jax.policies import BY_LANE, Common, Opaque, PolicyNode, policy_of
 from cuelearner_jax.spaces import DIRECTIONS, directions
 from cuelearner_jax.types import Label
 
@@ -35,7 +33,7 @@ MESH = lane_mesh(jax.local_devices()[:1])
 JUDGING = Judging(ENV, num_envs=20, steps=200)
 
 
-class Shifted(struct.PyTreeNode):
+class Shifted(PolicyNode):
     """Misses the best direction by a constant angle [deg]."""
 
     shift: jax.Array
@@ -69,7 +67,7 @@ def degrees(turn):
 def errors(policy, lane):
     """How far a lane's actions lie from the best ones, over all observations [deg]."""
     return degrees(
-        DIRECTIONS.distance(one_lane(policy, lane).act(jax.random.key(0), None, OBS), directions.rotate(OBS, 0.6))
+        DIRECTIONS.distance(policy.lane(lane).act(jax.random.key(0), None, OBS), directions.rotate(OBS, 0.6))
     )
 
 
@@ -100,7 +98,7 @@ def test_the_bound_is_never_exceeded():
     for lane, bound in enumerate(LANES.bound_deg):
         base = Shifted(jnp.array(SHIFTS[LANES.base[lane]]))
         own = base.act(None, None, OBS)
-        moved = degrees(DIRECTIONS.distance(own, one_lane(policy, lane).act(jax.random.key(0), None, OBS)))
+        moved = degrees(DIRECTIONS.distance(own, policy.lane(lane).act(jax.random.key(0), None, OBS)))
         assert moved.max() <= bound + 1e-3
         if bound == 10:  # too near to be right: as far as it may go
             np.testing.assert_allclose(moved, bound, atol=0.5)
@@ -117,7 +115,7 @@ def test_the_bound_is_never_exceeded():
     everywhere = directions.evenly_spaced(100)
     for lane, bound in enumerate(LANES.bound_deg):
         own = Shifted(jnp.array(SHIFTS[LANES.base[lane]])).act(None, None, everywhere)
-        moved = DIRECTIONS.distance(own, one_lane(policy, lane).act(jax.random.key(0), None, everywhere))
+        moved = DIRECTIONS.distance(own, policy.lane(lane).act(jax.random.key(0), None, everywhere))
         assert degrees(moved).max() <= bound + 1e-3
         assert degrees(moved).max() > bound / 2
 

@@ -4,6 +4,7 @@ import dataclasses
 import subprocess
 import sys
 import warnings
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -11,6 +12,7 @@ import probes
 import pytest
 
 import cuelearner_jax as cl
+from cuelearner_jax import loop
 from cuelearner_jax.config import GuideSizes
 from cuelearner_jax.policies import Agent, Uniform
 from cuelearner_jax.runs import sweep
@@ -18,6 +20,7 @@ from cuelearner_jax.runs.grid import Grid
 from cuelearner_jax.runs.order import Order
 from cuelearner_jax.spaces import DIRECTIONS
 from cuelearner_jax.storage import label_files, results
+from cuelearner_jax.task import Task
 from cuelearner_jax.types import Label
 
 TASK = dataclasses.replace(probes.make_task(), presets={})
@@ -105,6 +108,15 @@ def test_a_policy_of_a_run_acts_on_one_observation_and_on_many(tmp_path):
         loaded(np.array([np.nan, 0.0]))
     taught = cl.teacher_of(loaded.policy)
     np.testing.assert_array_equal(taught.best_action(SEEN[0], jax.numpy.asarray(SEEN[0])), many[0])
+
+
+def test_the_shipped_agent_is_loaded_without_worlds_and_without_a_training_program(monkeypatch):
+    monkeypatch.setattr(Task, "environment", lambda *_: pytest.fail("an environment was made"))
+    monkeypatch.setattr(loop, "make_program", lambda *_: pytest.fail("a training program was made"))
+    loaded = cl.load_policy(Path(__file__).parents[2] / "docs" / "data" / "navigation_agent")
+    assert sum(np.size(leaf) for leaf in jax.tree.leaves(loaded.policy.view)) < 20
+    size = sum(quantity.size for quantity in loaded.observation)
+    np.testing.assert_allclose(np.linalg.norm(loaded(np.full(size, 0.5))), 1, atol=1e-6)
 
 
 def test_labels_about_a_policys_own_actions_alone_lead_no_farther_than_they_reach():

@@ -106,7 +106,7 @@ def test_a_task_alone_is_evaluated_and_drawn_on_any_of_its_tables(tmp_path, caps
     assert main(["render", *table, "--question", "--out", str(tmp_path)]) == 0
     for command in ("evaluate", "render"):
         with pytest.raises(SystemExit) as stopped:
-            main([command, "billiards", "--help"])
+            main([command, "billiards", "--help-all"])
         assert not stopped.value.code
         assert re.search(
             r"presets \(--preset.*\):\n  paper +.*\n  regulation +.*\n  easy +.*\n  quickstart", capsys.readouterr().out
@@ -220,19 +220,36 @@ def test_tuning_episodes_are_others_and_stay_out_of_reports(run_folder, tmp_path
     assert main(["report", str(out), "--split", "tuning", "--out", str(tmp_path / "report")]) == 0
 
 
-@pytest.mark.parametrize("command", ["train", "sweep", "evaluate", "report", "render", "bench"])
-def test_every_command_explains_itself(command, capsys):
-    task = [] if command == "report" else ["billiards"]
-    with pytest.raises(SystemExit) as stopped:
-        main([command, *task, "--help"])
-    assert not stopped.value.code
-    explained(command, *capsys.readouterr())
+HELPED = [name.split() for command in dispatch.COMMANDS for name in dispatch.summaries(command)]
+
+
+@pytest.mark.parametrize("command", HELPED, ids=" ".join)
+def test_the_first_page_of_help_tells_what_one_needs_and_the_whole_page_the_rest(command, capsys):
+    task = [] if command[0] in ("report", "labels") else ["billiards"]
+    pages = []
+    for option in ("--help", "--help-all"):
+        with pytest.raises(SystemExit) as stopped:
+            main([*command, *task, option])
+        assert not stopped.value.code
+        pages.append(capsys.readouterr())
+    first, whole = pages
+    lines = first.out.splitlines()
+    assert len(lines) <= 40
+    assert max(map(len, lines)) <= 118
+    assert f"{' '.join([*command, *task])} --help-all" in " ".join(first.out.split())
+    assert {"--out"} <= set(re.findall(r"^  (--[\w-]+)", first.out, re.MULTILINE)) or command == ["labels", "inspect"]
+    assert "--sizes." not in first.out
+    explained(command[0], *whole)
+    if task and command[0] != "bench":
+        with pytest.raises(SystemExit):
+            main([*command, "--help"])
+        assert len(capsys.readouterr().out.splitlines()) <= 40
 
 
 @pytest.mark.long
 def test_the_installed_command_explains_itself():
     done = subprocess.run(
-        [*ENTRY, "sweep", "billiards", "--help"], check=False, capture_output=True, text=True, timeout=120
+        [*ENTRY, "sweep", "billiards", "--help-all"], check=False, capture_output=True, text=True, timeout=120
     )
     assert done.returncode == 0
     explained("sweep", done.stdout, done.stderr)
@@ -240,7 +257,6 @@ def test_the_installed_command_explains_itself():
 
 def explained(command, out, err):
     """What is told of a command."""
-    assert "--out" in out
     assert err == ""
     if command in ("train", "sweep", "evaluate", "render"):
         assert "(--preset; paper where none is given)" in out

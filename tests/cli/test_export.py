@@ -8,6 +8,7 @@ import numpy as np
 from cuelearner_jax.api.acting import load_policy
 from cuelearner_jax.cli import main
 from cuelearner_jax.export import contract, decisions, runner
+from cuelearner_jax.policies import layers
 
 
 def test_a_runs_guided_agent_is_exported_and_checked(run_folder, refused, tmp_path, capsys, monkeypatch):
@@ -19,7 +20,7 @@ def test_a_runs_guided_agent_is_exported_and_checked(run_folder, refused, tmp_pa
     told = json.loads((out / runner.CONTRACT).read_text())
     assert told["source"]["policy"] == "guided"
     assert told["source"]["world"]["name"] == "billiards"
-    assert [each["layer"] for each in told["policy"]] == ["guided", "agent"]
+    assert [each["policy"] for each in layers(told["policy"])] == ["guided", "agent"]
     assert [each["unit"] for each in told["observation"]["slices"][:2]] == ["m", "1"]
     with np.load(out / runner.GOLDEN) as golden:
         obs, actions = golden["obs"], golden["actions"]

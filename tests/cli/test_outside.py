@@ -126,7 +126,7 @@ def test_what_cannot_be_is_refused(run, refused, tmp_path):
 def test_help_names_what_there_is_to_choose_from(capsys):
     for command in ("train", "sweep", "evaluate", "render"):
         with pytest.raises(SystemExit) as stop:
-            main([command, "own_window:TASK", "--help"])
+            main([command, "own_window:TASK", "--help-all"])
         assert stop.value.code == 0
         told = capsys.readouterr().out
         for name, about in (

@@ -47,17 +47,11 @@ def adapted():
     return asked(40, BOUND_DEG)
 
 
-def lane_of(policy, index):
-    """A lane's policy, whose base all lanes share."""
-    model, bound = jax.tree.map(lambda leaf: leaf[index], (policy.model, policy.bound))
-    return policy.replace(model=model, bound=bound)
-
-
 @pytest.mark.long
 def test_a_constant_shift_is_recovered(adapted):
     _, policy = adapted
     for lane in range(2):
-        done = lane_of(policy, lane).act(jax.random.key(0), None, OBS)
+        done = policy.lane(lane).act(jax.random.key(0), None, OBS)
         off = np.rad2deg(DIRECTIONS.distance(done, jax.vmap(ENV.best)(OBS)))
         assert off.max() < TURN_DEG / 4
 

@@ -106,10 +106,9 @@ def test_evaluation_leaves_it_out_and_says_so(ended, capsys):
     assert [row.seeds.tolist() for row in found] == [[3, 8], [3, 5, 8]]
     np.testing.assert_array_equal(found[0].metrics["reward"], found[1].metrics["reward"][[0, 2]])
     assert "none: seed 5 failed, no longer finite, and left out" in capsys.readouterr().err
-    env = TASK.environment(CONFIG.task)
     source = trained.PolicySource(TASK, CONFIG, GRID, sick)
     for seed, says in ((3, ""), (5, "seed 5 failed, no longer finite: this is its last finite state\n")):
-        trained.one_policy(source, env, CONFIG.task, "agent", "none", None, seed)
+        trained.one_policy(source, CONFIG.task, "agent", "none", None, seed)
         assert capsys.readouterr().err == says
 
 

@@ -6,6 +6,8 @@ import sys
 from importlib.metadata import EntryPoint
 from pathlib import Path
 
+import chex
+import jax
 import probes
 import pytest
 
@@ -153,3 +155,19 @@ def test_the_help_names_the_tables_that_have_a_shipped_teacher():
 
     (told,) = re.findall(r"\(shipped for ([^)]*)\)", Path(config.__file__).read_text(encoding="utf-8"))
     assert told.split(" and ") == sorted(folder.name for folder in SHIPPED_TEACHERS.iterdir())
+
+
+def test_what_policies_look_at_needs_no_worlds():
+    """Navigation looks at an observation alone: the view sees what the environment sees."""
+    task = registry.find("navigation")
+    config = task.configured("rooms", worlds=1)
+    env, view = task.environment(config), task.view(config)
+    assert view.worlds is None
+    assert view.observation == env.observation
+    obs = jax.random.uniform(jax.random.key(0), (env.obs_size,))
+    action = env.heuristic(obs)
+    for looks in (lambda of: of.features(obs, action), lambda of: of.aims(obs), lambda of: of.heuristic(obs)):
+        chex.assert_trees_all_equal(jax.jit(looks)(view), jax.jit(looks)(env))
+    table = registry.find("billiards")
+    easy = table.presets["quickstart"].config.task
+    chex.assert_trees_all_equal(table.view(easy), table.environment(easy))

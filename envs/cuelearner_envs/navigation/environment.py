@@ -70,6 +70,10 @@ class Navigation(Described, struct.PyTreeNode):
         """Identity, and left and right exchanged: body, lidar and motion are symmetric, worlds are as likely as not."""
         return 2 if self.mirrors else 1
 
+    def view(self) -> Navigation:
+        """The environment without its worlds, at which no policy looks."""
+        return self.replace(worlds=None)
+
     def world(self, index: Int[ArrayLike, "*n"]) -> World:
         """One of the worlds, or as many as there are indices."""
         return jax.tree.map(lambda leaf: leaf[index], self.worlds)

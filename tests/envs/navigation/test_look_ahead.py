@@ -181,7 +181,7 @@ def test_the_option_widens_aims_and_leaves_observations_alone():
 
 def test_the_option_is_on_the_command_line(capsys):
     with pytest.raises(SystemExit):
-        main(["adapt", "--task", "navigation", "--help"])
+        main(["adapt", "--task", "navigation", "--help-all"])
     assert "--task.look-ahead, --task.no-look-ahead" in capsys.readouterr().out
 
 

@@ -1,0 +1,51 @@
+"""Policies: pytrees that act. What evaluation, pictures, labelling and adaptation are about.
+
+A policy's `act` sees many environments at once. Its `axes` say which of its leaves a block of lanes has one of each
+(`evaluate.evaluate_lanes` maps over them); what lanes share is there once.
+"""
+
+from cuelearner_jax.policies.layers import (
+    Agent,
+    Common,
+    Corrected,
+    Guided,
+    Heuristic,
+    NearAims,
+    Taught,
+    Teaching,
+    Uniform,
+    best_actions,
+    uniform_in,
+    wanted_actions,
+)
+from cuelearner_jax.policies.node import BY_LANE, SHARED, PolicyBlock, PolicyNode, describe, lanes_in, layers
+from cuelearner_jax.policies.opaque import Opaque, acted, in_space, named, policy_of
+from cuelearner_jax.types import Policy
+
+__all__ = [
+    "BY_LANE",
+    "SHARED",
+    "Agent",
+    "Common",
+    "Corrected",
+    "Guided",
+    "Heuristic",
+    "NearAims",
+    "Opaque",
+    "Policy",
+    "PolicyBlock",
+    "PolicyNode",
+    "Taught",
+    "Teaching",
+    "Uniform",
+    "acted",
+    "best_actions",
+    "describe",
+    "in_space",
+    "lanes_in",
+    "layers",
+    "named",
+    "policy_of",
+    "uniform_in",
+    "wanted_actions",
+]

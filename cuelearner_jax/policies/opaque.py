@@ -1,0 +1,158 @@
+"""Policies of the user's own making: any function of observations, and how messages call it."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from cuelearner_jax import types, user_code
+from cuelearner_jax.errors import UserError, raised_by, shown
+from cuelearner_jax.policies.node import PolicyNode
+from cuelearner_jax.spaces import DIRECTIONS, Space
+from cuelearner_jax.types import EnvState
+
+
+class Opaque(PolicyNode):
+    """Any function of a batch of observations: of JAX arrays, or, `on_host`, of NumPy arrays in plain Python.
+
+    What it returns (n, action) is retracted to the space: made unit vectors, held within bounds. A function on the host
+    is called back from compiled programs (`jax.pure_callback`): it must give the same for the same observations.
+    """
+
+    function: Callable[[Any], Any] = struct.field(pytree_node=False)
+    on_host: bool = struct.field(pytree_node=False, default=False)
+    actions: Space = struct.field(pytree_node=False, default=DIRECTIONS)
+
+    def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
+        """What the function gives. Raises UserError if that has another shape."""
+        if self.on_host:
+            # Asked once while tracing: another shape is told before anything is compiled.
+            with jax.ensure_compile_time_eval():  # the function may compute with JAX itself
+                self._called(np.zeros(obs.shape, obs.dtype))
+            shape = jax.ShapeDtypeStruct((obs.shape[0], self.actions.size), jnp.float32)
+            chosen = jax.pure_callback(self._called_back, shape, obs, vmap_method="expand_dims")
+        else:
+            chosen = self._checked(self.function(obs), obs.shape[0], jnp.asarray)
+        return self.actions.retract(self.actions.only_actions(chosen))
+
+    def _called_back(self, obs: Any) -> np.ndarray:
+        """The function's actions; NaN once it has failed, which `user_code` tells when the program is done."""
+        nothing = np.full((*obs.shape[:-1], self.actions.size), np.nan, np.float32)
+        if user_code.is_waiting():
+            return nothing
+        try:
+            chosen = self._called(np.asarray(obs))
+            usable = self.actions.usable(chosen, np)
+            if not usable.all():
+                count = f"{(~usable).sum()} of {usable.size}"
+                raise UserError(
+                    f"{named(self)} gave zero or not finite numbers in place of actions, in {count} situations"
+                )
+            return chosen
+        except UserError as error:
+            user_code.leave(named(self), error)
+            return nothing
+
+    def _called(self, rows: np.ndarray) -> np.ndarray:
+        """The function of a batch with any leading axes. Raises UserError for whatever it raises."""
+        flat = rows.reshape(-1, rows.shape[-1])
+        try:
+            chosen = self.function(flat)
+        except Exception as error:
+            raise raised_by(named(self), error) from error
+        return self._checked(chosen, len(flat), np.asarray).reshape(*rows.shape[:-1], self.actions.size)
+
+    def _checked(self, chosen: Any, rows: int, as_array: Callable[..., Any]) -> Any:
+        """What the function returned, as an array of real numbers."""
+        wanted = (rows, self.actions.size)
+        try:
+            found = as_array(chosen)
+        except (TypeError, ValueError) as error:
+            raise UserError(f"{named(self)} returned {shown(chosen)}: return an array of shape {wanted}") from error
+        if getattr(found.dtype, "kind", "key") not in "fiu" and not jnp.issubdtype(found.dtype, jnp.floating):
+            raise UserError(f"{named(self)} returned {found.dtype} numbers: return real ones, of shape {wanted}")
+        if found.shape != wanted:
+            raise UserError(
+                f"{named(self)} returned actions of shape {found.shape} for {rows} observations: return {wanted}"
+            )
+        with np.errstate(over="ignore"):
+            return found.astype(np.float32)
+
+    def describe(self) -> dict[str, Any]:
+        """Code, named as Python names it."""
+        return {"policy": "code", "named": _called(self.function)}
+
+
+def acted(
+    policy: types.Policy, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"], actions: Space
+) -> Float[Array, "n action"]:
+    """A policy's actions, NaN in place of each that is none. Raises UserError if they have another shape."""
+    chosen, wanted = jnp.asarray(policy.act(key, states, obs)), (obs.shape[0], actions.size)
+    if chosen.shape != wanted:
+        raise UserError(f"{named(policy)} returned actions of shape {chosen.shape}: return {wanted}")
+    return actions.only_actions(chosen)
+
+
+def named(policy: Any) -> str:
+    """A policy for a message: by the user's function or class that acts, below whatever changes its actions."""
+    while (below := getattr(policy, "base", None) or getattr(policy, "policy", None)) is not None:
+        policy = below
+    return f"policy {_called(getattr(policy, 'function', type(policy)))}"
+
+
+def _called(code: Any) -> str:
+    """How Python calls a function or class."""
+    return getattr(code, "__qualname__", type(code).__qualname__).replace("<locals>.", "")
+
+
+def in_space(policy: Any, space: Space) -> Any:
+    """A policy with actions of a space, where it is a bare function, of which nobody said in which space it acts."""
+    return policy.replace(actions=space) if isinstance(policy, Opaque) else policy
+
+
+def policy_of(given: Any) -> Any:
+    """Anything that acts as a policy.
+
+    Args:
+        given: a policy; a class or function that gives one when it is called with nothing; or a function of a batch of
+            observations: one that `jax.jit` made is compiled with what calls it, any other gets NumPy arrays.
+
+    Raises:
+        UserError: it is none of these, or a policy that is no pytree.
+    """
+    if callable(given) and not (hasattr(given, "act") and not isinstance(given, type)) and _takes_nothing(given):
+        try:
+            given = given()
+        except Exception as error:
+            raise raised_by(f"policy {getattr(given, '__qualname__', given)}", error) from error
+    if hasattr(given, "act"):
+        if any(leaf is given for leaf in jax.tree.leaves(given)):
+            kind = type(given).__name__
+            raise UserError(
+                f"a {kind} has `act` but is no pytree: make it a flax.struct.PyTreeNode, or give a function"
+            )
+        return given
+    if isinstance(given, jax.stages.Wrapped):
+        return Opaque(given)
+    if callable(given) and not isinstance(given, type):
+        return Opaque(given, on_host=True)
+    raise UserError(f"{shown(given)} is no policy: give a function of observations (n, obs), or load one")
+
+
+def _takes_nothing(given: Callable[..., Any]) -> bool:
+    """Can it be called without arguments?"""
+    try:
+        parameters = inspect.signature(given).parameters.values()
+    except (TypeError, ValueError):  # of code that is not Python's
+        return False
+    variable = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
+    return all(one.default is not one.empty for one in parameters if one.kind not in variable) and not any(
+        one.kind in variable for one in parameters
+    )
