@@ -13,6 +13,7 @@ from cuelearner_jax.adaptation.adapting import check_amounts
 from cuelearner_jax.config import GuideSizes, RunConfig, Schedule, Sizes, check, check_guide
 from cuelearner_jax.feedback.answers import check_teacher
 from cuelearner_jax.runs.trained import PolicySource
+from cuelearner_jax.spaces import DIRECTIONS
 from cuelearner_jax.storage import table as tables
 from cuelearner_jax.studies.adapt import suggested
 from cuelearner_jax.tasks import registry
