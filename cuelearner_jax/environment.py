@@ -27,7 +27,7 @@ class Quantity(NamedTuple):
     about: str = ""  # what it is, where from and in which order, in a few words
 
 
-# What `actions.DIRECTIONS` are, where an environment does not say more by its own `action`.
+# What `spaces.DIRECTIONS` are, where an environment does not say more by its own `action`.
 DIRECTION = Quantity("direction", 2, "1", "unit vector (x, y) in the frame of the observation")
 
 

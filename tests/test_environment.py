@@ -19,7 +19,7 @@ from cuelearner_jax.environment import (
     spaces_of,
     symmetries_of,
 )
-from cuelearner_jax.spaces import DIRECTIONS
+from cuelearner_jax.spaces import DIRECTIONS, Box
 from cuelearner_jax.spaces.directions import difference, evenly_spaced, rotate
 from cuelearner_jax.task import shape_of
 from cuelearner_jax.tasks import registry
@@ -107,7 +107,7 @@ def test_actions_are_directions_where_nothing_else_is_said():
     assert spaces_of(probes.Chain())[:2] == (2, DIRECTIONS)
 
     class Other(probes.Chain):
-        actions = DIRECTIONS._replace(size=5)
+        actions = Box((0.0,) * 5, (1.0,) * 5)
 
     assert actions_of(Other()).size == 5
     assert spaces_of(Other()).actions.size == 5

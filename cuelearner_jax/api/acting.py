@@ -15,6 +15,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from cuelearner_jax import user_code
 from cuelearner_jax.api import arguments
 from cuelearner_jax.api.worlds import World, a_world
+from cuelearner_jax.config import LARGEST_FLOAT
 from cuelearner_jax.environment import Quantity, actions_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.policies import Policy, acted, in_space, named
@@ -148,6 +149,8 @@ def load_policy(
         if value is not None:
             arguments.text(argument, value, trained.POLICIES if argument == "policy" else ())
     labels = None if labels is None else arguments.budget("labels", labels, least=0)
+    if bound_deg is not None:  # up to the reach of actions, which the folder says
+        arguments.number("bound_deg", bound_deg, LARGEST_FLOAT, "a number above 0")
     seed = None if seed is None else arguments.seed("seed", seed)
     code = None if base is None else as_policy(base, "base")
     if isinstance(task, str):

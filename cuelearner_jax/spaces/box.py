@@ -56,19 +56,21 @@ class Box(Space):
 
     def sample(self, key: PRNGKeyArray, shape: tuple[int, ...] = ()) -> Float[Array, "*shape action"]:
         """Draw vectors uniformly between the bounds."""
-        return jnp.asarray(self.low) + self._range * jax.random.uniform(key, (*shape, self.size))
+        return self._at(jax.random.uniform(key, (*shape, self.size)))
 
     def log(self, action: Vectors, other: Vectors) -> Float[Array, "... cues"]:
         """Return the difference in each entry, as a share of its range."""
-        return (jnp.asarray(other) - action) / self._range
+        action, other = jnp.broadcast_arrays(action, other)
+        return (other - action) / _row(self._range, other)
 
     def exp(self, action: Vectors, change: Float[Array, "... cues"]) -> Float[Array, "... action"]:
         """Add shares of the ranges; the bounds hold."""
-        return self.retract(action + change * self._range)
+        action, change = jnp.broadcast_arrays(action, change)
+        return self.retract(action + change * _row(self._range, change))
 
     def retract(self, vector: Vectors) -> Float[Array, "... action"]:
         """Return the vector between the bounds that is nearest; NaN where an entry is not finite."""
-        bounded = jnp.clip(jnp.asarray(vector), jnp.asarray(self.low), jnp.asarray(self.high))
+        bounded = jnp.clip(vector, _row(self.low, vector), _row(self.high, vector))
         return jnp.where(jnp.isfinite(vector), bounded, jnp.nan)
 
     def spread(self, count: int) -> Float[Array, "count action"]:
@@ -78,18 +80,26 @@ class Box(Space):
         quasirandom sequences", 2018); of one entry they are evenly spaced.
         """
         if count == 1:
-            return jnp.asarray(self.low)[None] + self._range / 2
+            return self._at(jnp.full((1, self.size), 0.5))
         ratio = 2.0
         for _ in range(64):  # the root of x^(size + 1) = x + 1
             ratio = (1 + ratio) ** (1 / (self.size + 1))
         steps = ratio ** -np.arange(1.0, self.size + 1)
         places = np.arange(count)[:, None] * steps % 1.0 if self.size > 1 else np.arange(float(count))[:, None]
         places = (places - places.min(0)) / np.ptp(places, 0)
-        return jnp.asarray(self.low) + self._range * jnp.asarray(places, jnp.float32)
+        return self._at(jnp.asarray(places, jnp.float32))
+
+    def _at(self, shares: Float[Array, "... action"]) -> Float[Array, "... action"]:
+        return _row(self.low, shares) + _row(self._range, shares) * shares
 
     def to_json(self) -> dict[str, Any]:
         """Describe the box with its bounds."""
         return {**super().to_json(), "low": list(self.low), "high": list(self.high)}
+
+
+def _row(values: Any, like: Vectors) -> Float[Array, "... action"]:
+    """One number an entry, for every action of an array."""
+    return jnp.broadcast_to(jnp.asarray(values, jnp.float32), jnp.shape(like))
 
 
 def _plain_cues(size: int) -> tuple[Cue, ...]:

@@ -81,7 +81,7 @@ def _check_shapes(laws: Laws, env: Environment) -> None:
     """Shapes and types, from traces alone."""
     space, key = actions_of(env), jax.random.key(0)
     shape = jax.eval_shape(lambda: space.sample(key, (3,))).shape
-    laws.hold(shape == (3, space.size), f"its actions' `uniform` gives shape {shape} for 3 actions of {space.size}")
+    laws.hold(shape == (3, space.size), f"its actions' `sample` gives shape {shape} for 3 actions of {space.size}")
     mend = "what depends on traced values must be jax.numpy, with jnp.where and lax.cond in place of if"
     with laws.attempted("tracing `reset`", mend):
         state, obs = jax.eval_shape(lambda env: env.reset(key), env)
@@ -211,7 +211,7 @@ def _asked(env: Any, obs: Array, actions: Array) -> dict[str, Any]:
 def _check_walk(laws: Laws, env: Environment, walk: Trajectory, steps: int) -> None:
     """Laws of the steps themselves."""
     step = walk.step
-    laws.actions(actions_of(env), walk.actions, "what its actions' `uniform` draws")
+    laws.actions(actions_of(env), walk.actions, "what its actions' `sample` draws")
     told = {"obs": step.obs, "final_obs": step.final_obs, "reward": step.reward, **step.metrics, **step.outcome}
     for name, values in told.items():
         laws.hold(

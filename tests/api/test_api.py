@@ -148,11 +148,6 @@ def test_a_label_file_gives_what_its_arrays_give(tmp_path):
         np.testing.assert_array_equal(one, other)
     with pytest.raises(cl.UserError, match="leave out eps_deg"):
         cl.fit_feedback(tmp_path / "labels.parquet", eps_deg=7.0)
-    # Labels of two fifths of that turn by two fifths of that, and a file of them by all of its own.
-    rows = rows.replace(eps_deg=np.full((1, 200), 2.0, np.float32))
-    label_files.write(tmp_path / "finer.parquet", {"name": "window"}, "relative", DIRECTIONS, 5.0, np.array([4]), rows)
-    finer = cl.fit_feedback(tmp_path / "finer.parquet", sizes=SIZES, scalars=dataclasses.replace(SCALARS, k_max=1))
-    assert errors(cl.refine(policy, finer)) == pytest.approx(ERROR - 2.0, abs=0.3)
 
 
 def changed(**parts):

@@ -68,9 +68,9 @@ def one_line(call, says):
 FAULTS = {
     "raised ValueError: boom": ValueError("boom"),
     "raised KeyError": KeyError("a\nb"),
-    "gave no direction": [np.nan, 0.0],
-    "gave no direction but": [0.0, 0.0],
-    "gave no": [0.0, 1e39],
+    "gave zero or not finite numbers in place of actions": [np.nan, 0.0],
+    "gave zero or not finite numbers": [0.0, 0.0],
+    "gave zero or not finite": [0.0, 1e39],
 }
 
 

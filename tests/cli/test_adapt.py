@@ -301,7 +301,7 @@ def test_what_cannot_be_is_refused(adapted, refused, tmp_path):
     refused(["adapt", "own_turned:straight", *new], "is to act in some task: name it, as --task", tmp_path)
     plain = ["adapt", "own_turned:straight", *TASK, *new]
     refused([*plain, "--labels", "0"], "a label budget of 0 teaches nothing", tmp_path)
-    refused([*plain, "--bound-deg", "200"], "bound_deg is 200: give an angle", tmp_path)
+    refused([*plain, "--bound-deg", "200"], "bound_deg is 200: give a number above 0 and up to 180", tmp_path)
     refused([*plain, "--bound-deg", "0.3"], "say nothing within a bound of 0.3: give a smaller", tmp_path)
     refused([*plain, "--guidance", "none"], "asks nothing that could be learned from", tmp_path)
     refused([*plain, "--guidance", "relativ"], "did you mean 'relative'", tmp_path)

@@ -117,7 +117,7 @@ def test_what_is_labelled_by_default_trains_in_minutes(monkeypatch, tmp_path, ca
     place = tmp_path / "my labels"
     asked, plan, commands = asked_for(monkeypatch, "billiards", "--out", str(place), "--who", "Ada B")
     preset = tasks.find("billiards").presets["quickstart"]
-    assert (asked.task, asked.labels, plan.eps_deg) == (preset.config.task, 100, preset.config.scalars.eps_deg)
+    assert (asked.task, asked.labels, plan.eps) == (preset.config.task, 100, preset.config.scalars.eps_deg)
     assert (plan.base.name, asked.practice) == ("near_aims", True)
     assert commands.again == f"cuelearner label billiards --out '{place}' --who 'Ada B'"
     following = "cuelearner train billiards --preset quickstart --guidance relative --labels-from"

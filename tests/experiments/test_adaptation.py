@@ -16,6 +16,7 @@ from cuelearner_jax.feedback.answers import check_teacher
 from cuelearner_jax.guides import intent
 from cuelearner_jax.run_config import GROUPS, check
 from cuelearner_jax.runs.trained import PolicySource
+from cuelearner_jax.spaces import DIRECTIONS
 from cuelearner_jax.storage import table as tables
 from cuelearner_jax.studies.adapt import suggested
 from cuelearner_jax.tasks import registry

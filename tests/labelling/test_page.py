@@ -24,6 +24,7 @@ from cuelearner_jax.feedback.forms import AnswerForm
 from cuelearner_jax.labelling import controls, ending, server, view
 from cuelearner_jax.labelling.ending import Commands
 from cuelearner_jax.labelling.page import Page
+from cuelearner_jax.spaces import DIRECTIONS
 from cuelearner_jax.storage import label_files
 
 
@@ -150,13 +151,13 @@ def test_other_forms_of_feedback_have_a_page_of_the_same_parts(opened, tmp_path,
 
 
 def test_keys_are_told_apart_and_every_answer_is_one_of_the_form():
-    five = AnswerForm("five", 1, "worth", lambda *told: None, values=(0.0, 0.25, 0.5, 0.75, 1.0))
+    five = AnswerForm("five", lambda _: 1, lambda _: "worth", lambda *told: None, lambda _: (0.0, 0.25, 0.5, 0.75, 1.0))
     for form in (RELATIVE, DEMONSTRATION, SCALAR, five):
         known = controls.controls(form)
         keys = [key for control in known.values() for key in control.keys]
         assert len(keys) == len(set(keys)) >= 5
         answers = [control.answer for control in controls.answers(form)]
-        assert sorted(answers) == sorted((value,) for value in form.values or ())
+        assert sorted(answers) == sorted((value,) for value in (form.values(DIRECTIONS) if form.values else ()))
     assert controls.LEFT.answer == (1.0,)
     assert controls.given(RELATIVE, controls.UNSURE, None) is None
 

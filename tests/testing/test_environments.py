@@ -9,7 +9,7 @@ from probes import Aimed, Chain, Window
 
 from cuelearner_jax.environment import Features, Quantity, WholeObservations
 from cuelearner_jax.spaces import DIRECTIONS
-from cuelearner_jax.spaces.directions import rotate
+from cuelearner_jax.spaces.directions import Directions, rotate
 from cuelearner_jax.testing import check_environment
 
 
@@ -138,12 +138,22 @@ class Pointless(Aimed):
     possible = (False, False, False, False)
 
 
+class LongActions(Directions):
+    def sample(self, key, shape=()):
+        return 2.0 * DIRECTIONS.sample(key, shape)
+
+
+class FlatActions(Directions):
+    def sample(self, key, shape=()):
+        return jnp.zeros(shape)
+
+
 class Loose(Window):
-    actions = DIRECTIONS._replace(uniform=lambda key, shape: 2.0 * DIRECTIONS.sample(key, shape))
+    actions = LongActions()
 
 
 class Short(Window):
-    actions = DIRECTIONS._replace(uniform=lambda key, shape: jnp.zeros(shape))
+    actions = FlatActions()
 
 
 def mirrored(image, count=2):
@@ -183,8 +193,8 @@ BROKEN = {
     "features of an action": (Confused(), "`features` hold in `own` what hangs on the action"),
     "aims": (Unequal(), "give a row of each, and a bool, for every aim"),
     "possible aims": (Pointless(), "no aim was possible in any step"),
-    "uniform": (Loose(), "what its actions' `uniform` draws is no action of the space"),
-    "uniform's shape": (Short(), "`uniform` gives shape (3,) for 3 actions of 2"),
+    "sample": (Loose(), "what its actions' `sample` draws is no action of the space"),
+    "shape of samples": (Short(), "`sample` gives shape (3,) for 3 actions of 2"),
     "both ends": (altered(truncated=lambda step, _: step.terminated), "is terminated and truncated"),
     "an integer": (
         altered(reward=lambda step, _: jnp.array(1)),

@@ -1,0 +1,254 @@
+"""Boxes of three and seven entries: laws by hand, answers about each entry, refinement, label files, a guide fitted."""
+
+import dataclasses
+import itertools
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import probes
+import pytest
+from flax import struct
+
+from cuelearner_jax import asking
+from cuelearner_jax.environment import Quantity, WholeObservations
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.feedback import given
+from cuelearner_jax.feedback.answers import (
+    DEMONSTRATION,
+    RELATIVE,
+    SCALAR,
+    demonstrated,
+    human_answer,
+    relative_feedback,
+    scalar_answer,
+)
+from cuelearner_jax.guides import registry
+from cuelearner_jax.guides.refining import refine
+from cuelearner_jax.policies import Uniform
+from cuelearner_jax.spaces import UNSAID, Box, Cue, from_json
+from cuelearner_jax.storage import label_files
+from cuelearner_jax.testing import check_environment
+from cuelearner_jax.types import Label, Step
+
+SMALL = Box((-1.0, 0.0, -2.0), (1.0, 4.0, 0.0))  # ranges 2, 4, 2
+LARGE = Box((-1.0,) * 7, tuple(1.0 + 0.5 * entry for entry in range(7)))
+KEY = jax.random.key(3)
+EPS = 0.1  # shares
+SCALARS = dataclasses.replace(
+    probes.SCALARS, eps_deg=EPS, tau_deg=0.01, tau_max_deg=1.0, scalar_within_deg=0.2, k_max=50
+)
+boxes = pytest.mark.parametrize("box", [SMALL, LARGE], ids=["three", "seven"])
+
+
+class Reach(WholeObservations, struct.PyTreeNode):
+    """A bandit with actions of a box: rewarded within 0.1 of the ranges of a goal, which the observation tells."""
+
+    actions: Box = struct.field(pytree_node=False, default=SMALL)
+
+    observation = (Quantity("context", 2, "1"),)
+    action = Quantity("reach", 3, "1", "a vector of the box")
+
+    def best(self, obs):
+        """The middle of the box, and a fifth of the range of its first two entries along the observation."""
+        shares = jnp.zeros(self.actions.size).at[:2].set(0.2 * obs)
+        return self.actions.exp(self.actions.spread(1)[0], shares)
+
+    def reset(self, key):
+        angle = jax.random.randint(key, (), 0, 4) * (jnp.pi / 2)
+        obs = jnp.stack([jnp.cos(angle), jnp.sin(angle)])
+        return obs, obs
+
+    def step(self, key, state, action):
+        reward = (self.actions.distance(self.best(state), action) <= 0.1).astype(jnp.float32)
+        following, obs = self.reset(key)
+        return following, Step(obs, state, state, reward, jnp.array(True), jnp.array(False), {"hit": reward}, {})
+
+
+def pairs(box, count=64):
+    """Actions and as many others."""
+    return box.sample(jax.random.key(0), (count,)), box.sample(jax.random.key(1), (count,))
+
+
+@boxes
+def test_what_log_says_exp_goes(box):
+    action, other = pairs(box)
+    assert action.shape == (64, box.size)
+    np.testing.assert_allclose(box.exp(action, box.log(action, other)), other, atol=1e-5)
+    np.testing.assert_array_equal(box.log(action, action), 0)
+    low, high = np.array(box.low), np.array(box.high)
+    np.testing.assert_allclose(box.log(low, high), np.ones(box.size), rtol=1e-6)  # shares of the range
+    np.testing.assert_allclose(box.exp(low, 3.0 * jnp.ones(box.size)), high)  # no farther than the bound
+
+
+@boxes
+def test_retract_gives_the_nearest_action_and_leaves_actions_alone(box):
+    action, _ = pairs(box)
+    low, high = np.array(box.low, np.float32), np.array(box.high, np.float32)
+    np.testing.assert_array_equal(box.retract(action), action)
+    np.testing.assert_array_equal(box.retract(jnp.stack([low - 5, high + 5])), [low, high])
+    np.testing.assert_array_equal(box.retract(box.retract(3 * action)), box.retract(3 * action))
+    lost = np.asarray(box.retract(action.at[0, 1].set(jnp.nan).at[1, 0].set(jnp.inf)))
+    assert np.isnan(lost[[0, 1], [1, 0]]).all()
+    assert np.isnan(lost).sum() == 2
+
+
+@boxes
+def test_clip_and_approach_go_no_farther_than_the_bound_along_any_entry(box):
+    action, base = pairs(box)
+    clipped = box.clip(action, base, 0.25)
+    assert np.abs(box.log(base, clipped)).max() <= 0.25 + 1e-6
+    for bound in (0.0, 0.25, 1.0):
+        expected = np.clip(box.log(action, base), -bound, bound)
+        np.testing.assert_allclose(box.log(action, box.approach(action, base, bound)), expected, atol=1e-5)
+    inside = np.asarray(box.distance(base, action)) <= 0.5
+    assert 0 < inside.sum() < 64 or box is LARGE
+    np.testing.assert_array_equal(np.asarray(box.clip(action, base, 0.5))[inside], np.asarray(action)[inside])
+    np.testing.assert_array_equal(box.clip(action, base, 1.0), action)
+
+
+@boxes
+def test_samples_and_the_even_spread_fill_the_box(box):
+    low, high = np.array(box.low), np.array(box.high)
+    for actions in (np.asarray(box.sample(KEY, (500,))), np.asarray(box.spread(500))):
+        shares = (actions - low) / (high - low)
+        assert shares.min() >= -1e-6
+        assert shares.max() <= 1 + 1e-6
+        np.testing.assert_allclose(shares.mean(0), 0.5, atol=0.06)  # of samples: standard deviation 0.013
+        np.testing.assert_allclose(shares.std(0), 1 / np.sqrt(12), atol=0.03)
+    np.testing.assert_allclose(box.spread(1)[0], (low + high) / 2, rtol=1e-6)
+
+
+@boxes
+def test_a_file_describes_a_box(box):
+    assert from_json(box.to_json()) == box
+    assert hash(from_json(box.to_json())) == hash(box)
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        (((0.0, 1.0), (1.0,)), "as many of both"),
+        (((0.0, 1.0), (1.0, 1.0)), "each high above its low"),
+        (((0.0,), (float("inf"),)), "finite number"),
+        (((0.0,), (1.0,), (Cue("a", ("more", "less"), ("q", "a"), "degrees"),)), "has the unit 'degrees'"),
+        (((0.0, 0.0), (1.0, 1.0), (Cue("a", ("more", "less"), ("q", "a"), "shares"),)), "one cue an entry"),
+        (((0.0,) * 9, (1.0,) * 9), "give `cues`"),
+    ],
+)
+def test_bounds_and_cues_that_fit_no_box_are_refused(given, said):
+    with pytest.raises(UserError, match=said):
+        Box(*given)
+
+
+@pytest.mark.parametrize(
+    ("change", "h"),
+    [
+        ((0, 0, 0.3), (0, 0, 1)),  # wrong in its third entry alone
+        ((0, 0, -0.3), (0, 0, -1)),
+        ((0.04, -0.04, 0), (0, 0, 0)),  # right within eps / 2
+        ((0.06, -0.06, 0.04), (1, -1, 0)),
+        ((-0.3, 0.3, 0.3), (-1, 1, 1)),
+    ],
+)
+def test_a_relative_answer_says_of_each_entry_which_way(change, h):
+    action = SMALL.spread(1)[0]
+    best = SMALL.exp(action, jnp.array(change, jnp.float32))
+    np.testing.assert_array_equal(relative_feedback(SMALL, action, best, EPS), h)
+    answer, answered = human_answer(KEY, SMALL, action, best, SCALARS)
+    np.testing.assert_array_equal(answer, h)
+    assert bool(answered)
+    np.testing.assert_allclose(SMALL.log(action, SMALL.toward(action, answer, EPS)), EPS * np.array(h), atol=1e-6)
+
+
+def test_mistakes_and_silence_come_upon_each_entry_by_itself():
+    action = LARGE.spread(1)[0]
+    best = LARGE.exp(action, jnp.full(7, 0.3))
+
+    def answers(**faults):
+        scalars = dataclasses.replace(SCALARS, **faults)
+        keys = jax.random.split(KEY, 400)
+        return map(np.asarray, jax.vmap(lambda key: human_answer(key, LARGE, action, best, scalars))(keys))
+
+    h, answered = answers(mistake_probability=0.25)
+    np.testing.assert_allclose((h == -1).mean(0), 0.25, atol=0.09)  # standard deviation 0.022
+    assert answered.all()
+    h, answered = answers(silence_probability=0.5)
+    np.testing.assert_allclose((h == UNSAID).mean(0), 0.5, atol=0.1)
+    np.testing.assert_array_equal(answered, (h != UNSAID).any(1))
+    unsaid = LARGE.toward(action, jnp.full(7, UNSAID), EPS)
+    np.testing.assert_array_equal(unsaid, action)
+
+
+def test_good_is_an_action_near_the_goal_along_every_entry_and_a_demonstration_is_the_goal():
+    env, obs = Reach(), jnp.array([1.0, 0.0])
+    best, teacher = env.best(obs), probes.Expert(Reach())
+    for change, good in (((0.15, -0.15, 0.15), 1.0), ((0.0, 0.0, 0.25), 0.0)):
+        action = SMALL.exp(best, jnp.array(change))
+        answer, answered = scalar_answer(KEY, env, teacher, obs, obs, action, SCALARS)
+        assert (float(answer[0]), bool(answered)) == (good, True)
+        shown, answered = demonstrated(KEY, env, teacher, obs, obs, action, SCALARS)
+        np.testing.assert_allclose(shown, best, atol=1e-6)
+        assert bool(answered)
+
+
+@boxes
+def test_a_perfect_model_ends_within_half_eps_along_every_entry(box):
+    first, _ = pairs(box)
+    goal = box.exp(box.spread(1)[0], jnp.linspace(-0.4, 0.4, box.size))
+
+    @jax.vmap
+    def residual(action):
+        return box.toward(action, relative_feedback(box, action, goal, EPS), EPS) - action
+
+    active = jnp.ones(64, bool)
+    refined = refine(residual, first, active, space=box, tau=0.01, tau_max=1.0, k_max=50)
+    assert np.abs(box.log(refined.actions, goal)).max() <= EPS / 2 + 1e-5
+    assert np.asarray(refined.passes).max() <= 1 / EPS + 2
+    near = refine(residual, first, active, space=box, tau=0.01, tau_max=0.2, k_max=50)
+    assert np.abs(box.log(first, near.actions)).max() <= 0.2 + 1e-5
+
+
+def test_a_probe_with_a_box_keeps_the_laws_of_environments():
+    check_environment(Reach())
+
+
+def test_relative_labels_lead_to_the_goal_of_a_box():
+    sizes = dataclasses.replace(probes.SIZES, labels_per_round=100, fit_steps=600)
+    env, scalars = Reach(), SCALARS
+    guidance = registry.make("relative", sizes, env)
+    guide = asking.start(guidance, env, 400, 400, jax.random.key(1), jax.random.key(2))
+    label_round = jax.jit(partial(asking.label_round, guidance, sizes))
+    for _ in range(4):
+        guide = label_round(env, probes.Expert(env), scalars, Uniform(SMALL), guide, KEY)
+    assert guide.labels.answer.shape == (400, 3)
+    contexts = jnp.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
+    obs = jnp.repeat(contexts, 16, 0)
+    first, goals = SMALL.sample(KEY, (64,)), jax.vmap(env.best)(obs)
+    acted = jax.jit(guidance.act)(guide.model, env, obs, first, jnp.ones(64, bool), scalars)
+    away = np.asarray(SMALL.distance(acted.actions, goals))
+    assert np.mean(np.asarray(SMALL.distance(first, goals)) <= 0.1) < 0.1
+    assert np.mean(away <= 0.1) > 0.9
+
+
+@pytest.mark.parametrize("form", [RELATIVE, DEMONSTRATION, SCALAR], ids=lambda form: form.name)
+def test_a_label_file_holds_answers_about_a_box(form, tmp_path):
+    action, other = pairs(SMALL, 12)
+    kinds = {
+        "relative": np.array(list(itertools.islice(itertools.product((-1, 0, 1, UNSAID), repeat=3), 12)), np.float32),
+        "demonstration": np.asarray(other),
+        "scalar": np.arange(12, dtype=np.float32)[:, None] % 2,
+    }
+    labels = Label(np.zeros((1, 12, 2), np.float32), action[None], kinds[form.name][None], np.ones((1, 12), bool))
+    eps = EPS if form.by_eps else None
+    path = tmp_path / "labels.parquet"
+    label_files.write(path, {"name": "reach"}, form.name, SMALL, eps, np.array([4]), labels, form.meaning(SMALL))
+    file = label_files.read(path)
+    assert (file.space, file.answers, file.eps) == (SMALL, form.name, eps)
+    np.testing.assert_array_equal(file.labels.action, action)
+    np.testing.assert_array_equal(file.labels.answer, kinds[form.name])
+    given.check_file(file, None, form, "labels.parquet")
+    spoilt = file._replace(labels=file.labels.replace(action=file.labels.action + np.float32([5, 0, 0])))
+    with pytest.raises(UserError, match="vectors between the bounds"):
+        given.check_file(spoilt, None, form, "labels.parquet")
