@@ -107,7 +107,7 @@ def test_the_contract_says_what_goes_in_and_what_comes_out(folder):
     assert told["action"]["clip_radius_deg"] == pytest.approx(7.0)
     outer, inner = layers(told["policy"])
     assert (outer["policy"], outer["guidance"], outer["scalars"]["k_max"]) == ("guided", "relative", SCALARS.k_max)
-    assert (inner["policy"], inner["sizes"]["directions"], inner["sizes"]["frame"]) == ("agent", 72, "raw")
+    assert (inner["policy"], inner["agent"]["directions"], inner["frame"]) == ("agent", 72, "raw")
     assert f"jax {jax.__version__}" in told["versions"]
     for name, recorded in told["files"].items():
         assert hashlib.sha256((folder / "numpy" / name).read_bytes()).hexdigest() == recorded
