@@ -175,7 +175,7 @@ TABLE = {
         "world": NO_WORLDS,
         "teacher": (*NO_TEACHERS, None),
         "labels": (*NO_WHOLE, None, 0, 2**40),
-        "bound_deg": (*NO_ANGLES, None),
+        "bound_deg": NO_ANGLES,
         "eps_deg": NO_ANGLES,
         "sizes": NO_SIZES,
         "scalars": NO_SCALARS,
