@@ -19,7 +19,6 @@ from cuelearner_jax.environment import Environment, actions_of
 from cuelearner_jax.guides.base import Guide
 from cuelearner_jax.guides.refining import within
 from cuelearner_jax.policies import Policy, acted, best_actions, named
-from cuelearner_jax.spaces import DIRECTIONS
 from cuelearner_jax.types import GuideState, Label, Stream, Teacher
 
 ONE_BY_ONE = GuideSizes()  # questions as they come, of one strength: as a page asks them
@@ -265,20 +264,24 @@ def ask_all(
 
 
 def blame(
-    teacher: Teacher | None, guide: GuideState, base: Policy | None = None, key: PRNGKeyArray | None = None
+    env: Environment,
+    teacher: Teacher | None,
+    guide: GuideState,
+    base: Policy | None = None,
+    key: PRNGKeyArray | None = None,
 ) -> None:
     """Raises UserError if a teacher or a base policy gives something else than actions where a guide stands.
 
     For a lane that failed while it asked: it stands where it did before, and its labels hold nothing of the fault.
     """
-    states, obs = guide.env, guide.obs
+    states, obs, space = guide.env, guide.obs, actions_of(env)
     if obs.ndim == 1:
         states, obs = jax.tree.map(lambda leaf: leaf[None], (states, obs))
     if base is not None:
         assert key is not None
-        user_code.check_actions(DIRECTIONS.only_actions(base.act(key, states, obs)), named(base))
+        user_code.check_actions(space.only_actions(base.act(key, states, obs)), named(base))
     if teacher is not None:
-        given = DIRECTIONS.only_actions(best_actions(teacher, states, obs))
+        given = space.only_actions(best_actions(teacher, states, obs))
         user_code.check_actions(given, f"teacher {type(teacher).__name__}")
 
 

@@ -191,7 +191,7 @@ def adapt(
                 program.ask_round(work.guidance, work.sizes, env, asks, work.scalars, bases, block, mesh)
             )
             if block.failed.all():
-                program.blame(bases, asks, block)
+                program.blame(env, bases, asks, block)
         tell(number, number)
     judged, block = measure.judged(block)
     curve = [{name: values[:count] for name, values in row.items()} for row in measure.curve]

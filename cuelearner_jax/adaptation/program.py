@@ -229,10 +229,10 @@ def take_labels(
     return _take(guidance, sizes, mesh, env, scalars, bases, labels, block)
 
 
-def blame(bases: PolicyBlock, teacher: Teacher | None, block: Adapting) -> None:
+def blame(env: Environment, bases: PolicyBlock, teacher: Teacher | None, block: Adapting) -> None:
     """Raises UserError if the first lane, which failed, did so for its policy or its teacher (see `asking.blame`)."""
     lane = jax.tree.map(lambda leaf: leaf[0], block)
-    asking.blame(teacher, lane.guide, bases.lane(lane.base), lane.key)
+    asking.blame(env, teacher, lane.guide, bases.lane(lane.base), lane.key)
 
 
 def adapted(

@@ -23,6 +23,7 @@ from cuelearner_jax.agents.replay import Memory
 from cuelearner_jax.config import POSITIVE, SHARE, Bounds, Frame, Layers, Scalars, Sizes, part
 from cuelearner_jax.environment import Spaces
 from cuelearner_jax.errors import UserError
+from cuelearner_jax.spaces import check_directions
 from cuelearner_jax.types import Params, Transition
 
 ALIGNED = 64  # layers computed in bfloat16 are filled up to multiples: 20% faster on an H200, whose rows want alignment
@@ -66,7 +67,9 @@ class Config:
     """Gradient steps between two moves of the target network."""
 
     def make(self, frame: Frame, spaces: Spaces, bootstraps: bool = False) -> DoubleDQN:
-        """The agent for an environment's spaces. Raises UserError for a frame in which it cannot be seen."""
+        """The agent for an environment's spaces. Raises UserError for a frame or a search that does not fit them."""
+        if self.coarse_directions:
+            check_directions(spaces.actions, "agent.coarse_directions", "give 0")
         view.widths(frame, spaces)
         return DoubleDQN(self, frame, spaces, bootstraps)
 

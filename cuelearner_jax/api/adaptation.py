@@ -160,7 +160,7 @@ def adapt(
     subject = Subject(source, Base(source.default_policy), own, teacher=teacher, rows=rows)
     outcome = study.run(subject, request, note=partial(warnings.warn, stacklevel=5))
     if outcome.found.block.failed.any():
-        program.blame(outcome.found.asked.bases, teacher, outcome.found.block)
+        program.blame(env, outcome.found.asked.bases, teacher, outcome.found.block)
         raise diverged()
     if not outcome.found.judged.used.all():
         warnings.warn(study.sentences(outcome.found)[0], stacklevel=3)

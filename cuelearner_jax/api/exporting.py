@@ -10,7 +10,6 @@ from cuelearner_jax.api import arguments
 from cuelearner_jax.api.acting import as_policy, as_policy_in
 from cuelearner_jax.api.worlds import World, a_world
 from cuelearner_jax.config import to_json
-from cuelearner_jax.environment import action_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.export import contract, decisions, runner
 
@@ -38,7 +37,7 @@ def export_policy(policy: Any, out: str | Path, world: World, format: str = "sta
     acting = as_policy_in(policy, env)
     about = {"subject": type(policy).__name__, "world": {"name": world.task.name, **to_json(world.config)}}
     drawn = lambda: decisions.observations(env, acting)  # noqa: E731
-    return contract.write(acting, env.observation, action_of(env), drawn, format, out, about)
+    return contract.write(acting, env, drawn, format, out, about)
 
 
 def load_exported(folder: str | Path) -> runner.Decision:

@@ -156,7 +156,7 @@ def ask(
     for _ in range(program.rounds(lanes, sizes)):
         block = program.ask_round(guidance, sizes, env, teacher, scalars, base, block)
     if block.failed.any():
-        program.blame(base, teacher, block)
+        program.blame(env, base, teacher, block)
         raise diverged()
     guide = jax.tree.map(lambda leaf: leaf[0], block.guide)
     return FeedbackModel(guidance, guide.model, scalars, labels_of(guide.labels), sizes, space, env)

@@ -18,9 +18,9 @@ from brax.envs.wrappers import training
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from cuelearner_jax.environment import Environment, Quantity, WholeObservations
+from cuelearner_jax.environment import Environment, Quantity, WholeObservations, actions_of
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.spaces.directions import retract
+from cuelearner_jax.spaces.directions import check_directions, retract
 from cuelearner_jax.types import EnvState, Step
 
 RawKey = Any  # uint32 words, which is what brax passes: the wrappers read a batch's shape from them
@@ -136,7 +136,10 @@ def to_brax(env: Environment) -> BraxView:
 
     `metrics` are `Step.metrics` and, where an episode ends, `Step.outcome` (elsewhere 0), so that brax's sum over an
     episode is the outcome. A brax `randomization_fn` gets our environment and returns a batch of it with its axes.
+
+    Raises UserError for an environment whose actions are no directions.
     """
+    check_directions(actions_of(env), "to_brax", "train on this environment with `cuelearner train`")
     supply_device_put_replicated()
     return BraxView(env)
 

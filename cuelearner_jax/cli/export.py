@@ -9,7 +9,6 @@ from typing import Generic
 from cuelearner_jax.cli.parsing import about, out, parse, source_of, taken, world_of
 from cuelearner_jax.cli.shared_options import TaskT
 from cuelearner_jax.config import digest, to_json
-from cuelearner_jax.environment import action_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.export import contract, decisions
 from cuelearner_jax.export.formats import FORMATS
@@ -68,8 +67,7 @@ def run(arguments: list[str]) -> None:
     )
     written = contract.write(
         policy,
-        env.observation,
-        action_of(env),
+        env,
         lambda: decisions.observations(env, policy),
         asked.format,
         asked.out,

@@ -31,6 +31,7 @@ from cuelearner_jax.policies import NearAims, uniform_in
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs.grid import LARGEST_SEED
 from cuelearner_jax.runs.trained import PolicySource
+from cuelearner_jax.spaces import check_directions
 from cuelearner_jax.storage import label_files
 from cuelearner_jax.storage.folders import claimed
 from cuelearner_jax.task import Task, shape_of
@@ -176,6 +177,7 @@ def planned(
     robot, task = _robot(task, asked.robot), task.on(asked.robot)
     env = shape_of(task, asked.task)
     space = actions_of(env)
+    check_directions(space, "the labelling page", "collect answers with a program of your own, and give --labels-from")
     if asked.bound_deg is not None and not 0 < asked.bound_deg <= space.reach:
         raise UserError(
             f"--bound-deg is {asked.bound_deg:g}: give a number above 0 and up to {space.reach:g} ({space.unit})"

@@ -22,12 +22,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from cuelearner_jax.environment import Quantity
+from cuelearner_jax.environment import Quantity, action_of, actions_of
 from cuelearner_jax.errors import UserError, closest
 from cuelearner_jax.export import operations, runner
 from cuelearner_jax.export.decisions import TOLERANCE, golden_cases
 from cuelearner_jax.export.formats import FORMATS, traced
 from cuelearner_jax.policies import Policy, describe
+from cuelearner_jax.spaces import check_directions
 from cuelearner_jax.storage.provenance import provenance
 from cuelearner_jax.storage.whole import Place, is_used, place_of, replacing
 
@@ -48,8 +49,7 @@ def _check_free(out: Path) -> None:
 
 def write(
     policy: Policy,
-    observation: Sequence[Quantity],
-    action: Quantity,
+    env: Any,
     drawn: Callable[[], Float[np.ndarray, "n obs"]],
     format: str,
     out: Path,
@@ -59,8 +59,7 @@ def write(
 
     Args:
         policy: whose decision it is.
-        observation: the slices of what it sees.
-        action: what it gives.
+        env: whose observations and actions the contract describes.
         drawn: gives observations such as it will meet, among which golden cases are chosen.
         format: a key of `FORMATS`.
         out: the folder.
@@ -70,11 +69,12 @@ def write(
         The contract, with "difference": the largest one of a golden case, just now.
 
     Raises:
-        UserError: no such format; the folder is in use; the policy cannot be exported.
+        UserError: no such format; the folder is in use; the policy cannot be exported; its actions are no directions.
     """
+    check_directions(actions_of(env), "an exported decision", "call the policy from Python")
     check_request(format, out)
     with place_of(out, _check_free) as place:
-        return _made(policy, observation, action, drawn, format, place, source)
+        return _made(policy, env.observation, action_of(env), drawn, format, place, source)
 
 
 def _made(

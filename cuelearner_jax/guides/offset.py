@@ -10,6 +10,7 @@ action and is fitted to what the spline leaves. The network counts as much as he
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import Any
 
@@ -24,7 +25,7 @@ from cuelearner_jax.guides.fitting import fit_least_squares, held_out, lessons
 from cuelearner_jax.guides.model import GuideModel, guide_model
 from cuelearner_jax.guides.refining import Refined
 from cuelearner_jax.guides.relative import Relative
-from cuelearner_jax.spaces import Space
+from cuelearner_jax.spaces import Space, check_directions
 from cuelearner_jax.types import GuidanceModel, Label, Params
 
 KNOTS = 13  # evenly spaced, from the largest turn that was asked about on one side to that on the other
@@ -96,11 +97,16 @@ def share_of(
     return jnp.clip(product / jnp.where(size > 0, size, 1.0), 0, 1)
 
 
+@dataclass(frozen=True)
 class Offset(Relative):
     """A guide that corrects actions by how far they have been turned; its labels keep what the policy did (`base`).
 
     Members of an ensemble disagree about actions as if they had not been turned.
     """
+
+    def __post_init__(self) -> None:
+        """Raises UserError for actions other than directions: an action may have turned along one cue alone."""
+        check_directions(self.spaces.actions, "guidance 'offset'", "give guidance 'relative'")
 
     @cached_property
     def network(self) -> GuideModel:

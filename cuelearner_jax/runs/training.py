@@ -90,7 +90,7 @@ class Training:
             self.clock, self.blocks = self.group.label_round(teacher, self.clock, self.blocks)
             self.wall += time.perf_counter() - started
             if self.failed.all():
-                blame(teacher, jax.tree.map(lambda leaf: leaf[0], self.blocks[0].guide))
+                blame(self.group.env, teacher, jax.tree.map(lambda leaf: leaf[0], self.blocks[0].guide))
             yield self.round
 
     def take(self, file: label_files.LabelFile) -> None:

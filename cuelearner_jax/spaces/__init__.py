@@ -7,10 +7,10 @@ from typing import Any
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.spaces.box import Box
 from cuelearner_jax.spaces.choices import Choices
-from cuelearner_jax.spaces.directions import DIRECTIONS
+from cuelearner_jax.spaces.directions import DIRECTIONS, check_directions
 from cuelearner_jax.spaces.space import UNSAID, Cue, Space, said
 
-__all__ = ["DIRECTIONS", "UNSAID", "Box", "Choices", "Cue", "Space", "from_json", "said"]
+__all__ = ["DIRECTIONS", "UNSAID", "Box", "Choices", "Cue", "Space", "check_directions", "from_json", "said"]
 
 
 def from_json(about: Any) -> Space:

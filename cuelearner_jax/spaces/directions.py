@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from cuelearner_jax.errors import UserError
 from cuelearner_jax.spaces.space import Cue, Space
 
 SQUARABLE = 1e15  # an entry up to this, and down to its inverse, has a square in single precision
@@ -133,6 +134,13 @@ class Directions(Space):
 
 
 DIRECTIONS = Directions()
+
+
+def check_directions(space: Space, what: str, instead: str) -> None:
+    """Raises UserError for another space than `DIRECTIONS`, in which `what` would be wrong; `instead`: what to do."""
+    if space != DIRECTIONS:
+        about = f"{space.name} of {space.size} entries"
+        raise UserError(f"{what} works for directions in the plane alone, not for actions of a {about}: {instead}")
 
 
 def best_direction(

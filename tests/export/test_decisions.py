@@ -54,7 +54,7 @@ POLICIES = {
 
 
 def write(policy, format, out, drawn=DRAWN):
-    return contract.write(policy, ENV.observation, action_of(ENV), lambda: drawn, format, out, {"subject": "test"})
+    return contract.write(policy, ENV, lambda: drawn, format, out, {"subject": "test"})
 
 
 @pytest.fixture(scope="module")
@@ -288,7 +288,7 @@ def test_of_two_exports_at_once_the_second_is_refused(folder, tmp_path):
         second.append(str(refused.value))
         return DRAWN
 
-    contract.write(Heuristic(ENV), ENV.observation, action_of(ENV), meanwhile, "numpy", out, {})
+    contract.write(Heuristic(ENV), ENV, meanwhile, "numpy", out, {})
     assert len(second) == 1
     assert "\n" not in second[0]
     assert contract.checked(out) <= 1e-5

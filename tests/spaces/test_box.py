@@ -3,6 +3,7 @@
 import dataclasses
 import itertools
 from functools import partial
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -12,8 +13,13 @@ import pytest
 from flax import struct
 
 from cuelearner_jax import asking
-from cuelearner_jax.environment import Quantity, WholeObservations
+from cuelearner_jax.agents import ddqn
+from cuelearner_jax.bridges import brax
+from cuelearner_jax.cli import label
+from cuelearner_jax.config import GuideScalars, GuideSizes
+from cuelearner_jax.environment import Quantity, WholeObservations, spaces_of
 from cuelearner_jax.errors import UserError
+from cuelearner_jax.export import contract
 from cuelearner_jax.feedback import given
 from cuelearner_jax.feedback.answers import (
     DEMONSTRATION,
@@ -27,8 +33,10 @@ from cuelearner_jax.feedback.answers import (
 from cuelearner_jax.guides import registry
 from cuelearner_jax.guides.refining import refine
 from cuelearner_jax.policies import Uniform
+from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.spaces import UNSAID, Box, Cue, from_json
 from cuelearner_jax.storage import label_files
+from cuelearner_jax.task import Body, Task
 from cuelearner_jax.testing import check_environment
 from cuelearner_jax.types import Label, Step
 
@@ -252,3 +260,44 @@ def test_a_label_file_holds_answers_about_a_box(form, tmp_path):
     spoilt = file._replace(labels=file.labels.replace(action=file.labels.action + np.float32([5, 0, 0])))
     with pytest.raises(UserError, match="vectors between the bounds"):
         given.check_file(spoilt, None, form, "labels.parquet")
+
+
+def labelled():
+    """What `cuelearner label` plans for a task whose actions are a box."""
+    body = Body("arm", "", lambda config, split: Reach())
+    task, config = Task("reach", "a box", probes.WindowConfig, (body,)), probes.WindowConfig()
+    asked = label.Label(config, GuideSizes(), GuideScalars(), Path("labels"), guidance="relative")
+    return label.planned(task, RunConfig(config), asked, None)
+
+
+@pytest.mark.parametrize(
+    ("what", "planar"),
+    [
+        ("guidance 'offset'", lambda: registry.make("offset", probes.SIZES, Reach())),
+        ("agent.coarse_directions", lambda: ddqn.Config(coarse_directions=36).make("raw", spaces_of(Reach()))),
+        ("an exported decision", lambda: contract.write(Uniform(SMALL), Reach(), list, "numpy", Path("new"), {})),
+        ("to_brax", lambda: brax.to_brax(Reach())),
+        ("the labelling page", labelled),
+    ],
+)
+def test_what_knows_directions_alone_refuses_a_box(what, planar):
+    with pytest.raises(UserError, match=f"{what} works for directions .* not for actions of a box of 3 entries: [a-z]"):
+        planar()
+
+
+class Saying(struct.PyTreeNode):
+    """A teacher of one action."""
+
+    action: jax.Array
+
+    def best_action(self, state, obs):
+        return self.action
+
+
+def test_a_teacher_is_blamed_by_the_rules_of_their_space():
+    """A vector of zeros is no direction, and an action of this box."""
+    env = Reach()
+    guide = asking.start(registry.make("relative", probes.SIZES, env), env, 20, 20, KEY, KEY)
+    asking.blame(env, Saying(jnp.zeros(3)), guide)
+    with pytest.raises(UserError, match="teacher Saying gave actions that are not finite"):
+        asking.blame(env, Saying(jnp.array([0.0, jnp.nan, 0.0])), guide)
