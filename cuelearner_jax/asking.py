@@ -190,7 +190,23 @@ def fit(
     """The guide with a model of its labels. `times`: fits before this one, where it is one of several."""
     key = jax.random.fold_in(lane_key, Stream.FIT)
     key = key if times is None else jax.random.fold_in(key, times)
-    return guide.replace(model=guidance.fit(key, env, guide.labels, guide.model, scalars))
+    labels = fitted_labels(key, guide.labels, scalars)
+    return guide.replace(model=guidance.fit(key, env, labels, guide.model, scalars))
+
+
+def fitted_labels(key: PRNGKeyArray, labels: Label, scalars: GuideScalars) -> Label:
+    """Return what a model is fitted to: labels (slots, ...), or, where `scalars.answer` is shuffled, its control.
+
+    Of the control each label that counts has the answer of another. Situations, actions and answers are then as
+    frequent as in the labels, and no answer is about its action. `key`: of the fit.
+    """
+    if getattr(scalars, "answer", "best") != "shuffled":
+        return labels
+    drawn = jax.random.uniform(jax.random.fold_in(key, Stream.SHUFFLE), labels.valid.shape)
+    order = jnp.argsort(jnp.where(labels.valid, drawn, jnp.inf))  # those that count first
+    place, count = jnp.arange(len(order)), labels.valid.sum()
+    after = jnp.where(place < count, (place + 1) % jnp.maximum(count, 1), place)
+    return labels.replace(answer=labels.answer.at[order].set(labels.answer[order[after]]))
 
 
 def ask(

@@ -178,3 +178,4 @@ class Stream(IntEnum):
     FIT = 2
     TRAIN = 3
     WALK = 4
+    SHUFFLE = 5

@@ -186,3 +186,48 @@ def test_labels_given_elsewhere_are_fitted_once():
     given = begun().replace(labels=labels, asked=begun().budget)
     chex.assert_trees_all_equal(taken, fit(ENV, probes.SCALARS, given, LANE_KEY))
     assert bool(taken.model.fitted)
+
+
+def test_shuffled_answers_are_those_given_each_with_another_label():
+    """A control that can fail: how often each answer is given stays, and no answer is about its action."""
+    answer, valid = np.arange(20.0)[:, None], np.arange(20) % 7 != 3  # told apart; three count for nothing
+    labels = begun(budget=20).labels.replace(answer=jnp.asarray(answer), valid=jnp.asarray(valid))
+    assert asking.fitted_labels(LANE_KEY, labels, FAULTY) is labels
+    scalars = dataclasses.replace(FAULTY, answer="shuffled")
+    given = asking.fitted_labels(LANE_KEY, labels, scalars)
+    found = np.asarray(given.answer)
+    chex.assert_trees_all_equal(given.replace(answer=labels.answer), labels)
+    np.testing.assert_array_equal(np.sort(found[valid], 0), answer[valid])
+    assert (found[valid] != answer[valid]).all()
+    np.testing.assert_array_equal(found[~valid], answer[~valid])
+    other = asking.fitted_labels(jax.random.key(12), labels, scalars)
+    assert (np.asarray(other.answer) != found).any()
+
+
+@pytest.mark.parametrize("told", [False, True], ids=["asked", "given"])
+def test_models_are_fitted_to_shuffled_answers_and_labels_keep_their_own(told, monkeypatch):
+    fitted = []
+
+    def fit(self, key, env, labels, former, scalars):
+        jax.debug.callback(lambda *rows: fitted.append(rows), labels.answer, labels.valid)
+        return former
+
+    monkeypatch.setattr(type(RELATIVE), "fit", fit)
+    scalars, start = dataclasses.replace(probes.SCALARS, answer="shuffled"), begun(budget=20)
+    asked = jax.jit(partial(asking.label_round, RELATIVE, probes.SIZES))
+    guide, best = start, start
+    for _ in range(20 // ROUND):
+        guide = asked(ENV, EXPERT, scalars, Heuristic(ENV), guide, LANE_KEY)
+        best = asked(ENV, EXPERT, probes.SCALARS, Heuristic(ENV), best, LANE_KEY)
+    chex.assert_trees_all_equal(guide.labels, best.labels)  # what is kept, and what files hold
+    labels = guide.labels.replace(answer=jnp.arange(20.0)[:, None])
+    if told:
+        fitted.clear()
+        taken = asking.take_labels(RELATIVE, ENV, scalars, labels, start, LANE_KEY)
+        chex.assert_trees_all_equal(taken.labels, labels)
+    jax.effects_barrier()
+    answers, valid = map(np.asarray, fitted[-1])
+    kept = np.asarray(labels.answer if told else guide.labels.answer)
+    assert valid.sum() == 20
+    np.testing.assert_array_equal(np.sort(answers, 0), np.sort(kept, 0))
+    assert not told or (answers != kept).all()

@@ -45,7 +45,7 @@ from cuelearner_jax.run_config import RunConfig
         ("scalars", {"mistake_probability": -0.1}, "scalars.mistake_probability is -0.1"),
         ("scalars", {"silence_probability": 2.0}, "scalars.silence_probability is 2.0"),
         ("scalars", {"refined_fraction": 1.1}, "scalars.refined_fraction is 1.1"),
-        ("scalars", {"answer": "worst"}, "scalars.answer is 'worst': give best or nearest"),
+        ("scalars", {"answer": "worst"}, "scalars.answer is 'worst': give best or nearest or shuffled"),
         ("scalars", {"nearest_share": 1.1}, "scalars.nearest_share is 1.1: give a number from 0 to 1"),
         ("scalars", {"nearest_aim_deg": -1.0}, "scalars.nearest_aim_deg is -1.0: give a number that is not negative"),
         ("scalars", {"scalar_within_deg": math.nan}, "scalars.scalar_within_deg is nan"),

@@ -17,6 +17,7 @@ from jax.sharding import Mesh
 from jaxtyping import Array, Float
 
 from cuelearner_jax.adaptation.program import Adapting, Lanes
+from cuelearner_jax.asking import fitted_labels
 from cuelearner_jax.config import GuideSizes, Scalars
 from cuelearner_jax.devices import each_lane
 from cuelearner_jax.environment import Environment, actions_of
@@ -125,7 +126,8 @@ def _predicted(guidance: Guide, env: Any, scalars: Any, block: Adapting) -> tupl
     space = actions_of(env)
 
     def one(lane: Adapting) -> tuple[Array, Array]:
-        labels, key = lane.guide.labels, jax.random.fold_in(lane.key, HELD_OUT)
+        key = jax.random.fold_in(lane.key, HELD_OUT)
+        labels = fitted_labels(key, lane.guide.labels, scalars)
         held = labels.valid & (jnp.arange(labels.valid.shape[0]) % HELD_OUT == HELD_OUT - 2)
         others = labels.replace(valid=labels.valid & ~held)
         model = guidance.fit(key, env, others, guidance.init(key), scalars)

@@ -80,8 +80,9 @@ class GuideScalars:
 class TeacherFaults:
     """Scalars of a simulated teacher: what it answers about, and how it errs; traced, but for words."""
 
-    answer: Literal["best", "nearest"] = "best"
-    """What it has in mind: its best action, or of those that it holds for good the nearest to the one asked about."""
+    answer: Literal["best", "nearest", "shuffled"] = "best"
+    """What it has in mind: its best action, or of those that it holds for good the nearest to the one asked about.
+    shuffled, a control: best, but models are fitted to labels that have each other's answers."""
     nearest_share: Annotated[float, SHARE] = 0.6
     """Good is an action worth at least this share of the best one."""
     nearest_aim_deg: Annotated[float, Bounds(0)] = 1.0
