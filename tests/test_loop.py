@@ -19,7 +19,7 @@ from cuelearner_jax.devices import lane_mesh
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.policies import Agent, Guided, Uniform
 from cuelearner_jax.spaces import directions
-from cuelearner_jax.types import Label, Transition
+from cuelearner_jax.types import Label, Step, Transition
 
 ENV, EXPERT = probes.Window(), probes.Expert(probes.Window())
 MESH = lane_mesh()
@@ -475,6 +475,50 @@ def test_one_stretch_of_steps_is_two_of_half_the_length():
             clock, state, _ = program.train(ENV, probes.SETTINGS, clock, state, count)
         results.append(jax.tree.map(np.asarray, (clock, state.replace(key=jax.random.key_data(state.key)))))
     assert_equal(*results)
+
+
+# Environments that are no program of JAX.
+
+
+class PlainWindow:
+    """The bandit in NumPy, its contexts drawn beforehand: (steps, num_envs, 2)."""
+
+    def __init__(self, contexts):
+        self.contexts, self.now, self.seen = contexts, contexts[0], []
+
+    def step(self, actions):
+        """Returns what the actions led to, as `types.Step` has it, of every environment."""
+        best = [complex(*obs) * np.exp(0.6j) for obs in self.now]
+        error = [abs(np.angle(complex(*action) / goal)) for action, goal in zip(actions, best, strict=True)]
+        reward = np.array(np.array(error) <= 0.5, np.float32)
+        self.seen.append(self.now)
+        final, self.now = self.now, self.contexts[len(self.seen)]
+        ended = np.ones(len(reward), bool)
+        return Step(self.now, final, final, reward, ended, ~ended, {"hit": reward}, {})
+
+
+def test_a_plain_environment_between_acting_and_learning_gives_the_compiled_loop():
+    program, guide = probes.window_program("heuristic"), guidances.make("heuristic", probes.SIZES, ENV)
+    lane, settings, key = loop.make_lane(probes.CONFIG, guide, ENV, 0), replaced(), jax.random.key(0)
+    _, compiled, _ = run(program, settings, loop.start_clock(), probes.start(program, [3], [0]))
+    clock, state = loop.start_clock(), lane.init(ENV, jax.random.fold_in(key, 3), 0)
+
+    def drawn(step):  # the contexts that the environment of JAX draws
+        return jax.vmap(ENV.reset)(jax.random.split(lane.keys(clock.replace(step=step), state)[1], 4))[1]
+
+    later = jax.jit(jax.vmap(drawn))(4 * jnp.arange(STRETCH))
+    contexts = np.concatenate([np.asarray(state.agent.obs)[None], later])
+    act, absorb, learn = jax.jit(lane.act), jax.jit(lane.absorb), jax.jit(lane.learn)
+    plain = PlainWindow(contexts)
+    for _ in range(STRETCH):
+        acted = act(ENV, settings, clock, state)
+        state, _ = absorb(settings, clock, state, acted, plain.step(np.asarray(acted.actions)))
+        state, _ = learn(ENV, settings, clock, state)
+        clock = lane.advance(clock, settings.schedule)
+    compiled, own = probes.lane(compiled, 0), jax.tree.map(lambda leaf: np.asarray(probes.words(leaf)), state)
+    assert own.agent.replay[:48, 4].any()  # rewards
+    drop = lambda found: found.replace(agent=found.agent.replace(env=None))  # noqa: E731  # the world keeps its state
+    assert_equal(drop(own), drop(compiled))  # to the last bit
 
 
 # Compiling once.

@@ -37,7 +37,7 @@ class Evaluate(Request[TaskT], Generic[TaskT]):
     folder. The table then shows both and the difference."""
     out: Path | None = None
     """Also write the measurements to this JSON file. (Beside all these: --base package.module:NAME gives the code of a
-    policy folder that has some.)"""
+    policy folder that has some, --agent and --arbiter that of a run's own parts.)"""
 
 
 OPTIONS = {"evaluate": Evaluate}

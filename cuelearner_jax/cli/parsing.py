@@ -23,6 +23,7 @@ from cuelearner_jax.cli.dispatch import HELP, HELP_ALL
 from cuelearner_jax.errors import UserError, closest, no_space
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.policies import policy_of
+from cuelearner_jax.run_config import PARTS
 from cuelearner_jax.runs.trained import POLICIES, PolicySource
 from cuelearner_jax.storage import policy_folders, whole
 from cuelearner_jax.task import PAPER, Preset, Task
@@ -224,7 +225,7 @@ def preset_of(task: Task, arguments: list[str], default: str = PAPER) -> tuple[s
 def source_of(arguments: list[str], command: str, kind: type) -> tuple[PolicySource, list[str]]:
     """The run folder, policy folder or task named first, and the other arguments.
 
-    --task makes a task from outside known, and --base the code in a policy.
+    --task makes a task from outside known, --agent and --arbiter those of a run, and --base the code in a policy.
 
     Raises:
         UserError: there is no such folder or task, or it cannot be had.
@@ -233,6 +234,10 @@ def source_of(arguments: list[str], command: str, kind: type) -> tuple[PolicySou
     known = None if given is None else registry.resolve(given)
     reference, rest = taken(rest, "--base", "package.module:NAME")
     code = None if reference is None else code_of(reference)
+    for name, parts in PARTS.items():
+        reference, rest = taken(rest, f"--{name}", "package.module:NAME")
+        if reference is not None:
+            parts.resolve(reference)
     if known is None and (not rest or rest[0] in HELP):
         print(f"usage: cuelearner {command} FOLDER|TASK [OPTIONS]\n\n{summary(kind)}\n\n{_tasks(HELP_ALL in rest)}\n")
         print(f"options and their defaults: cuelearner {command} {registry.names()[0]} --help")

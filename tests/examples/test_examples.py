@@ -11,11 +11,20 @@ from importlib.abc import Loader, MetaPathFinder
 from importlib.util import spec_from_loader
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+import probes
 import pytest
 from PIL import Image
 
+from cuelearner_jax import loop
+from cuelearner_jax.agents.protocol import AgentFunctions
+from cuelearner_jax.agents.registry import AGENTS
+from cuelearner_jax.arbiters.protocol import Arbiter, Outcome
+from cuelearner_jax.arbiters.registry import ARBITERS
 from cuelearner_jax.cli import main
+from cuelearner_jax.environment import spaces_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.storage import results
@@ -66,18 +75,20 @@ def forget_modules():
 
 @contextlib.contextmanager
 def stranger():
-    """A process that knows no task, kind or module of the examples, and forgets them again."""
-    kinds, known, modules = dict(guidances._KINDS), dict(tasks._registered), forget_modules()
-    guidances._KINDS.pop("clone", None)
+    """A process that knows no task, part, kind or module of the examples, and forgets them again."""
+    tables = (guidances._KINDS, tasks._registered, AGENTS._found, ARBITERS._found)
+    before, modules = [dict(table) for table in tables], forget_modules()
     tasks._registered.clear()
+    for table, name in ((guidances._KINDS, "clone"), (AGENTS._found, "soft"), (ARBITERS._found, "late")):
+        table.pop(name, None)
     sys.meta_path.insert(0, AGAIN)
     try:
         yield
     finally:
         sys.meta_path.remove(AGAIN)
-        for table, before in ((guidances._KINDS, kinds), (tasks._registered, known)):
+        for table, known in zip(tables, before, strict=True):
             table.clear()
-            table.update(before)
+            table.update(known)
         forget_modules()
         sys.modules.update(modules)
 
@@ -169,6 +180,98 @@ def test_a_kind_from_outside_must_be_named_again(runs, capsys):
     assert not (runs / "new").exists()
     with stranger():
         assert main([*map(str, command), "--guidance", "none", *SMALL["evaluate"]]) == 0  # the other lanes need no code
+
+
+BANDIT = """
+from dataclasses import replace
+from probes import CONFIG, make_task
+from cuelearner_jax.task import Preset
+TASK = replace(make_task("own_parts"), presets={"quickstart": Preset("tiny", CONFIG)})
+"""
+PARTS = ["--agent", "examples.soft_agent:Config", "--arbiter", "examples.late_arbiter:Config"]
+OPTIONS = shlex.split("""
+    --agent.layers 8 --agent.actions 6 --agent.temperature 0.2 --agent.batch-size 8 --agent.replay-capacity 80
+    --agent.learning-rate 0.02 --arbiter.after 0 --arbiter.probability 0.25
+    --schedule.total-steps 80 --schedule.guidance-until 60 --schedule.eval-every 40 --schedule.checkpoint-every 40
+""")
+
+
+def test_an_agent_and_an_arbiter_of_ones_own_train_and_are_evaluated(tmp_path, monkeypatch, capsys):
+    (tmp_path / "own_parts.py").write_text(BANDIT)
+    monkeypatch.syspath_prepend(tmp_path)
+    run = str(tmp_path / "run")
+    command = [
+        "sweep",
+        "own_parts:TASK",
+        "--preset",
+        "quickstart",
+        *PARTS,
+        *OPTIONS,
+        "--guidance",
+        "heuristic",
+        "--seeds",
+        "1",
+        "--out",
+        run,
+    ]
+    with stranger():
+        assert main(command) == 0
+    described = json.loads((tmp_path / "run" / "config.json").read_text())
+    expected = {"actions": 6, "batch_size": 8, "layers": [8], "learning_rate": 0.02, "replay_capacity": 80}
+    assert described["agent"] == {"name": "soft", "temperature": 0.2, **expected}
+    assert described["arbiter"] == {"name": "late", "after": 0, "probability": 0.25}
+    rows = results.read(tmp_path / "run").to_pylist()
+    losses = [row["train_loss"] for row in rows if row["step"]]
+    assert len(losses) == 2
+    assert 0 < min(losses) < max(losses) < 1
+    evaluated = ["evaluate", run, "--task", "own_parts:TASK", "--steps", "40", "--envs", "4"]
+    refused(capsys, evaluated, "package.module:NAME")  # no code is loaded that a file names
+    with stranger():
+        assert main([*evaluated, *PARTS]) == 0
+    assert "hit" in capsys.readouterr().out
+
+
+def test_the_soft_agent_learns_the_soft_values_of_a_chain():
+    """Q(1, a) = a_x, and Q(0, a) = a_y / 2 + discount * temperature * log mean exp(Q(1, .) / temperature)."""
+    soft = importlib.import_module("examples.soft_agent")
+    heat, discount = 0.5, 0.5
+    options = soft.Config((8,), actions=4, temperature=heat, batch_size=16, replay_capacity=1200, learning_rate=0.02)
+    config = dataclasses.replace(
+        probes.config(sizes={"num_envs": 2}, scalars={"discount": discount}, schedule={"random_steps": 100}),
+        agent=options,
+    )
+    env = probes.Chain(False)
+    program = loop.make_program(config, guidances.make("none", config.sizes, env), env, 0)
+    _, state, _ = program.train(env, config.settings, loop.start_clock(), probes.start(program, [0], [0], env), 600)
+    agent, params = options.make("raw", spaces_of(env), True), probes.lane(state.agent.params, 0)
+    assert isinstance(agent, AgentFunctions)
+    start, end = (np.asarray(agent.value(env, params, env.observe(place), agent.choices)) for place in (0, 1))
+    east = np.array([1.0, 0.0, -1.0, 0.0])  # x of the four actions
+    following = discount * heat * np.log(np.mean(np.exp(east / heat)))
+    np.testing.assert_allclose(end, east, atol=0.1)
+    np.testing.assert_allclose(start, np.roll(east, 1) / 2 + following, atol=0.1)
+    assert following == pytest.approx(0.2, abs=0.05)  # a greedy target would have 0.5
+
+
+def test_the_late_arbiter_leaves_the_first_steps_to_the_agent():
+    late = importlib.import_module("examples.late_arbiter")
+    options = late.Config(after=2, probability=1.0)
+    arbiter = options.make(False)
+    assert isinstance(arbiter, Arbiter)
+    state, guided = arbiter.init(2), []
+    for done in ([0, 1], [0, 0], [1, 0], [0, 0], [0, 0]):
+        outcome = Outcome(jnp.zeros(2), jnp.array(done, bool), jnp.array(True))
+        state = arbiter.follow(state, options, probes.SCALARS, outcome, jax.random.key(0))
+        guided.append(arbiter.guided(state).tolist())
+    assert guided == [[False, False], [False, False], [False, True], [False, True], [True, True]]
+    outcome = outcome._replace(done=jnp.ones(2, bool))
+    assert not arbiter.follow(state, late.Config(2, 0.0), probes.SCALARS, outcome, jax.random.key(0)).chosen.any()
+
+
+def test_the_soft_agent_does_not_see_from_the_action():
+    soft = importlib.import_module("examples.soft_agent")
+    with pytest.raises(UserError, match=r"--sizes\.frame raw"):
+        soft.Config().make("action", spaces_of(probes.Window()))
 
 
 def test_a_kind_that_asks_needs_a_teacher(home, capsys):
