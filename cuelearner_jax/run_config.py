@@ -125,6 +125,12 @@ def kind_from_json(name: str, values: Any) -> Any:
     Raises as `from_json`, and UserError for a value out of bounds or a kind without options.
     """
     kind = guidances.registered(name)
+    if (
+        values is not None
+        and not isinstance(values, dict)
+        and not isinstance(values, getattr(kind, "config", None) or ())
+    ):
+        raise UserError(f"the options of guidance {name!r} are {values!r}: give them by name")
     if not isinstance(values, dict) or kind is None:
         return values
     if kind.config is None:

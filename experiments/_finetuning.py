@@ -88,7 +88,7 @@ class NoisyDQN(ddqn.DoubleDQN):
     ) -> Float[Array, "n action"]:
         """The greedy action, turned by a normal angle."""
         greedy = super().explore(env, options, params, obs, key)
-        turns = jax.random.normal(key, (len(obs),))
+        turns = jax.random.normal(key, (len(obs), 1))
         return self.spaces.actions.toward(greedy, turns, jnp.deg2rad(options.noise_deg))
 
 

@@ -9,6 +9,7 @@ from _flops import forward, forward_and_backward, step_operations
 
 from cuelearner_jax.agents import ddqn
 from cuelearner_jax.agents.networks import applied, q_network
+from cuelearner_jax.config import Scalars
 from cuelearner_jax.environment import Spaces
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.spaces import DIRECTIONS

@@ -32,7 +32,7 @@ ARGUMENTS = [
     ([*QUICK, "--schedule.total-steps", "3000000000"], "give at most 2147483647"),
     (["train", "billiards", "--preset", "quickstart", "--seed", "-1"], "--seed is -1: give a number from 0"),
     ([*QUICK, "--agent.replay-capacity", "1001"], "give a multiple of sizes.num_envs"),
-    ([*QUICK, "--agent.q-layers", "8"], "give --agent.q-layers"),
+    ([*QUICK, "--sizes.q-layers", "8"], "give --agent.q-layers"),
     ([*QUICK, "--agent", "sac"], "unknown agent 'sac'"),
     ([*QUICK, "--arbiter", "pacd"], "did you mean 'paced'"),
     ([*QUICK, "--schedule.total-steps", "150"], "give a multiple of schedule.eval_every"),

@@ -1,5 +1,6 @@
 """Measuring a machine: figures that agree with each other, of lanes that learn from the first step."""
 
+import probes
 import pytest
 from probes import CONFIG, Window, compilations
 
@@ -17,7 +18,8 @@ def test_a_row_s_figures_agree_with_each_other():
 
 
 def test_timed_lanes_learn_and_compile_once():
-    timed = speed.Timed(speed.learning(CONFIG), Window(), "none", 2)
+    config = probes.config(agent={"batch_size": 7})  # another program than that of other tests
+    timed = speed.Timed(speed.learning(config), Window(), "none", 2)
     assert [timed.train(3) > 0 for _ in range(2)] == [True, True]
     assert int(timed.clock.step) == int(timed.clock.update) == 2 * 3 * CONFIG.sizes.num_envs
     assert compilations(timed.group.program.train) == [1]
