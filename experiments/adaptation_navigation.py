@@ -78,7 +78,8 @@ IN_ROOMS: dict[str, dict[str, Mapping[str, Any]]] = {
         "members": {**SURE, **MEMBERS},
         "active": {**SURE, **ACTIVE},
         "look-ahead-only": {**SURE, **MEMBERS, **LOOK_AHEAD},
-        "contrary": {**SURE, **MEMBERS, "scalars.mistake_probability": 0.5},  # do labels matter at all?
+        "contrary": {**SURE, **MEMBERS, "scalars.mistake_probability": 0.5},  # leaves "already right" true
+        "shuffled": {**SURE, **MEMBERS, "scalars.answer": "shuffled"},  # do labels matter at all?
         "doubting": {**SURE, **MEMBERS, "intent.aim_doubt": 2.0},
         "small": {**SURE, **MEMBERS, "intent.aim_layers": (32, 32)},
         "close": {**SURE, **MEMBERS, "sizes.question_every": 1},

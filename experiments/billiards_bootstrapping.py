@@ -63,7 +63,8 @@ FAULTS: dict[str, Options] = {
     "flipped-05": {"scalars.mistake-probability": 0.05},
     "flipped-10": {"scalars.mistake-probability": 0.1},
     "flipped-20": {"scalars.mistake-probability": 0.2},
-    "random": {"scalars.mistake-probability": 0.5},
+    "random": {"scalars.mistake-probability": 0.5},  # leaves "already right" true, which `shuffled` does not
+    "shuffled": {"scalars.answer": "shuffled"},
     "silent-20": {"scalars.silence-probability": 0.2},
     "indifferent": {"scalars.indifference-deg": 5.0},
     "biased": {"scalars.teacher-bias-deg": 2.5},
@@ -136,6 +137,7 @@ def variations(world: str, options: Options, minutes: int) -> list[Piece]:
     ]
     paced: Options = {**options, "arbiter": "paced", "arbiter.lead": LEAD}
     random = {**paced, **FAULTS["random"]}
+    shuffled = {**paced, **FAULTS["shuffled"]}
     any_lead: Options = {**paced, "arbiter.lead": 0.0}
     serves = "guidance never costs"
     pieces += [
@@ -144,6 +146,7 @@ def variations(world: str, options: Options, minutes: int) -> list[Piece]:
         Piece(world, "paced", "intent", ("intent",), (500,), 8, paced, minutes // 2, serves),
         Piece(world, "paced", "relative", ("relative",), (500,), 8, paced, minutes // 2, serves),
         Piece(world, "paced-random", "relative", ("relative",), (500,), 8, random, minutes // 2, serves),
+        Piece(world, "paced-shuffled", "relative", ("relative",), (500,), 8, shuffled, minutes // 2, serves),
     ]
     return pieces
 

@@ -39,7 +39,8 @@ FAULTS: dict[str, Options] = {
     "flipped-05": {"scalars.mistake-probability": 0.05},
     "flipped-10": {"scalars.mistake-probability": 0.1},
     "flipped-20": {"scalars.mistake-probability": 0.2},
-    "random": {"scalars.mistake-probability": 0.5},
+    "random": {"scalars.mistake-probability": 0.5},  # leaves "already right" true, which `shuffled` does not
+    "shuffled": {"scalars.answer": "shuffled"},
     "silent-20": {"scalars.silence-probability": 0.2},
     "indifferent": {"scalars.indifference-deg": 20.0},
     "biased": {"scalars.teacher-bias-deg": 10.0},
@@ -87,11 +88,13 @@ def variations(minutes: int) -> list[Piece]:
     serves = "labels given on the page"
     pieces.append(Piece("clutter", "page", "relative", relative, (450, 500), seeds, given, brief, serves))
     random = {**paced, **FAULTS["random"]}
+    shuffled = {**paced, **FAULTS["shuffled"]}
     serves = "guidance never costs"
     pieces += [
         Piece("clutter", "paced", "heuristic", ("heuristic",), (), seeds, paced, brief, serves),
         Piece("clutter", "paced", "relative", relative, (500,), seeds, paced, brief, serves),
         Piece("clutter", "paced-random", "relative", relative, (500,), seeds, random, brief, serves),
+        Piece("clutter", "paced-shuffled", "relative", relative, (500,), seeds, shuffled, brief, serves),
     ]
     return pieces
 

@@ -2,12 +2,12 @@
 
     python experiments/pace.py --out FOLDER
 
-The preset `quickstart` of the task `billiards` on tuning episodes and seeds, unguided and under three guides: 100
-relative labels, 100 labels of which every turn is told the wrong way round half of the time, and the closest ball. Each
-guides a fixed half of the episodes, paced by any lead, and paced by the preset's lead. Prints the mean over the
-learning curve, its difference from the same seeds unguided, and the share of guided steps. Options that are not listed
-here are given to every sweep, for instance --schedule.total-steps 6000. Called again, it goes on where it was
-interrupted.
+The preset `quickstart` of the task `billiards` on tuning episodes and seeds, unguided and under four guides: 100
+relative labels, 100 labels of which every turn is told the wrong way round half of the time ("already right" stays
+true), 100 labels that have each other's answers, and the closest ball. Each guides a fixed half of the episodes, paced
+by any lead, and paced by the preset's lead. Prints the mean over the learning curve, its difference from the same seeds
+unguided, and the share of guided steps. Options that are not listed here are given to every sweep, for instance
+--schedule.total-steps 6000. Called again, it goes on where it was interrupted.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from cuelearner_jax.storage import results
 GUIDES = {
     "relative, 100 labels": ["--guidance", "relative"],
     "relative, answers at random": ["--guidance", "relative", "--scalars.mistake-probability", "0.5"],
+    "relative, shuffled answers": ["--guidance", "relative", "--scalars.answer", "shuffled"],
     "heuristic": ["--guidance", "heuristic"],
 }
 HOW = {
