@@ -20,7 +20,7 @@ from jaxtyping import Array
 
 from cuelearner_jax.agents.ddqn import optimizer
 from cuelearner_jax.agents.replay import Memory
-from cuelearner_jax.config import POSITIVE, Bounds, Frame, Layers, Scalars, Sizes, part
+from cuelearner_jax.config import POSITIVE, SHARE, Bounds, Frame, Layers, Scalars, Sizes, part
 from cuelearner_jax.environment import Spaces
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.types import Params
@@ -45,6 +45,8 @@ class Config:
     """Transitions kept (a multiple of num_envs)."""
     learning_rate: Annotated[float, Bounds(0)] = 0.003
     """Step size of Adam."""
+    polyak: Annotated[float, SHARE] = 0.05
+    """Rate at which the target network follows."""
 
     def make(self, frame: Frame, spaces: Spaces, bootstraps: bool = False) -> SoftQ:
         """Return the agent for an environment's spaces. Raises UserError for observations seen from the action."""
@@ -86,9 +88,9 @@ class SoftQ:
         return {"--agent.batch-size": 4 * self.options.batch_size * (sum(self.options.layers) + len(self.choices))}
 
     def init(self, key: Array) -> tuple[Params, Any]:
-        """Return random parameters and the state of Adam."""
+        """Return random parameters; beside them the target network, their copy, and the state of Adam."""
         params = self.network.init(key, jnp.zeros(self.spaces.obs_size))
-        return params, optimizer("adam", 0.0, 0.0).init(params)
+        return params, (jax.tree.map(jnp.copy, params), optimizer("adam", 0.0, 0.0).init(params))
 
     def values(self, params: Params, obs: Array) -> Array:
         """Return the value of every choice (..., choices)."""
@@ -121,10 +123,11 @@ class SoftQ:
         key: Array,
     ) -> tuple[Params, Any, Array, Array]:
         """Take one gradient step toward the reward plus the discounted soft value of the next observation."""
+        target_params, opt_state = rest
         (batch,) = memory.batches(key, self.options.batch_size)
         target = batch.reward
         if self.bootstraps:
-            values, heat = self.values(params, batch.next_obs), options.temperature
+            values, heat = self.values(target_params, batch.next_obs), options.temperature
             soft = heat * (jax.nn.logsumexp(values / heat, -1) - jnp.log(values.shape[-1]))
             target = target + scalars.discount * batch.discount * soft
 
@@ -133,5 +136,7 @@ class SoftQ:
 
         loss, gradient = jax.value_and_grad(loss_of)(params)
         adam = optimizer("adam", options.learning_rate, scalars.max_grad_norm)
-        change, rest = adam.update(gradient, rest, params)
-        return optax.apply_updates(params, change), rest, loss, optax.tree.norm(gradient)
+        change, opt_state = adam.update(gradient, opt_state, params)
+        params = optax.apply_updates(params, change)
+        rest = (optax.incremental_update(params, target_params, options.polyak), opt_state)
+        return params, rest, loss, optax.tree.norm(gradient)

@@ -217,7 +217,14 @@ def test_an_agent_and_an_arbiter_of_ones_own_train_and_are_evaluated(tmp_path, m
     with stranger():
         assert main(command) == 0
     described = json.loads((tmp_path / "run" / "config.json").read_text())
-    expected = {"actions": 6, "batch_size": 8, "layers": [8], "learning_rate": 0.02, "replay_capacity": 80}
+    expected = {
+        "actions": 6,
+        "batch_size": 8,
+        "layers": [8],
+        "learning_rate": 0.02,
+        "polyak": 0.05,
+        "replay_capacity": 80,
+    }
     assert described["agent"] == {"name": "soft", "temperature": 0.2, **expected}
     assert described["arbiter"] == {"name": "late", "after": 0, "probability": 0.25}
     rows = results.read(tmp_path / "run").to_pylist()
