@@ -48,7 +48,7 @@ class Config:
 
     probability: Annotated[float, SHARE] = 0.5
     """Probability that an episode is guided while both kinds are unknown, and at most."""
-    lead: Annotated[float, Bounds(0)] = 0.0
+    lead: Annotated[float, Bounds(0)] = 0.25
     """What guided episodes must earn more than own ones to have their whole share; below it the share is proportional
     (0: any lead will do)."""
 

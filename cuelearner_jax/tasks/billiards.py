@@ -239,7 +239,7 @@ BILLIARDS = Task(
                     checkpoint_every=500,
                 ),
                 ddqn.Config(q_layers=(128, 128), directions=360, replay_capacity=20_000, learning_rate=0.01),
-                paced.Config(),
+                paced.Config(lead=0.25),
             ),
             guidance=("none", "relative"),
             labels=(100,),
