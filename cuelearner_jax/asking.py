@@ -6,22 +6,45 @@ adaptation gives another base policy than uniform actions.
 
 from __future__ import annotations
 
+from enum import IntEnum
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from flax import struct
 from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray
 
 from cuelearner_jax import user_code
-from cuelearner_jax.choosing import chosen
 from cuelearner_jax.config import GuideScalars, GuideSizes, Scalars
 from cuelearner_jax.environment import Environment, actions_of
 from cuelearner_jax.guides.base import Guide
 from cuelearner_jax.guides.refining import within
 from cuelearner_jax.policies import Policy, acted, best_actions, named
-from cuelearner_jax.types import GuideState, Label, Stream, Teacher
+from cuelearner_jax.types import EnvState, Label, Teacher
 
 ONE_BY_ONE = GuideSizes()  # questions as they come, of one strength: as a page asks them
+
+
+class GuideState(struct.PyTreeNode):
+    """The guide's part of a lane: its model, the answers so far, and the situation in which it asks next."""
+
+    model: GuidanceModel
+    labels: Label  # leading axis: slots, the largest budget of the sweep in whole rounds
+    budget: Int[Array, ""]  # labels that this lane may use
+    asked: Int[Array, ""]  # questions so far that count within it, answered or not
+    env: EnvState  # leading axis: candidates, where each question is chosen among several situations
+    obs: Float[Array, "*candidates obs"]
+
+
+class Stream(IntEnum):
+    """Streams of random numbers of one lane, each folded into the lane's key before a counter is."""
+
+    INIT = 0
+    ASK = 1
+    FIT = 2
+    TRAIN = 3
+    WALK = 4
+    SHUFFLE = 5
 
 
 class QuestionKeys(NamedTuple):
@@ -44,29 +67,6 @@ def label_slots(budget: int, sizes: GuideSizes) -> int:
     return -(-budget // sizes.labels_per_round) * sizes.labels_per_round
 
 
-def empty_labels(
-    slots: int,
-    obs_size: int,
-    action_size: int,
-    answer_width: int,
-    with_base: bool = False,
-) -> Label:
-    """`slots` rows of padding.
-
-    Args:
-        slots: their number.
-        obs_size, action_size, answer_width: entries of a row.
-        with_base: is kept what was proposed before any correction?
-    """
-    return Label(
-        obs=jnp.zeros((slots, obs_size)),
-        action=jnp.zeros((slots, action_size)),
-        answer=jnp.zeros((slots, answer_width)),
-        valid=jnp.zeros((slots,), bool),
-        base=jnp.zeros((slots, action_size)) if with_base else None,
-    )
-
-
 def start(
     guidance: Guide,
     env: Environment,
@@ -84,15 +84,16 @@ def start(
     by_members = candidates > 1 and not sizes.ask_all
     if by_members and guidance.asks and not guidance.has_members:
         raise ValueError(f"guidance {guidance.name!r} has no members whose disagreement could choose its questions")
+    size = actions_of(env).size
     state, obs = env.reset(k_env) if candidates == 1 else jax.vmap(env.reset)(jax.random.split(k_env, candidates))
     return GuideState(
         model=guidance.init(k_model),
-        labels=empty_labels(
-            slots,
-            env.obs_size,
-            actions_of(env).size,
-            guidance.form.width(actions_of(env)) if guidance.form else 0,
-            with_base=guidance.kind.sees_base,
+        labels=Label(  # padding
+            obs=jnp.zeros((slots, env.obs_size)),
+            action=jnp.zeros((slots, size)),
+            answer=jnp.zeros((slots, guidance.form.width(actions_of(env)) if guidance.form else 0)),
+            valid=jnp.zeros((slots,), bool),
+            base=jnp.zeros((slots, size)) if guidance.kind.sees_base else None,
         ),
         budget=jnp.asarray(budget, jnp.int32),
         asked=jnp.zeros((), jnp.int32),
@@ -153,19 +154,18 @@ def _asked_of(
 def record(
     guide: GuideState,
     position: Int[Array, ""] | int,
-    action: Float[Array, " action"],
-    answer: Float[Array, " answer"],
-    answered: Bool[Array, ""] | bool,
-    base: Float[Array, " action"] | None = None,
+    obs: Float[Array, "n obs"],
+    action: Float[Array, "n action"],
+    answer: Float[Array, "n answer"],
+    answered: Bool[Array, " n"],
+    base: Float[Array, "n action"] | None,
 ) -> GuideState:
-    """The guide with an answer in the row `position` of its labels; it counts within the budget alone.
-
-    `base`: what was proposed in place of the action, if labels keep that.
-    """
-    label = Label(guide.obs, action, answer, jnp.asarray(answered) & (position < guide.budget), base)
-    put = lambda rows, row: jax.lax.dynamic_update_index_in_dim(rows, row, position, 0)  # noqa: E731
-    asked = jnp.minimum(position + 1, guide.budget)
-    return guide.replace(labels=jax.tree.map(put, guide.labels, label), asked=asked)
+    """The guide with answers in its labels from the row `position` on; `base`: what was proposed at first, if kept."""
+    positions = position + jnp.arange(len(obs))
+    rows = Label(obs, action, answer, answered & (positions < guide.budget), base)
+    put = lambda known, new: jax.lax.dynamic_update_slice_in_dim(known, new, position, 0)  # noqa: E731
+    asked = jnp.minimum(position + len(obs), guide.budget)
+    return guide.replace(labels=jax.tree.map(put, guide.labels, rows), asked=asked)
 
 
 def proceed(
@@ -219,6 +219,7 @@ def ask(
     lane_key: PRNGKeyArray,
     position: Int[Array, ""],
     bound: Float[Array, ""] | None = None,
+    every: bool = False,
 ) -> GuideState:
     """Question number `position`, answered by a simulated teacher, recorded and acted on.
 
@@ -228,55 +229,47 @@ def ask(
         lane_key: of all questions.
         position: of this one, from 0.
         bound: see `question`.
+        every: ask about every candidate, as many questions at once, the first of them number `position`.
 
     Raises:
         ValueError: the guidance asks nothing.
     """
-    if guidance.form is None:
+    form = guidance.form
+    if form is None:
         raise ValueError(f"guidance {guidance.name!r} asks nothing")
     keys = question_keys(lane_key, position)
     proposals = proposed(env, base, guide, keys)
     actions = _asked_of(guidance, env, scalars, guide, proposals, keys, bound)
-    there, action, first = chosen(guidance, env, guide, actions, proposals)
-    answer, answered = guidance.form.answer(keys.answer, env, teacher, there.env, there.obs, action, scalars)
-    told = record(there, position, action, answer, answered, first if guidance.kind.sees_base else None)
-    return proceed(env, told.replace(env=guide.env, obs=guide.obs), actions, keys)
+    if every:
+        one = lambda key, state, obs, action: form.answer(key, env, teacher, state, obs, action, scalars)  # noqa: E731
+        obs, about, first = guide.obs, actions, proposals
+        answers, answered = jax.vmap(one)(jax.random.split(keys.answer, len(obs)), guide.env, obs, about)
+    else:
+        state, *there = _chosen(guidance, env, guide, actions, proposals)
+        answer, spoken = form.answer(keys.answer, env, teacher, state, there[0], there[1], scalars)
+        obs, about, first, answers, answered = (row[None] for row in (*there, answer, spoken))
+    told = record(guide, position, obs, about, answers, answered, first if guidance.kind.sees_base else None)
+    return proceed(env, told, actions, keys)
 
 
-def ask_all(
+def _chosen(
     guidance: Guide,
     env: Environment,
-    teacher: Teacher,
-    scalars: Scalars,
-    base: Policy,
     guide: GuideState,
-    lane_key: PRNGKeyArray,
-    position: Int[Array, ""],
-    bound: Float[Array, ""] | None = None,
-) -> GuideState:
-    """Like `ask`, of every candidate: as many questions as there are, the first of them number `position`.
+    actions: Float[Array, "*candidates action"],
+    first: Float[Array, "*candidates action"],
+) -> tuple[EnvState, Float[Array, " obs"], Float[Array, " action"], Float[Array, " action"]]:
+    """The one situation to ask in (state, observation), the action to ask about there, and what was proposed at first.
 
-    `guide` stands in several situations. Raises ValueError if the guidance asks nothing.
+    Of several candidates it is the one on which the members of the guide's model disagree most (query by committee:
+    Seung, Opper, Sompolinsky, 1992); before the first fit, when they know nothing, the first.
     """
-    form = guidance.form
-    if form is None:
-        raise ValueError(f"guidance {guidance.name!r} asks nothing")
-    keys, count = question_keys(lane_key, position), len(guide.obs)
-    proposals = proposed(env, base, guide, keys)
-    actions = _asked_of(guidance, env, scalars, guide, proposals, keys, bound)
-    positions = position + jnp.arange(count)
-
-    def one(key: PRNGKeyArray, state: Any, obs: Array, action: Array) -> tuple[Array, Array]:
-        return form.answer(key, env, teacher, state, obs, action, scalars)
-
-    answer_keys = jax.random.split(keys.answer, count)
-    answers, answered = jax.vmap(one)(answer_keys, guide.env, guide.obs, actions)
-    first = proposals if guidance.kind.sees_base else None
-    rows = Label(guide.obs, actions, answers, answered & (positions < guide.budget), first)
-    put = lambda known, new: jax.lax.dynamic_update_slice_in_dim(known, new, position, 0)  # noqa: E731
-    asked = jnp.minimum(position + count, guide.budget)
-    told = guide.replace(labels=jax.tree.map(put, guide.labels, rows), asked=asked)
-    return proceed(env, told, actions, keys)
+    candidates = guide.env, guide.obs, actions, first
+    if guide.obs.ndim == 1 or not guidance.has_members:
+        return candidates
+    apart = guidance.disagreement(guide.model, env, guide.obs, actions)
+    index = jnp.where(guide.model.fitted, jnp.argmax(apart), 0)
+    return jax.tree.map(lambda leaf: leaf[index], candidates)
 
 
 def blame(
@@ -335,13 +328,14 @@ def label_round(
     `bound`: see `question`.
     """
     first = guide.asked
-    asking, at_once = (ask_all, sizes.candidates) if sizes.ask_all else (ask, 1)
+    at_once = sizes.candidates if sizes.ask_all else 1
 
     def one(guide: GuideState, offset: Int[Array, ""]) -> tuple[GuideState, None]:
-        asked = asking(guidance, env, teacher, scalars, base, guide, lane_key, first + offset, bound)
+        position = first + offset
+        asked = ask(guidance, env, teacher, scalars, base, guide, lane_key, position, bound, sizes.ask_all)
         if sizes.question_every == 1:
             return asked, None
-        key = jax.random.fold_in(jax.random.fold_in(lane_key, Stream.WALK), first + offset)
+        key = jax.random.fold_in(jax.random.fold_in(lane_key, Stream.WALK), position)
         keys = jax.random.split(key, sizes.question_every - 1)
         return walked(guidance, env, scalars, base, asked, keys, bound), None
 

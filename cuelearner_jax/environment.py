@@ -1,8 +1,7 @@
 """What an environment is to the method, what it may offer beyond that, and the symmetries of its data.
 
 An environment is a pytree: its parameters are traced, so a changed world needs no new compile. What every environment
-has stands in `Environment`. Optional are `heuristic`, `mirror` with `symmetries`, `features`, `aims`, `view` and
-`actions`; ask by `offers`, `symmetries_of`, `view_of` and `actions_of`, never by the name of a task.
+has stands in `Environment`, what it may have in `OptionalMembers`; nobody asks by the name of a task.
 """
 
 from __future__ import annotations
@@ -42,7 +41,7 @@ class Features(NamedTuple):
 class View(Protocol):
     """What a policy looks at: the observation, and of the optional members `features`, `aims`, `heuristic`, `mirror`.
 
-    Every environment is one. An environment whose episodes need more than that (generated worlds, say) offers `view()`.
+    Every environment is one; one whose episodes need more than that (generated worlds, say) offers `view()`.
     """
 
     @property
@@ -53,15 +52,6 @@ class View(Protocol):
     @property
     def obs_size(self) -> int:
         """Number of entries of an observation: the sum of its slices."""
-        ...
-
-
-@runtime_checkable
-class OffersView(Protocol):
-    """An environment with parts that no policy looks at."""
-
-    def view(self) -> View:
-        """The environment without these parts."""
         ...
 
 
@@ -92,22 +82,34 @@ class Environment(View, Protocol):
         ...
 
 
-@runtime_checkable
-class OffersHeuristic(Protocol):
-    """An environment with an obvious action that needs no learning."""
+class Aims(NamedTuple):
+    """Actions that somebody may have in mind in a situation, as many in each; see `OptionalMembers.aims`."""
 
-    def heuristic(self, obs: Float[Array, " obs"]) -> Float[Array, " action"]:
-        """The obvious action."""
+    actions: Float[Array, "aims action"]
+    features: Float[Array, "aims features"]  # what tells good ones from bad ones, of the order of one
+    possible: Bool[Array, " aims"]  # False: none of these, here
+    open: Bool[Array, " aims"] | None = None  # False: may be meant, but is not to be done; None: all that are meant may
+
+
+class OptionalMembers(Protocol):
+    """What an environment may have beside; ask by `offers`, `view_of`, `symmetries_of` and `actions_of`."""
+
+    @property
+    def actions(self) -> Space:
+        """The space of its actions, where these are no directions in the plane."""
         ...
 
+    def view(self) -> View:
+        """The environment without the parts that no policy looks at."""
+        ...
 
-@runtime_checkable
-class OffersMirror(Protocol):
-    """An environment with exact symmetries that data may be multiplied by."""
+    def heuristic(self, obs: Float[Array, " obs"]) -> Float[Array, " action"]:
+        """The obvious action, which needs no learning."""
+        ...
 
     @property
     def symmetries(self) -> int:
-        """Their number (1: only the identity)."""
+        """Number of exact symmetries that data may be multiplied by (1: only the identity)."""
         ...
 
     def mirror(
@@ -119,33 +121,14 @@ class OffersMirror(Protocol):
         """
         ...
 
-
-@runtime_checkable
-class OffersFeatures(Protocol):
-    """An environment that can show an observation as it looks from an action."""
-
     def features(self, obs: Float[Array, " obs"], actions: Float[Array, "*n action"]) -> Features:
         """What a network is to see of one observation and each of the actions."""
         ...
 
-
-class Aims(NamedTuple):
-    """Actions that somebody may have in mind in a situation, as many in each; see `OffersAims`."""
-
-    actions: Float[Array, "aims action"]
-    features: Float[Array, "aims features"]  # what tells good ones from bad ones, of the order of one
-    possible: Bool[Array, " aims"]  # False: none of these, here
-    open: Bool[Array, " aims"] | None = None  # False: may be meant, but is not to be done; None: all that are meant may
-
-
-@runtime_checkable
-class OffersAims(Protocol):
-    """An environment in which an action is about something: a ball and a pocket, say."""
-
     def aims(self, obs: Float[Array, " obs"]) -> Aims:
-        """One aim for each thing that an action may be about.
+        """One aim for each thing that an action may be about (a ball and a pocket, say), in one order of things.
 
-        In one order of things, which means nothing: one network with the same weights looks at each of them.
+        The order means nothing: one network with the same weights looks at each aim.
         """
         ...
 

@@ -13,13 +13,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
-from jax.typing import ArrayLike
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from cuelearner_jax import user_code
 from cuelearner_jax.devices import BY_LANE, SHARED, over_lanes, portions
 from cuelearner_jax.environment import Environment, actions_of
-from cuelearner_jax.policies import Policy, PolicyBlock, acted, named
+from cuelearner_jax.policies import Policy, PolicyBlock, acted, lanes_in, named
 
 # Folded into the root key: episodes for reported figures only, and episodes for choosing settings.
 SPLITS = {"validation": 1_000_003, "tuning": 1_000_001}
@@ -113,76 +112,22 @@ def _summed(walk: _Walk, steps: int) -> Rolled:
     return Rolled({name: values.mean() for name, values in each.items()}, each, walk.episode_steps)
 
 
-class _Structure(NamedTuple):
-    """How a block's policy is put together again from the leaves that lanes have each and those that they share."""
-
-    tree: Any
-    by_lane: tuple[bool, ...]
-
-    def take_apart(self, policy: Any) -> tuple[list[ArrayLike], list[ArrayLike]]:
-        """(one for each lane, shared)"""
-        leaves = jax.tree.leaves(policy)
-        each = [leaf for leaf, own in zip(leaves, self.by_lane, strict=True) if own]
-        return each, [leaf for leaf, own in zip(leaves, self.by_lane, strict=True) if not own]
-
-    def put_together(self, each: list[ArrayLike], shared: list[ArrayLike]) -> Any:
-        """The inverse, also of one lane's leaves."""
-        own, common = iter(each), iter(shared)
-        return jax.tree.unflatten(self.tree, [next(own if lane else common) for lane in self.by_lane])
-
-
-def _structure(policy: PolicyBlock) -> _Structure:
-    leaves, tree = jax.tree.flatten(policy)
-    axes = jax.tree.map(
-        lambda axis, part: jax.tree.map(lambda _: axis is not None, part),
-        policy.axes,
-        policy,
-        is_leaf=lambda leaf: leaf is None,
+def _apart(policy: PolicyBlock) -> tuple[Any, Any]:
+    """A policy twice, None in place of leaves: with those that each lane has, and with those that lanes share."""
+    by_lane = lambda axis, part: jax.tree.map(lambda _: axis is not None, part)  # noqa: E731
+    own = jax.tree.map(by_lane, policy.axes, policy, is_leaf=lambda axis: axis is None)
+    each, shared = (
+        jax.tree.map(lambda own, leaf, wanted=wanted: leaf if own is wanted else None, own, policy)
+        for wanted in (True, False)
     )
-    found = _Structure(tree, tuple(jax.tree.leaves(axes)))
-    assert len(found.by_lane) == len(leaves)
-    return found
+    return each, shared
 
 
-def evaluate_lanes(
-    env: Environment, policy: PolicyBlock, key: PRNGKeyArray, *, mesh: Mesh, num_envs: int, steps: int
-) -> dict[str, Float[Array, " lanes"]]:
-    """Validation of a block of lanes, all on the same episodes.
-
-    Args:
-        env: the environment.
-        policy: leaves that are `BY_LANE` in its `axes` have a leading axis of lanes.
-        key: of the episodes.
-        mesh: devices that share the lanes.
-        num_envs, steps: as `rollout` has them.
-
-    Returns:
-        Metrics by name.
-    """
-    return roll_lanes(env, policy, key, mesh=mesh, num_envs=num_envs, steps=steps).means
-
-
-def roll_lanes(
-    env: Environment, policy: PolicyBlock, key: PRNGKeyArray, *, mesh: Mesh, num_envs: int, steps: int
-) -> Rolled:
-    """Like `evaluate_lanes`, with the values of each environment."""
-    structure = _structure(policy)
-    each, shared = structure.take_apart(policy)
-    return _evaluate(env, each, shared, key, structure=structure, mesh=mesh, num_envs=num_envs, steps=steps)
-
-
-@partial(jax.jit, static_argnames=("structure", "mesh", "num_envs", "steps"))
-def _evaluate(
-    env: Any, each: list[Array], shared: list[Array], key: PRNGKeyArray, *, structure, mesh, num_envs, steps
-) -> Rolled:
-    def share(env: Any, each: list[Array], shared: list[Array], key: PRNGKeyArray) -> Rolled:
-        def one(lane: list[Array]) -> Rolled:
-            return _rolled(structure.put_together(lane, shared), env, key, num_envs, steps)
-
-        # As many lanes at once as the device takes well.
-        return jax.lax.map(one, each, batch_size=min(each[0].shape[0], portions().agents))
-
-    return over_lanes(mesh, share, (SHARED, BY_LANE, SHARED, SHARED), BY_LANE)(env, each, shared, key)
+def _together(each: Any, shared: Any) -> Any:
+    """The inverse of `_apart`, also of one lane's leaves."""
+    return jax.tree.map(
+        lambda own, common: common if own is None else own, each, shared, is_leaf=lambda leaf: leaf is None
+    )
 
 
 @partial(jax.jit, static_argnames=("num_envs", "steps"))
@@ -233,48 +178,71 @@ def watched(
 
     Raises UserError, which names the policy, once one of its actions is not finite.
     """
-    leaves, tree = jax.tree.flatten(policy)
-    shared = _Structure(tree, (False,) * len(leaves))
-    return _in_stretches(env, shared, [], leaves, key, num_envs, steps, tell, named(policy))
+    return _in_stretches(env, None, policy, key, num_envs, steps, tell, named(policy))
 
 
 def watched_lanes(
-    env: Environment, policy: PolicyBlock, key: PRNGKeyArray, num_envs: int, steps: int, tell: Tell = untold
+    env: Environment,
+    policy: PolicyBlock,
+    key: PRNGKeyArray,
+    num_envs: int,
+    steps: int,
+    tell: Tell = untold,
+    mesh: Mesh | None = None,
 ) -> Rolled:
-    """Like `roll_lanes`, on one device in stretches: as many lanes at once as it takes well. Returns NumPy arrays."""
-    structure = _structure(policy)
-    each, shared = structure.take_apart(policy)
-    lanes = jnp.asarray(each[0]).shape[0]
+    """Roll out a block of lanes, all on the same episodes; a policy that all lanes share is one lane.
+
+    Without a mesh in stretches, as many lanes at once as the device takes well.
+
+    Args:
+        env: the environment.
+        policy: leaves that are `BY_LANE` in its `axes` have a leading axis of lanes.
+        key: of the episodes.
+        num_envs, steps: as `rollout` has them.
+        tell: is told how far it is.
+        mesh: devices that share the lanes, in one stretch, of which nobody is told.
+
+    Returns:
+        NumPy arrays with a leading axis of lanes.
+    """
+    lanes = lanes_in(policy)
+    if lanes is None:
+        return jax.tree.map(lambda leaf: np.asarray(leaf)[None], watched(env, policy, key, num_envs, steps, tell))
+    each, shared = _apart(policy)
+    if mesh is not None:
+        return jax.device_get(_on_mesh(env, each, shared, key, mesh=mesh, num_envs=num_envs, steps=steps))
     size = min(lanes, portions().agents)
     firsts, found = range(0, lanes, size), []
     for number, first in enumerate(firsts):
         rows = np.minimum(np.arange(first, first + size), lanes - 1)  # the last are repeated, which saves a compile
-        part = [jnp.asarray(leaf)[rows] for leaf in each]
+        part = jax.tree.map(lambda leaf, rows=rows: jnp.asarray(leaf)[rows], each)
         told = part_of(tell, number, len(firsts))
-        found.append(_in_stretches(env, structure, part, shared, key, num_envs, steps, told))
+        found.append(_in_stretches(env, part, shared, key, num_envs, steps, told))
     return jax.tree.map(lambda *parts: np.concatenate(parts)[:lanes], *found)
 
 
+@partial(jax.jit, static_argnames=("mesh", "num_envs", "steps"))
+def _on_mesh(env: Any, each: Any, shared: Any, key: PRNGKeyArray, *, mesh: Mesh, num_envs: int, steps: int) -> Rolled:
+    def share(env: Any, each: Any, shared: Any, key: PRNGKeyArray) -> Rolled:
+        one = lambda lane: _rolled(_together(lane, shared), env, key, num_envs, steps)  # noqa: E731
+        lanes = jax.tree.leaves(each)[0].shape[0]
+        return jax.lax.map(one, each, batch_size=min(lanes, portions().agents))
+
+    return over_lanes(mesh, share, (SHARED, BY_LANE, SHARED, SHARED), BY_LANE)(env, each, shared, key)
+
+
 def _in_stretches(
-    env: Environment,
-    structure: _Structure,
-    each: list[Array],
-    shared: list[ArrayLike],
-    key: PRNGKeyArray,
-    num_envs: int,
-    steps: int,
-    tell: Tell,
-    whose: str = "",
+    env: Environment, each: Any, shared: Any, key: PRNGKeyArray, num_envs: int, steps: int, tell: Tell, whose: str = ""
 ) -> Rolled:
-    """A roll-out of one policy, or of as many lanes as `each` has rows, side by side; a lane that fails is NaN."""
-    count = _stretches(steps // num_envs)
-    walk = _begin(env, key, num_envs=num_envs, lanes=len(each[0]) if each else 0)
+    """A roll-out of one policy (`each` is None), or of the lanes of `each` side by side; a lane that fails is NaN."""
+    count, lanes = _stretches(steps // num_envs), 0 if each is None else len(jax.tree.leaves(each)[0])
+    walk = _begin(env, key, num_envs=num_envs, lanes=lanes)
     for number, indices in enumerate(np.arange(steps // num_envs).reshape(count, -1)):
         tell(number, count)
-        walk = jax.block_until_ready(_walk(env, each, shared, key, walk, jnp.asarray(indices), structure=structure))
-        user_code.check_actions(True if each else walk.acts, whose)
+        walk = jax.block_until_ready(_walk(env, each, shared, key, walk, jnp.asarray(indices)))
+        user_code.check_actions(True if lanes else walk.acts, whose)
     tell(count, count)
-    return jax.device_get(_sum_up(walk, steps=steps // num_envs, lanes=bool(each)))
+    return jax.device_get(_sum_up(walk, steps=steps // num_envs, lanes=bool(lanes)))
 
 
 def _stretches(steps: int) -> int:
@@ -291,14 +259,12 @@ def _begin(env: Any, key: PRNGKeyArray, *, num_envs: int, lanes: int) -> _Walk:
     return jax.tree.map(lambda leaf: jnp.repeat(leaf[None], lanes, axis=0), walk) if lanes else walk
 
 
-@partial(jax.jit, static_argnames=("structure",))
-def _walk(
-    env: Any, each: list[Array], shared: list[Array], key: PRNGKeyArray, walk: _Walk, indices: Array, *, structure
-) -> _Walk:
-    def one(lane: list[Array], walk: _Walk) -> _Walk:
-        return _walked(structure.put_together(lane, shared), env, key, walk, indices)
-
-    return jax.vmap(one)(each, walk) if each else one([], walk)
+@jax.jit
+def _walk(env: Any, each: Any, shared: Any, key: PRNGKeyArray, walk: _Walk, indices: Array) -> _Walk:
+    if each is None:
+        return _walked(shared, env, key, walk, indices)
+    one = lambda lane, walk: _walked(_together(lane, shared), env, key, walk, indices)  # noqa: E731
+    return jax.vmap(one)(each, walk)
 
 
 @partial(jax.jit, static_argnames=("steps", "lanes"))

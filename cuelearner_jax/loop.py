@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from flax import struct
 from jax.sharding import Mesh
 from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray
 
@@ -24,7 +25,7 @@ from cuelearner_jax.agents.networks import all_finite
 from cuelearner_jax.agents.protocol import AgentFunctions, AgentOptions
 from cuelearner_jax.agents.replay import Memory, RingBuffer, buffer_for, stored_step
 from cuelearner_jax.arbiters.protocol import Arbiter, ArbiterOptions, Outcome
-from cuelearner_jax.asking import label_slots
+from cuelearner_jax.asking import GuideState, Stream, label_slots
 from cuelearner_jax.config import Scalars, Schedule, Sizes, static
 from cuelearner_jax.devices import (
     BY_LANE,
@@ -40,11 +41,39 @@ from cuelearner_jax.guides.base import Guide
 from cuelearner_jax.guides.refining import Refined, untouched
 from cuelearner_jax.policies import uniform_in
 from cuelearner_jax.run_config import RunConfig, Settings
-from cuelearner_jax.types import AgentState, Clock, GuideState, Label, Step, Stream, Teacher, TrainState
+from cuelearner_jax.types import Label, Step, Teacher
 
 _Parts = tuple[AgentOptions, ArbiterOptions, bool]  # their floats None; does anything bootstrap?
 
 PROGRAMS_KEPT = 8  # compiled ones that a process holds for its next runs
+
+
+class AgentState(struct.PyTreeNode):
+    """The agent's part of a lane: what it learns, what it has met, and where it stands."""
+
+    params: Params  # with which it acts
+    training: Any  # what learning keeps beside them, such as a target network and the optimiser's state
+    replay: Float[Array, "capacity width"]
+    env: EnvState  # leading axis: num_envs
+    obs: Float[Array, "num_envs obs"]
+
+
+class TrainState(struct.PyTreeNode):
+    """One lane's everything: a lane is one seed with one label budget."""
+
+    agent: AgentState
+    guide: GuideState
+    arbiter: Any  # in which environments the guide's action is executed; see `arbiters.protocol`
+    key: PRNGKeyArray
+    failed: Bool[Array, ""]  # did a loss, a gradient or a parameter stop being finite? It stays as it was before then
+
+
+class Clock(struct.PyTreeNode):
+    """Counters shared by all lanes: never vmapped, so that branches on them stay branches."""
+
+    step: Int[Array, ""]  # environment steps of each lane
+    update: Int[Array, ""]  # gradient steps of each lane
+    round: Int[Array, ""]  # label rounds of each lane
 
 
 class Program(NamedTuple):

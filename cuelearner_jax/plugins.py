@@ -75,9 +75,8 @@ class PartRegistry(Generic[T]):
     def find(self, name: str) -> type[T]:
         """The class of that name; no code is loaded that the name leads to. Raises UserError if there is none."""
         if name not in self._found:
-            raise UserError(
-                f"unknown {self._sort} {name!r}{closest(name, self._found)} (your own is named as package.module:NAME)"
-            )
+            own = f"name your own by --{self._sort} package.module:NAME, if you trust that code"
+            raise UserError(f"unknown {self._sort} {name!r}{closest(name, self._found)} ({own})")
         return self._found[name]
 
     def resolve(self, text: str) -> type[T]:

@@ -63,8 +63,20 @@ class RunConfig(Generic[TaskT, AgentT, ArbiterT, KindsT]):
 
     def guide_in(self, env: Any, kind: str) -> Guide:
         """The guide of a kind for an environment. Raises UserError as `guides.registry.make`."""
+        return guidances.make(kind, self.sizes, env, self.options_of(kind))
+
+    def options_of(self, kind: str) -> Any:
+        """Options of a kind of guidance; None: its defaults; plain values: the kind is from outside and not known here.
+
+        Raises UserError for options of another kind.
+        """
         kinds: Any = self.kinds
-        return guidances.make(kind, self.sizes, env, kind_from_json(kind, kinds.get(kind)))
+        if isinstance(own := kinds.get(kind), dict):
+            return kind_from_json(kind, own)
+        config = getattr(guidances.registered(kind), "config", None)
+        if own is not None and not (config and isinstance(own, config)):
+            raise UserError(f"the options of guidance {kind!r} are {own!r}: give its own, or leave them out")
+        return own
 
     @property
     def settings(self) -> Settings:
@@ -79,8 +91,8 @@ def check(config: RunConfig) -> None:
     check_guide(sizes, config.scalars)
     check_part(config.agent, "agent")
     check_part(config.arbiter, "arbiter")
-    for name, options in config.kinds.items():
-        if not isinstance(own := kind_from_json(name, options), dict):  # of a kind that is not known here
+    for name in config.kinds:
+        if not isinstance(own := config.options_of(name), dict | None):
             check_part(own, name)
     config.agent.check(sizes, config.bootstraps)
     if config.scalars.discount >= 1:
@@ -119,19 +131,15 @@ def kind_to_json(options: Any) -> Any:
     return options if options is None or isinstance(options, dict) else configuration.to_json(options)
 
 
-def kind_from_json(name: str, values: Any) -> Any:
+def kind_from_json(name: str, values: dict[str, Any] | None) -> Any:
     """The inverse of `kind_to_json`; of a kind from outside that is not known here the plain values.
 
     Raises as `from_json`, and UserError for a value out of bounds or a kind without options.
     """
+    if not isinstance(values, dict | None):
+        raise TypeError(f"options of a kind are told by name, not as {values!r}")
     kind = guidances.registered(name)
-    if (
-        values is not None
-        and not isinstance(values, dict)
-        and not isinstance(values, getattr(kind, "config", None) or ())
-    ):
-        raise UserError(f"the options of guidance {name!r} are {values!r}: give them by name")
-    if not isinstance(values, dict) or kind is None:
+    if values is None or kind is None:
         return values
     if kind.config is None:
         raise UserError(f"guidance {name!r} has no options: leave them out")

@@ -1,4 +1,4 @@
-"""Every record that flows through the system, with the shape and unit of each field.
+"""What environments, teachers, policies and guides exchange, with the shape and unit of each field.
 
 Records describe one sample or one seed; leading axes appear only where code is vmapped.
 Directions are unit vectors in the plane; angles are radians, counterclockwise positive.
@@ -7,11 +7,10 @@ Directions are unit vectors in the plane; angles are radians, counterclockwise p
 from __future__ import annotations
 
 from collections.abc import Mapping
-from enum import IntEnum
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 from flax import struct
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 Params = Any  # a Flax parameter pytree
 EnvState = Any  # whatever pytree an environment carries from step to step
@@ -67,27 +66,6 @@ class Policy(Protocol):
         ...
 
 
-class StoredStep(struct.PyTreeNode):
-    """One step in replay, as small as the environment can make it."""
-
-    obs: Float[Array, " memory"]  # see `Environment.remember`
-    action: Float[Array, " action"]  # as executed
-    reward: Float[Array, ""]
-    discount: Float[Array, " 1_or_0"]  # this and the next two have no entries where nothing bootstraps
-    ended: Float[Array, " 1_or_0"]  # 1 where the episode ended, terminated or truncated
-    aftermath: Float[Array, " aftermath_or_0"]  # see `Environment.recall_next`
-
-
-class Transition(struct.PyTreeNode):
-    """One step to learn from. `next_obs` has no entries where nothing bootstraps from it (discount 0)."""
-
-    obs: Float[Array, " obs"]
-    action: Float[Array, " action"]  # as executed
-    reward: Float[Array, ""]
-    discount: Float[Array, ""]  # of `next_obs`: 0 at termination, never at truncation; 1 after one step
-    next_obs: Float[Array, " obs_or_0"]
-
-
 class Label(struct.PyTreeNode):
     """One answer of a teacher: what it said, not what a network is to predict of it (`Guide.target`)."""
 
@@ -103,37 +81,6 @@ class GuidanceModel(struct.PyTreeNode):
 
     params: Params
     fitted: Bool[Array, ""]  # False until labels have been fitted: the model then leaves actions alone
-
-
-class GuideState(struct.PyTreeNode):
-    """The guide's part of a lane: its model, the answers so far, and the situation in which it asks next."""
-
-    model: GuidanceModel
-    labels: Label  # leading axis: slots, the largest budget of the sweep in whole rounds
-    budget: Int[Array, ""]  # labels that this lane may use
-    asked: Int[Array, ""]  # questions so far that count within it, answered or not
-    env: EnvState  # leading axis: candidates, where each question is chosen among several situations
-    obs: Float[Array, "*candidates obs"]
-
-
-class AgentState(struct.PyTreeNode):
-    """The agent's part of a lane: what it learns, what it has met, and where it stands."""
-
-    params: Params  # with which it acts
-    training: Any  # what learning keeps beside them, such as a target network and the optimiser's state
-    replay: Float[Array, "capacity width"]
-    env: EnvState  # leading axis: num_envs
-    obs: Float[Array, "num_envs obs"]
-
-
-class TrainState(struct.PyTreeNode):
-    """One lane's everything: a lane is one seed with one label budget."""
-
-    agent: AgentState
-    guide: GuideState
-    arbiter: Any  # in which environments the guide's action is executed; see `arbiters.protocol`
-    key: PRNGKeyArray
-    failed: Bool[Array, ""]  # did a loss, a gradient or a parameter stop being finite? It stays as it was before then
 
 
 class Sketch(NamedTuple):
@@ -160,22 +107,3 @@ class Reel(NamedTuple):
     period: float  # between two frames [s]
     frames: list[dict[str, tuple[float, float, float] | None]]  # of each mover, as `Sketch.places`; None: not seen
     words: str = ""  # how it ended
-
-
-class Clock(struct.PyTreeNode):
-    """Counters shared by all lanes: never vmapped, so that branches on them stay branches."""
-
-    step: Int[Array, ""]  # environment steps of each lane
-    update: Int[Array, ""]  # gradient steps of each lane
-    round: Int[Array, ""]  # label rounds of each lane
-
-
-class Stream(IntEnum):
-    """Streams of random numbers of one lane, each folded into the lane's key before a counter is."""
-
-    INIT = 0
-    ASK = 1
-    FIT = 2
-    TRAIN = 3
-    WALK = 4
-    SHUFFLE = 5

@@ -20,7 +20,9 @@ import numpy as np
 from _finetuning import FineTuning, every
 from _pieces import chosen, listed
 
-from cuelearner_jax.adaptation import adapting, program
+from cuelearner_jax.adaptation import adapting
+from cuelearner_jax.adaptation.judging import Judging
+from cuelearner_jax.adaptation.lanes import Adaptation, product, side_by_side
 from cuelearner_jax.cli import main as cuelearner
 from cuelearner_jax.config import GuideSizes
 from cuelearner_jax.environment import actions_of, spaces_of
@@ -192,11 +194,11 @@ def by_labels(kind: Any, bench: Bench) -> Iterator[Row]:
     scalars = bench.scalars()
     options = bench.set(f"{kind.name}.", kind.config()) if kind.config else None
     guidance = kind.make(sizes, spaces_of(env), options)
-    lanes = program.product(len(bench.seeds), (SEED,), piece.labels, (piece.bound_deg,))
+    lanes = product(len(bench.seeds), (SEED,), piece.labels, (piece.bound_deg,))
     envs = min(bench.envs, JUDGED)
-    judge = adapting.Judging(bench.env("tuning"), envs, envs * bench.steps, piece.judge_by, bounds=piece.judge_bounds)
-    asked = adapting.Adaptation(guidance, sizes, scalars, env, bench.agents, lanes, judge)
-    found = adapting.adapt(asked, bench.task.make_teacher(bench.world, env))
+    judge = Judging(bench.env("tuning"), envs, envs * bench.steps, piece.judge_by, bounds=piece.judge_bounds)
+    of = Adaptation(guidance, sizes, scalars, env, bench.agents)
+    found = adapting.adapt(of, lanes, judge, bench.task.make_teacher(bench.world, env))
     told = {"used": found.judged.used.astype(float), "failed": np.asarray(found.block.failed).astype(float)}
     told |= {
         "within_deg": found.judged.within_deg,
@@ -286,7 +288,7 @@ def opened(folder: Path, study: Study, piece: Piece, scale: Scale, out: Path) ->
     world = dataclasses.replace(world, **own)
     env = environment(source.task.name, world, "training", piece.robot)
     policies, seeds = several(source, world, "agent", None, None, source.grid.seeds[: piece.bases], env=env)
-    agents = program.side_by_side(policies)
+    agents = side_by_side(policies)
     if scale.directions:
         agents = agents.replace(
             sizes=dataclasses.replace(agents.sizes, directions=scale.directions, coarse_directions=0)

@@ -6,9 +6,9 @@ import jax
 import numpy as np
 import probes
 
-from cuelearner_jax.adaptation import program
-from cuelearner_jax.adaptation.adapting import Adaptation, Adapted, Judging
+from cuelearner_jax.adaptation.adapting import Adapted
 from cuelearner_jax.adaptation.judging import Judged
+from cuelearner_jax.adaptation.lanes import Adaptation, Lanes, begin
 from cuelearner_jax.config import GuideSizes
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides import registry as guidances
@@ -19,7 +19,7 @@ from cuelearner_jax.storage import policy_folders
 TASK = probes.make_task()
 ENV = TASK.environment(probes.CONFIG.task)
 SIZES = GuideSizes(**{field.name: getattr(probes.SIZES, field.name) for field in dataclasses.fields(GuideSizes)})
-LANES = program.Lanes(*(np.array(column) for column in ([0, 0], [0, 1], [10, 10], [45.0, 45.0])))
+LANES = Lanes(*(np.array(column) for column in ([0, 0], [0, 1], [10, 10], [45.0, 45.0])))
 
 
 def find(name):
@@ -38,9 +38,9 @@ def agent():
 def write(folder, overwrite=False, origin="run"):
     """Writes the folder; `origin`: what policy.json says was adapted."""
     guidance = guidances.make("relative", SIZES, ENV)
-    asked = Adaptation(guidance, SIZES, probes.SCALARS, ENV, Common(agent()), LANES, Judging(None))
+    of = Adaptation(guidance, SIZES, probes.SCALARS, ENV, Common(agent()))
     worth = np.zeros(2), np.ones(2), np.ones(2, bool), np.full(2, 45.0)
     judged = Judged("reward", *worth, difference=np.ones((2, 3)), rewarded_steps=np.zeros(2, int))
-    found = Adapted(asked, program.begin(guidance, SIZES, ENV, LANES), judged, [])
+    found = Adapted(of, LANES, begin(of, LANES), judged, [])
     with policy_folders.place_of(folder, overwrite) as place:
         adapted.write(place, found, TASK, probes.CONFIG.task, {"folder": origin})

@@ -27,7 +27,15 @@ LANE_KEY = jax.random.key(11)
 label_round = jax.jit(partial(asking.label_round, RELATIVE, probes.SIZES))
 # What a page calls, each compiled by itself.
 question = jax.jit(partial(asking.question, RELATIVE))
-record = jax.jit(asking.record)
+
+
+@jax.jit
+def record(guide, position, action, answer, answered):
+    """One answer, in one situation."""
+    rows = (jnp.asarray(row)[None] for row in (guide.obs, action, answer, answered))
+    return asking.record(guide, position, *rows, None)
+
+
 proceed = jax.jit(asking.proceed)
 fit = jax.jit(partial(asking.fit, RELATIVE))
 said = jax.jit(RELATIVE.form.answer)

@@ -83,7 +83,7 @@ def test_lanes_in_stretches_are_bitwise_those_in_one(monkeypatch, at_once):
     told = []
     watched = evaluate.watched_lanes(ENV, agents, KEY, 10, 120, lambda *given: told.append(given))
     mesh = lane_mesh(jax.local_devices()[:1])
-    whole = jax.device_get(evaluate.evaluate_lanes(ENV, agents, KEY, mesh=mesh, num_envs=10, steps=120))
+    whole = evaluate.watched_lanes(ENV, agents, KEY, 10, 120, mesh=mesh).means
     for name, value in whole.items():
         np.testing.assert_array_equal(watched.means[name], value, strict=True)
     assert len(set(watched.means["reward"])) > 1
@@ -91,7 +91,7 @@ def test_lanes_in_stretches_are_bitwise_those_in_one(monkeypatch, at_once):
     batches = -(-3 // at_once)
     assert told[0] == (0, 6 * batches)
     assert told[-1] == (6 * batches, 6 * batches)
-    evaluate._evaluate.clear_cache()  # it has seen other portions than the device's
+    evaluate._on_mesh.clear_cache()  # it has seen other portions than the device's
 
 
 @dataclasses.dataclass

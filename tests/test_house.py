@@ -24,7 +24,6 @@ ROWS = [
     ["run_config"],
     ["task"],
     ["policies"],
-    ["choosing"],
     ["asking", "evaluate"],
     ["export"],
     ["loop"],

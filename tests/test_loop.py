@@ -13,13 +13,13 @@ import pytest
 
 from cuelearner_jax import asking, evaluate, loop
 from cuelearner_jax.agents.networks import applied, q_network
-from cuelearner_jax.agents.replay import mirrored
+from cuelearner_jax.agents.replay import Transition, mirrored
 from cuelearner_jax.arbiters import episodes
 from cuelearner_jax.devices import lane_mesh
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.policies import Agent, Guided, Uniform
 from cuelearner_jax.spaces import directions
-from cuelearner_jax.types import Label, Step, Transition
+from cuelearner_jax.types import Label, Step
 
 ENV, EXPERT = probes.Window(), probes.Expert(probes.Window())
 MESH = lane_mesh()
@@ -71,7 +71,7 @@ def test_the_agent_learns_a_bandit_by_itself():
 def reward_of(params):
     key = jax.random.key(7)
     agents = Agent(params, probes.FUNCTIONS)
-    measured = evaluate.evaluate_lanes(ENV, agents, key, mesh=MESH, num_envs=40, steps=80)
+    measured = evaluate.watched_lanes(ENV, agents, key, 40, 80, mesh=MESH).means
     np.testing.assert_array_equal(measured["reward"], measured["hit"])
     return np.asarray(measured["reward"])
 
@@ -305,7 +305,7 @@ def test_refined_uniform_actions_win_far_more_often_than_chance():
 
     def reward(model):
         guide = Guided(Uniform(), model, ENV, probes.SCALARS, guidance)
-        found = evaluate.evaluate_lanes(ENV, guide, jax.random.key(3), mesh=MESH, num_envs=100, steps=1000)
+        found = evaluate.watched_lanes(ENV, guide, jax.random.key(3), 100, 1000, mesh=MESH).means
         return np.asarray(found["reward"])
 
     guided = reward(state.guide.model)
@@ -540,13 +540,13 @@ def test_other_scalars_schedules_worlds_and_times_compile_nothing(grid):
 
 
 def test_evaluation_compiles_once_for_all_parameters_and_worlds():
-    before = probes.compilations(evaluate._evaluate)[0]
+    before = probes.compilations(evaluate._on_mesh)[0]
     for index in range(3):
         params = probes.start(probes.window_program("none"), [index], [0]).agent.params
         env = probes.Window(0.1 * index, 0.6)
         agents = Agent(params, probes.FUNCTIONS)
-        evaluate.evaluate_lanes(env, agents, jax.random.key(index), mesh=MESH, num_envs=3, steps=6)
-    assert probes.compilations(evaluate._evaluate) == [before + 1]
+        evaluate.watched_lanes(env, agents, jax.random.key(index), 3, 6, mesh=MESH)
+    assert probes.compilations(evaluate._on_mesh) == [before + 1]
 
 
 def test_transitions_are_mirrored_as_a_whole():

@@ -7,7 +7,8 @@ split of the changed world. Without one, held-out labels are predicted, against 
 from __future__ import annotations
 
 import dataclasses
-from functools import partial
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import jax
@@ -16,22 +17,33 @@ import numpy as np
 from jax.sharding import Mesh
 from jaxtyping import Array, Float
 
-from cuelearner_jax.adaptation.program import Adapting, Lanes
+from cuelearner_jax.adaptation.lanes import Adaptation, Lanes, LaneState
 from cuelearner_jax.asking import fitted_labels
-from cuelearner_jax.config import GuideSizes, Scalars
 from cuelearner_jax.devices import each_lane
 from cuelearner_jax.environment import Environment, actions_of
 from cuelearner_jax.errors import UserError, closest
-from cuelearner_jax.evaluate import Rolled, Tell, episodes, mean_interval, roll_lanes, untold, watched, watched_lanes
-from cuelearner_jax.guides.base import Guide
-from cuelearner_jax.policies import PolicyBlock, lanes_in
-from cuelearner_jax.spaces import Space, said
+from cuelearner_jax.evaluate import Rolled, Tell, episodes, mean_interval, watched_lanes
+from cuelearner_jax.policies import PolicyBlock
+from cuelearner_jax.spaces import said
 from cuelearner_jax.types import Label
 
 HELD_OUT = 5  # every fifth label
 LABELS = "labels"  # what is judged by, in place of a metric
+SPLIT = "tuning"  # of the episodes
 STEPS = 100  # of an environment, where a task counts steps
 MOST_BOUNDS = 16  # shares of a bound
+
+
+@dataclass(frozen=True)
+class Judging:
+    """How policies are compared with their bases, and how often on the way."""
+
+    env: Environment | None  # the changed world with the episodes of `SPLIT`; None: there is no simulator
+    num_envs: int = 100
+    steps: int = 10_000  # that the environments share
+    by: str = "reward"  # a metric, or "labels"
+    every: int = 0  # labels between two measurements on the way (0: at the end alone)
+    bounds: tuple[float, ...] = ()  # shares of a lane's bound within which its policy is tried as well
 
 
 class Judged(NamedTuple):
@@ -59,120 +71,6 @@ def _step_of(env: Environment) -> Any:
     return jax.eval_shape(env.step, key, state, jnp.zeros(actions_of(env).size))[1]
 
 
-def steps_played(env: Environment, by: str, rolled: Rolled, steps: int) -> np.ndarray:
-    """Environment steps (lanes,) of a roll-out that a metric is about: of an outcome those of first episodes alone."""
-    first = np.asarray(rolled.episode_steps)
-    return first.sum(-1) if by in _step_of(env).outcome else np.full(len(first), steps)
-
-
-def measured(
-    env: Environment,
-    policy: PolicyBlock,
-    num_envs: int,
-    steps: int,
-    split: str = "tuning",
-    mesh: Mesh | None = None,
-    tell: Tell = untold,
-) -> Rolled:
-    """Roll out a block of policies, or one that all lanes share (as one lane), on the episodes of a split.
-
-    Args:
-        env: the changed world, of that split.
-        policy: a block, or one policy for all lanes.
-        num_envs, steps: as `evaluate.rollout` has them.
-        split: see `evaluate.SPLITS`.
-        mesh: devices that share the lanes (default: one).
-        tell: is told how far it is.
-    """
-    key = episodes(split)
-    if lanes_in(policy) is None:
-        found = watched(env, policy, key, num_envs, steps, tell)
-        return jax.tree.map(lambda leaf: np.asarray(leaf)[None], found)
-    if mesh is not None and mesh.size > 1:
-        return jax.device_get(roll_lanes(env, policy, key, mesh=mesh, num_envs=num_envs, steps=steps))
-    return watched_lanes(env, policy, key, num_envs, steps, tell)
-
-
-def judged(
-    by: str,
-    lanes: Lanes,
-    bases: Rolled,
-    policies: Rolled,
-    usable: np.ndarray,
-    within_deg: np.ndarray,
-    rewarded_steps: np.ndarray,
-) -> Judged:
-    """Compares base policies (bases or one) and lanes on the same episodes.
-
-    Args:
-        by: the metric.
-        lanes: which base is whose.
-        bases, policies: from `measured`.
-        usable: (lanes,) bool: False where nothing could be fitted, or not to finite numbers.
-        within_deg: (lanes,) the bounds of the policies.
-        rewarded_steps: (lanes,) that it took.
-    """
-    own = np.zeros(lanes.number, int) if len(bases.means[by]) == 1 else lanes.base
-    before, after = np.asarray(bases.means[by])[own], np.asarray(policies.means[by])
-    used = np.asarray(usable) & (after >= before)  # NaN is worth less than anything
-    difference = mean_interval(np.asarray(policies.each[by]) - np.asarray(bases.each[by])[own]).T
-    return Judged(by, before, after, used, within_deg, difference, rewarded_steps)
-
-
-@partial(jax.jit, static_argnames=("guidance",))
-def _predicted(guidance: Guide, env: Any, scalars: Any, block: Adapting) -> tuple[Array, Array]:
-    """Shares (lanes,) of held-out answers that are 0, and that a model of the others predicts."""
-    one_pass = dataclasses.replace(scalars, k_max=1, tau_max_deg=actions_of(env).reach)
-    space = actions_of(env)
-
-    def one(lane: Adapting) -> tuple[Array, Array]:
-        key = jax.random.fold_in(lane.key, HELD_OUT)
-        labels = fitted_labels(key, lane.guide.labels, scalars)
-        held = labels.valid & (jnp.arange(labels.valid.shape[0]) % HELD_OUT == HELD_OUT - 2)
-        others = labels.replace(valid=labels.valid & ~held)
-        model = guidance.fit(key, env, others, guidance.init(key), scalars)
-        right, zero = _right(labels, guidance.moved_on(model, env, labels, held, one_pass).actions)
-        count = jnp.maximum(held.sum(), 1)
-        return jnp.sum(zero, where=held) / count, jnp.where(held.any(), jnp.sum(right, where=held) / count, jnp.nan)
-
-    def _right(labels: Label, moved: Float[Array, "n action"]) -> tuple[Array, Array]:
-        """Shares (n,) of what was said of each label that the model says too, and that is "already right"."""
-        moves = space.log(labels.action, moved) / space.from_unit(scalars.eps_deg)
-        told = said(labels.answer)
-        share = lambda flags: jnp.mean(flags, -1, where=told)  # noqa: E731
-        return share(jnp.round(jnp.clip(moves, -1, 1)) == labels.answer), share(labels.answer == 0)
-
-    return each_lane(one)(block)
-
-
-def judged_by_labels(guidance: Guide, sizes: GuideSizes, env: Environment, scalars: Scalars, block: Adapting) -> Judged:
-    """Compares a model with answering "already right" always, on every fifth label, to which it was not fitted.
-
-    The model that is kept is fitted to all of them; this one is made for the comparison alone.
-
-    Args:
-        guidance, sizes, env, scalars, block: as `program.ask_round` has them; the block has its labels.
-
-    Raises:
-        UserError: answers that say nothing about turning an action, or fewer than five.
-    """
-    form = guidance.form
-    if form is None or not form.by_eps:
-        told = form.name if form else "no"
-        raise UserError(f"{told} answers cannot be judged by held-out labels: give --judge-by a metric of the task")
-    if int(np.asarray(block.guide.labels.valid).sum(-1).min()) < HELD_OUT:
-        raise UserError(f"fewer than {HELD_OUT} labels cannot be judged by: give more, or --judge-by a metric")
-    zero, right = jax.device_get(_predicted(guidance, env, scalars, block))
-    used = ~np.asarray(block.failed) & (right >= zero)
-    unknown, none = np.full((len(used), 3), np.nan), np.zeros(len(used), int)
-    return Judged(LABELS, zero, right, used, within(actions_of(env), block), unknown, none)
-
-
-def within(space: Space, block: Adapting) -> np.ndarray:
-    """The bounds (lanes,) of a block, in the unit of the space."""
-    return space.to_unit(np.asarray(block.bound), np)
-
-
 def check_bounds(shares: tuple[float, ...], by: str, named: str) -> None:
     """Raises UserError for shares of a bound that cannot be tried; `named` is what the user calls them."""
     if len(shares) > MOST_BOUNDS:
@@ -184,13 +82,128 @@ def check_bounds(shares: tuple[float, ...], by: str, named: str) -> None:
         raise UserError(f"{named} needs episodes to try them on: judge by a metric of the task")
 
 
-def check_metric(by: str, policies: Rolled) -> None:
-    """Raises UserError if there is no such metric."""
-    if by not in policies.means:
-        raise UserError(f"there is no metric {by!r} to judge by{closest(by, [*policies.means, LABELS])}")
+class Judge:
+    """Measures the lanes of an adaptation on the way, and says in the end what is used of them."""
+
+    def __init__(self, of: Adaptation, lanes: Lanes, how: Judging, mesh: Mesh, watch: Callable[[str], Tell]) -> None:
+        """`mesh`: devices that share the lanes; `watch`: by what is being done, who is told how far it is."""
+        self.of, self.lanes, self.how, self.watch = of, lanes, how, watch
+        self.mesh = mesh if mesh.size > 1 else None
+        self.curve: list[dict[str, np.ndarray]] = []
+
+    def measure_if_due(self, block: LaneState, asked: int) -> None:
+        """Adds a row to the curve after so many labels."""
+        if self.how.every and asked % self.how.every == 0:
+            self._add(block)
+
+    def judged(self, block: LaneState) -> tuple[Judged, LaneState]:
+        """What is used of the finished lanes, and these within the bounds that are used.
+
+        Raises UserError if there is no such metric, or labels cannot judge.
+        """
+        how, lanes = self.how, self.lanes
+        found = judged_by_labels(self.of, block) if how.by == LABELS else None
+        after = self._add(block) if how.env is not None else None
+        if found is not None:
+            return found, block
+        assert after is not None  # a metric is of episodes
+        if how.by not in after.means:
+            raise UserError(f"there is no metric {how.by!r} to judge by{closest(how.by, [*after.means, LABELS])}")
+        bases = self._rolled(self.of.bases, "the policy as it was")
+        own = np.zeros(lanes.number, int) if len(bases.means[how.by]) == 1 else lanes.base
+        played = self._played(after) + self._played(bases)[own]
+        block, after, more = self._narrowed(block, after)
+        before, worth = np.asarray(bases.means[how.by])[own], np.asarray(after.means[how.by])
+        usable = ~np.asarray(block.failed) & np.asarray(block.guide.model.fitted)
+        used = usable & (worth >= before)  # NaN is worth less than anything
+        difference = mean_interval(np.asarray(after.each[how.by]) - np.asarray(bases.each[how.by])[own]).T
+        return Judged(how.by, before, worth, used, bounds_of(self.of, block), difference, played + more), block
+
+    def _narrowed(self, block: LaneState, after: Rolled) -> tuple[LaneState, Rolled, np.ndarray]:
+        """Lanes within the share of their bounds with which they are worth most, what they are worth so, and the
+        rewarded steps (lanes,) that it took to know."""
+        bound, played, by = block.bound, np.zeros(self.lanes.number, int), self.how.by
+        for share in self.how.bounds:
+            tried = block.replace(bound=share * block.bound)
+            found = self._rolled(self._policy(tried), f"the adapted policy within {share:g} of its bound")
+            played = played + self._played(found)
+            better = np.asarray(found.means[by] > after.means[by])
+            after = jax.tree.map(
+                lambda new, old, better=better: np.where(better.reshape(-1, *[1] * (new.ndim - 1)), new, old),
+                found,
+                after,
+            )
+            bound = jnp.where(jnp.asarray(better), tried.bound, bound)
+        return block.replace(bound=bound), after, played
+
+    def _add(self, block: LaneState) -> Rolled:
+        found = self._rolled(self._policy(block), "the adapted policy")
+        asked, failed = np.asarray(block.guide.asked), np.asarray(block.failed)
+        self.curve.append({"asked": asked, "failed": failed, **found.means})
+        return found
+
+    def _policy(self, block: LaneState) -> PolicyBlock:
+        return self.of.policy(block, self.how.env)
+
+    def _rolled(self, policy: PolicyBlock, what: str) -> Rolled:
+        how = self.how
+        assert how.env is not None
+        mesh = None if policy is self.of.bases else self.mesh  # there may be another number of them
+        return watched_lanes(how.env, policy, episodes(SPLIT), how.num_envs, how.steps, self.watch(what), mesh)
+
+    def _played(self, rolled: Rolled) -> np.ndarray:
+        """Environment steps (lanes,) of a roll-out that decide: of an outcome those of first episodes alone."""
+        assert self.how.env is not None
+        first = np.asarray(rolled.episode_steps)
+        return first.sum(-1) if self.how.by in _step_of(self.how.env).outcome else np.full(len(first), self.how.steps)
 
 
-def kept(block: Adapting, used: np.ndarray) -> Adapting:
-    """The block with models that leave actions alone where they are not to be used."""
-    model = block.guide.model
-    return block.replace(guide=block.guide.replace(model=model.replace(fitted=model.fitted & jnp.asarray(used))))
+def judged_by_labels(of: Adaptation, block: LaneState) -> Judged:
+    """Compares a model with answering "already right" always, on every fifth label, to which it was not fitted.
+
+    The model that is kept is fitted to all of them; this one is made for the comparison alone.
+
+    Raises:
+        UserError: answers that say nothing about turning an action, or fewer than five.
+    """
+    form = of.guidance.form
+    if form is None or not form.by_eps:
+        told = form.name if form else "no"
+        raise UserError(f"{told} answers cannot be judged by held-out labels: give --judge-by a metric of the task")
+    if int(np.asarray(block.guide.labels.valid).sum(-1).min()) < HELD_OUT:
+        raise UserError(f"fewer than {HELD_OUT} labels cannot be judged by: give more, or --judge-by a metric")
+    zero, right = jax.device_get(_predicted(of, block))
+    used = ~np.asarray(block.failed) & (right >= zero)
+    unknown, none = np.full((len(used), 3), np.nan), np.zeros(len(used), int)
+    return Judged(LABELS, zero, right, used, bounds_of(of, block), unknown, none)
+
+
+@jax.jit
+def _predicted(of: Adaptation, block: LaneState) -> tuple[Array, Array]:
+    """Shares (lanes,) of held-out answers that are 0, and that a model of the others predicts."""
+    guidance, env, space = of.guidance, of.env, actions_of(of.env)
+    one_pass = dataclasses.replace(of.scalars, k_max=1, tau_max_deg=space.reach)
+
+    def one(lane: LaneState) -> tuple[Array, Array]:
+        key = jax.random.fold_in(lane.key, HELD_OUT)
+        labels = fitted_labels(key, lane.guide.labels, of.scalars)
+        held = labels.valid & (jnp.arange(labels.valid.shape[0]) % HELD_OUT == HELD_OUT - 2)
+        others = labels.replace(valid=labels.valid & ~held)
+        model = guidance.fit(key, env, others, guidance.init(key), of.scalars)
+        right, zero = _right(labels, guidance.moved_on(model, env, labels, held, one_pass).actions)
+        count = jnp.maximum(held.sum(), 1)
+        return jnp.sum(zero, where=held) / count, jnp.where(held.any(), jnp.sum(right, where=held) / count, jnp.nan)
+
+    def _right(labels: Label, moved: Float[Array, "n action"]) -> tuple[Array, Array]:
+        """Shares (n,) of what was said of each label that the model says too, and that is "already right"."""
+        moves = space.log(labels.action, moved) / space.from_unit(of.scalars.eps_deg)
+        told = said(labels.answer)
+        share = lambda flags: jnp.mean(flags, -1, where=told)  # noqa: E731
+        return share(jnp.round(jnp.clip(moves, -1, 1)) == labels.answer), share(labels.answer == 0)
+
+    return each_lane(one)(block)
+
+
+def bounds_of(of: Adaptation, block: LaneState) -> np.ndarray:
+    """The bounds (lanes,) of a block, in the unit of the space."""
+    return actions_of(of.env).to_unit(np.asarray(block.bound), np)

@@ -19,12 +19,12 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 from cuelearner_jax.agents import view
 from cuelearner_jax.agents.choice import best_near_peaks, best_of, looked_at
 from cuelearner_jax.agents.networks import applied, q_network, widened
-from cuelearner_jax.agents.replay import Memory
+from cuelearner_jax.agents.replay import Memory, Transition
 from cuelearner_jax.config import POSITIVE, SHARE, Bounds, Frame, Layers, Scalars, Sizes, part
 from cuelearner_jax.environment import Spaces
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.spaces import check_directions
-from cuelearner_jax.types import Params, Transition
+from cuelearner_jax.types import Params
 
 ALIGNED = 64  # layers computed in bfloat16 are filled up to multiples: 20% faster on an H200, whose rows want alignment
 

@@ -13,11 +13,33 @@ from typing import Any, NamedTuple
 import jax
 import jax.custom_batching
 import jax.numpy as jnp
+from flax import struct
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from cuelearner_jax.environment import Environment, actions_of, random_symmetries
-from cuelearner_jax.types import Step, StoredStep, Transition
+from cuelearner_jax.types import Step
+
+
+class StoredStep(struct.PyTreeNode):
+    """One step in replay, as small as the environment can make it."""
+
+    obs: Float[Array, " memory"]  # see `Environment.remember`
+    action: Float[Array, " action"]  # as executed
+    reward: Float[Array, ""]
+    discount: Float[Array, " 1_or_0"]  # this and the next two have no entries where nothing bootstraps
+    ended: Float[Array, " 1_or_0"]  # 1 where the episode ended, terminated or truncated
+    aftermath: Float[Array, " aftermath_or_0"]  # see `Environment.recall_next`
+
+
+class Transition(struct.PyTreeNode):
+    """One step to learn from. `next_obs` has no entries where nothing bootstraps from it (discount 0)."""
+
+    obs: Float[Array, " obs"]
+    action: Float[Array, " action"]  # as executed
+    reward: Float[Array, ""]
+    discount: Float[Array, ""]  # of `next_obs`: 0 at termination, never at truncation; 1 after one step
+    next_obs: Float[Array, " obs_or_0"]
 
 
 class Following(NamedTuple):

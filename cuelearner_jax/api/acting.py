@@ -145,20 +145,17 @@ def load_policy(
         UserError: no such folder, lane or policy.
     """
     path = arguments.path("folder", folder)
-    for argument, value in (("policy", policy), ("guidance", guidance)):
-        if value is not None:
-            arguments.text(argument, value, trained.POLICIES if argument == "policy" else ())
-    labels = None if labels is None else arguments.budget("labels", labels, least=0)
-    if bound_deg is not None:  # up to the reach of actions, which the folder says
-        arguments.number("bound_deg", bound_deg, LARGEST_FLOAT, "a number above 0")
-    seed = None if seed is None else arguments.seed("seed", seed)
+    arguments.optional(arguments.text, "policy", policy, trained.POLICIES)
+    arguments.optional(arguments.text, "guidance", guidance)
+    labels = arguments.optional(arguments.budget, "labels", labels, 0)
+    # The bound is up to the reach of actions, which the folder says.
+    arguments.optional(arguments.number, "bound_deg", bound_deg, LARGEST_FLOAT, "a number above 0")
+    seed = arguments.optional(arguments.seed, "seed", seed)
     code = None if base is None else as_policy(base, "base")
     if isinstance(task, str):
         task = registry.resolve(arguments.text("task", task))
-    elif task is not None:
-        arguments.instance("task", task, Task, "a task, or its name")
-    if world is not None:
-        a_world("world", world)
+    arguments.optional(arguments.instance, "task", task, Task, "a task, or its name")
+    arguments.optional(a_world, "world", world)
     whole.check_not_aside(path)
     if not path.exists():
         raise UserError(f"folder {path} does not exist: give the folder of a run, or of an adapted policy")
@@ -168,6 +165,6 @@ def load_policy(
     changed = world.config if world else source.config.task
     source.check(name, changed)
     shape = shape_of(known, changed)
-    bound_deg = None if bound_deg is None else arguments.amount("bound_deg", bound_deg, actions_of(shape))
+    bound_deg = arguments.optional(arguments.amount, "bound_deg", bound_deg, actions_of(shape))
     found = trained.one_policy(source, changed, name, guidance, labels, seed, bound_deg)
     return CallablePolicy(found, shape.observation, trained.POLICIES[name].taught, source.config, actions_of(shape))

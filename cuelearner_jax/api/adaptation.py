@@ -14,8 +14,8 @@ import jax
 import numpy as np
 
 from cuelearner_jax import user_code
-from cuelearner_jax.adaptation import program
 from cuelearner_jax.adaptation.adapting import plain_scalars
+from cuelearner_jax.adaptation.lanes import blame
 from cuelearner_jax.api import arguments
 from cuelearner_jax.api.acting import CallablePolicy, as_policy, as_policy_in, source_of
 from cuelearner_jax.api.feedback import Labels, diverged, given_settings, label_path, labels_of, rows_of
@@ -27,7 +27,7 @@ from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs.trained import PolicySource
 from cuelearner_jax.storage import label_files, policy_folders
 from cuelearner_jax.studies import adapt as study
-from cuelearner_jax.studies.adapt import Base, Outcome, Subject
+from cuelearner_jax.studies.adapt import BaseLanes, Outcome, Subject
 from cuelearner_jax.task import Body, Task
 from cuelearner_jax.types import Label, Teacher
 
@@ -133,17 +133,17 @@ def adapt(
     env = world.env if isinstance(world, World) else world
     space = actions_of(env)
     sizes, scalars, eps_deg = given_settings(space, sizes, scalars, eps_deg)
-    names = {"guidance": guidance, "judge_by": judge_by}
-    names = {name: arguments.text(name, value) for name, value in names.items() if value is not None}
+    guidance, judge_by = (
+        arguments.optional(arguments.text, name, value)
+        for name, value in (("guidance", guidance), ("judge_by", judge_by))
+    )
     count, file, rows = _given(labels, world)
     scenario = world.scenario if isinstance(world, World) else None
-    request = study.suggested(
-        source, scenario, labels_from=file, eps_deg=eps_deg, sizes=sizes, scalars=scalars, **names
-    )
+    request = study.suggested(source, scenario, guidance, judge_by, file, eps_deg, sizes, scalars)
     asked = {
         "labels": None if count is None else (count,),
         "bound_deg": None if bound_deg is None else (arguments.amount("bound_deg", bound_deg, space),),
-        "judge_bounds": None if judge_bounds is None else _shares(judge_bounds),
+        "judge_bounds": arguments.optional(_shares, "judge_bounds", judge_bounds),
     }
     request = dataclasses.replace(
         request,
@@ -157,10 +157,10 @@ def adapt(
         user_code.answers_in("teacher", arguments.teacher("teacher", teacher), env)
     elif file is None and rows is None:
         raise UserError("labels are asked of a teacher: give one, for instance teacher_of(world), or labels")
-    subject = Subject(source, Base(source.default_policy), own, teacher=teacher, rows=rows)
+    subject = Subject(source, BaseLanes(source.default_policy), own, teacher=teacher, rows=rows)
     outcome = study.run(subject, request, note=partial(warnings.warn, stacklevel=5))
     if outcome.found.block.failed.any():
-        program.blame(env, outcome.found.asked.bases, teacher, outcome.found.block)
+        blame(outcome.found.of, teacher, outcome.found.block)
         raise diverged()
     if not outcome.found.judged.used.all():
         warnings.warn(study.sentences(outcome.found)[0], stacklevel=3)
@@ -201,10 +201,9 @@ def _given(labels: Any, world: Any) -> tuple[int | None, Path | None, Label | No
     return None, None, Label(obs, action, answer, np.ones(len(obs), bool))  # pyright: ignore[reportArgumentType]
 
 
-def _shares(given: Any) -> tuple[float, ...]:
+def _shares(name: str, given: Any) -> tuple[float, ...]:
     wanted = "shares of the bound below 1"
-    bounds = arguments.several("judge_bounds", given, wanted)
-    return tuple(arguments.number("judge_bounds", bound, 1.0, wanted) for bound in bounds)
+    return tuple(arguments.number(name, bound, 1.0, wanted) for bound in arguments.several(name, given, wanted))
 
 
 def _called(policy: Any) -> str:

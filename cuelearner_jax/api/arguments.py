@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import operator
 import os
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -27,12 +27,18 @@ from cuelearner_jax.types import Teacher
 
 LONGEST = 200  # characters of a name
 
+FoundT = TypeVar("FoundT")
 KindT = TypeVar("KindT")
 
 
 def refused(name: str, value: Any, wanted: str) -> UserError:
     """Build the error for an argument: what was given, and what is wanted."""
     return UserError(f"{name} is {shown(value)}: give {wanted}")
+
+
+def optional(check: Callable[..., FoundT], name: str, value: Any, *more: Any) -> FoundT | None:
+    """An argument that may be left out (None), else as `check` has it."""
+    return None if value is None else check(name, value, *more)
 
 
 def instance(name: str, value: Any, kind: type[KindT], wanted: str) -> KindT:

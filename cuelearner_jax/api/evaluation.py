@@ -40,10 +40,8 @@ def measure(
     """
     source = source_of(policy, a_world("world", world))
     own = as_policy_in(policy, world.env)
-    given: dict[str, Any] = {"episodes": episodes, "steps": steps, "envs": envs}
-    given = {name: arguments.whole(name, value, 1, study.MOST) for name, value in given.items() if value is not None}
-    if engine is not None:
-        arguments.text("engine", engine)
-    asked = study.Request(task=world.config, policy="agent", engine=engine, **given)
-    (found,) = study.run(source, asked, policy=own)
+    amounts = {"episodes": episodes, "steps": steps, "envs": envs}
+    amounts = {name: arguments.optional(arguments.whole, name, value, 1, study.MOST) for name, value in amounts.items()}
+    engine = arguments.optional(arguments.text, "engine", engine)
+    (found,) = study.run(source, study.EvaluateRequest(task=world.config, engine=engine, **amounts), policy=own)
     return found

@@ -20,7 +20,8 @@ import numpy as np
 from jaxtyping import Float
 
 from cuelearner_jax import user_code
-from cuelearner_jax.adaptation import adapting, program
+from cuelearner_jax.adaptation import adapting
+from cuelearner_jax.adaptation.lanes import Adaptation, blame, check_memory, product
 from cuelearner_jax.agents.networks import all_finite
 from cuelearner_jax.api import arguments
 from cuelearner_jax.api.acting import CallablePolicy, as_policy, as_policy_in, entries_of
@@ -100,14 +101,16 @@ def fit_feedback(
         labels = labels_of(rows)
     labels = _checked(labels, space)
     sizes, scalars = settings(space, sizes, scalars, eps_deg)
-    guidance = _relative(sizes, Spaces(labels.obs.shape[1], space))
+    guidance = KIND.make(sizes, Spaces(labels.obs.shape[1], space))
     valid = np.ones(len(labels.obs), bool)
     answers = labels.answer.reshape(len(valid), -1)
     rows = Label(*(jnp.asarray(part) for part in (labels.obs, labels.action, answers, valid)))
     k_init, k_fit = jax.random.split(jax.random.key(seed))
-    program.check_memory(sizes, jax.eval_shape(guidance.init, k_init))
+    check_memory(sizes, jax.eval_shape(guidance.init, k_init))
     fit = jax.jit(lambda key, rows, former, scalars: guidance.fit(key, None, rows, former, scalars))
-    model = _finite(fit(k_fit, rows, guidance.init(k_init), scalars))
+    model = fit(k_fit, rows, guidance.init(k_init), scalars)
+    if not all_finite(model):
+        raise diverged()
     return FeedbackModel(guidance, model, scalars, labels, sizes, space)
 
 
@@ -145,18 +148,16 @@ def ask(
     labels, seed = arguments.budget("labels", labels), arguments.seed("seed", seed)
     a_world("world", world)
     space = actions_of(world.env)
-    bound = adapting.BOUND * space.reach if bound_deg is None else arguments.amount("bound_deg", bound_deg, space)
+    bound = arguments.optional(arguments.amount, "bound_deg", bound_deg, space) or adapting.BOUND * space.reach
     sizes, scalars = settings(space, *given_settings(space, sizes, scalars, eps_deg))
     check_teacher(arguments.teacher("teacher", teacher), scalars)
     adapting.check_amounts(space, [bound], scalars)
-    env, guidance = world.env, _relative(sizes, spaces_of(world.env))
+    env, guidance = world.env, KIND.make(sizes, spaces_of(world.env))
     user_code.answers_in("teacher", teacher, env)
-    lanes, base = program.product(1, (seed,), (labels,), (bound,)), Common(as_policy_in(policy, env))
-    block = program.begin(guidance, sizes, env, lanes)
-    for _ in range(program.rounds(lanes, sizes)):
-        block = program.ask_round(guidance, sizes, env, teacher, scalars, base, block)
+    of = Adaptation(guidance, sizes, scalars, env, Common(as_policy_in(policy, env)))
+    block = adapting.learned(of, product(1, (seed,), (labels,), (bound,)), teacher)
     if block.failed.any():
-        program.blame(env, base, teacher, block)
+        blame(of, teacher, block)
         raise diverged()
     guide = jax.tree.map(lambda leaf: leaf[0], block.guide)
     return FeedbackModel(guidance, guide.model, scalars, labels_of(guide.labels), sizes, space, env)
@@ -187,7 +188,7 @@ def refine(policy: Any, model: FeedbackModel, bound_deg: float | None = None) ->
     arguments.instance("model", model, FeedbackModel, "a model, as cl.ask and cl.fit_feedback give it")
     space = model.space
     base = in_space(base, space)
-    bound_deg = None if bound_deg is None else arguments.amount("bound_deg", bound_deg, space)
+    bound_deg = arguments.optional(arguments.amount, "bound_deg", bound_deg, space)
     labels = _checked_model(model).labels
     width, seen = labels.obs.shape[1], entries_of(policy)
     if seen not in (0, width):
@@ -212,18 +213,14 @@ def _checked_model(model: FeedbackModel) -> FeedbackModel:
     return model
 
 
-def _relative(sizes: GuideSizes, spaces: Spaces) -> Guide:
-    return KIND.make(sizes, spaces)
-
-
 def given_settings(
     space: Space, sizes: Any, scalars: Any, eps_deg: Any
 ) -> tuple[GuideSizes | None, Scalars | None, float | None]:
     """These arguments as they are, each of them one of its kind or None. Raises UserError for the first that is not."""
     return (
-        None if sizes is None else arguments.settings("sizes", sizes, GuideSizes),
-        None if scalars is None else arguments.settings("scalars", scalars, Scalars),
-        None if eps_deg is None else arguments.amount("eps_deg", eps_deg, space),
+        arguments.optional(arguments.settings, "sizes", sizes, GuideSizes),
+        arguments.optional(arguments.settings, "scalars", scalars, Scalars),
+        arguments.optional(arguments.amount, "eps_deg", eps_deg, space),
     )
 
 
@@ -269,13 +266,6 @@ def _checked(labels: Any, space: Space) -> Labels:
     rows = Label(obs, action, answers, np.ones(len(obs), bool))  # pyright: ignore[reportArgumentType]
     given.check(rows, Spaces(obs.shape[1], space), RELATIVE)
     return labels
-
-
-def _finite(model: GuidanceModel) -> GuidanceModel:
-    """A fitted model. Raises UserError if it is not finite."""
-    if not all_finite(model):
-        raise diverged()
-    return model
 
 
 def diverged() -> UserError:

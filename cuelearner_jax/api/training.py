@@ -52,8 +52,8 @@ class Run:
         Raises:
             UserError: there is no such lane.
         """
-        labels = None if labels is None else arguments.budget("labels", labels, least=0)
-        seed = None if seed is None else arguments.seed("seed", seed)
+        labels = arguments.optional(arguments.budget, "labels", labels, 0)
+        seed = arguments.optional(arguments.seed, "seed", seed)
         name = list(self.trainings)[-1] if guidance is None else arguments.text("guidance", guidance)
         if name not in self.trainings:
             raise UserError(f"no guidance {name!r} was trained{closest(name, self.trainings)}")
@@ -100,8 +100,8 @@ def train(
         UserError: settings that make no sense, no teacher where one is asked, or too little memory.
     """
     a_world("world", world)
-    if teacher is not None:
-        user_code.answers_in("teacher", arguments.teacher("teacher", teacher), world.env)
+    if arguments.optional(arguments.teacher, "teacher", teacher) is not None:
+        user_code.answers_in("teacher", teacher, world.env)
     guidance = [arguments.text("guidance", kind) for kind in arguments.several("guidance", guidance, "kinds")]
     budgets = tuple(arguments.budget("labels", one) for one in arguments.several("labels", labels, "label budgets"))
     arguments.text("split", split, SPLITS)

@@ -95,9 +95,8 @@ def make(name: str | Task, *, scenario: str | None = None, robot: str | None = N
     """
     task = registry.resolve(arguments.text("name", name)) if isinstance(name, str) else name
     task = arguments.instance("name", task, Task, "the name of a task, or a task")
-    task = task.on(None if robot is None else arguments.text("robot", robot))
-    if scenario is not None:
-        arguments.text("scenario", scenario)
+    task = task.on(arguments.optional(arguments.text, "robot", robot))
+    arguments.optional(arguments.text, "scenario", scenario)
     return World(task, task.configured(scenario, **changes), scenario)
 
 

@@ -13,12 +13,12 @@ from cuelearner_jax.plugins import REFERENCE
 from cuelearner_jax.runs.trained import PolicySource
 from cuelearner_jax.storage import policy_folders
 from cuelearner_jax.studies import adapt
-from cuelearner_jax.studies.adapt import Base, Request, Subject
+from cuelearner_jax.studies.adapt import AdaptRequest, BaseLanes, Subject
 from cuelearner_jax.terminal import console, progress_bars, watched_by
 
 
 @dataclass(frozen=True, kw_only=True)
-class Adapt(Request[TaskT, KindsT], Generic[TaskT, KindsT]):
+class Adapt(AdaptRequest[TaskT, KindsT], Generic[TaskT, KindsT]):
     """Correct a finished policy (of a run folder or policy folder; or, with --task, package.module:NAME, any function
     of observations) by labels about what it does in a changed world."""
 
@@ -26,7 +26,7 @@ class Adapt(Request[TaskT, KindsT], Generic[TaskT, KindsT]):
     """The policy folder that is written."""
     overwrite: Flag[bool] = False
     """Delete the policy folder that is there."""
-    base: Base = field(default_factory=Base)
+    base: BaseLanes = field(default_factory=BaseLanes)
 
 
 OPTIONS = {"adapt": Adapt}
@@ -45,7 +45,7 @@ def run(arguments: list[str]) -> None:
     default = kind(
         **{**vars(default), "kinds": kinds()},
         out=Path("policies") / source.folder.name,
-        base=Base(policy=source.default_policy),
+        base=BaseLanes(policy=source.default_policy),
     )
     asked = parse(kind, rest, f"adapt {source.folder}", default, about(Adapt, source.task, policies=True))
     asked = replace(asked, kinds=vars(asked.kinds))

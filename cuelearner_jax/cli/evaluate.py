@@ -15,7 +15,7 @@ from cuelearner_jax.errors import UserError
 from cuelearner_jax.runs.trained import POLICIES, PolicySource
 from cuelearner_jax.storage import policy_folders
 from cuelearner_jax.studies import evaluate
-from cuelearner_jax.studies.evaluate import Measured, Request
+from cuelearner_jax.studies.evaluate import EvaluateRequest, Measured
 from cuelearner_jax.tasks import registry
 from cuelearner_jax.terminal import console, progress_bars, watched_by
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Evaluate(Request[TaskT], Generic[TaskT]):
+class Evaluate(EvaluateRequest[TaskT], Generic[TaskT]):
     """Validate a run, an adapted policy, or a task's teacher, heuristic or chance; in any changed world."""
 
     robot: str | None = None

@@ -16,10 +16,11 @@ import numpy as np
 from jaxtyping import PRNGKeyArray
 
 from cuelearner_jax.agents.networks import all_finite
+from cuelearner_jax.asking import GuideState
 from cuelearner_jax.guides.fitting import held_out
 from cuelearner_jax.labelling.plan import Plan
 from cuelearner_jax.labelling.programs import Agreement, Programs, agreement
-from cuelearner_jax.types import GuidanceModel, GuideState, Label
+from cuelearner_jax.types import GuidanceModel, Label
 
 # A fit computes in its own thread alone, which makes way for whoever answers.
 ALONE = {"xla_cpu_multi_thread_eigen": False}

@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from cuelearner_jax import asking, user_code
+from cuelearner_jax.asking import GuideState
 from cuelearner_jax.environment import actions_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.labelling import controls
@@ -32,7 +33,7 @@ from cuelearner_jax.storage import label_files
 from cuelearner_jax.storage.label_checks import ANSWERED, UNDONE, UNSURE
 from cuelearner_jax.storage.provenance import provenance
 from cuelearner_jax.task import shape_of
-from cuelearner_jax.types import GuideState, Label, Reel, Sketch
+from cuelearner_jax.types import Label, Reel, Sketch
 
 RECENT = 50  # answers by which the pace is told
 NUMBERS = 2**31  # of questions: those of practice count down to 0, and their random numbers are the last ones

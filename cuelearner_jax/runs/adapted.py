@@ -13,7 +13,8 @@ import numpy as np
 from cuelearner_jax import config as configuration
 from cuelearner_jax.adaptation import stored
 from cuelearner_jax.adaptation.adapting import Adapted
-from cuelearner_jax.adaptation.program import Lanes
+from cuelearner_jax.adaptation.judging import SPLIT
+from cuelearner_jax.adaptation.lanes import Lanes
 from cuelearner_jax.environment import actions_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.feedback.forms import AnswerForm
@@ -148,20 +149,15 @@ def write(
     Raises:
         UserError: something came to the place meanwhile, or the policy cannot be kept.
     """
-    of, judged = adapted.asked, adapted.judged
-    env = shape_of(task, world)
-    block = adapted.policy(env)
-    bases = of.bases
-    rows = lanes_in(bases)
-    block = replace(block, base=bases)
+    lanes, judged, env = adapted.lanes, adapted.judged, shape_of(task, world)
+    block = replace(adapted.policy(env), base=adapted.of.bases)
     values, arrays = stored.told(block, origin.get("code")), stored.arrays_of(block)
-    lanes = of.lanes
     described = {
         "task": {"name": task.name, **({"from": task.origin} if task.origin else {}), **configuration.to_json(world)},
         **({"files": files} if (files := task.files(world)) else {}),
         "of": origin,
         "policy": values,
-        "rows": rows,
+        "rows": lanes_in(adapted.of.bases),
         "lanes": {
             "base": lanes.base.tolist(),
             "seeds": lanes.seed.tolist(),
@@ -171,7 +167,7 @@ def write(
         },
         "judged": {
             "by": judged.by,
-            "split": of.judging.split,
+            "split": SPLIT,
             "before": _plain(judged.before),
             "after": _plain(judged.after),
             "within_deg": [float(f"{bound:g}") for bound in judged.within_deg],
@@ -201,36 +197,36 @@ def labels_name(lanes: Lanes, bound_deg: float) -> str:
 
 def _write_labels(folder: Path, adapted: Adapted, task: Task, world: Any) -> None:
     """One file a bound, with a set a seed: that of the largest budget, of which smaller ones have the first labels."""
-    of = adapted.asked
+    of, lanes = adapted.of, adapted.lanes
     form: AnswerForm | None = of.guidance.form
     assert form is not None
     told, space = {"name": task.name, **configuration.to_json(world)}, actions_of(of.env)
     rows: Label = adapted.labels
-    largest = of.lanes.budget == of.lanes.budget.max()
-    for bound in np.unique(of.lanes.bound_deg):
-        own = np.flatnonzero(largest & (of.lanes.bound_deg == bound))
+    largest = lanes.budget == lanes.budget.max()
+    for bound in np.unique(lanes.bound_deg):
+        own = np.flatnonzero(largest & (lanes.bound_deg == bound))
         eps = of.scalars.eps_deg if form.by_eps else None
         sets = jax.tree.map(lambda leaf, own=own: leaf[own], rows)
-        file = folder / labels_name(of.lanes, float(bound))
-        label_files.write(file, told, form.name, space, eps, of.lanes.seed[own], sets, form.meaning(space))
+        file = folder / labels_name(lanes, float(bound))
+        label_files.write(file, told, form.name, space, eps, lanes.seed[own], sets, form.meaning(space))
 
 
 def _write_curve(folder: Path, name: str, adapted: Adapted, task: Task) -> None:
     """What the policies were worth after so many labels, as runs keep it of their guides."""
-    of = adapted.asked
+    of = adapted.of
     if not adapted.curve:
         return
     constants = {
         "run": name,
         "task": task.name,
         "guidance": of.guidance.name,
-        "split": of.judging.split,
+        "split": SPLIT,
         "config_hash": "",
         **provenance(),
     }
-    lanes = {"seed": of.lanes.seed, "labels": of.lanes.budget, "bound_deg": of.lanes.bound_deg}
+    lanes = {"seed": adapted.lanes.seed, "labels": adapted.lanes.budget, "bound_deg": adapted.lanes.bound_deg}
     with guides.GuideWriter(folder, **constants) as writer:
-        done = np.full(of.lanes.number, -1)
+        done = np.full(adapted.lanes.number, -1)
         for row in adapted.curve:
             new = row["asked"] > done  # a lane that has its budget does not change any more
             done = row["asked"]

@@ -10,12 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.loop import start_clock
+from cuelearner_jax.loop import Clock, TrainState, start_clock
 from cuelearner_jax.runs.lanes import LaneGroup
 from cuelearner_jax.storage import formats, guides, label_files, results
 from cuelearner_jax.storage import table as tables
 from cuelearner_jax.storage.checkpoint import Checkpoints, checkpoints
-from cuelearner_jax.types import Clock, TrainState
 
 DUE = "due.json"  # beside a checkpoint whose evaluation was ended: the columns that its row will have beside that
 

@@ -16,13 +16,13 @@ from jaxtyping import PRNGKeyArray
 from cuelearner_jax.asking import label_slots
 from cuelearner_jax.devices import BY_LANE, lane_mesh, place
 from cuelearner_jax.environment import Environment
-from cuelearner_jax.evaluate import Tell, evaluate_lanes, untold, watched_lanes
+from cuelearner_jax.evaluate import Tell, untold, watched_lanes
 from cuelearner_jax.guides.base import Guide
-from cuelearner_jax.loop import Program, make_program
+from cuelearner_jax.loop import Clock, Program, TrainState, make_program
 from cuelearner_jax.policies import PolicyBlock
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs.grid import Grid
-from cuelearner_jax.types import Clock, Label, Teacher, TrainState
+from cuelearner_jax.types import Label, Teacher
 
 CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
@@ -166,11 +166,10 @@ class LaneGroup:
 
         One device tells between stretches how far each block is; several devices evaluate in one stretch.
         """
+        mesh = self.mesh if self.mesh.size > 1 else None
 
         def measured(block: TrainState) -> dict[str, Any]:
-            if self.mesh.size > 1:
-                return evaluate_lanes(env, policy_of(block), key, mesh=self.mesh, num_envs=num_envs, steps=steps)
-            return watched_lanes(env, policy_of(block), key, num_envs, steps, tell).means
+            return watched_lanes(env, policy_of(block), key, num_envs, steps, tell, mesh).means
 
         return self.columns(self.each(measured, blocks))
 

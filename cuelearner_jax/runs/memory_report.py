@@ -12,9 +12,9 @@ from cuelearner_jax.devices import portions
 from cuelearner_jax.environment import spaces_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides.base import Footprint
+from cuelearner_jax.loop import TrainState
 from cuelearner_jax.runs.lanes import LaneGroup
 from cuelearner_jax.storage.room import free_bytes
-from cuelearner_jax.types import TrainState
 
 FLOAT = 4  # bytes
 METRICS = 16  # of an evaluation's step, at most

@@ -14,11 +14,11 @@ from cuelearner_jax.asking import blame, label_slots
 from cuelearner_jax.devices import SHARED, place
 from cuelearner_jax.environment import Environment, view_of
 from cuelearner_jax.evaluate import Tell, episodes, untold
-from cuelearner_jax.loop import start_clock
+from cuelearner_jax.loop import Clock, TrainState, start_clock
 from cuelearner_jax.policies import Agent, Guided, PolicyBlock, uniform_in
 from cuelearner_jax.runs.lanes import LaneGroup
 from cuelearner_jax.storage import label_files
-from cuelearner_jax.types import Clock, Label, Teacher, TrainState
+from cuelearner_jax.types import Label, Teacher
 
 
 class Training:

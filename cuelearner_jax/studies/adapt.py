@@ -17,8 +17,12 @@ from typing import Any, Generic, NamedTuple, TypeVar
 import numpy as np
 
 from cuelearner_jax import user_code
-from cuelearner_jax.adaptation import adapting, judging, program, stored
-from cuelearner_jax.adaptation.adapting import Adaptation, Adapted, Judging
+from cuelearner_jax.adaptation import adapting, judging, stored
+from cuelearner_jax.adaptation import lanes as adaptation_lanes
+from cuelearner_jax.adaptation.adapting import Adapted
+from cuelearner_jax.adaptation.judging import Judging
+from cuelearner_jax.adaptation.lanes import Adaptation
+from cuelearner_jax.asking import label_slots
 from cuelearner_jax.config import GuideSizes, Scalars, check_guide, check_part
 from cuelearner_jax.environment import Environment, actions_of, spaces_of
 from cuelearner_jax.errors import UserError, closest
@@ -48,7 +52,7 @@ AS_IT_IS = Scenario("the world as it is", {})
 
 
 @dataclass(frozen=True)
-class Base:
+class BaseLanes:
     """Which lanes of the folder are adapted."""
 
     policy: str = "agent"
@@ -64,7 +68,7 @@ class Base:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Request(Generic[TaskT, KindsT]):
+class AdaptRequest(Generic[TaskT, KindsT]):
     """What adaptation is asked for."""
 
     task: TaskT
@@ -105,7 +109,7 @@ class Subject(NamedTuple):
     """What is adapted, and who answers."""
 
     source: PolicySource  # with the task that acts, and the configuration that policies were trained with
-    base: Base = Base()  # which of the source's policies
+    base: BaseLanes = BaseLanes()  # which of the source's policies
     policy: Any = None  # in place of one of the source's; None: none
     named: str | None = None  # package.module:NAME of the code, that policy or what the source's folder holds
     teacher: Teacher | None = None  # None: the task's own
@@ -117,7 +121,7 @@ class Outcome(NamedTuple):
 
     found: Adapted
     subject: Subject
-    request: Request
+    request: AdaptRequest
     origin: dict[str, Any]  # what was adapted, in plain values
 
     def write(self, place: Place) -> None:
@@ -136,7 +140,7 @@ def suggested(
     eps_deg: float | None = None,
     sizes: GuideSizes | None = None,
     scalars: Scalars | None = None,
-) -> Request:
+) -> AdaptRequest:
     """The request that holds where nothing else is given: the only place where the rules of scenarios are applied.
 
     Args:
@@ -156,7 +160,7 @@ def suggested(
         rules = replace(rules, guidance=None, sizes={}, scalars={}, options={})  # which are for the suggested kind
     if judge_by == judging.LABELS:
         rules = replace(rules, judge_bounds=())  # which are tried on episodes
-    labels = Request.labels
+    labels = AdaptRequest.labels
     if labels_from is not None:
         file = label_files.read(labels_from)
         eps_deg = file.eps if eps_deg is None else eps_deg
@@ -167,16 +171,16 @@ def suggested(
         scalars = replace(adapting.settling(source.config.scalars, eps_deg), **rules.scalars)
     else:
         scalars = adapting.settling(scalars, eps_deg)
-    kind = guidances.resolve(guidance or rules.guidance or Request.guidance)
+    kind = guidances.resolve(guidance or rules.guidance or AdaptRequest.guidance)
     own = source.config.kinds.get(kind.name) or (kind.config and kind.config())
-    return Request(
+    return AdaptRequest(
         task=rules.applied(source.config.task),
         labels=labels,
         bound_deg=() if rules.bound_deg is None else (rules.bound_deg,),
-        guidance=guidance or rules.guidance or Request.guidance,
+        guidance=guidance or rules.guidance or AdaptRequest.guidance,
         scenario=scenario,
         labels_from=labels_from,
-        judge_by=judge_by or rules.judge_by or Request.judge_by,
+        judge_by=judge_by or rules.judge_by or AdaptRequest.judge_by,
         judge_bounds=rules.judge_bounds,
         sizes=sizes,
         scalars=scalars,
@@ -186,7 +190,7 @@ def suggested(
 
 def run(
     subject: Subject,
-    request: Request,
+    request: AdaptRequest,
     watch: Callable[[str], Tell] = lambda what: untold,
     note: Callable[[str], None] = console.print,
 ) -> Outcome:
@@ -218,27 +222,26 @@ def run(
     rows, request = _rows(subject, request, guidance, env, bases, seeds)
     if note_of := adapting.check_amounts(actions_of(env), request.bound_deg, scalars):
         note(note_of)
-    each = program.one_each(seeds, request.labels, request.bound_deg)
-    lanes = program.product(1, seeds, request.labels, request.bound_deg) if shared else each
+    varied = seeds, request.labels, request.bound_deg
+    lanes = adaptation_lanes.product(1, *varied) if shared else adaptation_lanes.one_each(*varied)
     how = _judging(task, request, env)
     teacher = None
     if rows is None:
         teacher = subject.teacher or task.make_teacher(request.task, env)
         check_teacher(teacher, scalars)
-    asked = Adaptation(guidance, sizes, scalars, env, bases, lanes, how)
+    of = Adaptation(guidance, sizes, scalars, env, bases)
     if subject.policy is None or subject.named:  # it is to be kept in a folder
-        stored.told(program.adapted(guidance, sizes, env, scalars, bases, program.begin(guidance, sizes, env, lanes)))
+        stored.told(of.policy(adaptation_lanes.begin(of, lanes)))
     if rows is not None:
-        slots = program.rounds(lanes, sizes) * sizes.labels_per_round
-        rows = label_files.for_lanes(rows, lanes.seed, lanes.budget, slots)
-    return Outcome(adapting.adapt(asked, teacher, rows, watch=watch), subject, request, origin)
+        rows = label_files.for_lanes(rows, lanes.seed, lanes.budget, label_slots(int(lanes.budget.max()), sizes))
+    return Outcome(adapting.adapt(of, lanes, how, teacher, rows, watch=watch), subject, request, origin)
 
 
-def _bases(subject: Subject, request: Request, env: Any) -> tuple[Any, tuple[int, ...], dict[str, Any]]:
+def _bases(subject: Subject, request: AdaptRequest, env: Any) -> tuple[Any, tuple[int, ...], dict[str, Any]]:
     """The base policies, their seeds, and what they are in plain values."""
     source, base, named = subject.source, subject.base, subject.named
     if subject.policy is not None:
-        if base != Base(policy=source.default_policy):
+        if base != BaseLanes(policy=source.default_policy):
             raise UserError(f"--base.… chooses among the lanes of a folder, and {named} is none: leave it out")
         policy = in_space(subject.policy, actions_of(env))
         user_code.acts_in(named or "policy", policy, env)
@@ -254,12 +257,12 @@ def _bases(subject: Subject, request: Request, env: Any) -> tuple[Any, tuple[int
     )
     told = {name: value for name, value in dataclasses.asdict(base).items() if value not in (None, ())}
     origin = {"folder": source.folder.name, **told, "seeds": list(seeds), **({"code": named} if named else {})}
-    return Common(policies[0]) if len(policies) == 1 else program.side_by_side(policies), seeds, origin
+    return Common(policies[0]) if len(policies) == 1 else adaptation_lanes.side_by_side(policies), seeds, origin
 
 
 def _rows(
-    subject: Subject, request: Request, guidance: Guide, env: Environment, bases: Any, seeds: tuple[int, ...]
-) -> tuple[label_files.LabelFile | None, Request]:
+    subject: Subject, request: AdaptRequest, guidance: Guide, env: Environment, bases: Any, seeds: tuple[int, ...]
+) -> tuple[label_files.LabelFile | None, AdaptRequest]:
     """Labels in place of questions (None: none), and the request with its budgets and bounds in it.
 
     Raises UserError for labels that do not fit.
@@ -287,7 +290,7 @@ def _reach(space: Space, bases: Any, file: label_files.LabelFile, scalars: Scala
     return max(adapting.reach(space, bases.policy, file.labels.obs, file.labels.action), scalars.eps_deg)
 
 
-def _judging(task: Task, request: Request, env: Environment) -> Judging:
+def _judging(task: Task, request: AdaptRequest, env: Environment) -> Judging:
     """How policies are judged. Raises UserError for what makes no sense."""
     by, envs, unit = request.judge_by, request.judge_episodes, request.sizes.labels_per_round
     if not 1 <= envs <= MOST_ENVS:
@@ -320,8 +323,8 @@ def _steps(lanes: np.ndarray) -> str:
 
 def sentences(found: Adapted) -> list[str]:
     """What adaptation has led to, a line for each budget and bound."""
-    lanes, judged, lines = found.asked.lanes, found.judged, []
-    unit = actions_of(found.asked.env).unit
+    lanes, judged, lines = found.lanes, found.judged, []
+    unit = actions_of(found.of.env).unit
     for bound, budget in sorted({*zip(lanes.bound_deg.tolist(), lanes.budget.tolist(), strict=True)}):
         own = (lanes.bound_deg == bound) & (lanes.budget == budget)
         before, after = (f"{float(np.mean(values[own])):.4g}" for values in (judged.before, judged.after))

@@ -6,15 +6,14 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Generic, NamedTuple, TypeVar
 
-import jax
 import numpy as np
 
 from cuelearner_jax.environment import view_of
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.evaluate import Rolled, Tell, episodes, part_of, untold, watched, watched_lanes
+from cuelearner_jax.evaluate import Tell, episodes, part_of, untold, watched_lanes
 from cuelearner_jax.guides import registry as guidances
-from cuelearner_jax.policies import lanes_in
-from cuelearner_jax.runs.trained import POLICIES, Parts, PolicySource, blocks_of
+from cuelearner_jax.policies import Common, lanes_in
+from cuelearner_jax.runs.trained import POLICIES, Block, Parts, PolicySource, blocks_of
 from cuelearner_jax.task import Task
 
 TaskT = TypeVar("TaskT")
@@ -25,7 +24,7 @@ MOST = MOST_ENVS * MOST_STEPS
 
 
 @dataclass(frozen=True, kw_only=True)
-class Request(Generic[TaskT]):
+class EvaluateRequest(Generic[TaskT]):
     """What an evaluation is asked for."""
 
     task: TaskT
@@ -57,7 +56,7 @@ class Measured(NamedTuple):
     is_shared: bool = False  # do all seeds have one policy?
 
 
-def amount(task: Task, asked: Request[Any]) -> tuple[int, int]:
+def amount(task: Task, asked: EvaluateRequest[Any]) -> tuple[int, int]:
     """Return environments, and steps that they share. Raises UserError for nonsense, or what cuts episodes short."""
     longest = None if task.longest is None else task.longest(asked.task)
     if asked.episodes is not None:
@@ -82,7 +81,10 @@ def amount(task: Task, asked: Request[Any]) -> tuple[int, int]:
 
 
 def run(
-    source: PolicySource, asked: Request[Any], watch: Callable[[str], Tell] = lambda kind: untold, policy: Any = None
+    source: PolicySource,
+    asked: EvaluateRequest[Any],
+    watch: Callable[[str], Tell] = lambda kind: untold,
+    policy: Any = None,
 ) -> list[Measured]:
     """Metrics of a policy on validation episodes of a world, for each guidance and budget.
 
@@ -103,41 +105,25 @@ def run(
     teacher = task.make_teacher(world, env) if policy is None and named.taught else None
     if policy is not None or not named.kept:
         policy = named.make(Parts(source.config, view_of(env), teacher, None)) if policy is None else policy
-        tell = watch(name)
-        if engine:
-            means, each = _of_lanes([engine(policy, env, key, num_envs, steps, tell)])
-        else:
-            means, each = _repeated(watched(env, policy, key, num_envs, steps, tell), 1)
-        return [Measured("-", 0, 0, np.zeros(1, int), means, each)]
+        none = np.zeros(1, int)
+        blocks = [Block("-", none, none, none, 0, Common(policy), none > 0)]
+    else:
+        blocks = blocks_of(source, named, view_of(env), teacher, tuple(map(guidances.named, asked.guidance)))
     rows = []
-    for block in blocks_of(source, named, view_of(env), teacher, tuple(map(guidances.named, asked.guidance))):
-        tell, policy, count = watch(block.guidance), block.policy, len(block.seeds)
-        is_shared = lanes_in(policy) is None
+    for block in blocks:
+        count, is_shared = len(block.seeds), lanes_in(block.policy) is None
+        tell = watch(name if block.guidance == "-" else block.guidance)
         if engine:
             tells = [part_of(tell, lane, count) for lane in range(count)]
-            means, each = _of_lanes(
-                [engine(policy.lane(lane), env, key, num_envs, steps, tells[lane]) for lane in range(count)]
-            )
-        elif is_shared:
-            means, each = _repeated(watched(env, policy, key, num_envs, steps, tell), count)
+            lanes = [engine(block.policy.lane(lane), env, key, num_envs, steps, tells[lane]) for lane in range(count)]
+            each = {metric: np.stack([np.asarray(lane[metric], float) for lane in lanes]) for metric in lanes[0]}
+            means = {metric: values.mean(-1) for metric, values in each.items()}
         else:
-            means, each, _ = watched_lanes(env, policy, key, num_envs, steps, tell)
-        variants = sorted(set(zip(block.bounds.tolist(), block.budgets.tolist(), strict=True)))
-        for bound, budget in variants:
+            means, each, _ = watched_lanes(env, block.policy, key, num_envs, steps, tell)
+        place = np.zeros(count, int) if is_shared and not engine else np.arange(count)  # of each lane's row
+        for bound, budget in sorted(set(zip(block.bounds.tolist(), block.budgets.tolist(), strict=True))):
             own = (block.budgets == budget) & (block.bounds == bound)
-            mine, apart = ({name: np.asarray(of[name])[own] for name in of} for of in (means, each))
-            bounded = None if source.adapted is None else bound
+            mine, apart = ({metric: np.asarray(of[metric])[place[own]] for metric in of} for of in (means, each))
+            bounded = bound if source.adapted is not None and block.guidance != "-" else None
             rows.append(Measured(block.guidance, budget, block.step, block.seeds[own], mine, apart, bounded, is_shared))
     return rows
-
-
-def _of_lanes(lanes: list[dict[str, Any]]) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """Means (lanes,) and values (lanes, envs) of what an engine gave for each lane."""
-    each = {name: np.stack([np.asarray(lane[name], float) for lane in lanes]) for name in lanes[0]}
-    return {name: values.mean(-1) for name, values in each.items()}, each
-
-
-def _repeated(rolled: Rolled, lanes: int) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """Means (lanes,) and values (lanes, envs) of a policy that all lanes share."""
-    means, each, _ = jax.tree.map(lambda leaf: np.repeat(np.asarray(leaf)[None], lanes, axis=0), rolled)
-    return means, each

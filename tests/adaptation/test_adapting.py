@@ -10,9 +10,10 @@ import numpy as np
 import probes
 import pytest
 
-from cuelearner_jax.adaptation import adapting, judging, program
-from cuelearner_jax.adaptation.adapting import Adaptation, Judging
-from cuelearner_jax.adaptation.program import Lanes
+from cuelearner_jax.adaptation import adapting, judging
+from cuelearner_jax.adaptation import lanes as program
+from cuelearner_jax.adaptation.judging import Judging
+from cuelearner_jax.adaptation.lanes import Adaptation, Lanes
 from cuelearner_jax.config import GuideSizes
 from cuelearner_jax.devices import lane_mesh
 from cuelearner_jax.errors import UserError
@@ -50,14 +51,14 @@ BASES = program.side_by_side([Shifted(jnp.array(shift)) for shift in SHIFTS])
 LANES = program.product(2, (3,), (30, 80), (10.0, 60.0))
 
 
-def asked(bases=BASES, lanes=LANES, how=JUDGING):
-    return Adaptation(RELATIVE, SIZES, SCALARS, ENV, bases, lanes, how)
+def of(bases=BASES):
+    return Adaptation(RELATIVE, SIZES, SCALARS, ENV, bases)
 
 
 @cache
 def found():
     """All lanes, measured on the way."""
-    return adapting.adapt(asked(how=dataclasses.replace(JUDGING, every=10)), EXPERT, mesh=MESH)
+    return adapting.adapt(of(), LANES, dataclasses.replace(JUDGING, every=10), EXPERT, mesh=MESH)
 
 
 def degrees(turn):
@@ -111,7 +112,7 @@ def test_the_bound_is_never_exceeded():
     wild = found().block.replace(
         guide=found().block.guide.replace(model=jax.tree.map(_blown, found().block.guide.model))
     )
-    policy = program.adapted(RELATIVE, SIZES, ENV, SCALARS, BASES, wild)
+    policy = of().policy(wild)
     everywhere = directions.evenly_spaced(100)
     for lane, bound in enumerate(LANES.bound_deg):
         own = Shifted(jnp.array(SHIFTS[LANES.base[lane]])).act(None, None, everywhere)
@@ -135,9 +136,9 @@ def test_budgets_are_masks_and_lanes_do_not_know_each_other():
     lane = 5
     own = program.side_by_side([Shifted(jnp.array(SHIFTS[LANES.base[lane]]))])
     one = Lanes(*(column[[lane]] for column in LANES))._replace(base=np.zeros(1, np.int32))
-    alone = program.begin(RELATIVE, SIZES, ENV, one)
+    alone = program.begin(of(own), one)
     for _ in range(program.rounds(one, SIZES)):
-        alone = program.ask_round(RELATIVE, SIZES, ENV, EXPERT, SCALARS, own, alone, MESH)
+        alone = program.ask_round(of(own), EXPERT, alone, MESH)
     kept = jax.tree.map(lambda leaf: leaf[lane], block.guide.model)
     chex.assert_trees_all_equal(jax.tree.map(lambda leaf: leaf[0], alone.guide.model), kept)
 
@@ -152,7 +153,7 @@ def test_the_curve_says_what_policies_were_worth_on_the_way():
 
 def test_given_labels_lead_where_asking_for_them_did():
     labels = found().labels
-    given = adapting.adapt(asked(), labels=labels, mesh=MESH)
+    given = adapting.adapt(of(), LANES, JUDGING, labels=labels, mesh=MESH)
     chex.assert_trees_all_equal(given.block.guide.model, found().block.guide.model)
     np.testing.assert_array_equal(given.judged.after, found().judged.after)
 
@@ -173,16 +174,16 @@ def test_without_a_simulator_held_out_answers_decide():
     chance = np.random.default_rng(1).choice([-1.0, 0.0, 0.0, 0.0, 1.0], (1, 40, 1)).astype(np.float32)
     noise = one.replace(answer=chance)
     both = jax.tree.map(lambda *leaves: np.concatenate(leaves), one, noise)
-    judged = adapting.adapt(asked(base, lanes, how), labels=both, mesh=MESH).judged
+    judged = adapting.adapt(of(base), lanes, how, labels=both, mesh=MESH).judged
     assert judged.by == "labels"
     assert judged.rewarded_steps.tolist() == [0, 0]
     assert (judged.before[0], judged.after[0], judged.used[0]) == (0.0, 1.0, True)
     held = chance[0, 3::5, 0]
     assert judged.before[1] == pytest.approx((held == 0).mean())
     assert judged.after[1] <= judged.before[1]
-    few = program.begin(RELATIVE, SIZES, ENV, program.product(1, (0,), (4,), (10.0,)))
+    few = program.begin(of(), program.product(1, (0,), (4,), (10.0,)))
     with pytest.raises(UserError, match="fewer than 5 labels"):
-        judging.judged_by_labels(RELATIVE, SIZES, ENV, SCALARS, few)
+        judging.judged_by_labels(of(), few)
 
 
 def test_a_bound_is_narrowed_where_that_is_worth_more():
@@ -190,7 +191,7 @@ def test_a_bound_is_narrowed_where_that_is_worth_more():
     lanes = program.product(1, (0,), (40,), (60.0,))
     base = Common(Shifted(jnp.array(0.0)))
     wide, narrow = (
-        adapting.adapt(asked(base, lanes, dataclasses.replace(JUDGING, bounds=shares)), labels=own_labels(0.0, 40))
+        adapting.adapt(of(base), lanes, dataclasses.replace(JUDGING, bounds=shares), labels=own_labels(0.0, 40))
         for shares in ((), (0.5, 0.05))
     )
     assert (wide.judged.before[0], wide.judged.after[0], wide.judged.used[0]) == (1.0, 0.0, False)
@@ -211,11 +212,10 @@ def test_an_opaque_function_gives_what_the_same_in_jax_gives():
     lanes = program.product(1, (0,), (30,), (60.0,))
     policies = [policy_of(quarter), policy_of(jax.jit(quarter))]
     assert [policy.on_host for policy in policies] == [True, False]
-    blocks = [program.begin(RELATIVE, SIZES, ENV, lanes)] * 2
+    blocks = [program.begin(of(), lanes)] * 2
     for _ in range(program.rounds(lanes, SIZES)):
         blocks = [
-            program.ask_round(RELATIVE, SIZES, ENV, EXPERT, SCALARS, Common(policy), block)
-            for policy, block in zip(policies, blocks, strict=True)
+            program.ask_round(of(Common(policy)), EXPERT, block) for policy, block in zip(policies, blocks, strict=True)
         ]
     assert blocks[0].guide.labels.valid.sum() == 30
     chex.assert_trees_all_equal(*blocks)

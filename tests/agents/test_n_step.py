@@ -12,13 +12,12 @@ import pytest
 
 from cuelearner_jax import loop
 from cuelearner_jax.agents.networks import MLP, Joined, applied, q_network
-from cuelearner_jax.agents.replay import Following, Memory, buffer_for, n_step_return
+from cuelearner_jax.agents.replay import Following, Memory, StoredStep, Transition, buffer_for, n_step_return
 from cuelearner_jax.environment import spaces_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.run_config import check
 from cuelearner_jax.spaces.directions import evenly_spaced
-from cuelearner_jax.types import StoredStep, Transition
 
 HALF = 0.5  # the discount factor of everything worked out by hand
 

@@ -5,8 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from cuelearner_jax.agents.replay import ring_buffer
-from cuelearner_jax.types import StoredStep
+from cuelearner_jax.agents.replay import StoredStep, ring_buffer
 
 EXAMPLE = StoredStep(jnp.zeros(3), jnp.zeros(2), jnp.zeros(()), jnp.zeros(1), jnp.zeros(1), jnp.zeros(3))
 

@@ -9,12 +9,12 @@ from _flops import forward, forward_and_backward, step_operations
 
 from cuelearner_jax.agents import ddqn
 from cuelearner_jax.agents.networks import applied, q_network
+from cuelearner_jax.agents.replay import Transition
 from cuelearner_jax.config import Scalars
 from cuelearner_jax.environment import Spaces
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.spaces import DIRECTIONS
 from cuelearner_jax.tasks.billiards import BILLIARDS
-from cuelearner_jax.types import Transition
 
 LAYERS, OBS = (64, 48), 10
 SPACES = Spaces(OBS, DIRECTIONS)

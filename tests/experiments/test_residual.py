@@ -8,7 +8,7 @@ import probes
 import pytest
 from flax import struct
 
-from cuelearner_jax.adaptation import program
+from cuelearner_jax.adaptation.lanes import Adaptation, ask_round, begin, product, rounds
 from cuelearner_jax.config import GuideSizes, Scalars
 from cuelearner_jax.environment import spaces_of
 from cuelearner_jax.guides.fitting import lessons
@@ -34,12 +34,12 @@ class Finished:
 
 def asked(budget, bound_deg):
     """Lanes of a budget and bound after all of their rounds."""
-    lanes = program.product(bases=1, seeds=(0, 1), budgets=(budget,), bounds_deg=(bound_deg,))
-    bases = Common(Finished())
-    block = program.begin(GUIDANCE, SIZES, ENV, lanes)
-    for _ in range(program.rounds(lanes, SIZES)):
-        block = program.ask_round(GUIDANCE, SIZES, ENV, probes.Expert(ENV), SCALARS, bases, block)
-    return block, program.adapted(GUIDANCE, SIZES, ENV, SCALARS, bases, block)
+    lanes = product(bases=1, seeds=(0, 1), budgets=(budget,), bounds_deg=(bound_deg,))
+    of = Adaptation(GUIDANCE, SIZES, SCALARS, ENV, Common(Finished()))
+    block = begin(of, lanes)
+    for _ in range(rounds(lanes, SIZES)):
+        block = ask_round(of, probes.Expert(ENV), block)
+    return block, of.policy(block)
 
 
 @pytest.fixture(scope="module")

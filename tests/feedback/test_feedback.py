@@ -10,7 +10,6 @@ import numpy as np
 import probes
 import pytest
 
-from cuelearner_jax import asking
 from cuelearner_jax.agents.networks import applied, residual_network
 from cuelearner_jax.config import Scalars, Sizes
 from cuelearner_jax.environment import random_symmetries
@@ -286,11 +285,3 @@ def test_without_symmetries_rows_stay_as_they_are():
     obs, target = random_symmetries(jax.random.key(0), probes.Window(), ROWS)(labels.obs, labels.target)
     assert obs is labels.obs
     assert target is labels.target
-
-
-def test_empty_labels_are_padding():
-    labels = asking.empty_labels(7, 5, 2, 1)
-    assert labels.obs.shape == (7, 5)
-    assert labels.action.shape == (7, 2)
-    assert labels.answer.shape == (7, 1)
-    assert not bool(labels.valid.any())

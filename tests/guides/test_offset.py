@@ -9,7 +9,7 @@ import numpy as np
 import probes
 import pytest
 
-from cuelearner_jax.adaptation import program
+from cuelearner_jax.adaptation.lanes import Adaptation, ask_round, begin, product, side_by_side, take_labels
 from cuelearner_jax.config import GuideSizes
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides import offset, registry
@@ -80,25 +80,25 @@ def test_a_constant_miss_is_known_everywhere_from_forty_answers_a_fifth_of_them_
 
 
 def test_what_the_base_did_is_kept_with_labels_and_told_again_for_labels_from_a_file():
-    lanes = program.product(1, (3,), (20,), (60.0,))
-    bases = program.side_by_side([BASE])
-    start = program.begin(BUNDLE, SIZES, ENV, lanes)
+    lanes = product(1, (3,), (20,), (60.0,))
+    of = Adaptation(BUNDLE, SIZES, SCALARS, ENV, side_by_side([BASE]))
+    start = begin(of, lanes)
     block = start
     for _ in range(2):
-        block = program.ask_round(BUNDLE, SIZES, ENV, EXPERT, SCALARS, bases, block)
+        block = ask_round(of, EXPERT, block)
     labels = block.guide.labels
     np.testing.assert_allclose(labels.base, missing(labels.obs), atol=1e-6)
     assert float(DIRECTIONS.distance(labels.base, labels.action).max()) > jnp.deg2rad(
         4.0
     )  # refined ones were asked about
-    given = program.take_labels(BUNDLE, SIZES, ENV, SCALARS, bases, labels.replace(base=None), start)
+    given = take_labels(of, labels.replace(base=None), start)
     chex.assert_trees_all_close(given.guide.model, block.guide.model, atol=1e-5)
 
 
 def test_labels_of_other_kinds_keep_no_base_and_training_refuses_this_one():
-    lanes = program.product(1, (3,), (20,), (60.0,))
+    lanes = product(1, (3,), (20,), (60.0,))
     plain = registry.make("relative", SIZES, ENV)
-    assert program.begin(plain, SIZES, ENV, lanes).guide.labels.base is None
+    assert begin(Adaptation(plain, SIZES, SCALARS, ENV, side_by_side([BASE])), lanes).guide.labels.base is None
     with pytest.raises(UserError, match="adapt"):
         check_grid(Grid(("relative", "offset"), (0,), (20,)))
     assert "offset" not in registry.possible(ENV, taught=True)

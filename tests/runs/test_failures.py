@@ -99,7 +99,7 @@ def test_evaluation_leaves_it_out_and_says_so(ended, capsys):
     for folder in (sick, healthy):
         _, config, grid = load(folder, {TASK.name: TASK}.__getitem__)
         source = trained.PolicySource(TASK, config, grid, folder)
-        found += evaluate.run(source, evaluate.Request(task=config.task, envs=10, steps=10))
+        found += evaluate.run(source, evaluate.EvaluateRequest(task=config.task, envs=10, steps=10))
         policies = source.load()[0].policies
         np.testing.assert_array_equal(policies["failed"], [False, folder == sick, False])
         assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(policies["params"]))
@@ -134,7 +134,7 @@ def test_diverging_from_the_command_line_and_from_python(tmp_path):
     _, config, grid = load(tmp_path / "run", {TASK.name: TASK}.__getitem__)
     source = trained.PolicySource(TASK, config, grid, tmp_path / "run")
     with pytest.raises(UserError, match="all of these lanes failed"):
-        evaluate.run(source, evaluate.Request(task=config.task, envs=10, steps=10))
+        evaluate.run(source, evaluate.EvaluateRequest(task=config.task, envs=10, steps=10))
     with pytest.warns(UserWarning, match=r"3 of 3 lanes failed, no longer finite .*: leave out the rows"):
         found = cl.train(
             cl.World(TASK, probes.WindowConfig()), None, wild, guidance=("none",), seeds=(3, 5, 8), progress=False

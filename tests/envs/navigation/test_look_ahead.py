@@ -15,7 +15,7 @@ from cuelearner_envs.navigation.look_ahead import LEAST, SHORT
 from cuelearner_envs.navigation.world import World
 from cuelearner_envs.navigation.worlds import FARTHEST
 from cuelearner_jax.adaptation import stored
-from cuelearner_jax.adaptation.program import Lanes
+from cuelearner_jax.adaptation.lanes import Lanes
 from cuelearner_jax.cli import main
 from cuelearner_jax.config import GuideSizes, to_json
 from cuelearner_jax.environment import spaces_of

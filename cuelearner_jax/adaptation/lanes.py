@@ -1,0 +1,206 @@
+"""The lanes of an adaptation, each a (base policy, seed, label budget, bound), asked and fitted together.
+
+A lane asks about what its base policy does, then about what its model so far makes of that (DAgger), never farther from
+the base than its bound, and fits its model anew after each round. Lanes differ by arrays alone: budgets are masks over
+labels, bounds are traced, and several base policies are one pytree with a leading axis. So any number of them is one
+compiled program: side by side on an accelerator, one by one on a CPU (`devices.each_lane`), shared out over a mesh.
+
+    of = Adaptation(guide, sizes, scalars, env, bases)    # what lanes share
+    lanes = product(bases=8, seeds=(0,), budgets=(100, 250, 500), bounds_deg=(60.0, 180.0))    # or `one_each`
+    block = begin(of, lanes)
+    for _ in range(rounds(lanes, sizes)):
+        block = ask_round(of, teacher, block)    # or once: take_labels(of, labels, block)
+    policy = of.policy(block)    # a block for `evaluate.watched_lanes`
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from functools import partial
+from itertools import product as combinations
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax.sharding import Mesh
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+from cuelearner_jax import asking
+from cuelearner_jax.agents.networks import all_finite
+from cuelearner_jax.asking import GuideState
+from cuelearner_jax.config import GuideSizes, Scalars
+from cuelearner_jax.devices import BY_LANE, SHARED, each_lane, lane_mesh, over_lanes
+from cuelearner_jax.environment import Environment, actions_of, view_of
+from cuelearner_jax.guides.base import Guide
+from cuelearner_jax.policies import Guided, PolicyBlock
+from cuelearner_jax.storage.room import check_room
+from cuelearner_jax.types import Label, Teacher
+
+FLOAT = 4  # bytes
+OPTIMIZER = 4  # times the parameters: with their gradients and two moments
+
+
+class Lanes(NamedTuple):
+    """What is adapted: one row a lane."""
+
+    base: np.ndarray  # (lanes,) int: which of the base policies
+    seed: np.ndarray  # (lanes,) int: of everything random
+    budget: np.ndarray  # (lanes,) int: labels
+    bound_deg: np.ndarray  # (lanes,) float: how far from the base's actions [deg]
+
+    @property
+    def number(self) -> int:
+        """How many there are."""
+        return len(self.seed)
+
+    def rows(self, index: Any) -> Lanes:
+        """Some of the lanes."""
+        return Lanes(*(column[index] for column in self))
+
+
+def _lanes(rows: Sequence[tuple[int, int, int, float]]) -> Lanes:
+    kinds = (np.int32, np.int32, np.int32, np.float32)
+    return Lanes(*(np.array(column, kind) for column, kind in zip(zip(*rows, strict=True), kinds, strict=True)))
+
+
+def product(bases: int, seeds: Sequence[int], budgets: Sequence[int], bounds_deg: Sequence[float]) -> Lanes:
+    """Every base policy with every seed, budget and bound."""
+    rows = combinations(bounds_deg, budgets, range(bases), seeds)
+    return _lanes([(base, seed, budget, bound) for bound, budget, base, seed in rows])
+
+
+def one_each(seeds: Sequence[int], budgets: Sequence[int], bounds_deg: Sequence[float]) -> Lanes:
+    """As many base policies as seeds, each with a seed of its own, with every budget and bound."""
+    rows = combinations(bounds_deg, budgets, enumerate(seeds))
+    return _lanes([(base, seed, budget, bound) for bound, budget, (base, seed) in rows])
+
+
+def side_by_side(policies: Sequence[Any]) -> Any:
+    """Single policies of one make as a block, whose leaves that are `BY_LANE` have a row for each of them."""
+
+    def stacked(axis: Any, *parts: Any) -> Any:
+        if axis is None:
+            return parts[0]
+        return jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(leaf) for leaf in leaves]), *parts)
+
+    return jax.tree.map(stacked, policies[0].axes, *policies, is_leaf=lambda axis: axis is None)
+
+
+class LaneState(struct.PyTreeNode):
+    """A lane on its way; of a block every leaf has a leading axis of lanes."""
+
+    guide: GuideState
+    base: Int[Array, ""]  # which of the base policies
+    bound: Float[Array, ""]  # as `log` of the space counts
+    key: PRNGKeyArray
+    failed: Bool[Array, ""]  # did its model stop being finite? It stays as it was before then
+
+
+class Adaptation(struct.PyTreeNode):
+    """What lanes share: a kind of guidance, a world to ask in, and the policies that are corrected."""
+
+    guidance: Guide = struct.field(pytree_node=False)  # it must ask
+    sizes: GuideSizes = struct.field(pytree_node=False)  # that the guidance was made with
+    scalars: Scalars  # of refinement, of fitting and of a simulated teacher's faults
+    env: Environment  # the changed world
+    bases: PolicyBlock  # leaves that are `BY_LANE` in its `axes` have a row for each base; or `policies.Common`
+
+    def policy(self, block: LaneState, env: Any = None) -> Guided:
+        """Every lane's policy: its base's actions under its model, within its bound.
+
+        `env`: where it is to act (default: where was asked).
+        """
+        base, view = self.bases.lane(block.base), view_of(self.env if env is None else env)
+        return Guided(base, block.guide.model, view, self.scalars, self.guidance, block.bound, self.sizes)
+
+
+def rounds(lanes: Lanes, sizes: GuideSizes) -> int:
+    """Rounds until the largest budget is asked for."""
+    return asking.label_slots(int(lanes.budget.max()), sizes) // sizes.labels_per_round
+
+
+@partial(jax.jit, static_argnames=("guidance", "sizes", "slots"))
+def _begin(guidance: Guide, sizes: GuideSizes, slots: int, env: Any, columns: Any) -> LaneState:
+    def one(base: Array, seed: Array, budget: Array, bound: Array) -> LaneState:
+        k_model, k_env, k_lane = jax.random.split(jax.random.key(seed), 3)
+        guide = asking.start(guidance, env, slots, budget, k_model, k_env, sizes)
+        return LaneState(guide, base, bound, k_lane, jnp.array(False))
+
+    return each_lane(one)(*columns)
+
+
+def begin(of: Adaptation, lanes: Lanes) -> LaneState:
+    """Lanes that have asked nothing yet. Their number must divide among the devices of the mesh used later."""
+    slots = rounds(lanes, of.sizes) * of.sizes.labels_per_round
+    bound = actions_of(of.env).from_unit(lanes.bound_deg)
+    columns = (*(jnp.asarray(column) for column in (lanes.base, lanes.seed, lanes.budget)), bound)
+    check_memory(of.sizes, jax.eval_shape(partial(_begin, of.guidance, of.sizes, slots), of.env, columns))
+    return _begin(of.guidance, of.sizes, slots, of.env, columns)
+
+
+def check_memory(sizes: GuideSizes, kept: Any) -> None:
+    """Raises UserError if guides and their fitting need more memory than is free; `kept`: a tree of their shapes."""
+    size = sum(math.prod(leaf.shape) * leaf.dtype.itemsize for leaf in jax.tree.leaves(kept))
+    fitting = 3 * FLOAT * sizes.ensemble * sizes.fit_batch_size * sum(sizes.feedback_layers)  # activations, gradients
+    declared = f"sizes.feedback_layers {sizes.feedback_layers} with sizes.fit_batch_size {sizes.fit_batch_size}"
+    check_room(declared, OPTIMIZER * size + fitting, "lower these, or the number of labels and lanes")
+
+
+def _kept_finite(lane: LaneState, guide: GuideState) -> LaneState:
+    """The lane with a new guide; where that is not finite the lane fails, and keeps the one that it had."""
+    failed = lane.failed | ~all_finite((guide.model, guide.labels))
+    kept = jax.tree.map(lambda new, old: jnp.where(failed, old, new), guide, lane.guide)
+    return lane.replace(guide=kept, failed=failed)
+
+
+def ask_round(of: Adaptation, teacher: Teacher, block: LaneState, mesh: Mesh | None = None) -> LaneState:
+    """One round of questions to a simulated teacher in every lane, and the fit that follows it (`asking.label_round`).
+
+    A lane that has its budget stays as it is. `mesh`: devices that share the lanes (default: the first one alone).
+    """
+    return _ask_round(of, teacher, block, mesh=mesh or lane_mesh(jax.local_devices()[:1]))
+
+
+@partial(jax.jit, static_argnames="mesh")
+def _ask_round(of: Adaptation, teacher: Any, block: LaneState, *, mesh: Mesh) -> LaneState:
+    def of_device(of: Adaptation, teacher: Any, block: LaneState) -> LaneState:
+        def one(lane: LaneState) -> LaneState:
+            who = of.guidance, of.sizes, of.env, teacher, of.scalars, of.bases.lane(lane.base)
+            return _kept_finite(lane, asking.label_round(*who, lane.guide, lane.key, bound=lane.bound))
+
+        return each_lane(one)(block)
+
+    return over_lanes(mesh, of_device, (SHARED, SHARED, BY_LANE), BY_LANE)(of, teacher, block)
+
+
+def take_labels(of: Adaptation, labels: Label, block: LaneState, mesh: Mesh | None = None) -> LaneState:
+    """Labels (lanes, slots, ...) that were given elsewhere, fitted once, as the last round of asking for them fits.
+
+    A kind that fits from scratch has then the model of the lane that asked; one that goes on learning (deep COACH) is
+    corrected by all of them in one go, with other random numbers.
+    """
+    return _take(of, labels, block, mesh=mesh or lane_mesh(jax.local_devices()[:1]))
+
+
+@partial(jax.jit, static_argnames="mesh")
+def _take(of: Adaptation, labels: Label, block: LaneState, *, mesh: Mesh) -> LaneState:
+    def of_device(of: Adaptation, labels: Label, block: LaneState) -> LaneState:
+        def one(labels: Label, lane: LaneState) -> LaneState:
+            if of.guidance.kind.sees_base:  # files do not keep what the base policy does: it tells again
+                labels = labels.replace(base=of.bases.lane(lane.base).act(lane.key, None, labels.obs))
+            guide = lane.guide.replace(labels=labels, asked=lane.guide.budget)
+            last = (lane.guide.budget - 1) // of.sizes.labels_per_round  # the fit that follows the last round
+            return _kept_finite(lane, asking.fit(of.guidance, of.env, of.scalars, guide, lane.key, last))
+
+        return each_lane(one)(labels, block)
+
+    return over_lanes(mesh, of_device, (SHARED, BY_LANE, BY_LANE), BY_LANE)(of, labels, block)
+
+
+def blame(of: Adaptation, teacher: Teacher | None, block: LaneState) -> None:
+    """Raises UserError if the first lane, which failed, did so for its policy or its teacher (see `asking.blame`)."""
+    lane = jax.tree.map(lambda leaf: leaf[0], block)
+    asking.blame(of.env, teacher, lane.guide, of.bases.lane(lane.base), lane.key)
