@@ -20,7 +20,7 @@ from cuelearner_jax.environment import Environment, actions_of
 from cuelearner_jax.guides.base import Guide
 from cuelearner_jax.guides.refining import within
 from cuelearner_jax.policies import Policy, acted, best_actions, named
-from cuelearner_jax.types import EnvState, Label, Teacher
+from cuelearner_jax.types import EnvState, GuidanceModel, Label, Teacher
 
 ONE_BY_ONE = GuideSizes()  # questions as they come, of one strength: as a page asks them
 

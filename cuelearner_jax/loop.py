@@ -41,7 +41,7 @@ from cuelearner_jax.guides.base import Guide
 from cuelearner_jax.guides.refining import Refined, untouched
 from cuelearner_jax.policies import uniform_in
 from cuelearner_jax.run_config import RunConfig, Settings
-from cuelearner_jax.types import Label, Step, Teacher
+from cuelearner_jax.types import EnvState, Label, Params, Step, Teacher
 
 _Parts = tuple[AgentOptions, ArbiterOptions, bool]  # their floats None; does anything bootstrap?
 

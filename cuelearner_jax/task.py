@@ -137,23 +137,23 @@ class Task:
                 kind = type(preset.config.task).__name__
                 raise ValueError(f"task {self.name}: preset {name!r} configures {kind}, not {self.config.__name__}")
         for name in self.scenarios:
-            self._check_scenario(name, fields)
+            self._check_scenario(name)
 
-    def _check_scenario(self, name: str, fields: set[str]) -> None:
-        scenario, config = self.scenarios[name], self.config.__name__
-        if unknown := sorted(set(scenario.changes) - fields):
-            raise ValueError(f"task {self.name}: scenario {name!r} changes {unknown[0]!r}, no field of {config}")
-        for group, given in ((GuideSizes, scenario.sizes), (Scalars, scenario.scalars)):
+    def _check_scenario(self, name: str) -> None:
+        scenario, called = self.scenarios[name], f"task {self.name}: scenario {name!r}"
+        changed = ("changes", self.config, scenario.changes)
+        for verb, group, given in (
+            changed,
+            ("suggests", GuideSizes, scenario.sizes),
+            ("suggests", Scalars, scenario.scalars),
+        ):
             if unknown := sorted(set(given) - {entry.name for entry in dataclasses.fields(group)}):
-                group_name = group.__name__
-                raise ValueError(
-                    f"task {self.name}: scenario {name!r} suggests {unknown[0]!r}, no field of {group_name}"
-                )
+                raise ValueError(f"{called} {verb} {unknown[0]!r}, no field of {group.__name__}")
         try:
             for base in [preset.config.task for preset in self.presets.values()] or [self.config()]:
                 scenario.applied(base)
         except Exception as error:
-            raise ValueError(f"task {self.name}: scenario {name!r} makes no configuration ({error})") from error
+            raise ValueError(f"{called} makes no configuration ({error})") from error
 
     def configured(self, scenario: str | None = None, **changes: Any) -> Any:
         """The task's configuration in a changed world, with fields changed.

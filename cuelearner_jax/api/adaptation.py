@@ -27,7 +27,7 @@ from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs.trained import PolicySource
 from cuelearner_jax.storage import label_files, policy_folders
 from cuelearner_jax.studies import adapt as study
-from cuelearner_jax.studies.adapt import BaseLanes, Outcome, Subject
+from cuelearner_jax.studies.adapt import AdaptedStudy, BaseLanes, Subject
 from cuelearner_jax.task import Body, Task
 from cuelearner_jax.types import Label, Teacher
 
@@ -36,7 +36,7 @@ from cuelearner_jax.types import Label, Teacher
 class AdaptedPolicy(CallablePolicy):
     """A policy under a feedback model, within a bound; or the policy as it was, where the model is not `used`."""
 
-    outcome: Outcome
+    outcome: AdaptedStudy
     named: str | None  # the base, as Python calls it; None: its world has no name either
 
     @property

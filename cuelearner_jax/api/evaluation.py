@@ -40,7 +40,7 @@ def measure(
     """
     source = source_of(policy, a_world("world", world))
     own = as_policy_in(policy, world.env)
-    amounts = {"episodes": episodes, "steps": steps, "envs": envs}
+    amounts: dict[str, Any] = {"episodes": episodes, "steps": steps, "envs": envs}
     amounts = {name: arguments.optional(arguments.whole, name, value, 1, study.MOST) for name, value in amounts.items()}
     engine = arguments.optional(arguments.text, "engine", engine)
     (found,) = study.run(source, study.EvaluateRequest(task=world.config, engine=engine, **amounts), policy=own)

@@ -40,7 +40,7 @@ class Untaught(Guide):
         return untouched(actions)
 
 
-class Heuristic(Untaught):
+class HeuristicGuide(Untaught):
     """The environment's own obvious action."""
 
     def act(
@@ -57,4 +57,4 @@ class Heuristic(Untaught):
 
 
 NONE = Kind("none", "the agent alone", Untaught, title="no guidance", colour="#4d4d4d")
-HEURISTIC = Kind("heuristic", "the task's obvious action", Heuristic, needs=("heuristic",), colour="#D55E00")
+HEURISTIC = Kind("heuristic", "the task's obvious action", HeuristicGuide, needs=("heuristic",), colour="#D55E00")

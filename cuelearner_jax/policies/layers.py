@@ -164,11 +164,6 @@ class Common(PolicyNode):
         """What the policy does."""
         return self.policy.act(key, states, obs)
 
-    @property
-    def axes(self) -> Common:
-        """No lane has anything of its own."""
-        return self.replace(policy=SHARED)
-
     def describe(self) -> dict[str, Any]:
         """The policy's own description."""
         return describe(self.policy)

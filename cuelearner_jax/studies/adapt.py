@@ -116,7 +116,7 @@ class Subject(NamedTuple):
     rows: Label | None = None  # labels (labels, ...) in place of questions; None: none
 
 
-class Outcome(NamedTuple):
+class AdaptedStudy(NamedTuple):
     """What an adaptation has led to, and from what."""
 
     found: Adapted
@@ -193,7 +193,7 @@ def run(
     request: AdaptRequest,
     watch: Callable[[str], Tell] = lambda what: untold,
     note: Callable[[str], None] = console.print,
-) -> Outcome:
+) -> AdaptedStudy:
     """Check a request and adapt; nothing is written.
 
     Args:
@@ -234,7 +234,7 @@ def run(
         stored.told(of.policy(adaptation_lanes.begin(of, lanes)))
     if rows is not None:
         rows = label_files.for_lanes(rows, lanes.seed, lanes.budget, label_slots(int(lanes.budget.max()), sizes))
-    return Outcome(adapting.adapt(of, lanes, how, teacher, rows, watch=watch), subject, request, origin)
+    return AdaptedStudy(adapting.adapt(of, lanes, how, teacher, rows, watch=watch), subject, request, origin)
 
 
 def _bases(subject: Subject, request: AdaptRequest, env: Any) -> tuple[Any, tuple[int, ...], dict[str, Any]]:

@@ -122,17 +122,11 @@ def _check_step_shapes(laws: Laws, env: Environment, step: Step) -> None:
     _vector(laws, step.aftermath, "Step.aftermath")
     scalars = {"reward": step.reward} | {f"metrics[{name!r}]": value for name, value in step.metrics.items()}
     scalars |= {f"outcome[{name!r}]": value for name, value in step.outcome.items()}
-    for name, value in scalars.items():
-        laws.hold(
-            value.shape == () and value.dtype == jnp.float32,
-            f"Step.{name} is {value.dtype} of shape {value.shape}: make it one float32 (.astype(jnp.float32))",
-        )
-    for name in ("terminated", "truncated"):
-        value = getattr(step, name)
-        laws.hold(
-            value.shape == () and value.dtype == bool,
-            f"Step.{name} is {value.dtype} of shape {value.shape}: make it one bool",
-        )
+    flags = {"terminated": step.terminated, "truncated": step.truncated}
+    for name, value in {**scalars, **flags}.items():
+        kind = "bool" if name in flags else "float32"
+        fits = value.shape == () and value.dtype == kind
+        laws.hold(fits, f"Step.{name} is {value.dtype} of shape {value.shape}: make it one {kind} (.astype)")
     taken = sorted(OWN_COLUMNS & {*step.metrics, *step.outcome} | {*step.metrics} & {*step.outcome})
     laws.hold(not taken, f"a metric or outcome is called {taken[:1]}, which results have already: give another name")
 
