@@ -15,7 +15,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray
 
 from cuelearner_jax import user_code
-from cuelearner_jax.config import GuideScalars, GuideSizes, Scalars
+from cuelearner_jax.config import GuideScalars, GuideSizes
 from cuelearner_jax.environment import Environment, actions_of
 from cuelearner_jax.guides.base import Guide
 from cuelearner_jax.guides.refining import within
@@ -45,6 +45,17 @@ class Stream(IntEnum):
     TRAIN = 3
     WALK = 4
     SHUFFLE = 5
+
+
+class Inquiry(struct.PyTreeNode):
+    """Who asks about what: what stays the same from question to question of a lane."""
+
+    guidance: Guide = struct.field(pytree_node=False)
+    env: Environment
+    scalars: Any  # `GuideScalars`; with a simulated teacher `Scalars`
+    base: Policy  # whose actions are asked about, as the guide so far has them
+    # Questions stay within it of what the base policy does, as `log` of the space counts; None: wherever guidance leads
+    bound: Float[Array, ""] | None = None
 
 
 class QuestionKeys(NamedTuple):
@@ -102,53 +113,26 @@ def start(
     )
 
 
-def proposed(
-    env: Environment, base: Policy, guide: GuideState, keys: QuestionKeys
-) -> Float[Array, "*candidates action"]:
-    """What the base policy does in the guide's situation, or in each of its candidates."""
-    if guide.obs.ndim > 1:
-        return acted(base, keys.base, guide.env, guide.obs, actions_of(env))
-    states = jax.tree.map(lambda leaf: leaf[None], guide.env)
-    return acted(base, keys.base, states, guide.obs[None], actions_of(env))[0]
-
-
 def question(
-    guidance: Guide,
-    env: Environment,
-    scalars: GuideScalars,
-    base: Policy,
-    guide: GuideState,
-    keys: QuestionKeys,
-    bound: Float[Array, ""] | None = None,
-) -> Float[Array, "*candidates action"]:
-    """The action to ask about in the guide's situation, or in each of its candidates.
-
-    `bound`: questions stay within it of what the base policy does, as `log` of the space counts; None: wherever the
-    guidance leads.
-    """
-    return _asked_of(guidance, env, scalars, guide, proposed(env, base, guide, keys), keys, bound)
-
-
-def _asked_of(
-    guidance: Guide,
-    env: Environment,
-    scalars: GuideScalars,
-    guide: GuideState,
-    first: Float[Array, "*candidates action"],
-    keys: QuestionKeys,
-    bound: Float[Array, ""] | None,
-) -> Float[Array, "*candidates action"]:
-    """What is asked about where the base policy proposes `first`; see `question`."""
-    if bound is not None:
-        scalars = within(actions_of(env), scalars, bound)
+    of: Inquiry, guide: GuideState, keys: QuestionKeys
+) -> tuple[Float[Array, "*candidates action"], Float[Array, "*candidates action"]]:
+    """The action to ask about in the guide's situation, or in each of its candidates; and what the base policy does."""
+    space, scalars, several = actions_of(of.env), of.scalars, guide.obs.ndim > 1
+    if several:
+        first = acted(of.base, keys.base, guide.env, guide.obs, space)
+    else:
+        states = jax.tree.map(lambda leaf: leaf[None], guide.env)
+        first = acted(of.base, keys.base, states, guide.obs[None], space)[0]
+    if of.bound is not None:
+        scalars = within(space, scalars, of.bound)
 
     def one(key: PRNGKeyArray, obs: Array, first: Array) -> Array:
-        asked = guidance.question(key, guide.model, env, obs, first, scalars)
-        return asked if bound is None else actions_of(env).clip(asked, first, bound)
+        asked = of.guidance.question(key, guide.model, of.env, obs, first, scalars)
+        return asked if of.bound is None else space.clip(asked, first, of.bound)
 
-    if guide.obs.ndim > 1:
-        return jax.vmap(one)(jax.random.split(keys.question, len(guide.obs)), guide.obs, first)
-    return one(keys.question, guide.obs, first)
+    if several:
+        return jax.vmap(one)(jax.random.split(keys.question, len(guide.obs)), guide.obs, first), first
+    return one(keys.question, guide.obs, first), first
 
 
 def record(
@@ -210,51 +194,46 @@ def fitted_labels(key: PRNGKeyArray, labels: Label, scalars: GuideScalars) -> La
 
 
 def ask(
-    guidance: Guide,
-    env: Environment,
+    of: Inquiry,
     teacher: Teacher,
-    scalars: Scalars,
-    base: Policy,
     guide: GuideState,
     lane_key: PRNGKeyArray,
     position: Int[Array, ""],
-    bound: Float[Array, ""] | None = None,
     every: bool = False,
 ) -> GuideState:
     """Question number `position`, answered by a simulated teacher, recorded and acted on.
 
     Args:
-        guidance, env, teacher, scalars, base: who asks whom about what.
+        of: who asks about what.
+        teacher: who answers.
         guide: where it stands.
         lane_key: of all questions.
         position: of this one, from 0.
-        bound: see `question`.
         every: ask about every candidate, as many questions at once, the first of them number `position`.
 
     Raises:
         ValueError: the guidance asks nothing.
     """
-    form = guidance.form
+    form = of.guidance.form
     if form is None:
-        raise ValueError(f"guidance {guidance.name!r} asks nothing")
+        raise ValueError(f"guidance {of.guidance.name!r} asks nothing")
     keys = question_keys(lane_key, position)
-    proposals = proposed(env, base, guide, keys)
-    actions = _asked_of(guidance, env, scalars, guide, proposals, keys, bound)
+    actions, proposals = question(of, guide, keys)
+    answer = lambda key, *row: form.answer(key, of.env, teacher, *row, of.scalars)  # noqa: E731
     if every:
-        one = lambda key, state, obs, action: form.answer(key, env, teacher, state, obs, action, scalars)  # noqa: E731
         obs, about, first = guide.obs, actions, proposals
-        answers, answered = jax.vmap(one)(jax.random.split(keys.answer, len(obs)), guide.env, obs, about)
+        answers, answered = jax.vmap(answer)(jax.random.split(keys.answer, len(obs)), guide.env, obs, about)
     else:
-        state, *there = _chosen(guidance, env, guide, actions, proposals)
-        answer, spoken = form.answer(keys.answer, env, teacher, state, there[0], there[1], scalars)
-        obs, about, first, answers, answered = (row[None] for row in (*there, answer, spoken))
-    told = record(guide, position, obs, about, answers, answered, first if guidance.kind.sees_base else None)
-    return proceed(env, told, actions, keys)
+        state, *there = _chosen(of, guide, actions, proposals)
+        obs, about, first, answers, answered = (
+            row[None] for row in (*there, *answer(keys.answer, state, there[0], there[1]))
+        )
+    told = record(guide, position, obs, about, answers, answered, first if of.guidance.kind.sees_base else None)
+    return proceed(of.env, told, actions, keys)
 
 
 def _chosen(
-    guidance: Guide,
-    env: Environment,
+    of: Inquiry,
     guide: GuideState,
     actions: Float[Array, "*candidates action"],
     first: Float[Array, "*candidates action"],
@@ -265,9 +244,9 @@ def _chosen(
     Seung, Opper, Sompolinsky, 1992); before the first fit, when they know nothing, the first.
     """
     candidates = guide.env, guide.obs, actions, first
-    if guide.obs.ndim == 1 or not guidance.has_members:
+    if guide.obs.ndim == 1 or not of.guidance.has_members:
         return candidates
-    apart = guidance.disagreement(guide.model, env, guide.obs, actions)
+    apart = of.guidance.disagreement(guide.model, of.env, guide.obs, actions)
     index = jnp.where(guide.model.fitted, jnp.argmax(apart), 0)
     return jax.tree.map(lambda leaf: leaf[index], candidates)
 
@@ -294,53 +273,32 @@ def blame(
         user_code.check_actions(given, f"teacher {type(teacher).__name__}")
 
 
-def walked(
-    guidance: Guide,
-    env: Environment,
-    scalars: GuideScalars,
-    base: Policy,
-    guide: GuideState,
-    keys: Key[Array, " steps"],
-    bound: Float[Array, ""] | None = None,
-) -> GuideState:
-    """The guide after steps in which it acts as it would ask, and nobody answers; `bound`: see `question`."""
+def walked(of: Inquiry, guide: GuideState, keys: Key[Array, " steps"]) -> GuideState:
+    """The guide after steps in which it acts as it would ask, and nobody answers."""
 
     def step(guide: GuideState, key: PRNGKeyArray) -> tuple[GuideState, None]:
         own = QuestionKeys(*jax.random.split(key, 4))
-        return proceed(env, guide, question(guidance, env, scalars, base, guide, own, bound), own), None
+        return proceed(of.env, guide, question(of, guide, own)[0], own), None
 
     return jax.lax.scan(step, guide, keys)[0]
 
 
 def label_round(
-    guidance: Guide,
-    sizes: GuideSizes,
-    env: Environment,
-    teacher: Teacher,
-    scalars: Scalars,
-    base: Policy,
-    guide: GuideState,
-    lane_key: PRNGKeyArray,
-    bound: Float[Array, ""] | None = None,
+    of: Inquiry, sizes: GuideSizes, teacher: Teacher, guide: GuideState, lane_key: PRNGKeyArray
 ) -> GuideState:
-    """As many questions as a round has, then a fit to all labels so far; a guide with its budget stays as it is.
-
-    `bound`: see `question`.
-    """
+    """As many questions as a round has, then a fit to all labels so far; a guide with its budget stays as it is."""
     first = guide.asked
     at_once = sizes.candidates if sizes.ask_all else 1
 
     def one(guide: GuideState, offset: Int[Array, ""]) -> tuple[GuideState, None]:
-        position = first + offset
-        asked = ask(guidance, env, teacher, scalars, base, guide, lane_key, position, bound, sizes.ask_all)
+        asked = ask(of, teacher, guide, lane_key, first + offset, sizes.ask_all)
         if sizes.question_every == 1:
             return asked, None
-        key = jax.random.fold_in(jax.random.fold_in(lane_key, Stream.WALK), position)
-        keys = jax.random.split(key, sizes.question_every - 1)
-        return walked(guidance, env, scalars, base, asked, keys, bound), None
+        key = jax.random.fold_in(jax.random.fold_in(lane_key, Stream.WALK), first + offset)
+        return walked(of, asked, jax.random.split(key, sizes.question_every - 1)), None
 
     asked, _ = jax.lax.scan(one, guide, jnp.arange(0, sizes.labels_per_round, at_once))
-    fitted = fit(guidance, env, scalars, asked, lane_key, first // sizes.labels_per_round)
+    fitted = fit(of.guidance, of.env, of.scalars, asked, lane_key, first // sizes.labels_per_round)
     return jax.tree.map(lambda new, old: jnp.where(first < guide.budget, new, old), fitted, guide)
 
 

@@ -228,9 +228,8 @@ class Lane(NamedTuple):
 
         `state` may be without its agent.
         """
-        base = uniform_in(env)
-        guide = asking.label_round(self.guidance, self.sizes, env, teacher, scalars, base, state.guide, state.key)
-        return self.guided(state, guide)
+        of = asking.Inquiry(self.guidance, env, scalars, uniform_in(env))
+        return self.guided(state, asking.label_round(of, self.sizes, teacher, state.guide, state.key))
 
     def take_labels(self, env: Environment, scalars: Scalars, labels: Label, state: TrainState) -> TrainState:
         """Labels that were given elsewhere, in place of questions, and the model fitted to them."""

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
+from cuelearner_jax import asking
 from cuelearner_jax.agents import ddqn
 from cuelearner_jax.config import Scalars, Schedule, Sizes, digest
 from cuelearner_jax.environment import Aims, Features, Quantity, WholeObservations
@@ -181,6 +182,16 @@ def window_program(kind):
     """One compiled loop on the bandit for all tests; four lanes in each of them compile one program."""
     guide = guidances.make(kind, SIZES, Window())
     return make_program(CONFIG, guide, Window(), LARGEST if guide.asks else 0)
+
+
+def label_rounds(guidance, sizes):
+    """`asking.label_round` of a guidance, compiled."""
+
+    def one(env, teacher, scalars, base, guide, lane_key):
+        of = asking.Inquiry(guidance, env, scalars, base)
+        return asking.label_round(of, sizes, teacher, guide, lane_key)
+
+    return jax.jit(one)
 
 
 def start(program, seeds, budgets, env=None):

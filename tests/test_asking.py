@@ -24,9 +24,14 @@ FAULTY = dataclasses.replace(
 )
 LANE_KEY = jax.random.key(11)
 
-label_round = jax.jit(partial(asking.label_round, RELATIVE, probes.SIZES))
+
+def asks(scalars, base, env=ENV, guidance=RELATIVE):
+    return asking.Inquiry(guidance, env, scalars, base)
+
+
+label_round = probes.label_rounds(RELATIVE, probes.SIZES)
 # What a page calls, each compiled by itself.
-question = jax.jit(partial(asking.question, RELATIVE))
+question = jax.jit(lambda env, scalars, base, guide, keys: asking.question(asks(scalars, base, env), guide, keys)[0])
 
 
 @jax.jit
@@ -98,10 +103,10 @@ def test_an_unguided_question_is_the_base_policys_own_action():
     none = guidances.make("none", probes.SIZES, ENV)
     guide = begun(guidance=none)
     keys = asking.question_keys(LANE_KEY, 0)
-    action = asking.question(none, ENV, probes.SCALARS, Heuristic(ENV), guide, keys)
+    action = asking.question(asks(probes.SCALARS, Heuristic(ENV), guidance=none), guide, keys)[0]
     np.testing.assert_array_equal(action, ENV.heuristic(guide.obs))
     with pytest.raises(ValueError, match="'none' asks nothing"):
-        asking.ask(none, ENV, EXPERT, probes.SCALARS, Uniform(), guide, LANE_KEY, jnp.asarray(0))
+        asking.ask(asks(probes.SCALARS, Uniform(), guidance=none), EXPERT, guide, LANE_KEY, jnp.asarray(0))
 
 
 def test_after_a_question_comes_what_its_action_leads_to():
@@ -125,7 +130,7 @@ def test_questions_may_lie_steps_apart():
     env, sizes = probes.Chain(jnp.array(False)), dataclasses.replace(probes.SIZES, question_every=2)
     bundle = guidances.make("relative", sizes, env)
     base = Heuristic(env)
-    ask = jax.jit(partial(asking.label_round, bundle, sizes))
+    ask = probes.label_rounds(bundle, sizes)
     found = ask(env, Teaching(base), probes.SCALARS, base, begun(env=env, guidance=bundle), LANE_KEY)
     np.testing.assert_array_equal(found.labels.obs[:ROUND], np.tile(env.observe(0), (ROUND, 1)))
     assert int(found.asked) == ROUND
@@ -222,7 +227,7 @@ def test_models_are_fitted_to_shuffled_answers_and_labels_keep_their_own(told, m
 
     monkeypatch.setattr(type(RELATIVE), "fit", fit)
     scalars, start = dataclasses.replace(probes.SCALARS, answer="shuffled"), begun(budget=20)
-    asked = jax.jit(partial(asking.label_round, RELATIVE, probes.SIZES))
+    asked = probes.label_rounds(RELATIVE, probes.SIZES)
     guide, best = start, start
     for _ in range(20 // ROUND):
         guide = asked(ENV, EXPERT, scalars, Heuristic(ENV), guide, LANE_KEY)

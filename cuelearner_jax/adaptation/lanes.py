@@ -168,8 +168,8 @@ def ask_round(of: Adaptation, teacher: Teacher, block: LaneState, mesh: Mesh | N
 def _ask_round(of: Adaptation, teacher: Any, block: LaneState, *, mesh: Mesh) -> LaneState:
     def of_device(of: Adaptation, teacher: Any, block: LaneState) -> LaneState:
         def one(lane: LaneState) -> LaneState:
-            who = of.guidance, of.sizes, of.env, teacher, of.scalars, of.bases.lane(lane.base)
-            return _kept_finite(lane, asking.label_round(*who, lane.guide, lane.key, bound=lane.bound))
+            own = asking.Inquiry(of.guidance, of.env, of.scalars, of.bases.lane(lane.base), lane.bound)
+            return _kept_finite(lane, asking.label_round(own, of.sizes, teacher, lane.guide, lane.key))
 
         return each_lane(one)(block)
 

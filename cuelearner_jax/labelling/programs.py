@@ -46,8 +46,11 @@ def programs(guidance: Guide) -> Programs:
 
         return jax.vmap(one)(jnp.asarray(labels.obs), jnp.asarray(labels.action))
 
+    def question(env: Any, scalars: Any, base: Any, guide: Any, keys: Any, bound: Any) -> Array:
+        return asking.question(asking.Inquiry(guidance, env, scalars, base, bound), guide, keys)[0]
+
     return Programs(
-        question=jax.jit(partial(asking.question, guidance)),
+        question=jax.jit(question),
         fit=jax.jit(partial(asking.fit, guidance)),
         refined=jax.jit(refined),
         answers=jax.jit(answers),

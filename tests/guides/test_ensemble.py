@@ -100,7 +100,7 @@ def test_the_candidate_is_asked_about_on_which_members_disagree_most_and_all_wal
     best = int(np.argmax(2 * fitted.obs[:, 0] + proposed[:, 1]))
     assert best != 0
     for asked, index in ((guide, 0), (fitted, best)):  # members that were never fitted have no say
-        after = asking.ask(told, ENV, expert, probes.SCALARS, Uniform(), asked, key, jnp.asarray(0))
+        after = asking.ask(asking.Inquiry(told, ENV, probes.SCALARS, Uniform()), expert, asked, key, jnp.asarray(0))
         np.testing.assert_array_equal(after.labels.obs[0], asked.obs[index])
         np.testing.assert_array_equal(after.labels.action[0], proposed[index])
         error = directions.difference(proposed[index], ENV.best(asked.obs[index]))
@@ -114,11 +114,9 @@ def test_the_candidate_is_asked_about_on_which_members_disagree_most_and_all_wal
 def test_rounds_of_chosen_questions_fill_the_budget_and_fit_each_member_from_numbers_of_its_own():
     several = registry.make("relative", CHOOSING, ENV)
     guide, expert, key = begun(several, CHOOSING, budget=15), probes.Expert(ENV), jax.random.key(3)
-    one = jax.jit(
-        lambda guide: asking.label_round(several, CHOOSING, ENV, expert, probes.SCALARS, Uniform(), guide, key)
-    )
+    one = probes.label_rounds(several, CHOOSING)
     for _ in range(2):
-        guide = one(guide)
+        guide = one(ENV, expert, probes.SCALARS, Uniform(), guide, key)
     assert np.asarray(guide.labels.valid).tolist() == [True] * 15 + [False] * 5
     assert int(guide.asked) == 15
     assert bool(guide.model.fitted)
@@ -151,7 +149,9 @@ def test_every_candidate_is_asked_about_at_once_within_the_budget():
     guide = asking.start(single, ENV, slots, 21, jax.random.key(1), jax.random.key(2), sizes)
     keys = asking.question_keys(key, 12)
     proposed = Uniform().act(keys.base, guide.env, guide.obs)
-    after = asking.ask(single, ENV, expert, probes.SCALARS, Uniform(), guide, key, jnp.asarray(12), every=True)
+    after = asking.ask(
+        asking.Inquiry(single, ENV, probes.SCALARS, Uniform()), expert, guide, key, jnp.asarray(12), every=True
+    )
     np.testing.assert_array_equal(after.labels.obs[12:18], guide.obs)
     np.testing.assert_array_equal(after.labels.action[12:18], proposed)
     errors = jax.vmap(directions.difference)(proposed, jax.vmap(ENV.best)(guide.obs))
@@ -161,8 +161,9 @@ def test_every_candidate_is_asked_about_at_once_within_the_budget():
     assert np.flatnonzero(after.labels.valid).tolist() == list(range(12, 18))
     states, steps = jax.vmap(ENV.step)(jax.random.split(keys.env, 6), guide.env, proposed)
     chex.assert_trees_all_equal((after.env, after.obs), (states, steps.obs))
-    one = jax.jit(lambda guide: asking.label_round(single, sizes, ENV, expert, probes.SCALARS, Uniform(), guide, key))
-    guide = one(one(guide))
+    one = probes.label_rounds(single, sizes)
+    for _ in range(2):
+        guide = one(ENV, expert, probes.SCALARS, Uniform(), guide, key)
     assert np.asarray(guide.labels.valid).tolist() == [True] * 21 + [False] * 3
     assert (int(guide.asked), bool(guide.model.fitted)) == (21, True)
     assert len(np.unique(np.asarray(guide.labels.action)[:21], axis=0)) == 21

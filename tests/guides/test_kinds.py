@@ -1,7 +1,7 @@
 """Demonstrations, scalar feedback and deep COACH on the bandit whose best direction is known."""
 
 import dataclasses
-from functools import cache, partial
+from functools import cache
 
 import chex
 import jax
@@ -35,7 +35,7 @@ def compiled(kind, frame="raw"):
 def taught(kind, rounds, scalars=SCALARS, frame="raw"):
     """A guide after rounds of ten questions about its own choices, uniform actions before there is a model."""
     bundle = compiled(kind, frame)[0]
-    label_round = jax.jit(partial(asking.label_round, bundle, SIZES))
+    label_round = probes.label_rounds(bundle, SIZES)
     guide = asking.start(bundle, ENV, 10 * rounds, 10 * rounds, jax.random.key(1), jax.random.key(2))
     for _ in range(rounds):
         guide = label_round(ENV, probes.Expert(ENV), scalars, Uniform(), guide, KEY)

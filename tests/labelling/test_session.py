@@ -3,7 +3,6 @@
 import errno
 import math
 import os
-from functools import partial
 from itertools import pairwise
 
 import chex
@@ -68,7 +67,7 @@ def test_the_first_round_is_that_of_a_simulated_teacher(opened, tmp_path):
     status = settled(session, fits=1)
     guidance, keys = guidances.make("relative", probes.SIZES, ENV), keys_of(0)
     guide = asking.start(guidance, ENV, 20, 20, keys.model, keys.start)
-    round_of = jax.jit(partial(asking.label_round, guidance, probes.SIZES))
+    round_of = probes.label_rounds(guidance, probes.SIZES)
     taught = round_of(ENV, probes.Expert(ENV), probes.SCALARS, Uniform(), guide, keys.session)
     file = label_files.read(tmp_path / "labels")
     for name in ("obs", "action", "answer"):

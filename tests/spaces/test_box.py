@@ -2,7 +2,6 @@
 
 import dataclasses
 import itertools
-from functools import partial
 from pathlib import Path
 
 import jax
@@ -227,7 +226,7 @@ def test_relative_labels_lead_to_the_goal_of_a_box():
     env, scalars = Reach(), SCALARS
     guidance = registry.make("relative", sizes, env)
     guide = asking.start(guidance, env, 400, 400, jax.random.key(1), jax.random.key(2))
-    label_round = jax.jit(partial(asking.label_round, guidance, sizes))
+    label_round = probes.label_rounds(guidance, sizes)
     for _ in range(4):
         guide = label_round(env, probes.Expert(env), scalars, Uniform(SMALL), guide, KEY)
     assert guide.labels.answer.shape == (400, 3)
