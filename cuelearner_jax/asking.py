@@ -219,17 +219,19 @@ def ask(
         raise ValueError(f"guidance {of.guidance.name!r} asks nothing")
     keys = question_keys(lane_key, position)
     actions, proposals = question(of, guide, keys)
-    answer = lambda key, *row: form.answer(key, of.env, teacher, *row, of.scalars)  # noqa: E731
+
+    def answer(key: PRNGKeyArray, state: EnvState, obs: Array, action: Array) -> tuple[Array, Array]:
+        return form.answer(key, of.env, teacher, state, obs, action, of.scalars)
+
     if every:
         obs, about, first = guide.obs, actions, proposals
         answers, answered = jax.vmap(answer)(jax.random.split(keys.answer, len(obs)), guide.env, obs, about)
     else:
         state, *there = _chosen(of, guide, actions, proposals)
-        obs, about, first, answers, answered = (
-            row[None] for row in (*there, *answer(keys.answer, state, there[0], there[1]))
-        )
-    told = record(guide, position, obs, about, answers, answered, first if of.guidance.kind.sees_base else None)
-    return proceed(of.env, told, actions, keys)
+        told = answer(keys.answer, state, there[0], there[1])
+        obs, about, first, answers, answered = (row[None] for row in (*there, *told))
+    recorded = record(guide, position, obs, about, answers, answered, first if of.guidance.kind.sees_base else None)
+    return proceed(of.env, recorded, actions, keys)
 
 
 def _chosen(

@@ -127,18 +127,9 @@ def learned(
 
 
 def check_amounts(space: Space, bounds: Sequence[float], scalars: Scalars) -> str:
-    """Whether bounds and the strength of labels go together.
+    """Return what may be meant otherwise of bounds and the strength of labels, in the space's unit; or nothing.
 
-    Args:
-        space: of the actions, in whose unit the numbers are.
-        bounds: of the lanes.
-        scalars: of refinement.
-
-    Returns:
-        What may be meant otherwise, or nothing.
-
-    Raises:
-        UserError: what cannot be, or could teach nothing.
+    Raises UserError for what cannot be, or could teach nothing.
     """
     eps, given = scalars.eps_deg, " ".join(f"{bound:g}" for bound in bounds)
     if not all(math.isfinite(bound) and 0 < bound <= space.reach for bound in bounds):
@@ -164,14 +155,7 @@ def check_amounts(space: Space, bounds: Sequence[float], scalars: Scalars) -> st
 
 
 def reach(space: Space, policy: Policy, obs: Any, action: Any) -> float:
-    """How far from a policy's own actions labels lie: the distance of 95% of them, in the space's unit.
-
-    Args:
-        space: of the actions.
-        policy: the policy.
-        obs: of the labels (labels, obs).
-        action: asked about (labels, action).
-    """
+    """The distance within which 95% of actions (labels, action) lie from a policy's own, in the space's unit."""
     away = _distances(space, policy, jnp.asarray(obs), jnp.asarray(action))
     user_code.check_actions(away, named(policy))
     return float(space.to_unit(np.quantile(np.asarray(away), REACH_QUANTILE), np))

@@ -20,26 +20,20 @@ from cuelearner_jax.config import Frame, GuideSizes, Scalars, check_guide, check
 from cuelearner_jax.environment import Spaces, offers, spaces_of, view_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides import registry as guidances
-from cuelearner_jax.guides.base import NAME
+from cuelearner_jax.guides.base import NAME, Guide
 from cuelearner_jax.policies import Agent, Guided, Heuristic, describe, layers, uniform_in
 from cuelearner_jax.run_config import kind_from_json, part_from_json
 
-Told = dict[str, Any]
 KINDS = ("agent", "uniform", "heuristic", "guided", "code")
 PARTS = ((GuideSizes, "sizes"), (Scalars, "scalars"))  # of a guided policy's values
 DERIVED = ("clip_radius_deg", "fitted")  # of a description: the other values and the arrays say them already
 MOST_LAYERS = 16  # of a policy that was adapted again and again
 
 
-def told(policy: Any, named: str | None = None) -> Told:
-    """A policy, or a block of them, as plain values.
+def to_json(policy: Any, named: str | None = None) -> dict[str, Any]:
+    """A policy, or a block of policies, as plain values; `named`: how the code in it is named, if there is any.
 
-    Args:
-        policy: the policy.
-        named: how the code in it is named, if there is any.
-
-    Raises:
-        UserError: it asks a teacher, or is refined in a way that cannot be kept.
+    Raises UserError if it asks a teacher, or is refined in a way that cannot be kept.
     """
     described = describe(policy)
     for layer in layers(described):
@@ -56,38 +50,35 @@ def told(policy: Any, named: str | None = None) -> Told:
     return described
 
 
-def check(values: Told, outermost: bool = True, depth: int = MOST_LAYERS) -> None:
-    """Whether plain values from a file say what a policy is made of.
-
-    Args:
-        values: as `told` gives them.
-        outermost: is it the policy itself, not one that it refines?
-        depth: layers that it may have.
+def check(values: dict[str, Any]) -> None:
+    """Whether plain values from a file say what an adapted policy is made of.
 
     Raises:
         UserError: a size or scalar that cannot work.
-        ValueError, TypeError, KeyError, AttributeError: anything else that `told` would not have written.
+        ValueError, TypeError, KeyError, AttributeError: anything else that `to_json` would not have written.
     """
-    kind = values["policy"]
-    if kind not in (("guided",) if outermost else KINDS) or not depth:
-        raise ValueError(f"{kind!r} is no policy here")
-    if kind == "agent":
-        check_part(part_from_json(AGENTS, values["agent"]), "agent")
-        if set(values) != {"policy", "agent", "frame"} or values["frame"] not in get_args(Frame):
-            raise ValueError(f"an agent is told by {sorted(values)}, in the frame {values.get('frame')!r}")
-    if kind == "code" and not isinstance(values["named"], str):
-        raise TypeError(f"code is named {values['named']!r}")
-    if kind == "guided":
-        sizes, scalars = (configuration.from_json(of, values[part]) for of, part in PARTS)
-        check_guide(sizes, scalars)
-        if not NAME.fullmatch(values["guidance"]) or type(values["bounded"]) is not bool:
-            raise ValueError(f"a guidance is called {values['guidance']!r}, and bounded {values['bounded']!r}")
-        kind_from_json(values["guidance"], values["options"])
-        check(values["base"], outermost=False, depth=depth - 1)
+    for depth, layer in enumerate(layers(values)):
+        kind = layer["policy"]
+        if kind not in (KINDS if depth else ("guided",)) or depth >= MOST_LAYERS:
+            raise ValueError(f"{kind!r} is no policy here")
+        if (kind == "guided") != isinstance(layer.get("base"), dict):
+            raise ValueError(f"a policy of kind {kind} has a base, or a guided one has none")
+        if kind == "agent":
+            check_part(part_from_json(AGENTS, layer["agent"]), "agent")
+            if set(layer) != {"policy", "agent", "frame"} or layer["frame"] not in get_args(Frame):
+                raise ValueError(f"an agent is told by {sorted(layer)}, in the frame {layer.get('frame')!r}")
+        if kind == "code" and not isinstance(layer["named"], str):
+            raise TypeError(f"code is named {layer['named']!r}")
+        if kind == "guided":
+            sizes, scalars = (configuration.from_json(of, layer[part]) for of, part in PARTS)
+            check_guide(sizes, scalars)
+            if not NAME.fullmatch(layer["guidance"]) or type(layer["bounded"]) is not bool:
+                raise ValueError(f"a guidance is called {layer['guidance']!r}, and bounded {layer['bounded']!r}")
+            kind_from_json(layer["guidance"], layer["options"])
 
 
 def arrays_of(policy: Any) -> Any:
-    """The arrays of a policy, or of a block of them."""
+    """The arrays of a policy, or of a block of policies."""
     kind, policy = describe(policy)["policy"], getattr(policy, "policy", policy)  # that `Common` holds
     if kind == "agent":
         return {"params": policy.params}
@@ -97,20 +88,14 @@ def arrays_of(policy: Any) -> Any:
     return {}
 
 
-def shapes_of(values: Told, env: Any, rows: int | None = None) -> Any:
-    """The shapes of a policy's arrays.
+def shapes_of(values: dict[str, Any], env: Any, rows: int | None = None) -> Any:
+    """The shapes of a policy's arrays, of its values; of a block of so many `rows` where there are several.
 
-    Args:
-        values: from `told`.
-        env: of the policy's task, shapes in place of arrays will do.
-        rows: of a block of so many policies; None: of one.
-
-    Raises:
-        UserError, ValueError: the environment is none that the policy can act in.
+    Shapes in place of arrays will do for `env`. Raises UserError or ValueError if the policy cannot act in it.
     """
     spaces = spaces_of(env)
 
-    def one(values: Told) -> Any:
+    def one(values: dict[str, Any]) -> Any:
         if values["policy"] == "agent":
             return {"params": _agent(values, spaces).init(jax.random.key(0))[0]}
         if values["policy"] == "guided":
@@ -118,19 +103,13 @@ def shapes_of(values: Told, env: Any, rows: int | None = None) -> Any:
             return {"base": one(values["base"]), "model": _guidance(values, env).init(jax.random.key(0)), **bound}
         return {}
 
-    shapes = jax.eval_shape(lambda: one(values))
     leading = () if rows is None else (rows,)
+    shapes = jax.eval_shape(lambda: one(values))
     return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct((*leading, *leaf.shape), leaf.dtype), shapes)
 
 
-def made(values: Told, arrays: Any, env: Any, code: Any = None) -> Any:
-    """The policy of plain values and arrays; the inverse of `told` and `arrays_of`.
-
-    Args:
-        values: from `told`.
-        arrays: of one policy, or of a block of them.
-        env: where it is to act.
-        code: the policy that stands for `code` (see `policies.policy_of`).
+def from_json(values: dict[str, Any], arrays: Any, env: Any, code: Any = None) -> Any:
+    """The policy of plain values and arrays, in a world; `code`: the policy that stands for code in it.
 
     Raises:
         UserError: the policy's code was not given, or it needs what the environment has not.
@@ -146,25 +125,25 @@ def made(values: Told, arrays: Any, env: Any, code: Any = None) -> Any:
             raise UserError("the policy is the task's heuristic, and this world has none: choose another world")
         return Heuristic(view_of(env))
     if kind == "guided":
-        base = made(values["base"], arrays["base"], env, code)
+        base = from_json(values["base"], arrays["base"], env, code)
         sizes, scalars = (configuration.from_json(of, values[part]) for of, part in PARTS)
         return Guided(base, arrays["model"], view_of(env), scalars, _guidance(values, env), arrays.get("bound"), sizes)
-    if kind == "code":
-        if code is None:
-            raise UserError(
-                f"this policy is made of code, {values['named']}, which is not loaded because a file names it: add "
-                f"--base {values['named']} if you trust that code"
-            )
-        return code
-    raise ValueError(f"{kind!r} is no policy")
+    if kind != "code":
+        raise ValueError(f"{kind!r} is no policy")
+    if code is None:
+        raise UserError(
+            f"this policy is made of code, {values['named']}, which is not loaded because a file names it: add "
+            f"--base {values['named']} if you trust that code"
+        )
+    return code
 
 
-def _agent(values: Told, spaces: Spaces) -> AgentFunctions:
+def _agent(values: dict[str, Any], spaces: Spaces) -> AgentFunctions:
     """The functions of an agent. Raises UserError if it is not known here."""
     return part_from_json(AGENTS, values["agent"]).make(values["frame"], spaces)
 
 
-def _guidance(values: Told, env: Any) -> Any:
+def _guidance(values: dict[str, Any], env: Any) -> Guide:
     """The guide of a guided policy. Raises UserError if its kind is not known here."""
     name = values["guidance"]
     if guidances.registered(name) is None:

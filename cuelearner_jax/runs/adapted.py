@@ -18,7 +18,7 @@ from cuelearner_jax.adaptation.lanes import Lanes
 from cuelearner_jax.environment import actions_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.feedback.forms import AnswerForm
-from cuelearner_jax.policies import Common, Guided, lanes_in
+from cuelearner_jax.policies import Common, Guided, lanes_in, layers
 from cuelearner_jax.runs.grid import LARGEST_BUDGET, LARGEST_SEED, world_of
 from cuelearner_jax.storage import formats, guides, label_files, policy_folders
 from cuelearner_jax.storage.provenance import provenance
@@ -26,7 +26,7 @@ from cuelearner_jax.storage.whole import Place
 from cuelearner_jax.task import Task, shape_of
 from cuelearner_jax.types import Label
 
-COLUMNS = ("base", "seeds", "labels", "bounds_deg", "used")  # of the lanes
+COLUMNS = {"base": int, "seeds": int, "labels": int, "bounds_deg": float, "used": bool}  # of the lanes
 CONVENTIONS = {
     "action": "unit vector: the base policy's, refined by the model until a pass turns it by less than tau, within the "
     "bound",
@@ -53,19 +53,14 @@ class AdaptedLanes:
     @property
     def kinds(self) -> tuple[str, ...]:
         """The kinds of guidance that the policy is under, the last first."""
-        layer, found = self.values["policy"], []
-        while layer is not None:
-            if layer["policy"] == "guided":
-                found.append(layer["guidance"])
-            layer = layer.get("base")
-        return tuple(found)
+        return tuple(layer["guidance"] for layer in layers(self.values["policy"]) if layer["policy"] == "guided")
 
     def policy(self, env: Any) -> Guided:
         """A block of the lanes' policies. Raises UserError if it cannot be had."""
         values, arrays = self.values["policy"], self._arrays(env)
-        base = stored.made(values["base"], arrays["base"], env, self.code)
+        base = stored.from_json(values["base"], arrays["base"], env, self.code)
         base = Common(base) if self.rows is None else base.lane(self.lanes.base)
-        made = stored.made({**values, "base": {"policy": "uniform"}}, arrays, env)
+        made = stored.from_json({**values, "base": {"policy": "uniform"}}, arrays, env)
         return replace(made, base=base)
 
     def base(self, env: Any) -> Any:
@@ -112,12 +107,10 @@ def _lanes(told: dict[str, Any], rows: int | None) -> tuple[Lanes, np.ndarray]:
     `rows`: base policies; None: the lanes share one.
     """
     columns = [told[column] for column in COLUMNS]
-    sound = all(isinstance(column, list) and len(column) == len(columns[0]) > 0 for column in columns)
-    if sound:
-        kinds = zip(columns, (int, int, int, float, bool), strict=True)
-        sound = all(type(value) is kind for column, kind in kinds for value in column)
-    if not sound:
-        raise ValueError("its lanes' columns are of several lengths, or hold something else than they should")
+    for column, kind in zip(columns, COLUMNS.values(), strict=True):
+        sound = isinstance(column, list) and len(column) == len(columns[0]) > 0
+        if not sound or not all(type(value) is kind for value in column):
+            raise ValueError("its lanes' columns are of several lengths, or hold something else than they should")
     base, seeds, labels, bounds, used = columns
     if rows is not None and (type(rows) is not int or not 1 <= rows <= len(seeds)):
         raise ValueError(f"{len(seeds)} lanes have {rows!r} base policies")
@@ -151,7 +144,7 @@ def write(
     """
     lanes, judged, env = adapted.lanes, adapted.judged, shape_of(task, world)
     block = replace(adapted.policy(env), base=adapted.of.bases)
-    values, arrays = stored.told(block, origin.get("code")), stored.arrays_of(block)
+    values, arrays = stored.to_json(block, origin.get("code")), stored.arrays_of(block)
     described = {
         "task": {"name": task.name, **({"from": task.origin} if task.origin else {}), **configuration.to_json(world)},
         **({"files": files} if (files := task.files(world)) else {}),

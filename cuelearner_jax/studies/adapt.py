@@ -37,7 +37,6 @@ from cuelearner_jax.runs import adapted, trained
 from cuelearner_jax.runs.grid import Grid, check_grid, seeds_of
 from cuelearner_jax.runs.order import read_labels
 from cuelearner_jax.runs.trained import PolicySource
-from cuelearner_jax.spaces import Space
 from cuelearner_jax.storage import label_files
 from cuelearner_jax.storage.whole import Place
 from cuelearner_jax.task import Scenario, Task
@@ -194,16 +193,9 @@ def run(
     watch: Callable[[str], Tell] = lambda what: untold,
     note: Callable[[str], None] = console.print,
 ) -> AdaptedStudy:
-    """Check a request and adapt; nothing is written.
+    """Check a request and adapt; nothing is written. Raises UserError for what makes no sense, or cannot be adapted.
 
-    Args:
-        subject: what is adapted, and who answers.
-        request: how.
-        watch: by what is being done, who is told how far it is.
-        note: takes what may be meant otherwise.
-
-    Raises:
-        UserError: what makes no sense, or cannot be adapted.
+    `watch`: by what is being done, who is told how far it is; `note` takes what may be meant otherwise.
     """
     task, sizes, scalars = subject.source.task, request.sizes, request.scalars
     check_guide(sizes, scalars)
@@ -231,7 +223,7 @@ def run(
         check_teacher(teacher, scalars)
     of = Adaptation(guidance, sizes, scalars, env, bases)
     if subject.policy is None or subject.named:  # it is to be kept in a folder
-        stored.told(of.policy(adaptation_lanes.begin(of, lanes)))
+        stored.to_json(of.policy(adaptation_lanes.begin(of, lanes)))
     if rows is not None:
         rows = label_files.for_lanes(rows, lanes.seed, lanes.budget, label_slots(int(lanes.budget.max()), sizes))
     return AdaptedStudy(adapting.adapt(of, lanes, how, teacher, rows, watch=watch), subject, request, origin)
@@ -279,15 +271,15 @@ def _rows(
         request = replace(request, labels=(len(rows.obs),))
         eps = request.scalars.eps_deg if form.by_eps else None
         file = label_files.LabelFile({}, form.name, space, eps, np.full(len(rows.obs), seeds[0]), rows)
-    widest = adapting.BOUND * space.reach if file is None else _reach(space, bases, file, request.scalars)
-    return file, replace(request, bound_deg=request.bound_deg or (widest,))
-
-
-def _reach(space: Space, bases: Any, file: label_files.LabelFile, scalars: Scalars) -> float:
-    """How far labels reach from what the base policy does, in the space's unit; at least eps."""
-    if lanes_in(bases) is not None:
-        raise UserError("labels of several base policies reach differently far: give --bound-deg")
-    return max(adapting.reach(space, bases.policy, file.labels.obs, file.labels.action), scalars.eps_deg)
+    if request.bound_deg:
+        return file, request
+    widest = adapting.BOUND * space.reach
+    if file is not None:
+        if lanes_in(bases) is not None:
+            raise UserError("labels of several base policies reach differently far: give --bound-deg")
+        reach = adapting.reach(space, bases.policy, file.labels.obs, file.labels.action)
+        widest = max(reach, request.scalars.eps_deg)
+    return file, replace(request, bound_deg=(widest,))
 
 
 def _judging(task: Task, request: AdaptRequest, env: Environment) -> Judging:
@@ -307,18 +299,15 @@ def _judging(task: Task, request: AdaptRequest, env: Environment) -> Judging:
     return Judging(tuned, envs, envs * steps, by, request.judge_every, bounds=request.judge_bounds)
 
 
-def _difference(lanes: np.ndarray) -> str:
-    """Differences (lanes, 3) in words: one with its 95% interval, or how many of several exclude 0."""
-    if len(lanes) > 1:
-        return f"the difference's 95% interval lies above 0 in {int((lanes[:, 1] > 0).sum())} of {len(lanes)} lanes"
-    ((estimate, lower, upper),) = lanes
+def _worth(difference: np.ndarray, steps: np.ndarray) -> str:
+    """Differences (lanes, 3) and rewarded steps (lanes,) in words: one with its interval, or how many exclude 0."""
+    count, told = len(steps), f"{int(np.mean(steps)):,} rewarded steps"
+    if count > 1:
+        above = int((difference[:, 1] > 0).sum())
+        return f"the difference's 95% interval lies above 0 in {above} of {count} lanes; {told} a lane"
+    ((estimate, lower, upper),) = difference
     zero = ", which includes 0" if lower <= 0 <= upper else ""
-    return f"difference {estimate:+.3g} [{lower:+.3g}, {upper:+.3g}]{zero}"
-
-
-def _steps(lanes: np.ndarray) -> str:
-    """Rewarded steps (lanes,) in words."""
-    return f"{int(np.mean(lanes)):,} rewarded steps{'' if len(lanes) == 1 else ' a lane'}"
+    return f"difference {estimate:+.3g} [{lower:+.3g}, {upper:+.3g}]{zero}; {told}"
 
 
 def sentences(found: Adapted) -> list[str]:
@@ -332,7 +321,7 @@ def sentences(found: Adapted) -> list[str]:
             worth, worse = f"predicts {after} of held-out answers, always 'already right' {before}", "fewer than that"
         else:
             worth, worse = f"{judged.by} on tuning episodes {before} before, {after} after", "worse than before"
-            worth += f" ({_difference(judged.difference[own])}; {_steps(judged.rewarded_steps[own])})"
+            worth += f" ({_worth(judged.difference[own], judged.rewarded_steps[own])})"
         lines.append(f"{budget} labels within {bound:g} {unit}: {worth}")
         if narrowed := sorted({*judged.within_deg[own & judged.used].round(3).tolist()} - {round(bound, 3)}):
             lines[-1] += f", used within {' or '.join(f'{angle:g}' for angle in narrowed)} {unit}"
