@@ -7,7 +7,7 @@ adaptation gives another base policy than uniform actions.
 from __future__ import annotations
 
 from enum import IntEnum
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -15,12 +15,15 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray
 
 from cuelearner_jax import user_code
+from cuelearner_jax.agents.networks import all_finite
 from cuelearner_jax.config import GuideScalars, GuideSizes
 from cuelearner_jax.environment import Environment, actions_of
 from cuelearner_jax.guides.base import Guide
 from cuelearner_jax.guides.refining import within
 from cuelearner_jax.policies import Policy, acted, best_actions, named
 from cuelearner_jax.types import EnvState, GuidanceModel, Label, Teacher
+
+LaneT = TypeVar("LaneT", bound=Any)
 
 ONE_BY_ONE = GuideSizes()  # questions as they come, of one strength: as a page asks them
 
@@ -302,6 +305,16 @@ def label_round(
     asked, _ = jax.lax.scan(one, guide, jnp.arange(0, sizes.labels_per_round, at_once))
     fitted = fit(of.guidance, of.env, of.scalars, asked, lane_key, first // sizes.labels_per_round)
     return jax.tree.map(lambda new, old: jnp.where(first < guide.budget, new, old), fitted, guide)
+
+
+def with_guide(lane: LaneT, guide: GuideState) -> LaneT:
+    """The lane with a new guide; where that is not finite the lane fails, and keeps the guide that it had.
+
+    `lane`: a record with `guide` and `failed`.
+    """
+    failed = lane.failed | ~all_finite((guide.model, guide.labels))
+    kept = jax.tree.map(lambda new, old: jnp.where(failed, old, new), guide, lane.guide)
+    return lane.replace(guide=kept, failed=failed)
 
 
 def take_labels(

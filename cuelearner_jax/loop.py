@@ -229,17 +229,11 @@ class Lane(NamedTuple):
         `state` may be without its agent.
         """
         of = asking.Inquiry(self.guidance, env, scalars, uniform_in(env))
-        return self.guided(state, asking.label_round(of, self.sizes, teacher, state.guide, state.key))
+        return asking.with_guide(state, asking.label_round(of, self.sizes, teacher, state.guide, state.key))
 
     def take_labels(self, env: Environment, scalars: Scalars, labels: Label, state: TrainState) -> TrainState:
         """Labels that were given elsewhere, in place of questions, and the model fitted to them."""
-        return self.guided(state, asking.take_labels(self.guidance, env, scalars, labels, state.guide, state.key))
-
-    def guided(self, state: TrainState, guide: GuideState) -> TrainState:
-        """The lane with a new guide; where that is not finite the lane fails, and keeps the one that it had."""
-        failed = state.failed | ~all_finite((guide.model, guide.labels))
-        kept = jax.tree.map(lambda new, old: jnp.where(failed, old, new), guide, state.guide)
-        return state.replace(guide=kept, failed=failed)
+        return asking.with_guide(state, asking.take_labels(self.guidance, env, scalars, labels, state.guide, state.key))
 
     def kept_finite(self, state: TrainState, before: TrainState) -> TrainState:
         """A lane after a stretch; one that has failed, in it or before, with what it had learned `before`.

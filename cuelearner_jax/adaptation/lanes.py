@@ -29,7 +29,6 @@ from jax.sharding import Mesh
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from cuelearner_jax import asking
-from cuelearner_jax.agents.networks import all_finite
 from cuelearner_jax.asking import GuideState
 from cuelearner_jax.config import GuideSizes, Scalars
 from cuelearner_jax.devices import BY_LANE, SHARED, each_lane, lane_mesh, over_lanes
@@ -149,13 +148,6 @@ def check_memory(sizes: GuideSizes, kept: Any) -> None:
     check_room(declared, OPTIMIZER * size + fitting, "lower these, or the number of labels and lanes")
 
 
-def _kept_finite(lane: LaneState, guide: GuideState) -> LaneState:
-    """The lane with a new guide; where that is not finite the lane fails, and keeps the one that it had."""
-    failed = lane.failed | ~all_finite((guide.model, guide.labels))
-    kept = jax.tree.map(lambda new, old: jnp.where(failed, old, new), guide, lane.guide)
-    return lane.replace(guide=kept, failed=failed)
-
-
 def ask_round(of: Adaptation, teacher: Teacher, block: LaneState, mesh: Mesh | None = None) -> LaneState:
     """One round of questions to a simulated teacher in every lane, and the fit that follows it (`asking.label_round`).
 
@@ -169,7 +161,7 @@ def _ask_round(of: Adaptation, teacher: Any, block: LaneState, *, mesh: Mesh) ->
     def of_device(of: Adaptation, teacher: Any, block: LaneState) -> LaneState:
         def one(lane: LaneState) -> LaneState:
             own = asking.Inquiry(of.guidance, of.env, of.scalars, of.bases.lane(lane.base), lane.bound)
-            return _kept_finite(lane, asking.label_round(own, of.sizes, teacher, lane.guide, lane.key))
+            return asking.with_guide(lane, asking.label_round(own, of.sizes, teacher, lane.guide, lane.key))
 
         return each_lane(one)(block)
 
@@ -193,7 +185,7 @@ def _take(of: Adaptation, labels: Label, block: LaneState, *, mesh: Mesh) -> Lan
                 labels = labels.replace(base=of.bases.lane(lane.base).act(lane.key, None, labels.obs))
             guide = lane.guide.replace(labels=labels, asked=lane.guide.budget)
             last = (lane.guide.budget - 1) // of.sizes.labels_per_round  # the fit that follows the last round
-            return _kept_finite(lane, asking.fit(of.guidance, of.env, of.scalars, guide, lane.key, last))
+            return asking.with_guide(lane, asking.fit(of.guidance, of.env, of.scalars, guide, lane.key, last))
 
         return each_lane(one)(labels, block)
 

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import numpy as np
 
 from cuelearner_jax import user_code
 from cuelearner_jax.adaptation.adapting import plain_scalars
@@ -196,9 +195,7 @@ def _given(labels: Any, world: Any) -> tuple[int | None, Path | None, Label | No
         return None, None, label_files.read(path).labels  # a bare environment has no name that a file could hold
     if not isinstance(labels, tuple):
         return arguments.budget("labels", labels), None, None
-    obs, action, answer = rows_of(labels)
-    answer = answer[:, None] if answer.ndim == 1 else answer
-    return None, None, Label(obs, action, answer, np.ones(len(obs), bool))  # pyright: ignore[reportArgumentType]
+    return None, None, rows_of(labels)
 
 
 def _shares(name: str, given: Any) -> tuple[float, ...]:

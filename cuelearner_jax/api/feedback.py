@@ -97,21 +97,21 @@ def fit_feedback(
             raise UserError(f"{labels} holds answers of {file.eps:g} {file.space.unit}: leave out eps_deg")
         own = file.seeds == file.seeds[0]
         eps_deg = file.eps
-        rows = jax.tree.map(lambda leaf: np.asarray(leaf)[own], file.labels)
-        labels = labels_of(rows)
-    labels = _checked(labels, space)
+        labels = labels_of(jax.tree.map(lambda leaf: np.asarray(leaf)[own], file.labels))
+    rows = rows_of(labels)
+    if len(rows.obs) < 2:
+        raise UserError(f"{len(rows.obs)} labels teach nothing: give more")
+    spaces = Spaces(rows.obs.shape[1], space)
+    given.check(rows, spaces, RELATIVE)
     sizes, scalars = settings(space, sizes, scalars, eps_deg)
-    guidance = KIND.make(sizes, Spaces(labels.obs.shape[1], space))
-    valid = np.ones(len(labels.obs), bool)
-    answers = labels.answer.reshape(len(valid), -1)
-    rows = Label(*(jnp.asarray(part) for part in (labels.obs, labels.action, answers, valid)))
+    guidance = KIND.make(sizes, spaces)
     k_init, k_fit = jax.random.split(jax.random.key(seed))
     check_memory(sizes, jax.eval_shape(guidance.init, k_init))
     fit = jax.jit(lambda key, rows, former, scalars: guidance.fit(key, None, rows, former, scalars))
-    model = fit(k_fit, rows, guidance.init(k_init), scalars)
+    model = fit(k_fit, jax.tree.map(jnp.asarray, rows), guidance.init(k_init), scalars)
     if not all_finite(model):
         raise diverged()
-    return FeedbackModel(guidance, model, scalars, labels, sizes, space)
+    return FeedbackModel(guidance, model, scalars, labels_of(rows), sizes, space)
 
 
 @user_code.told
@@ -241,31 +241,20 @@ def settings(
     return sizes, scalars
 
 
-def rows_of(labels: Any) -> Labels:
-    """Labels of finite floats. Raises UserError if they are not three arrays of one length."""
+def rows_of(labels: Any) -> Label:
+    """Labels of finite floats as rows (labels, ...). Raises UserError if they are not three arrays of one length."""
     if not isinstance(labels, tuple) or len(labels) != 3:
         raise arguments.refused("labels", labels, "a label file, or Labels(obs, action, answer)")
     obs, action, answer = (
         arguments.numbers(f"labels.{name}", part) for name, part in zip(Labels._fields, labels, strict=True)
     )
-    answer = answer[:, 0] if answer.ndim == 2 and answer.shape[1] == 1 else answer
     if obs.ndim != 2 or not obs.size or action.shape[:1] != (len(obs),) or answer.shape[:1] != (len(obs),):
         raise UserError(
             f"labels have shapes {obs.shape}, {action.shape}, {answer.shape}: give observations (n, obs), "
             "actions (n, action) and answers (n,), or (n, cues) where there are several"
         )
-    return Labels(obs, action, answer)
-
-
-def _checked(labels: Any, space: Space) -> Labels:
-    """Labels that a model can be fitted to. Raises UserError for what makes no sense."""
-    obs, action, answer = labels = rows_of(labels)
-    if len(obs) < 2:
-        raise UserError(f"{len(obs)} labels teach nothing: give more")
-    answers = answer[:, None] if answer.ndim == 1 else answer
-    rows = Label(obs, action, answers, np.ones(len(obs), bool))  # pyright: ignore[reportArgumentType]
-    given.check(rows, Spaces(obs.shape[1], space), RELATIVE)
-    return labels
+    answer = answer[:, None] if answer.ndim == 1 else answer
+    return Label(obs, action, answer, np.ones(len(obs), bool))  # pyright: ignore[reportArgumentType]
 
 
 def diverged() -> UserError:
