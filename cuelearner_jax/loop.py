@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 from jax.sharding import Mesh
-from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from cuelearner_jax import asking
 from cuelearner_jax.agents.networks import all_finite
@@ -189,6 +189,15 @@ def _program_of(
     )
 
 
+class Keys(NamedTuple):
+    """Random numbers of one iteration, by who draws them; derived once, which takes an accelerator microseconds."""
+
+    act: PRNGKeyArray
+    step: PRNGKeyArray  # the environments
+    absorb: PRNGKeyArray  # the arbiter
+    learn: PRNGKeyArray
+
+
 class Acted(NamedTuple):
     """What `Lane.act` has chosen, to be executed and then given to `Lane.absorb`."""
 
@@ -251,31 +260,31 @@ class Lane(NamedTuple):
         updates = jnp.where(clock.step + steps >= schedule.learn_after, steps, 0)
         return clock.replace(step=clock.step + steps, update=clock.update + updates)
 
-    def keys(self, clock: Clock, state: TrainState) -> Key[Array, "4"]:
-        """Keys (4,) of one iteration: to act, to step the environments, for the arbiter, to learn."""
+    def keys(self, clock: Clock, state: TrainState) -> Keys:
+        """Keys of one iteration."""
         key = jax.random.fold_in(jax.random.fold_in(state.key, Stream.TRAIN), clock.step)
-        return jax.random.split(key, 4)
+        return Keys(*jax.random.split(key, 4))
 
     def iterate(
         self, env: Environment, settings: Settings, clock: Clock, state: TrainState
     ) -> tuple[TrainState, dict[str, Float[Array, ""]]]:
         """One step in each of the lane's environments, then as many gradient steps."""
-        k_env = self.keys(clock, state)[1]
-        acted = self.act(env, settings, clock, state)
-        stepped = jax.vmap(env.step)(jax.random.split(k_env, self.sizes.num_envs), state.agent.env, acted.actions)
-        env_state, step = stepped
-        state, met = self.absorb(settings, clock, state, acted, step)
+        keys = self.keys(clock, state)
+        acted = self.act(env, settings, clock, state, keys.act)
+        k_envs = jax.random.split(keys.step, self.sizes.num_envs)
+        env_state, step = jax.vmap(env.step)(k_envs, state.agent.env, acted.actions)
+        state, met = self.absorb(settings, clock, state, keys.absorb, acted, step)
         state = state.replace(agent=state.agent.replace(env=env_state))
-        state, learned = self.learn(env, settings, clock, state)
+        state, learned = self.learn(env, settings, clock, state, keys.learn)
         return state, {**met, **learned}
 
-    def act(self, env: Environment, settings: Settings, clock: Clock, state: TrainState) -> Acted:
+    def act(self, env: Environment, settings: Settings, clock: Clock, state: TrainState, key: PRNGKeyArray) -> Acted:
         """Actions to execute in each environment.
 
         Uniform at first, then the agent's; refined by the guidance until the cut-off, where the arbiter says so. The
         branches depend on the shared clock alone, so they stay branches under vmap.
         """
-        key, agent, schedule = self.keys(clock, state)[0], state.agent, settings.schedule
+        agent, schedule = state.agent, settings.schedule
         base = jax.lax.cond(
             clock.step < schedule.random_steps,
             lambda: actions_of(env).sample(key, (self.sizes.num_envs,)),
@@ -290,7 +299,7 @@ class Lane(NamedTuple):
         return Acted(refined.actions, refined.passes, jax.vmap(env.remember)(agent.env, agent.obs))
 
     def absorb(
-        self, settings: Settings, clock: Clock, state: TrainState, acted: Acted, step: Step
+        self, settings: Settings, clock: Clock, state: TrainState, key: PRNGKeyArray, acted: Acted, step: Step
     ) -> tuple[TrainState, dict[str, Float[Array, ""]]]:
         """The lane after its actions were executed: they are in replay, and the next observations are there.
 
@@ -298,7 +307,6 @@ class Lane(NamedTuple):
         """
         agent, done = state.agent, step.terminated | step.truncated
         outcome = Outcome(step.reward, done, guides(clock, settings.schedule))
-        key = self.keys(clock, state)[2]
         arbiter = self.arbiter.follow(state.arbiter, settings.arbiter, settings.scalars, outcome, key)
         stored = jax.vmap(partial(stored_step, bootstraps=self.bootstraps))(acted.remembered, acted.actions, step)
         agent = agent.replace(replay=self.buffer.add(agent.replay, clock.step, stored), obs=step.obs)
@@ -311,10 +319,10 @@ class Lane(NamedTuple):
         return state.replace(agent=agent, arbiter=arbiter), metrics
 
     def learn(
-        self, env: Environment, settings: Settings, clock: Clock, state: TrainState
+        self, env: Environment, settings: Settings, clock: Clock, state: TrainState, key: PRNGKeyArray
     ) -> tuple[TrainState, dict[str, Float[Array, ""]]]:
         """As many gradient steps as environment steps were just made, once there are enough of these."""
-        filled, agent, key = clock.step + self.sizes.num_envs, state.agent, self.keys(clock, state)[3]
+        filled, agent = clock.step + self.sizes.num_envs, state.agent
         memory = Memory(env, self.buffer, agent.replay, filled, self.sizes.num_envs, self.bootstraps)
 
         def update(learned: tuple[Any, Any], index: Array) -> tuple[tuple[Any, Any], tuple[Array, Array]]:

@@ -91,8 +91,13 @@ def test_options_of_a_part_are_checked_under_its_name():
         run_config.check(probes.config(arbiter=paced.Config(lead=-1.0)))
 
 
-def test_a_part_is_a_tree_of_its_floats_and_the_rest_is_its_structure():
-    assert jax.tree.leaves(ddqn.Config(learning_rate=0.5, n_step_weight=0.25, polyak=0.125)) == [0.5, 0.25, 0.125]
+def test_a_part_is_a_tree_of_what_is_traced_and_the_rest_is_its_structure():
+    assert jax.tree.leaves(ddqn.Config(learning_rate=0.5, n_step_weight=0.25, polyak=0.125, target_every=3)) == [
+        0.5,
+        0.25,
+        0.125,
+        3,
+    ]
     assert hash(static(ddqn.Config(learning_rate=0.5))) == hash(static(ddqn.Config()))
     assert static(ddqn.Config(n_step=2)) != static(ddqn.Config())
 

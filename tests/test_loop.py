@@ -504,16 +504,17 @@ def test_a_plain_environment_between_acting_and_learning_gives_the_compiled_loop
     clock, state = loop.start_clock(), lane.init(ENV, jax.random.fold_in(key, 3), 0)
 
     def drawn(step):  # the contexts that the environment of JAX draws
-        return jax.vmap(ENV.reset)(jax.random.split(lane.keys(clock.replace(step=step), state)[1], 4))[1]
+        return jax.vmap(ENV.reset)(jax.random.split(lane.keys(clock.replace(step=step), state).step, 4))[1]
 
     later = jax.jit(jax.vmap(drawn))(4 * jnp.arange(STRETCH))
     contexts = np.concatenate([np.asarray(state.agent.obs)[None], later])
     act, absorb, learn = jax.jit(lane.act), jax.jit(lane.absorb), jax.jit(lane.learn)
     plain = PlainWindow(contexts)
     for _ in range(STRETCH):
-        acted = act(ENV, settings, clock, state)
-        state, _ = absorb(settings, clock, state, acted, plain.step(np.asarray(acted.actions)))
-        state, _ = learn(ENV, settings, clock, state)
+        keys = lane.keys(clock, state)
+        acted = act(ENV, settings, clock, state, keys.act)
+        state, _ = absorb(settings, clock, state, keys.absorb, acted, plain.step(np.asarray(acted.actions)))
+        state, _ = learn(ENV, settings, clock, state, keys.learn)
         clock = lane.advance(clock, settings.schedule)
     compiled, own = probes.lane(compiled, 0), jax.tree.map(lambda leaf: np.asarray(probes.words(leaf)), state)
     assert own.agent.replay[:48, 4].any()  # rewards
@@ -534,6 +535,7 @@ def test_other_scalars_schedules_worlds_and_times_compile_nothing(grid):
         scalars = dataclasses.replace(probes.SCALARS, eps_deg=5.0 + index, k_max=10 + index)
         other = {"learning_rate": 0.01 * index, "random_steps": index, "learn_after": 4 * index}
         settings = replaced(0.2, guidance_until=20 + index, **other)._replace(scalars=scalars)
+        settings = settings._replace(agent=dataclasses.replace(settings.agent, target_every=1 + index))
         clock, state = program.label_round(env, probes.Expert(env), scalars, clock, state)
         clock, state, _ = program.train(env, settings, clock, state, STRETCH)
     assert probes.compilations(*functions) == before

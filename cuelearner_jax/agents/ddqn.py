@@ -20,7 +20,7 @@ from cuelearner_jax.agents import view
 from cuelearner_jax.agents.choice import best_near_peaks, best_of, looked_at
 from cuelearner_jax.agents.networks import applied, q_network, widened
 from cuelearner_jax.agents.replay import Memory, Transition
-from cuelearner_jax.config import POSITIVE, SHARE, Bounds, Frame, Layers, Scalars, Sizes, part
+from cuelearner_jax.config import POSITIVE, SHARE, TRACED, Bounds, Frame, Layers, Scalars, Sizes, part
 from cuelearner_jax.environment import Spaces
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.spaces import check_directions
@@ -63,7 +63,7 @@ class Config:
     """Share of the n-step return in a target; the rest is the one-step return."""
     polyak: Annotated[float, SHARE] = 0.005
     """Rate at which the target network follows."""
-    target_every: Annotated[int, POSITIVE] = 2
+    target_every: Annotated[int, POSITIVE, TRACED] = 2
     """Gradient steps between two moves of the target network."""
 
     def make(self, frame: Frame, spaces: Spaces, bootstraps: bool = False) -> DoubleDQN:
@@ -193,7 +193,7 @@ class DoubleDQN:
         params = optax.apply_updates(params, change)
         if self.bootstraps:
             target_params = jax.lax.cond(
-                count % own.target_every == 0,
+                count % options.target_every == 0,
                 lambda: optax.incremental_update(params, target_params, options.polyak),
                 lambda: target_params,
             )

@@ -7,8 +7,8 @@
         learning_rate: Annotated[float, Bounds(0)] = 0.1
         \"\"\"Step size.\"\"\"
 
-Floats are traced: another value costs no new compile. All other fields shape the program. The docstring below a field
-is its help on the command line.
+Floats, and whole numbers annotated with `TRACED`, are traced: another value costs no new compile. All other fields
+shape the program. The docstring below a field is its help on the command line.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from cuelearner_jax.errors import UserError, closest, shown
 LARGEST = 2**31 - 1  # counters and indices are 32-bit integers
 LARGEST_FLOAT = 3.4028234e38  # scalars are computed in single precision
 MOST_LAYERS = 64  # each is compiled by itself
+TRACED = "traced"  # annotates a whole number that shapes nothing
 
 PartT = TypeVar("PartT")
 
@@ -64,10 +65,10 @@ def part(kind: type[PartT]) -> type[PartT]:
 
 
 def register(kind: type, *traced_too: type) -> None:
-    """Register a dataclass as a pytree: floats (and fields of `traced_too`) are leaves, all others its structure."""
-    hints = get_type_hints(kind)
+    """Register a dataclass as a pytree: floats, `TRACED` fields and those of `traced_too` are its leaves."""
+    hints, extras = get_type_hints(kind), get_type_hints(kind, include_extras=True)
     names = [field.name for field in dataclasses.fields(kind)]
-    traced = [name for name in names if hints[name] in (float, *traced_too)]
+    traced = [name for name in names if hints[name] in (float, *traced_too) or TRACED in get_args(extras[name])]
     jax.tree_util.register_dataclass(kind, traced, [name for name in names if name not in traced])
 
 
