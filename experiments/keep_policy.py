@@ -15,7 +15,7 @@ import numpy as np
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.loop import start_clock
 from cuelearner_jax.runs.grid import load
-from cuelearner_jax.runs.trained import Lanes, PolicySource
+from cuelearner_jax.runs.trained import PolicySource, RunLanes
 from cuelearner_jax.storage import formats
 from cuelearner_jax.storage.checkpoint import checkpoints
 from cuelearner_jax.tasks import registry
@@ -38,7 +38,7 @@ def keep(run: Path, out: Path, seeds: Sequence[int], kind: str | None, labels: i
     write(out / lanes.guidance.name, lanes, np.array([rows[seed] for seed in seeds]))
 
 
-def write(folder: Path, lanes: Lanes, rows: np.ndarray) -> None:
+def write(folder: Path, lanes: RunLanes, rows: np.ndarray) -> None:
     """The checkpoint of some lanes' policies."""
     kept = jax.tree.map(lambda leaf: leaf[rows], lanes.policies)
     policy, failed = {name: kept[name] for name in ("params", "guidance")}, kept["failed"]

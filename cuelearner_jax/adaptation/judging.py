@@ -71,15 +71,15 @@ def _step_of(env: Environment) -> Any:
     return jax.eval_shape(env.step, key, state, jnp.zeros(actions_of(env).size))[1]
 
 
-def check_bounds(shares: tuple[float, ...], by: str, named: str) -> None:
-    """Raises UserError for shares of a bound that cannot be tried; `named` is what the user calls them."""
+def check_bounds(shares: tuple[float, ...], by: str) -> None:
+    """Raises UserError for shares of a bound that cannot be tried."""
     if len(shares) > MOST_BOUNDS:
-        raise UserError(f"{named} has {len(shares):,} shares, each played by itself: give at most {MOST_BOUNDS}")
+        raise UserError(f"judge_bounds has {len(shares):,} shares, each played by itself: give at most {MOST_BOUNDS}")
     if not all(0 < share < 1 for share in shares) or len(set(shares)) < len(shares):
         given = " ".join(f"{share:g}" for share in shares)
-        raise UserError(f"{named} is {given}: give shares of the bound above 0 and below 1, each once")
+        raise UserError(f"judge_bounds is {given}: give shares of the bound above 0 and below 1, each once")
     if shares and by == LABELS:
-        raise UserError(f"{named} needs episodes to try them on: judge by a metric of the task")
+        raise UserError("judge_bounds needs episodes to try them on: judge by a metric of the task")
 
 
 class Judge:

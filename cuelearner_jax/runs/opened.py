@@ -32,7 +32,7 @@ class Piece(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Lanes:
+class RunLanes:
     """The lanes of one kind of guidance that have come to the same step, as their newest checkpoints have them."""
 
     guidance: Guide
@@ -80,7 +80,7 @@ def open_run(folder: Path, find: Callable[[str], Task]) -> Opened:
     return Opened(task, config, Grid(first.guidance, seeds, first.labels), pieces)
 
 
-def lanes_of(task: Task, config: RunConfig, pieces: tuple[Piece, ...], kind: str, sweep: bool) -> list[Lanes]:
+def lanes_of(task: Task, config: RunConfig, pieces: tuple[Piece, ...], kind: str, sweep: bool) -> list[RunLanes]:
     """The lanes of one kind of guidance, those at the same step together, the farthest first.
 
     What is missing or not finished is said on the console, a line for each piece.
@@ -98,7 +98,7 @@ def lanes_of(task: Task, config: RunConfig, pieces: tuple[Piece, ...], kind: str
     env = shape_of(task, config.task)
     guidance = config.guide_in(env, kind)
     like = jax.eval_shape(lambda key: _acting(config, guidance, env, key), jax.random.key(0))
-    found: dict[int, list[Lanes]] = {}
+    found: dict[int, list[RunLanes]] = {}
     told = shards.missing([piece.folder / CONFIG for piece in pieces]) if sweep else []
     for folder, grid in pieces:
         if sweep and not (folder / kind / "checkpoints").is_dir():
@@ -106,7 +106,7 @@ def lanes_of(task: Task, config: RunConfig, pieces: tuple[Piece, ...], kind: str
             continue
         seeds, budgets = grid.lanes(guidance)
         policies, step = restore_policies(folder / kind, like, len(seeds))
-        found.setdefault(step, []).append(Lanes(guidance, seeds, budgets, policies, step))
+        found.setdefault(step, []).append(RunLanes(guidance, seeds, budgets, policies, step))
         if step < config.schedule.total_steps:
             told.append(f"{folder}: {kind} guidance at step {step:,} of {config.schedule.total_steps:,}")
     for line in told:
@@ -121,10 +121,10 @@ def _acting(config: RunConfig, guidance: Guide, env: Any, key: PRNGKeyArray) -> 
     return {"params": config.agent_in(env).init(key)[0], "guidance": guidance.init(key)}
 
 
-def _joined(parts: list[Lanes]) -> Lanes:
+def _joined(parts: list[RunLanes]) -> RunLanes:
     """Lanes of several pieces at one step."""
     if len(parts) == 1:
         return parts[0]
     seeds, budgets = (np.concatenate([getattr(part, name) for part in parts]) for name in ("seeds", "budgets"))
     policies = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *(part.policies for part in parts))
-    return Lanes(parts[0].guidance, seeds, budgets, policies, parts[0].step)
+    return RunLanes(parts[0].guidance, seeds, budgets, policies, parts[0].step)

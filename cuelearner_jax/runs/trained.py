@@ -17,7 +17,7 @@ from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs.adapted import AdaptedLanes, open_folder
 from cuelearner_jax.runs.failures import without_failed
 from cuelearner_jax.runs.grid import Grid
-from cuelearner_jax.runs.opened import Lanes, Piece, lanes_of, open_run
+from cuelearner_jax.runs.opened import Piece, RunLanes, lanes_of, open_run
 from cuelearner_jax.storage import policy_folders
 from cuelearner_jax.task import Task, shape_of
 from cuelearner_jax.terminal import console
@@ -30,7 +30,7 @@ class Parts(NamedTuple):
     config: RunConfig
     view: Any  # of where it acts
     teacher: Teacher | None
-    lanes: Lanes | None
+    lanes: RunLanes | None
     adapted: AdaptedLanes | None = None
 
     @property
@@ -182,7 +182,7 @@ class PolicySource:
         found = (guidances.registered(kind) for kind in kinds)
         return any(kind is not None and "aims" in kind.needs for kind in found)
 
-    def load(self, kinds: tuple[str, ...] = ()) -> list[Lanes]:
+    def load(self, kinds: tuple[str, ...] = ()) -> list[RunLanes]:
         """The lanes of a run's kinds of guidance (none named: all), those at different steps apart.
 
         Raises UserError for a kind that the run does not have, or without a checkpoint.

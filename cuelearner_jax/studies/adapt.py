@@ -18,10 +18,9 @@ import numpy as np
 
 from cuelearner_jax import user_code
 from cuelearner_jax.adaptation import adapting, judging, stored
-from cuelearner_jax.adaptation import lanes as adaptation_lanes
 from cuelearner_jax.adaptation.adapting import Adapted
 from cuelearner_jax.adaptation.judging import Judging
-from cuelearner_jax.adaptation.lanes import Adaptation
+from cuelearner_jax.adaptation.lanes import Adaptation, begin, one_each, product, side_by_side
 from cuelearner_jax.asking import label_slots
 from cuelearner_jax.config import GuideSizes, Scalars, check_guide, check_part
 from cuelearner_jax.environment import Environment, actions_of, spaces_of
@@ -215,7 +214,7 @@ def run(
     if note_of := adapting.check_amounts(actions_of(env), request.bound_deg, scalars):
         note(note_of)
     varied = seeds, request.labels, request.bound_deg
-    lanes = adaptation_lanes.product(1, *varied) if shared else adaptation_lanes.one_each(*varied)
+    lanes = product(1, *varied) if shared else one_each(*varied)
     how = _judging(task, request, env)
     teacher = None
     if rows is None:
@@ -223,7 +222,7 @@ def run(
         check_teacher(teacher, scalars)
     of = Adaptation(guidance, sizes, scalars, env, bases)
     if subject.policy is None or subject.named:  # it is to be kept in a folder
-        stored.to_json(of.policy(adaptation_lanes.begin(of, lanes)))
+        stored.to_json(of.policy(begin(of, lanes)))
     if rows is not None:
         rows = label_files.for_lanes(rows, lanes.seed, lanes.budget, label_slots(int(lanes.budget.max()), sizes))
     return AdaptedStudy(adapting.adapt(of, lanes, how, teacher, rows, watch=watch), subject, request, origin)
@@ -249,7 +248,7 @@ def _bases(subject: Subject, request: AdaptRequest, env: Any) -> tuple[Any, tupl
     )
     told = {name: value for name, value in dataclasses.asdict(base).items() if value not in (None, ())}
     origin = {"folder": source.folder.name, **told, "seeds": list(seeds), **({"code": named} if named else {})}
-    return Common(policies[0]) if len(policies) == 1 else adaptation_lanes.side_by_side(policies), seeds, origin
+    return Common(policies[0]) if len(policies) == 1 else side_by_side(policies), seeds, origin
 
 
 def _rows(
@@ -289,7 +288,7 @@ def _judging(task: Task, request: AdaptRequest, env: Environment) -> Judging:
         raise UserError(f"judge_episodes is {envs}: give a number from 1 to {MOST_ENVS:,}")
     if request.judge_every < 0 or request.judge_every % unit:
         raise UserError(f"judge_every is {request.judge_every}: give a multiple of sizes.labels_per_round ({unit})")
-    judging.check_bounds(request.judge_bounds, by, "judge_bounds")
+    judging.check_bounds(request.judge_bounds, by)
     known = [*judging.metrics_of(env), judging.LABELS]
     if by not in known:
         raise UserError(f"judge_by is {by!r}, no metric of {task.name}{closest(by, known)}")

@@ -11,9 +11,8 @@ import probes
 import pytest
 
 from cuelearner_jax.adaptation import adapting, judging
-from cuelearner_jax.adaptation import lanes as program
 from cuelearner_jax.adaptation.judging import Judging
-from cuelearner_jax.adaptation.lanes import Adaptation, Lanes
+from cuelearner_jax.adaptation.lanes import Adaptation, Lanes, ask_round, begin, one_each, product, rounds, side_by_side
 from cuelearner_jax.config import GuideSizes
 from cuelearner_jax.devices import lane_mesh
 from cuelearner_jax.errors import UserError
@@ -47,8 +46,8 @@ class Shifted(PolicyNode):
         return self.replace(shift=BY_LANE)
 
 
-BASES = program.side_by_side([Shifted(jnp.array(shift)) for shift in SHIFTS])
-LANES = program.product(2, (3,), (30, 80), (10.0, 60.0))
+BASES = side_by_side([Shifted(jnp.array(shift)) for shift in SHIFTS])
+LANES = product(2, (3,), (30, 80), (10.0, 60.0))
 
 
 def of(bases=BASES):
@@ -77,7 +76,7 @@ def test_lanes_are_every_combination_or_one_each():
     assert {*zip(*(column.tolist() for column in LANES), strict=True)} == {
         (base, 3, budget, bound) for base in (0, 1) for budget in (30, 80) for bound in (10.0, 60.0)
     }
-    each = program.one_each((4, 7, 9), (30,), (60.0,))
+    each = one_each((4, 7, 9), (30,), (60.0,))
     assert (each.base.tolist(), each.seed.tolist()) == ([0, 1, 2], [4, 7, 9])
 
 
@@ -134,11 +133,11 @@ def test_budgets_are_masks_and_lanes_do_not_know_each_other():
         first = jax.tree.map(lambda leaf, lane=lane: leaf[lane][:30], labels)
         chex.assert_trees_all_equal(first, jax.tree.map(lambda leaf, lane=larger: leaf[lane][:30], labels))
     lane = 5
-    own = program.side_by_side([Shifted(jnp.array(SHIFTS[LANES.base[lane]]))])
+    own = side_by_side([Shifted(jnp.array(SHIFTS[LANES.base[lane]]))])
     one = Lanes(*(column[[lane]] for column in LANES))._replace(base=np.zeros(1, np.int32))
-    alone = program.begin(of(own), one)
-    for _ in range(program.rounds(one, SIZES)):
-        alone = program.ask_round(of(own), EXPERT, alone, MESH)
+    alone = begin(of(own), one)
+    for _ in range(rounds(one, SIZES)):
+        alone = ask_round(of(own), EXPERT, alone, MESH)
     kept = jax.tree.map(lambda leaf: leaf[lane], block.guide.model)
     chex.assert_trees_all_equal(jax.tree.map(lambda leaf: leaf[0], alone.guide.model), kept)
 
@@ -168,7 +167,7 @@ def own_labels(shift, count, answer=1.0):
 
 def test_without_a_simulator_held_out_answers_decide():
     how = dataclasses.replace(JUDGING, env=None, by="labels")
-    lanes = program.product(1, (0, 1), (40,), (10.0,))
+    lanes = product(1, (0, 1), (40,), (10.0,))
     base = Common(Shifted(jnp.array(-25.0)))
     one = own_labels(-25.0, 40)
     chance = np.random.default_rng(1).choice([-1.0, 0.0, 0.0, 0.0, 1.0], (1, 40, 1)).astype(np.float32)
@@ -181,14 +180,14 @@ def test_without_a_simulator_held_out_answers_decide():
     held = chance[0, 3::5, 0]
     assert judged.before[1] == pytest.approx((held == 0).mean())
     assert judged.after[1] <= judged.before[1]
-    few = program.begin(of(), program.product(1, (0,), (4,), (10.0,)))
+    few = begin(of(), product(1, (0,), (4,), (10.0,)))
     with pytest.raises(UserError, match="fewer than 5 labels"):
         judging.judged_by_labels(of(), few)
 
 
 def test_a_bound_is_narrowed_where_that_is_worth_more():
     """Wrong answers about a policy that is right already: within half of the window it stays right."""
-    lanes = program.product(1, (0,), (40,), (60.0,))
+    lanes = product(1, (0,), (40,), (60.0,))
     base = Common(Shifted(jnp.array(0.0)))
     wide, narrow = (
         adapting.adapt(of(base), lanes, dataclasses.replace(JUDGING, bounds=shares), labels=own_labels(0.0, 40))
@@ -209,14 +208,12 @@ def quarter(obs):
 
 @pytest.mark.long
 def test_an_opaque_function_gives_what_the_same_in_jax_gives():
-    lanes = program.product(1, (0,), (30,), (60.0,))
+    lanes = product(1, (0,), (30,), (60.0,))
     policies = [policy_of(quarter), policy_of(jax.jit(quarter))]
     assert [policy.on_host for policy in policies] == [True, False]
-    blocks = [program.begin(of(), lanes)] * 2
-    for _ in range(program.rounds(lanes, SIZES)):
-        blocks = [
-            program.ask_round(of(Common(policy)), EXPERT, block) for policy, block in zip(policies, blocks, strict=True)
-        ]
+    blocks = [begin(of(), lanes)] * 2
+    for _ in range(rounds(lanes, SIZES)):
+        blocks = [ask_round(of(Common(policy)), EXPERT, block) for policy, block in zip(policies, blocks, strict=True)]
     assert blocks[0].guide.labels.valid.sum() == 30
     chex.assert_trees_all_equal(*blocks)
 
