@@ -181,8 +181,11 @@ def actions_of(env: Any) -> Space:
 
 
 def action_of(env: Any) -> Quantity:
-    """What an action is, in words: an environment's own `action`, or a direction."""
-    return getattr(env, "action", DIRECTION)
+    """What an action is, in words: an environment's own `action`, a direction, or what its space says."""
+    space = actions_of(env)
+    return getattr(
+        env, "action", DIRECTION if space == DIRECTIONS else Quantity("action", space.size, "1", space.about)
+    )
 
 
 class Spaces(NamedTuple):

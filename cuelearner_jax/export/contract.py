@@ -28,9 +28,9 @@ from cuelearner_jax.export import operations, runner
 from cuelearner_jax.export.decisions import TOLERANCE, golden_cases
 from cuelearner_jax.export.formats import FORMATS, traced
 from cuelearner_jax.policies import Policy, describe
-from cuelearner_jax.spaces import check_directions
+from cuelearner_jax.spaces import DIRECTIONS
 from cuelearner_jax.storage.provenance import provenance
-from cuelearner_jax.storage.whole import Place, is_used, place_of, replacing
+from cuelearner_jax.storage.whole import is_used, place_of, replacing
 
 ANGLE = "atan2(action[1], action[0]) [rad]: 0 along x, positive counterclockwise (from x to y)"
 
@@ -57,75 +57,48 @@ def write(
 ) -> dict[str, Any]:
     """Writes a policy's decision and replays its golden cases; the folder is there as a whole or not at all.
 
-    Args:
-        policy: whose decision it is.
-        env: whose observations and actions the contract describes.
-        drawn: gives observations such as it will meet, among which golden cases are chosen.
-        format: a key of `FORMATS`.
-        out: the folder.
-        source: where the policy comes from, for the contract.
+    `drawn` gives observations of the environment, among which golden cases are chosen; `source` is for the contract.
 
-    Returns:
-        The contract, with "difference": the largest one of a golden case, just now.
-
-    Raises:
-        UserError: no such format; the folder is in use; the policy cannot be exported; its actions are no directions.
+    Returns the contract, with "difference": the largest one of a golden case, just now. Raises UserError if there is no
+    such format, the folder is in use, or the policy cannot be exported.
     """
-    check_directions(actions_of(env), "an exported decision", "call the policy from Python")
     check_request(format, out)
     with place_of(out, _check_free) as place:
-        return _made(policy, env.observation, action_of(env), drawn, format, place, source)
+        policy = jax.tree.map(jnp.asarray, jax.device_get(policy))  # what was trained may lie on several devices
+        artefact = FORMATS[format].make(policy, traced(policy, env.obs_size), env.obs_size, actions_of(env).size)
+        golden, cases = golden_cases(policy, drawn()), io.BytesIO()
+        np.savez(cases, obs=golden.obs, actions=golden.actions)
+        files = {artefact.file: artefact.contents, runner.GOLDEN: cases.getvalue(), "decide.py": decide_source()}
+        contract = {
+            "version": runner.VERSION,
+            "artefact": {"format": format, "file": artefact.file, **artefact.about},
+            "observation": {"size": env.obs_size, "dtype": "float32", "slices": _slices(env.observation)},
+            "action": _action(env, describe(policy)),
+            "batch": "observations (n, size), any n; every row is decided by itself",
+            "policy": describe(policy),
+            "source": source,
+            "golden": {"cases": len(golden.obs), "tolerance": TOLERANCE}
+            | {"drawn": golden.drawn, "steady": golden.steady},
+            "files": {name: hashlib.sha256(contents).hexdigest() for name, contents in files.items()},
+            **provenance(),
+        }
+        contract = json.loads(json.dumps(contract))
+        sealed = json.dumps({**contract, runner.DIGEST: runner.digest(contract)}, indent=1) + "\n"
+        with place.writing() as folder:
+            for name, contents in {**files, runner.CONTRACT: sealed.encode()}.items():
+                with replacing(folder / name, "wb") as file:
+                    file.write(contents)
+            return {**contract, "difference": checked(folder)}
 
 
-def _made(
-    policy: Policy,
-    observation: Sequence[Quantity],
-    action: Quantity,
-    drawn: Callable[[], Float[np.ndarray, "n obs"]],
-    format: str,
-    place: Place,
-    source: dict[str, Any],
-) -> dict[str, Any]:
-    """`write` at a place that is kept for it."""
-    policy = jax.tree.map(jnp.asarray, jax.device_get(policy))  # what was trained may lie on several devices
-    size = sum(quantity.size for quantity in observation)
-    found = traced(policy, size)
-    artefact = FORMATS[format].make(policy, found, size, action.size)
-    golden = golden_cases(policy, drawn())
-    cases = io.BytesIO()
-    np.savez(cases, obs=golden.obs, actions=golden.actions)
-    values = describe(policy)
-    files = {
-        artefact.file: artefact.contents,
-        runner.GOLDEN: cases.getvalue(),
-        "decide.py": decide_source(),
-    }
-    contract = {
-        "version": runner.VERSION,
-        "artefact": {"format": format, "file": artefact.file, **artefact.about},
-        "observation": {"size": size, "dtype": "float32", "slices": _slices(observation)},
-        "action": {
-            "name": action.name,
-            "size": action.size,
-            "unit": action.unit,
-            "about": action.about,
-            "dtype": "float32",
-            "angle": ANGLE,
-            "clip_radius_deg": values.get("clip_radius_deg"),
-        },
-        "batch": "observations (n, size), any n; every row is decided by itself",
-        "policy": values,
-        "source": source,
-        "golden": {
-            "cases": len(golden.obs),
-            "tolerance": TOLERANCE,
-            "drawn": golden.drawn,
-            "steady": golden.steady,
-        },
-        "files": {name: hashlib.sha256(contents).hexdigest() for name, contents in files.items()},
-        **provenance(),
-    }
-    return {**contract, "difference": _written(place, files, contract)}
+def _action(env: Any, policy: dict[str, Any]) -> dict[str, Any]:
+    """What an action is: its space with cues and units, and how far a guide leads from the policy's own."""
+    action, space, radius = action_of(env), actions_of(env), policy.get("clip_radius_deg")
+    told = {"name": action.name, "size": space.size, "unit": action.unit, "about": action.about, "dtype": "float32"}
+    told["space"] = space.to_json()
+    if space == DIRECTIONS:
+        return {**told, "angle": ANGLE, "clip_radius_deg": radius}
+    return {**told, "clip_radius": radius, "clip_radius_unit": space.unit}
 
 
 def decide_source() -> bytes:
@@ -141,18 +114,6 @@ def _slices(observation: Sequence[Quantity]) -> list[dict[str, Any]]:
         {"name": q.name, "from": end - q.size, "to": end, "size": q.size, "unit": q.unit, "about": q.about}
         for q, end in zip(observation, ends, strict=True)
     ]
-
-
-def _written(place: Place, files: dict[str, bytes], contract: dict[str, Any]) -> float:
-    """Writes everything beside the place, tries it there, and moves it."""
-    with place.writing() as folder:
-        for name, contents in files.items():
-            with replacing(folder / name, "wb") as file:
-                file.write(contents)
-        contract = json.loads(json.dumps(contract))
-        with replacing(folder / runner.CONTRACT) as file:
-            file.write(json.dumps({**contract, runner.DIGEST: runner.digest(contract)}, indent=1) + "\n")
-        return checked(folder)
 
 
 def checked(folder: Path) -> float:

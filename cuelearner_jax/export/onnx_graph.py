@@ -65,13 +65,7 @@ class _Writer:
         self._numbers = itertools.count()
 
     def nodes(self, ops: list[list[Any]], names: dict[str, str], suffix: str) -> list[Any]:
-        """Nodes of operations.
-
-        Args:
-            ops: the operations.
-            names: of values that are called otherwise here.
-            suffix: of the names of what they give.
-        """
+        """Nodes of operations; `names` are called otherwise here, what they give has a suffix."""
         outer, self._made = self._made, []
         self.names.update(names)
         for op, inputs, outputs, attributes in ops:
@@ -188,10 +182,6 @@ def _sliced(w: _Writer, x: str, start: list[int], stop: list[int], step: list[in
 
 # By the names of `operations.OPERATIONS`: (writer, names of inputs, attributes) -> name of the output.
 NODES: dict[str, Callable[..., str]] = {
-    **{
-        name.lower(): _plain(name)
-        for name in ("Neg", "Abs", "Sign", "Floor", "Ceil", "Round", "Exp", "Log", "Sin", "Cos")
-    },
     **{name.lower(): _plain(name) for name in ("Neg", "Abs", "Sign", "Floor", "Ceil", "Round", "Exp", "Log", "Sin")},
     **{name.lower(): _plain(name) for name in ("Cos", "Tan", "Tanh", "Atan", "Sqrt", "Not", "Add", "Sub", "Mul")},
     **{name.lower(): _plain(name) for name in ("Div", "Pow", "Max", "Min", "And", "Or", "Xor")},

@@ -2,7 +2,7 @@
 
     from decide import Decision
     decide = Decision("folder")        # verifies every file against the contract
-    action = decide(observation)       # (obs,) -> a unit vector (2,); or (n, obs) -> (n, 2)
+    action = decide(observation)       # (obs,) -> (action,); or (n, obs) -> (n, action)
 
 It needs Python and NumPy, nothing of cuelearner or JAX; decisions in ONNX also need onnxruntime, those in StableHLO
 need JAX. Every row of a batch is decided by itself.
@@ -50,10 +50,10 @@ class Decision:
         return sorted(path.name for path in self.folder.iterdir() if path.name not in known)
 
     def __call__(self, obs: Any) -> np.ndarray:
-        """The action for an observation (obs,), or for each of a batch (n, obs): unit vectors (2,) or (n, 2).
+        """The action for an observation (obs,), or for each of a batch (n, obs): (action,) or (n, action).
 
         Raises ContractError for an observation of another size, or one that is not finite in single precision; for a
-        decision that is no direction.
+        decision that is no action.
         """
         rows, size = _numbers(obs), self.contract["observation"]["size"]
         batch = rows[None] if rows.ndim == 1 else rows
@@ -67,7 +67,7 @@ class Decision:
         wanted = (len(batch), self.contract["action"]["size"])
         if actions.shape != wanted or actions.dtype.kind != "f" or not np.isfinite(actions).all():
             raise ContractError(f"{self.folder} decides on no finite numbers of shape {wanted}: export the policy anew")
-        if not actions.any(axis=-1).all():
+        if "angle" in self.contract["action"] and not actions.any(axis=-1).all():
             raise ContractError(f"{self.folder} decides on zero, which is no direction: export the policy anew")
         return actions[0] if rows.ndim == 1 else actions
 
@@ -84,7 +84,12 @@ class Decision:
             ) from None
 
     def angle(self, obs: Any) -> np.ndarray:
-        """The same as angles [rad], counterclockwise positive, 0 along x: () or (n,)."""
+        """Directions as angles [rad], counterclockwise positive, 0 along x: () or (n,).
+
+        Raises ContractError for a decision whose actions are no directions.
+        """
+        if "angle" not in self.contract["action"]:
+            raise ContractError(f"{self.folder} decides on actions without an angle: call it, and read its contract")
         actions = self(obs)
         return np.asarray(np.arctan2(actions[..., 1], actions[..., 0]))
 

@@ -92,6 +92,15 @@ class Box(Space):
     def _at(self, shares: Float[Array, "... action"]) -> Float[Array, "... action"]:
         return _row(self.low, shares) + _row(self._range, shares) * shares
 
+    def words_of(self, action: Any) -> str:
+        """Return each entry by the name of its cue."""
+        return ", ".join(f"{cue.name} {value:.3g}" for cue, value in zip(self.cues, np.asarray(action), strict=True))
+
+    @classmethod
+    def of_json(cls, about: dict[str, Any], cues: tuple[Cue, ...]) -> Box:
+        """Return the box of a file's bounds and cues."""
+        return cls(about["low"], about["high"], cues)
+
     def to_json(self) -> dict[str, Any]:
         """Describe the box with its bounds."""
         return {**super().to_json(), "low": list(self.low), "high": list(self.high)}

@@ -7,6 +7,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from cuelearner_jax.errors import UserError
@@ -82,6 +83,15 @@ class Choices(Space):
             return super().distance(action, other)
         differ = jnp.argmax(jnp.asarray(action), -1) != jnp.argmax(jnp.asarray(other), -1)
         return differ.astype(jnp.float32)
+
+    def words_of(self, action: Any) -> str:
+        """Return the number of the choice."""
+        return f"choice {int(np.argmax(action)) + 1} of {self.count}"
+
+    @classmethod
+    def of_json(cls, about: dict[str, Any], cues: tuple[Cue, ...]) -> Choices:
+        """Return the choices of a file's number and order."""
+        return cls(about["count"], *cues)
 
     def to_json(self) -> dict[str, Any]:
         """Describe the choices with their number."""

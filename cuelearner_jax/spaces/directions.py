@@ -96,6 +96,10 @@ class Directions(Space):
     cues = (Cue("turn", ("counterclockwise", "clockwise"), ("ArrowLeft", "ArrowRight"), "degrees"),)
     reach = 180.0
 
+    def words_of(self, action: Any) -> str:
+        """Return the angle of a direction."""
+        return f"{math.degrees(math.atan2(float(action[1]), float(action[0]))):.0f} degrees"
+
     def sample(self, key: PRNGKeyArray, shape: tuple[int, ...] = ()) -> Direction:
         """Draw directions uniformly (paper, Eq. 6)."""
         return uniform(key, shape)

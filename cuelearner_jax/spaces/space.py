@@ -31,6 +31,9 @@ class Cue:
     unit: str  # of a change in options and files: "degrees", "shares" (of the cue's range), "steps"
 
 
+KNOWN: dict[str, type[Space]] = {}  # by the names that files hold
+
+
 class Space:
     """A space of actions: frozen, hashable, compared by value, so that pytrees may hold one as a static field.
 
@@ -42,6 +45,12 @@ class Space:
     size: int  # entries of an action
     cues: tuple[Cue, ...]  # none: nobody can say in which way an action should change
     reach: float  # the largest change along a cue that means anything, in `unit`
+
+    def __init_subclass__(cls) -> None:
+        """Make a space of one's own known to `spaces.from_json`, by its name."""
+        super().__init_subclass__()
+        if "name" in vars(cls):
+            KNOWN[cls.name] = cls
 
     def sample(self, key: PRNGKeyArray, shape: tuple[int, ...] = ()) -> Float[Array, "*shape action"]:
         """Draw actions uniformly."""
@@ -69,6 +78,15 @@ class Space:
             "name": self.name,
             "cues": [{"name": c.name, "words": list(c.words), "keys": list(c.keys), "unit": c.unit} for c in self.cues],
         }
+
+    @classmethod
+    def of_json(cls, about: dict[str, Any], cues: tuple[Cue, ...]) -> Space:
+        """Return the space that `to_json` described; a space with parameters of its own reads them from `about`."""
+        return cls()
+
+    def words_of(self, action: Any) -> str:
+        """Return an action in words for people; here: its entries."""
+        return ", ".join(f"{value:.3g}" for value in np.asarray(action))
 
     @property
     def unit(self) -> str:

@@ -2,23 +2,20 @@
 
 import dataclasses
 import itertools
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import probes
 import pytest
+from box_task import EPS, SCALARS, SMALL, Reach
 from flax import struct
 
 from cuelearner_jax import asking
 from cuelearner_jax.agents import ddqn
 from cuelearner_jax.bridges import brax
-from cuelearner_jax.cli import label
-from cuelearner_jax.config import GuideScalars, GuideSizes
-from cuelearner_jax.environment import Quantity, WholeObservations, spaces_of
+from cuelearner_jax.environment import spaces_of
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.export import contract
 from cuelearner_jax.feedback import given
 from cuelearner_jax.feedback.answers import (
     DEMONSTRATION,
@@ -32,45 +29,14 @@ from cuelearner_jax.feedback.answers import (
 from cuelearner_jax.guides import registry
 from cuelearner_jax.guides.refining import refine
 from cuelearner_jax.policies import Uniform
-from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.spaces import UNSAID, Box, Cue, from_json
 from cuelearner_jax.storage import label_files
-from cuelearner_jax.task import Body, Task
 from cuelearner_jax.testing import check_environment
-from cuelearner_jax.types import Label, Step
+from cuelearner_jax.types import Label
 
-SMALL = Box((-1.0, 0.0, -2.0), (1.0, 4.0, 0.0))  # ranges 2, 4, 2
 LARGE = Box((-1.0,) * 7, tuple(1.0 + 0.5 * entry for entry in range(7)))
 KEY = jax.random.key(3)
-EPS = 0.1  # shares
-SCALARS = dataclasses.replace(
-    probes.SCALARS, eps_deg=EPS, tau_deg=0.01, tau_max_deg=1.0, scalar_within_deg=0.2, k_max=50
-)
 boxes = pytest.mark.parametrize("box", [SMALL, LARGE], ids=["three", "seven"])
-
-
-class Reach(WholeObservations, struct.PyTreeNode):
-    """A bandit with actions of a box: rewarded within 0.1 of the ranges of a goal, which the observation tells."""
-
-    actions: Box = struct.field(pytree_node=False, default=SMALL)
-
-    observation = (Quantity("context", 2, "1"),)
-    action = Quantity("reach", 3, "1", "a vector of the box")
-
-    def best(self, obs):
-        """The middle of the box, and a fifth of the range of its first two entries along the observation."""
-        shares = jnp.zeros(self.actions.size).at[:2].set(0.2 * obs)
-        return self.actions.exp(self.actions.spread(1)[0], shares)
-
-    def reset(self, key):
-        angle = jax.random.randint(key, (), 0, 4) * (jnp.pi / 2)
-        obs = jnp.stack([jnp.cos(angle), jnp.sin(angle)])
-        return obs, obs
-
-    def step(self, key, state, action):
-        reward = (self.actions.distance(self.best(state), action) <= 0.1).astype(jnp.float32)
-        following, obs = self.reset(key)
-        return following, Step(obs, state, state, reward, jnp.array(True), jnp.array(False), {"hit": reward}, {})
 
 
 def pairs(box, count=64):
@@ -261,22 +227,12 @@ def test_a_label_file_holds_answers_about_a_box(form, tmp_path):
         given.check_file(spoilt, None, form, "labels.parquet")
 
 
-def labelled():
-    """What `cuelearner label` plans for a task whose actions are a box."""
-    body = Body("arm", "", lambda config, split: Reach())
-    task, config = Task("reach", "a box", probes.WindowConfig, (body,)), probes.WindowConfig()
-    asked = label.Label(config, GuideSizes(), GuideScalars(), Path("labels"), guidance="relative")
-    return label.planned(task, RunConfig(config), asked, None)
-
-
 @pytest.mark.parametrize(
     ("what", "planar"),
     [
         ("guidance 'offset'", lambda: registry.make("offset", probes.SIZES, Reach())),
         ("agent.coarse_directions", lambda: ddqn.Config(coarse_directions=36).make("raw", spaces_of(Reach()))),
-        ("an exported decision", lambda: contract.write(Uniform(SMALL), Reach(), list, "numpy", Path("new"), {})),
         ("to_brax", lambda: brax.to_brax(Reach())),
-        ("the labelling page", labelled),
     ],
 )
 def test_what_knows_directions_alone_refuses_a_box(what, planar):
