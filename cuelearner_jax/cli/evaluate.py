@@ -4,23 +4,22 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Generic
+from typing import Any, Generic
 
 import numpy as np
 from rich.table import Table
 
-from cuelearner_jax.cli.parsing import about, out, parse, source_of, world_of
-from cuelearner_jax.cli.shared_options import TaskT
+from cuelearner_jax.cli.parsing import out
+from cuelearner_jax.cli.shared_options import TaskT, asked_of_source
 from cuelearner_jax.errors import UserError
+from cuelearner_jax.report import measurements
+from cuelearner_jax.report.measurements import Difference
 from cuelearner_jax.runs.trained import POLICIES, PolicySource
 from cuelearner_jax.storage import policy_folders
 from cuelearner_jax.studies import evaluate
 from cuelearner_jax.studies.evaluate import EvaluateRequest, Measured
 from cuelearner_jax.tasks import registry
 from cuelearner_jax.terminal import console, progress_bars, watched_by
-
-if TYPE_CHECKING:
-    from cuelearner_jax.report.measurements import Difference
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,11 +44,7 @@ OPTIONS = {"evaluate": Evaluate}
 
 def run(arguments: list[str]) -> None:
     """Runs the command. Raises UserError for what cannot be evaluated."""
-    source, rest = source_of(arguments, "evaluate", Evaluate)
-    kind = Evaluate[source.task.config]  # pyright: ignore[reportInvalidTypeArguments]
-    default = kind(task=world_of(source, rest), policy=source.default_policy)
-    asked = parse(kind, rest, f"evaluate {source.folder}", default, about(Evaluate, source.task, policies=True))
-    source = source.on(asked.robot)
+    source, asked = asked_of_source(arguments, "evaluate", Evaluate)
     source.task.engine(asked.engine)
     source.check(asked.policy, asked.task, guidance=asked.guidance)
     envs, steps = evaluate.amount(source.task, asked)
@@ -60,8 +55,6 @@ def run(arguments: list[str]) -> None:
         watch = watched_by(bars)
         found = evaluate.run(source, asked, watch)
         others = evaluate.run(other[0], replace(asked, policy=other[1], guidance=()), watch) if other else []
-    from cuelearner_jax.report import measurements  # loads SciPy
-
     compared = measurements.differences(found, others) if other else None
     told = {"robot": asked.robot, "engine": asked.engine, "scenario": asked.scenario}
     told = {name: value for name, value in told.items() if value}
@@ -106,19 +99,11 @@ def _other(source: PolicySource, asked: Evaluate[Any]) -> tuple[PolicySource, st
 
 
 def _measurements(found: list[Measured], title: str, episodes: str) -> Table:
-    """Means with their intervals, a section for each guidance and budget.
-
-    Args:
-        found: the rows.
-        title: of the table.
-        episodes: what the interval of a single policy is over.
-    """
-    from cuelearner_jax.report import measurements
-
+    """Means with their intervals, those of one policy over `episodes`; a section for each guidance and budget."""
     columns = {
         "guidance": lambda row: row.guidance,
         "labels": lambda row: str(row.labels),
-        "within": lambda row: "" if row.bound_deg is None else f"{row.bound_deg:g} deg",
+        "within": lambda row: row.within,
         "seeds": lambda row: str(len(row.seeds)),
         "trained steps": lambda row: f"{row.step:,}",
     }
@@ -148,8 +133,6 @@ def _measurements(found: list[Measured], title: str, episodes: str) -> Table:
 
 def _over(found: list[Measured], episodes: str) -> str:
     """What means and intervals are over."""
-    from cuelearner_jax.report import measurements
-
     kinds = {measurements.over(row) for row in found}
     told = {
         measurements.EPISODES: f"one policy: mean and bootstrap over {episodes}",
@@ -160,8 +143,6 @@ def _over(found: list[Measured], episodes: str) -> str:
 
 def _comparison(difference: Difference, other: str, title: str, episodes: str) -> Table:
     """Two policies side by side, with their difference."""
-    from cuelearner_jax.report import measurements
-
     mine, its = (measurements.variant(row) for row in (difference.row, difference.other))
     over = f"{episodes}, paired" if difference.over == measurements.EPISODES else "seeds (interquartile means)"
     named = " against ".join(name + (f" ({told})" if told else "") for name, told in ((title, mine), (other, its)))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import shlex
 import webbrowser
 from dataclasses import dataclass, field
 from functools import partial
@@ -14,11 +15,8 @@ import numpy as np
 
 from cuelearner_jax import config as configuration
 from cuelearner_jax.adaptation import adapting
-from cuelearner_jax.api.acting import load_policy
-from cuelearner_jax.api.worlds import World
-from cuelearner_jax.cli import label_commands
-from cuelearner_jax.cli.parsing import PAPER, about, code_of, out, parse, preset_of, taken, task_of
-from cuelearner_jax.cli.shared_options import Flag, TaskT, asking_kind, preset_kinds
+from cuelearner_jax.cli.parsing import PAPER, about, check_numbers, code_of, out, parse, preset_of, taken, task_of
+from cuelearner_jax.cli.shared_options import Flag, Lane, TaskT, asking_kind, preset_kinds
 from cuelearner_jax.config import GuideScalars, GuideSizes
 from cuelearner_jax.environment import actions_of, offers
 from cuelearner_jax.errors import UserError
@@ -31,7 +29,6 @@ from cuelearner_jax.policies import NearAims, uniform_in
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs.grid import LARGEST_SEED
 from cuelearner_jax.runs.trained import PolicySource
-from cuelearner_jax.spaces import check_directions
 from cuelearner_jax.storage import label_files
 from cuelearner_jax.storage.folders import claimed
 from cuelearner_jax.task import Task, shape_of
@@ -43,22 +40,6 @@ REACH = 1.5  # of questions near an aim: from the aim, in turns by eps
 PRESET = "quickstart"  # where none is given and chance is asked about: what is labelled trains in minutes
 PRACTICE = len(controls.PRACTICE)  # questions
 MOST_LABELS = 100_000
-
-
-@dataclass(frozen=True)
-class Lane:
-    """Which lane of the folder is asked about."""
-
-    policy: str | None = None
-    """Which of its policies, as for evaluate (default: the agent, or the adapted)."""
-    guidance: str | None = None
-    """Kind of guidance of the lane (default: the run's last)."""
-    labels: int | None = None
-    """Its label budget (default: the largest)."""
-    bound_deg: float | None = None
-    """Of a policy folder: its bound (default: the largest) [deg]."""
-    seed: int | None = None
-    """Its seed (default: the first)."""
 
 
 @dataclass(frozen=True)
@@ -142,9 +123,8 @@ def run(arguments: list[str]) -> None:
     asked = parse(kind, rest, f"label {task.name}", default, about(Label, task, preset=usual))
     plan = planned(task, preset.config, asked, named, source)
     config = preset.config if source is None else dataclasses.replace(preset.config, task=world)
-    commands = server.Commands(
-        label_commands.again(typed), partial(label_commands.following, task, chosen, config, asked, named)
-    )
+    again = shlex.join(["cuelearner", "label", *typed])
+    commands = server.Commands(again, partial(_following, task, chosen, config, asked, named))
     # The port first: where it is refused, nothing has been made.
     with server.bound(asked.port) as port, claimed(asked.out), interruptible("the answer of the moment") as stopping:
         finished = _served(server, plan, asked, port, stopping, commands)
@@ -164,12 +144,7 @@ def planned(
         scalars=dataclasses.replace(config.scalars, **dataclasses.asdict(asked.scalars)),
     )
     configuration.check_guide(merged.sizes, merged.scalars)
-    if not 1 <= asked.labels <= MOST_LABELS:
-        raise UserError(f"--labels is {asked.labels}: give a number from 1 to {MOST_LABELS:,}")
-    if not 0 <= asked.seed < LARGEST_SEED:
-        raise UserError(f"--seed is {asked.seed}: give a number from 0 to {LARGEST_SEED - 1}")
-    if not 0 <= asked.port < 65536:
-        raise UserError(f"--port is {asked.port}: give a number from 0 to 65535")
+    check_numbers(asked, labels=(1, MOST_LABELS), seed=(0, LARGEST_SEED - 1), port=(0, 65535))
     if not asked.who.strip():
         raise UserError("--who is empty: give a name, or leave it out")
     if merged.sizes.candidates > 1:
@@ -177,7 +152,6 @@ def planned(
     robot, task = _robot(task, asked.robot), task.on(asked.robot)
     env = shape_of(task, asked.task)
     space = actions_of(env)
-    check_directions(space, "the labelling page", "collect answers with a program of your own, and give --labels-from")
     if asked.bound_deg is not None and not 0 < asked.bound_deg <= space.reach:
         raise UserError(
             f"--bound-deg is {asked.bound_deg:g}: give a number above 0 and up to {space.reach:g} ({space.unit})"
@@ -188,14 +162,11 @@ def planned(
     if guidance.form is None:
         asking = [kind.name for kind in guidances.known() if kind.asks]
         raise UserError(f"guidance {guidance.name!r} asks for no labels: give --guidance {' or '.join(asking)}")
+    controls.check(guidance.form, space)
+    wanted = asked.labels, asked.seed, asked.who.strip(), asked.bound_deg, robot
     if asked.again is not None:
-        return _second(
-            Plan(task, merged, guidance, Base(uniform_in(env), ""), asked.labels, who=asked.who.strip(), robot=robot),
-            asked,
-            named,
-        )
-    base = _base(task, asked, named, source, env)
-    return Plan(task, merged, guidance, base, asked.labels, asked.seed, asked.who.strip(), asked.bound_deg, robot)
+        return _second(Plan(task, merged, guidance, Base(uniform_in(env), ""), *wanted), asked, named)
+    return Plan(task, merged, guidance, _base(task, asked, named, source, env), *wanted)
 
 
 def _robot(task: Task, name: str | None) -> str:
@@ -256,10 +227,10 @@ def _base(task: Task, asked: Label[Any], named: str | None, source: PolicySource
             raise UserError(f"--questions is {NEAR_AIMS}, but {task.name} has no aims in this world: give {UNIFORM}")
         reach = float(actions_of(env).from_unit(REACH * asked.scalars.eps_deg))
         return Base(NearAims(task.view(asked.task), reach), NEAR_AIMS)
-    found = load_policy(source.folder, task=task, world=World(task, asked.task), **dataclasses.asdict(lane))
-    if found.observation and tuple(found.observation) != tuple(env.observation):
+    name = lane.name_in(source, asked.task)
+    if tuple(shape_of(source.task, asked.task).observation) != tuple(env.observation):
         raise UserError(f"{source.folder} acts on other observations than this world has: give a policy of this world")
-    return Base(found.policy, f"{source.folder.resolve().name}, {lane.policy or source.default_policy}")
+    return Base(lane.policy_in(source, asked.task, None), f"{source.folder.resolve().name}, {name}")
 
 
 def _part(kind: type, values: Any) -> Any:
@@ -295,3 +266,40 @@ def _served(server: Any, plan: Plan, asked: Label[Any], port: Any, stopping: Any
 
     with Session(plan, asked.out, tell, practice=PRACTICE if asked.practice else 0) as session:
         return server.serve(session, port, stopping, open_page, commands)
+
+
+def _following(task: Task, preset: str, config: RunConfig, asked: Any, policy: str | None, labels: int) -> str:
+    """The command that uses so many labels: `train` for labels of chance, `adapt` for those about a policy.
+
+    `asked` are the options of `cuelearner label` as they were used, `config` the preset's configuration.
+    """
+    name, out = task.origin or task.name, str(asked.out)
+    if asked.again is not None:
+        return shlex.join(["cuelearner", "labels", "inspect", str(asked.again), out])
+    given = ["--labels-from", out, "--labels", str(labels)]
+    if policy is None:
+        words = ["train", name, "--preset", preset, "--guidance", asked.guidance, *given]
+        parts = ("task", task.config), ("sizes", GuideSizes), ("scalars", GuideScalars)
+        for part, kind in parts:
+            words += _differing(part, kind, getattr(config, part), getattr(asked, part))
+        return shlex.join(["cuelearner", *words, "--out", f"runs/{Path(out).name}"])
+    words = ["adapt", policy, *(["--task", name] if not Path(policy).exists() else [])]
+    words += [] if asked.scenario is None else ["--scenario", asked.scenario]
+    words += [] if asked.robot is None else ["--robot", asked.robot]
+    words += ["--guidance", asked.guidance, *given]
+    words += _differing("task", task.config, config.task, asked.task)
+    return shlex.join(["cuelearner", *words, "--out", f"policies/{Path(out).name}"])
+
+
+def _differing(part: str, kind: type, before: Any, now: Any) -> list[str]:
+    """The options that make one part of a configuration another."""
+    words = []
+    for entry in dataclasses.fields(kind):
+        value, option = getattr(now, entry.name), entry.name.replace("_", "-")
+        if value == getattr(before, entry.name):
+            continue
+        if isinstance(value, bool):
+            words.append(f"--{part}.{option}" if value else f"--{part}.no-{option}")
+        else:
+            words += [f"--{part}.{option}", *map(str, value if isinstance(value, tuple) else (value,))]
+    return words

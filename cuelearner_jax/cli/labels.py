@@ -19,6 +19,7 @@ from cuelearner_jax.config import Scalars
 from cuelearner_jax.errors import UserError, closest, one_line
 from cuelearner_jax.labelling import comparing
 from cuelearner_jax.report.escaping import cell
+from cuelearner_jax.spaces import UNSAID
 from cuelearner_jax.storage import label_files
 from cuelearner_jax.storage.label_checks import UNDONE, UNSURE
 from cuelearner_jax.storage.label_files import LabelFile
@@ -105,7 +106,9 @@ def _told(path: Path, file: LabelFile, teacher: bool) -> dict[str, str]:
     form = comparing.form_of(file)
     if form is not None and form.values is not None:
         counts = Counter(np.asarray(file.labels.answer).ravel().tolist())
-        facts["of each answer"] = ", ".join(f"{value:g}: {counts.get(value, 0)}" for value in form.values(file.space))
+        names = {UNSAID: "not said"} if form.by_eps else {}
+        values = form.values(file.space)
+        facts["of each answer"] = ", ".join(f"{names.get(one, f'{one:g}')}: {counts.get(one, 0)}" for one in values)
     if file.said:
         facts["not known"], facts["taken back"] = (str(file.said.get(name, 0)) for name in (UNSURE, UNDONE))
     if file.session:

@@ -50,12 +50,7 @@ def summary(kind: type) -> str:
 def parse(kind: Any, arguments: list[str], program: str, default: Any = None, about: str | None = None) -> Any:
     """Arguments as a dataclass. Raises UserError with tyro's message in one line, or for an `out` that cannot be.
 
-    Args:
-        kind: the dataclass.
-        arguments: what was typed after the command and its task.
-        program: the command, as the help shows it.
-        default: an instance whose values hold where nothing was typed.
-        about: the text above the options (default: the docstring of the dataclass).
+    `program` is the command as its help shows it, `about` the text above the options (default: the kind's docstring).
     """
     errors = io.StringIO()
     keywords = {
@@ -109,12 +104,7 @@ WIDE, NARROW = 118, 99  # columns of a first page, and those within which tyro's
 
 
 def _first_page(tell: Callable[[], Any], program: str) -> str:
-    """What one needs of a help page: what there is to choose from, and the command's own options, a line each.
-
-    Args:
-        tell: prints the whole page, by tyro.
-        program: the command.
-    """
+    """What one needs of the page that `tell` prints: what there is to choose from, and own options, a line each."""
     whole, before = io.StringIO(), os.environ.get("COLUMNS")
     os.environ["COLUMNS"] = str(NARROW)
     try:
@@ -140,6 +130,13 @@ def _first_page(tell: Callable[[], Any], program: str) -> str:
             others.append(f"{title} ({sum(name.startswith('--') for name, _ in options)})")
     whole_page = f"The whole page, with {', '.join(others) or 'all of each line'}: {program} {HELP_ALL}"
     return "\n".join([*lines, "", *textwrap.wrap(whole_page, WIDE, break_on_hyphens=False)])
+
+
+def check_numbers(asked: Any, **bounds: tuple[int, int]) -> None:
+    """Raises UserError for the first option, by its field, that is not within its bounds (least, most)."""
+    for name, (least, most) in bounds.items():
+        if not least <= (value := getattr(asked, name)) <= most:
+            raise UserError(f"--{name} is {value}: give a number from {least} to {most:,}")
 
 
 def _check_given(arguments: list[str]) -> None:
@@ -272,14 +269,7 @@ def world_of(source: PolicySource, arguments: list[str]) -> Any:
 
 
 def about(kind: type, task: Task, policies: bool = False, preset: str = PAPER) -> str:
-    """The text above a command's options: what it does, and what there is to choose from.
-
-    Args:
-        kind: the command's options.
-        task: with its presets, changed worlds and robots.
-        policies: does one choose among policies?
-        preset: that holds where none is given.
-    """
+    """The text above a command's options: what it does, and what there is to choose from."""
     groups = {"guidance (--guidance; your own as package.module:NAME)": {k.name: k.about for k in guidances.known()}}
     if policies:
         trained = {name: named.about for name, named in POLICIES.items() if named.trained}

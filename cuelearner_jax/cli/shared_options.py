@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, make_dataclass, replace
 from itertools import takewhile
 from pathlib import Path
@@ -10,18 +10,66 @@ from typing import Annotated, Any, Generic, TypeVar
 
 import tyro
 
-from cuelearner_jax.cli.parsing import taken
+from cuelearner_jax.cli.parsing import about, parse, preset_of, source_of, taken, task_of, world_of
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.run_config import PARTS, RunConfig
+from cuelearner_jax.runs import trained
 from cuelearner_jax.runs.grid import Grid
 from cuelearner_jax.runs.order import Order
 from cuelearner_jax.runs.shards import Shard
+from cuelearner_jax.runs.trained import PolicySource
 from cuelearner_jax.task import Preset, Task, shape_of
 
 TaskT = TypeVar("TaskT")
 RunT = TypeVar("RunT", bound=RunConfig)
 KindsT = TypeVar("KindsT")
 Flag = tyro.conf.FlagCreatePairsOff
+
+
+@dataclass(frozen=True, kw_only=True)
+class Lane:
+    """Which policy of a folder, and which of its lanes."""
+
+    policy: str | None = None
+    """Who acts, as for evaluate (default: the agent, or the adapted policy)."""
+    guidance: str | None = None
+    """Kind of guidance of the lane (default: the run's last)."""
+    labels: int | None = None
+    """Label budget of the lane (default: the largest)."""
+    bound_deg: float | None = None
+    """Bound of a policy folder's lane (default: the largest) [deg]."""
+    seed: int | None = None
+    """Seed of the lane (default: the first)."""
+
+    @property
+    def chosen(self) -> dict[str, Any]:
+        """What was given of the lane, by the names of the options."""
+        lane = {"guidance": self.guidance, "labels": self.labels, "seed": self.seed, "bound-deg": self.bound_deg}
+        return {name: value for name, value in lane.items() if value is not None}
+
+    def name_in(self, source: PolicySource, world: Any) -> str:
+        """Return the policy's name. Raises UserError if the source has none of that name, or none for that world."""
+        name = self.policy or source.default_policy
+        source.check(name, world, **self.chosen)
+        return name
+
+    def policy_in(self, source: PolicySource, world: Any, env: Any) -> Any:
+        """Return the single policy. Raises UserError if there is no such lane."""
+        name = self.policy or source.default_policy
+        return trained.one_policy(source, world, name, self.guidance, self.labels, self.seed, self.bound_deg, env)
+
+
+def asked_of_source(arguments: list[str], command: str, kind: Any, more: str = "") -> tuple[PolicySource, Any]:
+    """Return where policies come from, with the robot that is asked for, and the options of a command.
+
+    `kind` is generic in the task's configuration; `more` is text below the help's. Raises UserError for what there is
+    not.
+    """
+    source, rest = source_of(arguments, command, kind)
+    default = kind[source.task.config](task=world_of(source, rest), policy=source.default_policy)
+    told = f"{about(kind, source.task, policies=True)}{more}"
+    asked = parse(kind[source.task.config], rest, f"{command} {source.folder}", default, told)
+    return source.on(getattr(asked, "robot", None)), asked
 
 
 @dataclass(frozen=True)
@@ -63,24 +111,31 @@ class Training(Generic[RunT]):
         return f"done: {self.out} (see it with: cuelearner report {self.out} --out {self.out}/report)"
 
 
+def asked_of_preset(
+    arguments: list[str], command: str, kind: Any, suggested: Callable[[Preset, tuple[str, ...]], dict[str, Any]]
+) -> tuple[Task, Any]:
+    """Return the task and the options of a command that trains. Raises UserError for what there is not.
+
+    `kind` is generic in the run's configuration; `suggested` gives options that hold where none are typed.
+    """
+    task, rest = task_of(arguments, command, kind)
+    name, preset, rest = preset_of(task, rest)
+    kinds = preset_kinds(task, preset)
+    config, run_type, rest = parts_of(preset.config, rest, kinds)
+    default = kind[run_type](config, out=Path("runs") / f"{task.name}-{name}", **suggested(preset, kinds))
+    return task, parse(kind[run_type], rest, f"{command} {task.name}", default, about(kind, task))
+
+
 def as_kept(run: RunConfig) -> RunConfig:
     """A configuration of the command line with its options of kinds by name."""
     return replace(run, kinds=vars(run.kinds))
 
 
 def parts_of(config: RunConfig, arguments: list[str], kinds: tuple[str, ...]) -> tuple[RunConfig, Any, list[str]]:
-    """The configuration with the agent and the arbiter that are asked for, and options of kinds that are in use.
+    """A preset's configuration with the agent, the arbiter and the options of kinds that are asked for.
 
-    Args:
-        config: a preset's; its own options of a part hold if the part is the same.
-        arguments: what was typed; --agent and --arbiter name parts.
-        kinds: of guidance, by name or as package.module:NAME, where --guidance names none.
-
-    Returns:
-        The configuration, its `kinds` a dataclass; its type, of which tyro makes options; the other arguments.
-
-    Raises:
-        UserError: a part that cannot be had.
+    Returns the configuration, its `kinds` a dataclass; its type, of which tyro makes options; the other arguments.
+    Raises UserError for a part that cannot be had.
     """
     for name, known in PARTS.items():
         asked, arguments = taken(arguments, f"--{name}", ", ".join(kind.NAME for kind in known.known))

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Generic, Literal
+from typing import Any, Generic, Literal
 
-from cuelearner_jax.cli.parsing import about, out, parse, preset_of, task_of
-from cuelearner_jax.cli.shared_options import RunT, Training, parts_of, preset_kinds
+from cuelearner_jax.cli.parsing import out
+from cuelearner_jax.cli.shared_options import RunT, Training, asked_of_preset
 from cuelearner_jax.runs import submission, sweep
 from cuelearner_jax.runs.cluster import Job
 from cuelearner_jax.runs.grid import Grid, seeds_of
 from cuelearner_jax.runs.order import Plan, planned
 from cuelearner_jax.runs.shards import Shard
+from cuelearner_jax.task import Preset
 
 
 @dataclass(frozen=True)
@@ -43,20 +43,11 @@ OPTIONS = {"sweep": Sweep}
 
 def run(arguments: list[str]) -> None:
     """Runs the command. Raises what `sweep.run` and `submission.submit` raise."""
-    task, rest = task_of(arguments, "sweep", Sweep)
-    name, preset, rest = preset_of(task, rest)
-    kinds = preset_kinds(task, preset)
-    config, run_type, rest = parts_of(preset.config, rest, kinds)
-    kind = Sweep[run_type]  # pyright: ignore[reportInvalidTypeArguments]
-    default = kind(
-        config,
-        out=Path("runs") / f"{task.name}-{name}",
-        guidance=kinds,
-        labels=preset.labels,
-        seeds=preset.seeds,
-        first_seed=preset.first_seed,
-    )
-    asked = parse(kind, rest, f"sweep {task.name}", default, about(Sweep, task))
+
+    def suggested(preset: Preset, kinds: tuple[str, ...]) -> dict[str, Any]:
+        return {"guidance": kinds, **{name: getattr(preset, name) for name in ("labels", "seeds", "first_seed")}}
+
+    task, asked = asked_of_preset(arguments, "sweep", Sweep, suggested)
     grid = Grid(asked.guidance, seeds_of(asked.first_seed, asked.seeds), asked.labels)
     submission.check(asked.cluster, asked.shards, asked.job, asked.shard, asked.overwrite, asked.out)
     if asked.cluster:

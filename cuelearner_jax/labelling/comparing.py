@@ -18,8 +18,7 @@ from cuelearner_jax.errors import UserError
 from cuelearner_jax.feedback import given
 from cuelearner_jax.feedback.forms import AnswerForm
 from cuelearner_jax.guides import registry as guidances
-from cuelearner_jax.labelling.living import keys_of, lived
-from cuelearner_jax.labelling.programs import Agreement, agreement, as_teacher
+from cuelearner_jax.labelling.programs import Agreement, agreement, as_teacher, keys_of, lived
 from cuelearner_jax.storage import label_files
 from cuelearner_jax.storage.label_files import LabelFile
 from cuelearner_jax.task import Task
@@ -58,15 +57,8 @@ def with_teacher(
 ) -> Agreement:
     """How well a page's labels agree with the answers of the task's teacher, who makes no faults.
 
-    Args:
-        task: whose teacher is asked.
-        file: the labels.
-        rows: all rows of it, see `label_files.history`; the situations are lived through anew.
-        scalars: what counts of a teacher's answers, but for eps, which is the file's.
-        tell: is told what is being done.
-
-    Raises:
-        UserError: the task has no teacher, or the file's situations cannot be had again.
+    The situations of all `rows` (`label_files.history`) are lived through anew. Raises UserError if the task has no
+    teacher, or the situations cannot be had again.
     """
     form = form_of(file)
     if form is None or file.people is None or file.session is None:

@@ -1,14 +1,27 @@
-"""What a person may press, and what the answers mean: derived from their form, so that each form has a page."""
+"""What a person may press, and what the answers mean: from the form of answers and the space of actions."""
 
 from __future__ import annotations
 
-import math
+from collections.abc import Mapping
 from typing import NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 
+from cuelearner_jax.errors import UserError
 from cuelearner_jax.feedback.forms import AnswerForm
-from cuelearner_jax.spaces import DIRECTIONS
+from cuelearner_jax.spaces import DIRECTIONS, UNSAID, Cue, Space
+
+# What is said on the page of a turn, by somebody who walks along the arrow: its cue says counterclockwise, clockwise.
+WALKED = ("more to the left", "more to the right")
+BESIDE = {"ArrowLeft": "aA", "ArrowRight": "dD"}  # keys for the other hand
+SHOWN = {" ": "space", "Backspace": "⌫", "Enter": "⏎"}  # keys, for people
+SHOWN |= {"ArrowLeft": "←", "ArrowRight": "→", "ArrowUp": "↑", "ArrowDown": "↓"}
+PRACTICE = (  # what a person is to try, one a question of practice
+    "Compare the action with what is wanted, then answer by key, button or click.",
+    "Where you cannot tell, press ↓: it costs nothing. F shows a film of where the action leads.",
+    "An answer can be taken back with ⌫. After this one it counts.",
+)
 
 
 class Control(NamedTuple):
@@ -16,73 +29,121 @@ class Control(NamedTuple):
 
     name: str  # of its event
     words: str
-    keys: tuple[str, ...]  # as browsers call them (`KeyboardEvent.key`)
-    shown: str  # the keys, for people
+    keys: tuple[str, ...] = ()  # as browsers call them (`KeyboardEvent.key`)
     answer: tuple[float, ...] | None = None  # in the words of the form; None: no answer
     colour: str = ""  # of the button, and of the arrow that shows what it would do: a name of `outcomes`
+    cue: int | None = None  # of several: the one that it answers about; None: it gives the whole answer
+
+    @property
+    def shown(self) -> str:
+        """The first of its keys, for people."""
+        return _shown(self.keys[0]) if self.keys else ""
 
 
-UNSURE = Control("unsure", "don't know", ("ArrowDown", "s", "S"), "↓")
-UNDO = Control("undo", "undo", ("Backspace", "u", "U"), "⌫")
-FILM = Control("film", "film", ("f", "F"), "F")
-HELP = Control("help", "help", ("h", "H", "?"), "H")
-TURNED_FILMS = (
-    Control("film-left", "film of more to the left", ("q", "Q"), "Q"),
-    Control("film-right", "film of more to the right", ("e", "E"), "E"),
-)
-LEFT = Control("+1", "more to the left", ("ArrowLeft", "a", "A"), "←", (1.0,), "left")
-RIGHT = Control("-1", "more to the right", ("ArrowRight", "d", "D"), "→", (-1.0,), "right")
-AS_IT_IS = Control("0", "already right", ("ArrowUp", "w", "W", " "), "↑", (0.0,), "asked")
-KEYS = {" ": "space", "ArrowLeft": "←", "ArrowRight": "→", "ArrowUp": "↑", "ArrowDown": "↓"}  # for people
-PRACTICE = (  # what a person is to try, one a question of practice
-    "Compare the arrows with what is wanted, then answer by key, button or click.",
-    "Where you cannot tell, press ↓: it costs nothing. F shows a film of where the arrow leads.",
-    "An answer can be taken back with ⌫. After this one it counts.",
-)
+UNSURE = Control("unsure", "don't know", ("ArrowDown", "s", "S"))
+UNDO = Control("undo", "undo", ("Backspace", "u", "U"))
+FILM = Control("film", "film", ("f", "F", "v", "V"))
+HELP = Control("help", "help", ("h", "H", "?"))
+AS_IT_IS = Control("0", "already right", ("ArrowUp", "w", "W", " "), (0.0,), "asked")
+REST_UNSAID = Control("send", "send, of the others nothing is said", ("Enter",), (UNSAID,))
+REST_RIGHT = Control("rest", "send, the others are already right", (" ", "ArrowUp"), (0.0,))
 
 
-def answers(form: AnswerForm) -> tuple[Control, ...]:
+def _shown(key: str) -> str:
+    return SHOWN.get(key, key.upper() if len(key) == 1 else key)
+
+
+def _either(key: str) -> tuple[str, ...]:
+    """A key, of a letter both of its cases."""
+    return tuple(dict.fromkeys((key.lower(), key.upper()))) if len(key) == 1 else (key, *BESIDE.get(key, ""))
+
+
+def _of_cue(number: int, cue: Cue) -> tuple[Control, ...]:
+    """What can be said about one cue of several."""
+    more, less = (_either(key) for key in cue.keys)
+    return (
+        Control(f"pick-{number}-more", cue.words[0], more, (1.0,), "left", number),
+        Control(f"pick-{number}-right", "already right", (), (0.0,), "asked", number),
+        Control(f"pick-{number}-less", cue.words[1], less, (-1.0,), "right", number),
+        Control(f"pick-{number}-unsaid", "not said", (), (UNSAID,), "", number),
+    )
+
+
+def answers(form: AnswerForm, space: Space) -> tuple[Control, ...]:
     """The answers that a form has, in the order of their buttons; none where an answer is pointed at."""
+    if form.by_eps and len(space.cues) == 1:
+        cue = space.cues[0]
+        words = WALKED if space == DIRECTIONS else cue.words
+        more, less = (_either(key) for key in cue.keys)
+        return Control("+1", words[0], more, (1.0,), "left"), AS_IT_IS, Control("-1", words[1], less, (-1.0,), "right")
     if form.by_eps:
-        return LEFT, AS_IT_IS, RIGHT
+        about_cues = (control for number, cue in enumerate(space.cues) for control in _of_cue(number, cue))
+        return (*about_cues, REST_RIGHT, REST_UNSAID)
     if form.values is None:
         return ()
-    if set(form.values(DIRECTIONS)) == {0.0, 1.0}:
-        no = Control("no", "no", ("ArrowLeft", "n", "N"), "←", (0.0,))
-        yes = Control("yes", "yes", ("ArrowRight", "y", "Y"), "→", (1.0,))
-        return no, yes
+    values = form.values(space)
+    if set(values) == {0.0, 1.0}:
+        no = Control("no", "no", ("ArrowLeft", "n", "N"), (0.0,))
+        return no, Control("yes", "yes", ("ArrowRight", "y", "Y"), (1.0,))
     return tuple(
-        Control(f"value-{place}", f"{value:g}", (str(place),), str(place), (value,))
-        for place, value in enumerate(form.values(DIRECTIONS), start=1)
+        Control(f"value-{place}", f"{value:g}", (str(place),), (value,)) for place, value in enumerate(values, start=1)
     )
 
 
-def controls(form: AnswerForm) -> dict[str, Control]:
-    """Everything that can be pressed, by name."""
-    films = TURNED_FILMS if form.by_eps else ()
-    return {control.name: control for control in (*answers(form), UNSURE, UNDO, FILM, *films, HELP)}
+def controls(form: AnswerForm, space: Space) -> dict[str, Control]:
+    """Everything that can be pressed, by name; a key that an answer has is no other control's."""
+    own, films = answers(form, space), ()
+    if form.by_eps and len(space.cues) == 1:
+        films = tuple(
+            Control(f"film-{control.colour}", f"film of {control.words}", _either(key))
+            for control, key in ((own[0], "q"), (own[2], "e"))
+        )
+    taken = {key for control in own for key in control.keys}
+    others = (
+        control._replace(keys=tuple(key for key in control.keys if key not in taken))
+        for control in (UNSURE, UNDO, FILM, *films, HELP)
+    )
+    return {control.name: control for control in (*own, *others)}
 
 
-def question(form: AnswerForm) -> str:
+def check(form: AnswerForm, space: Space) -> None:
+    """Raises UserError for a form of answers that a page cannot take in a space, or two cues with one key."""
+    if form.is_action and space != DIRECTIONS:
+        raise UserError(
+            f"{form.name} answers are pointed at, which a page can for directions alone: give --guidance relative"
+        )
+    if form.by_eps and not space.cues:
+        raise UserError(f"the space {space.name} has no cues to ask about: give --guidance scalar")
+    keys = [key for control in answers(form, space) for key in control.keys]
+    if twice := [key for key in keys if keys.count(key) > 1]:
+        raise UserError(f"the key {_shown(twice[0])!r} stands for two answers: give the cues of the space other keys")
+
+
+def question(form: AnswerForm, space: Space) -> str:
     """What a person is asked."""
+    planar = space == DIRECTIONS
     if form.by_eps:
-        return "Which way should the middle arrow turn?"
+        return "Which way should the middle arrow turn?" if planar else "Which way should the action change?"
     if form.is_action:
         return "Point at what to do instead: click there."
-    return (
-        "Is the arrow good?"
-        if set(form.values(DIRECTIONS) if form.values else ()) == {0.0, 1.0}
-        else f"Your answer? ({form.meaning(DIRECTIONS)})"
-    )
+    if set(form.values(space) if form.values else ()) == {0.0, 1.0}:
+        return f"Is the {'arrow' if planar else 'action'} good?"
+    return f"Your answer? ({form.meaning(space)})"
 
 
-def help_lines(form: AnswerForm) -> list[str]:
+def help_lines(form: AnswerForm, space: Space) -> list[str]:
     """What the page's help says, line by line."""
-    lines = [f"{control.words}: {keys_of(control)}" for control in controls(form).values()]
-    if form.by_eps:
+    told = controls(form, space).values()
+    names = [f"{space.cues[one.cue].name}: " if one.cue is not None else "" for one in told]
+    lines = [f"{name}{one.words}: {keys_of(one)}" for name, one in zip(names, told, strict=True) if one.keys]
+    if form.by_eps and space == DIRECTIONS:
         lines.append(
             "Left and right are those of somebody who walks along the arrow: left turns it counterclockwise. "
             "Two arrows in the picture show both turns, in the colour of their button and with its key."
+        )
+    if form.by_eps and len(space.cues) > 1:
+        lines.append(
+            "Say which way each cue should change, then send. Where nothing is said of any, it is: don't know."
         )
     return [
         *lines,
@@ -93,29 +154,31 @@ def help_lines(form: AnswerForm) -> list[str]:
 
 def keys_of(control: Control) -> str:
     """All keys of a control, for people."""
-    return ", ".join(dict.fromkeys(KEYS.get(key, key.upper() if len(key) == 1 else key) for key in control.keys))
+    return ", ".join(dict.fromkeys(map(_shown, control.keys)))
 
 
-def given(form: AnswerForm, pressed: Control | None, angle_deg: float | None) -> np.ndarray | None:
-    """An answer in the words of the form: what was pressed, or pointed at [deg]; None: no answer."""
-    if pressed is not None:
-        return None if pressed.answer is None else np.asarray(pressed.answer, np.float32)
-    assert angle_deg is not None
-    return np.array([np.cos(np.deg2rad(angle_deg)), np.sin(np.deg2rad(angle_deg))], np.float32)
+def given(
+    space: Space, pressed: Control | None, angle_deg: float | None, said: Mapping[int, float]
+) -> np.ndarray | None:
+    """An answer in the words of the form; None: no answer.
+
+    Where nothing was pressed, a direction was pointed at [deg]. `said`: what was picked of cues, by their numbers.
+    """
+    if pressed is None:
+        assert angle_deg is not None
+        return np.array([np.cos(np.deg2rad(angle_deg)), np.sin(np.deg2rad(angle_deg))], np.float32)
+    if pressed.answer is None:
+        return None
+    if pressed.name not in (REST_RIGHT.name, REST_UNSAID.name):
+        return np.asarray(pressed.answer, np.float32)
+    found = np.array([said.get(number, *pressed.answer) for number in range(len(space.cues))], np.float32)
+    return None if (found == UNSAID).all() else found
 
 
-def angle_of(action: np.ndarray) -> float:
-    """Of a direction, counterclockwise [deg]."""
-    return math.degrees(math.atan2(float(action[1]), float(action[0])))
-
-
-def turned(action: np.ndarray, by_deg: float) -> np.ndarray:
-    """A direction turned counterclockwise."""
-    angle = math.radians(angle_of(action) + by_deg)
-    return np.array([math.cos(angle), math.sin(angle)], np.float32)
-
-
-def outcomes(form: AnswerForm, action: np.ndarray, eps_deg: float) -> dict[str, np.ndarray]:
-    """The action in question ("asked"), and what the answers would make of it ("left", "right") if they turn it."""
-    ways = {"left": eps_deg, "right": -eps_deg} if form.by_eps else {}
-    return {"asked": action, **{name: turned(action, way) for name, way in ways.items()}}
+def outcomes(form: AnswerForm, space: Space, action: np.ndarray, eps: float) -> dict[str, np.ndarray]:
+    """The action in question ("asked"), and what the answers about its only cue would make of it ("left", "right")."""
+    found = {"asked": action}
+    if form.by_eps and len(space.cues) == 1:
+        for name, h in (("left", 1.0), ("right", -1.0)):
+            found[name] = np.asarray(space.toward(jnp.asarray(action), jnp.array([h]), space.from_unit(eps)))
+    return found

@@ -8,9 +8,9 @@ needed, which a cookie then carries.
 from __future__ import annotations
 
 import secrets
-from http.cookies import CookieError, SimpleCookie
 from typing import Any
-from urllib.parse import parse_qs
+
+from fastapi.requests import HTTPConnection
 
 HEADERS = (
     (b"referrer-policy", b"no-referrer"),  # the address has the token in it
@@ -45,24 +45,16 @@ class Gate:
 
     def refusal(self, scope: Any) -> tuple[str | None, bool]:
         """Why a connection is refused (None: it is not), and whether it brought the token in its address."""
-        told: dict[bytes, list[str]] = {}
-        for name, value in scope["headers"]:
-            told.setdefault(name.lower(), []).append(value.decode("latin-1"))
-        if len(told.get(b"host", [])) != 1 or told[b"host"][0].lower() not in self.hosts:
+        told = HTTPConnection(scope)
+        hosts = [host.lower() for host in told.headers.getlist("host")]
+        if len(hosts) != 1 or hosts[0] not in self.hosts:
             return "this page answers to 127.0.0.1 alone: open the address that the command printed", False
-        origins = told.get(b"origin", [])
-        if any(origin.lower() not in {f"http://{host}" for host in self.hosts} for origin in origins):
+        sites = {f"http://{host}" for host in self.hosts}
+        if any(origin.lower() not in sites for origin in told.headers.getlist("origin")):
             return "this page answers no other site", False
-        given = parse_qs(scope.get("query_string", b"").decode("latin-1")).get("token", [])
-        if any(self._right(token) for token in given):
+        if any(self._right(token) for token in told.query_params.getlist("token")):
             return None, True
-        jar = SimpleCookie()
-        for header in told.get(b"cookie", []):
-            try:
-                jar.load(header)
-            except CookieError:
-                continue
-        if self.cookie in jar and self._right(jar[self.cookie].value):
+        if self._right(told.cookies.get(self.cookie, "")):
             return None, False
         return "the token is missing or wrong: open the address that the command printed when it started last", False
 

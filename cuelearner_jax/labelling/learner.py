@@ -48,15 +48,7 @@ class Learner:
     """Fits whenever as many labels as a round has are new; one fit at a time."""
 
     def __init__(self, plan: Plan, env: Any, programs: Programs, blank: GuideState, key: PRNGKeyArray) -> None:
-        """Compiles the fit.
-
-        Args:
-            plan: of the session.
-            env: its world.
-            programs: its compiled functions.
-            blank: a guide that knows nothing.
-            key: of the session.
-        """
+        """Compiles the fit; `blank` is a guide that knows nothing, `key` the session's."""
         self._plan, self._env, self._programs, self._blank, self._key = plan, env, programs, blank, key
         self.newest = Fitted(blank.model)
         self.running = False

@@ -26,6 +26,7 @@ const cue = {
     const why = cue.why(told.clicks || 1);
     if (why) { cue.drop(why); return; }
     if (!cue.scene() && name !== "undo") return;
+    if (name.startsWith("pick")) { emitEvent("cue", {name, item: cue.at()}); return; }  // one cue of several
     cue.sent = true;
     cue.tell("");
     emitEvent("cue", {name, item: cue.at(), angle: told.angle === undefined ? null : told.angle, seconds: cue.seconds()});
@@ -99,7 +100,7 @@ document.addEventListener("keydown", event => {
   if (event.ctrlKey || event.altKey || event.metaKey) return;
   const name = cue.keys[event.key];
   if (!name) return;
-  if (cue.window() && (event.key === " " || name === "undo")) return;  // they are the window's own
+  if (cue.window() && (["Enter", " "].includes(event.key) || name === "undo")) return;  // the window's own
   event.preventDefault();
   if (!event.repeat) cue.send(name);
 });

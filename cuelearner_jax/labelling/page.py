@@ -15,14 +15,9 @@ from cuelearner_jax.errors import UserError
 from cuelearner_jax.labelling import controls, view
 from cuelearner_jax.labelling.controls import Control
 from cuelearner_jax.labelling.session import Session, Status
+from cuelearner_jax.spaces import UNSAID
 
 HERE = Path(__file__).parent
-SWATCHES = (
-    ("asked", "the action in question"),
-    ("left", "more to the left"),
-    ("right", "more to the right"),
-    ("refined", "what the model makes of it"),
-)
 LATE = "another question had come by then"  # to the server
 
 Finish = Callable[[], Awaitable[None]]  # ends the work; raises UserError if that cannot be
@@ -34,14 +29,14 @@ class Page:
     def __init__(self, session: Session, pages: set[Page], finish: Finish | None = None, again: str = "") -> None:
         """Builds the page in NiceGUI's current client.
 
-        Args:
-            session: whose question it shows.
-            pages: all pages of the session, which it joins while it is open.
-            finish: is called by the button that ends the work; None: there is none.
-            again: the command that opens the session once more.
+        It joins the `pages` of the session while it is open. `finish` is called by the button that ends the work (None:
+        there is no such button); `again` is the command that opens the session once more.
         """
         self.session, self._pages, self._finish = session, pages, finish
-        self.controls = controls.controls(session.plan.form)
+        self.form, self.space = session.plan.form, session.space
+        self.controls = controls.controls(self.form, self.space)
+        self._said: dict[int, float] = {}  # of the question on the screen, by the number of the cue
+        self._said_of = session.number
         self._loop = asyncio.get_running_loop()
         self._client = ui.context.client
         ui.add_css((HERE / "page.css").read_text())
@@ -53,7 +48,7 @@ class Page:
             with ui.column().classes("w-full gap-2"):
                 self._practice()
                 ui.label(session.plan.task.wants(session.plan.config.task)).classes("note")
-                self._asked = ui.label(controls.question(session.plan.form)).classes("big")
+                self._asked = ui.label(controls.question(self.form, self.space)).classes("big")
                 self._note = ui.label().classes("note")
                 self._scene = ui.html("", sanitize=False).classes("stage")
                 self._answers()
@@ -86,9 +81,17 @@ class Page:
             ui.button("skip practice", on_click=self._skip, color=None).props("flat dense").mark("skip")
 
     def _answers(self) -> None:
+        own = controls.answers(self.form, self.space)
+        self._pressable, self._picks = [], {}
+        for number, cue in enumerate(self.space.cues):
+            if picks := [control for control in own if control.cue == number]:
+                ui.label(cue.name)
+                with ui.element("div").classes("answers"):
+                    self._picks |= {control: self._button(control) for control in picks}
         with ui.element("div").classes("answers"):
-            self._pressable = [self._button(control) for control in controls.answers(self.session.plan.form)]
-            self._pressable.append(self._button(controls.UNSURE).classes("wide"))
+            self._pressable += [self._button(control) for control in own if control.cue is None]
+            self._pressable.append(self._button(self.controls["unsure"]).classes("wide"))
+        self._pressable += self._picks.values()
         ui.label("").classes("dropped").props("aria-live=polite")
         ui.label("").classes("film-words")
 
@@ -103,12 +106,14 @@ class Page:
         ui.separator()
         self._words = ui.label()
         with ui.element("div").classes("hide-small"):
-            for name, about in SWATCHES if self.session.plan.form.by_eps else (SWATCHES[0], SWATCHES[3]):
+            turned = [one for one in self.controls.values() if one.colour in ("left", "right") and one.cue is None]
+            swatches = {"asked": "the action in question", **{one.colour: one.words for one in turned}}
+            for name, about in {**swatches, "refined": "what the model makes of it"}.items():
                 ui.html(f'<span class=swatch style="background:var(--{name})"></span>{about}', sanitize=False)
             ui.label(self.session.legend).classes("text-caption")
         with ui.element("div").classes("tools"):
-            for control in (controls.UNDO, controls.FILM, controls.HELP):
-                self._button(control, props="flat dense")
+            for name in ("undo", "film", "help"):
+                self._button(self.controls[name], props="flat dense")
             dark = ui.dark_mode(None)
             ui.button("light or dark", on_click=lambda: dark.set_value(not dark.value), color=None).props("flat dense")
         self._saved = ui.label().classes("text-caption")
@@ -119,7 +124,7 @@ class Page:
     def _overlay(self) -> ui.dialog:
         with ui.dialog() as dialog, ui.card().classes("gap-1"):
             ui.label("Help").classes("big")
-            for line in controls.help_lines(self.session.plan.form):
+            for line in controls.help_lines(self.form, self.space):
                 ui.label(line)
             ui.button("close", on_click=dialog.close)
         return dialog
@@ -149,17 +154,21 @@ class Page:
             await self._show_film(name, number)
             return
         pressed, angle = self.controls.get(name), told.get("angle")
-        if pressed is None and not (name == "point" and self.session.plan.form.is_action and angle is not None):
+        if pressed is None and not (name == "point" and self.form.is_action and angle is not None):
             return
         taken, why = False, LATE
         if self._help.value or self._early.value:  # a browser may not know yet that it opened
             why = "a window lies over the question: close it first"
+        elif pressed is not None and pressed.cue is not None and pressed.answer is not None:
+            if taken := number == self.session.number:
+                self._said[pressed.cue] = pressed.answer[0]  # until the answer is sent
         else:
             try:
                 if name == "undo":
                     taken = await run.io_bound(self.session.undo, number)
                 else:
-                    answer = controls.given(self.session.plan.form, pressed, angle)
+                    said = self._said if self._said_of == number else {}
+                    answer = controls.given(self.space, pressed, angle, said)
                     taken = await run.io_bound(self.session.answer, number, answer, told.get("seconds"))
             except UserError as error:
                 why = str(error)
@@ -200,9 +209,8 @@ class Page:
         item = self.session.item
         if item is None or item.number != number:
             return
-        eps = self.session.plan.config.scalars.eps_deg
-        way = {"film-left": eps, "film-right": -eps}.get(name, 0.0)
-        reel = await run.io_bound(self.session.film, number, controls.turned(item.action, way))
+        shown = self.session.outcomes(item).get(name.removeprefix("film-"), item.action)
+        reel = await run.io_bound(self.session.film, number, shown)
         if reel is not None:
             with self._client:
                 ui.run_javascript(f"cue.play({view.film(item, reel)})")
@@ -220,13 +228,19 @@ class Page:
         """Shows the session as it is."""
         status, item = self.session.status(), self.session.item
         plan = self.session.plan
-        self._scene.content = "" if item is None else view.picture(item, plan.form, plan.config.scalars.eps_deg)
-        self._note.text = "" if item is None else view.note(item, plan.form, plan.config.scalars.eps_deg)
+        how = self.form, plan.config.scalars.eps_deg, self.space
+        self._scene.content = "" if item is None else view.picture(item, *how)
+        self._note.text = "" if item is None else view.note(item, *how)
+        if self._said_of != self.session.number:
+            self._said, self._said_of = {}, self.session.number
+        for control, button in self._picks.items():
+            picked = control.answer == (self._said.get(control.cue, UNSAID),)
+            button.classes(add="picked" if picked else "", remove="" if picked else "picked")
         self._practising.set_visibility(item is not None and item.number < 0)
         if item is None:
             self._asked.text = "All labels are given. Thank you. Press finish, or undo to change the last one."
         else:
-            self._asked.text = controls.question(plan.form)
+            self._asked.text = controls.question(self.form, self.space)
             self._words.text = item.sketch.words if item.sketch else ""
         if item is not None and item.number < 0:
             number, count = self.session.practice + item.number, self.session.practice

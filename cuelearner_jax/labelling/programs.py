@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from functools import cache, partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from cuelearner_jax import asking
 from cuelearner_jax.asking import GuideState
@@ -18,7 +18,55 @@ from cuelearner_jax.config import Scalars
 from cuelearner_jax.environment import Environment, actions_of
 from cuelearner_jax.feedback.forms import AnswerForm
 from cuelearner_jax.guides.base import Guide
+from cuelearner_jax.spaces import UNSAID
 from cuelearner_jax.types import EnvState, Label, Teacher
+
+SAME = 1e-5  # by which an observation may differ that is lived through anew
+
+Advance = Callable[[Any, PRNGKeyArray, EnvState, Any], tuple[EnvState, Any]]  # (env, key, state, action)
+
+
+class Keys(NamedTuple):
+    """Random numbers of a session."""
+
+    session: PRNGKeyArray  # of its questions and fits
+    model: PRNGKeyArray
+    start: PRNGKeyArray  # of the first situation
+
+
+def keys_of(seed: int) -> Keys:
+    """Those of a seed."""
+    return Keys(*jax.random.split(jax.random.key(seed), 3))
+
+
+@jax.jit
+def begin(env: Environment, key: PRNGKeyArray) -> tuple[EnvState, jax.Array]:
+    """The first situation of an episode: (state, observation)."""
+    return env.reset(key)
+
+
+@jax.jit
+def advance(env: Environment, key: PRNGKeyArray, state: EnvState, action: jax.Array) -> tuple[EnvState, jax.Array]:
+    """The situation that an action leads to: (state, observation)."""
+    after, step = env.step(key, state, action)
+    return after, step.obs
+
+
+def lived(
+    env: Environment, keys: Keys, rows: Iterable[tuple[np.ndarray, np.ndarray]]
+) -> Iterator[tuple[EnvState, jax.Array]]:
+    """Situation after situation: before each of the items, whose observations and actions `rows` hold, and after all.
+
+    Ends early, before the first item that was seen otherwise: by a program of another version.
+    """
+    state, obs = begin(env, keys.start)
+    for number, (seen, action) in enumerate(rows):
+        if seen.shape != obs.shape or not np.allclose(np.asarray(obs), seen, atol=SAME):
+            return
+        yield state, obs
+        key = asking.question_keys(keys.session, number).env
+        state, obs = advance(env, key, state, jnp.asarray(action))
+    yield state, obs
 
 
 class Programs(NamedTuple):
@@ -90,20 +138,25 @@ def as_teacher(
 class Agreement(NamedTuple):
     """How well two sets of answers agree."""
 
-    value: float  # share of answers that are equal; of actions the mean angle between them [deg]
+    value: float  # share of answers that are equal; of actions the mean distance between them
     count: int
-    unit: str  # "%" or "deg"
+    unit: str  # "%", or the unit of the space
 
     def __str__(self) -> str:
         if not self.count:
             return "no labels to compare"
-        amount = f"{100 * self.value:.0f}%" if self.unit == "%" else f"{self.value:.1f} degrees apart"
-        return f"{amount} of {self.count}" if self.unit == "%" else f"{amount} over {self.count}"
+        if self.unit == "%":
+            return f"{100 * self.value:.0f}% of {self.count}"
+        return f"{self.value:.3g} {self.unit} apart over {self.count}"
 
 
 def agreement(form: AnswerForm, env: Environment, one: np.ndarray, other: np.ndarray) -> Agreement:
-    """That of answers (n, width) with others of the same questions."""
+    """That of answers (n, width) with others of the same questions; of cues, where both say something."""
+    space = actions_of(env)
     if form.is_action:
-        apart = np.asarray(actions_of(env).distance(jnp.asarray(one), jnp.asarray(other)))
-        return Agreement(float(np.degrees(apart).mean()) if len(one) else 0.0, len(one), "deg")
-    return Agreement(float((one == other).all(-1).mean()) if len(one) else 0.0, len(one), "%")
+        apart = np.asarray(space.to_unit(space.distance(jnp.asarray(one), jnp.asarray(other))))
+        return Agreement(float(apart.mean()) if len(one) else 0.0, len(one), space.unit)
+    alike = one == other
+    if form.by_eps and len(space.cues) > 1:
+        alike |= (one == UNSAID) | (other == UNSAID)
+    return Agreement(float(alike.all(-1).mean()) if len(one) else 0.0, len(one), "%")

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import html
 import secrets
 import socket
 import threading
 from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import NamedTuple
 
 import uvicorn
 from fastapi import FastAPI
@@ -15,8 +18,6 @@ from fastapi.responses import HTMLResponse
 from nicegui import run, ui
 
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.labelling import ending
-from cuelearner_jax.labelling.ending import Commands, Ending
 from cuelearner_jax.labelling.gate import Gate
 from cuelearner_jax.labelling.page import Page
 from cuelearner_jax.labelling.session import Session
@@ -24,6 +25,57 @@ from cuelearner_jax.labelling.session import Session
 HOST = "127.0.0.1"
 SHOWN_WITHIN = 10.0  # of the end every browser should have shown the last page; nobody waits longer [s]
 RECONNECT = 60.0  # for which a page whose connection broke is kept [s]
+
+
+ADDRESS, SEEN = "/finished", "/finished/seen"  # the last page, and what its script asks for once it is shown
+
+
+class Commands(NamedTuple):
+    """What a person may type."""
+
+    again: str  # opens the session once more
+    following: Callable[[int], str]  # number of labels -> what uses them
+
+
+class Ending(NamedTuple):
+    """How the work ended."""
+
+    file: Path
+    labels: int
+    unsure: int
+    wanted: int
+    following: str  # the command that uses the labels
+    again: str  # the one that goes on
+
+    @property
+    def line(self) -> str:
+        """What was saved, and where."""
+        also = f", and {self.unsure} questions without an answer" if self.unsure else ""
+        return f"{self.labels} of {self.wanted} labels are saved{also}, in {self.file}"
+
+
+def last_page(told: Ending) -> str:
+    """The end as a whole page of HTML, which needs no server once it is shown, and tells the server that it is."""
+    line, following, again = (html.escape(text) for text in (told.line, told.following, told.again))
+    return f"""<!doctype html>
+<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width">
+<title>finished</title><style>
+:root {{ color-scheme: light dark; }}
+body {{ font: 1.1rem/1.6 system-ui, sans-serif; max-width: 46rem; margin: 3rem auto; padding: 0 1rem; }}
+pre {{ background: #80808022; padding: 0.8rem; border-radius: 6px; white-space: pre-wrap; overflow-wrap: anywhere; }}
+button {{ font: inherit; padding: 0.2rem 0.8rem; }}
+</style></head><body>
+<h1>Finished. Thank you.</h1>
+<p class="saved">{line}</p>
+<h2>What to type next</h2>
+<pre id="next">{following}</pre>
+<p><button onclick="navigator.clipboard.writeText(document.getElementById('next').textContent);
+this.textContent = 'copied'">copy</button></p>
+<h2>To add labels later</h2>
+<pre>{again}</pre>
+<p>The command in the terminal has ended by itself. You may close this tab.</p>
+<script>fetch("{SEEN}", {{method: "POST", keepalive: true}});</script>
+</body></html>"""
 
 
 def bound(port: int) -> socket.socket:
@@ -67,22 +119,24 @@ class _Last:
         file = await run.io_bound(self._session.finish)
         if file is None or self.told is not None:  # the program ends, or another page was first
             return
-        self.told = ending.ending(file, self._session.status(), self._commands)
+        status = self._session.status()
+        counts, following = (status.answered, status.unsure, status.labels), self._commands.following(status.answered)
+        self.told = Ending(file.resolve(), *counts, following, self._commands.again)
         asyncio.get_running_loop().call_later(SHOWN_WITHIN, self._stopping.set)
         self._waited_for = len(self._pages)
         for page in list(self._pages):
-            page.goto(ending.ADDRESS)
+            page.goto(ADDRESS)
 
     def routes(self, app: FastAPI) -> None:
         """The last page, and where it says that it is shown."""
 
-        @app.get(ending.ADDRESS)
+        @app.get(ADDRESS)
         def show() -> HTMLResponse:
             if self.told is None:
                 return HTMLResponse("nothing is finished yet", 404)
-            return HTMLResponse(ending.page(self.told))
+            return HTMLResponse(last_page(self.told))
 
-        @app.post(ending.SEEN)
+        @app.post(SEEN)
         def seen() -> None:
             if self.told is None:
                 return
@@ -98,17 +152,9 @@ def serve(
     tell: Callable[[str], None],
     commands: Commands,
 ) -> Ending | None:
-    """Serves the page; `tell` is given its address once it can be opened.
+    """Serves the page on a socket of `bound`; `tell` is given its address, whose token nobody else knows.
 
-    Args:
-        session: whose page it is.
-        taken: from `bound`.
-        stopping: ends it when set.
-        tell: called with the address, whose token nobody else knows.
-        commands: what a person may type afterwards.
-
-    Returns:
-        How a person finished; None: `stopping` was set before.
+    Returns how a person finished; None: `stopping` was set before.
     """
     token, port = secrets.token_urlsafe(18), taken.getsockname()[1]
     pages: set[Page] = set()

@@ -25,9 +25,8 @@ from cuelearner_jax.environment import actions_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.labelling import controls
 from cuelearner_jax.labelling.learner import Fitted, Learner
-from cuelearner_jax.labelling.living import advance, begin, keys_of, lived
 from cuelearner_jax.labelling.plan import Plan
-from cuelearner_jax.labelling.programs import programs
+from cuelearner_jax.labelling.programs import advance, begin, keys_of, lived, programs
 from cuelearner_jax.policies import named
 from cuelearner_jax.storage import label_files
 from cuelearner_jax.storage.label_checks import ANSWERED, UNDONE, UNSURE
@@ -95,7 +94,7 @@ class Session:
             raise UserError(f"{plan.task.name} has no sketches to label by: give its body's Pictures `sketch`")
         self.plan = plan
         shape = shape_of(plan.task, plan.config.task)
-        space = actions_of(shape)
+        self.space = space = actions_of(shape)
         named = plan.world, plan.form.name, space, plan.eps, plan.form.meaning(space), plan.session(shape)
         self._writer = label_files.LabelWriter(folder, *named, written_by=provenance())
         tell("making the world")
@@ -195,9 +194,13 @@ class Session:
     def _trails(self, item: Item) -> dict[str, str]:
         if self._pictures.trails is None:
             return {}
-        outcomes = controls.outcomes(self.plan.form, item.action, self.plan.config.scalars.eps_deg)
+        outcomes = self.outcomes(item)
         drawn = self._pictures.trails(self.env, item.guide.env, jnp.asarray(np.stack([*outcomes.values()])))
         return dict(zip(outcomes, drawn, strict=True))
+
+    def outcomes(self, item: Item) -> dict[str, np.ndarray]:
+        """What the answers would make of an item's action, see `controls.outcomes`."""
+        return controls.outcomes(self.plan.form, self.space, item.action, self.plan.config.scalars.eps_deg)
 
     def _renew(self) -> None:
         """By the newest model: what is prepared but was never seen is asked anew, what is seen is refined anew."""

@@ -6,9 +6,12 @@ import html
 import json
 import math
 
+import numpy as np
+
 from cuelearner_jax.feedback.forms import AnswerForm
-from cuelearner_jax.labelling.controls import LEFT, RIGHT, angle_of
+from cuelearner_jax.labelling import controls
 from cuelearner_jax.labelling.session import Item
+from cuelearner_jax.spaces import DIRECTIONS, Space
 from cuelearner_jax.types import Reel, Sketch
 
 HAIR = 1 / 400  # of the sketch's width: a thin line
@@ -38,8 +41,11 @@ def _farthest(item: Item) -> float:
     return BESIDE_TRAILS if item.trails else TURNED_REACH[1]
 
 
-def note(item: Item, form: AnswerForm, eps_deg: float) -> str:
-    """What a person has to know about the picture; empty: nothing."""
+def note(item: Item, form: AnswerForm, eps_deg: float, space: Space = DIRECTIONS) -> str:
+    """What a person has to know about the picture, of an action that is no arrow in it what it is; empty: nothing."""
+    if space != DIRECTIONS:
+        refined = "" if item.refined is None else f"; the model makes of it: {space.words_of(item.refined)}"
+        return f"the action: {space.words_of(item.action)}{refined}"
     times = magnified(item, eps_deg) if form.by_eps else 1
     if times == 1:
         return ""
@@ -47,22 +53,51 @@ def note(item: Item, form: AnswerForm, eps_deg: float) -> str:
     return f"turns are drawn {times} times as large: {eps_deg:g}° as {times * eps_deg:g}°{true}"
 
 
-def picture(item: Item, form: AnswerForm, eps_deg: float) -> str:
-    """An item with a sketch, as an SVG element; attributes `data-…` tell the page's script what it shows."""
+def picture(item: Item, form: AnswerForm, eps_deg: float, space: Space = DIRECTIONS) -> str:
+    """An item with a sketch, as an SVG element; attributes `data-…` tell the page's script what it shows.
+
+    Directions are drawn as arrows; of other actions the picture shows what they lead to, where the task draws that.
+    """
     assert item.sketch is not None
-    sketch, angle = item.sketch, angle_of(item.action)
+    sketch, planar = item.sketch, space == DIRECTIONS
     parts = [f'<g class="still">{sketch.still}</g>']
     for name, drawn in reversed((item.trails or {}).items()):
         parts += [f'<g class="trail halo">{drawn}</g>', f'<g class="trail {name}">{drawn}</g>']
     for name, body in sketch.movers.items():
         place = f'class="mover" data-mover="{html.escape(name)}" transform="{_moved(sketch, name)}"'
         parts.append(f"<g {place}>{body}</g>")
-    times = magnified(item, eps_deg) if form.by_eps else 1
+    parts += _arrows(item, form, eps_deg) if planar else []
+    data = {
+        "item": item.number,
+        "foot": json.dumps(sketch.foot),
+        "turn": sketch.turn,
+        "points": int(form.is_action and planar),
+        "places": json.dumps(sketch.places),
+        "angle": angle_of(item.action) if planar else 0.0,
+    }
+    told = " ".join(f'data-{name}="{html.escape(str(value))}"' for name, value in data.items())
+    box = " ".join(f"{value:.4f}" for value in sketch.box)
+    asked = "the arrow is the action in question" if planar else note(item, form, eps_deg, space)
+    words = html.escape(f"{sketch.words}; {asked}")
+    return f'<svg class="scene" role="img" aria-label="{words}" viewBox="{box}" {told}>{"".join(parts)}</svg>'
+
+
+def angle_of(action: np.ndarray) -> float:
+    """Of a direction, counterclockwise [deg]."""
+    return math.degrees(math.atan2(float(action[1]), float(action[0])))
+
+
+def _arrows(item: Item, form: AnswerForm, eps_deg: float) -> list[str]:
+    """The direction in question, what the answers and the model would make of it, and where one points."""
+    assert item.sketch is not None
+    sketch, angle = item.sketch, angle_of(item.action)
+    parts, times = [], magnified(item, eps_deg) if form.by_eps else 1
     if form.by_eps:
         drawn = times * eps_deg
         longer = min(max(APART / drawn, TURNED_REACH[0]), _farthest(item))
-        turns = ((1, LEFT), (-1, RIGHT))
-        parts += [_arrow(sketch, angle + way * drawn, one.colour, longer, one.shown) for way, one in turns]
+        for one in controls.answers(form, DIRECTIONS):
+            if one.answer and one.answer[0]:
+                parts.append(_arrow(sketch, angle + one.answer[0] * drawn, one.colour, longer, one.shown))
     parts.append("" if item.trails else _line(sketch, angle))
     parts.append(_arrow(sketch, angle, "asked"))
     if item.refined is not None:
@@ -72,18 +107,7 @@ def picture(item: Item, form: AnswerForm, eps_deg: float) -> str:
             parts.append(_arrow(sketch, angle + turn, "refined", 0.8))
     if form.is_action:
         parts.append(_arrow(sketch, angle, "pointer"))
-    data = {
-        "item": item.number,
-        "foot": json.dumps(sketch.foot),
-        "turn": sketch.turn,
-        "points": int(form.is_action),
-        "places": json.dumps(sketch.places),
-        "angle": angle,
-    }
-    told = " ".join(f'data-{name}="{html.escape(str(value))}"' for name, value in data.items())
-    box = " ".join(f"{value:.4f}" for value in sketch.box)
-    words = html.escape(f"{sketch.words}; the arrow is the action in question")
-    return f'<svg class="scene" role="img" aria-label="{words}" viewBox="{box}" {told}>{"".join(parts)}</svg>'
+    return parts
 
 
 def film(item: Item, reel: Reel) -> str:

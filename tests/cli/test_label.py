@@ -15,7 +15,6 @@ import pytest
 from sessions import OWN, expert, plan, served
 
 from cuelearner_jax.cli import label, main
-from cuelearner_jax.labelling import ending
 from cuelearner_jax.labelling.plan import Base
 from cuelearner_jax.labelling.session import Session
 from cuelearner_jax.policies import Uniform
@@ -105,7 +104,7 @@ def asked_for(monkeypatch, *arguments):
 
     def served(server, plan, asked, port, stopping, commands):
         found.extend([asked, plan, commands])
-        return ending.Ending(asked.out, 40, 0, 50, commands.following(40), commands.again)
+        return server.Ending(asked.out, 40, 0, 50, commands.following(40), commands.again)
 
     monkeypatch.setattr(label, "_served", served)
     assert main(["label", *arguments]) == 0

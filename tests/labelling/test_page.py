@@ -16,28 +16,15 @@ from sessions import expert
 pytest.importorskip("nicegui")
 from fastapi import FastAPI
 from nicegui import ui
-from nicegui.testing.user_simulation import user_simulation
+from page_user import press, shown
 
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.feedback.answers import DEMONSTRATION, RELATIVE, SCALAR
 from cuelearner_jax.feedback.forms import AnswerForm
-from cuelearner_jax.labelling import controls, ending, server, view
-from cuelearner_jax.labelling.ending import Commands
-from cuelearner_jax.labelling.page import Page
-from cuelearner_jax.spaces import DIRECTIONS
+from cuelearner_jax.labelling import controls, server, view
+from cuelearner_jax.labelling.server import Commands
+from cuelearner_jax.spaces import DIRECTIONS, directions
 from cuelearner_jax.storage import label_files
-
-
-def shown(session, acts, finish=None):
-    """Opens the page of a session in a browser that is none, and has `acts` use it."""
-
-    async def used():
-        pages = set()
-        async with user_simulation(root=lambda: Page(session, pages, finish, "cuelearner label") and None) as user:
-            await user.open("/")
-            await acts(user, pages)
-
-    asyncio.run(used())
 
 
 @contextlib.contextmanager
@@ -49,16 +36,6 @@ def told_browser(user):
         yield sent
     finally:
         ui.run_javascript = run
-
-
-async def press(user, name, moved):
-    """Presses a button and waits until that has moved the session on."""
-    user.find(marker=name).click()
-    for _ in range(400):
-        await asyncio.sleep(0.01)
-        if moved():
-            return
-    raise AssertionError(f"{name} did nothing")
 
 
 def test_buttons_answer_what_is_on_the_page_and_it_tells_how_far_it_is(opened, tmp_path):
@@ -153,20 +130,21 @@ def test_other_forms_of_feedback_have_a_page_of_the_same_parts(opened, tmp_path,
 def test_keys_are_told_apart_and_every_answer_is_one_of_the_form():
     five = AnswerForm("five", lambda _: 1, lambda _: "worth", lambda *told: None, lambda _: (0.0, 0.25, 0.5, 0.75, 1.0))
     for form in (RELATIVE, DEMONSTRATION, SCALAR, five):
-        known = controls.controls(form)
+        known = controls.controls(form, DIRECTIONS)
         keys = [key for control in known.values() for key in control.keys]
         assert len(keys) == len(set(keys)) >= 5
-        answers = [control.answer for control in controls.answers(form)]
+        answers = [control.answer for control in controls.answers(form, DIRECTIONS)]
         assert sorted(answers) == sorted((value,) for value in (form.values(DIRECTIONS) if form.values else ()))
-    assert controls.LEFT.answer == (1.0,)
-    assert controls.given(RELATIVE, controls.UNSURE, None) is None
+    left, _, right = controls.answers(RELATIVE, DIRECTIONS)
+    assert (left.answer, left.keys, right.keys) == ((1.0,), ("ArrowLeft", "a", "A"), ("ArrowRight", "d", "D"))
+    assert controls.given(DIRECTIONS, controls.UNSURE, None, {}) is None
 
 
 def test_practice_is_marked_and_can_be_skipped(opened, tmp_path):
     session = opened(practice=3)
 
     async def acts(user, pages):
-        await user.should_see("Practice 1 of 3, nothing is saved. Compare the arrows")
+        await user.should_see("Practice 1 of 3, nothing is saved. Compare the action")
         await press(user, "+1", lambda: session.number == -2)
         await user.should_see("Practice 2 of 3, nothing is saved. Where you cannot tell, press ↓")
         await press(user, "skip", lambda: session.number == 0)
@@ -200,18 +178,18 @@ def test_finishing_early_is_asked_about_and_every_page_ends_where_it_says_what_w
         await asyncio.sleep(0.1)
         for number in range(2):
             await press(user, "+1", lambda number=number: session.number == number + 1)
-        assert (await seen("GET", ending.ADDRESS)).status_code == 404
+        assert (await seen("GET", server.ADDRESS)).status_code == 404
         user.find(marker="finish").click()
         await user.should_see("2 of 20 labels are given, and saved")
         with told_browser(user) as told_it:
             await page._end()
-        assert told_it == [f'location.replace("{ending.ADDRESS}")']
-        text = (await seen("GET", ending.ADDRESS)).text
+        assert told_it == [f'location.replace("{server.ADDRESS}")']
+        text = (await seen("GET", server.ADDRESS)).text
         place = str(tmp_path / "labels" / label_files.PARQUET)
         for words in (f"2 of 20 labels are saved, in {place}", "cuelearner train &lt;2&gt;", "cuelearner label mine"):
             assert words in text
         assert not stopping.is_set()  # until a browser has shown it
-        await seen("POST", ending.SEEN)
+        await seen("POST", server.SEEN)
         assert stopping.is_set()
 
     shown(session, acts, last.finish)
@@ -219,6 +197,11 @@ def test_finishing_early_is_asked_about_and_every_page_ends_where_it_says_what_w
 
 
 WAYS = ("left", "right")
+
+
+def turned_by(action, by_deg):
+    """A direction turned counterclockwise."""
+    return np.asarray(directions.rotate(action, math.radians(by_deg)))
 
 
 def tip(svg, name):
@@ -256,12 +239,12 @@ def test_arrows_point_where_actions_do(opened):
     )
     trails = session._trails(item)
     assert [*trails] == ["asked", *WAYS]
-    assert trails["left"] == f"<{controls.turned(item.action, 20.0)[0]:.2f}>"
+    assert trails["left"] == f"<{turned_by(item.action, 20.0)[0]:.2f}>"
     shown = view.picture(item._replace(trails=trails), RELATIVE, 20.0)
     assert all(f'<g class="trail {name}">{drawn}</g>' in shown for name, drawn in trails.items())
     assert 'class="aim"' not in shown
     assert "refined" not in view.picture(item._replace(refined=item.action), RELATIVE, 20.0)
-    np.testing.assert_allclose(controls.turned(item.action, 90.0), [-0.8, 0.6], atol=1e-6)
+    np.testing.assert_allclose(turned_by(item.action, 90.0), [-0.8, 0.6], atol=1e-6)
 
 
 def test_small_turns_are_drawn_larger_and_the_page_says_so(opened):
@@ -288,7 +271,7 @@ def test_small_turns_are_drawn_larger_and_the_page_says_so(opened):
     near = asked._replace(sketch=asked.sketch._replace(box=(-0.1, -0.3, 2.0, 2.0)))  # the picture ends close by
     assert view.magnified(near, 0.1) > times
     for refined, seen in ((0.3, 0.3 * times), (20.0, 60.0), (100.0, 100.0)):  # never past what it is, or 60
-        item = asked._replace(refined=controls.turned(asked.action, refined))
+        item = asked._replace(refined=turned_by(asked.action, refined))
         assert drawn("refined", 0.1, item)[0] == pytest.approx(seen, abs=0.1)
 
 
@@ -296,6 +279,6 @@ def test_a_film_shows_what_the_action_leads_to(opened):
     session = opened()
     best = np.asarray(session.env.best(session.item.guide.obs))
     assert session.film(0, best).words == "True"
-    assert session.film(0, controls.turned(best, 90.0)).words == "False"
+    assert session.film(0, turned_by(best, 90.0)).words == "False"
     film = json.loads(view.film(session.item, session.film(0, best)))
     assert (film["item"], film["frames"][-1]) == (0, {"dot": None})

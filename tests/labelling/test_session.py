@@ -18,9 +18,8 @@ from cuelearner_jax import asking
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.labelling import comparing
-from cuelearner_jax.labelling.living import keys_of
 from cuelearner_jax.labelling.plan import Base
-from cuelearner_jax.labelling.programs import programs
+from cuelearner_jax.labelling.programs import keys_of, programs
 from cuelearner_jax.labelling.session import Session
 from cuelearner_jax.policies import Opaque, Uniform
 from cuelearner_jax.storage import label_files

@@ -1,0 +1,123 @@
+"""The page of a task whose actions are a box: each cue by its own words and keys, "already right" or not said."""
+
+import asyncio
+
+import numpy as np
+import probes
+import pytest
+from box_task import EPS, GRIPPER, SCALARS, TASK
+
+from cuelearner_jax.cli import label
+from cuelearner_jax.config import GuideScalars, GuideSizes
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.feedback.answers import DEMONSTRATION, RELATIVE, SCALAR
+from cuelearner_jax.labelling import controls, view
+from cuelearner_jax.labelling.programs import agreement
+from cuelearner_jax.spaces import UNSAID, Box, Choices, Cue
+from cuelearner_jax.storage import label_files
+
+
+def planned(**options):
+    """What `cuelearner label` plans for the task."""
+    config = TASK.presets["paper"].config
+    sizes, scalars = label._part(GuideSizes, config.sizes), label._part(GuideScalars, SCALARS)
+    options = {"labels": 20, "guidance": "relative", **options}
+    asked = label.Label(config.task, sizes, scalars, label.Path("labels"), **options)
+    return label.planned(TASK, config, asked, None)
+
+
+def test_each_cue_has_its_words_and_keys_and_no_key_says_two_things():
+    known = controls.controls(RELATIVE, GRIPPER)
+    keys = [key for control in known.values() for key in control.keys]
+    assert len(keys) == len(set(keys))
+    words = [control.words for control in known.values() if control.cue == 2]
+    assert words == ["open", "already right", "close", "not said"]
+    assert known["pick-2-more"].keys == ("o", "O")
+    assert known["pick-1-less"].keys == ("f", "F")
+    assert known["film"].keys == ("v", "V")  # F is the second cue's
+    assert "height: down: F" in controls.help_lines(RELATIVE, GRIPPER)
+    assert "ArrowDown" in known["unsure"].keys
+
+
+def test_what_is_picked_and_sent_is_the_answer_and_nothing_picked_is_no_answer():
+    picked = {0: 1.0, 2: -1.0}
+    for pressed, rest in ((controls.REST_RIGHT, 0.0), (controls.REST_UNSAID, UNSAID)):
+        np.testing.assert_array_equal(controls.given(GRIPPER, pressed, None, picked), [1.0, rest, -1.0])
+    assert controls.given(GRIPPER, controls.REST_UNSAID, None, {}) is None
+    assert controls.given(GRIPPER, controls.UNSURE, None, picked) is None
+
+
+def test_the_page_asks_about_each_cue_and_the_file_keeps_what_was_said(tmp_path):
+    pytest.importorskip("nicegui")
+    from page_user import press, shown
+
+    from cuelearner_jax.labelling.session import Session
+
+    with Session(planned(), tmp_path) as session:
+
+        async def acts(user, pages):
+            (page,) = pages
+            for words in ("sideways", "height", "fingers", "open", "not said", "Which way should the action change?"):
+                await user.should_see(words)
+            await user.should_see("the action: sideways")
+            assert 'class="arrow' not in page._scene.content
+            assert "<path d='0'/>" in page._scene.content
+            user.find(marker="pick-0-less").click()
+            user.find(marker="pick-2-more").click()
+            await asyncio.sleep(0.1)
+            chosen = [control.name for control, button in page._picks.items() if "picked" in button.classes]
+            assert chosen == ["pick-0-less", "pick-1-unsaid", "pick-2-more"]
+            await press(user, "rest", lambda: session.number == 1)
+            assert page._said == {}  # of the next question nothing is said yet
+            user.find(marker="pick-1-more").click()
+            await asyncio.sleep(0.1)
+            await press(user, "send", lambda: session.number == 2)
+            await press(user, "send", lambda: session.number == 3)
+            await user.should_see("1 not known")
+
+        shown(session, acts)
+    file = label_files.read(tmp_path)
+    np.testing.assert_array_equal(file.labels.answer, [[-1.0, 0.0, 1.0], [UNSAID, 1.0, UNSAID]])
+    assert (file.space, file.eps) == (GRIPPER, pytest.approx(EPS))
+    assert [cue.words for cue in file.space.cues] == [("left", "right"), ("up", "down"), ("open", "close")]
+
+
+def test_of_one_cue_the_page_has_its_words_and_shows_what_answers_would_make_of_the_action():
+    order = Choices(5, Cue("gear", ("higher", "lower"), ("PageUp", "PageDown"), "steps"))
+    more, right, less = controls.answers(RELATIVE, order)
+    assert [one.words for one in (more, right, less)] == ["higher", "already right", "lower"]
+    assert (more.keys, less.keys) == (("PageUp",), ("PageDown",))
+    found = controls.outcomes(RELATIVE, order, np.eye(5, dtype=np.float32)[2], 1.0)
+    assert {name: int(np.argmax(action)) for name, action in found.items()} == {"asked": 2, "left": 3, "right": 1}
+    assert controls.question(SCALAR, order) == "Is the action good?"
+
+
+def test_what_a_page_cannot_ask_is_refused():
+    with pytest.raises(UserError, match="pointed at, which a page can for directions alone"):
+        planned(guidance="demonstration")
+    with pytest.raises(UserError, match="no cues to ask about"):
+        controls.check(RELATIVE, Choices(3))
+    controls.check(SCALAR, Choices(3))
+    twice = Box((0.0, 0.0), (1.0, 1.0), (Cue("a", ("more", "less"), ("q", "x"), "shares"),) * 2)
+    with pytest.raises(UserError, match="the key 'Q' stands for two answers"):
+        controls.check(RELATIVE, twice)
+    controls.check(RELATIVE, Box((0.0,) * 8, (1.0,) * 8))  # cues that no task named have keys of their own
+
+
+def test_agreement_counts_the_cues_of_which_both_say_something():
+    env = TASK.environment(TASK.presets["paper"].config.task)
+    one = np.array([[1, 0, UNSAID], [1, 0, 0], [0, 0, 0]], np.float32)
+    other = np.array([[1, UNSAID, -1], [1, 0, -1], [0, 0, 0]], np.float32)
+    assert str(agreement(RELATIVE, env, one, other)) == "67% of 3"
+    apart = agreement(DEMONSTRATION, env, np.zeros((1, 3), np.float32), np.array([[0.0, 1.0, 0.0]], np.float32))
+    assert str(apart) == "0.25 shares apart over 1"
+
+
+def test_the_picture_of_an_action_that_is_no_arrow_says_what_it_is():
+    item = view.Item(0, None, np.float32([0.5, 1.0, -1.0]), TASK.pictures().sketch(None, np.float32([1.0, 0.0])))
+    svg = view.picture(item, RELATIVE, EPS, GRIPPER)
+    assert "the action: sideways 0.5, height 1, fingers -1" in svg
+    assert view.note(item._replace(refined=item.action), RELATIVE, EPS, GRIPPER).endswith(
+        "the model makes of it: sideways 0.5, height 1, fingers -1"
+    )
+    assert probes.SCALARS.eps_deg != EPS

@@ -1,0 +1,29 @@
+"""A page in a browser that is none; needs NiceGUI."""
+
+import asyncio
+
+from nicegui.testing.user_simulation import user_simulation
+
+from cuelearner_jax.labelling.page import Page
+
+
+def shown(session, acts, finish=None):
+    """Opens the page of a session in a browser that is none, and has `acts` use it."""
+
+    async def used():
+        pages = set()
+        async with user_simulation(root=lambda: Page(session, pages, finish, "cuelearner label") and None) as user:
+            await user.open("/")
+            await acts(user, pages)
+
+    asyncio.run(used())
+
+
+async def press(user, name, moved):
+    """Presses a button and waits until that has moved the session on."""
+    user.find(marker=name).click()
+    for _ in range(400):
+        await asyncio.sleep(0.01)
+        if moved():
+            return
+    raise AssertionError(f"{name} did nothing")
