@@ -44,12 +44,7 @@ class Planned(NamedTuple):
 
 
 def missing(folders: Sequence[str | os.PathLike[str]], table: pa.Table) -> list[str]:
-    """One line for everything that was planned and is not there, or of which that is not known.
-
-    Args:
-        folders: those given to the report.
-        table: the rows that it shows, with their `folder`.
-    """
+    """One line for everything that was planned and is not in the table, or of which that is not known."""
     configurations = {folder: _configuration(Path(folder)) for folder in dict.fromkeys(table["folder"].to_pylist())}
     files = {file for folder in folders for file in Path(folder).rglob(CONFIG)} | set(configurations.values())
     planned: dict[Path, Planned] = {}
@@ -77,12 +72,7 @@ def failed_lanes(failed: pa.Table, variants: Sequence[Variant]) -> list[str]:
 
 
 def short(table: pa.Table, variants: Sequence[Variant]) -> list[str]:
-    """One line for each variant that is shown less far than it is known, or without an interval, and for mixed runs.
-
-    Args:
-        table: all rows of results that are taken together.
-        variants: made of them.
-    """
+    """One line for each variant that is shown less far than it is known, or without an interval, and for mixed runs."""
     lines = []
     guidance, labels = np.array(table["guidance"].to_pylist()), table["labels"].to_numpy()
     reached = table["step"].to_numpy()

@@ -13,7 +13,7 @@ import numpy as np
 from cuelearner_jax.config import to_json
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import mean_interval
-from cuelearner_jax.report.statistics import RESAMPLES, interquartile_mean, interval, resampled
+from cuelearner_jax.report.statistics import RESAMPLES, Interval, interquartile_mean, interval, resampled
 from cuelearner_jax.runs.trained import POLICIES, PolicySource
 from cuelearner_jax.storage.provenance import provenance
 from cuelearner_jax.storage.whole import replacing
@@ -21,25 +21,6 @@ from cuelearner_jax.studies.evaluate import Measured
 
 EPISODES = "episodes"  # what the interval of a single policy is over
 SEEDS = "seeds"
-
-
-class Spread(NamedTuple):
-    """An estimate with its 95% bootstrap interval; the bounds are nan where one value alone is known."""
-
-    estimate: float
-    lower: float
-    upper: float
-
-    @property
-    def excludes_zero(self) -> bool:
-        """Whether zero lies outside the interval."""
-        return self.lower > 0 or self.upper < 0
-
-    def __str__(self) -> str:
-        """As tables show it."""
-        if math.isnan(self.lower):
-            return f"{self.estimate:.3f}"
-        return f"{self.estimate:.3f} [{self.lower:.3f}, {self.upper:.3f}]"
 
 
 def is_single(row: Measured) -> bool:
@@ -52,12 +33,11 @@ def over(row: Measured) -> str:
     return EPISODES if is_single(row) else SEEDS
 
 
-def spread(row: Measured, metric: str) -> Spread | None:
+def spread(row: Measured, metric: str) -> Interval | None:
     """One policy's mean over its episodes, or the interquartile mean over seeds; None where a value is not finite."""
     if not np.isfinite(row.metrics[metric]).all():
         return None
-    found = mean_interval(row.each[metric][0]) if is_single(row) else interval(row.metrics[metric])
-    return Spread(*map(float, found))
+    return Interval(*mean_interval(row.each[metric][0])) if is_single(row) else interval(row.metrics[metric])
 
 
 class Difference(NamedTuple):
@@ -66,15 +46,14 @@ class Difference(NamedTuple):
     row: Measured
     other: Measured
     over: str  # "episodes" or "seeds"
-    metrics: dict[str, Spread]
+    metrics: dict[str, Interval]
 
 
 def variant(row: Measured) -> str:
     """The guidance, labels and bound of a row, as a phrase; empty for a policy without them."""
     if row.guidance == "-":
         return ""
-    bound = "" if row.bound_deg is None else f" within {row.bound_deg:g} deg"
-    return f"{row.guidance}, {row.labels} labels{bound}"
+    return f"{row.guidance}, {row.labels} labels{f' within {row.within}' if row.within else ''}"
 
 
 def differences(rows: Sequence[Measured], others: Sequence[Measured]) -> list[Difference]:
@@ -111,23 +90,22 @@ def _difference(row: Measured, other: Measured) -> Difference:
     return Difference(row, other, EPISODES if is_single(row) and is_single(other) else SEEDS, ordered)
 
 
-def _less(row: Measured, other: Measured, name: str) -> Spread:
+def _less(row: Measured, other: Measured, name: str) -> Interval:
     if is_single(row) and is_single(other):
-        return Spread(*map(float, mean_interval(row.each[name][0] - other.each[name][0])))
+        return Interval(*mean_interval(row.each[name][0] - other.each[name][0]))
     mine, its = row.metrics[name], other.metrics[name]
     if is_single(row) or is_single(other) or np.array_equal(row.seeds, other.seeds):
         mine, its = (values[:1] if is_single(of) else values for of, values in ((row, mine), (other, its)))
-        return Spread(*map(float, interval(mine - its)))
+        return interval(mine - its)
     drawn = resampled(mine, RESAMPLES, seed=0) - resampled(its, RESAMPLES, seed=1)
-    estimate = float(interquartile_mean(mine) - interquartile_mean(its))
-    return Spread(estimate, *map(float, np.quantile(drawn, [0.025, 0.975])))
+    return Interval(interquartile_mean(mine) - interquartile_mean(its), *np.quantile(drawn, [0.025, 0.975]))
 
 
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None
+def _finite(value: Any) -> float | None:
+    return float(value) if math.isfinite(value) else None
 
 
-def _plain(found: Spread | None) -> list[float | None] | None:
+def _plain(found: Interval | None) -> list[float | None] | None:
     """(estimate, lower, upper)"""
     return None if found is None else [_finite(value) for value in found]
 
@@ -157,12 +135,7 @@ def write(
 ) -> None:
     """Write measurements as JSON: the world, the rows with intervals, and where the numbers come from.
 
-    Args:
-        path: of the file.
-        source, world, policy, num_envs, steps: what was measured, as `measured.evaluate` has it.
-        rows: the measurements.
-        body: robot, engine and scenario, where they are not the task's own.
-        compared: the name of the other policy, and the differences.
+    `body` names robot, engine and scenario where they are not the task's own, `compared` the other policy.
     """
     contents = {
         "subject": source.folder.name,

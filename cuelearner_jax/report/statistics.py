@@ -23,6 +23,16 @@ class Interval(NamedTuple):
     lower: Float[np.ndarray, "*steps"]
     upper: Float[np.ndarray, "*steps"]
 
+    @property
+    def excludes_zero(self) -> bool:
+        """Whether zero lies outside an interval of one number."""
+        return bool(self.lower > 0 or self.upper < 0)
+
+    def __str__(self) -> str:
+        """An interval of one number, as tables show it."""
+        bounds = "" if np.isnan(self.lower) else f" [{self.lower:.3f}, {self.upper:.3f}]"
+        return f"{self.estimate:.3f}{bounds}"
+
 
 class Curve(NamedTuple):
     """An interval at each evaluation."""

@@ -157,14 +157,7 @@ def _matrices(group: Group, metric: str) -> dict[tuple[str, int], Matrix]:
 
 
 def _guides(rows: pa.Table, metric: str, guides: pa.Table | None, key: tuple[str, int]) -> np.ndarray:
-    """The metric of each seed's guide after all the labels it has asked for so far, (seeds,); empty if none is known.
-
-    Args:
-        rows: of the results, which have it for what never asks and for guides before the first step.
-        metric: of results.
-        guides: rows of guides after their rounds, if there are any.
-        key: kind of guidance and budget.
-    """
+    """The metric of each seed's guide after its last label, (seeds,), or as the results have it."""
     column = f"guide_{metric}"
     latest: dict[int, float] = {}
     if column in rows.column_names:

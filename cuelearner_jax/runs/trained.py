@@ -307,8 +307,9 @@ def several(
                 break
         else:
             of = "run" if source.grid else "folder"
-            bounds = "" if source.grid else f" within {bound:g} degrees"
-            told = "" if source.grid else f" within {_listed(known['bounds'])} degrees"
+            unit = actions_of(view).unit
+            bounds = "" if source.grid else f" within {bound:g} {unit}"
+            told = "" if source.grid else f" within {_listed(known['bounds'])} {unit}"
             raise UserError(
                 f"no lane with seed {seed} and {budget} labels{bounds}: the {of} has seeds {_listed(known['seeds'])} "
                 f"and labels {_listed(known['budgets'])}{told}"

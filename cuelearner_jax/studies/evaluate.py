@@ -8,7 +8,7 @@ from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 
-from cuelearner_jax.environment import view_of
+from cuelearner_jax.environment import actions_of, view_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import Tell, episodes, part_of, untold, watched_lanes
 from cuelearner_jax.guides import registry as guidances
@@ -52,8 +52,14 @@ class Measured(NamedTuple):
     seeds: np.ndarray  # (seeds,)
     metrics: dict[str, np.ndarray]  # each (seeds,)
     each: dict[str, np.ndarray]  # the same of each environment (seeds, envs), nan where its first episode goes on
-    bound_deg: float | None = None  # of a policy folder's lanes [deg]
+    bound_deg: float | None = None  # of a policy folder's lanes, in `unit`
     is_shared: bool = False  # do all seeds have one policy?
+    unit: str = "deg"  # of the space of actions
+
+    @property
+    def within(self) -> str:
+        """The bound with its unit; empty: there is none."""
+        return "" if self.bound_deg is None else f"{self.bound_deg:g} {self.unit}"
 
 
 def amount(task: Task, asked: EvaluateRequest[Any]) -> tuple[int, int]:
@@ -109,7 +115,7 @@ def run(
         blocks = [Block("-", none, none, none, 0, Common(policy), none > 0)]
     else:
         blocks = blocks_of(source, named, view_of(env), teacher, tuple(map(guidances.named, asked.guidance)))
-    rows = []
+    rows, unit = [], actions_of(env).unit.replace("degrees", "deg")
     for block in blocks:
         count, is_shared = len(block.seeds), lanes_in(block.policy) is None
         tell = watch(name if block.guidance == "-" else block.guidance)
@@ -125,5 +131,6 @@ def run(
             own = (block.budgets == budget) & (block.bounds == bound)
             mine, apart = ({metric: np.asarray(of[metric])[place[own]] for metric in of} for of in (means, each))
             bounded = bound if source.adapted is not None and block.guidance != "-" else None
-            rows.append(Measured(block.guidance, budget, block.step, block.seeds[own], mine, apart, bounded, is_shared))
+            lanes = block.guidance, budget, block.step, block.seeds[own]
+            rows.append(Measured(*lanes, mine, apart, bounded, is_shared, unit))
     return rows
