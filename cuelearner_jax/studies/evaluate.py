@@ -131,6 +131,6 @@ def run(
             own = (block.budgets == budget) & (block.bounds == bound)
             mine, apart = ({metric: np.asarray(of[metric])[place[own]] for metric in of} for of in (means, each))
             bounded = bound if source.adapted is not None and block.guidance != "-" else None
-            lanes = block.guidance, budget, block.step, block.seeds[own]
-            rows.append(Measured(*lanes, mine, apart, bounded, is_shared, unit))
+            variant = block.guidance, budget, block.step, block.seeds[own]
+            rows.append(Measured(*variant, mine, apart, bounded, is_shared, unit))
     return rows

@@ -10,8 +10,9 @@ import probes
 import pytest
 from box_task import GRIPPER, SCALARS, Reach
 
-from cuelearner_jax.adaptation import adapting, program
-from cuelearner_jax.adaptation.adapting import Adaptation, Judging
+from cuelearner_jax.adaptation import adapting, lanes
+from cuelearner_jax.adaptation.judging import Judging
+from cuelearner_jax.adaptation.lanes import Adaptation
 from cuelearner_jax.config import GuideSizes
 from cuelearner_jax.devices import lane_mesh
 from cuelearner_jax.guides import registry as guidances
@@ -20,7 +21,7 @@ from cuelearner_jax.policies import PolicyNode
 ENV = Reach(GRIPPER)
 SIZES = GuideSizes(feedback_layers=(32, 32), labels_per_round=25, fit_steps=400, fit_batch_size=32)
 MISS = jnp.array([0.2, -0.15, 0.2])  # shares
-LANES = program.product(1, (3,), (200,), (0.1, 0.5))
+LANES = lanes.product(1, (3,), (200,), (0.1, 0.5))
 OBS = jnp.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
 
 
@@ -38,8 +39,8 @@ def found():
     scalars = dataclasses.replace(SCALARS, eps_deg=0.08)
     guidance = guidances.make("relative", SIZES, ENV)
     judging = Judging(ENV, num_envs=20, steps=40)
-    asked = Adaptation(guidance, SIZES, scalars, ENV, program.side_by_side([Missing(MISS)]), LANES, judging)
-    return adapting.adapt(asked, probes.Expert(ENV), mesh=lane_mesh(jax.local_devices()[:1]))
+    asked = Adaptation(guidance, SIZES, scalars, ENV, lanes.side_by_side([Missing(MISS)]))
+    return adapting.adapt(asked, LANES, judging, probes.Expert(ENV), mesh=lane_mesh(jax.local_devices()[:1]))
 
 
 def acted(lane):

@@ -1,7 +1,7 @@
 """Every kind of guidance in a box of three, whose goal is known: what teachers with and without faults lead to."""
 
 import dataclasses
-from functools import cache, partial
+from functools import cache
 
 import jax
 import jax.numpy as jnp
@@ -37,7 +37,7 @@ def away(kind, rounds=3, **faults):
     guidance = registry.make(kind, SIZES, env)
     slots = rounds * SIZES.labels_per_round if guidance.asks else 0
     guide = asking.start(guidance, env, slots, slots, jax.random.key(1), jax.random.key(2))
-    label_round = jax.jit(partial(asking.label_round, guidance, SIZES))
+    label_round = probes.label_rounds(guidance, SIZES)
     for _ in range(rounds if guidance.asks else 0):
         guide = label_round(env, probes.Expert(env), scalars, Uniform(SMALL), guide, KEY)
     obs, first = jnp.repeat(CONTEXTS, 16, 0), SMALL.sample(KEY, (64,))
