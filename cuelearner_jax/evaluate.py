@@ -77,7 +77,7 @@ def _begun(env: Environment, key: PRNGKeyArray, num_envs: int) -> _Walk:
     _, step = jax.eval_shape(jax.vmap(env.step), keys, state, jnp.zeros((num_envs, actions_of(env).size)))
     names: list[str] = ["reward", *step.metrics]
     sums = dict.fromkeys(names, jnp.zeros(num_envs))
-    outcomes = dict.fromkeys(step.outcome, jnp.full(num_envs, jnp.nan))
+    outcomes = dict.fromkeys(step.outcome, jnp.full(num_envs, jnp.nan, jnp.float32))  # as steps have them: one program
     yes = jnp.ones(num_envs, bool)
     return _Walk(state, obs, yes, jnp.zeros(num_envs, jnp.int32), sums, outcomes, yes)
 

@@ -12,6 +12,7 @@ from functools import cache, partial
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from flax import struct
 
 from cuelearner_jax import asking
@@ -198,6 +199,11 @@ def start(program, seeds, budgets, env=None):
     """Fresh lanes; the arrays of another call are never the same, for programs donate what they are given."""
     seeds, budgets = jnp.array(seeds, jnp.int32), jnp.array(budgets, jnp.int32)
     return program.init(Window() if env is None else env, seeds, budgets, jax.random.key(0))
+
+
+def long_but(few, names):
+    """Parameters of a test: `make test` runs the few, `make test-all` the others too."""
+    return [pytest.param(name, marks=() if name in few else pytest.mark.long) for name in names]
 
 
 def stored(state, lane, steps):

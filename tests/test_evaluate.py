@@ -74,7 +74,7 @@ def test_a_roll_out_in_stretches_is_bitwise_that_in_one(steps):
     assert told[-1][1] == {1: 1, 2: 1, 5: 1, 6: 3, 48: 24}[steps]  # none of a single step
 
 
-@pytest.mark.parametrize("at_once", [1, 2, 16])
+@pytest.mark.parametrize("at_once", [2, *(pytest.param(number, marks=pytest.mark.long) for number in (1, 16))])
 def test_lanes_in_stretches_are_bitwise_those_in_one(monkeypatch, at_once):
     """Three lanes, one, two or all at a time."""
     monkeypatch.setattr(evaluate, "portions", lambda: Portions(at_once))

@@ -191,7 +191,7 @@ def learned(truncates, weight, polyak=LOOP.agent.polyak):
     return [np.asarray(q(params, env.observe(place), evenly_spaced(4)))[:, 0] for place in (0, 1)]
 
 
-@pytest.mark.parametrize("weight", [0.0, 0.5, 1.0])
+@pytest.mark.parametrize("weight", probes.long_but([0.5], [0.0, 0.5, 1.0]))
 def test_values_of_a_chain_that_terminates(weight):
     # Place 1: Q(1, a) = a_x. Place 0: a_y / 2 and half of what follows, which is the best (1) to the one-step target
     # and what a uniform action gets on average (0) to the n-step one.
@@ -200,7 +200,7 @@ def test_values_of_a_chain_that_terminates(weight):
     np.testing.assert_allclose(start, np.array([0, 0.5, 0, -0.5]) + 0.5 * (1 - weight), atol=0.1)
 
 
-@pytest.mark.parametrize("weight", [0.5, 1.0])
+@pytest.mark.parametrize("weight", probes.long_but([0.5], [0.5, 1.0]))
 def test_values_of_a_chain_that_is_truncated(weight):
     # Place 1 goes on as if it had no end, whatever the window: Q(1, a) = a_x + 1, at most 2. Place 0: a_y / 2 plus
     # 0.5 * 2 by one step; plus 0.5 * 0 + 0.25 * 2 by two, for the episode's end cuts the window of three.

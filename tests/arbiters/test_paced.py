@@ -240,6 +240,7 @@ def test_random_steps_are_no_arms(program):
     assert 0 < float(metrics["guided_share"][0]) < 0.5
 
 
+@pytest.mark.long
 def test_lanes_beside_each_other_are_lanes_alone(program):
     env = probes.Window()
     _, beside, _ = run(program, env, [3, 4], 2)

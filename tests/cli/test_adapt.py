@@ -150,11 +150,12 @@ RULED = GuideSizes(labels_per_round=20, feedback_layers=(16,), fit_steps=40, fit
     ("world", "options", "settings"),
     [
         ({"scenario": "ruled"}, [], {}),
-        (
+        pytest.param(
             {"offset_deg": 20.0},
             [*("--guidance", "demonstration", "--sizes.labels-per-round", "20", "--sizes.feedback-layers", "16"),
              *("--sizes.fit-steps", "40", "--sizes.frame", "action", "--judge-by", "hit", "--first-seed", "7")],
             {"guidance": "demonstration", "judge_by": "hit", "seed": 7, "sizes": RULED},
+            marks=pytest.mark.long,
         ),
     ],
     ids=["a scenario's rules", "a plain world"],
@@ -371,16 +372,6 @@ def _shapes(folder):
     values, env = policy_folders.read(folder), registry.find("turned").environment(registry.find("turned").config())
     lanes = stored.shapes_of({**values["policy"], "base": {"policy": "uniform"}}, env, len(values["lanes"]["seeds"]))
     return {**lanes, "base": {}}
-
-
-def test_help_names_what_there_is_to_choose_from(capsys):
-    with pytest.raises(SystemExit) as stop:
-        main(["adapt", *TASK, "--help"])
-    assert stop.value.code == 0
-    told = capsys.readouterr().out
-    assert "aslant" in told
-    assert "--bound-deg" in told
-    assert jax.default_backend() == "cpu"
 
 
 def test_of_two_adaptations_at_once_the_second_is_refused_before_it_works(home, refused, tmp_path):

@@ -16,7 +16,10 @@ def test_no_damage_gives_a_traceback_or_another_number(run_folder, tmp_path):
     assert not [(case, outcome) for case, outcome in found if outcome]
 
 
-def test_no_damage_of_a_policy_an_export_labels_or_a_teacher_gives_another_value(tmp_path):
+@pytest.mark.parametrize("cases", [15, pytest.param(60, marks=pytest.mark.long)])
+def test_no_damage_of_a_policy_an_export_labels_or_a_teacher_gives_another_value(tmp_path, cases):
     expected = damaged_files.make_folders(tmp_path)
-    found = [(case, damaged_files.wrong(tmp_path, expected, case)) for case in damaged_files.cases(tmp_path, 60, SEED)]
+    found = [
+        (case, damaged_files.wrong(tmp_path, expected, case)) for case in damaged_files.cases(tmp_path, cases, SEED)
+    ]
     assert not [(case, outcome) for case, outcome in found if outcome]

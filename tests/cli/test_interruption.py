@@ -72,7 +72,7 @@ def test_kill_loses_one_stretch_at_most_and_resume_goes_on(tmp_path, uninterrupt
 
 
 @pytest.mark.parametrize(
-    ("seconds", "number"), [pytest.param(0.3, signal.SIGTERM, marks=pytest.mark.long), (6.0, signal.SIGINT)]
+    ("seconds", "number"), [(0.3, signal.SIGTERM), pytest.param(6.0, signal.SIGINT, marks=pytest.mark.long)]
 )
 def test_an_evaluation_ends_at_once_in_one_line(seconds, number):
     """While modules are loaded, and while something is compiled or computed."""

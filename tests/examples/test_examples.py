@@ -281,6 +281,7 @@ def test_the_soft_agent_does_not_see_from_the_action():
         soft.Config().make("action", spaces_of(probes.Window()))
 
 
+@pytest.mark.long
 def test_a_kind_that_asks_needs_a_teacher(home, capsys):
     for kind in ("relative", "examples.clone:KIND"):
         command = ["train", "examples.brax_task:TASK", *TINY, "--guidance", kind, "--out", home / "new"]

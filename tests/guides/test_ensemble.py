@@ -64,7 +64,9 @@ def test_one_member_is_the_network_itself():
     assert float(one.init(key)) == float(jax.random.normal(key))
 
 
-@pytest.mark.parametrize("kind", ["relative", "demonstration", "scalar", "dcoach", "intent"])
+@pytest.mark.parametrize(
+    "kind", probes.long_but(["relative"], ["relative", "demonstration", "scalar", "dcoach", "intent"])
+)
 def test_members_that_are_the_same_do_what_one_does_and_do_not_disagree(kind):
     single, several = (registry.make(kind, sizes, ENV) for sizes in (ONE, FOUR))
     alone = single.init(jax.random.key(0)).replace(fitted=jnp.array(True))

@@ -59,7 +59,9 @@ def drawn(count):
     return OBS[jax.random.randint(k_context, (count,), 0, 4)], directions.uniform(k_action, (count,))
 
 
-@pytest.mark.parametrize(("frame", "rounds", "within"), [("raw", 3, 2), ("action", 6, 10)])
+@pytest.mark.parametrize(
+    ("frame", "rounds", "within"), [("raw", 3, 2), pytest.param("action", 6, 10, marks=pytest.mark.long)]
+)
 def test_demonstrations_are_cloned_and_replace_whatever_the_agent_would_do(frame, rounds, within):
     guide = taught("demonstration", rounds, frame=frame)
     for base in (BEST, -BEST, directions.rotate(BEST, 1.0)):

@@ -17,6 +17,7 @@ def test_a_row_s_figures_agree_with_each_other():
     assert row["spread"] >= 0
 
 
+@pytest.mark.long
 def test_timed_lanes_learn_and_compile_once():
     config = probes.config(agent={"batch_size": 7})  # another program than that of other tests
     timed = speed.Timed(speed.learning(config), Window(), "none", 2)

@@ -4,13 +4,14 @@ import dataclasses
 
 import jax.numpy as jnp
 import pytest
-from probes import Aimed, Chain, Window
+from probes import Aimed, Chain, Window, long_but
 
 from cuelearner_jax.guides import registry
 from cuelearner_jax.guides.refining import Refined
 from cuelearner_jax.testing import check_guidance
 from cuelearner_jax.testing.guidances import SMALL
 
+FEW = ("a flat target", "a branch", "an unfitted guide")
 SIZES = dataclasses.replace(SMALL, feedback_layers=(4,), fit_steps=2, validate_every=2)
 
 
@@ -73,7 +74,7 @@ BROKEN = {
 }
 
 
-@pytest.mark.parametrize("law", BROKEN)
+@pytest.mark.parametrize("law", long_but(FEW, BROKEN))
 def test_a_broken_law_is_told_in_one_line(law):
     kind, told = BROKEN[law]
     with pytest.raises(AssertionError) as raised:
@@ -83,7 +84,7 @@ def test_a_broken_law_is_told_in_one_line(law):
     assert "\n" not in str(raised.value)
 
 
-@pytest.mark.parametrize("name", [kind.name for kind in registry.known()])
+@pytest.mark.parametrize("name", long_but(("none", "relative"), [kind.name for kind in registry.known()]))
 def test_our_own_kinds_keep_the_laws(name):
     check_guidance(registry.find(name), Aimed(mirrors=True), SIZES)
 

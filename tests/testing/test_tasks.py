@@ -159,7 +159,10 @@ def test_navigation_keeps_them():
     check_task(NAVIGATION, NavigationConfig(worlds=8, max_steps=12, mirrors=True), steps=24)
 
 
-@pytest.mark.parametrize(("table", "mirrors"), [("one_ball", True), ("regulation", False), ("regulation", True)])
+@pytest.mark.parametrize(
+    ("table", "mirrors"),
+    [("one_ball", True), *(pytest.param("regulation", mirrors, marks=pytest.mark.long) for mirrors in (False, True))],
+)
 def test_billiards_keeps_them(table, mirrors):
     check_task(BILLIARDS, BilliardsConfig(table=table, mirrors=mirrors, search_directions=24), steps=12)
 

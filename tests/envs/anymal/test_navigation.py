@@ -72,6 +72,7 @@ def test_every_end_has_its_name(walked):
     assert np.asarray(first.terminated).tolist() == [False, True, True, True]
 
 
+@pytest.mark.long
 def test_time_runs_out_without_a_termination(walked):
     _, (_, _, third) = walked
     assert bool(third.truncated[0])
@@ -79,6 +80,7 @@ def test_time_runs_out_without_a_termination(walked):
     assert float(third.outcome["duration"][0]) == pytest.approx(0.6)
 
 
+@pytest.mark.long
 def test_told_straight_ahead_it_walks_straight_ahead(walked):
     (before, _, after, _), _ = walked
     start, end = before.body.qpos[0], after.body.qpos[0]
@@ -89,6 +91,7 @@ def test_told_straight_ahead_it_walks_straight_ahead(walked):
     assert aside < 0.1
 
 
+@pytest.mark.long
 def test_after_an_end_an_episode_begins_anew_standing_on_a_route(env, walked):
     (_, following, _, _), _ = walked
     for number in (1, 2, 3):
@@ -99,6 +102,7 @@ def test_after_an_end_an_episode_begins_anew_standing_on_a_route(env, walked):
     assert int(following.steps[0]) == 1
 
 
+@pytest.mark.long
 def test_replay_recalls_what_was_seen(env, walked):
     states, steps = walked
     state = jax.tree.map(lambda leaf: leaf[0], states[1])
@@ -109,6 +113,7 @@ def test_replay_recalls_what_was_seen(env, walked):
     np.testing.assert_allclose(after, steps[1].final_obs[0], atol=1e-6)
 
 
+@pytest.mark.long
 def test_all_that_is_carried_is_small(walked):
     (state, *_), _ = walked
     body = sum(leaf.size for leaf in jax.tree.leaves(state.body)) // WALKERS
@@ -116,6 +121,7 @@ def test_all_that_is_carried_is_small(walked):
     assert sum(leaf.size for leaf in jax.tree.leaves(state)) // WALKERS < 90
 
 
+@pytest.mark.long
 def test_commands_lead_where_the_direction_points(env, walked):
     body = jax.tree.map(lambda leaf: leaf[0], walked[0][0].body)
     yaw = robot.planar_pose(body.qpos)[2]
@@ -129,6 +135,7 @@ def test_commands_lead_where_the_direction_points(env, walked):
         np.testing.assert_allclose(told, wanted, atol=1e-4)
 
 
+@pytest.mark.long
 def test_commands_change_no_faster_than_legs_can_follow(env, walked):
     body = jax.tree.map(lambda leaf: leaf[0], walked[0][0].body)
     yaw = robot.planar_pose(body.qpos)[2]

@@ -25,6 +25,7 @@ def by_ball(aims):
     return [np.asarray(leaf).reshape(3, 6, *leaf.shape[1:]) for leaf in aims[:3]]
 
 
+@pytest.mark.long
 def test_the_laws_of_an_environment_hold_with_aims():
     check_environment(scenes.EASY.replace(max_shots=8), steps=16)
 

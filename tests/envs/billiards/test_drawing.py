@@ -158,6 +158,7 @@ def test_gif_has_the_frames_of_the_shot_and_lasts_as_long(shot, tmp_path):
     assert share(pictures[-1][: int(below)], drawing.TARGETS[0]) == 0
 
 
+@pytest.mark.long
 @pytest.mark.filterwarnings("ignore:os.fork:RuntimeWarning")  # by the reader of this test
 def test_mp4_has_even_sides_and_every_frame_of_both_shots(shot, tmp_path):
     drawing.animate(TABLE, [shot, shot], tmp_path / "shots.mp4", fps=25, speed=3.0)

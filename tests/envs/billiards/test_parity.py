@@ -9,8 +9,6 @@ import pytest
 
 from cuelearner_envs.billiards import Table, simulate_many
 
-SCENES = 40
-
 
 @pytest.fixture(scope="module")
 def engine():
@@ -23,18 +21,19 @@ def engine():
     return module
 
 
-def test_random_shots_end_as_in_chipmunk(engine):
+@pytest.mark.parametrize("count", [15, pytest.param(40, marks=pytest.mark.long)])
+def test_random_shots_end_as_in_chipmunk(engine, count):
     table = Table.regulation()
-    places, angles = engine.scenes(table, SCENES, seed=1)
+    places, angles = engine.scenes(table, count, seed=1)
     angles[::2] = np.arctan2(*(places[::2, 1] - places[::2, 0]).T[::-1])  # else few shots would move a target
     world = engine.PymunkTable(table, engine.FINE_STEP)
     theirs = [world.play(place, angle) for place, angle in zip(places, angles, strict=True)]
-    ours = jax.jit(simulate_many)(table, places.astype("f4"), np.zeros((SCENES, 4), bool), angles.astype("f4"))
+    ours = jax.jit(simulate_many)(table, places.astype("f4"), np.zeros((count, 4), bool), angles.astype("f4"))
 
     pocketed = np.array([gone for _, gone, _ in theirs])
     assert pocketed.any()
     agree = (pocketed == np.asarray(ours.pocketed)).all(1)
-    assert agree.mean() >= 0.95  # 0.997 over 300 scenes; 0.95 allows two of these forty
+    assert agree.sum() >= count - 2  # 0.997 of 300 scenes agree
     distance = np.linalg.norm(np.array([place for place, _, _ in theirs]) - ours.positions, axis=-1)
     moved = np.linalg.norm(places - ours.positions, axis=-1) > 1e-3
     assert np.median(distance[agree[:, None] & ~pocketed & moved]) < 0.6e-3

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from flax import struct
+from probes import long_but
 
 from cuelearner_envs.billiards.config import BilliardsConfig, make_environment
 from cuelearner_envs.billiards.teacher import PROPOSALS, LocalSearchTeacher, NearbyTeacher, SearchTeacher, Transferred
@@ -155,7 +156,7 @@ def test_a_configuration_names_the_search_near_a_networks_proposals():
     assert isinstance(learned(action_turn_deg=0.8)[1], Transferred)
 
 
-@pytest.fixture(scope="module", params=SCENARIOS)
+@pytest.fixture(scope="module", params=long_but(["turned_strike"], SCENARIOS))
 def near(request, easy):
     """In a changed world: the search near proposals, the search of all directions, what these are worth, the states."""
     config = SCENARIOS[request.param].applied(BilliardsConfig("easy", teacher="local_search"))

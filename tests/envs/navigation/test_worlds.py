@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from probes import long_but
 from scipy import ndimage
 
 from cuelearner_envs.navigation import generate
@@ -31,7 +32,7 @@ OPTIMISED = {"xla_backend_optimization_level": 1}
 generate_one = jax.jit(generate, static_argnames=("style", "routes"), compiler_options=OPTIMISED)
 
 
-@pytest.fixture(scope="module", params=STYLES)
+@pytest.fixture(scope="module", params=long_but(["rooms"], STYLES))
 def sample(request):
     """Hundreds of worlds of a style, as numpy arrays: those of `generate_many`, one at a time on two threads."""
     keys = list(jax.vmap(partial(jax.random.fold_in, jax.random.key(3)))(jnp.arange(KEYS)))
@@ -254,6 +255,7 @@ def test_some_rooms_routes_have_no_straight_way(sample):
     assert np.mean(blocked) > 0.5
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("sample", ["corridor"], indirect=True)
 @pytest.mark.parametrize("side", [1.0, -1.0])
 def test_every_obstacle_of_a_corridor_can_be_passed_on_either_side(sample, side):
