@@ -19,7 +19,7 @@ from cuelearner_jax.devices import lane_mesh
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.policies import Agent, Guided, Uniform
 from cuelearner_jax.spaces import directions
-from cuelearner_jax.types import Label, Step
+from cuelearner_jax.types import Step
 
 ENV, EXPERT = probes.Window(), probes.Expert(probes.Window())
 MESH = lane_mesh()
@@ -570,10 +570,3 @@ def test_transitions_are_mirrored_as_a_whole():
 
 def test_label_slots_are_whole_rounds():
     assert [asking.label_slots(budget, probes.SIZES) for budget in (1, 10, 11, 100)] == [10, 10, 20, 100]
-
-
-def test_empty_label_sets_have_the_shape_of_the_largest_budget():
-    labels = probes.start(probes.window_program("relative"), SEEDS, [15] * 4).guide.labels
-    assert isinstance(labels, Label)
-    assert (labels.obs.shape, labels.action.shape, labels.answer.shape) == ((4, 60, 2), (4, 60, 2), (4, 60, 1))
-    assert not labels.valid.any()

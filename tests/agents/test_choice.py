@@ -64,7 +64,7 @@ def test_the_higher_of_two_peaks_is_found_though_the_first_look_sees_it_lower():
     assert chosen_deg(both, peaks=1) == pytest.approx(90.0, abs=0.01)  # which one peak alone does not see
 
 
-@pytest.mark.parametrize("coarse", long_but([36], [36, 120, 360]))
+@pytest.mark.parametrize("coarse", probes.long_but([36], [36, 120, 360]))
 def test_the_quick_choice_of_a_network_is_the_full_one(coarse):
     obs = jax.random.normal(jax.random.key(1), (64, 5))
     quick = dataclasses.replace(FULL, coarse_directions=coarse, peaks=4)

@@ -106,11 +106,6 @@ def test_the_hash_of_a_configuration_depends_on_what_a_lane_learns_from_alone():
     assert runs.config_hash({**values, "agent": {**values["agent"], "polyak": 0.5}}) != found
 
 
-def test_a_run_of_another_format_is_not_loaded(out):
-    probes.edit_json(out / "config.json", lambda values: values.update(format=3))
-    not_loaded(out, "is of format 3, this program reads format 1")
-
-
 def not_loaded(folder, message):
     before = probes.files_of(folder)
     with pytest.raises(UserError, match=message) as refusal:
@@ -122,12 +117,6 @@ def not_loaded(folder, message):
 def test_a_folder_that_is_no_run_is_not_loaded(tmp_path):
     not_loaded(tmp_path, "no run folder")
     not_loaded(tmp_path / "missing", "no run folder")
-
-
-@pytest.mark.parametrize("content", [b"", b"{", b"\xff\xfe\x00", b"[]", b"3", b"null"])
-def test_a_damaged_description_is_not_loaded(out, content):
-    (out / "config.json").write_bytes(content)
-    not_loaded(out, "damaged or of another program")
 
 
 @pytest.mark.parametrize(

@@ -120,11 +120,6 @@ def test_resuming_from_a_damaged_description_is_refused(out, content):
     folders.check_folder(out, DESCRIBED, resume=False, overwrite=True)  # as the message says
 
 
-def test_a_run_of_another_format_is_not_resumed(out):
-    probes.edit_json(out / "config.json", lambda values: values.update(format=FORMATS["config"] + 1))
-    refused(out, r"config\.json is of format", resume=True)
-
-
 def test_a_clean_start_deletes_the_run_and_any_other_keeps_it(out):
     folders.prepare_folder(out, described(split="validation"), clean=False)
     assert (out / "none" / "results.jsonl").exists()

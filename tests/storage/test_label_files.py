@@ -151,14 +151,6 @@ def test_damage_is_noticed_wherever_it_changes_anything(path):
     assert refusals > columns // 60
 
 
-@pytest.mark.parametrize("share", [0.0, 0.5, 0.99])
-def test_a_cut_off_file_is_refused(path, share):
-    written(path)
-    path.write_bytes(path.read_bytes()[: int(share * path.stat().st_size)])
-    with pytest.raises(UserError, match="damaged"):
-        files.read(path)
-
-
 def test_text_and_foreign_tables_are_refused(path):
     path.write_text("seed,obs\n1,2\n")
     with pytest.raises(UserError, match="not a label file"):
@@ -188,27 +180,6 @@ def assert_holds(file, labels, count):
     assert file.seeds.tolist() == [7] * count
     for name in NAMES:
         np.testing.assert_array_equal(getattr(file.labels, name), getattr(labels, name)[0, :count])
-
-
-def test_each_label_can_be_read_before_the_writer_closes(tmp_path):
-    labels = label_sets(lanes=1)
-    writer = files.LabelWriter(tmp_path, TASK, "relative", DIRECTIONS, EPS)
-    with pytest.raises(UserError, match="holds no labels"):
-        files.read(tmp_path / files.JSONL)
-    for index in range(3):
-        writer.append(seed=7, **{name: getattr(labels, name)[0, index] for name in NAMES})
-        assert_holds(files.read(tmp_path / files.JSONL), labels, index + 1)
-    writer.close()
-
-
-@pytest.mark.parametrize("torn", [b'{"seed": 7, "ob', b'{"seed": 7, "obs": [1.0', b"\x00\x00\x00"])
-def test_a_killed_session_goes_on_where_it_was(tmp_path, torn):
-    labels = said(tmp_path, range(5))
-    with (tmp_path / files.JSONL).open("ab") as file:
-        file.write(torn)
-    assert_holds(files.read(tmp_path / files.JSONL), labels, 5)
-    said(tmp_path, range(5, 8))
-    assert_holds(files.read(tmp_path / files.JSONL), labels, 8)
 
 
 def test_a_file_cut_in_its_first_line_starts_anew_and_says_so(tmp_path, capsys):
@@ -269,12 +240,3 @@ def test_a_label_that_could_not_be_read_is_not_written(tmp_path):
             with pytest.raises(ValueError, match=message):
                 writer.append(seed=7, **{**row, name: wrong})
     assert_holds(files.read(tmp_path / files.JSONL), labels, 2)
-
-
-def test_a_damaged_line_of_a_person_s_work_is_named(tmp_path):
-    said(tmp_path, range(4))
-    path = tmp_path / files.JSONL
-    written = path.read_text().splitlines()
-    path.write_text("\n".join([*written[:2], written[2][:-9], *written[3:]]) + "\n")
-    with pytest.raises(UserError, match=r"damaged: .*\(line 3: it has no checksum, so it, or a line before it"):
-        files.read(path)

@@ -35,13 +35,6 @@ def test_a_row_for_each_lane_with_its_types(tmp_path):
     assert results.metrics(table) == ["reward"]
 
 
-def test_every_append_is_readable_before_the_writer_closes(tmp_path):
-    writer = results.ResultsWriter(tmp_path, **CONSTANTS)
-    writer.append(step=0, split="training", seed=0, labels=0, reward=1.0)
-    assert len(rows(tmp_path)) == 1
-    writer.close()
-
-
 def test_values_that_are_not_finite_are_null_in_strict_json(tmp_path):
     with results.ResultsWriter(tmp_path, **CONSTANTS) as writer:
         writer.append(step=0, split="training", seed=[0, 1, 2], labels=0, reward=[float("nan"), float("inf"), 2.0])
@@ -54,44 +47,6 @@ def test_values_that_are_not_finite_are_null_in_strict_json(tmp_path):
     assert table["success"].to_pylist() == [None, None, None, 1.0]
 
 
-def test_append_refuses_rows_that_cannot_be_told_apart(tmp_path):
-    with results.ResultsWriter(tmp_path, **CONSTANTS) as writer:
-        with pytest.raises(ValueError, match="seed"):
-            writer.append(step=0, split="training", labels=0, reward=1.0)
-        with pytest.raises(ValueError, match="one length"):
-            writer.append(step=0, split="training", seed=[1, 2], labels=0, reward=[1.0, 2.0, 3.0])
-
-
-@pytest.mark.parametrize("torn", [b'{"step": 30, "se', b"\x00\x00\x00", b'{"step": 30, "split": "valid\xc3'])
-def test_a_torn_last_line_is_not_read_and_not_continued(tmp_path, torn):
-    write(tmp_path)
-    whole = rows(tmp_path)
-    with (tmp_path / results.JSONL).open("ab") as file:
-        file.write(torn)
-    assert rows(tmp_path) == whole
-    write(tmp_path, steps=[30])
-    assert len(rows(tmp_path)) == len(whole) + 2
-    assert rows(tmp_path)[: len(whole)] == whole
-
-
-def test_a_whole_last_line_without_its_line_end_is_kept(tmp_path):
-    write(tmp_path)
-    path = tmp_path / results.JSONL
-    path.write_bytes(path.read_bytes().rstrip(b"\n"))
-    write(tmp_path, steps=[30])
-    assert len(rows(tmp_path)) == 8
-
-
-def test_a_broken_line_in_the_middle_is_an_error_that_names_it(tmp_path):
-    write(tmp_path)
-    path = tmp_path / results.JSONL
-    lines = path.read_text().splitlines()
-    lines[2] = lines[2][:-5]
-    path.write_text("\n".join(lines) + "\n")
-    with pytest.raises(UserError, match="line 3"):
-        results.read(tmp_path)
-
-
 def test_truncation_and_a_resumed_writer_give_the_uninterrupted_table(tmp_path):
     write(tmp_path / "whole", steps=[0, 10, 20, 30])
     write(tmp_path / "resumed", steps=[0, 10, 20])
@@ -101,17 +56,6 @@ def test_truncation_and_a_resumed_writer_give_the_uninterrupted_table(tmp_path):
     assert {row["step"] for row in rows(tmp_path / "resumed")} == {0, 10}
     write(tmp_path / "resumed", steps=[20, 30])
     assert (tmp_path / "resumed" / results.JSONL).read_bytes() == (tmp_path / "whole" / results.JSONL).read_bytes()
-
-
-def test_changed_constants_hold_from_the_resumption_on(tmp_path):
-    write(tmp_path, steps=[0, 10])
-    write(tmp_path, steps=[20], hardware="8 x gpu")
-    assert [row["hardware"] for row in rows(tmp_path)] == ["1 x cpu"] * 4 + ["8 x gpu"] * 2
-
-
-def test_truncating_nothing_does_nothing(tmp_path):
-    results.truncate_after(tmp_path, 10)
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_parquet_round_trip_keeps_every_value_and_leaves_one_file(tmp_path):

@@ -24,7 +24,6 @@ from cuelearner_envs.billiards.config import BilliardsConfig, make_environment
 from cuelearner_envs.billiards.environment import Billiards
 from cuelearner_envs.billiards.recording import record
 from cuelearner_envs.billiards.table import Table, rack
-from cuelearner_jax.environment import Environment
 from cuelearner_jax.policies import Heuristic
 from cuelearner_jax.spaces import directions
 
@@ -275,34 +274,6 @@ def test_changed_worlds_compile_nothing_new():
 
 
 # ----------------------------------------------------------------------------------------------- interface, recordings
-
-
-@pytest.mark.parametrize("name", TABLES)
-def test_the_environment_fulfils_the_protocol(name):
-    env: Environment = make_environment(BilliardsConfig(name))
-    action = jax.ShapeDtypeStruct((2,), jnp.float32)
-    state, obs = jax.eval_shape(env.reset, KEY)
-    after, result = jax.eval_shape(env.step, KEY, state, action)
-    assert obs.shape == result.obs.shape == result.final_obs.shape == (env.obs_size,)
-    chex.assert_trees_all_equal_shapes_and_dtypes(state, after)  # a step can be scanned
-    assert result.reward.shape == result.terminated.shape == result.truncated.shape == ()
-    assert (obs.dtype, result.reward.dtype) == (jnp.float32, jnp.float32)
-    assert (result.terminated.dtype, result.truncated.dtype) == (bool, bool)
-    assert all((value.shape, value.dtype) == ((), jnp.float32) for value in result.metrics.values())
-    assert jax.eval_shape(env.heuristic, obs).shape == (2,)
-    chex.assert_trees_all_equal_shapes_and_dtypes(
-        jax.eval_shape(env.mirror, jax.ShapeDtypeStruct((), jnp.int32), obs, action), (obs, action)
-    )
-
-
-def test_a_batch_plays_as_one_table_does():
-    states, strikes = random_states()
-    keys = jax.random.split(jax.random.key(7), BATCH)
-    after, result = step_many(EASY, keys, states, strikes)
-    for number in (0, 5, 10):
-        alone = step(EASY, keys[number], jax.tree.map(lambda leaf, n=number: leaf[n], states), strikes[number])
-        one_of_many = jax.tree.map(lambda leaf, n=number: leaf[n], (after, result))
-        chex.assert_trees_all_close(alone, one_of_many, atol=1e-5)
 
 
 def test_records_hold_the_path_of_every_shot_and_what_the_environment_paid():

@@ -14,7 +14,6 @@ from cuelearner_envs.navigation.config import NavigationConfig, make_environment
 from cuelearner_envs.navigation.environment import Navigation, Walker
 from cuelearner_envs.navigation.lidar import Lidar
 from cuelearner_envs.navigation.world import FAR_AWAY
-from cuelearner_jax.environment import Environment
 from cuelearner_jax.errors import UserError
 
 KEY = jax.random.key(0)
@@ -62,16 +61,6 @@ def moved(env, state, action):
 
 
 # --- observation -----------------------------------------------------------------------------------------------------
-
-
-def test_the_environment_follows_the_protocol():
-    env: Environment = HALL
-    assert (env.obs_size, env.symmetries, env.replace(mirrors=True).symmetries) == (280, 1, 2)
-    state, obs = jax.eval_shape(env.reset, KEY)
-    assert (obs.shape, obs.dtype) == ((280,), jnp.float32)
-    following, result = jax.eval_shape(env.step, KEY, state, AHEAD)
-    assert jax.tree.map(jnp.shape, following) == jax.tree.map(jnp.shape, state)
-    assert (result.obs.shape, result.final_obs.shape, result.aftermath.shape) == ((280,), (280,), (3,))
 
 
 def test_the_observation_is_nearness_then_the_goals_direction_and_distance_then_actions():

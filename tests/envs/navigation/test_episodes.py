@@ -257,15 +257,6 @@ def assert_mostly_close(found, expected):
     assert (apart > 1e-4).mean() < 1e-3
 
 
-def test_mirroring_twice_or_under_the_identity_changes_nothing(plays):
-    _, played_steps = plays["plain"]
-    obs, action = flat(played_steps)[1][:50], flat(played_steps)[3][:50]
-    image = jax.vmap(worlds().mirror, (None, 0, 0))
-    chex.assert_trees_all_equal(image(0, obs, action), (obs, action))
-    chex.assert_trees_all_equal(image(1, *image(1, obs, action)), (obs, action))
-    np.testing.assert_array_equal(image(1, obs, action)[1], action * SIGNS[None, :2])
-
-
 # --- changes ---------------------------------------------------------------------------------------------------------
 
 

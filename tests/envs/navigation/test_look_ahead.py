@@ -16,7 +16,6 @@ from cuelearner_envs.navigation.world import World
 from cuelearner_envs.navigation.worlds import FARTHEST
 from cuelearner_jax.adaptation import stored
 from cuelearner_jax.adaptation.lanes import Lanes
-from cuelearner_jax.cli import main
 from cuelearner_jax.config import GuideSizes, to_json
 from cuelearner_jax.environment import spaces_of
 from cuelearner_jax.errors import UserError
@@ -177,12 +176,6 @@ def test_the_option_widens_aims_and_leaves_observations_alone():
     assert (plain.aims, more.aims) == (PLAINLY, PLAINLY + 3)
     assert plain._replace(aims=None) == more._replace(aims=None)
     assert not NavigationConfig().look_ahead
-
-
-def test_the_option_is_on_the_command_line(capsys):
-    with pytest.raises(SystemExit):
-        main(["adapt", "--task", "navigation", "--help-all"])
-    assert "--task.look-ahead, --task.no-look-ahead" in capsys.readouterr().out
 
 
 def kept(guidance, look_ahead):
