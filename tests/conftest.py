@@ -86,26 +86,24 @@ def pytest_runtest_setup(item):
     jax.config.update("jax_numpy_rank_promotion", "allow" if lies_in(item.path, LOOSE_RANKS) else "raise")
 
 
-# What `make test-quick` leaves out: files and folders with a compile of more than a few seconds, or with processes of
-# their own to wait for.
-SLOW = (
-    *("adaptation", "bridges", "cli", "envs/anymal", "examples", "api", "labelling"),
-    *("testing", "experiments", "export/test_decisions.py", "storage/test_tracking.py"),
-    *("agents/test_choice.py", "agents/test_n_step.py", "storage/test_checkpoint.py", "runs/test_runs.py"),
-    *("runs/test_failures.py", "runs/test_given_labels.py", "runs/test_lanes.py", "runs/test_resume.py"),
-    *("envs/billiards/test_environment.py", "envs/billiards/test_mirrors.py", "envs/billiards/test_parity.py"),
-    *("envs/billiards/test_teacher.py", "envs/navigation/test_drawing.py", "envs/navigation/test_environment.py"),
-    *("envs/navigation/test_episodes.py", "envs/navigation/test_roadmap.py", "envs/navigation/test_worlds.py"),
-    "envs/navigation/test_sides.py",
-    *("test_asking.py", "test_devices.py", "test_environment.py", "test_evaluate.py", "test_loop.py"),
-    *("tasks/test_registry.py", "test_policies.py"),
-)
+def recorded():
+    """Seconds of each file of tests, as `make durations` has last written them."""
+    rows = (line.split() for line in (TESTS / "durations.txt").read_text().splitlines() if not line.startswith("#"))
+    return {file: float(seconds) for seconds, _, file in rows}
 
+
+SECONDS = recorded()
+SLOW = 8.0  # seconds above which `make test-quick` leaves a file out
 
 # Files that train or call the same compiled programs: one process runs them one after the other, and compiles once.
+SWEEPS = ("commands", "export", "failures", "hostile_files", "interruption", "pieces", "shards")
 SHARING = {
     **dict.fromkeys(("tests/test_loop.py", "tests/test_asking.py", "tests/test_policies.py"), "loop"),
+    **{f"tests/cli/test_{name}.py": "sweeps of billiards" for name in SWEEPS},
 }
+GROUPS = Counter()
+for file, seconds in SECONDS.items():
+    GROUPS[SHARING.get(file, file)] += seconds
 
 
 @pytest.hookimpl(optionalhook=True)
@@ -122,8 +120,9 @@ def pytest_xdist_make_scheduler(config, log):
 
 
 def pytest_collection_modifyitems(items):
-    """Marks the tests of `SLOW`, and has them begin first: what is left for the end can be shared out evenly."""
-    for item in items:
-        if lies_in(item.path, SLOW):
+    """Marks slow files, and begins with those that take longest: what is left for the end is shared out evenly."""
+    files = {item: item.nodeid.partition("::")[0] for item in items}
+    for item, file in files.items():
+        if SECONDS.get(file, 0.0) > SLOW:
             item.add_marker(pytest.mark.slow)
-    items.sort(key=lambda item: item.get_closest_marker("slow") is None)  # keeps the order among equals
+    items.sort(key=lambda item: -GROUPS[SHARING.get(files[item], files[item])])  # keeps the order among equals

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import copy
 import functools
 import hashlib
 import io
@@ -21,12 +20,13 @@ import sys
 import tempfile
 import traceback
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import json_ways
 import numpy as np
 import probes
 import small_policies
@@ -214,25 +214,10 @@ def _signed(path: Path, at: int) -> None:
         DAMAGES["flipped"](path, at)
         return
     values = json.loads(path.read_text())
-    ways = [way for way in _ways(values) if way[0] not in ("digest", runner.DIGEST)]
+    ways = [way for way in json_ways.ways(values) if way[0] not in ("digest", runner.DIGEST)]
     way = ways[at % len(ways)]
-    parent = functools.reduce(lambda part, name: part[name], way[:-1], values)
-    chosen = at // len(ways) % (len(NONSENSE) + 2)
-    if chosen < len(NONSENSE):
-        parent[way[-1]] = NONSENSE[chosen]
-    elif chosen == len(NONSENSE):
-        del parent[way[-1]]
-    else:
-        parent[way[-1]] = [copy.deepcopy(parent[way[-1]])] * 3
-    path.write_text(json.dumps(values))
-
-
-def _ways(values: Any, way: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
-    """The ways to everything in nested JSON values."""
-    if isinstance(values, dict | list):
-        for name, value in values.items() if isinstance(values, dict) else enumerate(values):
-            yield (*way, name)
-            yield from _ways(value, (*way, name))
+    tried = (*NONSENSE, json_ways.GONE, [json_ways.at(values, way)] * 3)
+    path.write_text(json.dumps(json_ways.changed(values, way, tried[at // len(ways) % len(tried)])))
 
 
 FILE_DAMAGES = {**DAMAGES, "swapped": _swapped, "zeroed": _zeroed, "repeated": _repeated, "signed": _signed}

@@ -10,9 +10,6 @@ import pytest
 
 from cuelearner_jax.bridges.brax import from_brax, to_brax
 from cuelearner_jax.environment import (
-    Described,
-    Quantity,
-    WholeObservations,
     actions_of,
     offers,
     random_symmetries,
@@ -53,23 +50,6 @@ def test_an_observation_has_as_many_entries_as_its_slices_together(name):
     assert obs.shape == (env.obs_size,)
     assert len({quantity.name for quantity in slices}) == len(slices)
     assert all(quantity.name and quantity.unit and quantity.size > 0 for quantity in slices)
-
-
-def test_the_size_follows_from_the_slices():
-    class Two(Described):
-        observation = (Quantity("place", 3, "m"), Quantity("speed", 4, "m/s", "along and across"))
-
-    assert Two().obs_size == 7
-
-
-def test_whole_observations_come_back_as_they_are():
-    class Plain(WholeObservations):
-        observation = (Quantity("place", 2, "m"),)
-
-    obs, following = jnp.array([1.0, 2.0]), jnp.array([3.0, 4.0])
-    kept = Plain().remember(None, obs)
-    assert Plain().recall(kept) is obs
-    assert Plain().recall_next(kept, obs, following) is following
 
 
 # What is optional.

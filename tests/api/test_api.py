@@ -154,26 +154,11 @@ def changed(**parts):
     return own_labels()._replace(**parts)
 
 
-NONSENSE = [
-    (lambda: cl.fit_feedback(changed(answer=np.full(200, 0.5))), "an answer is none of -1, 0, 1"),
-    (lambda: cl.fit_feedback(changed(action=np.zeros((200, 2)))), "no unit vectors"),
-    (
-        lambda: cl.fit_feedback(changed(action=np.full((200, 2), np.nan))),
-        "labels.action holds numbers that are not finite",
-    ),
-    (lambda: cl.fit_feedback(changed(obs=np.full((200, 2), np.inf))), "labels.obs holds numbers that are not finite"),
+NONSENSE = [  # that test_nonsense_calls.py does not have
     (lambda: cl.fit_feedback(changed(answer=np.ones(7))), r"give observations \(n, obs\)"),
     (lambda: cl.fit_feedback(cl.Labels(SEEN[:1], SEEN[:1], np.ones(1))), "1 labels teach nothing"),
-    (lambda: cl.fit_feedback(own_labels(), eps_deg=0.0), "eps_deg is 0.0"),
     (lambda: cl.fit_feedback(own_labels(), sizes=SIZES, scalars=WILD), "the fit of the feedback model diverged"),
-    (lambda: cl.fit_feedback("nowhere.parquet"), "no label file at nowhere.parquet"),
-    (lambda: cl.ask(policy, WORLD, TEACHER, labels=0), "labels is 0"),
-    (lambda: cl.ask(policy, WORLD, TEACHER, labels=5, bound_deg=200.0), "bound_deg is 200.0:"),
-    (lambda: cl.ask(42, WORLD, TEACHER, labels=5), "42 is no policy"),
-    (lambda: cl.load_policy("nowhere"), "folder nowhere does not exist"),
     (lambda: cl.train(WORLD, None, probes.CONFIG, guidance=["relative"], seeds=1), "asks a teacher: give one"),
-    (lambda: cl.train(WORLD, TEACHER, "quickstat", seeds=1), "unknown preset 'quickstat'"),
-    (lambda: cl.train(WORLD, TEACHER, probes.CONFIG, seeds=0), "seeds is 0: give a whole number from 1"),
     (lambda: cl.train(WORLD, TEACHER, probes.CONFIG, guidance=["telepathy"]), "unknown guidance 'telepathy'"),
 ]
 

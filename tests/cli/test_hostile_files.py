@@ -1,7 +1,5 @@
 """Files written to execute code: no string of any file that is read reaches an import, a pickle or a process."""
 
-import copy
-import functools
 import hashlib
 import json
 import pickle
@@ -11,6 +9,7 @@ import threading
 
 import jax
 import jax.numpy as jnp
+import json_ways
 import numpy as np
 import probes
 import pyarrow as pa
@@ -78,22 +77,12 @@ def listening(hook, tmp_path, monkeypatch):
     sys.modules.pop("hostile", None)
 
 
-def strings(values, way=()):
-    """The ways to every string of nested JSON values."""
-    for name, value in values.items() if isinstance(values, dict) else enumerate(values):
-        if isinstance(value, str):
-            yield (*way, name)
-        elif isinstance(value, dict | list):
-            yield from strings(value, (*way, name))
-
-
 def spoiled(values):
     """The values with one string after the other replaced by the attacker's; without their digest."""
     values.pop("digest", None)
-    for way in list(strings(values)):
-        changed = copy.deepcopy(values)
-        functools.reduce(lambda part, name: part[name], way[:-1], changed)[way[-1]] = HOSTILE
-        yield way, changed
+    for way in json_ways.ways(values):
+        if isinstance(json_ways.at(values, way), str):
+            yield way, json_ways.changed(values, way, HOSTILE)
 
 
 def reads(read, folder):

@@ -13,10 +13,8 @@ import pytest
 from small_runs import SMALL
 
 from cuelearner_jax.cli import main
-from cuelearner_jax.errors import UserError
 from cuelearner_jax.runs.shards import Shard
 from cuelearner_jax.storage import results
-from cuelearner_jax.storage.folders import claimed
 
 ENTRY = [str(Path(sys.executable).with_name("cuelearner"))]
 SWEEP = ["sweep", "billiards", "--preset", "quickstart", *SMALL, "--seeds", "3", "--first-seed", "7"]
@@ -102,15 +100,6 @@ def test_a_piece_that_was_killed_goes_on_with_the_same_command(tmp_path, capsys)
     assert "is being written by another process" in capsys.readouterr().err
     assert main([*command, "--out", str(killed)]) == 0
     assert rows(killed) == rows(calm)
-
-
-def test_a_folder_is_free_again_after_its_process(tmp_path):
-    out = tmp_path / "run"
-    with claimed(out), pytest.raises(UserError, match="another process"), claimed(out):
-        pass
-    with claimed(out):
-        pass
-    assert os.listdir(out) == [".lock"]  # empty, and free
 
 
 def test_a_full_disk_stops_a_piece_and_damages_nothing(whole, tmp_path, capsys, monkeypatch):

@@ -1,7 +1,6 @@
 """Exported decisions: the policies' own in every format, the contract that lies beside them, and what is refused."""
 
 import dataclasses
-import functools
 import hashlib
 import json
 import os
@@ -12,6 +11,7 @@ import warnings
 
 import jax
 import jax.numpy as jnp
+import json_ways
 import numpy as np
 import onnxruntime
 import pytest
@@ -173,14 +173,6 @@ JUNK = [None, -1, 1e30, True, "/etc/passwd", [], {"a": 1}, float("nan")]
 NEEDED = {"version", "artefact", "files"} | {"observation", "action", "golden"}
 
 
-def leaves(values, way=()):
-    """The ways to every value of nested JSON values, the lists and objects themselves included."""
-    for name, value in values.items() if isinstance(values, dict) else enumerate(values):
-        yield (*way, name)
-        if isinstance(value, dict | list):
-            yield from leaves(value, (*way, name))
-
-
 @pytest.mark.parametrize("every", [5, pytest.param(1, marks=pytest.mark.long)])
 def test_nonsense_in_a_contract_is_refused_in_one_line_wherever_it_stands(tmp_path, every):
     """Whoever writes it signs it too; what is not refused decides as before."""
@@ -189,17 +181,12 @@ def test_nonsense_in_a_contract_is_refused_in_one_line_wherever_it_stands(tmp_pa
     whole = json.loads((there / runner.CONTRACT).read_text())
     whole.pop(runner.DIGEST)
     wanted, refused, taken = runner.Decision(there)(DRAWN[:3]), 0, set()
-    ways = [way for way in leaves(whole) if way[0] in NEEDED and "space" not in way]  # its cues are words
+    ways = [way for way in json_ways.ways(whole) if way[0] in NEEDED and "space" not in way]  # its cues are words
     for way in ways[::every]:
-        for junk in (*JUNK, "gone"):
-            told = json.loads(json.dumps(whole))
-            place = functools.reduce(lambda part, name: part[name], way[:-1], told)
-            if place[way[-1]] == junk:
+        for junk in (*JUNK, json_ways.GONE):
+            if json_ways.at(whole, way) == junk:
                 continue
-            if junk == "gone":
-                del place[way[-1]]
-            else:
-                place[way[-1]] = junk
+            told = json_ways.changed(whole, way, junk)
             (there / runner.CONTRACT).write_text(json.dumps({**told, runner.DIGEST: runner.digest(told)}))
             try:
                 decide = runner.Decision(there)

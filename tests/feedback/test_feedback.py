@@ -12,7 +12,6 @@ import pytest
 
 from cuelearner_jax.agents.networks import applied, residual_network
 from cuelearner_jax.config import Scalars, Sizes
-from cuelearner_jax.environment import random_symmetries
 from cuelearner_jax.feedback.answers import human_answer, relative_feedback
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.guides.fitting import Lesson, fit_least_squares, lessons
@@ -110,21 +109,11 @@ def answers(scalars, best_deg):
     return jax.vmap(lambda key: human_answer(key, DIRECTIONS, direction(0), direction(best_deg), scalars))(keys)
 
 
-def test_a_teacher_without_faults():
-    h, answered = answers(Scalars(eps_deg=10.0), 30.0)
-    assert set(h[:, 0].tolist()) == {1.0}
-    assert bool(answered.all())
-
-
 def test_a_teacher_that_is_always_mistaken_tells_every_turn_the_wrong_way():
     scalars = Scalars(eps_deg=10.0, mistake_probability=1.0)
     assert set(answers(scalars, 30.0)[0][:, 0].tolist()) == {-1.0}
     assert set(answers(scalars, -30.0)[0][:, 0].tolist()) == {1.0}
     assert set(answers(scalars, 3.0)[0][:, 0].tolist()) == {0.0}
-
-
-def test_a_silent_teacher_never_answers():
-    assert not bool(answers(Scalars(eps_deg=10.0, silence_probability=1.0), 30.0)[1].any())
 
 
 def test_faults_come_with_their_probabilities_and_independently():
@@ -260,28 +249,7 @@ def test_the_key_and_the_learning_rate_matter():
     assert mean_error(slow, labels, ~HELD_OUT) > 3 * mean_error(one, labels, ~HELD_OUT)
 
 
-def test_vectors_are_turned_with_what_was_observed():
-    labels = jax.tree.map(jnp.asarray, label_set(4))
-    image = random_symmetries(jax.random.key(0), probes.Window(mirrors=True), ROWS)
-    (obs, action), (again, target) = image(labels.obs, labels.action), image(labels.obs, labels.target)
-    np.testing.assert_array_equal(obs, again)
-    turn = directions.difference(labels.obs, obs)
-    quarters = np.round(np.asarray(turn) / (math.pi / 2)).astype(int) % 4
-    np.testing.assert_allclose(np.abs(np.exp(1j * np.asarray(turn)) - 1j**quarters), 0, atol=1e-5)
-    assert set(quarters) == {0, 1, 2, 3}
-    for name, found in (("action", action), ("target", target)):
-        expected = directions.rotate(getattr(labels, name), jnp.array(quarters * math.pi / 2))
-        np.testing.assert_allclose(found, expected, atol=1e-5)
-
-
 def test_every_fit_starts_from_its_key_and_from_no_earlier_model():
     still = dataclasses.replace(SCALARS, feedback_learning_rate=0.0)
     model = fit(jax.random.key(7), label_set(0), still)
     assert_same(model.params, fresh(jax.random.split(jax.random.key(7))[0]))
-
-
-def test_without_symmetries_rows_stay_as_they_are():
-    labels = label_set(4)
-    obs, target = random_symmetries(jax.random.key(0), probes.Window(), ROWS)(labels.obs, labels.target)
-    assert obs is labels.obs
-    assert target is labels.target

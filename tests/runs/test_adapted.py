@@ -1,11 +1,11 @@
 """Policy folders whose policy.json was changed and signed anew: refused in one line, or opened as what they are."""
 
 import copy
-import functools
 import json
 
 import jax
 import jax.numpy as jnp
+import json_ways
 import pytest
 import small_policies
 
@@ -53,29 +53,15 @@ def opened(folder, monkeypatch):
     path.write_text(whole)
 
 
-def leaves(values, way=()):
-    """The ways to every value of nested JSON values, the lists and objects themselves included."""
-    for name, value in values.items() if isinstance(values, dict) else enumerate(values):
-        yield (*way, name)
-        if isinstance(value, dict | list):
-            yield from leaves(value, (*way, name))
-
-
 @pytest.mark.parametrize("every", [5, pytest.param(1, marks=pytest.mark.long)])
 def test_nonsense_in_a_policy_is_refused_in_one_line_wherever_it_stands(opened, every):
     open_as, whole = opened
     refused, taken = 0, []
-    ways = [way for way in leaves(whole) if way[0] not in TOLD]
+    ways = [way for way in json_ways.ways(whole) if way[0] not in TOLD]
     for way in [*[way for way in ways if way[-2:-1] not in (("sizes",), ("scalars",))], *ways[::4]][::every]:
-        for junk in (*JUNK, "gone"):
-            values = copy.deepcopy(whole)
-            place = functools.reduce(lambda part, name: part[name], way[:-1], values)
-            if junk == "gone":
-                del place[way[-1]]
-            else:
-                place[way[-1]] = junk
+        for junk in (*JUNK, json_ways.GONE):
             try:
-                lanes, _ = open_as(values)
+                lanes, _ = open_as(json_ways.changed(whole, way, junk))
             except UserError as error:
                 refused += 1
                 assert "\n" not in str(error)
@@ -83,7 +69,7 @@ def test_nonsense_in_a_policy_is_refused_in_one_line_wherever_it_stands(opened, 
             taken.append((way, junk))
             assert len({len(column) for column in (*lanes.lanes, lanes.used)}) == 1
             assert all(isinstance(kind, str) for kind in lanes.kinds)
-    odd = [way for way, junk in taken if isinstance(junk, str) and junk != "gone"]
+    odd = [way for way, junk in taken if isinstance(junk, str)]
     assert odd == [], odd
     assert refused > 150 / every
 

@@ -93,14 +93,8 @@ def test_a_task_from_outside_is_known_once_it_is_named(tmp_path):
 REFUSED = [
     ("own_here:TASKK", "own_here has no 'TASKK', did you mean 'TASK'?"),
     ("own_here:NUMBER", "own_here:NUMBER is of type int: a task is a cuelearner_jax.task.Task"),
-    ("own_nowhere:TASK", "no module 'own_nowhere' for own_nowhere:TASK: run in the folder that holds it"),
-    ("own_here.part:TASK", "no module 'own_here.part' for own_here.part:TASK"),
     ("own_broken:TASK", "own_broken fails to import (ZeroDivisionError: division by zero): mend it first"),
-    ("own_poor:TASK", "own_poor fails to import (ModuleNotFoundError: No module named 'own_missing')"),
-    ("own_leaving:TASK", "own_leaving fails to import (SystemExit: 3)"),
     ("own_taken:TASK", "there is a task 'billiards' already: give this one another name"),
-    ("own_here:", "does not name a task: give package.module:NAME"),
-    ("own here:TASK", "does not name a task: give package.module:NAME"),
     ("billards", "unknown task 'billards', did you mean 'billiards'?"),
 ]
 
@@ -110,8 +104,6 @@ def test_what_names_no_task_is_refused_in_one_line(tmp_path, text, says):
     (tmp_path / "own_here.py").write_text(OWN.format(name="mine"))
     (tmp_path / "own_taken.py").write_text(OWN.format(name="billiards"))
     (tmp_path / "own_broken.py").write_text("1 / 0\n")
-    (tmp_path / "own_poor.py").write_text("import own_missing\n")
-    (tmp_path / "own_leaving.py").write_text("import sys; sys.exit(3)\n")
     with pytest.raises(UserError) as refusal:
         registry.resolve(text)
     assert says in str(refusal.value)
