@@ -57,7 +57,7 @@ def communication() -> list[str]:
     group = lanes.LaneGroup(CONFIG, env, guidances.make("relative", CONFIG.sizes, env), GRID)
     (block,) = group.start()
     train = group.program.train
-    text = train.lower(env, CONFIG.scalars, CONFIG.schedule, start_clock(), block, 4).compile().as_text()
+    text = train.lower(env, CONFIG.settings, start_clock(), block, 4).compile().as_text()
     assert "while" in text
     assert len(block.key.sharding.device_set) == jax.device_count()
     return re.findall(r"all-reduce|all-gather|all-to-all|collective-permute|reduce-scatter", text)
