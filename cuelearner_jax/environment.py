@@ -24,6 +24,8 @@ class Quantity(NamedTuple):
     size: int  # entries
     unit: str  # of an entry, as "m", "rad" or "1" for a pure number
     about: str = ""  # what it is, where from and in which order, in a few words
+    kind: str = ""  # "beams" at equal angles, counterclockwise, or "directions", unit vectors: what a sensor turns with
+    step_deg: float = 0.0  # of beams: the angle between two neighbours
 
 
 # What `spaces.DIRECTIONS` are, where an environment does not say more by its own `action`.

@@ -25,6 +25,7 @@ ROWS = [
     ["task"],
     ["policies"],
     ["asking", "evaluate"],
+    ["calibration"],
     ["export"],
     ["loop"],
     ["adaptation"],

@@ -58,8 +58,15 @@ class Navigation(Described, struct.PyTreeNode):
     look_ahead: bool = struct.field(pytree_node=False, default=False)  # do aims tell where a second leg leads?
 
     observation = (
-        Quantity("lidar", BEAMS, "1", "exp(-distance / 1 m) of each beam, from -135 to +135 degrees, counterclockwise"),
-        Quantity("goal: direction", 2, "1", "unit vector in the body's frame"),
+        Quantity(
+            "lidar",
+            BEAMS,
+            "1",
+            "exp(-distance / 1 m) of each beam, from -135 to +135 degrees, counterclockwise",
+            "beams",
+            step_deg=1.0,
+        ),
+        Quantity("goal: direction", 2, "1", "unit vector in the body's frame", "directions"),
         Quantity("goal: distance", 1, f"{FARTHEST:g} m"),
         Quantity("previous actions", 2 * REMEMBERED, "1", "unit vectors, the latest first; zeros before the first"),
     )

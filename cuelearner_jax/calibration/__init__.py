@@ -1,0 +1,1 @@
+"""Calibration: relative answers read as evidence of what changed in the world."""

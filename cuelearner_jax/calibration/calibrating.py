@@ -1,0 +1,298 @@
+"""Calibration from the first question to the result: which changes explain the answers, how large they are, how sure.
+
+calibration = Calibration(policy, declared(env), actions_of(env), eps_deg=2.0)
+while calibration.asked < 100:
+    questions = calibration.questions(obs, 10)
+    calibration.learn(obs[questions.index], questions.action, answers, doubt=questions.doubt)
+found = calibration.result()    # found.words(), found.estimates, found.policy
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from cuelearner_jax.calibration.corrected import Calibrated
+from cuelearner_jax.calibration.families import Distortion, check_family, unknowns_of
+from cuelearner_jax.calibration.likelihood import GRID
+from cuelearner_jax.calibration.meaning import Meaning
+from cuelearner_jax.calibration.posterior import HELD_OUT, Answers, Fit
+from cuelearner_jax.calibration.questions import Questions, choose, drawn, ties
+from cuelearner_jax.calibration.scales import scales_of
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.policies import in_space, policy_of
+from cuelearner_jax.spaces import Space, said
+
+Floats = np.ndarray
+Given = Array | np.ndarray  # what is taken
+BATCH = 10  # questions between two fits
+CHOICE = 6  # situations of which one is asked about
+ROUNDS = 3  # of samples, where there were none
+LEAST = 20  # answers that two changes at once are asked of
+DOUBT = 2.0  # what the evidence of each change must exceed [nats]
+SURE = 3.0  # what the evidence of all must exceed, against no change [nats]
+SPREADS = 2.0  # standard errors by which held-out answers must be predicted better
+LARGEST = 3  # changes at once
+SETTLED, SETTLING = 10.0, 6  # samples that must count in the end, for each unknown and one; rounds for these at most
+APART = 2.5  # [eps]: a policy from which teachers differ by more, as a rule, is not explained
+
+CHANGED, UNCHANGED, UNEXPLAINED = "changed", "nothing changed", "none of these"
+
+
+class Estimate(NamedTuple):
+    """An unknown after all answers, in its unit."""
+
+    name: str
+    unit: str
+    mean: float
+    low: float  # ends of the 95% interval
+    high: float
+    changed: bool  # do the answers ask for it? If not, the interval is as if it alone were added
+
+    def words(self) -> str:
+        """One line."""
+        return f"{self.name}: {self.mean:.4g} [{self.low:.4g}, {self.high:.4g}] {self.unit}"
+
+
+class Result(NamedTuple):
+    """What answers tell about the changes of a world."""
+
+    verdict: str  # CHANGED, UNCHANGED or UNEXPLAINED
+    changes: tuple[str, ...]  # names of the distortions that are corrected
+    estimates: tuple[Estimate, ...]  # of every unknown
+    evidence: dict[tuple[str, ...], float]  # of each set of changes, less that of no change [nats]
+    held_out: tuple[float, float]  # mean log probability of a held-out answer without and with the changes [nats]
+    wrong: float  # share of answers about something else
+    apart: float  # how far teacher and corrected policy differ as a rule, in the space's unit
+    more: int | None  # labels that are probably still needed; None: not known
+    policy: Any  # the corrected policy, or the policy as it was
+
+    def words(self) -> list[str]:
+        """The result, line by line."""
+        if self.verdict == UNEXPLAINED:
+            return ["None of these changes explains the answers. The policy stays as it was."]
+        if self.verdict == UNCHANGED:
+            return ["The answers ask for no change. The policy stays as it was."]
+        lines = [one.words() for one in self.estimates if one.changed]
+        return [*lines, f"About {self.more} more labels are needed." if self.more else "No more labels are needed."]
+
+
+class Calibration:
+    """Answers so far, and what they tell.
+
+    Args:
+        policy: a policy, or any function of a batch of observations.
+        family: what may have changed; see `families.declared`.
+        space: of the actions.
+        eps_deg: strength of an answer, in the space's unit.
+        seed: of everything random.
+
+    Raises:
+        UserError: a family that makes no sense, or actions without cues.
+    """
+
+    def __init__(self, policy: Any, family: Sequence[Distortion], space: Space, eps_deg: float, seed: int = 0) -> None:
+        if not space.cues:
+            raise UserError("actions without cues cannot be corrected by relative answers: give another space")
+        self.family, self.space, self.seed = check_family(family), space, seed
+        self.base = in_space(policy_of(policy), space)
+        self.meaning = Meaning(self.base, space)
+        self.eps = float(space.from_unit(eps_deg))
+        self.random = np.random.default_rng(seed)
+        self.answers: Answers | None = None
+        self.scales: dict[str, float] = {}
+        self.fits: dict[tuple[str, ...], Fit] = {}
+
+    @property
+    def asked(self) -> int:
+        """Number of answers so far."""
+        return 0 if self.answers is None else len(self.answers.obs)
+
+    def questions(self, obs: Float[Given, "n obs"], count: int = BATCH) -> Questions:
+        """Return what to ask in some of n situations, n at least `count`; more give better questions."""
+        obs = np.asarray(obs, np.float32)
+        self._scaled(obs)
+        best = self.best
+        fits = list(self.fits.values()) or [self._new(names) for names in self._singles()]
+        theta = np.zeros(0) if best is None else best.interval()[0][: best.changes]
+        doubt = ties(self.meaning, () if best is None else best.sees, theta, obs, self.eps)
+        draws = drawn(fits, self._odds(fits), self.random)
+        return choose(draws, self.meaning, obs, doubt, count, self.eps, self.random)
+
+    def learn(
+        self,
+        obs: Float[Given, "n obs"],
+        action: Float[Given, "n action"],
+        answer: Float[Given, "n cues"],
+        doubt: Float[Given, " n"] | None = None,
+    ) -> None:
+        """Take answers (-1, 0, 1 or `UNSAID`, a cue each) and fit what may have changed to all so far."""
+        obs, action, answer = (np.asarray(rows, np.float32) for rows in (obs, action, answer))
+        self._scaled(obs)
+        if doubt is None:
+            doubt = ties(self.meaning, (), np.zeros(0), obs, self.eps)
+        told = np.asarray(said(jnp.asarray(answer)), np.float32) * np.isfinite(answer)
+        new = Answers(obs, action, answer, told, np.asarray(doubt, np.float32))
+        old = self.answers
+        self.answers = new if old is None else Answers(*(np.concatenate(pair) for pair in zip(old, new, strict=True)))
+        self._compare()
+
+    def _scaled(self, obs: Floats) -> None:
+        if not self.scales:
+            self.scales = scales_of(self.meaning, self.family, obs, self.eps)
+
+    def _singles(self) -> list[tuple[str, ...]]:
+        return [(one.name,) for one in self.family]
+
+    def _new(self, names: tuple[str, ...]) -> Fit:
+        family = tuple(one for one in self.family if one.name in names)
+        number = sum(1 << place for place, one in enumerate(self.family) if one.name in names)
+        return Fit(family, self.scales, self.meaning, self.eps, self.seed * 1000 + number)
+
+    def _fit(self, names: tuple[str, ...]) -> Fit:
+        """The fit of some changes to all answers so far."""
+        assert self.answers is not None
+        rounds = 1 if names in self.fits else ROUNDS
+        fit = self.fits.setdefault(names, self._new(names))
+        fit.learn(self.answers, rounds)
+        return fit
+
+    def _compare(self) -> None:
+        """Fit no change, each change, and what the best asks for beside it."""
+        self._fit(())
+        for names in self._singles():
+            self._fit(names)
+        path: list[tuple[str, ...]] = [()]
+        for size in range(1, 1 + (min(LARGEST, len(self.family)) if self.asked >= LEAST else 1)):
+            wider = [self._named({*path[-1], one.name}) for one in self.family if one.name not in path[-1]]
+            fits = {names: self._fit(names) if size > 1 else self.fits[names] for names in wider}
+            path.append(max(wider, key=lambda names: self._score(fits[names])))
+            if size > 1 and self._score(self.fits[path[-1]]) <= self._score(self.fits[path[-2]]):
+                break
+        self._choose(max(path, key=lambda names: self._score(self.fits[names])))
+
+    def _settle(self) -> None:
+        """Choose anew among what differs from the chosen changes by one, with enough samples of each."""
+        near = {self._named({one.name} ^ set(self.chosen)) for one in self.family} | {self.chosen}
+        current = [names for names in self.fits if self.fits[names].answers is self.answers]
+        for names in near & set(current):
+            self.fits[names].refine(SETTLED * (1 + self.fits[names].unknowns), SETTLING)
+        self._choose(max(current, key=lambda names: self._score(self.fits[names])))
+
+    def _choose(self, best: tuple[str, ...]) -> None:
+        gain = self._score(self.fits[best]) - self._score(self.fits[()])
+        self.chosen = best if gain > SURE - DOUBT else ()
+
+    def _named(self, names: set[str]) -> tuple[str, ...]:
+        """Names in the order of the family."""
+        return tuple(one.name for one in self.family if one.name in names)
+
+    def _score(self, fit: Fit) -> float:
+        return fit.evidence - DOUBT * len(fit.family)
+
+    def _odds(self, fits: list[Fit]) -> Floats:
+        """Of fits that know all answers; before the first answer all are as likely."""
+        if not self.asked:
+            return np.zeros(len(fits))
+        return np.array([self._score(fit) if fit.answers is self.answers else -np.inf for fit in fits])
+
+    @property
+    def best(self) -> Fit | None:
+        """The fit of the chosen changes; None before the first answer."""
+        return self.fits[self.chosen] if self.asked else None
+
+    def policy(self) -> Any:
+        """The policy behind what is most likely so far."""
+        best = self.best
+        if best is None or not [one for one in best.family if not one.of_teacher]:
+            return self.base
+        return Calibrated(self.base, jnp.asarray(best.interval()[0], jnp.float32), best.family)
+
+    def result(self) -> Result:
+        """What all answers tell. Raises UserError for too few."""
+        if self.asked < HELD_OUT:
+            raise UserError(f"{self.asked} answers tell too little: give at least {HELD_OUT}")
+        self._settle()
+        best, none = self.fits[self.chosen], self.fits[()]
+        before, after = none.predicted(), best.predicted()
+        gain = after - before
+        holds = bool(best.family) and gain.mean() > SPREADS * gain.std() / np.sqrt(len(gain))
+        if not holds:
+            self.chosen, best, after = (), none, before
+        rho, width = best.nuisance @ GRID
+        corrected = [one.name for one in best.family if not one.of_teacher]
+        unexplained = not best.family and (rho > 0.5 or width > APART)
+        verdict = CHANGED if corrected else (UNEXPLAINED if unexplained else UNCHANGED)
+        evidence = {names: fit.evidence - none.evidence for names, fit in self.fits.items()}
+        apart = float(self.space.to_unit(width * self.eps * np.log(3), np))
+        more = self._more(best) if corrected else None
+        estimates = tuple(estimate for one in self.family for estimate in self._estimates(one))
+        held = (float(before.mean()), float(after.mean()))
+        return Result(verdict, tuple(corrected), estimates, evidence, held, float(rho), apart, more, self.policy())
+
+    def _estimates(self, distortion: Distortion) -> list[Estimate]:
+        names = self._named({*self.chosen, distortion.name})
+        current = [known for known, fit in self.fits.items() if fit.answers is self.answers]
+        fit = self.fits[names if names in current else (distortion.name,)]
+        rows = zip(unknowns_of(fit.family), *fit.interval(), strict=True)
+        changed = distortion.name in self.chosen
+        own = [one.name for one in distortion.unknowns]
+        return [Estimate(one.name, one.unit, *map(float, ends), changed) for one, *ends in rows if one.name in own]
+
+    def _more(self, fit: Fit) -> int:
+        """Labels until the corrected actions are as sure as an answer can tell: within eps / 2."""
+        weight = fit.weight[:, None, None]
+        offset = np.clip(fit.offset, -20, 20)
+        spread = np.sqrt((weight * np.square(offset - (weight * offset).sum(0))).sum(0))
+        ratio = float(np.median(spread)) / 0.5
+        return max(0, int(np.ceil(self.asked * (ratio**2 - 1))))
+
+
+Situations = Callable[[PRNGKeyArray, Any, int], tuple[Any, Any]]  # (key, policy, count) -> states, observations
+Asked = Callable[[PRNGKeyArray, Any, Any, Any], Any]  # (key, states, observations, actions) -> answers (n, cues)
+
+
+def calibrate(
+    policy: Any,
+    family: Sequence[Distortion],
+    situations: Situations,
+    teacher: Asked,
+    labels: int,
+    key: PRNGKeyArray,
+    *,
+    space: Space,
+    eps_deg: float,
+) -> Result:
+    """Ask a teacher in batches and tell what changed. Held-out answers judge; no reward is seen.
+
+    Args:
+        policy: a policy, or any function of a batch of observations.
+        family: what may have changed.
+        situations: gives states and observations (count, obs) that a policy meets.
+        teacher: gives answers (n, cues), -1, 0, 1 or `UNSAID`; NaN where it did not answer.
+        labels: number of questions.
+        key: of everything random.
+        space: of the actions.
+        eps_deg: strength of an answer, in the space's unit.
+
+    Raises:
+        UserError: settings that make no sense, or too few labels.
+    """
+    k_seed, key = jax.random.split(key)
+    calibration = Calibration(policy, family, space, eps_deg, int(jax.random.randint(k_seed, (), 0, 1 << 20)))
+    for start in range(0, labels, BATCH):
+        k_where, k_answer, key = jax.random.split(key, 3)
+        count = min(BATCH, labels - start)
+        states, obs = situations(k_where, calibration.policy(), CHOICE * count)
+        asked = calibration.questions(np.asarray(obs), count)
+        states = jax.tree.map(lambda leaf, index=asked.index: leaf[index], states)
+        obs = np.asarray(obs)[asked.index]
+        answers = np.asarray(teacher(k_answer, states, jnp.asarray(obs), jnp.asarray(asked.action)))
+        there = np.isfinite(answers).any(-1)
+        calibration.learn(obs[there], asked.action[there], answers[there], asked.doubt[there])
+    return calibration.result()

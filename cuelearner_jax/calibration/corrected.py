@@ -1,0 +1,39 @@
+"""A policy behind the changes of its world: it sees what it would have seen, and does what it meant."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import jax
+import numpy as np
+from flax import struct
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from cuelearner_jax.calibration.families import Family, acted, seen, unknowns_of
+from cuelearner_jax.policies import SHARED, PolicyNode, describe
+from cuelearner_jax.types import EnvState
+
+
+class Calibrated(PolicyNode):
+    """Another policy's actions, behind the changes of a family; with all unknowns at zero that policy's own."""
+
+    base: Any  # a policy
+    theta: Float[Array, " unknowns"]  # in their units
+    family: Family = struct.field(pytree_node=False)
+
+    def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
+        """The base's actions, corrected."""
+        before = jax.vmap(partial(seen, self.family, self.theta))(obs)
+        return jax.vmap(partial(acted, self.family, self.theta))(self.base.act(key, states, before))
+
+    @property
+    def axes(self) -> Calibrated:
+        """Each lane has its own base; what changed is one for all."""
+        return self.replace(base=self.base.axes, theta=SHARED)
+
+    def describe(self) -> dict[str, Any]:
+        """What has changed, by how much and in which unit, and the base."""
+        values = zip(unknowns_of(self.family), np.asarray(self.theta).tolist(), strict=True)
+        changes = [{"name": one.name, "value": value, "unit": one.unit} for one, value in values]
+        return {"policy": "calibrated", "changes": changes, "base": describe(self.base)}

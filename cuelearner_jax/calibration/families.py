@@ -1,0 +1,230 @@
+"""What may have changed between a policy and its world, in named unknowns, and how each change is undone.
+
+A distortion says how observations or actions may have changed: balls are seen shifted, a lidar is mounted turned, every
+strike is turned. `sees` gives the observation as it was before the change, `acts` the action that leads there to what
+the policy meant. Several distortions together are a family; with all unknowns at zero a family changes nothing.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from cuelearner_jax.environment import Quantity, action_of, actions_of
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.spaces import Box, Space
+
+AXES = ("x", "y", "z")
+SHIFTING = ("m", "rad")  # units of what a displaced sensor adds a constant to
+PERCENT = 0.01
+
+
+class Unknown(NamedTuple):
+    """A number that says how much has changed; 0: nothing."""
+
+    name: str
+    unit: str
+    scale: float | None = None  # how large it may well be, in its unit; None: found by what it makes a policy do
+    most: float = math.inf  # the largest that makes sense, in its unit
+
+
+Undoing = Callable[[Float[Array, " unknowns"], Float[Array, " size"]], Float[Array, " size"]]
+
+
+class Distortion(NamedTuple):
+    """One way in which a world may have changed. Both functions take the unknowns in their units, and one row."""
+
+    name: str
+    unknowns: tuple[Unknown, ...]
+    sees: Undoing | None = None  # (unknowns, observation) -> observation before the change
+    acts: Undoing | None = None  # (unknowns, meant action) -> action that leads to it after the change
+    of_teacher: bool = False  # a fault of the answers, which is told and not corrected
+
+
+Family = tuple[Distortion, ...]
+
+
+def unknowns_of(family: Family) -> tuple[Unknown, ...]:
+    """Return all unknowns of a family, in the order of theta."""
+    return tuple(unknown for distortion in family for unknown in distortion.unknowns)
+
+
+def seen(family: Family, theta: Float[Array, " unknowns"], obs: Float[Array, " obs"]) -> Float[Array, " obs"]:
+    """Return an observation as it was before the changes."""
+    for distortion, values in _parts(family, theta):
+        obs = obs if distortion.sees is None else distortion.sees(values, obs)
+    return obs
+
+
+def acted(
+    family: Family, theta: Float[Array, " unknowns"], action: Float[Array, " action"], corrects: bool = True
+) -> Float[Array, " action"]:
+    """Return the action that leads after the changes to what `action` meant before them.
+
+    `corrects`: leave out what is a fault of the answers. Without, it is the action that the teacher would call right.
+    """
+    for distortion, values in _parts(family, theta):
+        if distortion.acts is not None and not (corrects and distortion.of_teacher):
+            action = distortion.acts(values, action)
+    return action
+
+
+def _parts(family: Family, theta: Float[Array, " unknowns"]) -> list[tuple[Distortion, Float[Array, " n"]]]:
+    parts, start = [], 0
+    for distortion in family:
+        parts.append((distortion, theta[start : start + len(distortion.unknowns)]))
+        start += len(distortion.unknowns)
+    return parts
+
+
+def check_family(family: Sequence[Distortion]) -> Family:
+    """Return a family as a tuple. Raises UserError for no distortion, one without unknowns, or two of one name."""
+    if not family:
+        raise UserError("there is nothing that could have changed: give at least one distortion")
+    names = [unknown.name for unknown in unknowns_of(tuple(family))]
+    for distortion in family:
+        if not distortion.unknowns:
+            raise UserError(f"distortion {distortion.name!r} has no unknowns: give at least one")
+        if distortion.sees is None and distortion.acts is None:
+            raise UserError(f"distortion {distortion.name!r} changes nothing: give `sees` or `acts`")
+    for taken in (names, [distortion.name for distortion in family]):
+        if twice := sorted({name for name in taken if taken.count(name) > 1}):
+            raise UserError(f"{twice[0]!r} stands twice in a family: give each name once")
+    return tuple(family)
+
+
+def declared(env: Any, gains: bool = False, teacher_bias: bool = False) -> Family:
+    """Derive the distortions of an environment from what it declares of its observation and actions.
+
+    Slices in metres or radians of the same size shift together. Beams at equal angles roll. Directions turn. Actions
+    turn or shift along their cues.
+
+    Args:
+        env: an environment, or its view.
+        gains: also ask whether slices in metres and entries of a box were scaled.
+        teacher_bias: a constant difference between answers and policy is the teacher's, not the world's.
+
+    Raises:
+        UserError: the environment declares nothing that could have changed.
+    """
+    places = _places(env.observation)
+    found: list[Distortion] = []
+    for (unit, size), slices in _alike(places).items():
+        found.append(_shift(unit, size, slices))
+        if gains and unit == "m":
+            found.append(_gain(slices))
+    found += [_roll(quantity, start) for quantity, start in places if quantity.kind == "beams"]
+    found += [_turned(quantity, start) for quantity, start in places if quantity.kind == "directions"]
+    space, name = actions_of(env), action_of(env).name
+    if space.cues:
+        found.append(_bias(space) if teacher_bias else _acts(space, name))
+    if gains and isinstance(space, Box):
+        found.append(_action_gain(space, name))
+    return check_family(found)
+
+
+def _places(observation: Sequence[Quantity]) -> list[tuple[Quantity, int]]:
+    """Each slice with the number of its first entry."""
+    starts = [sum(quantity.size for quantity in observation[:number]) for number in range(len(observation))]
+    return list(zip(observation, starts, strict=True))
+
+
+def _alike(places: list[tuple[Quantity, int]]) -> dict[tuple[str, int], list[tuple[Quantity, int]]]:
+    """Slices that a displaced sensor shifts together: those of one unit and size."""
+    groups: dict[tuple[str, int], list[tuple[Quantity, int]]] = {}
+    for quantity, start in places:
+        if quantity.unit in SHIFTING and not quantity.kind:
+            groups.setdefault((quantity.unit, quantity.size), []).append((quantity, start))
+    return groups
+
+
+def _called(slices: list[tuple[Quantity, int]]) -> str:
+    names = [quantity.name for quantity, _ in slices]
+    return names[0] if len(names) == 1 else f"{names[0]} and {len(names) - 1} more"
+
+
+def _shift(unit: str, size: int, slices: list[tuple[Quantity, int]]) -> Distortion:
+    entries = AXES[:size] if size <= len(AXES) else tuple(str(number + 1) for number in range(size))
+    name = f"{_called(slices)}: shift"
+    unknowns = tuple(Unknown(f"{name} {entry}" if size > 1 else name, unit) for entry in entries)
+    index = jnp.array([start + number for _, start in slices for number in range(size)])
+
+    def sees(theta: Array, obs: Array) -> Array:
+        return obs - jnp.zeros(len(obs)).at[index].set(jnp.tile(theta, len(slices)))
+
+    return Distortion(name, unknowns, sees)
+
+
+def _gain(slices: list[tuple[Quantity, int]]) -> Distortion:
+    index = jnp.array([start + number for quantity, start in slices for number in range(quantity.size)])
+
+    def sees(theta: Array, obs: Array) -> Array:
+        return obs * jnp.ones(len(obs)).at[index].set(jnp.exp(-PERCENT * theta[0]))
+
+    name = f"{_called(slices)}: gain"
+    return Distortion(name, (Unknown(name, "percent", most=100.0),), sees)
+
+
+def _roll(quantity: Quantity, start: int) -> Distortion:
+    if quantity.step_deg <= 0:
+        raise UserError(f"slice {quantity.name!r} has beams and no angle between them: give its `step_deg`")
+    ring = abs(quantity.size * quantity.step_deg - 360) < 0.5 * quantity.step_deg
+
+    own = slice(start, start + quantity.size)
+
+    def sees(theta: Array, obs: Array) -> Array:
+        number = jnp.arange(quantity.size) - theta[0] / quantity.step_deg
+        number = jnp.mod(number, quantity.size) if ring else jnp.clip(number, 0.0, quantity.size - 1.0)
+        first = jnp.floor(number)
+        here = first.astype(jnp.int32) % quantity.size
+        following = (here + 1) % quantity.size if ring else jnp.minimum(here + 1, quantity.size - 1)
+        every = jnp.arange(len(obs))
+        before, after = obs[every.at[own].set(start + here)], obs[every.at[own].set(start + following)]
+        return before + jnp.zeros(len(obs)).at[own].set(number - first) * (after - before)
+
+    name = f"{quantity.name}: turn"
+    return Distortion(name, (Unknown(name, "degrees", most=180.0),), sees)
+
+
+def _turned(quantity: Quantity, start: int) -> Distortion:
+    x, y = (slice(start + entry, start + quantity.size, 2) for entry in (0, 1))
+
+    def sees(theta: Array, obs: Array) -> Array:
+        cos, sin = jnp.cos(jnp.deg2rad(theta[0])), jnp.sin(jnp.deg2rad(theta[0]))
+        every = jnp.arange(len(obs))
+        other = obs[every.at[x].add(1).at[y].add(-1)]
+        along = jnp.ones(len(obs)).at[x].set(cos).at[y].set(cos)
+        return along * obs + jnp.zeros(len(obs)).at[x].set(sin).at[y].set(-sin) * other
+
+    name = f"{quantity.name}: turn"
+    return Distortion(name, (Unknown(name, "degrees", most=180.0),), sees)
+
+
+def _along(space: Space, sign: float, theta: Array, action: Array) -> Array:
+    return space.exp(action, sign * space.from_unit(theta))
+
+
+def _acts(space: Space, name: str) -> Distortion:
+    """Executed actions lie a constant change away from those that were given."""
+    unknowns = tuple(Unknown(f"{name}: {cue.name}", space.unit, most=space.reach) for cue in space.cues)
+    return Distortion(f"{name}: change", unknowns, acts=partial(_along, space, -1.0))
+
+
+def _bias(space: Space) -> Distortion:
+    unknowns = tuple(Unknown(f"teacher: {cue.name}", space.unit, most=space.reach) for cue in space.cues)
+    return Distortion("teacher: bias", unknowns, acts=partial(_along, space, 1.0), of_teacher=True)
+
+
+def _action_gain(space: Box, name: str) -> Distortion:
+    """Executed actions are those that were given, times a factor an entry."""
+
+    def acts(theta: Array, action: Array) -> Array:
+        return space.retract(action * jnp.exp(-PERCENT * theta))
+
+    unknowns = tuple(Unknown(f"{name}: gain of {cue.name}", "percent", most=100.0) for cue in space.cues)
+    return Distortion(f"{name}: gain", unknowns, acts=acts)

@@ -1,0 +1,93 @@
+"""What a policy means under given unknowns: the policy as a black box, asked in rows of one size."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from cuelearner_jax import user_code
+from cuelearner_jax.calibration.families import Family, acted, seen
+from cuelearner_jax.policies import named
+from cuelearner_jax.spaces import Space
+
+Floats = np.ndarray
+ROWS_CPU, ROWS = 64, 2048  # observations that a policy sees at once
+CHEAP = 4096  # rows of what is computed without the policy
+
+
+class Meaning:
+    """A policy behind the changes of a family.
+
+    Args:
+        policy: acts by its observations alone; opaque Python functions included.
+        space: of its actions.
+    """
+
+    def __init__(self, policy: Any, space: Space) -> None:
+        self.policy, self.space = policy, space
+
+    def actions(
+        self, family: Family, thetas: Float[Floats, "thetas unknowns"], obs: Float[Floats, "n obs"]
+    ) -> Float[Floats, "thetas n action"]:
+        """Return what the policy does in each situation, seen as it was before the changes of each theta."""
+        number, count = len(thetas), len(obs)
+        theta, rows = np.repeat(thetas, count, 0), np.tile(obs, (number, 1))
+        portion = ROWS_CPU if jax.default_backend() == "cpu" else ROWS
+        found = in_portions(partial(_meant, family, self.policy), portion, theta, rows)
+        user_code.check_actions(found, named(self.policy))
+        return found.reshape(number, count, self.space.size)
+
+    def offsets(
+        self,
+        family: Family,
+        thetas: Float[Floats, "thetas unknowns"],
+        meant: Float[Floats, "thetas n action"],
+        asked: Float[Floats, "n action"],
+    ) -> Float[Floats, "thetas n cues"]:
+        """Return how far it is from asked actions to those that the changes make of what is meant, as `space.log`."""
+        number, count = meant.shape[:2]
+        theta, action = np.repeat(thetas, count, 0), np.tile(asked, (number, 1))
+        meant = meant.reshape(-1, self.space.size)
+        found = in_portions(partial(_offset, self.space, family), CHEAP, theta, meant, action)
+        return found.reshape(number, count, len(self.space.cues))
+
+    def right(
+        self, family: Family, thetas: Float[Floats, "thetas unknowns"], meant: Float[Floats, "thetas n action"]
+    ) -> Float[Floats, "thetas n action"]:
+        """Return the actions that the teacher would call right where the policy means these."""
+        theta, rows = np.repeat(thetas, meant.shape[1], 0), meant.reshape(-1, self.space.size)
+        return in_portions(partial(_right, family), CHEAP, theta, rows).reshape(meant.shape)
+
+
+def in_portions(program: Callable[..., Any], portion: int, *rows: Floats) -> Floats:
+    """Return a program's rows of any number of rows; each call sees as many, so that it is compiled once."""
+    count = len(rows[0])
+    found = []
+    for start in range(0, count, portion):
+        part = [np.asarray(row[start : start + portion], np.float32) for row in rows]
+        short = portion - len(part[0])
+        part = [np.concatenate([row, np.repeat(row[-1:], short, 0)]) if short else row for row in part]
+        found.append(np.asarray(program(*part))[: portion - short])
+    return np.concatenate(found)
+
+
+@partial(jax.jit, static_argnums=0)
+def _meant(family: Family, policy: Any, theta: Any, obs: Any) -> Any:
+    obs = jax.vmap(partial(seen, family))(theta, obs) if family else obs
+    return policy.act(jax.random.key(0), None, obs)
+
+
+@partial(jax.jit, static_argnums=0)
+def _right(family: Family, theta: Any, meant: Any) -> Any:
+    return jax.vmap(lambda one, action: acted(family, one, action, corrects=False))(theta, meant) if family else meant
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def _offset(space: Space, family: Family, theta: Any, meant: Any, asked: Any) -> Any:
+    return space.log(jnp.asarray(asked), _right(family, theta, meant))

@@ -1,0 +1,154 @@
+"""What to ask: actions of which an answer is expected to tell most about what changed, away from the policy's ties."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from cuelearner_jax.calibration.families import Family
+from cuelearner_jax.calibration.likelihood import chances
+from cuelearner_jax.calibration.meaning import Meaning
+from cuelearner_jax.calibration.posterior import Fit
+
+Floats = np.ndarray
+ANSWERS = (-1.0, 0.0, 1.0)
+DRAWS = 24  # of what may have changed
+NUDGES, NUDGE = 4, 1e-3  # tiny changes of an observation, as a share of how much its entries differ
+TURNS = np.array(
+    [-2.0, -1.3, -0.8, -0.4, 0.0, 0.4, 0.8, 1.3, 2.0]
+)  # of an action asked about, in spreads of what may be meant
+LEAST_SPREAD = 0.75  # [eps]
+WIDEST = 15.0  # [eps]
+
+
+class Questions(NamedTuple):
+    """Actions to ask about."""
+
+    index: Int[np.ndarray, " questions"]  # of the situations
+    action: Float[Floats, "questions action"]
+    doubt: Float[Floats, " questions"]  # see `ties`
+    information: Float[Floats, " questions"]  # expected of an answer [nats]
+
+
+def ties(
+    meaning: Meaning, family: Family, theta: Float[Floats, " unknowns"], obs: Float[Floats, "n obs"], eps: float
+) -> Float[Floats, " n"]:
+    """Return the share of tiny changes of each observation after which the policy does something else.
+
+    There the policy is at a tie of two actions, and a word about one of them tells nothing about the unknowns.
+    """
+    random = np.random.default_rng(0)
+    size = NUDGE * obs.std(0)
+    nudged = [obs, *(obs + size * random.standard_normal(obs.shape) for _ in range(NUDGES))]
+    found = meaning.actions(family, theta[None], np.concatenate(nudged).astype(np.float32))[0]
+    found = found.reshape(1 + NUDGES, len(obs), -1)
+    nothing = np.zeros((NUDGES, 0))
+    moved = meaning.offsets((), nothing, found[1:], found[0])
+    return (np.abs(moved).max(-1, initial=0.0) > eps).mean(0)
+
+
+def drawn(
+    fits: list[Fit], odds: Float[Floats, " fits"], random: np.random.Generator
+) -> list[tuple[Fit, Float[Floats, "draws unknowns"]]]:
+    """Return draws of what may have changed: of each family as many as it is likely."""
+    odds = np.exp(odds - odds.max())
+    counts = np.bincount(random.choice(len(fits), DRAWS, p=odds / odds.sum()), minlength=len(fits))
+    return [(fit, fit.draw(random, count)) for fit, count in zip(fits, counts.tolist(), strict=True) if count]
+
+
+def meant_by(
+    draws: list[tuple[Fit, Floats]], meaning: Meaning, obs: Float[Floats, "n obs"]
+) -> Float[Floats, "draws n action"]:
+    """Return what the teacher would call right in each situation under each draw."""
+    found = []
+    for fit, thetas in draws:
+        unique, where = np.unique(thetas[:, : fit.changes], axis=0, return_inverse=True)
+        meant = meaning.actions(fit.sees, unique, obs)[where.ravel()]
+        found.append(meaning.right(fit.family, thetas, meant))
+    return np.concatenate(found)
+
+
+def choose(
+    draws: list[tuple[Fit, Floats]],
+    meaning: Meaning,
+    obs: Float[Floats, "n obs"],
+    doubt: Float[Floats, " n"],
+    count: int,
+    eps: float,
+    random: np.random.Generator,
+) -> Questions:
+    """Return `count` questions: of each share of the situations, the one that is expected to tell most.
+
+    Args:
+        draws: what may have changed.
+        meaning: the policy.
+        obs: situations to choose from, at least `count`.
+        doubt: of these, see `ties`.
+        count: number of questions.
+        eps: strength of an answer, as `space.log` counts.
+        random: of answers that are imagined.
+    """
+    right = meant_by(draws, meaning, obs)
+    nuisance = np.concatenate([np.tile(fit.nuisance, (len(thetas), 1)) for fit, thetas in draws])
+    middle = _medoid(meaning, right, eps)
+    away = meaning.offsets((), np.zeros((len(right), 0)), right, middle) / eps  # (draws, n, cues)
+    centre = np.median(away, 0)
+    spread = np.clip(1.5 * np.median(np.abs(away - centre), 0), LEAST_SPREAD, WIDEST)
+    turns = centre[None] + TURNS[:, None, None] * spread[None]  # (turns, n, cues)
+    apart = away[:, None] - turns[None]
+    chance = np.stack([np.asarray(_chances(apart[..., cue], nuisance, doubt)) for cue in range(apart.shape[-1])])
+    shares = np.array_split(np.arange(len(obs)), count)
+    index, turn, worth = _told_most(chance, shares, random)
+    turned = np.stack([turns[turn[:, cue], index, cue] for cue in range(turns.shape[-1])], -1)
+    action = np.asarray(meaning.space.exp(middle[index], jnp.asarray(turned * eps, jnp.float32)))
+    return Questions(index, action, doubt[index], worth)
+
+
+def _told_most(
+    chance: Float[Floats, "cues answers draws turns n"], shares: list[Floats], random: np.random.Generator
+) -> tuple[Floats, Floats, Floats]:
+    """Return of each share of the situations the one to ask in, how to turn the action there, and the information.
+
+    One after the other: each draw in turn is taken for the truth, answers those before, and weighs all draws by that.
+    """
+    cues, _, draws = chance.shape[:3]
+    weight = np.full((draws, draws), 1 / draws)  # (truth, draw)
+    own = _entropy(chance.swapaxes(0, 1))  # (cues, draws, turns, n)
+    index, turn, worth = [], [], []
+    for share in shares:
+        mean = np.einsum("td,chdkn->hctkn", weight, chance[..., share])
+        told = (_entropy(mean) - np.einsum("td,cdkn->ctkn", weight, own[..., share])).mean(1)  # (cues, turns, n)
+        best = told.max(1).sum(0).argmax()
+        index.append(share[best])
+        turn.append(told[..., best].argmax(1))
+        worth.append(told[..., best].max(1).sum())
+        for cue in range(cues):
+            said = chance[cue, :, :, turn[-1][cue], share[best]]  # (answers, draws)
+            answer = (said.cumsum(0) < random.random(draws)[None]).sum(0).clip(max=2)  # of each truth
+            weight = weight * said[answer]
+        weight /= weight.sum(1, keepdims=True)
+    return np.array(index), np.array(turn), np.array(worth)
+
+
+def _medoid(meaning: Meaning, right: Float[Floats, "draws n action"], eps: float) -> Float[Floats, "n action"]:
+    """Of what may be meant in each situation, that which is nearest to the others."""
+    nothing = np.zeros((len(right), 0))
+    apart = [np.minimum(np.abs(meaning.offsets((), nothing, right, one)), WIDEST * eps).sum((0, 2)) for one in right]
+    return np.take_along_axis(right, np.argmin(apart, 0)[None, :, None], 0)[0]
+
+
+@jax.jit
+def _chances(
+    offset: Float[Array, "draws turns n"], nuisance: Float[Array, "draws grid"], doubt: Float[Array, " n"]
+) -> Float[Array, "answers draws turns n"]:
+    """Probability of each answer about one cue under each draw."""
+    doubt = jnp.broadcast_to(doubt, offset.shape)
+    return jnp.stack([jnp.einsum("dtng,dg->dtn", chances(offset, h, doubt), nuisance) for h in ANSWERS])
+
+
+def _entropy(chance: Float[Floats, "answers *n"]) -> Float[Floats, "*n"]:
+    return -(chance * np.log(np.maximum(chance, 1e-12))).sum(0)

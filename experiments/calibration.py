@@ -1,0 +1,154 @@
+"""What answers tell about a changed world, and what the policy is worth behind it: calibration by 10 to 100 labels.
+
+    python experiments/calibration.py --task billiards --bases RUN
+    python experiments/calibration.py --task navigation --bases docs/data/navigation_agent
+    python experiments/calibration.py --task billiards
+
+RUN is the folder of a run of the preset `regulation`; each of its seeds is calibrated. Without it, billiards is played
+by the shipped network, greedily. No rewarded step is spent; the last table compares the policies on episodes that
+nothing was chosen on.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import time
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from cuelearner_jax.adaptation.adapting import settling
+from cuelearner_jax.calibration.calibrating import Result, calibrate
+from cuelearner_jax.calibration.families import declared
+from cuelearner_jax.calibration.walking import Walk
+from cuelearner_jax.config import Scalars
+from cuelearner_jax.environment import actions_of
+from cuelearner_jax.evaluate import episodes, evaluate_policy
+from cuelearner_jax.policies import policy_of
+from cuelearner_jax.runs.trained import PolicySource, several
+from cuelearner_jax.storage.provenance import provenance
+from cuelearner_jax.tasks import registry
+
+UNCHANGED = "unchanged"
+WORLDS = {
+    "billiards": (UNCHANGED, "turned_strike", "shifted_balls", "tilted_table"),
+    "navigation": (UNCHANGED, "turned_lidar"),
+}
+METRIC = {"billiards": "reward", "navigation": "success"}
+LABELS = (10, 25, 50, 100)
+ENVS = 200
+
+
+class World(NamedTuple):
+    """A changed world."""
+
+    config: Any
+    env: Any  # in which is asked
+    shown: Any  # in which policies are compared
+    scalars: Scalars
+    teacher: Any
+
+
+def world_of(task: Any, name: str, own: Any, scalars: Scalars, split: str, mistakes: float) -> World:
+    """The world of a scenario, its teacher, and answers as the scenario has them."""
+    like = {"billiards": "turned_strike", "navigation": "turned_lidar"}[task.name]
+    rules = task.scenario(like if name == UNCHANGED else name)
+    applied = rules.applied(own)
+    config = dataclasses.replace(own, **({"teacher": applied.teacher} if task.name == "billiards" else {}))
+    config = config if name == UNCHANGED else applied
+    scalars = dataclasses.replace(settling(scalars, rules.eps_deg), mistake_probability=mistakes, **rules.scalars)
+    env = task.environment(config)
+    return World(config, env, task.environment(config, split), scalars, task.make_teacher(config, env))
+
+
+def bases_of(task: Any, folder: Path | None) -> tuple[Any, Scalars, dict[int, Any]]:
+    """The task's configuration, the scalars and the base policies by their seeds."""
+    if folder is None:
+        if task.name != "billiards":
+            raise SystemExit("give --bases a run folder of navigation")
+        own = task.config(teacher="learned")
+        network = task.make_teacher(own, task.environment(own))
+        return own, Scalars(), {0: policy_of(jax.jit(jax.vmap(lambda obs: network.best_action(None, obs))))}
+    source = PolicySource.of_run(folder, registry.find)
+    assert source.grid is not None
+    env = task.environment(source.config.task)
+    policies, seeds = several(source, source.config.task, "agent", None, None, source.grid.seeds, env=env)
+    return source.config.task, source.config.scalars, dict(zip(map(int, seeds), policies, strict=True))
+
+
+def worth(world: World, policy: Any, split: str, steps: int) -> float:
+    """The task's metric of a policy."""
+    name = METRIC["billiards" if hasattr(world.config, "table") else "navigation"]
+    return float(evaluate_policy(world.shown, policy, episodes(split), ENVS, steps)[name])
+
+
+def told(found: Result) -> dict[str, Any]:
+    """A result in plain values."""
+    estimates = {one.name: [round(number, 5) for number in (one.mean, one.low, one.high)] for one in found.estimates}
+    evidence = {" + ".join(names) or "none": round(value, 2) for names, value in found.evidence.items()}
+    plain = {"verdict": found.verdict, "changes": found.changes, "estimates": estimates, "evidence": evidence}
+    return {**plain, "held_out": found.held_out, "wrong": found.wrong, "apart": found.apart, "more": found.more}
+
+
+def main() -> None:
+    """Calibrates each base in each world with each number of labels; prints a line each, then the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--task", choices=list(WORLDS), default="billiards")
+    parser.add_argument("--bases", type=Path, help="run folder of the base agents")
+    parser.add_argument("--worlds", nargs="+", help="these alone")
+    parser.add_argument("--labels", nargs="+", type=int, default=LABELS)
+    parser.add_argument("--seeds", type=int, default=1, help="of labels, for each base")
+    parser.add_argument("--most-bases", type=int, default=8)
+    parser.add_argument("--mistakes", type=float, default=0.0, help="probability that a cue's answer is reversed")
+    parser.add_argument("--steps", type=int, default=10_000, help="of an evaluation; 0: none")
+    parser.add_argument("--split", choices=("tuning", "validation"), default="tuning", help="of its episodes")
+    parser.add_argument("--out", type=Path, help="write all rows to this JSON file")
+    asked = parser.parse_args()
+    task = registry.find(asked.task)
+    own, scalars, bases = bases_of(task, asked.bases)
+    rows: list[dict[str, Any]] = []
+    for name in asked.worlds or WORLDS[asked.task]:
+        world = world_of(task, name, own, scalars, asked.split, asked.mistakes)
+        family, space = declared(world.env), actions_of(world.env)
+        for base, policy in list(bases.items())[: asked.most_bases]:
+            if asked.steps:
+                rows.append(
+                    {"world": name, "base": base, "labels": 0, "worth": worth(world, policy, asked.split, asked.steps)}
+                )
+                print(rows[-1], flush=True)
+            for labels in asked.labels:
+                for seed in range(asked.seeds):
+                    start, walk = time.time(), Walk(world.env, world.teacher, world.scalars)
+                    key = jax.random.fold_in(jax.random.key(seed), labels)
+                    found = calibrate(
+                        policy, family, walk.situations, walk.answers, labels, key,
+                        space=space, eps_deg=world.scalars.eps_deg,
+                    )  # fmt: skip
+                    row = {"world": name, "base": base, "labels": labels, "seed": seed, **told(found)}
+                    row["seconds"] = round(time.time() - start, 1)
+                    if asked.steps:
+                        row["worth"] = worth(world, found.policy, asked.split, asked.steps)
+                    rows.append(row)
+                    print(json.dumps(row), flush=True)
+    if asked.out:
+        asked.out.write_text(json.dumps({**provenance(), "task": asked.task, "rows": rows}, indent=1) + "\n")
+    table(rows)
+
+
+def table(rows: list[dict[str, Any]]) -> None:
+    """Prints the mean worth, and how often each verdict was found, by world and number of labels."""
+    for world, labels in dict.fromkeys((row["world"], row["labels"]) for row in rows):
+        own = [row for row in rows if (row["world"], row["labels"]) == (world, labels)]
+        worths = [row["worth"] for row in own if "worth" in row]
+        shown = f"{np.mean(worths):.3f} (least {np.min(worths):.3f})" if worths else "-"
+        found = [" + ".join(row["changes"]) or row["verdict"] for row in own if "verdict" in row]
+        counts = ", ".join(f"{found.count(one)} x {one}" for one in dict.fromkeys(found))
+        print(f"{world:<16}{labels:>4} labels  {shown}  {counts}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,112 @@
+"""Worlds whose truth is known: what changed is named, with an interval that holds it, and nothing else is touched."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from known_worlds import BOX, Yard, aims, changed, grips, person, situations
+
+from cuelearner_jax.calibration.calibrating import CHANGED, UNCHANGED, UNEXPLAINED, Calibration, calibrate
+from cuelearner_jax.calibration.families import declared
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.policies import policy_of
+from cuelearner_jax.spaces import DIRECTIONS, Choices
+from cuelearner_jax.spaces.directions import rotate
+
+EPS_DEG = 2.0
+# Once, so that programs are compiled once: shifted places, a turned lidar, a turned action.
+FAMILY, POLICY = tuple(one for one in declared(Yard()) if one.name != "wind: turn"), policy_of(jax.jit(aims))
+EPS = float(np.deg2rad(EPS_DEG))
+TURNED = lambda obs: rotate(aims(obs), -jnp.deg2rad(30.0))  # noqa: E731
+SHIFTED = lambda obs: aims(changed(obs, shift=(0.05, -0.03)))  # noqa: E731
+
+
+def asked(meant, labels=50, wrong=0.0, policy=POLICY, family=FAMILY, seed=0):
+    answers = person(DIRECTIONS, EPS, meant, wrong)
+    key = jax.random.key(seed)
+    return calibrate(policy, family, situations, answers, labels, key, space=DIRECTIONS, eps_deg=EPS_DEG)
+
+
+def missed(found, meant, space=DIRECTIONS):
+    """Mean distance from the corrected policy to what is meant, in the space's unit."""
+    _, obs = situations(jax.random.key(99), None, 200)
+    away = jnp.abs(space.log(found.policy.act(jax.random.key(0), None, obs), meant(obs)))
+    return float(jnp.mean(space.to_unit(away)))
+
+
+def estimates(found):
+    return {one.name: one for one in found.estimates}
+
+
+def test_a_python_function_turned_by_30_degrees_is_put_right_by_50_answers():
+    found = asked(TURNED, policy=lambda obs: np.asarray(aims(obs)), family=(FAMILY[1], FAMILY[-1]))
+    assert (found.verdict, found.changes) == (CHANGED, ("direction: change",))
+    turn = estimates(found)["direction: turn"]
+    assert abs(turn.mean - 30) < 1.5
+    assert turn.low < 30.5
+    assert turn.high > 29.5
+    assert missed(found, TURNED) < 1.5
+
+
+def test_shifted_places_are_told_from_a_turned_action():
+    found = asked(SHIFTED)
+    assert "ball and 1 more: shift" in found.changes
+    assert missed(found, SHIFTED) < 0.25 * missed(found._replace(policy=asked(aims).policy), SHIFTED)
+
+
+def test_one_answer_in_five_may_be_wrong():
+    found = asked(TURNED, labels=80, wrong=0.2)
+    assert found.changes == ("direction: change",)
+    assert missed(found, TURNED) < 2
+    assert 0.05 < found.wrong < 0.45
+
+
+def test_no_change_is_told_and_nothing_is_corrected():
+    found = asked(aims)
+    assert (found.verdict, found.changes) == (UNCHANGED, ())
+    for one in found.estimates:  # 95% of intervals hold zero, and here all that are half as wide again
+        more = 0.25 * (one.high - one.low)
+        assert one.low - more < 0 < one.high + more
+    assert missed(found, aims) < 1e-4
+
+
+def test_a_change_outside_the_family_is_told_and_nothing_is_corrected():
+    side = lambda obs: rotate(aims(obs), jnp.where(jnp.sin(40 * obs[:, 1]) > 0, 0.5, -0.5))  # noqa: E731
+    found = asked(side)
+    assert (found.verdict, found.changes) == (UNEXPLAINED, ())
+    assert missed(found, aims) < 1e-4
+    assert "None of these" in found.words()[0]
+
+
+def test_a_biased_teacher_is_told_from_a_change_of_the_world_where_that_is_asked_for():
+    meant = lambda obs: rotate(SHIFTED(obs), jnp.deg2rad(8.0))  # noqa: E731
+    found = asked(meant, labels=80, family=(FAMILY[0], declared(Yard(), teacher_bias=True)[-1]))
+    assert found.changes == ("ball and 1 more: shift",)
+    assert abs(estimates(found)["teacher: turn"].mean - 8) < 2
+    assert missed(found, SHIFTED) < 2
+
+
+def test_a_box_is_calibrated_cue_by_cue():
+    eps = 0.05
+    meant = lambda obs: BOX.exp(grips(obs), jnp.array([0.2, 0.0, -0.1]))  # noqa: E731
+    family = [one for one in declared(Yard(BOX)) if one.acts]
+    found = calibrate(
+        jax.jit(grips), family, situations, person(BOX, eps, meant), 60, jax.random.key(0), space=BOX, eps_deg=eps
+    )
+    assert found.changes == ("direction: change",)
+    assert missed(found, meant, BOX) < eps / 2
+
+
+def test_questions_tell_more_than_actions_at_random():
+    calibration = Calibration(POLICY, FAMILY[-1:], DIRECTIONS, EPS_DEG)
+    _, obs = situations(jax.random.key(0), None, 60)
+    asked = calibration.questions(obs, 10)
+    assert len(set(asked.index.tolist())) == 10
+    assert asked.information.min() > 0.15  # of log 3
+
+
+def test_too_few_answers_and_spaces_without_cues_are_refused():
+    with pytest.raises(UserError, match="give at least 5"):
+        Calibration(POLICY, FAMILY, DIRECTIONS, EPS_DEG).result()
+    with pytest.raises(UserError, match="without cues"):
+        Calibration(POLICY, FAMILY, Choices(3), EPS_DEG)

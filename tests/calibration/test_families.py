@@ -1,0 +1,85 @@
+"""What an environment declares can have changed: each change is undone exactly, and none leaves everything alone."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from known_worlds import BOX, STEP_DEG, Yard, aims, changed, grips, situations
+
+from cuelearner_envs.billiards.config import BilliardsConfig, make_environment
+from cuelearner_envs.navigation.environment import Navigation
+from cuelearner_jax.calibration.corrected import Calibrated
+from cuelearner_jax.calibration.families import Distortion, Unknown, acted, check_family, declared, seen, unknowns_of
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.policies import policy_of
+from cuelearner_jax.spaces import DIRECTIONS
+from cuelearner_jax.spaces.directions import from_angle, rotate
+
+
+def test_an_environment_declares_what_can_have_changed():
+    names = [distortion.name for distortion in declared(Yard())]
+    assert names == ["ball and 1 more: shift", "lidar: turn", "wind: turn", "direction: change"]
+    units = [(unknown.name, unknown.unit) for unknown in unknowns_of(declared(make_environment(BilliardsConfig())))]
+    assert units == [
+        ("cue ball: place and 3 more: shift x", "m"),
+        ("cue ball: place and 3 more: shift y", "m"),
+        ("direction: turn", "degrees"),
+    ]
+    assert [distortion.name for distortion in declared(Navigation(worlds=None))] == [  # pyright: ignore
+        "lidar: turn",
+        "goal: direction: turn",
+        "direction: change",
+    ]
+
+
+@pytest.mark.parametrize(("space", "policy"), [(DIRECTIONS, aims), (BOX, grips)])
+def test_without_a_change_the_policy_stays_what_it_was(space, policy):
+    family = declared(Yard(space), gains=True)
+    _, obs = situations(jax.random.key(0), None, 8)
+    base = policy_of(jax.jit(policy)).replace(actions=space)
+    corrected = Calibrated(base, jnp.zeros(len(unknowns_of(family))), family)
+    np.testing.assert_array_equal(corrected.act(jax.random.key(0), None, obs), base.act(jax.random.key(0), None, obs))
+
+
+@pytest.mark.parametrize(
+    ("name", "theta", "change"),
+    [
+        ("ball and 1 more: shift", (0.05, -0.03), {"shift": (0.05, -0.03)}),
+        ("lidar: turn", (2 * STEP_DEG,), {"lidar_deg": 2 * STEP_DEG}),
+        ("lidar: turn", (-STEP_DEG,), {"lidar_deg": -STEP_DEG}),
+        ("wind: turn", (25.0,), {"wind_deg": 25.0}),
+    ],
+)
+def test_a_change_of_the_sensors_is_undone(name, theta, change):
+    family = tuple(one for one in declared(Yard()) if one.name == name)
+    _, obs = situations(jax.random.key(0), None, 8)
+    before = jax.vmap(lambda row: seen(family, jnp.array(theta), row))(obs)
+    np.testing.assert_allclose(before, changed(obs, **change), atol=1e-5)
+
+
+def test_beams_between_two_are_interpolated_and_nothing_is_seen_beyond_the_last():
+    (lidar,) = [one for one in declared(Navigation(worlds=None)) if one.name == "lidar: turn"]  # pyright: ignore
+    obs = jnp.zeros(280).at[:271].set(jnp.arange(271.0))
+    before = seen((lidar,), jnp.array([1.5]), obs)
+    np.testing.assert_allclose(before[:4], [0.0, 0.0, 0.5, 1.5])  # turned by 1.5 beams: beam 2 is at 0.5
+    assert before[270] == 268.5
+
+
+def test_an_action_leads_where_the_policy_meant_it_to():
+    (turn,) = [one for one in declared(Yard()) if one.acts]
+    given = acted((turn,), jnp.array([30.0]), from_angle(1.0))
+    np.testing.assert_allclose(rotate(given, jnp.deg2rad(30.0)), from_angle(1.0), atol=1e-6)
+    faulty = [one for one in declared(Yard(), teacher_bias=True) if one.acts]
+    np.testing.assert_array_equal(acted(tuple(faulty), jnp.array([30.0]), from_angle(1.0)), from_angle(1.0))
+
+
+def test_families_that_make_no_sense_are_refused():
+    one = Distortion("tilt", (Unknown("tilt", "degrees"),), sees=lambda theta, obs: obs)
+    for family, message in (
+        ([], "nothing that could have changed"),
+        ([one._replace(unknowns=())], "no unknowns"),
+        ([one._replace(sees=None)], "changes nothing"),
+        ([one, one], "stands twice"),
+    ):
+        with pytest.raises(UserError, match=message):
+            check_family(family)
