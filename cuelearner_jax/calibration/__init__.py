@@ -1,1 +1,20 @@
 """Calibration: relative answers read as evidence of what changed in the world."""
+
+from cuelearner_jax.calibration.calibrating import CHANGED, UNCHANGED, UNEXPLAINED, Calibration, Result, calibrate
+from cuelearner_jax.calibration.corrected import Calibrated
+from cuelearner_jax.calibration.families import Distortion, Unknown, declared
+from cuelearner_jax.calibration.walking import Walk
+
+__all__ = [
+    "CHANGED",
+    "UNCHANGED",
+    "UNEXPLAINED",
+    "Calibrated",
+    "Calibration",
+    "Distortion",
+    "Result",
+    "Unknown",
+    "Walk",
+    "calibrate",
+    "declared",
+]

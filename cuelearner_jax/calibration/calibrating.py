@@ -35,8 +35,8 @@ CHOICE = 6  # situations of which one is asked about
 ROUNDS = 3  # of samples, where there were none
 LEAST = 20  # answers that two changes at once are asked of
 DOUBT = 2.0  # what the evidence of each change must exceed [nats]
-SURE = 3.0  # what the evidence of all must exceed, against no change [nats]
-SPREADS = 2.0  # standard errors by which held-out answers must be predicted better
+SURE = 5.0  # what the evidence of all must exceed, against no change [nats]
+SPREADS = 1.0  # standard errors by which held-out answers must be predicted better
 LARGEST = 3  # changes at once
 SETTLED, SETTLING = 10.0, 6  # samples that must count in the end, for each unknown and one; rounds for these at most
 APART = 2.5  # [eps]: a policy from which teachers differ by more, as a rule, is not explained
@@ -139,7 +139,7 @@ class Calibration:
         told = np.asarray(said(jnp.asarray(answer)), np.float32) * np.isfinite(answer)
         new = Answers(obs, action, answer, told, np.asarray(doubt, np.float32))
         old = self.answers
-        self.answers = new if old is None else Answers(*(np.concatenate(pair) for pair in zip(old, new, strict=True)))
+        self.answers = new if old is None else Answers._make(map(np.concatenate, zip(old, new, strict=True)))
         self._compare()
 
     def _scaled(self, obs: Floats) -> None:
@@ -224,7 +224,7 @@ class Calibration:
         holds = bool(best.family) and gain.mean() > SPREADS * gain.std() / np.sqrt(len(gain))
         if not holds:
             self.chosen, best, after = (), none, before
-        rho, width = best.nuisance @ GRID
+        rho, width = (best.nuisance @ GRID)[:2]
         corrected = [one.name for one in best.family if not one.of_teacher]
         unexplained = not best.family and (rho > 0.5 or width > APART)
         verdict = CHANGED if corrected else (UNEXPLAINED if unexplained else UNCHANGED)
@@ -242,7 +242,11 @@ class Calibration:
         rows = zip(unknowns_of(fit.family), *fit.interval(), strict=True)
         changed = distortion.name in self.chosen
         own = [one.name for one in distortion.unknowns]
-        return [Estimate(one.name, one.unit, *map(float, ends), changed) for one, *ends in rows if one.name in own]
+        return [
+            Estimate(one.name, one.unit, float(mean), float(low), float(high), changed)
+            for one, mean, low, high in rows
+            if one.name in own
+        ]
 
     def _more(self, fit: Fit) -> int:
         """Labels until the corrected actions are as sure as an answer can tell: within eps / 2."""

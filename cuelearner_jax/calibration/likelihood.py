@@ -1,24 +1,26 @@
 """How likely a relative answer is, when it is known what the teacher means.
 
 An answer about an action is, with probability 1 - rho, an ordered logistic in the way from the action to what is meant:
-"already right" within eps / 2, with a width w. With probability rho, it is about something else: each of the three
-answers is as likely. An action far from everything meant tells nothing either: who looks for the nearest good action
-finds another one there. Rho and w are not known; they are values of a grid with a prior.
+"already right" near it, with a width w. With probability rho, it is about something else: each of the three answers is
+as likely. An action far from what is meant tells nothing either: who looks for the nearest good action finds another
+one there. How near and how far that is, rho and w are not known; they are values of a grid with a prior.
 """
 
 from __future__ import annotations
+
+from itertools import product
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-RHO = np.array([0.02, 0.08, 0.18, 0.3, 0.5, 0.8])
-WIDTH = np.array([0.1, 0.25, 0.6, 1.5, 3.5, 8.0])  # in eps
-FAR = 30.0  # [eps]: answers about actions so far from what is meant are about something else
-GRID = np.array([(rho, width) for rho in RHO for width in WIDTH])  # (grid, 2)
-LOG_PRIOR = np.log(np.repeat((1 - RHO) / (1 - RHO).sum(), len(WIDTH)) / len(WIDTH))  # (grid,)
-ANSWERS = np.array([-1.0, 0.0, 1.0])
+RHO = (0.02, 0.1, 0.25, 0.45, 0.75)
+WIDTH = (0.1, 0.3, 0.8, 2.0, 6.0)  # [eps]
+RIGHT = (0.5, 1.5)  # how far from what is meant an action is still right [eps]: as asked, or what else is good too
+FAR = (10.0, 40.0)  # how far an answer is about what is meant [eps]
+GRID = np.array(list(product(RHO, WIDTH, RIGHT, FAR)))  # (grid, 4)
+LOG_PRIOR = np.log((1 - GRID[:, 0]) / (1 - GRID[:, 0]).sum())  # (grid,)
 
 Floats = np.ndarray
 
@@ -26,7 +28,7 @@ Floats = np.ndarray
 def chances(
     offset: Float[Array, "*n"], answer: Float[Array, "*n"] | float, doubt: Float[Array, "*n"]
 ) -> Float[Array, "*n grid"]:
-    """Return the probability of an answer about one cue, for each rho and w of the grid.
+    """Return the probability of an answer about one cue, for each point of the grid.
 
     Args:
         offset: how far it is from the action to what is meant [eps].
@@ -34,11 +36,12 @@ def chances(
         doubt: probability that the situation itself makes the answer one about something else.
     """
     offset, answer = offset[..., None], jnp.broadcast_to(jnp.asarray(answer), offset.shape)[..., None]
-    rho, width = (jnp.asarray(part, jnp.float32).reshape(*[1] * (offset.ndim - 1), -1) for part in GRID.T)
-    more = jax.nn.sigmoid((offset - 0.5) / width)
-    less = jax.nn.sigmoid((-offset - 0.5) / width)
+    of_grid = (jnp.asarray(part, jnp.float32).reshape(*[1] * (offset.ndim - 1), -1) for part in GRID.T)
+    rho, width, right, far = of_grid
+    more = jax.nn.sigmoid((offset - right) / width)
+    less = jax.nn.sigmoid((-offset - right) / width)
     told = jnp.where(answer > 0, more, jnp.where(answer < 0, less, 1 - more - less))
-    sound = (1 - rho) * (1 - doubt[..., None]) * jnp.exp(-jnp.square(offset / FAR))
+    sound = (1 - rho) * (1 - doubt[..., None]) * jnp.exp(-jnp.square(offset / far))
     return sound * jnp.maximum(told, 0.0) + (1 - sound) / 3
 
 
@@ -49,7 +52,7 @@ def log_chances(
     told: Float[Array, "n cues"],
     doubt: Float[Array, " n"],
 ) -> Float[Array, "n grid"]:
-    """Return the logarithm of the probability of each answer, for each rho and w of the grid.
+    """Return the logarithm of the probability of each answer, for each point of the grid.
 
     Args:
         offset: how far it is from the asked action to what is meant, along each cue [eps].

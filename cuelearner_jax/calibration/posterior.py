@@ -19,7 +19,7 @@ from cuelearner_jax.calibration.likelihood import GRID, LOG_PRIOR, log_chances
 from cuelearner_jax.calibration.meaning import CHEAP, Meaning, in_portions
 
 Floats = np.ndarray
-PRIOR_FREEDOM, KERNEL_FREEDOM = 3, 5  # of Student's t: changes may be larger than thought
+PRIOR_FREEDOM, KERNEL_FREEDOM = 5, 5  # of Student's t: changes may be larger than thought
 SEEING = 24  # samples of a round for each unknown that changes what is seen; the policy is asked about each
 ACTING = 16  # samples of the other unknowns with each of them; the policy is not asked again
 ALONE = 256  # samples of a round where no unknown changes what is seen
@@ -50,7 +50,7 @@ class Prior(NamedTuple):
         """Return samples (count, unknowns), evenly spread."""
         if not len(self.scale):
             return np.zeros((count, 0))
-        even = qmc.Halton(len(self.scale), seed=random).random(count)
+        even = qmc.Halton(len(self.scale), rng=random).random(count)
         return t.ppf(np.clip(even, 1e-4, 1 - 1e-4), PRIOR_FREEDOM) * self.scale
 
     def log_density(self, theta: Floats) -> Floats:
@@ -63,7 +63,7 @@ class Prior(NamedTuple):
 
     def allows(self, theta: Floats) -> Floats:
         """Return which rows (n,) make sense."""
-        return (np.abs(theta) <= self.most).all(-1)
+        return np.asarray((np.abs(theta) <= self.most).all(-1))
 
 
 class Kernels(NamedTuple):
@@ -255,7 +255,7 @@ class Fit:
 
     @property
     def nuisance(self) -> Float[Floats, " grid"]:
-        """Posterior of rho and w on their grid; before the first answer, their prior."""
+        """Posterior of the grid of `likelihood`; before the first answer, their prior."""
         if self.answers is None:
             return np.exp(LOG_PRIOR)
         joint = self.log_likelihood + self.log_origin[:, None]

@@ -22,7 +22,7 @@ TURNS = np.array(
     [-2.0, -1.3, -0.8, -0.4, 0.0, 0.4, 0.8, 1.3, 2.0]
 )  # of an action asked about, in spreads of what may be meant
 LEAST_SPREAD = 0.75  # [eps]
-WIDEST = 15.0  # [eps]
+WIDEST = 5.0  # [eps]: beyond, a teacher may have something else in mind
 
 
 class Questions(NamedTuple):
