@@ -37,9 +37,10 @@ import cuelearner_jax as cl
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.export import runner
 from cuelearner_jax.policies import Heuristic
-from cuelearner_jax.runs import kept
+from cuelearner_jax.runs import lane_checkpoints
 from cuelearner_jax.spaces import DIRECTIONS
-from cuelearner_jax.storage import guides, label_files, results
+from cuelearner_jax.storage import label_files, results
+from cuelearner_jax.storage import table as tables
 from cuelearner_jax.teachers import stored
 from cuelearner_jax.teachers.learned import LearnedTeacher, initial_params
 
@@ -110,20 +111,19 @@ def _teacher_read(folder: Path) -> Any:
 
 def _due(folder: Path) -> None:
     folder.mkdir()
-    kept.write_due(folder, STEP, {"train_loss": np.float32([0.1, 0.2])})
+    lane_checkpoints.write_due(folder, STEP, {"train_loss": np.float32([0.1, 0.2])})
 
 
 def _due_read(folder: Path) -> Any:
-    found = kept.read_due(folder, STEP, LANES)
+    found = lane_checkpoints.read_due(folder, STEP, LANES)
     if found is None:  # no stretch waits for its evaluation: its row must be there, or the run is refused
         raise UserError("rows are missing")
     return sorted(found.items())
 
 
 def _curve(folder: Path) -> None:
-    with guides.GuideWriter(
-        folder, run="r", task="window", guidance="relative", split="tuning", config_hash=""
-    ) as writer:
+    constants = {"run": "r", "task": "window", "guidance": "relative", "split": "tuning", "config_hash": ""}
+    with tables.TableWriter(folder, results.GUIDES, constants) as writer:
         for number in (1, 2, 3):
             columns = {"seed": [0, 1], "labels": [10, 10], "asked": [number] * 2, "guide_reward": [0.1, 0.2]}
             writer.append(round=number, step=0, wall_s=0.0, **{k: np.array(v) for k, v in columns.items()})
@@ -131,11 +131,11 @@ def _curve(folder: Path) -> None:
 
 def _curve_in_parquet(folder: Path) -> None:
     _curve(folder)
-    guides.finish(folder)
+    tables.finish(folder, results.GUIDES)
 
 
 def _curve_read(folder: Path) -> Any:
-    return results.read(folder, schema=guides.SCHEMA).drop_columns(["folder"]).to_pylist()
+    return results.read(folder, schema=results.GUIDES).drop_columns(["folder"]).to_pylist()
 
 
 class Kind(NamedTuple):
@@ -167,7 +167,7 @@ KINDS = {
     "lines of labels": Kind(_labels, _labels_read),
     "table of labels": Kind(_labels_in_parquet, _labels_read),
     "teacher": Kind(_teacher, _teacher_read, _sign(stored.ABOUT)),
-    "due": Kind(_due, _due_read, _sign(kept.DUE)),
+    "due": Kind(_due, _due_read, _sign(lane_checkpoints.DUE)),
     "lines of a curve": Kind(_curve, _curve_read),
     "table of a curve": Kind(_curve_in_parquet, _curve_read),
 }
@@ -251,7 +251,7 @@ def _what_is_signed(kind: str, file: str, rng: np.random.Generator) -> tuple[str
         return "flipped", file
     if kind in runner.RUNNERS:
         return "signed", file if rng.random() < 0.3 else runner.CONTRACT
-    return "signed", {"policy": "policy.json", "teacher": stored.ABOUT, "due": kept.DUE}[kind]
+    return "signed", {"policy": "policy.json", "teacher": stored.ABOUT, "due": lane_checkpoints.DUE}[kind]
 
 
 def _read(kind: Kind, folder: Path) -> tuple[Any, str]:

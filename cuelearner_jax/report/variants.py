@@ -18,7 +18,6 @@ from cuelearner_jax.report.escaping import one_line
 from cuelearner_jax.report.statistics import Curve, Interval, curve, interval, mean_over_curve
 from cuelearner_jax.runs import failures
 from cuelearner_jax.storage import results
-from cuelearner_jax.storage.guides import read_guides
 
 PathLike = str | os.PathLike[str]
 LONGEST_NAME = 40  # characters of a kind of guidance, or of a run, in a figure
@@ -65,7 +64,7 @@ class Group(NamedTuple):
     table: pa.Table  # the rows to report
     failed: pa.Table  # all rows of lanes that failed
     invalid: int  # rows left out for a metric that is not finite
-    guides: pa.Table | None  # rows of the guides' own quality, see `records.guides`; None: there are none
+    guides: pa.Table | None  # rows of the guides' own quality, see `storage.results`; None: there are none
 
     @property
     def all_rows(self) -> pa.Table:
@@ -94,7 +93,7 @@ def read_groups(folders: Sequence[PathLike], task: str | None, metric: str, spli
 
 def _group(name: str, folders: Sequence[PathLike], task: str | None, metric: str, split: str) -> Group:
     selected = _select(results.read(folders, task), metric, split)
-    guides = read_guides(folders, task)
+    guides = results.read_guides(folders, task)
     column = f"guide_{metric}"
     if guides is None or column not in guides.column_names:
         return Group(name, *selected, None)

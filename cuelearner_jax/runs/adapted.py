@@ -20,7 +20,8 @@ from cuelearner_jax.errors import UserError
 from cuelearner_jax.feedback.forms import AnswerForm
 from cuelearner_jax.policies import Common, Guided, lanes_in, layers
 from cuelearner_jax.runs.grid import LARGEST_BUDGET, LARGEST_SEED, world_of
-from cuelearner_jax.storage import formats, guides, label_files, policy_folders
+from cuelearner_jax.storage import formats, label_files, policy_folders, results
+from cuelearner_jax.storage import table as tables
 from cuelearner_jax.storage.provenance import provenance
 from cuelearner_jax.storage.whole import Place
 from cuelearner_jax.task import Task, shape_of
@@ -218,7 +219,7 @@ def _write_curve(folder: Path, name: str, adapted: Adapted, task: Task) -> None:
         **provenance(),
     }
     lanes = {"seed": adapted.lanes.seed, "labels": adapted.lanes.budget, "bound_deg": adapted.lanes.bound_deg}
-    with guides.GuideWriter(folder, **constants) as writer:
+    with tables.TableWriter(folder, results.GUIDES, constants) as writer:
         done = np.full(adapted.lanes.number, -1)
         for row in adapted.curve:
             new = row["asked"] > done  # a lane that has its budget does not change any more
@@ -229,4 +230,4 @@ def _write_curve(folder: Path, name: str, adapted: Adapted, task: Task) -> None:
             chosen = {column: np.asarray(values)[new] for column, values in columns.items()}
             if new.any():
                 writer.append(round=number, step=0, wall_s=0.0, **chosen)
-    guides.finish(folder)
+    tables.finish(folder, results.GUIDES)

@@ -17,7 +17,7 @@ from cuelearner_jax.guides.base import Guide
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs import shards
 from cuelearner_jax.runs.grid import Grid, defaults, load
-from cuelearner_jax.runs.kept import restore_policies
+from cuelearner_jax.runs.lane_checkpoints import restore_policies
 from cuelearner_jax.storage import formats
 from cuelearner_jax.storage.folders import CONFIG, differences
 from cuelearner_jax.task import Task, shape_of

@@ -4,24 +4,24 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import nullcontext
 from typing import Any
 
 import numpy as np
-from rich.progress import Progress, TaskID
+from rich.progress import Progress
 
 from cuelearner_jax import config as configuration
 from cuelearner_jax.environment import Environment, actions_of
 from cuelearner_jax.runs.failures import LISTED, variant_name
 from cuelearner_jax.runs.grid import config_hash
-from cuelearner_jax.runs.kept import items, read_due, restore_blocks, write_due
+from cuelearner_jax.runs.lane_checkpoints import items, read_due, restore_blocks, write_due
 from cuelearner_jax.runs.lanes import LaneGroup
 from cuelearner_jax.runs.order import Order
 from cuelearner_jax.runs.training import Training, mean_of_finite
-from cuelearner_jax.storage import guides as guide_records
 from cuelearner_jax.storage import label_files, provenance, results, tracking
+from cuelearner_jax.storage import table as tables
 from cuelearner_jax.storage.checkpoint import Checkpoints, checkpoints
-from cuelearner_jax.storage.guides import GuideWriter
+from cuelearner_jax.storage.table import TableWriter
 from cuelearner_jax.terminal import Interrupted, console
 from cuelearner_jax.types import Teacher
 
@@ -44,44 +44,39 @@ class Runner:
         self.training = Training(group, examined, order.split, self._end_if_asked)
         self.group, self.order, self.described = group, order, described
         self.stopping, self.bars = stopping, bars
-        self.folder = order.out / group.guidance.name
+        self.name = group.guidance.name
+        self.folder = order.out / self.name
         self.failed = np.zeros(len(group.seeds), bool)  # lanes that the user has been told of
-        self._bar: TaskID | None = None  # of training, once it has begun
 
     def run(self, teacher: Teacher | None, labels: label_files.LabelFile | None) -> None:
-        """From wherever the group stands to its end.
+        """From wherever the group stands to its end. `labels`: of a file, in place of the teacher's.
 
         Raises Interrupted once it was asked to stop and everything is saved.
         """
         if (self.folder / results.PARQUET).exists():
-            console.print(f"{self.group.guidance.name}: finished before, left as it is")
+            console.print(f"{self.name}: finished before, left as it is")
             return
+        asks = self.group.guidance.asks
         with checkpoints(self.folder / "checkpoints") as saved:
             self._restore(saved)
             constants = self._constants()
             with (
-                results.ResultsWriter(self.folder, **constants) as writer,
-                self._guide_table(constants) as guides,
+                TableWriter(self.folder, results.SCHEMA, constants) as writer,
+                TableWriter(self.folder, results.GUIDES, constants) if asks else nullcontext() as guides,
                 tracking.opened(self.order.track, self.folder, self.described, self.training.step) as tracker,
             ):
-                while True:
+                if guides is not None:
                     self._label(saved, guides, teacher, labels)
-                    self._train(saved, writer, tracker)
-                    if self.training.done:
-                        break
-        if self.group.guidance.asks:
-            guide_records.finish(self.folder)
-        results.finish(self.folder)  # last: a kind with finished results is finished
-
-    def _guide_table(self, constants: dict[str, Any]) -> AbstractContextManager[GuideWriter | None]:
-        """Where the guides' own quality is kept; kinds that never ask have no such table."""
-        return GuideWriter(self.folder, **constants) if self.group.guidance.asks else nullcontext()
+                self._train(saved, writer, tracker)
+        if asks:
+            tables.finish(self.folder, results.GUIDES)
+        tables.finish(self.folder, results.SCHEMA)  # last: a kind with finished results is finished
 
     def _constants(self) -> dict[str, Any]:
         return {
             "run": self.order.out.name,
             "task": self.order.task.name,
-            "guidance": self.group.guidance.name,
+            "guidance": self.name,
             "split": self.order.split,
             "config_hash": config_hash(self.described),
             **provenance.provenance(),
@@ -89,98 +84,82 @@ class Runner:
 
     def _restore(self, saved: Checkpoints) -> None:
         """The newest checkpoint, or a fresh start; rows past it are dropped."""
+        last_step = last_round = -1
         if saved.latest() is None:
             self.training.begin()
-            results.truncate_after(self.folder, -1)
-            guide_records.truncate_after(self.folder, -1)
-            return
-        blocks, clock, wall = restore_blocks(self.group, saved)
-        due = read_due(self.folder, int(clock.step), len(self.group.seeds))
-        self.training.go_on(blocks, clock, wall, due)
-        self.failed = self.training.failed
-        # A checkpoint of the labels alone comes before the rows of step 0, one without its evaluation before its rows.
-        before = self.training.step == 0 or due is not None
-        results.truncate_after(self.folder, self.training.step - before)
-        guide_records.truncate_after(self.folder, self.training.round)
+        else:
+            blocks, clock, wall = restore_blocks(self.group, saved)
+            due = read_due(self.folder, int(clock.step), len(self.group.seeds))
+            self.training.go_on(blocks, clock, wall, due)
+            self.failed = self.training.failed
+            # A checkpoint of labels alone comes before the rows of step 0, one without its evaluation before its rows.
+            last_step = self.training.step - (self.training.step == 0 or due is not None)
+            last_round = self.training.round
+        tables.truncate(self.folder, results.SCHEMA, keep=lambda row: row["step"] <= last_step)
+        tables.truncate(self.folder, results.GUIDES, keep=lambda row: row["round"] <= last_round)
 
     def _save(self, saved: Checkpoints) -> None:
         now = self.training
         saved.save(now.round + now.step, items(now.blocks, now.clock, now.wall))
 
+    def _interrupted(self, where: str = "") -> Interrupted:
+        return Interrupted(
+            f"stopped at step {self.training.step} of {self.name}{where}; go on with the same command and --resume"
+        )
+
     def _end_if_asked(self, done: int, count: int) -> None:
         """Ends an evaluation if that was asked for: an `evaluate.Tell`, called by several threads."""
         if self.stopping.wait(0):
-            raise Interrupted(
-                f"stopped at step {self.training.step} of {self.group.guidance.name}, before its evaluation; "
-                "go on with the same command and --resume"
-            )
+            raise self._interrupted(", before its evaluation")
 
     def _stop_if_asked(self, saved: Checkpoints) -> None:
         if self.stopping.is_set():
             self._save(saved)
-            raise Interrupted(
-                f"stopped at step {self.training.step} of {self.group.guidance.name}; "
-                "go on with the same command and --resume"
-            )
+            raise self._interrupted()
 
     def _tell_failed(self, when: str) -> None:
         """One line for each lane that is no longer finite since the last look, or for the first of very many."""
         found, group = np.flatnonzero(self.training.failed & ~self.failed), self.group
         for lane in found[:LISTED]:
-            variant = variant_name(group.guidance.name, int(group.budgets[lane]))
+            variant = variant_name(self.name, int(group.budgets[lane]))
             console.print(
                 f"{variant}: the lane of seed {group.seeds[lane]} is no longer finite {when}: kept at its last finite "
                 "state and marked as failed"
             )
         if len(found) > LISTED:
-            console.print(f"{group.guidance.name}: so are {len(found) - LISTED} more lanes")
+            console.print(f"{self.name}: so are {len(found) - LISTED} more lanes")
         self.failed = self.training.failed
 
     def _label(
         self,
         saved: Checkpoints,
-        guides: GuideWriter | None,
+        guides: TableWriter,
         teacher: Teacher | None,
         labels: label_files.LabelFile | None,
     ) -> None:
-        """Asks the teacher for the instalment that is due, or takes the labels of a file."""
-        now, rounds = self.training, self.group.rounds
-        if guides is None:
+        """Takes the labels of a file, or asks the teacher for those that are missing; leaves the label file."""
+        now = self.training
+        if now.labelled and label_files.readable(self.folder / label_files.PARQUET):
             return
         if not now.labelled:
-            self._ask(saved, guides, teacher, labels)
-        elif now.round < rounds or label_files.readable(self.folder / label_files.PARQUET):
-            return
-        if now.round >= rounds:
-            self._write_labels()
+            bar = self.bars.add_task(f"{self.name}: labels", total=self.group.rounds, note="", completed=now.round)
+            if labels is not None:
+                now.take(labels)
+                self._tell_failed("after its labels")
+                self._examine(guides, before=0)
+            else:
+                assert teacher is not None  # asked for where no file was given
+                for done in now.label_rounds(teacher):
+                    self.bars.update(bar, completed=done)
+                    self._tell_failed(f"after {done * self.group.config.sizes.labels_per_round} labels")
+                    self._examine(guides, before=done - 1)
+                    if done % ROUNDS_A_CHUNK == 0:
+                        self._save(saved)
+                    self._stop_if_asked(saved)
+        self._write_labels()
         self._save(saved)
 
-    def _ask(
-        self,
-        saved: Checkpoints,
-        guides: GuideWriter,
-        teacher: Teacher | None,
-        labels: label_files.LabelFile | None,
-    ) -> None:
-        now, unit = self.training, self.group.config.sizes.labels_per_round
-        bar = self.bars.add_task(
-            f"{self.group.guidance.name}: labels", total=self.group.rounds, note="", completed=now.round
-        )
-        if labels is not None:
-            now.take(labels)
-            self._tell_failed("after its labels")
-            self._examine(guides, before=0)
-            return
-        assert teacher is not None  # asked for where no file was given
-        for done in now.label_rounds(teacher):
-            self.bars.update(bar, completed=done)
-            self._tell_failed(f"after {done * unit} labels")
-            self._examine(guides, before=done - 1)
-            if done % ROUNDS_A_CHUNK == 0:
-                self._save(saved)
-            self._stop_if_asked(saved)
-
-    def _examine(self, guides: GuideWriter, before: int) -> None:
+    def _examine(self, guides: TableWriter, before: int) -> None:
         """Writes how good the guides are by themselves that are due after the rounds since `before`."""
         row = self.training.guides(before)
         if row is not None:
@@ -196,12 +175,9 @@ class Runner:
         told = form.name, space, eps, seeds, labels, form.meaning(space)
         label_files.write(self.folder / label_files.PARQUET, task, *told)
 
-    def _train(self, saved: Checkpoints, writer: results.ResultsWriter, tracker: tracking.Tracker | None) -> None:
+    def _train(self, saved: Checkpoints, writer: TableWriter, tracker: tracking.Tracker | None) -> None:
         now, schedule = self.training, self.group.config.schedule
-        if self._bar is None:
-            self._bar = self.bars.add_task(
-                self.group.guidance.name, total=schedule.total_steps, note="", completed=now.step
-            )
+        bar = self.bars.add_task(self.name, total=schedule.total_steps, note="", completed=now.step)
         for row in self._evaluated(saved):
             writer.append(**row)
             if tracker is not None:
@@ -209,7 +185,7 @@ class Runner:
             self._tell_failed(f"at step {now.step:,}")
             if now.step == 0:
                 continue
-            self.bars.update(self._bar, completed=now.step, note=f"reward {mean_of_finite(row['reward'])}")
+            self.bars.update(bar, completed=now.step, note=f"reward {mean_of_finite(row['reward'])}")
             if now.step % schedule.checkpoint_every == 0 or now.step >= schedule.total_steps:
                 self._save(saved)
             self._stop_if_asked(saved)

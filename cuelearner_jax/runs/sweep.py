@@ -6,7 +6,7 @@ from cuelearner_jax.devices import SHARED, lane_mesh, place
 from cuelearner_jax.feedback.answers import check_teacher
 from cuelearner_jax.runs import failures
 from cuelearner_jax.runs.grid import defaults
-from cuelearner_jax.runs.kept import check_standing
+from cuelearner_jax.runs.lane_checkpoints import check_standing
 from cuelearner_jax.runs.lanes import LaneGroup
 from cuelearner_jax.runs.memory_report import memory_report
 from cuelearner_jax.runs.order import Order, planned

@@ -47,14 +47,12 @@ class Training:
 
     def begin(self) -> None:
         """Fresh lanes."""
-        self._guides = None
         self.blocks = self.group.start()
 
     def go_on(
         self, blocks: list[TrainState], clock: Clock, wall: float, due: dict[str, np.ndarray] | None = None
     ) -> None:
         """From where others stood."""
-        self._guides = None
         self.blocks, self.wall, self.due = blocks, wall, due
         self.clock = place(self.group.mesh, clock, SHARED)
 
@@ -102,7 +100,6 @@ class Training:
             for seeds, budgets in group.blocks()
         ]
         self.blocks = group.take_labels(rows, self.blocks)
-        self._guides = None
         taken = self.clock.replace(round=jnp.asarray(group.rounds, jnp.int32))
         self.clock = place(group.mesh, taken, SHARED)
 

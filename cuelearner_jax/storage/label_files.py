@@ -162,7 +162,7 @@ def found_in(place: Path) -> Path | None:
     """The label file at a place: that file, or the one in that folder; None: there is none."""
     if not place.is_dir():
         return place if place.exists() else None
-    return next((place / name for name in (PARQUET, JSONL) if (place / name).exists()), None)
+    return SCHEMA.found_in(place)
 
 
 def history(path: Path) -> list[dict[str, Any]]:

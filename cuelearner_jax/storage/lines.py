@@ -121,31 +121,6 @@ def _tell(words: str) -> None:
     console.print(f"warning: {one_line(words)}")
 
 
-def newest(path: Path, most: int) -> Row | None:
-    """The last line but the closing one, of a file that may be growing; None: there is none, or it is not whole.
-
-    Args:
-        path: the file.
-        most: bytes to look at, from its end.
-
-    Raises FileNotFoundError.
-    """
-    with path.open("rb") as file:
-        file.seek(max(0, file.seek(0, os.SEEK_END) - most))
-        lines = file.read().split(b"\n")[:-1]
-    for line in lines[:-3:-1]:
-        try:
-            found = json.loads(line)
-        except (ValueError, RecursionError):  # whoever reads the whole table says so
-            return None
-        if not isinstance(found, dict):
-            return None
-        found.pop("crc", None)
-        if found.keys() != {END}:
-            return found
-    return None
-
-
 def _sealed(rows: Iterable[Row], count: int, checksum: int) -> tuple[bytes, int, int]:
     """Lines as they are written, after so many with that checksum: (text, count, checksum of the last)."""
     text = []

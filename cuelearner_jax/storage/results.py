@@ -1,6 +1,7 @@
-"""The results table of a run: `results.jsonl` while it runs, `results.parquet` once it is done.
+"""Tables of a run: its results, and how good its guides are by themselves while they are asked labels.
 
-One row holds one evaluation of one seed:
+`results.jsonl` grows while a run goes on, `results.parquet` is there once it is done. One row holds one evaluation of
+one seed:
 
 | column       | type  | meaning                                                          |
 |--------------|-------|------------------------------------------------------------------|
@@ -17,18 +18,27 @@ One row holds one evaluation of one seed:
 | failed       | float | 1 once the lane stopped being finite: its metrics are null then  |
 | all others   | float | metrics, for instance `reward`; a value that is not finite is null |
 
-In the JSONL file, columns that stay the same are written once: a line `{"constants": {...}}` holds for all lines after
-it, until the next such line (a run resumed on other hardware adds one). In Parquet they are ordinary columns.
+`guide.jsonl` and `guide.parquet` beside them hold evaluations of uniform actions under a lane's guide, in the same
+columns and these:
+
+| column     | type  | meaning                                                                             |
+|------------|-------|-------------------------------------------------------------------------------------|
+| asked      | int   | labels asked for so far, answered or not: at most the budget                        |
+| round      | int   | label rounds of the lanes trained with it so far: what a resumed run goes back by   |
+| guide_...  | float | metrics, for instance `guide_reward`                                                |
+
+A lane's guide has a row at every multiple of `--schedule.guide-eval-every` labels of its own, and at its last label.
+
+A run appends the rows of a step, or of a round, before it saves that checkpoint; then no row is lost.
 """
 
 from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
@@ -44,86 +54,46 @@ SCHEMA = tables.Schema(
     integers=("labels", "seed", "step"),
     remedy="is damaged: restore it, or delete its folder and give --resume, which trains these lanes anew",
 )
+GUIDES = tables.Schema(
+    stem="guide",
+    mark="asked",
+    required=(*SCHEMA.required, "asked", "round"),
+    strings=SCHEMA.strings,
+    integers=(*SCHEMA.integers, "asked", "round"),
+    remedy=SCHEMA.remedy,
+)
 JSONL, PARQUET = SCHEMA.jsonl, SCHEMA.parquet
 FAILED = "failed"  # the column that marks rows of lanes that have failed
 LANE = ("guidance", "labels", "seed")  # what tells the lanes of a run apart
 LaneKey = tuple[str, int, int]
 
 
-class ResultsWriter(tables.TableWriter):
-    """Appends rows to the JSONL file of one run; every append is on the disk when the call returns.
-
-    Opening an existing file continues it: a torn last line, left by a crash, is dropped first, and a table that was
-    already finished (Parquet) becomes JSONL again. Use `truncate_after` before that to go back to a checkpoint. A run
-    should append the rows of a step before it saves the checkpoint of that step; then no row is lost.
-    """
-
-    def __init__(self, folder: PathLike, **constants: str | int | float) -> None:
-        """Opens `folder/results.jsonl`, creating both where needed.
-
-        Args:
-            folder: folder of the run.
-            constants: columns with one value for all rows to come, for instance `run`, `task` and `**provenance()`.
-        """
-        super().__init__(folder, SCHEMA, constants)
-
-
-def last_step(folder: PathLike) -> int:
-    """Step of the newest complete row of a table that is still being written; 0 where there is none."""
-    row = tables.last_row(folder, SCHEMA)
-    return row["step"] if row else 0
-
-
-def truncate_after(folder: PathLike, step: int) -> None:
-    """Drops the rows past `step` and a torn last line; used before a run is resumed from the checkpoint of `step`.
+def check_complete(
+    folder: Path, schema: tables.Schema, columns: Sequence[str], rows: Iterable[tuple[int, ...]], among: pc.Expression
+) -> None:
+    """Whether a folder's table has each of the rows once.
 
     Args:
-        folder: folder of the run, or its `results.jsonl`; without results nothing happens.
-        step: environment steps of a seed at the checkpoint; rows at this step stay.
-    """
-    tables.truncate(folder, SCHEMA, keep=lambda row: row["step"] <= step)
-
-
-def finish(folder: PathLike) -> Path:
-    """Turns the JSONL table of a run that is done into Parquet and removes the JSONL; returns the Parquet file.
-
-    Args:
-        folder: folder of the run, or its `results.jsonl`. A table that is finished already is left as it is.
-
-    Raises:
-        UserError: if there is no table, a run without an evaluation, or it cannot be read.
-    """
-    return tables.finish(folder, SCHEMA)
-
-
-def check_complete(folder: Path, seeds: np.ndarray, budgets: np.ndarray, steps: Sequence[int]) -> None:
-    """Whether a table has one row of each lane at each of the steps; other steps are not looked at.
-
-    Args:
-        folder: folder of the run.
-        seeds: of the lanes, (lanes,).
-        budgets: their label budgets, (lanes,).
-        steps: at which each was evaluated.
+        folder: of one kind of guidance of a run.
+        schema: `SCHEMA` or `GUIDES`.
+        columns: that tell rows apart.
+        rows: the values of these columns in each row that must be there.
+        among: which rows of the table count.
 
     Raises:
         UserError: rows are missing or there more than once, there is no table, or it cannot be read.
     """
-    path = next((folder / name for name in (PARQUET, JSONL) if (folder / name).exists()), folder / JSONL)
-    found: Counter[tuple[int, int, int]] = Counter()
-    if path.exists():
-        table = tables.read(path, SCHEMA)
-        if table.num_rows:
-            table = table.filter(pc.field("step").isin(list(steps)))
-            found.update(zip(*(table[name].to_pylist() for name in ("seed", "labels", "step")), strict=True))
-    lanes = [(int(seed), int(budget)) for seed, budget in zip(seeds, budgets, strict=True)]
-    wanted = Counter((*lane, step) for lane in lanes for step in steps)
+    path = schema.found_in(folder) or folder / schema.jsonl
+    wanted, found = Counter(rows), Counter[tuple[int, ...]]()
+    if path.exists() and (table := tables.read(path, schema)).num_rows:
+        found.update(zip(*(table.filter(among)[name].to_pylist() for name in columns), strict=True))
     if found == wanted:
         return
     wrong = sorted((wanted - found) or (found - wanted))
+    first = ", ".join(f"{name} {value}" for name, value in zip(columns, wrong[0], strict=True))
     raise UserError(
-        f"{path} {'lacks' if wanted - found else 'has too many'} rows: {len(wrong)}, the first of seed {wrong[0][0]} "
-        f"with {wrong[0][1]} labels at step {wrong[0][2]}; restore it, or delete {folder} and give --resume, which "
-        "trains these lanes anew"
+        f"{path} {'lacks' if wanted - found else 'has too many'} rows: {len(wrong)}, the first of {first}; restore it, "
+        f"or delete {folder} and give --resume, which trains these lanes anew"
     )
 
 
@@ -183,6 +153,14 @@ def read(paths: PathLike | Sequence[PathLike], task: str | None = None, schema: 
     elif len(tasks) > 1:
         raise UserError(f"results of several tasks ({', '.join(tasks)}) cannot be mixed: choose one of them")
     return table
+
+
+def read_guides(paths: Sequence[PathLike], task: str | None = None) -> pa.Table | None:
+    """Like `read`, of how good guides are by themselves; None where no run asked for labels."""
+    there = [
+        path for path in paths if any(next(Path(path).rglob(name), None) for name in (GUIDES.jsonl, GUIDES.parquet))
+    ]
+    return read(there, task, GUIDES) if there else None
 
 
 def metrics(table: pa.Table) -> list[str]:

@@ -34,7 +34,6 @@ from cuelearner_jax.storage.whole import replacing, unreadable
 
 META = b"cuelearner"  # the key under which Parquet holds what the table is
 DIGEST = b"cuelearner.sha256"  # and the one of the digest of its contents
-TAIL = 1 << 16  # more than the longest row of most tables [bytes]
 VALUE = 64  # of memory, that a value takes while it is read: as Arrow's, as Python's, as NumPy's [bytes]
 
 PathLike = str | os.PathLike[str]
@@ -67,6 +66,10 @@ class Schema:
         """The JSONL file of a table, given that, its Parquet file or its folder."""
         path = Path(path)
         return path.with_name(self.jsonl) if path.name in (self.jsonl, self.parquet) else path / self.jsonl
+
+    def found_in(self, folder: Path) -> Path | None:
+        """The table's file in a folder; None: there is none. A finished one goes before one that grows."""
+        return next((folder / name for name in (self.parquet, self.jsonl) if (folder / name).exists()), None)
 
     def type(self, name: str) -> pa.DataType:
         """The type of a column."""
@@ -143,15 +146,6 @@ class TableWriter:
 
     def __exit__(self, *_: object) -> None:
         self.close()
-
-
-def last_row(path: PathLike, schema: Schema) -> Row | None:
-    """The newest complete row of a table that is still being written, without looking at the others."""
-    try:
-        found = lines.newest(schema.growing(path), TAIL)
-    except FileNotFoundError:
-        return None
-    return found if found is not None and schema.mark in found else None
 
 
 def truncate(path: PathLike, schema: Schema, keep: Callable[[Row], bool]) -> None:

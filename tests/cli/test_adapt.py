@@ -19,7 +19,7 @@ from cuelearner_jax.adaptation import stored
 from cuelearner_jax.cli import main
 from cuelearner_jax.config import GuideSizes
 from cuelearner_jax.policies import Guided
-from cuelearner_jax.storage import guides, label_files, policy_folders
+from cuelearner_jax.storage import label_files, policy_folders, results
 from cuelearner_jax.storage.checkpoint import checkpoints
 from cuelearner_jax.studies.adapt import sentences
 from cuelearner_jax.tasks import registry
@@ -135,7 +135,7 @@ def test_a_function_is_adapted_and_its_folder_evaluated(adapted, tmp_path):
     assert rewards[3] == 1.0
     (before,) = {row["reward"][0] for row in measured(tmp_path, adapted, *own(), "--policy", "base")}
     assert before == 0.0
-    curve = guides.read_guides(adapted)
+    curve = results.read_guides([adapted])
     assert curve is not None
     curve = curve.to_pylist()
     kept = {(row["bound_deg"], row["labels"], row["asked"]) for row in curve}

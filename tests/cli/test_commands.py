@@ -13,7 +13,7 @@ from small_runs import SMALL
 
 from cuelearner_jax import terminal
 from cuelearner_jax.cli import dispatch, evaluate, main
-from cuelearner_jax.storage import guides, results
+from cuelearner_jax.storage import results
 
 ENTRY = [str(Path(sys.executable).with_name("cuelearner"))]
 
@@ -100,7 +100,7 @@ def test_each_label_is_about_the_situation_that_members_disagree_on(tmp_path):
     command += ["--sizes.fit-steps", "20"]
     command += ["--schedule.guide-eval-every", "10"]
     assert main([*command, "--sizes.ensemble", "2", "--sizes.candidates", "3", "--out", str(out)]) == 0
-    found = guides.read_guides(out)
+    found = results.read_guides([out])
     assert found is not None
     assert [(row["asked"], row["step"]) for row in found.to_pylist()] == [(10, 0), (20, 0), (25, 0)]
 

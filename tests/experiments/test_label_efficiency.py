@@ -17,7 +17,7 @@ from cuelearner_jax.report.document import report
 from cuelearner_jax.report.statistics import Interval, curve, interval, mean_over_curve
 from cuelearner_jax.report.variants import Variant, read_groups, variants_of
 from cuelearner_jax.storage import results
-from cuelearner_jax.storage.guides import GuideWriter
+from cuelearner_jax.storage.table import TableWriter
 
 STEPS = np.arange(0, 101, 10)
 
@@ -191,7 +191,7 @@ def test_runs_are_compared_with_their_own_unguided_agents_or_the_first():
 
 def write(folder, guidance, labels, slope, *, seeds: Sequence[int] = range(4), guide=0.1):
     known = {"run": folder.name, "task": "one_ball", "guidance": guidance, "config_hash": folder.parent.name}
-    with results.ResultsWriter(folder, **known) as writer:
+    with TableWriter(folder, results.SCHEMA, known) as writer:
         for step, value in zip(STEPS, ramp(slope), strict=True):
             row = {"reward": value + 0.001 * np.array(seeds)}
             row |= {"guide_reward": guide + 0.001 * np.array(seeds)} if step == 0 else {}
@@ -222,7 +222,7 @@ def test_a_guide_is_as_good_as_after_its_last_label(runs):
     """Instalments go on after step 0: what the results say of guides then is not the last word."""
     folder = runs / "raw" / "relative-100"
     known = {"run": "raw", "task": "one_ball", "guidance": "relative", "config_hash": "raw", "split": "validation"}
-    with GuideWriter(folder, **known) as writer:
+    with TableWriter(folder, results.GUIDES, known) as writer:
         for asked, step, good in ((50, 0, 0.2), (100, 40, 0.7)):
             row = {"asked": asked, "step": step, "round": asked // 10, "labels": 100, "failed": 0.0, "wall_s": 1.0}
             writer.append(seed=np.arange(4), guide_reward=np.full(4, good), **row)

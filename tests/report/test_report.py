@@ -13,6 +13,7 @@ from matplotlib.image import imread
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.report.document import report
 from cuelearner_jax.storage import formats, results
+from cuelearner_jax.storage.table import TableWriter, finish
 
 STEPS = np.arange(0, 101, 10)
 
@@ -27,7 +28,7 @@ def write(folder, guidance, level, labels=0, *, seeds: Sequence[int] = range(8),
     known = {"run": folder.name, "task": "one_ball", "guidance": guidance, "config_hash": "0f"}
     known |= {"commit": "abc", "versions": "jax 0", "hardware": "1 x cpu"} | constants
     rng = np.random.default_rng(len(seeds))  # variants of one size differ in nothing but their level
-    with results.ResultsWriter(folder, **known) as writer:
+    with TableWriter(folder, results.SCHEMA, known) as writer:
         for step in steps:
             reward = (step > 30) * level + rng.uniform(-0.02, 0.02, len(seeds))
             writer.append(step=step, split="validation", seed=np.array(seeds), labels=labels, reward=reward, wall_s=1.0)
@@ -48,7 +49,7 @@ def runs(tmp_path):
     write(tmp_path / "runs" / "unguided", "none", 0.2)
     for labels, level in ((100, 0.3), (500, 0.6)):
         write(tmp_path / "runs" / f"relative-{labels}", "relative", level, labels)
-    results.finish(tmp_path / "runs" / "unguided")
+    finish(tmp_path / "runs" / "unguided", results.SCHEMA)
     return tmp_path / "runs"
 
 
@@ -117,7 +118,7 @@ def test_refuses_to_overwrite_and_leaves_what_is_there(runs, tmp_path):
 def test_of_collisions_the_fewest_are_best(tmp_path):
     for kind, values in (("none", (0.8, 0.5, 0.4)), ("heuristic", (0.8, 0.3, 0.35))):
         constants = {"run": kind, "task": "hall", "guidance": kind, "config_hash": "0f", "labels": 0}
-        with results.ResultsWriter(tmp_path / "runs" / kind, **constants) as writer:
+        with TableWriter(tmp_path / "runs" / kind, results.SCHEMA, constants) as writer:
             for step, value in zip((0, 10, 20), values, strict=True):
                 writer.append(step=step, split="validation", seed=[0, 1], collision=[value, value])
     found = {}
@@ -227,7 +228,7 @@ def test_names_are_only_names_in_markdown_csv_and_figures(tmp_path):
 
 def test_a_metric_that_is_not_finite_is_left_out_and_said(tmp_path):
     constants = {"run": "a", "task": "one_ball", "guidance": "none", "config_hash": "0f", "labels": 0}
-    with results.ResultsWriter(tmp_path / "a", **constants) as writer:
+    with TableWriter(tmp_path / "a", results.SCHEMA, constants) as writer:
         for step, second in ((0, 0.1), (10, float("nan")), (20, 0.3)):
             writer.append(step=step, split="validation", seed=[0, 1], reward=[0.1, second])
     text = report(tmp_path / "a", tmp_path / "report").read_text()
@@ -238,7 +239,7 @@ def test_a_metric_that_is_not_finite_is_left_out_and_said(tmp_path):
 def lose(folder, guidance, labels=0, seeds=(0, 1, 2), by=20):
     """Appends lanes that had failed by a step: their values before then must not count, those after are null."""
     constants = {"run": folder.name, "task": "one_ball", "guidance": guidance, "config_hash": "0f", "labels": labels}
-    with results.ResultsWriter(folder, **constants) as writer:
+    with TableWriter(folder, results.SCHEMA, constants) as writer:
         for step in STEPS:
             reward = np.full(len(seeds), 7.0 if step < by else np.nan)
             writer.append(step=step, split="validation", seed=seeds, reward=reward, failed=float(step >= by))

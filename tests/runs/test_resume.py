@@ -17,9 +17,9 @@ from cuelearner_jax.asking import label_slots
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.loop import make_program, start_clock
-from cuelearner_jax.runs import kept, lanes, runner, sweep, training
+from cuelearner_jax.runs import lane_checkpoints, lanes, runner, sweep, training
 from cuelearner_jax.runs.grid import Grid, config_hash
-from cuelearner_jax.runs.kept import items
+from cuelearner_jax.runs.lane_checkpoints import items
 from cuelearner_jax.runs.order import Order
 from cuelearner_jax.spaces import DIRECTIONS
 from cuelearner_jax.storage import formats, label_files, lines, results
@@ -191,13 +191,13 @@ def test_a_checkpoint_whose_lanes_had_another_state_is_refused_before_anything_i
     shutil.rmtree(out / "relative")
     (out / "none" / results.PARQUET).unlink()
     before = probes.files_of(out)
-    of_now = kept.items
+    of_now = lane_checkpoints.items
 
     def of_a_newer_program(blocks, clock, wall):
         made = of_now(blocks, clock, wall)
         return {**made, "rest": [block.replace(arbiter=(block.arbiter, block.failed)) for block in made["rest"]]}
 
-    monkeypatch.setattr(kept, "items", of_a_newer_program)
+    monkeypatch.setattr(lane_checkpoints, "items", of_a_newer_program)
     with pytest.raises(
         UserError, match="of another version of the program: go on with that one, or start anew"
     ) as told:
@@ -291,14 +291,16 @@ def test_stopped_in_an_evaluation(whole, tmp_path, evaluating):
 
 
 def test_the_note_of_a_stretch_that_waits_is_of_its_step_and_whole(tmp_path):
-    assert kept.read_due(tmp_path, 48, lanes=2) is None
-    kept.write_due(tmp_path, 48, {"train_loss": np.array([0.1, np.nan], np.float32)})
-    np.testing.assert_array_equal(kept.read_due(tmp_path, 48, lanes=2)["train_loss"], np.float32([0.1, np.nan]))
-    assert kept.read_due(tmp_path, 64, lanes=2) is None  # it lay beside another checkpoint
+    assert lane_checkpoints.read_due(tmp_path, 48, lanes=2) is None
+    lane_checkpoints.write_due(tmp_path, 48, {"train_loss": np.array([0.1, np.nan], np.float32)})
+    np.testing.assert_array_equal(
+        lane_checkpoints.read_due(tmp_path, 48, lanes=2)["train_loss"], np.float32([0.1, np.nan])
+    )
+    assert lane_checkpoints.read_due(tmp_path, 64, lanes=2) is None  # it lay beside another checkpoint
     for values in ({"step": 48}, {"step": 48, "columns": [1.0]}, {"step": 48, "columns": {"train_loss": [1.0]}}):
-        formats.write("due", tmp_path / kept.DUE, values)
+        formats.write("due", tmp_path / lane_checkpoints.DUE, values)
         with pytest.raises(UserError, match=r"due\.json is damaged"):
-            kept.read_due(tmp_path, 48, lanes=2)
+            lane_checkpoints.read_due(tmp_path, 48, lanes=2)
 
 
 @pytest.mark.long
@@ -414,9 +416,9 @@ def refused(out, message):
 @pytest.mark.parametrize(
     ("drop", "says"),
     [
-        (lambda line: line.get("step") == 16 and line["seed"] == 5, "lacks rows: 2, the first of seed 5 with 35"),
-        (lambda line: line.get("step", 0) > 16, "lacks rows: 8, the first of seed 3 with 35 labels at step 32"),
-        (lambda line: "step" in line, "lacks rows: 16, the first of seed 3 with 35 labels at step 0"),
+        (lambda line: line.get("step") == 16 and line["seed"] == 5, "lacks rows: 2, the first of seed 5, labels 35"),
+        (lambda line: line.get("step", 0) > 16, "lacks rows: 8, the first of seed 3, labels 35, step 32"),
+        (lambda line: "step" in line, "lacks rows: 16, the first of seed 3, labels 35, step 0"),
     ],
 )
 def test_rows_that_were_lost_before_the_checkpoint_are_missed(stopped, tmp_path, drop, says):

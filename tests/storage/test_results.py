@@ -7,13 +7,14 @@ import pytest
 
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.storage import lines, results
+from cuelearner_jax.storage.table import TableWriter, finish, truncate
 
 CONSTANTS = {"run": "a", "task": "one_ball", "guidance": "relative", "config_hash": "0f", "hardware": "1 x cpu"}
 SEEDS, LABELS = np.array([3, 4]), np.array([100, 500])
 
 
 def write(folder, steps=(0, 10, 20), **constants):
-    with results.ResultsWriter(folder, **(CONSTANTS | constants)) as writer:
+    with TableWriter(folder, results.SCHEMA, CONSTANTS | constants) as writer:
         for step in steps:
             reward = np.array([step / 100, step / 50])
             writer.append(step=step, split="validation", seed=SEEDS, labels=LABELS, reward=reward, wall_s=1.5)
@@ -36,7 +37,7 @@ def test_a_row_for_each_lane_with_its_types(tmp_path):
 
 
 def test_values_that_are_not_finite_are_null_in_strict_json(tmp_path):
-    with results.ResultsWriter(tmp_path, **CONSTANTS) as writer:
+    with TableWriter(tmp_path, results.SCHEMA, CONSTANTS) as writer:
         writer.append(step=0, split="training", seed=[0, 1, 2], labels=0, reward=[float("nan"), float("inf"), 2.0])
         writer.append(step=1, split="training", seed=[0], labels=0, success=np.array([True]))
     text = (tmp_path / results.JSONL).read_text()
@@ -52,7 +53,7 @@ def test_truncation_and_a_resumed_writer_give_the_uninterrupted_table(tmp_path):
     write(tmp_path / "resumed", steps=[0, 10, 20])
     with (tmp_path / "resumed" / results.JSONL).open("a") as file:
         file.write('{"step": 20, "torn')
-    results.truncate_after(tmp_path / "resumed", 10)
+    truncate(tmp_path / "resumed", results.SCHEMA, lambda row: row["step"] <= 10)
     assert {row["step"] for row in rows(tmp_path / "resumed")} == {0, 10}
     write(tmp_path / "resumed", steps=[20, 30])
     assert (tmp_path / "resumed" / results.JSONL).read_bytes() == (tmp_path / "whole" / results.JSONL).read_bytes()
@@ -61,17 +62,17 @@ def test_truncation_and_a_resumed_writer_give_the_uninterrupted_table(tmp_path):
 def test_parquet_round_trip_keeps_every_value_and_leaves_one_file(tmp_path):
     write(tmp_path)
     before = rows(tmp_path)
-    path = results.finish(tmp_path)
+    path = finish(tmp_path, results.SCHEMA)
     assert [file.name for file in tmp_path.iterdir()] == [results.PARQUET]
     assert rows(tmp_path) == before
     assert pq.read_table(path)["labels"].type == pa.int64()
-    assert results.finish(tmp_path) == path
+    assert finish(tmp_path, results.SCHEMA) == path
 
 
 def test_a_finished_run_can_be_continued(tmp_path):
     write(tmp_path, steps=[0, 10])
-    results.finish(tmp_path)
-    results.truncate_after(tmp_path, 0)
+    finish(tmp_path, results.SCHEMA)
+    truncate(tmp_path, results.SCHEMA, lambda row: row["step"] <= 0)
     write(tmp_path, steps=[10, 20])
     assert [file.name for file in tmp_path.iterdir()] == [results.JSONL]
     assert [row["step"] for row in rows(tmp_path)] == [0, 0, 10, 10, 20, 20]
@@ -81,18 +82,18 @@ def test_a_finished_run_can_be_continued(tmp_path):
 def test_a_crash_between_parquet_and_removal_does_not_double_rows(tmp_path):
     write(tmp_path)
     text = (tmp_path / results.JSONL).read_bytes()
-    results.finish(tmp_path)
+    finish(tmp_path, results.SCHEMA)
     (tmp_path / results.JSONL).write_bytes(text)
     assert results.read(tmp_path).num_rows == 6
 
 
 def test_reads_runs_at_any_depth_done_or_not_with_their_own_metrics(tmp_path):
     write(tmp_path / "x" / "done")
-    results.finish(tmp_path / "x" / "done")
+    finish(tmp_path / "x" / "done", results.SCHEMA)
     write(tmp_path / "going", guidance="none", run="b")
-    with results.ResultsWriter(tmp_path / "going", **CONSTANTS) as writer:
+    with TableWriter(tmp_path / "going", results.SCHEMA, CONSTANTS) as writer:
         writer.append(step=30, split="training", seed=0, labels=0, success=0.5)
-    results.ResultsWriter(tmp_path / "just_begun", **CONSTANTS).close()
+    TableWriter(tmp_path / "just_begun", results.SCHEMA, CONSTANTS).close()
     table = results.read(tmp_path)
     assert table.num_rows == 13
     assert len(set(table["folder"].to_pylist())) == 2
@@ -110,10 +111,10 @@ def test_errors_are_one_clear_line(tmp_path):
 
     assert "does not exist" in message(tmp_path / "nowhere")
     assert "no results below" in message(tmp_path)
-    results.ResultsWriter(tmp_path / "empty", **CONSTANTS).close()
+    TableWriter(tmp_path / "empty", results.SCHEMA, CONSTANTS).close()
     assert "no rows yet" in message(tmp_path / "empty")
     with pytest.raises(UserError, match="no rows"):
-        results.finish(tmp_path / "empty")
+        finish(tmp_path / "empty", results.SCHEMA)
 
     write(tmp_path / "a")
     write(tmp_path / "b", task="easy")

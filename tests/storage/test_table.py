@@ -107,7 +107,6 @@ def test_a_torn_last_line_is_dropped_by_whoever_continues(tmp_path, torn):
     with path.open("ab") as file:
         file.write(torn)
     assert read(tmp_path)["fish"].to_pylist() == ["pike", "eel"]
-    assert (tables.last_row(tmp_path, SCHEMA) or {})["fish"] == "eel"
     written(tmp_path, "carp")
     assert read(tmp_path)["fish"].to_pylist() == ["pike", "eel", "carp"]
 
@@ -141,14 +140,6 @@ def test_a_full_disk_leaves_no_row_behind_and_takes_the_next_one(tmp_path):
             resource.setrlimit(resource.RLIMIT_FSIZE, limits)
         writer.append(fish="carp", weights=[3.0])
     assert read(tmp_path)["fish"].to_pylist() == ["pike", "carp"]
-
-
-def test_the_newest_row(tmp_path):
-    assert tables.last_row(tmp_path, SCHEMA) is None
-    written(tmp_path)
-    assert tables.last_row(tmp_path, SCHEMA) is None
-    written(tmp_path, "pike", "eel")
-    assert tables.last_row(tmp_path, SCHEMA) == {"fish": "eel", "weights": [1.0, 0.1], "count": 1, "length": 0.5}
 
 
 @pytest.mark.parametrize("name", ["", "catches.jsonl", "catches.parquet"])

@@ -1,4 +1,4 @@
-"""What of a group of lanes is kept on disk, and how it comes back."""
+"""Save and restore a lane group's checkpoint, and check what its folder holds before it goes on."""
 
 from __future__ import annotations
 
@@ -8,11 +8,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pyarrow.compute as pc
 
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.loop import Clock, TrainState, start_clock
 from cuelearner_jax.runs.lanes import LaneGroup
-from cuelearner_jax.storage import formats, guides, label_files, results
+from cuelearner_jax.storage import formats, label_files, results
 from cuelearner_jax.storage import table as tables
 from cuelearner_jax.storage.checkpoint import Checkpoints, checkpoints
 
@@ -46,24 +47,14 @@ def _clock(saved: Checkpoints, lanes: int) -> tuple[dict[str, Any], int, int]:
     return clock, count, size
 
 
-def restore(group: LaneGroup, saved: Checkpoints, *names: str, whole: bool = False) -> dict[str, Any]:
-    """Items of the newest checkpoint by name, "failed" and "clock". Blocks are cut as they were when it was written.
+def _shapes(group: LaneGroup, saved: Checkpoints) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The newest checkpoint's item "clock", and shapes of all items, in blocks cut as they were when it was written.
 
-    Args:
-        group: the lanes.
-        saved: their checkpoints.
-        names: of the items.
-        whole: must training be able to go on from it? The items that are not named are then compared too, unread.
-
-    Raises UserError if there is no readable checkpoint or it holds other lanes, or another state of them.
+    Raises UserError if there is no readable checkpoint, or it holds fewer lanes.
     """
     clock, count, size = _clock(saved, len(group.seeds))
     cut = np.minimum(np.arange(count * size), len(group.seeds) - 1).reshape(count, size)
-    shapes = items(group.shapes_of(cut), jax.eval_shape(start_clock), 0.0)
-    if whole:
-        saved.compare({name: shapes[name] for name in ("policy", "rest")})
-    found = saved.restore({name: shapes[name] for name in (*names, "failed")})
-    return {**found, "clock": clock}
+    return clock, items(group.shapes_of(cut), jax.eval_shape(start_clock), 0.0)
 
 
 def restore_blocks(group: LaneGroup, saved: Checkpoints) -> tuple[list[TrainState], Clock, float]:
@@ -71,7 +62,8 @@ def restore_blocks(group: LaneGroup, saved: Checkpoints) -> tuple[list[TrainStat
 
     Raises UserError if there is no readable checkpoint or it holds other lanes.
     """
-    found = restore(group, saved, "policy", "rest")
+    clock, shapes = _shapes(group, saved)
+    found = saved.restore({name: shapes[name] for name in ("policy", "rest", "failed")})
     blocks = [
         rest.replace(
             agent=rest.agent.replace(params=policy["params"]),
@@ -80,7 +72,7 @@ def restore_blocks(group: LaneGroup, saved: Checkpoints) -> tuple[list[TrainStat
         )
         for policy, rest, failed in zip(found["policy"], found["rest"], found["failed"], strict=True)
     ]
-    return group.recut(blocks), found["clock"]["clock"], float(found["clock"]["wall_s"])
+    return group.recut(blocks), clock["clock"], float(clock["wall_s"])
 
 
 def write_due(folder: Path, step: int, columns: dict[str, np.ndarray]) -> None:
@@ -125,22 +117,24 @@ def check_standing(group: LaneGroup, folder: Path, given: bool = False) -> None:
     if not finished and (folder / "checkpoints").is_dir():
         with checkpoints(folder / "checkpoints", read_only=True) as saved:
             if saved.latest() is not None:
-                clock = restore(group, saved, whole=True)["clock"]["clock"]
-                step, rounds = int(clock.step), int(clock.round)
+                item, shapes = _shapes(group, saved)
+                saved.compare({name: shapes[name] for name in ("policy", "rest")})
+                saved.restore({"failed": shapes["failed"]})
+                step, rounds = int(item["clock"].step), int(item["clock"].round)
                 waits = read_due(folder, step, len(group.seeds)) is not None
     if step:
+        lanes = list(zip(group.seeds.tolist(), group.budgets.tolist(), strict=True))
         evaluated = range(0, step if waits else step + 1, schedule.eval_every)
-        results.check_complete(folder, group.seeds, group.budgets, evaluated)
+        rows = [(*lane, at) for lane in lanes for at in evaluated]
+        columns, among = ("seed", "labels", "step"), pc.field("step").isin(list(evaluated))
+        results.check_complete(folder, results.SCHEMA, columns, rows, among)
     elif (folder / results.JSONL).exists():
         tables.read(folder / results.JSONL, results.SCHEMA)
-    if _has_guides(folder) or (rounds and not finished):  # finished runs of before have no such table
-        guides.check_complete(folder, rounds, group.looks(rounds, given))
+    if results.GUIDES.found_in(folder) or (rounds and not finished):  # finished runs of before have no such table
+        columns, among = ("seed", "labels", "asked"), pc.field("round") <= rounds
+        results.check_complete(folder, results.GUIDES, columns, group.looks(rounds, given), among)
     if finished and group.guidance.asks:
         label_files.read(folder / label_files.PARQUET)
-
-
-def _has_guides(folder: Path) -> bool:
-    return any((folder / name).exists() for name in (guides.JSONL, guides.PARQUET))
 
 
 def restore_policies(folder: Path, like: Any, lanes: int) -> tuple[dict[str, Any], int]:
