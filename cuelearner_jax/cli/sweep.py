@@ -7,7 +7,7 @@ from typing import Any, Generic, Literal
 
 from cuelearner_jax.cli.parsing import out
 from cuelearner_jax.cli.shared_options import RunT, Training, asked_of_preset
-from cuelearner_jax.runs import submission, sweep
+from cuelearner_jax.runs import cluster, sweep
 from cuelearner_jax.runs.cluster import Job
 from cuelearner_jax.runs.grid import Grid, seeds_of
 from cuelearner_jax.runs.order import Plan, planned
@@ -42,21 +42,21 @@ OPTIONS = {"sweep": Sweep}
 
 
 def run(arguments: list[str]) -> None:
-    """Runs the command. Raises what `sweep.run` and `submission.submit` raise."""
+    """Runs the command. Raises what `sweep.run` and `cluster.submit` raise."""
 
     def suggested(preset: Preset, kinds: tuple[str, ...]) -> dict[str, Any]:
         return {"guidance": kinds, **{name: getattr(preset, name) for name in ("labels", "seeds", "first_seed")}}
 
     task, asked = asked_of_preset(arguments, "sweep", Sweep, suggested)
     grid = Grid(asked.guidance, seeds_of(asked.first_seed, asked.seeds), asked.labels)
-    submission.check(asked.cluster, asked.shards, asked.job, asked.shard, asked.overwrite, asked.out)
+    cluster.check(asked.cluster, asked.shards, asked.job, asked.shard, asked.overwrite, asked.out)
     if asked.cluster:
 
         def plan(shard: Shard) -> Plan:
             return planned(asked.order(task, grid, shard))
 
-        assert asked.shards  # `submission.check`
-        submission.submit(asked.shards, asked.job, asked.out, arguments, plan, out.print)
+        assert asked.shards  # `cluster.check`
+        cluster.submit(asked.shards, asked.job, asked.out, arguments, plan, out.print)
         return
     shard = Shard.parse(asked.shard) if asked.shard else None
     sweep.run(asked.order(task, grid, shard))

@@ -17,12 +17,17 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import jax
+
 from cuelearner_jax.errors import UserError
+from cuelearner_jax.runs import failures
+from cuelearner_jax.runs.order import Plan
 from cuelearner_jax.runs.shards import Shard
 
 # The command, named in the results as if it had been typed.
@@ -59,11 +64,24 @@ class Job:
     """Any other options of sbatch as KEY=VALUE, for instance qos=high gres=gpu:h200:1 constraint=ib."""
 
 
-def check(job: Job) -> None:
-    """Raises UserError for what cannot be submitted, before anything is written."""
+def check(place: str | None, shards: int | None, job: Job, shard: str | None, overwrite: bool, out: Path) -> None:
+    """Raises UserError for options that do not go together. `place`: "slurm", or None for no jobs."""
+    if place is None:
+        if shards is not None or job != Job():
+            raise UserError("--shards and --job belong to --cluster: give --cluster slurm, or --shard i/n alone")
+        return
+    if shard:
+        raise UserError("--shard runs one piece here, --cluster all of them as jobs: give one of the two")
+    if shards is None or shards < 1:
+        raise UserError(f"--cluster needs --shards of at least 1, the number of jobs; it is {shards}")
+    if overwrite:
+        raise UserError(
+            f"--overwrite with --cluster: a job that starts again would delete its own work; delete {out} by "
+            "hand, or give another --out"
+        )
     for name, least in (("gpus", 0), ("cpus", 1), ("minutes", 1), ("at_once", 0), ("restarts", 0), ("notice_s", 60)):
         if getattr(job, name) < least:
-            raise UserError(f"--job.{_typed(name)} is {getattr(job, name)}: give at least {least}")
+            raise UserError(f"--job.{name.replace('_', '-')} is {getattr(job, name)}: give at least {least}")
     if not 0 <= job.memory_gb < float("inf"):
         raise UserError(f"--job.memory-gb is {job.memory_gb}: give a positive number, or 0 for the partition's default")
     if job.notice_s >= 60 * job.minutes:
@@ -72,8 +90,45 @@ def check(job: Job) -> None:
     _submitit()
 
 
-def _typed(name: str) -> str:
-    return name.replace("_", "-")
+def submit(
+    shards: int,
+    job: Job,
+    out: Path,
+    arguments: list[str],
+    plan: Callable[[Shard], Plan],
+    tell: Callable[[str], None] = print,
+) -> None:
+    """Every piece of a sweep that is not finished, as a job of Slurm.
+
+    Args:
+        shards: number of pieces.
+        job: what each job gets.
+        out: the sweep's folder.
+        arguments: of the command `cuelearner sweep` that submits them.
+        plan: what the sweep does for a piece.
+        tell: told how it went, and how to go on.
+
+    Raises:
+        UserError: what the sweep or the cluster refuses, before anything is written.
+        NotFinite: all is done, but some lanes stopped being finite.
+    """
+    jax.config.update("jax_platforms", "cpu")  # the accelerator's memory is for the jobs
+    plans = {shard: plan(shard) for shard in (Shard(index, shards) for index in range(1, shards + 1))}
+    pieces = [piece_arguments(arguments, shard) for shard, planned in plans.items() if not planned.finished]
+    if len(pieces) < len(plans):
+        tell(f"{len(plans) - len(pieces)} of {len(plans)} pieces were finished before")
+    told = f"cuelearner report {out} --out {out}/report"
+    if pieces:
+        number, logs = _submit_to_slurm(pieces, out, job)
+        tell(
+            f"submitted {len(pieces)} jobs as {number}; logs in {logs}\n"
+            f"how they stand: squeue --job {number}\nwhat there is and what is missing: {told}\n"
+            f"stop them: scancel {number}; the same command again goes on with what is not finished"
+        )
+        return
+    orders = [planned.order for planned in plans.values()]
+    failures.check(out, [order.out / kind for order in orders for kind in order.grid.guidance])
+    tell(f"done: {out} (see it with: {told})")
 
 
 def _submitit() -> ModuleType:
@@ -102,7 +157,7 @@ def _sbatch_options(job: Job) -> dict[str, Any]:
         if not key or not equals or not value:
             raise UserError(f"--job.slurm is {text!r}: give KEY=VALUE, for instance qos=high")
         if key in OURS:
-            raise UserError(f"--job.slurm cannot set {_typed(key)!r}, which cuelearner sets: leave it out")
+            raise UserError(f"--job.slurm cannot set {key.replace('_', '-')!r}, which cuelearner sets: leave it out")
         found[key] = value
     return found
 
@@ -183,27 +238,10 @@ def _new_folder(out: Path) -> Path:
             number += 1
 
 
-def _withdraw(folder: Path) -> None:
-    """Takes a submission's folder away again, and those above it that are empty then."""
-    shutil.rmtree(folder)
-    with contextlib.suppress(OSError):  # not empty
-        folder.parent.rmdir()
-        folder.parent.parent.rmdir()
+def _submit_to_slurm(pieces: list[tuple[str, ...]], out: Path, job: Job) -> tuple[str, Path]:
+    """Submits one job array with a command for each piece; returns its number, and the folder of its logs.
 
-
-def submit_to_slurm(pieces: dict[Shard, tuple[str, ...]], out: Path, job: Job) -> tuple[str, Path]:
-    """Submits the pieces as one job array.
-
-    Args:
-        pieces: the arguments of each piece's command.
-        out: the sweep's folder.
-        job: what each job gets.
-
-    Returns:
-        The number of the array, and the folder of its logs.
-
-    Raises:
-        UserError: no Slurm here, or sbatch refused the jobs, with its last line; nothing has been left on disk then.
+    Raises UserError without Slurm, or with the last line of sbatch if that refused; nothing is left on disk then.
     """
     submitit = _submitit()
     if submitit.SlurmExecutor.affinity() < 0:
@@ -228,11 +266,14 @@ def submit_to_slurm(pieces: dict[Shard, tuple[str, ...]], out: Path, job: Job) -
             **{name: value for name, value in given.items() if value is not None},
         )
         grace = job.notice_s - REQUEUE_S
-        calls = [PieceJob(arguments, os.getcwd(), grace) for arguments in pieces.values()]
+        calls = [PieceJob(arguments, os.getcwd(), grace) for arguments in pieces]
         with contextlib.redirect_stderr(io.StringIO()):  # submitit prints what it then raises
             jobs = executor.submit_array(calls)
     except (submitit.core.utils.FailedJobError, submitit.core.utils.FailedSubmissionError, FileNotFoundError) as error:
-        _withdraw(folder)
+        shutil.rmtree(folder)
+        with contextlib.suppress(OSError):  # not empty
+            folder.parent.rmdir()
+            folder.parent.parent.rmdir()
         told = [line.strip() for line in str(error).splitlines() if line.strip()]
         raise UserError(f"sbatch refused the jobs ({told[-1] if told else type(error).__name__})") from error
     return jobs[0].job_id.partition("_")[0], folder

@@ -42,17 +42,8 @@ class RunLanes:
     step: int
 
 
-class Opened(NamedTuple):
-    """A run."""
-
-    task: Task
-    config: RunConfig
-    grid: Grid  # of all its pieces
-    pieces: tuple[Piece, ...]
-
-
-def open_run(folder: Path, find: Callable[[str], Task]) -> Opened:
-    """The run in a folder, or the sweep whose pieces lie below it (`--shard`, `--cluster`).
+def open_run(folder: Path, find: Callable[[str], Task]) -> tuple[Task, RunConfig, Grid, tuple[Piece, ...]]:
+    """The run in a folder, or the sweep whose pieces lie below it (`--shard`, `--cluster`); the grid is of all pieces.
 
     Args:
         folder: of the run or sweep.
@@ -64,12 +55,12 @@ def open_run(folder: Path, find: Callable[[str], Task]) -> Opened:
     files = [] if (folder / CONFIG).exists() else sorted(folder.glob(f"shard-*-of-*/{CONFIG}"))
     if not files:
         task, config, grid = load(folder, find)
-        return Opened(task, config, grid, (Piece(folder, grid),))
-    told = [formats.read("config", file) for file in files]
+        return task, config, grid, (Piece(folder, grid),)
+    described = [formats.read("config", file) for file in files]
     loaded = [load(file.parent, find) for file in files]
     task, config, first = loaded[0]
-    for file, other in zip(files, told, strict=True):
-        found = sorted({*differences(told[0], other, defaults(task))} - {*shards.OWN})
+    for file, other in zip(files, described, strict=True):
+        found = sorted({*differences(described[0], other, defaults(task))} - {*shards.OWN})
         if found:
             raise UserError(
                 f"{files[0].parent} and {file.parent} are pieces of different sweeps (another "
@@ -77,7 +68,7 @@ def open_run(folder: Path, find: Callable[[str], Task]) -> Opened:
             )
     pieces = tuple(Piece(file.parent, grid) for file, (_, _, grid) in zip(files, loaded, strict=True))
     seeds = tuple(seed for piece in pieces for seed in piece.grid.seeds)
-    return Opened(task, config, Grid(first.guidance, seeds, first.labels), pieces)
+    return task, config, Grid(first.guidance, seeds, first.labels), pieces
 
 
 def lanes_of(task: Task, config: RunConfig, pieces: tuple[Piece, ...], kind: str, sweep: bool) -> list[RunLanes]:
@@ -97,7 +88,11 @@ def lanes_of(task: Task, config: RunConfig, pieces: tuple[Piece, ...], kind: str
     """
     env = shape_of(task, config.task)
     guidance = config.guide_in(env, kind)
-    like = jax.eval_shape(lambda key: _acting(config, guidance, env, key), jax.random.key(0))
+
+    def acting(key: PRNGKeyArray) -> dict[str, Any]:
+        return {"params": config.agent_in(env).init(key)[0], "guidance": guidance.init(key)}
+
+    like = jax.eval_shape(acting, jax.random.key(0))
     found: dict[int, list[RunLanes]] = {}
     told = shards.missing([piece.folder / CONFIG for piece in pieces]) if sweep else []
     for folder, grid in pieces:
@@ -116,13 +111,8 @@ def lanes_of(task: Task, config: RunConfig, pieces: tuple[Piece, ...], kind: str
     return [_joined(found[step]) for step in sorted(found, reverse=True)]
 
 
-def _acting(config: RunConfig, guidance: Guide, env: Any, key: PRNGKeyArray) -> dict[str, Any]:
-    """What one lane acts with, before it learns."""
-    return {"params": config.agent_in(env).init(key)[0], "guidance": guidance.init(key)}
-
-
 def _joined(parts: list[RunLanes]) -> RunLanes:
-    """Lanes of several pieces at one step."""
+    """RunLanes of several pieces at one step."""
     if len(parts) == 1:
         return parts[0]
     seeds, budgets = (np.concatenate([getattr(part, name) for part in parts]) for name in ("seeds", "budgets"))

@@ -24,42 +24,10 @@ from cuelearner_jax.terminal import console
 from cuelearner_jax.types import Teacher
 
 
-class Parts(NamedTuple):
-    """What a named policy may be made of: `lanes` of a run, `adapted` of a policy folder."""
-
-    config: RunConfig
-    view: Any  # of where it acts
-    teacher: Teacher | None
-    lanes: RunLanes | None
-    adapted: AdaptedLanes | None = None
-
-    @property
-    def agent(self) -> Agent:
-        """The lanes' agents."""
-        assert self.lanes is not None
-        return Agent(self.lanes.policies["params"], self.config.agent_in(self.view), self.view)
-
-    def guided(self, base: Policy) -> Guided:
-        """A policy under the lanes' guidance."""
-        assert self.lanes is not None
-        return Guided(base, self.lanes.policies["guidance"], self.view, self.config.scalars, self.lanes.guidance)
-
-    def corrected(self, base: Policy) -> Corrected:
-        """A policy under the teacher's own corrections."""
-        assert self.teacher is not None
-        return Corrected(base, self.teacher, self.config.scalars, actions_of(self.view))
-
-    def taught(self) -> Taught:
-        """The teacher itself."""
-        assert self.teacher is not None
-        return Taught(self.teacher)
-
-
 class Named(NamedTuple):
     """A policy that can be asked for by name."""
 
     about: str
-    make: Callable[[Parts], Policy]
     trained: bool = False  # does it need a run?
     adapted: bool = False  # does it need a policy folder?
     taught: bool = False  # does it ask the teacher?
@@ -71,27 +39,54 @@ class Named(NamedTuple):
         return self.trained or self.adapted
 
 
-def _folder_of(parts: Parts) -> AdaptedLanes:
-    assert parts.adapted is not None
-    return parts.adapted
-
-
 POLICIES: dict[str, Named] = {
-    "agent": Named("the trained agent", lambda parts: parts.agent, trained=True),
-    "guide": Named("guidance of uniform actions", lambda parts: parts.guided(uniform_in(parts.view)), trained=True),
-    "guided": Named("guidance of the agent's actions", lambda parts: parts.guided(parts.agent), trained=True),
-    "corrected": Named(
-        "the teacher's own feedback on the agent's actions",
-        lambda parts: parts.corrected(parts.agent),
-        trained=True,
-        taught=True,
-    ),
-    "adapted": Named("the adapted policy", lambda parts: _folder_of(parts).policy(parts.view), adapted=True),
-    "base": Named("the policy that was adapted", lambda parts: _folder_of(parts).base(parts.view), adapted=True),
-    "teacher": Named("the teacher", lambda parts: parts.taught(), taught=True),
-    "heuristic": Named("the task's obvious action", lambda parts: Heuristic(parts.view), needs=("heuristic",)),
-    "uniform": Named("chance", lambda parts: uniform_in(parts.view)),
+    "agent": Named("the trained agent", trained=True),
+    "guide": Named("guidance of uniform actions", trained=True),
+    "guided": Named("guidance of the agent's actions", trained=True),
+    "corrected": Named("the teacher's own feedback on the agent's actions", trained=True, taught=True),
+    "adapted": Named("the adapted policy", adapted=True),
+    "base": Named("the policy that was adapted", adapted=True),
+    "teacher": Named("the teacher", taught=True),
+    "heuristic": Named("the task's obvious action", needs=("heuristic",)),
+    "uniform": Named("chance"),
 }
+
+
+def make(
+    name: str,
+    config: RunConfig,
+    view: Any,
+    teacher: Teacher | None = None,
+    lanes: RunLanes | None = None,
+    adapted: AdaptedLanes | None = None,
+) -> Policy:
+    """A policy by its name, or a block of lanes of it.
+
+    Args:
+        name: one of `POLICIES`.
+        config: what it was trained with.
+        view: of where it acts.
+        teacher: of that world, where the policy asks one.
+        lanes: of a run, where it is trained.
+        adapted: of a policy folder, where it is adapted.
+    """
+    if name in ("uniform", "heuristic"):
+        return uniform_in(view) if name == "uniform" else Heuristic(view)
+    if name == "teacher":
+        assert teacher is not None
+        return Taught(teacher)
+    if POLICIES[name].adapted:
+        assert adapted is not None
+        return adapted.policy(view) if name == "adapted" else adapted.base(view)
+    assert lanes is not None
+    agent = Agent(lanes.policies["params"], config.agent_in(view), view)
+    if name == "agent":
+        return agent
+    if name == "corrected":
+        assert teacher is not None
+        return Corrected(agent, teacher, config.scalars, actions_of(view))
+    base = uniform_in(view) if name == "guide" else agent
+    return Guided(base, lanes.policies["guidance"], view, config.scalars, lanes.guidance)
 
 
 @dataclass(frozen=True)
@@ -108,8 +103,8 @@ class PolicySource:
     @classmethod
     def of_run(cls, folder: Path, find: Callable[[str], Task]) -> PolicySource:
         """A run's, or those of a sweep in pieces; see `opened.open_run`."""
-        found = open_run(folder, find)
-        return cls(found.task, found.config, found.grid, folder, found.pieces)
+        task, config, grid, pieces = open_run(folder, find)
+        return cls(task, config, grid, folder, pieces)
 
     @classmethod
     def of_folder(cls, folder: Path, find: Callable[[str], Task], code: Any = None) -> PolicySource:
@@ -160,9 +155,9 @@ class PolicySource:
         for need in POLICIES[policy].needs:
             if not offers(after, need):
                 raise UserError(f"{self.task.name} has no {need}: choose another policy")
-        what = "run" if self.grid else "policy"
         if not POLICIES[policy].kept:
             return
+        what = "run" if self.grid else "policy"
         known = shape_of(self.task, self.config.task)
         if (size := known.obs_size) != after.obs_size:
             raise UserError(
@@ -203,7 +198,7 @@ class PolicySource:
 
 
 class Block(NamedTuple):
-    """Lanes of one kind of guidance at one step, and what they act with."""
+    """RunLanes of one kind of guidance at one step, and what they act with."""
 
     guidance: str
     seeds: np.ndarray  # (lanes,)
@@ -216,7 +211,7 @@ class Block(NamedTuple):
 
 def blocks_of(
     source: PolicySource,
-    named: Named,
+    name: str,
     view: Any,
     teacher: Teacher | None,
     kinds: tuple[str, ...],
@@ -228,12 +223,12 @@ def blocks_of(
         if kinds and kept.guidance not in kinds:
             raise UserError(f"{source.folder} is under {kept.guidance} guidance: leave out --guidance")
         columns = (kept.lanes.seed, kept.lanes.budget, kept.lanes.bound_deg)
-        policy = named.make(Parts(source.config, view, teacher, None, kept))
+        policy = make(name, source.config, view, teacher, adapted=kept)
         return [Block(kept.guidance, *columns, 0, policy, np.zeros(kept.lanes.number, bool))]
     loaded = source.load(kinds)
     blocks = []
     for lanes in loaded if failed_too else without_failed(loaded):
-        policy = named.make(Parts(source.config, view, teacher, lanes))
+        policy = make(name, source.config, view, teacher, lanes)
         columns = (lanes.seeds, lanes.budgets, np.zeros(len(lanes.seeds)))
         blocks.append(Block(lanes.guidance.name, *columns, lanes.step, policy, np.asarray(lanes.policies["failed"])))
     return blocks
@@ -287,9 +282,9 @@ def several(
     teacher = source.task.make_teacher(world, env) if named.taught else None
     view = source.task.view(world) if env is None else view_of(env)
     if not named.kept:
-        return [named.make(Parts(source.config, view, teacher, None))], (0,)
+        return [make(name, source.config, view, teacher)], (0,)
     kinds = (guidances.named(kind),) if kind else (source.grid.guidance[-1],) if source.grid else ()
-    blocks = blocks_of(source, named, view, teacher, kinds, failed_too=True)
+    blocks = blocks_of(source, name, view, teacher, kinds, failed_too=True)
     known = {
         part: np.concatenate([getattr(block, part) for block in blocks]) for part in ("seeds", "budgets", "bounds")
     }

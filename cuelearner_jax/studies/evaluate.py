@@ -13,7 +13,7 @@ from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import Tell, episodes, part_of, untold, watched_lanes
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.policies import Common, lanes_in
-from cuelearner_jax.runs.trained import POLICIES, Block, Parts, PolicySource, blocks_of
+from cuelearner_jax.runs.trained import POLICIES, Block, PolicySource, blocks_of, make
 from cuelearner_jax.task import Task
 
 TaskT = TypeVar("TaskT")
@@ -110,11 +110,11 @@ def run(
     named = POLICIES[name]
     teacher = task.make_teacher(world, env) if policy is None and named.taught else None
     if policy is not None or not named.kept:
-        policy = named.make(Parts(source.config, view_of(env), teacher, None)) if policy is None else policy
+        policy = make(name, source.config, view_of(env), teacher) if policy is None else policy
         none = np.zeros(1, int)
         blocks = [Block("-", none, none, none, 0, Common(policy), none > 0)]
     else:
-        blocks = blocks_of(source, named, view_of(env), teacher, tuple(map(guidances.named, asked.guidance)))
+        blocks = blocks_of(source, name, view_of(env), teacher, tuple(map(guidances.named, asked.guidance)))
     rows, unit = [], actions_of(env).unit.replace("degrees", "deg")
     for block in blocks:
         count, is_shared = len(block.seeds), lanes_in(block.policy) is None

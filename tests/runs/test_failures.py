@@ -13,7 +13,7 @@ import pytest
 import cuelearner_jax as cl
 from cuelearner_jax.cli import dispatch
 from cuelearner_jax.errors import NotFinite, UserError
-from cuelearner_jax.runs import lanes, submission, sweep, trained
+from cuelearner_jax.runs import cluster, lanes, sweep, trained
 from cuelearner_jax.runs.cluster import Job
 from cuelearner_jax.runs.grid import Grid, load
 from cuelearner_jax.runs.order import Order, Plan
@@ -121,7 +121,7 @@ def test_status_one_and_one_line(ended, capsys, monkeypatch):
 def test_a_sweep_in_pieces_that_were_finished_before_says_it_too(ended):
     plan = SimpleNamespace(finished=True, order=order(ended[0]))
     with pytest.raises(NotFinite) as raised:
-        submission.submit(1, Job(), ended[0], [], lambda shard: cast(Plan, plan), lambda line: None)
+        cluster.submit(1, Job(), ended[0], [], lambda shard: cast(Plan, plan), lambda line: None)
     assert str(raised.value) == ended[3]
 
 
