@@ -26,6 +26,7 @@ import scipy.stats
 from flax import struct
 
 import cuelearner_jax as cl
+from cuelearner_jax import teachers
 from cuelearner_jax.agents import ddqn
 from cuelearner_jax.environment import spaces_of
 from cuelearner_jax.evaluate import episodes, rollout
@@ -35,7 +36,6 @@ from cuelearner_jax.spaces import directions as geometry
 from cuelearner_jax.storage.provenance import provenance
 from cuelearner_jax.tasks import registry
 from cuelearner_jax.tasks.billiards import SHIPPED_TEACHERS
-from cuelearner_jax.teachers import stored
 
 STATES = 256  # of an agent
 ENVS = 100  # that share an evaluation's steps
@@ -73,7 +73,7 @@ class Agents(NamedTuple):
 def shipped() -> Agents:
     """The shipped teacher's network, which expects a reward of every direction, as one agent."""
     world = cl.make("billiards", table=TABLE)
-    network = stored.load(SHIPPED_TEACHERS / TABLE, world.env, 0.0, 0.0)
+    network = teachers.load(SHIPPED_TEACHERS / TABLE, world.env, 0.0, 0.0)
     params = jax.tree.map(lambda leaf: leaf[None], network.params)
     functions = ddqn.Config(q_layers=network.layers).make("action", spaces_of(world.env))
     return Agents(world.environment("validation"), functions, params, {"network": TABLE})

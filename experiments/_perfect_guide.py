@@ -17,14 +17,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from cuelearner_envs.billiards.config import BilliardsConfig, make_environment
+from cuelearner_jax import teachers
 from cuelearner_jax.config import GuideScalars
 from cuelearner_jax.environment import spaces_of
 from cuelearner_jax.guides.base import Kind
 from cuelearner_jax.guides.refining import Refined
 from cuelearner_jax.guides.untaught import Untaught
 from cuelearner_jax.tasks.billiards import AGENT, SHIPPED_TEACHERS
-from cuelearner_jax.teachers import stored
-from cuelearner_jax.teachers.learned import LearnedTeacher
+from cuelearner_jax.teachers import LearnedTeacher
 from cuelearner_jax.types import GuidanceModel
 
 
@@ -32,7 +32,7 @@ from cuelearner_jax.types import GuidanceModel
 def teacher(table: str) -> LearnedTeacher:
     """The table's shipped network, which aims without error. Its arrays are NumPy's: constants of any program."""
     with jax.ensure_compile_time_eval():
-        found = stored.load(SHIPPED_TEACHERS / table, make_environment(BilliardsConfig(cast(Any, table))), 0.0, 0.0)
+        found = teachers.load(SHIPPED_TEACHERS / table, make_environment(BilliardsConfig(cast(Any, table))), 0.0, 0.0)
     return jax.device_get(found)
 
 

@@ -24,7 +24,7 @@ from cuelearner_jax.config import LARGEST, MOST_LAYERS
 from cuelearner_jax.environment import random_symmetries
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.spaces import directions as geometry
-from cuelearner_jax.teachers.learned import LearnedTeacher, expected_reward, initial_params
+from cuelearner_jax.teachers import LearnedTeacher, expected_reward, initial_params
 from cuelearner_jax.types import Params
 
 SHARPNESS = 0.05  # values that differ by this are told apart when promising directions are drawn

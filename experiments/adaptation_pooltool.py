@@ -27,6 +27,7 @@ import scipy.stats
 
 import cuelearner_jax as cl
 from cuelearner_envs.billiards.teacher import NearbyTeacher
+from cuelearner_jax import teachers
 from cuelearner_jax.agents import ddqn
 from cuelearner_jax.config import GuideSizes, Scalars
 from cuelearner_jax.environment import spaces_of
@@ -37,7 +38,6 @@ from cuelearner_jax.policies import Agent, Taught, Teaching, best_actions
 from cuelearner_jax.spaces import DIRECTIONS
 from cuelearner_jax.storage.provenance import provenance
 from cuelearner_jax.tasks.billiards import SHIPPED_TEACHERS
-from cuelearner_jax.teachers import stored
 
 TABLE = "regulation"
 # Chosen on tuning racks. Labels are about the policy's own shots, which one pass turns by up to the strength of a
@@ -72,7 +72,7 @@ SCALES = {
 def shipped() -> Agent:
     """The shipped teacher's network as an agent: every direction's expected reward, and the largest is taken."""
     own = cl.make("billiards", table=TABLE).env
-    network = stored.load(SHIPPED_TEACHERS / TABLE, own, 0.0, 0.0)
+    network = teachers.load(SHIPPED_TEACHERS / TABLE, own, 0.0, 0.0)
     functions = ddqn.Config(q_layers=network.layers).make("action", spaces_of(own))
     return Agent(network.params, functions, own)
 

@@ -25,6 +25,7 @@ import tyro
 from _teacher_program import TeacherConfig, Trainer, check_config, finished, make_program
 
 from cuelearner_jax import config as configuration
+from cuelearner_jax import teachers
 from cuelearner_jax.config import LARGEST
 from cuelearner_jax.errors import NotFinite, UserError
 from cuelearner_jax.evaluate import episodes, evaluate_policy
@@ -36,8 +37,7 @@ from cuelearner_jax.storage.provenance import provenance
 from cuelearner_jax.storage.room import free_bytes
 from cuelearner_jax.task import Task, shape_of
 from cuelearner_jax.tasks import registry
-from cuelearner_jax.teachers import stored
-from cuelearner_jax.teachers.learned import LearnedTeacher
+from cuelearner_jax.teachers import LearnedTeacher
 from cuelearner_jax.terminal import Interrupted, interruptible, progress_bars
 
 ROUNDS_A_STRETCH = 50  # in one jitted call
@@ -105,7 +105,7 @@ def train(task: Task, asked: Asked, command: str) -> float:
     out, config, world = asked.out, asked.teacher, configuration.to_json(asked.task)
     described = {"config": configuration.to_json(config), "task": {"name": task.name, **world}, "seed": asked.seed}
     env = task.environment(asked.task)
-    if in_use(out) and (out / stored.ABOUT).exists() and not (out / CONFIG).exists():
+    if in_use(out) and (out / teachers.ABOUT).exists() and not (out / CONFIG).exists():
         raise UserError(f"{out} holds a finished teacher: give another --out")
     with claimed(out):
         check_folder(out, {"format": formats.FORMATS["config"], **described}, asked.resume, overwrite=False)
@@ -121,7 +121,7 @@ def train(task: Task, asked: Asked, command: str) -> float:
             "command": command,
             "history": {"columns": list(COLUMNS), "rows": [[int(row[0]), *np.round(row[1:], 5)] for row in rows]},
         }
-        stored.save(out, made, about)
+        teachers.save(out, made, about)
         (out / CONFIG).unlink()  # first: a folder that has it is still to be trained
         shutil.rmtree(out / TRAINING)
     return reward

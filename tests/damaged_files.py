@@ -34,6 +34,7 @@ from damaged_folders import DAMAGES
 from probes import files_of
 
 import cuelearner_jax as cl
+from cuelearner_jax import teachers
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.export import runner
 from cuelearner_jax.policies import Heuristic
@@ -41,8 +42,7 @@ from cuelearner_jax.runs import lane_checkpoints
 from cuelearner_jax.spaces import DIRECTIONS
 from cuelearner_jax.storage import label_files, results
 from cuelearner_jax.storage import table as tables
-from cuelearner_jax.teachers import stored
-from cuelearner_jax.teachers.learned import LearnedTeacher, initial_params
+from cuelearner_jax.teachers import LearnedTeacher, initial_params
 
 ANGLES = np.linspace(0.0, 6.0, 12)
 SEEN = np.stack([np.cos(ANGLES), np.sin(ANGLES)], -1).astype(np.float32)
@@ -101,12 +101,12 @@ def _teacher(folder: Path) -> None:
     params = initial_params((8,), small_policies.ENV, jax.random.key(0))
     made = LearnedTeacher(small_policies.ENV, params, jnp.zeros(()), jnp.zeros(()), (8,), 8)
     about = {"config": {"layers": [8], "directions": 8}, "task": {"name": "window", "half_width_deg": 28.0}}
-    stored.save(folder, made, about)
+    teachers.save(folder, made, about)
 
 
 def _teacher_read(folder: Path) -> Any:
-    stored.world_of(folder, "window", probes.WindowConfig(), ())
-    return jax.tree.leaves(stored.load(folder, small_policies.ENV, 0.0, 0.0).params)
+    teachers.world_of(folder, "window", probes.WindowConfig(), ())
+    return jax.tree.leaves(teachers.load(folder, small_policies.ENV, 0.0, 0.0).params)
 
 
 def _due(folder: Path) -> None:
@@ -166,7 +166,7 @@ KINDS = {
     **{name: Kind(functools.partial(_exported, name), _decides, _sign_contract) for name in runner.RUNNERS},
     "lines of labels": Kind(_labels, _labels_read),
     "table of labels": Kind(_labels_in_parquet, _labels_read),
-    "teacher": Kind(_teacher, _teacher_read, _sign(stored.ABOUT)),
+    "teacher": Kind(_teacher, _teacher_read, _sign(teachers.ABOUT)),
     "due": Kind(_due, _due_read, _sign(lane_checkpoints.DUE)),
     "lines of a curve": Kind(_curve, _curve_read),
     "table of a curve": Kind(_curve_in_parquet, _curve_read),
@@ -251,7 +251,7 @@ def _what_is_signed(kind: str, file: str, rng: np.random.Generator) -> tuple[str
         return "flipped", file
     if kind in runner.RUNNERS:
         return "signed", file if rng.random() < 0.3 else runner.CONTRACT
-    return "signed", {"policy": "policy.json", "teacher": stored.ABOUT, "due": lane_checkpoints.DUE}[kind]
+    return "signed", {"policy": "policy.json", "teacher": teachers.ABOUT, "due": lane_checkpoints.DUE}[kind]
 
 
 def _read(kind: Kind, folder: Path) -> tuple[Any, str]:

@@ -37,7 +37,7 @@ class Order:
     labels_from: Path | None = None  # a label file in place of the teacher
     shard: Shard | None = None  # its share of the seeds alone, in its own folder below `out`
     split: str = "validation"  # episodes of the evaluations
-    track: str | None = None  # where it can be followed, see `records.tracking`
+    track: str | None = None  # where it can be followed, see `storage.tracking`
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.storage import formats, locks
+from cuelearner_jax.storage import formats
 from cuelearner_jax.storage.locks import held
 from cuelearner_jax.storage.whole import TEMPORARY
 
@@ -97,11 +97,6 @@ def claimed(out: Path) -> Iterator[None]:
     out.mkdir(parents=True, exist_ok=True)
     with held(out / LOCK, out, stays=True):
         yield
-
-
-def holder(out: Path) -> str | None:
-    """Who keeps a folder, as "process N on MACHINE"; None: nobody, or nobody knows."""
-    return locks.holder(out / LOCK)
 
 
 def prepare_folder(out: Path, described: dict[str, Any], clean: bool) -> None:

@@ -37,6 +37,7 @@ from cuelearner_jax.errors import UserError
 from cuelearner_jax.spaces import Space
 from cuelearner_jax.storage import formats
 from cuelearner_jax.storage import table as tables
+from cuelearner_jax.storage.folders import differences
 from cuelearner_jax.storage.label_checks import ANSWERED, PEOPLE, ROW, SAID, check_head, check_rows
 from cuelearner_jax.types import Label
 
@@ -57,7 +58,7 @@ CONVENTIONS = {
     "answer": "what the teacher said of the action, in the form that `answers` names",
     "eps": "strength of an answer in the unit of the space's cues, null where the form has none",
 }
-TOLD = ("format", "task", "answers", "eps", "space", "session")  # what must be the same for labels to share a file
+TOLD = ("format", "answers", "eps", "task", "space", "session")  # what must be the same for labels to share a file
 
 
 class People(NamedTuple):
@@ -116,7 +117,7 @@ class LabelWriter(tables.TableWriter):
         Raises:
             UserError: the folder holds labels of something else, or they cannot be read; nothing has been changed.
         """
-        about = {**_about(task, answers, space, eps, meaning), **({} if session is None else {"session": session})}
+        about = _about(task, answers, space, eps, meaning, session)
         there = found_in(folder)
         self._widths: dict[str, int] = {}
         if there is not None:
@@ -204,16 +205,13 @@ def write(
     valid = np.asarray(labels.valid)
     rows = jax.tree.map(lambda leaf: np.asarray(leaf)[valid], labels)
     seed = np.broadcast_to(np.asarray(seeds)[:, None], valid.shape)[valid]
-    columns = {"seed": pa.array(seed.astype(np.int64))}
-    for name in ROW:
-        columns[name] = pa.array(list(getattr(rows, name)), SCHEMA.type(name))
-    tables.write(path, pa.table(columns), SCHEMA, about=_about(task, answers, space, eps, meaning))
+    write_file(path, LabelFile(task, answers, space, eps, seed, rows), meaning, fresh=False)
 
 
-def write_file(path: Path, file: LabelFile, **told: Any) -> None:
-    """Writes labels as a new Parquet file, with what a person's have beside them; `told`: see `LabelWriter`.
+def write_file(path: Path, file: LabelFile, meaning: str = "", fresh: bool = True, **told: Any) -> None:
+    """Writes labels as a Parquet file, with what a person's have beside them.
 
-    Raises UserError if the file exists.
+    `meaning` and `told`: see `LabelWriter`. Raises UserError if the file is to be `fresh` and exists.
     """
     columns = {"seed": pa.array(np.asarray(file.seeds, np.int64))}
     for name in ROW:
@@ -221,9 +219,8 @@ def write_file(path: Path, file: LabelFile, **told: Any) -> None:
     if file.people is not None:
         person = {**file.people._asdict(), "said": [ANSWERED] * len(file.seeds)}
         columns |= {name: pa.array(list(person[name]), SCHEMA.type(name)) for name in PEOPLE}
-    about = _about(file.task, file.answers, file.space, file.eps, "")
-    session = {} if file.session is None else {"session": file.session}
-    tables.write(path, pa.table(columns), SCHEMA, about={**about, **session, **told}, fresh=True)
+    about = _about(file.task, file.answers, file.space, file.eps, meaning, file.session)
+    tables.write(path, pa.table(columns), SCHEMA, about={**about, **told}, fresh=fresh)
 
 
 def read(path: Path) -> LabelFile:
@@ -315,7 +312,9 @@ def _listed(seeds: np.ndarray) -> str:
     return ", ".join(map(str, seeds[:LISTED])) + (" and others" if len(seeds) > LISTED else "")
 
 
-def _about(task: dict[str, Any], answers: str, space: Space, eps: float | None, meaning: str) -> dict[str, Any]:
+def _about(
+    task: dict[str, Any], answers: str, space: Space, eps: float | None, meaning: str, session: dict[str, Any] | None
+) -> dict[str, Any]:
     """What a file of labels says of itself."""
     return {
         "format": formats.FORMATS["labels"],
@@ -324,24 +323,22 @@ def _about(task: dict[str, Any], answers: str, space: Space, eps: float | None, 
         "space": space.to_json(),
         "eps": None if eps is None else float(eps),
         "conventions": {**CONVENTIONS, **({"answer": meaning} if meaning else {})},
+        **({} if session is None else {"session": session}),
     }
 
 
 def _check_same(path: Path, before: dict[str, Any], now: dict[str, Any]) -> None:
     """Raises UserError, with the first difference in words, unless labels may share a file."""
-    parts = [("", name, before.get(name), now.get(name)) for name in TOLD]
-    for group in ("task", "session"):
-        old, new = before.get(group) or {}, now.get(group) or {}
-        parts += [(f"{group}.", name, old.get(name), new.get(name)) for name in {**old, **new} if old and new]
-    differing = [part for part in parts if part[2] != part[3] and part[1] != "from"]
-    for prefix, name, old, new in differing:  # of a group its parts say more
-        if prefix or name not in ("task", "session"):
-            raise UserError(
-                f"{path} holds labels of another {prefix}{name} ({_short(old)}, asked for is {_short(new)}): "
-                "give the same, or another folder (--out)"
-            )
-    if differing:
-        raise UserError(f"{path} holds labels that were given otherwise ({differing[0][1]}): give another folder")
+    named = next(differences(*({name: head.get(name) for name in TOLD} for head in (before, now))), None)
+    if named is None:
+        return
+    old, new = before, now
+    for part in named.split("."):
+        old, new = (value.get(part) for value in (old, new))
+    raise UserError(
+        f"{path} holds labels of another {named} ({_short(old)}, asked for is {_short(new)}): "
+        "give the same, or another folder (--out)"
+    )
 
 
 def _short(value: Any) -> str:

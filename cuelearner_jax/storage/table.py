@@ -62,11 +62,6 @@ class Schema:
         """Name of the file once the table is done."""
         return f"{self.stem}.parquet"
 
-    def growing(self, path: PathLike) -> Path:
-        """The JSONL file of a table, given that, its Parquet file or its folder."""
-        path = Path(path)
-        return path.with_name(self.jsonl) if path.name in (self.jsonl, self.parquet) else path / self.jsonl
-
     def found_in(self, folder: Path) -> Path | None:
         """The table's file in a folder; None: there is none. A finished one goes before one that grows."""
         return next((folder / name for name in (self.parquet, self.jsonl) if (folder / name).exists()), None)
@@ -148,33 +143,21 @@ class TableWriter:
         self.close()
 
 
-def truncate(path: PathLike, schema: Schema, keep: Callable[[Row], bool]) -> None:
-    """Drops the rows that are not to be kept and a torn last line; without a table nothing happens.
-
-    Args:
-        path: folder of the table, or its file.
-        schema: what its rows are.
-        keep: says of a row whether it stays.
-    """
-    path = schema.growing(path)
+def truncate(folder: PathLike, schema: Schema, keep: Callable[[Row], bool]) -> None:
+    """Drops a folder's rows that `keep` does not choose, and a torn last line; without a table nothing happens."""
+    path = Path(folder) / schema.jsonl
     _reopen(path, schema)
     if path.exists():
         kept = [row for row in _rows(path, schema) if schema.mark not in row or keep(row)]
         lines.Writer(path, kept).close()
 
 
-def finish(path: PathLike, schema: Schema) -> Path:
-    """Turns the JSONL of a table that is done into Parquet and removes it; returns the Parquet file.
+def finish(folder: PathLike, schema: Schema) -> Path:
+    """Turns the JSONL of a folder's table into Parquet and removes it, unless that is done; returns the Parquet file.
 
-    Args:
-        path: folder of the table, or its file. A table that is finished already is left as it is.
-        schema: what its rows are.
-
-    Raises:
-        UserError: if there is no table, it has no rows or it cannot be read.
+    Raises UserError if there is no table, it has no rows or it cannot be read.
     """
-    path = schema.growing(path)
-    target = path.with_name(schema.parquet)
+    path, target = (Path(folder) / name for name in (schema.jsonl, schema.parquet))
     if path.exists():
         table = read(path, schema)
         if table.num_rows == 0:

@@ -14,6 +14,7 @@ from cuelearner_envs import billiards
 from cuelearner_envs.billiards.config import BilliardsConfig, make_environment
 from cuelearner_envs.billiards.environment import Billiards
 from cuelearner_envs.billiards.teacher import LocalSearchTeacher, NearbyTeacher, SearchTeacher, Transferred
+from cuelearner_jax import teachers
 from cuelearner_jax.agents import ddqn
 from cuelearner_jax.arbiters import paced
 from cuelearner_jax.config import Scalars, Schedule, Sizes
@@ -21,7 +22,6 @@ from cuelearner_jax.environment import Environment
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.task import PAPERS_FIT, Body, Pictures, Preset, Scenario, Task
-from cuelearner_jax.teachers import stored
 from cuelearner_jax.types import Teacher
 
 SHIPPED_TEACHERS = Path(billiards.__file__).parent / "teachers"
@@ -61,7 +61,7 @@ def make_teacher(config: BilliardsConfig, env: Any) -> Teacher:
         return SearchTeacher(env, aim_error, habit, config.search_directions)
     told = _learned_in(folder, config)
     own = make_environment(told)
-    network = stored.load(folder, own, aim_error, habit)
+    network = teachers.load(folder, own, aim_error, habit)
     if type(env) is not Billiards:  # other physics, of which a network knows only where to try
         return NearbyTeacher(Transferred(network, own, env), env, aim_error)
     if config.teacher == LOCAL_SEARCH or told.acceleration != config.acceleration:
@@ -75,10 +75,10 @@ def _learned_in(folder: Path, config: BilliardsConfig) -> BilliardsConfig:
     On a slightly tilted table its proposals are still near good shots, among which shots then decide.
     """
     try:
-        return stored.world_of(folder, "billiards", config, TRANSFERRED)
+        return teachers.world_of(folder, "billiards", config, TRANSFERRED)
     except UserError as refusal:
         with suppress(UserError):
-            told = stored.world_of(folder, "billiards", config, (*TRANSFERRED, "acceleration"))
+            told = teachers.world_of(folder, "billiards", config, (*TRANSFERRED, "acceleration"))
             if math.dist(told.acceleration, config.acceleration) <= SLIGHT_TILT:
                 return told
         raise refusal
@@ -88,7 +88,7 @@ def _files(config: BilliardsConfig) -> dict[str, str]:
     """The user's own teacher, by its digest."""
     folder = teacher_folder(config)
     own = folder and config.teacher not in ("learned", LOCAL_SEARCH)
-    return {"teacher": stored.digest(folder)} if folder and own else {}
+    return {"teacher": teachers.digest(folder)} if folder and own else {}
 
 
 def _pictures() -> Pictures:

@@ -18,6 +18,7 @@ import small_policies
 
 import cuelearner_jax as cl
 from cuelearner_jax import config as configuration
+from cuelearner_jax import teachers
 from cuelearner_jax.api.worlds import World
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.export import runner
@@ -27,8 +28,7 @@ from cuelearner_jax.runs.trained import PolicySource
 from cuelearner_jax.storage import label_files, results
 from cuelearner_jax.storage import table as tables
 from cuelearner_jax.tasks import registry as tasks
-from cuelearner_jax.teachers import stored
-from cuelearner_jax.teachers.learned import LearnedTeacher, initial_params
+from cuelearner_jax.teachers import LearnedTeacher, initial_params
 
 HOSTILE = "hostile:KIND"
 CODE = """
@@ -179,11 +179,11 @@ def test_no_string_of_a_teacher_is_imported(tmp_path):
     params = initial_params((8,), small_policies.ENV, jax.random.key(0))
     made = LearnedTeacher(small_policies.ENV, params, jnp.zeros(()), jnp.zeros(()), (8,), 8)
     about = {"config": {"layers": [8], "directions": 8}, "task": {"name": "window", "half_width_deg": 28.0}, "by": "me"}
-    stored.save(tmp_path / "teacher", made, about)
+    teachers.save(tmp_path / "teacher", made, about)
 
     def read(folder):
-        stored.world_of(folder, "window", probes.WindowConfig(), ())
-        stored.load(folder, small_policies.ENV, 0.0, 0.0)
+        teachers.world_of(folder, "window", probes.WindowConfig(), ())
+        teachers.load(folder, small_policies.ENV, 0.0, 0.0)
 
     assert taken_by(tmp_path / "teacher" / "teacher.json", read) == [("by",)]
 

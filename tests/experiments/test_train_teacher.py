@@ -15,13 +15,13 @@ import pytest
 import train_teacher
 from _teacher_program import TeacherConfig, Trainer, check_config, finished, make_program
 
+from cuelearner_jax import teachers
 from cuelearner_jax.config import to_json
 from cuelearner_jax.errors import NotFinite, UserError
 from cuelearner_jax.evaluate import rollout
 from cuelearner_jax.policies import Taught
 from cuelearner_jax.spaces import directions
 from cuelearner_jax.storage.folders import LOCK
-from cuelearner_jax.teachers import stored
 from cuelearner_jax.terminal import Interrupted
 
 TASK, WORLD = probes.make_task(), probes.WindowConfig()
@@ -131,7 +131,7 @@ def test_a_stopped_training_goes_on_to_the_same_teacher_and_mixes_with_nothing(b
     assert train(begun, resume=True) == train(tmp_path / "whole")
     assert {path.name for path in begun.iterdir()} == {LOCK, "network", "teacher.json"}
     mine, yours = (
-        jax.tree.leaves(stored.load(folder, TASK.environment(WORLD), 0.0, 0.0).params)
+        jax.tree.leaves(teachers.load(folder, TASK.environment(WORLD), 0.0, 0.0).params)
         for folder in (begun, tmp_path / "whole")
     )
     for one, another in zip(mine, yours, strict=True):

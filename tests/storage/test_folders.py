@@ -8,7 +8,7 @@ import probes
 import pytest
 
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.storage import folders, formats
+from cuelearner_jax.storage import folders, formats, locks
 from cuelearner_jax.storage.formats import FORMATS
 
 DESCRIBED = {
@@ -144,8 +144,8 @@ def test_a_folder_is_kept_for_one_process_and_free_afterwards(tmp_path):
         pass
     with folders.claimed(out):
         assert not folders.in_use(out)  # but for the mark
-        assert folders.holder(out) == f"process {os.getpid()} on {socket.gethostname()}"
-    assert folders.holder(out) is None
+        assert locks.holder(out / folders.LOCK) == f"process {os.getpid()} on {socket.gethostname()}"
+    assert locks.holder(out / folders.LOCK) is None
     folders.prepare_folder(out, DESCRIBED, clean=True)
     assert sorted(path.name for path in out.iterdir()) == [folders.LOCK, "config.json"]
     assert folders.in_use(out)

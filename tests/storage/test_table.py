@@ -34,7 +34,7 @@ def written(folder, *fish, about=ABOUT, **constants):
 
 
 def read(folder):
-    return tables.read(SCHEMA.growing(folder), SCHEMA)
+    return tables.read(folder / SCHEMA.jsonl, SCHEMA)
 
 
 def test_columns_have_their_types(tmp_path):
@@ -140,11 +140,6 @@ def test_a_full_disk_leaves_no_row_behind_and_takes_the_next_one(tmp_path):
             resource.setrlimit(resource.RLIMIT_FSIZE, limits)
         writer.append(fish="carp", weights=[3.0])
     assert read(tmp_path)["fish"].to_pylist() == ["pike", "carp"]
-
-
-@pytest.mark.parametrize("name", ["", "catches.jsonl", "catches.parquet"])
-def test_a_table_is_named_by_its_folder_or_either_file(tmp_path, name):
-    assert SCHEMA.growing(tmp_path / name) == tmp_path / "catches.jsonl"
 
 
 def test_a_failed_write_leaves_the_file_before(tmp_path, monkeypatch):

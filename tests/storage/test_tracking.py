@@ -64,7 +64,6 @@ def test_wandb_is_asked_to_stay_offline(tmp_path, monkeypatch):
     asked, logged, ended = {}, [], []
     run = SimpleNamespace(log=lambda metrics, step: logged.append((step, metrics)), finish=lambda: ended.append(True))
     monkeypatch.setitem(sys.modules, "wandb", SimpleNamespace(init=lambda **named: asked.update(named) or run))
-    monkeypatch.delitem(sys.modules, "cuelearner_jax.storage.tracking.wandb", raising=False)
     with tracking.opened("wandb", tmp_path / "run" / "relative", {"seeds": 3}, 0) as tracker:
         tracker.log(100, {"reward": 1.0})
         assert not ended

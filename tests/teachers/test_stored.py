@@ -8,11 +8,11 @@ import numpy as np
 import probes
 import pytest
 
+from cuelearner_jax import teachers
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.spaces import directions
 from cuelearner_jax.storage import formats
-from cuelearner_jax.teachers import stored
-from cuelearner_jax.teachers.learned import LearnedTeacher, initial_params
+from cuelearner_jax.teachers import LearnedTeacher, initial_params
 
 ENV = probes.Window(mirrors=True)
 ABOUT = {"config": {"layers": [32, 32], "directions": 72}}
@@ -25,8 +25,8 @@ def made():
 
 
 def test_it_comes_back_from_disk_in_half_precision(made, tmp_path):
-    stored.save(tmp_path / "made", made, ABOUT)
-    loaded = stored.load(tmp_path / "made", ENV, 0.2, 0.1)
+    teachers.save(tmp_path / "made", made, ABOUT)
+    loaded = teachers.load(tmp_path / "made", ENV, 0.2, 0.1)
     for mine, yours in zip(jax.tree.leaves(loaded.params), jax.tree.leaves(made.params), strict=True):
         assert mine.dtype == jnp.float32
         np.testing.assert_array_equal(mine, np.asarray(yours).astype(np.float16).astype(np.float32))
@@ -36,31 +36,31 @@ def test_it_comes_back_from_disk_in_half_precision(made, tmp_path):
 
 
 def test_saving_again_replaces_the_network(made, tmp_path):
-    stored.save(tmp_path, made, ABOUT)
+    teachers.save(tmp_path, made, ABOUT)
     other = made.replace(params=jax.tree.map(lambda leaf: 2 * leaf, made.params))
-    stored.save(tmp_path, other, ABOUT)
-    weights = jax.tree.leaves(stored.load(tmp_path, ENV, 0.0, 0.0).params)[1]
+    teachers.save(tmp_path, other, ABOUT)
+    weights = jax.tree.leaves(teachers.load(tmp_path, ENV, 0.0, 0.0).params)[1]
     np.testing.assert_allclose(weights, 2 * jax.tree.leaves(made.params)[1], rtol=2e-3)
 
 
 def test_a_folder_without_a_teacher_is_refused(tmp_path):
     with pytest.raises(UserError, match="no teacher"):
-        stored.load(tmp_path, ENV, 0.0, 0.0)
+        teachers.load(tmp_path, ENV, 0.0, 0.0)
 
 
 def test_a_teacher_of_another_task_is_refused(made, tmp_path):
-    stored.save(tmp_path, made, ABOUT)
+    teachers.save(tmp_path, made, ABOUT)
     probes.edit_json(tmp_path / "teacher.json", lambda about: about["config"].update(layers=[32]))
     with pytest.raises(UserError, match="another version of the program"):
-        stored.load(tmp_path, ENV, 0.0, 0.0)
+        teachers.load(tmp_path, ENV, 0.0, 0.0)
 
 
 @pytest.mark.parametrize("text", ["{", "[]", json.dumps({"format": 3}), {"config": 3}])
 def test_a_damaged_description_is_refused(made, tmp_path, text):
-    stored.save(tmp_path, made, ABOUT)
+    teachers.save(tmp_path, made, ABOUT)
     if isinstance(text, str):
         (tmp_path / "teacher.json").write_text(text)
     else:  # whole, but no teacher
         formats.write("teacher", tmp_path / "teacher.json", text)
     with pytest.raises(UserError, match="damaged"):
-        stored.load(tmp_path, ENV, 0.0, 0.0)
+        teachers.load(tmp_path, ENV, 0.0, 0.0)

@@ -16,7 +16,7 @@ from cuelearner_jax.evaluate import episodes, rollout
 from cuelearner_jax.policies import Taught
 from cuelearner_jax.spaces import directions
 from cuelearner_jax.tasks.billiards import SCENARIOS, SHIPPED_TEACHERS, make_teacher
-from cuelearner_jax.teachers.learned import LearnedTeacher
+from cuelearner_jax.teachers import LearnedTeacher
 from cuelearner_jax.types import Teacher
 
 RACKS, DIRECTIONS = 50, 1440

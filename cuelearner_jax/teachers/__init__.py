@@ -1,1 +1,0 @@
-"""Learned teachers and their training."""
