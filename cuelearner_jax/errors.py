@@ -11,6 +11,7 @@ FILE_SYSTEM = (
     *(errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOTDIR, errno.EISDIR, errno.ENAMETOOLONG, errno.ELOOP),
     *(errno.EIO, errno.ESTALE, errno.EMFILE, errno.ENFILE, errno.EBUSY),
 )
+MOST_LISTED = 20  # numbers that a message names
 
 
 def one_line(text: str) -> str:
@@ -42,13 +43,22 @@ class NotFinite(Exception):
     status = 1
 
 
-def no_space(error: BaseException | None) -> bool:
-    """Does an exception, or what it came from, say that the disk is full? TensorStore says so in words alone."""
-    if error is None:
-        return False
-    told = isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+def says(error: BaseException | None, numbers: Iterable[int], *words: str) -> bool:
+    """Does an exception, or what it came from, have one of these error numbers, or say one of these words?
+
+    TensorStore tells in words alone what the system refused.
+    """
+    while error is not None:
+        if (isinstance(error, OSError) and error.errno in numbers) or any(text in str(error) for text in words):
+            return True
+        error = error.__cause__ or error.__context__
+    return False
+
+
+def no_space(error: BaseException) -> bool:
+    """Does an exception, or what it came from, say that the disk is full?"""
     words = ("No space left on device", "Disk quota exceeded", "File too large")
-    return told or any(text in str(error) for text in words) or no_space(error.__cause__ or error.__context__)
+    return says(error, (errno.ENOSPC, errno.EDQUOT, errno.EFBIG), *words)
 
 
 def blamed(error: BaseException, resumes: bool) -> str | None:
@@ -93,6 +103,15 @@ def raised_by(named: str, error: Exception) -> UserError:
     except Exception:  # it has not even words
         words = ""
     return UserError(f"{named} raised {type(error).__name__}{': ' if words else ''}{words}: mend it first")
+
+
+def listed(numbers: Iterable[float]) -> str:
+    """Numbers in order for a message: as a range where no whole number between is absent, else 20 at most."""
+    known = sorted(set(numbers))
+    texts = [f"{number:g}" if isinstance(number, float) else str(number) for number in known]
+    if len(known) > 2 and known == list(range(int(known[0]), int(known[0]) + len(known))):
+        return f"{texts[0]} to {texts[-1]}"
+    return ", ".join(texts[:MOST_LISTED]) + (" and others" if len(texts) > MOST_LISTED else "")
 
 
 def closest(word: str, known: Iterable[str]) -> str:

@@ -90,7 +90,7 @@ def open_folder(folder: Path, find: Callable[[str], Task], code: Any = None) -> 
         UserError: it cannot be read, is damaged, or of a task that is not known.
     """
     path = folder / policy_folders.POLICY
-    values = policy_folders.read(folder)
+    values = formats.read("policy", path)
     try:
         task, world = world_of(values["task"], find, path)
         stored.check(values["policy"])

@@ -117,12 +117,8 @@ class LaneGroup:
         root = jax.random.key(0)
         return [self.program.init(self.env, jnp.asarray(s), jnp.asarray(b), root) for s, b in self.blocks()]
 
-    def shapes(self) -> list[TrainState]:
-        """Shapes of the blocks, without making them."""
-        return self.shapes_of(self.cut)
-
     def shapes_of(self, cut: np.ndarray) -> list[TrainState]:
-        """The same, of another cut."""
+        """Shapes of the blocks of a cut (see `cut`), without making them."""
         root, program = jax.random.key(0), self.program
         if len(cut[0]) % self.mesh.size:  # shapes alone: one device's program has the same
             program = make_program(self.config, self.guidance, self.env, self.largest_budget)

@@ -19,7 +19,7 @@ from cuelearner_jax.runs import shards
 from cuelearner_jax.runs.grid import Grid, defaults, load
 from cuelearner_jax.runs.lane_checkpoints import restore_policies
 from cuelearner_jax.storage import formats
-from cuelearner_jax.storage.folders import CONFIG, differences
+from cuelearner_jax.storage.folders import CONFIG
 from cuelearner_jax.task import Task, shape_of
 from cuelearner_jax.terminal import console
 
@@ -60,11 +60,10 @@ def open_run(folder: Path, find: Callable[[str], Task]) -> tuple[Task, RunConfig
     loaded = [load(file.parent, find) for file in files]
     task, config, first = loaded[0]
     for file, other in zip(files, described, strict=True):
-        found = sorted({*differences(described[0], other, defaults(task))} - {*shards.OWN})
-        if found:
+        if found := shards.apart(described[0], other, defaults(task)):
             raise UserError(
-                f"{files[0].parent} and {file.parent} are pieces of different sweeps (another "
-                f"{', '.join(found[:4])}): give the folder of one of them"
+                f"{files[0].parent} and {file.parent} are pieces of different sweeps (another {found}): give the "
+                "folder of one of them"
             )
     pieces = tuple(Piece(file.parent, grid) for file, (_, _, grid) in zip(files, loaded, strict=True))
     seeds = tuple(seed for piece in pieces for seed in piece.grid.seeds)

@@ -60,12 +60,10 @@ class Shard(NamedTuple):
                 )
             if folder == self.folder(out) or not (folder / CONFIG).is_file():
                 continue
-            told = formats.read("config", folder / CONFIG)
-            found = sorted({*differences(told, described, defaults)} - set(OWN))
-            if found:
+            if found := apart(formats.read("config", folder / CONFIG), described, defaults):
                 raise UserError(
-                    f"{folder} is a piece of a sweep with another {', '.join(found[:4])}: give the same options for "
-                    "all pieces, or another --out"
+                    f"{folder} is a piece of a sweep with another {found}: give the same options for all pieces, or "
+                    "another --out"
                 )
 
     def described(self, seeds: tuple[int, ...]) -> dict[str, Any]:
@@ -92,6 +90,11 @@ class Shard(NamedTuple):
         if self.count > len(seeds):
             raise UserError(f"--shard: {len(seeds)} seeds do not make {self.count} pieces, at most {len(seeds)}")
         return tuple(int(seed) for seed in np.array_split(np.array(seeds), self.count)[self.index - 1])
+
+
+def apart(before: dict[str, Any], now: dict[str, Any], defaults: dict[str, Any]) -> str:
+    """The options in which two descriptions are of different sweeps, four at most; see `folders.differences`."""
+    return ", ".join(sorted({*differences(before, now, defaults)} - set(OWN))[:4])
 
 
 def missing(configurations: list[Path]) -> list[str]:

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from cuelearner_jax.environment import actions_of, offers, spaces_of, view_of
-from cuelearner_jax.errors import UserError, closest
+from cuelearner_jax.errors import UserError, closest, listed
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.policies import Agent, Corrected, Guided, Heuristic, Policy, Taught, uniform_in
 from cuelearner_jax.run_config import RunConfig
@@ -304,16 +304,9 @@ def several(
             of = "run" if source.grid else "folder"
             unit = actions_of(view).unit
             bounds = "" if source.grid else f" within {bound:g} {unit}"
-            told = "" if source.grid else f" within {_listed(known['bounds'])} {unit}"
+            told = "" if source.grid else f" within {listed(known['bounds'])} {unit}"
             raise UserError(
-                f"no lane with seed {seed} and {budget} labels{bounds}: the {of} has seeds {_listed(known['seeds'])} "
-                f"and labels {_listed(known['budgets'])}{told}"
+                f"no lane with seed {seed} and {budget} labels{bounds}: the {of} has seeds {listed(known['seeds'])} "
+                f"and labels {listed(known['budgets'])}{told}"
             )
     return found, seeds or (int(known["seeds"][0]),)
-
-
-def _listed(values: np.ndarray) -> str:
-    known = np.unique(values)
-    if len(known) > 4 and known[-1] - known[0] == len(known) - 1:
-        return f"{known[0]} to {known[-1]}"
-    return ", ".join(f"{value:g}" if isinstance(value, np.floating) else str(value) for value in known)

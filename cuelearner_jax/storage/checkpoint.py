@@ -29,7 +29,7 @@ import jax.numpy as jnp
 import numpy as np
 import orbax.checkpoint as ocp
 
-from cuelearner_jax.errors import UserError, no_space
+from cuelearner_jax.errors import UserError, no_space, says
 from cuelearner_jax.signals import saving
 
 KEPT = 2  # the newest checkpoints of a run
@@ -101,27 +101,15 @@ class _OfAnother(ValueError):
     """A checkpoint holds other leaves, or of other shapes, than are wanted."""
 
 
-def _forbidden(error: BaseException | None) -> bool:
-    """Does an exception, or what it came from, say that a file may not be read? TensorStore says so in words alone."""
-    if error is None:
-        return False
-    told = isinstance(error, PermissionError) or "PERMISSION_DENIED" in str(error) or "Permission denied" in str(error)
-    return told or _forbidden(error.__cause__ or error.__context__)
-
-
-def _compare(stored: dict[str, Any], wanted: dict[str, jax.ShapeDtypeStruct]) -> None:
-    """Raises _OfAnother unless an item on disk has the leaves that are wanted, of their shapes (both by path)."""
-    for path in {**stored, **wanted}:
-        there, here = (tuple(tree[path].shape) if path in tree else "none" for tree in (stored, wanted))
-        if there != here:
-            raise _OfAnother(f"{path} is {there}, expected {here}")
-
-
-def _compare_items(folder: Any, wanted: dict[str, dict[str, Any]]) -> None:
-    """The same of the items in a checkpoint's folder."""
+def _compare(folder: Any, wanted: dict[str, dict[str, Any]]) -> None:
+    """Raises _OfAnother unless items in a checkpoint's folder have the leaves that are wanted, of their shapes."""
     reader = ocp.StandardCheckpointHandler()
     for name, item in wanted.items():
-        _compare(reader.metadata(folder / name).tree, item)
+        stored = reader.metadata(folder / name).tree
+        for path in {**stored, **item}:
+            there, here = (tuple(tree[path].shape) if path in tree else "none" for tree in (stored, item))
+            if there != here:
+                raise _OfAnother(f"{path} is {there}, expected {here}")
 
 
 @contextmanager
@@ -207,7 +195,7 @@ class Checkpoints:
             UserError: no checkpoint, one that cannot be read, or one of other shapes.
         """
         with self._reading() as folder:
-            _compare_items(folder, {name: _flat(item) for name, item in like.items()})
+            _compare(folder, {name: _flat(item) for name, item in like.items()})
 
     def restore(self, like: dict[str, Any]) -> dict[str, Any]:
         """The newest checkpoint's items named in `like` (trees of arrays or shapes), onto the default device.
@@ -224,7 +212,7 @@ class Checkpoints:
             for name, item in like.items()
         }
         with self._reading() as folder:
-            _compare_items(folder, wanted)
+            _compare(folder, wanted)
             if not (folder / DIGESTS).exists():
                 raise ValueError("the digests of its arrays are missing")
             args: dict[str, Any] = {name: ocp.args.StandardRestore(item) for name, item in wanted.items()}
@@ -247,7 +235,8 @@ class Checkpoints:
                 # Orbax means to print TensorStore's details and prints the method that has them.
                 told = re.sub(r"\.? See full TensorStore details.*", "", str(error), flags=re.DOTALL).strip()
                 reason = told.splitlines()[0][:160] if told else type(error).__name__
-                remedy = OTHERS if isinstance(error, _OfAnother) else FORBIDDEN if _forbidden(error) else self._damaged
+                forbidden = says(error, (errno.EACCES, errno.EPERM), "PERMISSION_DENIED", "Permission denied")
+                remedy = OTHERS if isinstance(error, _OfAnother) else FORBIDDEN if forbidden else self._damaged
             _settle()
         raise UserError(f"checkpoint {number} in {self._folder} cannot be read ({reason}): {remedy}")
 

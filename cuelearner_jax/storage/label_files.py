@@ -33,7 +33,7 @@ import numpy as np
 import pyarrow as pa
 
 from cuelearner_jax import spaces
-from cuelearner_jax.errors import UserError
+from cuelearner_jax.errors import UserError, listed
 from cuelearner_jax.spaces import Space
 from cuelearner_jax.storage import formats
 from cuelearner_jax.storage import table as tables
@@ -51,7 +51,6 @@ SCHEMA = tables.Schema(
     remedy=formats.REMEDIES["labels"],
 )
 JSONL, PARQUET = SCHEMA.jsonl, SCHEMA.parquet
-LISTED = 20  # seeds that a message names
 CONVENTIONS = {
     "obs": "the task's observation at the question",
     "action": "asked about, of the space that `space` describes",
@@ -292,7 +291,7 @@ def for_lanes(file: LabelFile, seeds: np.ndarray, budgets: np.ndarray, slots: in
         chosen = np.flatnonzero(file.seeds == own)
         if own not in kept:
             raise UserError(
-                f"the label file has labels for the seeds {_listed(kept)}, none for seed {seed}: "
+                f"the label file has labels for the seeds {listed(kept)}, none for seed {seed}: "
                 "give --first-seed and --seeds (train: --seed) of these, or the labels of another run"
             )
         if len(chosen) < budget:
@@ -303,13 +302,6 @@ def for_lanes(file: LabelFile, seeds: np.ndarray, budgets: np.ndarray, slots: in
         chosen = chosen[:budget]
         sets.append(jax.tree.map(lambda leaf, rows=chosen: _padded(leaf[rows], slots), file.labels))
     return jax.tree.map(lambda *leaves: np.stack(leaves), *sets)
-
-
-def _listed(seeds: np.ndarray) -> str:
-    """Seeds in order, as a range where none between is absent."""
-    if len(seeds) > 2 and seeds[-1] - seeds[0] == len(seeds) - 1:
-        return f"{seeds[0]} to {seeds[-1]}"
-    return ", ".join(map(str, seeds[:LISTED])) + (" and others" if len(seeds) > LISTED else "")
 
 
 def _about(
@@ -329,10 +321,11 @@ def _about(
 
 def _check_same(path: Path, before: dict[str, Any], now: dict[str, Any]) -> None:
     """Raises UserError, with the first difference in words, unless labels may share a file."""
-    named = next(differences(*({name: head.get(name) for name in TOLD} for head in (before, now))), None)
+    old: Any = {name: before.get(name) for name in TOLD}
+    new: Any = {name: now.get(name) for name in TOLD}
+    named = next(differences(old, new), None)
     if named is None:
         return
-    old, new = before, now
     for part in named.split("."):
         old, new = (value.get(part) for value in (old, new))
     raise UserError(

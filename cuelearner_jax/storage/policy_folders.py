@@ -50,30 +50,24 @@ def write(folder: Path, described: dict[str, Any], arrays: Any) -> None:
     formats.write("policy", folder / POLICY, {**described, "arrays": digest(arrays)})
 
 
-def read(folder: Path) -> dict[str, Any]:
-    """What a folder says of its policy. Raises UserError if it cannot be read or is damaged."""
-    return formats.read("policy", folder / POLICY)
-
-
 def read_arrays(folder: Path, like: Any, described: dict[str, Any]) -> Any:
     """The arrays of a policy.
 
     Args:
         folder: the policy's.
         like: a tree of their shapes.
-        described: from `read`.
+        described: what its policy.json says.
 
     Raises:
         UserError: they cannot be read, are damaged, or are those of another policy.
     """
-    place = folder / ARRAYS
-    remedy = "it is damaged: restore it, or adapt the policy anew"
+    place, remedy = folder / ARRAYS, "restore it, or adapt the policy anew"
     if not place.is_dir():
-        raise UserError(f"{place} is missing: restore it, or adapt the policy anew")
-    with checkpoints(place, read_only=True, damaged=remedy) as saved:
+        raise UserError(f"{place} is missing: {remedy}")
+    with checkpoints(place, read_only=True, damaged=f"it is damaged: {remedy}") as saved:
         if saved.latest() is None:
-            raise UserError(f"{place} holds no arrays: restore it, or adapt the policy anew")
+            raise UserError(f"{place} holds no arrays: {remedy}")
         found = saved.restore({"policy": like})["policy"]
     if digest(found) != described.get("arrays"):
-        raise UserError(f"{place} holds the arrays of another policy: restore it, or adapt the policy anew")
+        raise UserError(f"{place} holds the arrays of another policy: {remedy}")
     return found

@@ -19,7 +19,7 @@ from cuelearner_jax.adaptation import stored
 from cuelearner_jax.cli import main
 from cuelearner_jax.config import GuideSizes
 from cuelearner_jax.policies import Guided
-from cuelearner_jax.storage import label_files, policy_folders, results
+from cuelearner_jax.storage import formats, label_files, policy_folders, results
 from cuelearner_jax.storage.checkpoint import checkpoints
 from cuelearner_jax.studies.adapt import sentences
 from cuelearner_jax.tasks import registry
@@ -356,7 +356,9 @@ def test_a_damaged_folder_is_refused_or_whole(adapted, tmp_path):
     mixed = tmp_path / "mixed"  # of two folders, each of them whole
     shutil.copytree(adapted, mixed)
     shutil.rmtree(mixed / "arrays")
-    edited = policy_folders.read_arrays(adapted, _shapes(adapted), policy_folders.read(adapted))
+    edited = policy_folders.read_arrays(
+        adapted, _shapes(adapted), formats.read("policy", adapted / policy_folders.POLICY)
+    )
     (mixed / "spare").mkdir()
     policy_folders.write(
         mixed / "spare", {}, jax.tree.map(lambda leaf: leaf if leaf.dtype == bool else leaf + 1, edited)
@@ -369,7 +371,10 @@ def test_a_damaged_folder_is_refused_or_whole(adapted, tmp_path):
 def _shapes(folder):
     with checkpoints(folder / "arrays", read_only=True) as saved:
         assert saved.latest() == 0
-    values, env = policy_folders.read(folder), registry.find("turned").environment(registry.find("turned").config())
+    values, env = (
+        formats.read("policy", folder / policy_folders.POLICY),
+        registry.find("turned").environment(registry.find("turned").config()),
+    )
     lanes = stored.shapes_of({**values["policy"], "base": {"policy": "uniform"}}, env, len(values["lanes"]["seeds"]))
     return {**lanes, "base": {}}
 

@@ -97,7 +97,7 @@ def newest(out, kind, grid=GRID):
     """The newest checkpoint's arrays and number."""
     env = TASK.environment(CONFIG.task)
     group = lanes.LaneGroup(CONFIG, env, guidances.make(kind, CONFIG.sizes, env), grid)
-    like = items(group.shapes(), jax.eval_shape(start_clock), 0.0)
+    like = items(group.shapes_of(group.cut), jax.eval_shape(start_clock), 0.0)
     with checkpoints(out / kind / "checkpoints", read_only=True) as saved:
         found = saved.restore(like)
         del found["clock"]["wall_s"]
