@@ -99,7 +99,7 @@ def each_lane(function: Callable[..., Any]) -> Callable[..., Any]:
     def mapped(*blocks: Any) -> Any:
         if _lanes(blocks) == 1:
             return jax.tree.map(lambda leaf: leaf[None], function(*_lane(blocks, 0)))
-        if _side_by_side():
+        if jax.default_backend() != "cpu":
             return jax.vmap(function)(*blocks)
         return jax.lax.map(lambda lane: function(*lane), blocks)
 
@@ -120,7 +120,7 @@ def each_lane_in_place(function: Callable[[Any], tuple[Any, Any, Any]]) -> Calla
         if _lanes(block) == 1:
             lane, common, own = function(_lane(block, 0))
             return *jax.tree.map(lambda leaf: leaf[None], (lane,)), common, jax.tree.map(lambda leaf: leaf[None], own)
-        if _side_by_side():
+        if jax.default_backend() != "cpu":
             return jax.vmap(function, out_axes=(0, None, 0))(block)
 
         def turn(block: Any, index: jax.Array) -> tuple[Any, tuple[Any, Any]]:
@@ -132,10 +132,6 @@ def each_lane_in_place(function: Callable[[Any], tuple[Any, Any, Any]]) -> Calla
         return block, jax.tree.map(lambda leaf: leaf[0], common), own
 
     return mapped
-
-
-def _side_by_side() -> bool:
-    return jax.default_backend() != "cpu"
 
 
 def _lanes(blocks: Any) -> int:

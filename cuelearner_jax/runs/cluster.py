@@ -187,9 +187,7 @@ class PieceJob:
 
     def __call__(self) -> None:
         """Runs the command to its end; leaves the process with its status where it is not 0."""
-        again = signal.getsignal(
-            signal.SIGUSR2
-        )  # submitit's: it calls `checkpoint`, asks to be started again, and exits
+        again = signal.getsignal(signal.SIGUSR2)  # submitit's: calls `checkpoint`, asks to be started again, exits
         signals = (signal.SIGUSR2, signal.SIGTERM)
         for number in signals:  # a scheduler sends them to every process; the command is to hear of them from here
             signal.signal(number, signal.SIG_IGN)

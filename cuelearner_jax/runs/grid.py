@@ -118,14 +118,9 @@ def config_hash(described: dict[str, Any]) -> str:
 
 
 def load(folder: Path, find: Callable[[str], Task]) -> tuple[Task, RunConfig, Grid]:
-    """What a run folder's config.json says.
+    """What a run folder's config.json says; code that it names is never loaded.
 
-    Args:
-        folder: of the run.
-        find: the task of a name; raises UserError for one that is not known. Code that the file names is never loaded.
-
-    Raises:
-        UserError: it is no run folder, or of a task that is not known.
+    `find` gives the task of a name. Raises UserError for no run folder, or a task that is not known.
     """
     path = folder / CONFIG
     if not path.is_file():
@@ -160,19 +155,15 @@ def _check_room(path: Path, config: RunConfig, grid: Grid) -> None:
 
 def _grid(values: dict[str, Any]) -> Grid:
     """Raises ValueError, TypeError or KeyError if it is none; that its guidance is known is not asked."""
-    if not all(isinstance(values[name], list) for name in ("guidance", "seeds", "labels")):
-        raise TypeError("a grid is made of lists")
-    kinds, seeds, labels = (tuple(values[name]) for name in ("guidance", "seeds", "labels"))
-    if not kinds or not all(isinstance(kind, str) and NAME.fullmatch(kind) for kind in kinds):
+    kinds, seeds, labels = parts = [values[name] for name in ("guidance", "seeds", "labels")]
+    if not all(isinstance(part, list) and len(set(part)) == len(part) for part in parts) or not (kinds and seeds):
+        raise ValueError("it has no lists of different kinds of guidance, seeds and label budgets")
+    if not all(isinstance(kind, str) and NAME.fullmatch(kind) for kind in kinds):
         raise ValueError(f"{kinds} are no names of kinds of guidance")
-    if len(set(kinds)) < len(kinds):
-        raise ValueError(f"{kinds} name a kind twice")
-    for name, numbers, end in (("seeds", seeds, LARGEST_SEED), ("budgets", labels, LARGEST_BUDGET)):
-        if not all(type(number) is int and 0 <= number < end for number in numbers) or len(set(numbers)) < len(numbers):
-            raise ValueError(f"{numbers} are no {name}")
-    if not seeds:
-        raise ValueError("there are no seeds")
-    return Grid(kinds, seeds, labels)
+    numbers = [(number, end) for part, end in ((seeds, LARGEST_SEED), (labels, LARGEST_BUDGET)) for number in part]
+    if not all(type(number) is int and 0 <= number < end for number, end in numbers):
+        raise ValueError("some seed or label budget is none")
+    return Grid(*map(tuple, parts))
 
 
 def world_of(told: dict[str, Any], find: Callable[[str], Task], path: Path) -> tuple[Task, Any]:

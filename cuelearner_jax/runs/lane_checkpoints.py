@@ -100,16 +100,10 @@ def check_standing(group: LaneGroup, folder: Path, given: bool = False) -> None:
     """Whether a group can go on from what its folder holds: nothing lost, nothing changed.
 
     Its rows must be there up to the newest checkpoint, or to the end if it is finished; what comes after the checkpoint
-    is made again.
+    is made again. `given`: are its labels from a file?
 
-    Args:
-        group: the lanes.
-        folder: of the run and this kind of guidance.
-        given: are its labels from a file?
-
-    Raises:
-        UserError: rows are missing, a file cannot be read, or the checkpoint is of another version of the program;
-            nothing has been changed.
+    Raises UserError if rows are missing, a file cannot be read, or the checkpoint is of another version of the program;
+    nothing has been changed.
     """
     schedule, finished = group.config.schedule, (folder / results.PARQUET).exists()
     step, rounds = (schedule.total_steps, group.rounds) if finished else (0, 0)

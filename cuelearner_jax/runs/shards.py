@@ -38,15 +38,10 @@ class Shard(NamedTuple):
         return out / f"shard-{self.index:0{len(str(self.count))}d}-of-{self.count}"
 
     def check_sweep(self, out: Path, described: dict[str, Any], defaults: dict[str, Any]) -> None:
-        """Whether its piece belongs to the sweep that lies in a folder.
+        """Whether its piece, whose config.json is to hold `described`, belongs to the sweep in the folder `out`.
 
-        Args:
-            out: the sweep's folder.
-            described: what the piece's config.json is to say.
-            defaults: as `differences` has them.
-
-        Raises:
-            UserError: the folder holds a whole run, pieces of another count, or of a sweep with other settings.
+        `defaults`: as `differences` has them. Raises UserError if the folder holds a whole run, pieces of another
+        count, or of a sweep with other settings.
         """
         if out.exists() and not out.is_dir():
             raise UserError(f"{out} is no folder: give another --out")
@@ -74,12 +69,10 @@ class Shard(NamedTuple):
     def of(cls, described: dict[str, Any]) -> Shard:
         """From what config.json says. Raises ValueError, TypeError or KeyError if that makes no sense."""
         shard, seeds = cls(described["index"], described["count"]), described["seeds"]
-        if not all(type(number) is int for number in shard) or not 1 <= shard.index <= shard.count <= MOST_PIECES:
-            raise ValueError(f"{shard} is no piece")
-        if not isinstance(seeds, list) or not all(type(seed) is int for seed in seeds):
-            raise TypeError(f"{seeds} are no seeds")
-        if shard.count > len(seeds):
-            raise ValueError(f"{len(seeds)} seeds do not make {shard.count} pieces")
+        if not isinstance(seeds, list) or not all(type(number) is int for number in (*shard, *seeds)):
+            raise TypeError("a piece is made of whole numbers")
+        if not 1 <= shard.index <= shard.count <= min(MOST_PIECES, len(seeds)):
+            raise ValueError(f"{shard} is no piece of {len(seeds)} seeds")
         return shard
 
     def seeds(self, seeds: tuple[int, ...]) -> tuple[int, ...]:

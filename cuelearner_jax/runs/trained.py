@@ -17,7 +17,7 @@ from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs.adapted import AdaptedLanes, open_folder
 from cuelearner_jax.runs.failures import without_failed
 from cuelearner_jax.runs.grid import Grid
-from cuelearner_jax.runs.opened import Piece, RunLanes, lanes_of, open_run
+from cuelearner_jax.runs.run_folders import RunLanes, Piece, lanes_of, open_run
 from cuelearner_jax.storage import policy_folders
 from cuelearner_jax.task import Task, shape_of
 from cuelearner_jax.terminal import console
@@ -102,7 +102,7 @@ class PolicySource:
 
     @classmethod
     def of_run(cls, folder: Path, find: Callable[[str], Task]) -> PolicySource:
-        """A run's, or those of a sweep in pieces; see `opened.open_run`."""
+        """A run's, or those of a sweep in pieces; see `run_folders.open_run`."""
         task, config, grid, pieces = open_run(folder, find)
         return cls(task, config, grid, folder, pieces)
 

@@ -33,8 +33,7 @@ class Training:
 
         Args:
             group: the lanes.
-            examined: the environment of evaluations.
-            split: of the episodes of evaluations, see `evaluate.SPLITS`.
+            examined, split: environment and episodes of evaluations, see `evaluate.SPLITS`.
             tell: called while evaluations run; what it raises ends them.
         """
         self.group, self.split, self.tell = group, split, tell

@@ -36,13 +36,9 @@ def in_use(out: Path) -> bool:
 def check_folder(
     out: Path, described: dict[str, Any], resume: bool, overwrite: bool, defaults: dict[str, Any] | None = None
 ) -> None:
-    """Raises UserError unless `out` may be used as asked.
+    """Raises UserError unless `out`, whose config.json is to hold `described`, may be resumed, overwritten or begun.
 
-    Args:
-        out: the folder.
-        described: what config.json is to say.
-        resume, overwrite: what is asked for.
-        defaults: as `differences` has them.
+    `defaults`: as `differences` has them.
     """
     if resume and overwrite:
         raise UserError("--resume continues a run and --overwrite deletes it: give one of them")

@@ -105,12 +105,8 @@ class LabelWriter(tables.TableWriter):
 
         Args:
             folder: where the file lies.
-            task: {"name": ..., configuration of the task}.
-            answers: form of the answers.
-            space: of the actions.
-            eps: strength of an answer, in the space's unit; None where the form has none.
+            task, answers, space, eps, session: see `LabelFile`.
             meaning: of an answer's numbers, written into the file.
-            session: what else must be the same for labels to share a file.
             told: what else a new file says of itself, such as the versions that wrote it.
 
         Raises:
@@ -189,14 +185,11 @@ def write(
     labels: Label,
     meaning: str = "",
 ) -> None:
-    """Writes the labels that count as Parquet, replacing `path` in one step.
+    """Writes the valid labels of lanes as Parquet, replacing `path` in one step.
 
     Args:
         path: where to.
-        task: {"name": ..., configuration of the task}.
-        answers: form of the answers.
-        space: of the actions.
-        eps: strength of an answer, in the space's unit; None where the form has none.
+        task, answers, space, eps: see `LabelFile`.
         seeds: of the lanes, (lanes,).
         labels: (lanes, slots, ...).
         meaning: of an answer's numbers, written into the file.

@@ -32,10 +32,10 @@ class Damaged(ValueError):
 
 
 class Lines(NamedTuple):
-    """Rows of a file, and whether its closing line is there."""
+    """Rows of a file, without checksums, and whether its closing line follows."""
 
-    rows: list[Row]  # without checksums and closing line
-    is_closed: bool  # does the closing line follow?
+    rows: list[Row]
+    is_closed: bool
 
 
 class Writer:
@@ -43,8 +43,7 @@ class Writer:
 
     def __init__(self, path: Path, rows: Iterable[Row]) -> None:
         """Replaces the file by these lines, in one step, and opens it for more."""
-        text, self._count, self._checksum = _sealed(rows, 0, 0)
-        self._closing = _closing(self._count, self._checksum)
+        text, self._closing, self._count, self._checksum = _sealed(rows, 0, 0)
         with replacing(path, "wb") as file:
             file.write(text + self._closing)
         self._at = len(text)  # where the closing line begins [bytes]
@@ -52,8 +51,7 @@ class Writer:
 
     def append(self, rows: Iterable[Row]) -> None:
         """Appends lines. Raises OSError where the disk refuses."""
-        text, count, checksum = _sealed(rows, self._count, self._checksum)
-        closing = _closing(count, checksum)
+        text, closing, count, checksum = _sealed(rows, self._count, self._checksum)
         try:
             self._put(text + closing)
         except OSError:
@@ -121,17 +119,14 @@ def _tell(words: str) -> None:
     console.print(f"warning: {one_line(words)}")
 
 
-def _sealed(rows: Iterable[Row], count: int, checksum: int) -> tuple[bytes, int, int]:
-    """Lines as they are written, after so many with that checksum: (text, count, checksum of the last)."""
+def _sealed(rows: Iterable[Row], count: int, checksum: int) -> tuple[bytes, bytes, int, int]:
+    """Lines after so many with that checksum: (text, closing line, count and checksum with these)."""
     text = []
     for row in rows:
         line, checksum = _seal(row, checksum)
         text.append(line)
-    return b"".join(text), count + len(text), checksum
-
-
-def _closing(count: int, checksum: int) -> bytes:
-    return _seal({END: count}, checksum)[0]
+    count += len(text)
+    return b"".join(text), _seal({END: count}, checksum)[0], count, checksum
 
 
 def _seal(row: Row, before: int) -> tuple[bytes, int]:

@@ -16,17 +16,11 @@ from cuelearner_jax.errors import UserError
 
 @contextmanager
 def held(lock: Path, what: Path, stays: bool) -> Iterator[None]:
-    """Holds a lock; it is free again however the process ends.
+    """Holds a lock file, made if it is not there, that keeps the folder `what`; it is free however the process ends.
 
-    The lock is on a file, not on a folder: that is what NFS passes on between machines.
+    A file, not the folder, is locked: that is what NFS passes on between machines. `stays`: does the file stay behind?
 
-    Args:
-        lock: the file, made if it is not there.
-        what: the folder that it keeps for this process, for messages.
-        stays: does the file stay behind?
-
-    Raises:
-        UserError: another process holds it.
+    Raises UserError if another process holds it.
     """
     try:
         descriptor = locked(lock, wait=False)

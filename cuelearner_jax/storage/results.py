@@ -71,17 +71,9 @@ LaneKey = tuple[str, int, int]
 def check_complete(
     folder: Path, schema: tables.Schema, columns: Sequence[str], rows: Iterable[tuple[int, ...]], among: pc.Expression
 ) -> None:
-    """Whether a folder's table has each of the rows once.
+    """Raises UserError unless a folder's table has each of the rows once, and no other `among` those that count.
 
-    Args:
-        folder: of one kind of guidance of a run.
-        schema: `SCHEMA` or `GUIDES`.
-        columns: that tell rows apart.
-        rows: the values of these columns in each row that must be there.
-        among: which rows of the table count.
-
-    Raises:
-        UserError: rows are missing or there more than once, there is no table, or it cannot be read.
+    `rows` are values of the `columns`. A table that is missing has none.
     """
     path = schema.found_in(folder) or folder / schema.jsonl
     wanted, found = Counter(rows), Counter[tuple[int, ...]]()

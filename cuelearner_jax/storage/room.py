@@ -19,12 +19,9 @@ def check_size(path: Path) -> None:
 
 
 def check_room(declared: str, needed: int, remedy: str) -> None:
-    """Raises UserError if something needs more memory than is free; before any of it is taken.
+    """Raises UserError if `needed` bytes are more than are free; before any of them is taken.
 
-    Args:
-        declared: who declares how much of what, the beginning of the message.
-        needed: for that [bytes].
-        remedy: what to do, the end of the message.
+    The message begins with who `declared` how much of what, and ends with the remedy.
     """
     free = _least([_host_bytes(), group_bytes()])
     if free is not None and needed > free:

@@ -88,8 +88,7 @@ class TableWriter:
         """Opens the table in `folder`, creating both where needed.
 
         Args:
-            folder: where the table lies.
-            schema: what its rows are.
+            folder, schema: where the table lies, and what its rows are.
             constants: columns with one value for all rows to come; None: there are none.
             about: what the table is, written at the head of a new one; that of an existing one stays.
         """
@@ -172,12 +171,7 @@ def finish(folder: PathLike, schema: Schema) -> Path:
 def write(path: Path, table: pa.Table, schema: Schema, about: Row | None = None, fresh: bool = False) -> None:
     """Writes a whole table as Parquet, in one step.
 
-    Args:
-        path: the file.
-        table: its rows.
-        schema: what they are.
-        about: what the table is.
-        fresh: make folders as needed, and raise UserError rather than replace a file.
+    `about`: what the table is (default: what it says already). `fresh`: see `whole.replacing`.
     """
     told = about_of(table) if about is None else about
     table = _typed(table, schema)

@@ -89,8 +89,7 @@ class Place:
     """The place of a folder, kept for this process alone; see `place_of`."""
 
     def __init__(self, folder: Path, check: Callable[[], None], overwrite: bool) -> None:
-        self.folder = folder
-        self._check, self._overwrite = check, overwrite
+        self.folder, self._check, self._overwrite = folder, check, overwrite
         self._new, self._old = beside(folder, "new"), beside(folder, "old")
 
     @contextmanager
@@ -121,27 +120,22 @@ class Place:
 
     def _move(self) -> None:
         self._check()
-        if not (self._overwrite and is_used(self.folder)):
-            self._move_new()
-            return
-        os.rename(self.folder, self._old)
-        try:
-            self._move_new()
-        except BaseException:
-            os.rename(self._old, self.folder)
-            raise
-        _sync(self.folder.parent)  # before the old one goes
-        shutil.rmtree(self._old)
-
-    def _move_new(self) -> None:
+        replaces = self._overwrite and is_used(self.folder)
+        if replaces:
+            os.rename(self.folder, self._old)
         try:
             os.rename(self._new, self.folder)
-        except OSError as error:
-            if error.errno not in TAKEN:
-                raise
-            raise UserError(
-                f"{self.folder} was made meanwhile by another program and stays: give another --out"
-            ) from None
+        except BaseException as error:
+            if replaces:
+                os.rename(self._old, self.folder)
+            if isinstance(error, OSError) and error.errno in TAKEN:
+                raise UserError(
+                    f"{self.folder} was made meanwhile by another program and stays: give another --out"
+                ) from None
+            raise
+        if replaces:
+            _sync(self.folder.parent)  # before the old one goes
+            shutil.rmtree(self._old)
 
 
 def beside(folder: Path, what: str) -> Path:

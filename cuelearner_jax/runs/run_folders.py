@@ -45,12 +45,7 @@ class RunLanes:
 def open_run(folder: Path, find: Callable[[str], Task]) -> tuple[Task, RunConfig, Grid, tuple[Piece, ...]]:
     """The run in a folder, or the sweep whose pieces lie below it (`--shard`, `--cluster`); the grid is of all pieces.
 
-    Args:
-        folder: of the run or sweep.
-        find: as `grid.load` has it.
-
-    Raises:
-        UserError: it is none, of a task that is not known, or its pieces are of different sweeps.
+    `find`: as `grid.load` has it. Raises UserError for no run, a task that is not known, or pieces of different sweeps.
     """
     files = [] if (folder / CONFIG).exists() else sorted(folder.glob(f"shard-*-of-*/{CONFIG}"))
     if not files:
@@ -73,17 +68,8 @@ def open_run(folder: Path, find: Callable[[str], Task]) -> tuple[Task, RunConfig
 def lanes_of(task: Task, config: RunConfig, pieces: tuple[Piece, ...], kind: str, sweep: bool) -> list[RunLanes]:
     """The lanes of one kind of guidance, those at the same step together, the farthest first.
 
-    What is missing or not finished is said on the console, a line for each piece.
-
-    Args:
-        task: whose run it is.
-        config: of the run.
-        pieces: where its lanes lie.
-        kind: of guidance.
-        sweep: are these the pieces of a sweep, some of which may not have begun?
-
-    Raises:
-        UserError: no piece has a checkpoint, or one is damaged.
+    What is missing or not finished is said on the console, a line for each piece. `sweep`: are these the pieces of a
+    sweep, some of which may not have begun? Raises UserError if no piece has a checkpoint, or one is damaged.
     """
     env = shape_of(task, config.task)
     guidance = config.guide_in(env, kind)
