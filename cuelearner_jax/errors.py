@@ -3,7 +3,7 @@
 import difflib
 import errno
 import reprlib
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from typing import Any
 
 # Refusals of the file system that no check beforehand can rule out.
@@ -43,7 +43,7 @@ class NotFinite(Exception):
     status = 1
 
 
-def says(error: BaseException | None, numbers: Iterable[int], *words: str) -> bool:
+def says(error: BaseException | None, numbers: Collection[int | None], *words: str) -> bool:
     """Does an exception, or what it came from, have one of these error numbers, or say one of these words?
 
     TensorStore tells in words alone what the system refused.

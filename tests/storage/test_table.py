@@ -217,7 +217,8 @@ def test_lines_without_checksums_are_not_believed(tmp_path):
 
 
 def test_a_table_that_may_not_be_read_is_not_called_damaged(tmp_path, monkeypatch):
-    path = tables.finish(written(tmp_path, "pike"), SCHEMA)
+    written(tmp_path, "pike")
+    path = tables.finish(tmp_path, SCHEMA)
 
     def forbidden(*_, **__):
         raise PermissionError(13, "Permission denied")
