@@ -140,22 +140,24 @@ class PolicySource:
         """
         if policy not in POLICIES:
             raise UserError(f"unknown policy {policy!r}{closest(policy, POLICIES)}")
-        if POLICIES[policy].trained and not self.grid:
-            others = [name for name, named in POLICIES.items() if not named.kept or (named.adapted and self.adapted)]
+        named = POLICIES[policy]
+        if named.trained and not self.grid:
+            others = [name for name, one in POLICIES.items() if not one.kept or (one.adapted and self.adapted)]
             raise UserError(f"policy {policy!r} needs a trained run: give a run folder, or one of {', '.join(others)}")
-        if POLICIES[policy].adapted and not self.adapted:
+        if named.adapted and not self.adapted:
             raise UserError(f"policy {policy!r} needs a policy folder: give one that `cuelearner adapt` left")
         given = [name for name, value in lanes.items() if value not in (None, ())]
-        if given and not POLICIES[policy].kept:
-            what = f"policy {policy!r} belongs to no lane of a run"
-            raise UserError(f"--{given[0]} chooses nothing here, {what}: leave it out")
+        if given and not named.kept:
+            raise UserError(
+                f"--{given[0]} chooses nothing here, policy {policy!r} belongs to no lane of a run: leave it out"
+            )
         if self.grid and given and given[-1].endswith("bound-deg"):
             raise UserError("--bound-deg chooses among the lanes of a policy folder, this is a run: leave it out")
         after = shape_of(self.task, changed)
-        for need in POLICIES[policy].needs:
+        for need in named.needs:
             if not offers(after, need):
                 raise UserError(f"{self.task.name} has no {need}: choose another policy")
-        if not POLICIES[policy].kept:
+        if not named.kept:
             return
         what = "run" if self.grid else "policy"
         known = shape_of(self.task, self.config.task)
