@@ -303,12 +303,13 @@ def several(
                 found.append(block.policy.lane(int(index[0])))
                 break
         else:
-            of = "run" if source.grid else "folder"
-            unit = actions_of(view).unit
-            bounds = "" if source.grid else f" within {bound:g} {unit}"
-            told = "" if source.grid else f" within {listed(known['bounds'])} {unit}"
+            known_seeds, known_budgets, known_bounds = (listed(values.tolist()) for values in known.values())
+            of, bounds, others = "run", "", ""
+            if source.grid is None:
+                unit = actions_of(view).unit
+                of, bounds, others = "folder", f" within {bound:g} {unit}", f" within {known_bounds} {unit}"
             raise UserError(
-                f"no lane with seed {seed} and {budget} labels{bounds}: the {of} has seeds {listed(known['seeds'])} "
-                f"and labels {listed(known['budgets'])}{told}"
+                f"no lane with seed {seed} and {budget} labels{bounds}: the {of} has seeds {known_seeds} "
+                f"and labels {known_budgets}{others}"
             )
     return found, seeds or (int(known["seeds"][0]),)

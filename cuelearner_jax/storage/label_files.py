@@ -284,7 +284,7 @@ def for_lanes(file: LabelFile, seeds: np.ndarray, budgets: np.ndarray, slots: in
         chosen = np.flatnonzero(file.seeds == own)
         if own not in kept:
             raise UserError(
-                f"the label file has labels for the seeds {listed(kept)}, none for seed {seed}: "
+                f"the label file has labels for the seeds {listed(kept.tolist())}, none for seed {seed}: "
                 "give --first-seed and --seeds (train: --seed) of these, or the labels of another run"
             )
         if len(chosen) < budget:
