@@ -97,7 +97,7 @@ def lanes_of(task: Task, config: RunConfig, pieces: tuple[Piece, ...], kind: str
 
 
 def _joined(parts: list[RunLanes]) -> RunLanes:
-    """RunLanes of several pieces at one step."""
+    """Lanes of several pieces at one step."""
     if len(parts) == 1:
         return parts[0]
     seeds, budgets = (np.concatenate([getattr(part, name) for part in parts]) for name in ("seeds", "budgets"))

@@ -17,7 +17,7 @@ from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs.adapted import AdaptedLanes, open_folder
 from cuelearner_jax.runs.failures import without_failed
 from cuelearner_jax.runs.grid import Grid
-from cuelearner_jax.runs.run_folders import RunLanes, Piece, lanes_of, open_run
+from cuelearner_jax.runs.run_folders import Piece, RunLanes, lanes_of, open_run
 from cuelearner_jax.storage import policy_folders
 from cuelearner_jax.task import Task, shape_of
 from cuelearner_jax.terminal import console
@@ -200,7 +200,7 @@ class PolicySource:
 
 
 class Block(NamedTuple):
-    """RunLanes of one kind of guidance at one step, and what they act with."""
+    """Lanes of one kind of guidance at one step, and what they act with."""
 
     guidance: str
     seeds: np.ndarray  # (lanes,)
