@@ -1,4 +1,4 @@
-"""A room that pictures of navigation are looked at in."""
+"""Worlds of navigation that are made by hand."""
 
 import math
 
@@ -7,17 +7,34 @@ import jax.numpy as jnp
 from cuelearner_envs.navigation import World
 from cuelearner_envs.navigation.world import FAR_AWAY
 
+ORIGIN = ((0.0, 0.0),)
 
-def room(starts, goals):
-    """12 m by 8 m with a box in the middle of the upper half, turned by 30 degrees, and a column in the lower half."""
-    walls = [[6.1, 0, 0, 0.1, 4.2], [-6.1, 0, 0, 0.1, 4.2], [0, 4.1, 0, 6.2, 0.1], [0, -4.1, 0, 6.2, 0.1]]
-    boxes = [*walls, [0.0, 2.0, math.pi / 6, 0.9, 0.4], [FAR_AWAY, FAR_AWAY, 0.0, 0.01, 0.01]]
+
+def world(
+    boxes=(), circles=(), extent=(40.0, 40.0), starts=ORIGIN, goals=ORIGIN, heights=1.0, circle_heights=1.0, rows=(1, 1)
+):
+    """Boxes (x, y, yaw, half-length, half-width) and circles (x, y, radius), filled up to so many rows of each."""
+    boxes = [*boxes, *[[FAR_AWAY, FAR_AWAY, 0.0, 0.01, 0.01]] * (rows[0] - len(boxes))]
+    circles = [*circles, *[[FAR_AWAY, FAR_AWAY, 0.01]] * (rows[1] - len(circles))]
     return World(
-        boxes=jnp.array(boxes),
-        box_heights=jnp.array([1.5] * 4 + [0.8, 1.0]),
-        circles=jnp.array([[2.0, -2.0, 0.5], [FAR_AWAY, FAR_AWAY, 0.01]]),
-        circle_heights=jnp.array([1.4, 1.0]),
-        extent=jnp.array([12.0, 8.0]),
+        boxes=jnp.array(boxes, jnp.float32),
+        box_heights=jnp.broadcast_to(jnp.array(heights), (len(boxes),)),
+        circles=jnp.array(circles, jnp.float32),
+        circle_heights=jnp.broadcast_to(jnp.array(circle_heights), (len(circles),)),
+        extent=jnp.array(extent),
         starts=jnp.array(starts, float),
         goals=jnp.array(goals, float),
     )
+
+
+def walls(width, height):
+    """Four boxes around a hall, 0.2 m thick."""
+    x, y = width / 2 + 0.1, height / 2 + 0.1
+    return [[x, 0, 0, 0.1, y + 0.1], [-x, 0, 0, 0.1, y + 0.1], [0, y, 0, x + 0.1, 0.1], [0, -y, 0, x + 0.1, 0.1]]
+
+
+def room(starts, goals):
+    """12 m by 8 m with a box in the middle of the upper half, turned by 30 degrees, and a column in the lower half."""
+    boxes, heights = [*walls(12.0, 8.0), [0.0, 2.0, math.pi / 6, 0.9, 0.4]], [1.5] * 4 + [0.8, 1.0]
+    circles, tall = [[2.0, -2.0, 0.5]], [1.4, 1.0]
+    return world(boxes, circles, (12.0, 8.0), starts, goals, heights, tall, rows=(6, 2))

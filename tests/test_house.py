@@ -42,13 +42,8 @@ ROWS = [
 ]
 ROW = {room: number for number, row in enumerate(ROWS) for room in row}
 FOR_TASKS = {"errors", "types", "spaces", "environment"}  # what a task may know of the method
-KINDS = {
-    "relative",
-    "intent",
-    "demonstration",
-    "scalar",
-    "dcoach",
-}  # of guidance ("heuristic" names a member and a policy too)
+# Of guidance; "heuristic" names a member and a policy too.
+KINDS = {"relative", "intent", "demonstration", "scalar", "dcoach"}
 
 
 @cache

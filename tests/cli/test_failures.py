@@ -140,17 +140,7 @@ def test_a_finished_run_is_resumed_to_no_effect(copy):
 
 
 def test_a_run_that_diverges_ends_with_status_one_and_is_no_success_for_any_command(refused, tmp_path, capsys):
-    command = [
-        *QUICK,
-        "--guidance",
-        "none",
-        "--seeds",
-        "1",
-        "--agent.learning-rate",
-        "1e9",
-        "--out",
-        tmp_path / "wild",
-    ]
+    command = [*QUICK, "--guidance", "none", "--seeds", "1", "--agent.learning-rate", "1e9", "--out", tmp_path / "wild"]
     for options in ([], ["--resume"]):
         assert main([*map(str, command), *options]) == 1
         last = capsys.readouterr().err.strip().splitlines()[-1]

@@ -200,20 +200,8 @@ def test_an_agent_and_an_arbiter_of_ones_own_train_and_are_evaluated(tmp_path, m
     (tmp_path / "own_parts.py").write_text(BANDIT)
     monkeypatch.syspath_prepend(tmp_path)
     run = str(tmp_path / "run")
-    command = [
-        "sweep",
-        "own_parts:TASK",
-        "--preset",
-        "quickstart",
-        *PARTS,
-        *OPTIONS,
-        "--guidance",
-        "heuristic",
-        "--seeds",
-        "1",
-        "--out",
-        run,
-    ]
+    command = ["sweep", "own_parts:TASK", "--preset", "quickstart", *PARTS, *OPTIONS]
+    command += ["--guidance", "heuristic", "--seeds", "1", "--out", run]
     with stranger():
         assert main(command) == 0
     described = json.loads((tmp_path / "run" / "config.json").read_text())
@@ -367,15 +355,8 @@ def test_policies_of_ones_own_reach_the_buoy(tmp_path, capsys):
 
 
 def test_a_kind_of_ones_own_that_asks_needs_labels(tmp_path, capsys):
-    command = [
-        "sweep",
-        "examples.reach:TASK",
-        *TINY,
-        "--guidance",
-        "examples.clone:KIND",
-        "--out",
-        str(tmp_path / "run"),
-    ]
+    command = ["sweep", "examples.reach:TASK", *TINY, "--guidance", "examples.clone:KIND"]
+    command += ["--out", str(tmp_path / "run")]
     assert main([*command, "--labels", "0"]) == 2
     assert "a label budget of 0 teaches nothing" in capsys.readouterr().err
     assert not (tmp_path / "run").exists()

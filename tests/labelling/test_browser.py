@@ -36,6 +36,7 @@ def moved(page, item):
     page.wait_for_function(f"({ITEM})() !== {item} && cue.ready()")
 
 
+@pytest.mark.long
 def test_every_key_is_in_the_file_once(browser, tmp_path):
     rng, folder = np.random.default_rng(0), tmp_path / "labels"
     values = {"ArrowLeft": 1.0, "ArrowUp": 0.0, "ArrowRight": -1.0, "ArrowDown": None, "a": 1.0, " ": 0.0, "D": -1.0}
@@ -89,6 +90,7 @@ def test_pointing_shows_what_to_do_instead(browser, tmp_path):
     np.testing.assert_allclose(row["answer"], [0.5, math.sqrt(0.75)], atol=0.02)
 
 
+@pytest.mark.long
 def test_every_press_is_saved_or_told_and_the_end_outlives_the_command(browser, tmp_path):
     folder = tmp_path / "labels"
     dropped = "() => cue.dropped"

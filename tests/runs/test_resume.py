@@ -247,10 +247,18 @@ def test_stopped_and_killed_while_training(whole, tmp_path):
     assert_same_run(out, whole)
 
 
+ENDS = {
+    "killed before anything was saved": lambda: killed_at(1, "_label"),
+    "stopped in the last round of labels": lambda: stopping_at(6),
+    "stopped after the last step": lambda: stopping_at(6 + 6),
+}
+
+
 @pytest.mark.long
-def test_killed_before_anything_was_saved(whole, tmp_path):
+@pytest.mark.parametrize("end", ENDS)
+def test_a_run_that_was_cut_short_goes_on_as_one(whole, tmp_path, end):
     out = tmp_path / "run"
-    with killed_at(1, "_label"), pytest.raises(Killed):
+    with ENDS[end](), pytest.raises((Killed, Interrupted)):
         run(out)
     run(out, resume=True)
     assert_same_run(out, whole)
@@ -264,15 +272,6 @@ def test_killed_between_the_labels_and_the_first_row(whole, tmp_path):
     with killed_at(1, "_stop_if_asked"), pytest.raises(Killed):
         run(out, resume=True)
     assert {row["step"] for row in rows(out)} == {0, 16}
-    run(out, resume=True)
-    assert_same_run(out, whole)
-
-
-@pytest.mark.long
-def test_stopped_in_the_last_round_of_labels(whole, tmp_path):
-    out = tmp_path / "run"
-    with stopping_at(6), pytest.raises(Interrupted):
-        run(out)
     run(out, resume=True)
     assert_same_run(out, whole)
 
@@ -303,26 +302,25 @@ def test_the_note_of_a_stretch_that_waits_is_of_its_step_and_whole(tmp_path):
             lane_checkpoints.read_due(tmp_path, 48, lanes=2)
 
 
-@pytest.mark.long
-def test_stopped_after_the_last_step(whole, tmp_path):
-    out = tmp_path / "run"
-    with stopping_at(6 + 6), pytest.raises(Interrupted):
-        run(out)
-    run(out, resume=True)
-    assert_same_run(out, whole)
-
-
 def test_resuming_a_finished_run_changes_nothing(whole):
     before = probes.files_of(whole)
     run(whole, resume=True)
     assert probes.files_of(whole) == before
 
 
+def torn_row(out):
+    (out / "relative" / results.JSONL).write_text((out / "relative" / results.JSONL).read_text() + '{"step": 48, "se')
+
+
+def damaged_labels(out):
+    (out / "relative" / label_files.PARQUET).write_bytes(b"PAR1")
+
+
 @pytest.mark.long
-def test_a_torn_last_row_is_written_anew(stopped, whole, tmp_path):
+@pytest.mark.parametrize("damage", [torn_row, damaged_labels])
+def test_what_a_kill_can_tear_is_written_anew(stopped, whole, tmp_path, damage):
     out = copied(stopped, tmp_path)
-    with (out / "relative" / results.JSONL).open("a") as file:
-        file.write('{"step": 48, "se')
+    damage(out)
     run(out, resume=True)
     assert_same_run(out, whole)
 
@@ -449,14 +447,6 @@ def test_a_finished_kind_is_looked_at_before_it_is_called_finished(whole, tmp_pa
     labels = out / "relative" / label_files.PARQUET
     labels.write_bytes(labels.read_bytes()[:100])
     refused(out, "not a label file of cuelearner, or it is damaged")
-
-
-@pytest.mark.long
-def test_damaged_labels_of_a_run_that_goes_on_are_written_anew(stopped, whole, tmp_path):
-    out = copied(stopped, tmp_path)
-    (out / "relative" / label_files.PARQUET).write_bytes(b"PAR1")
-    run(out, resume=True)
-    assert_same_run(out, whole)
 
 
 @pytest.mark.parametrize(("resume", "says"), [(False, "not empty"), (True, "another scalars.eps_deg")])

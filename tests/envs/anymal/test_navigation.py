@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+import rooms
 from scipy.spatial.transform import Rotation
 
 from cuelearner_envs.anymal import judged
@@ -17,7 +18,6 @@ from cuelearner_envs.anymal.environment import SENSOR_NOISE, make_environment
 from cuelearner_envs.navigation.config import NavigationConfig
 from cuelearner_envs.navigation.config import make_environment as make_simple
 from cuelearner_envs.navigation.lidar import scan, scan_tilted
-from cuelearner_envs.navigation.world import World
 from cuelearner_jax.policies import Heuristic
 from cuelearner_jax.spaces import directions
 
@@ -165,32 +165,15 @@ def test_a_level_sensor_reads_what_the_simple_robots_does(one_world):
 
 
 def test_beams_that_point_down_meet_the_floor():
-    nowhere = World(
-        boxes=jnp.array([[1000.0, 1000.0, 0.0, 0.01, 0.01]]),
-        box_heights=jnp.ones(1),
-        circles=jnp.array([[1000.0, 1000.0, 0.01]]),
-        circle_heights=jnp.ones(1),
-        extent=jnp.array([40.0, 40.0]),
-        starts=jnp.zeros((1, 2)),
-        goals=jnp.zeros((1, 2)),
-    )
     pitch = 0.1  # nose down
-    ranges = look(nowhere, jnp.array([0.0, 0.0, 0.5]), jnp.asarray(tilted(0.3, pitch)))
+    ranges = look(rooms.world(), jnp.array([0.0, 0.0, 0.5]), jnp.asarray(tilted(0.3, pitch)))
     assert float(ranges[135]) == pytest.approx(0.5 / math.sin(pitch), rel=1e-5)
     assert float(ranges[135 + 90]) == pytest.approx(10.0)  # to the left: level
     assert float(ranges[270]) == pytest.approx(10.0)  # behind: up
 
 
 def test_beams_pass_over_what_is_too_low():
-    low = World(
-        boxes=jnp.array([[3.0, 0.0, 0.0, 0.1, 1.0], [6.0, 0.0, 0.0, 0.1, 1.0]]),
-        box_heights=jnp.array([0.6, 2.0]),
-        circles=jnp.array([[1000.0, 1000.0, 0.01]]),
-        circle_heights=jnp.ones(1),
-        extent=jnp.array([40.0, 40.0]),
-        starts=jnp.zeros((1, 2)),
-        goals=jnp.zeros((1, 2)),
-    )
+    low = rooms.world([[3.0, 0.0, 0.0, 0.1, 1.0], [6.0, 0.0, 0.0, 0.1, 1.0]], heights=[0.6, 2.0])
     for pitch, met in ((0.0, 2.9), (-0.03, 2.9), (-0.04, 5.9)):  # 0.5 + 2.9 tan 0.03 = 0.587, tan 0.04: 0.616
         ranges = look(low, jnp.array([0.0, 0.0, 0.5]), jnp.asarray(tilted(0.0, pitch)))
         assert float(ranges[135]) == pytest.approx(met / math.cos(pitch), rel=1e-5)

@@ -5,22 +5,14 @@ import math
 import jax
 import jax.numpy as jnp
 import numpy as np
+import rooms
 
-from cuelearner_envs.navigation import World
 from cuelearner_envs.navigation.aims import ROOM, free_ways
 from cuelearner_envs.navigation.environment import Navigation
 from cuelearner_envs.navigation.lidar import BEAM_ANGLES
 from cuelearner_jax.spaces.directions import from_angle
 
-WORLD = World(
-    boxes=jnp.array([[6.1, 0, 0, 0.1, 4.2], [-6.1, 0, 0, 0.1, 4.2], [0, 4.1, 0, 6.2, 0.1], [0, -4.1, 0, 6.2, 0.1]]),
-    box_heights=jnp.full(4, 1.5),
-    circles=jnp.array([[2.0, 0.0, 0.5]]),
-    circle_heights=jnp.ones(1),
-    extent=jnp.array([12.0, 8.0]),
-    starts=jnp.array([[-4.0, 0.0]]),
-    goals=jnp.array([[4.0, 0.0]]),
-)
+WORLD = rooms.world(rooms.walls(12.0, 8.0), [[2.0, 0.0, 0.5]], (12.0, 8.0), [[-4.0, 0.0]], [[4.0, 0.0]], heights=1.5)
 ENV = Navigation(worlds=jax.tree.map(lambda leaf: leaf[None], WORLD))
 AHEAD = jnp.array([1.0, 0.0])
 

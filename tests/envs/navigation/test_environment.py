@@ -8,12 +8,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import rooms
 
-from cuelearner_envs.navigation import World
 from cuelearner_envs.navigation.config import NavigationConfig, make_environment
 from cuelearner_envs.navigation.environment import Navigation, Walker
 from cuelearner_envs.navigation.lidar import Lidar
-from cuelearner_envs.navigation.world import FAR_AWAY
 from cuelearner_jax.errors import UserError
 
 KEY = jax.random.key(0)
@@ -26,19 +25,10 @@ CHANGED = NavigationConfig("clutter", 8, 5, 17, 0.7, 6.0, 15.0, 0.02, 0.1, True)
 observe = jax.jit(lambda env, state: env.observe(state))
 
 
-def hall(circles=((FAR_AWAY, FAR_AWAY, 0.01),), starts=((-4.0, 0.0), (-4.0, 2.0)), goals=((4.0, 0.0), (4.0, 2.0))):
+def hall(circles=(), starts=((-4.0, 0.0), (-4.0, 2.0)), goals=((4.0, 0.0), (4.0, 2.0))):
     """12 m by 8 m between walls, with columns."""
-    walls = [[6.1, 0, 0, 0.1, 4.2], [-6.1, 0, 0, 0.1, 4.2], [0, 4.1, 0, 6.2, 0.1], [0, -4.1, 0, 6.2, 0.1]]
-    world = World(
-        boxes=jnp.array(walls, jnp.float32),
-        box_heights=jnp.full(4, 1.5),
-        circles=jnp.array(circles, jnp.float32),
-        circle_heights=jnp.ones(len(circles)),
-        extent=jnp.array([12.0, 8.0]),
-        starts=jnp.array(starts),
-        goals=jnp.array(goals),
-    )
-    return Navigation(worlds=jax.tree.map(lambda leaf: leaf[None], world), max_steps=jnp.int32(200))
+    made = rooms.world(rooms.walls(12.0, 8.0), circles, (12.0, 8.0), starts, goals, heights=1.5)
+    return Navigation(worlds=jax.tree.map(lambda leaf: leaf[None], made), max_steps=jnp.int32(200))
 
 
 def walker(pose, goal=(4.0, 0.0), steps=0, previous=((0.0, 0.0),) * 3, velocity=(0.0, 0.0)):

@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from rooms import world
 
-from cuelearner_envs.navigation import World
 from cuelearner_envs.navigation.geometry import clearance, in_frame, line_clearance
 from cuelearner_envs.navigation.world import FAR_AWAY
 
@@ -16,18 +16,6 @@ SCENES = 12
 
 clearances = jax.jit(jax.vmap(clearance, (None, 0)))
 line_clearances = jax.jit(jax.vmap(line_clearance, (None, 0, 0)))
-
-
-def world(boxes, circles):
-    return World(
-        boxes=jnp.asarray(boxes, jnp.float32),
-        box_heights=jnp.ones(len(boxes)),
-        circles=jnp.asarray(circles, jnp.float32),
-        circle_heights=jnp.ones(len(circles)),
-        extent=jnp.array([10.0, 10.0]),
-        starts=jnp.zeros((1, 2)),
-        goals=jnp.zeros((1, 2)),
-    )
 
 
 def scene(seed):

@@ -9,13 +9,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import rooms
 
-from cuelearner_envs.navigation import BEAM_ANGLES, World, generate, scan
+from cuelearner_envs.navigation import BEAM_ANGLES, generate, scan
 from cuelearner_envs.navigation.lidar import Lidar
-from cuelearner_envs.navigation.world import FAR_AWAY
 
 AHEAD = 135  # number of the middle beam; neighbours are a degree apart
-UNUSED_BOX, UNUSED_CIRCLE = [FAR_AWAY, FAR_AWAY, 0.0, 0.01, 0.01], [FAR_AWAY, FAR_AWAY, 0.01]
 
 generate_one = jax.jit(generate, static_argnames=("style", "routes"))
 scan_one = jax.jit(scan)
@@ -26,18 +25,7 @@ read_many = jax.jit(jax.vmap(Lidar.read, (None, None, 0)))
 
 def world(boxes=(), circles=(), walls=0.0):
     """A world of up to two boxes and two circles, with walls round a square of so many metres if any."""
-    walled = [[s * (walls / 2 + 0.1), 0.0, 0.0, 0.1, walls] for s in (1, -1)]
-    walled += [[0.0, s * (walls / 2 + 0.1), 0.0, walls, 0.1] for s in (1, -1)]
-    rows = [*(walled if walls else [UNUSED_BOX] * 4), *boxes]
-    return World(
-        boxes=jnp.array(rows + [UNUSED_BOX] * (6 - len(rows))),
-        box_heights=jnp.ones(6),
-        circles=jnp.array([*circles] + [UNUSED_CIRCLE] * (2 - len(circles))),
-        circle_heights=jnp.ones(2),
-        extent=jnp.array([40.0, 40.0]),
-        starts=jnp.zeros((1, 2)),
-        goals=jnp.zeros((1, 2)),
-    )
+    return rooms.world([*(rooms.walls(walls, walls) if walls else []), *boxes], circles, rows=(6, 2))
 
 
 def ranges(solids, x=0.0, y=0.0, yaw=0.0, max_range=10.0):

@@ -7,12 +7,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import rooms
 
 from cuelearner_envs.navigation.aims import RADII, SCALE, WAYS, aims_of
 from cuelearner_envs.navigation.config import NavigationConfig
 from cuelearner_envs.navigation.lidar import BEAMS, scan
 from cuelearner_envs.navigation.look_ahead import LEAST, SHORT
-from cuelearner_envs.navigation.world import World
 from cuelearner_envs.navigation.worlds import FARTHEST
 from cuelearner_jax.adaptation import stored
 from cuelearner_jax.adaptation.lanes import Lanes
@@ -43,17 +43,7 @@ def seen(ranges, goal):
 
 def among(boxes, goal, pose=POSE):
     """What is seen among boxes (x, y, yaw, half-length, half-width) from a pose, of a goal in the body's frame."""
-    boxes = jnp.array(boxes, jnp.float32)
-    world = World(
-        boxes=boxes,
-        box_heights=jnp.full(len(boxes), 1.5),
-        circles=jnp.array([[1000.0, 1000.0, 0.01]]),
-        circle_heights=jnp.ones(1),
-        extent=jnp.array([20.0, 20.0]),
-        starts=jnp.zeros((1, 2)),
-        goals=jnp.ones((1, 2)),
-    )
-    return seen(scan(world, pose), goal)
+    return seen(scan(rooms.world(boxes), pose), goal)
 
 
 def ahead(obs):

@@ -8,13 +8,12 @@ import jax.numpy as jnp
 import networkx
 import numpy as np
 import pytest
+import rooms
 from probes import long_but
 
-from cuelearner_envs.navigation import World
 from cuelearner_envs.navigation.environment import Navigation, Walker
 from cuelearner_envs.navigation.layouts import BOXES, CIRCLES
 from cuelearner_envs.navigation.roadmap import BLOCKED, LINE_MARGIN, NODE_MARGIN, RoadMapTeacher, make_teacher, way
-from cuelearner_envs.navigation.world import FAR_AWAY
 from cuelearner_envs.navigation.worlds import generate_many
 from cuelearner_jax import evaluate
 from cuelearner_jax.config import Scalars, Sizes
@@ -87,19 +86,11 @@ def clear_of(world, points):
 
 def gate(side):
     """16 m by 12 m, cut in two at x = 0 by a wall with one gap of 2 m: to the left (1) or to the right (-1)."""
-    walls = [[8.1, 0, 0, 0.1, 6.2], [-8.1, 0, 0, 0.1, 6.2], [0, 6.1, 0, 8.2, 0.1], [0, -6.1, 0, 8.2, 0.1]]
     # From one side wall to 3 m beyond the middle, and from 5 m to the other side wall.
     pieces = [[0.0, -1.5 * side, 0, 0.1, 4.5], [0.0, 5.5 * side, 0, 0.1, 0.5]]
-    unused = [[FAR_AWAY, FAR_AWAY, 0.0, 0.01, 0.01]] * (BOXES - 6)
-    return World(
-        boxes=jnp.array(walls + pieces + unused, jnp.float32),
-        box_heights=jnp.full(BOXES, 1.5),
-        circles=jnp.array([[FAR_AWAY, FAR_AWAY, 0.01]] * CIRCLES),
-        circle_heights=jnp.ones(CIRCLES),
-        extent=jnp.array([16.0, 12.0]),
-        starts=jnp.tile(jnp.array([[-4.0, 0.0], [4.0, -3.0]]), (8, 1)),
-        goals=jnp.tile(jnp.array([[4.0, 0.0], [4.0, 3.0]]), (8, 1)),
-    )
+    starts, goals = [[-4.0, 0.0], [4.0, -3.0]] * 8, [[4.0, 0.0], [4.0, 3.0]] * 8
+    boxes = [*rooms.walls(16.0, 12.0), *pieces]
+    return rooms.world(boxes, (), (16.0, 12.0), starts, goals, heights=1.5, rows=(BOXES, CIRCLES))
 
 
 WORLDS = range(2 * len(STYLES))

@@ -6,9 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from rooms import world
 from scipy.integrate import solve_ivp
 
-from cuelearner_envs.navigation import World
 from cuelearner_envs.navigation.robot import Motion, Robot, collides, discs, walk
 
 step = jax.jit(walk)
@@ -25,21 +25,7 @@ def toward(angle):
     return jnp.array([math.cos(angle), math.sin(angle)])
 
 
-def world(boxes, circles, extent=(10.0, 10.0)):
-    return World(
-        boxes=jnp.array(boxes, float).reshape(-1, 5),
-        box_heights=jnp.ones(len(boxes)),
-        circles=jnp.array(circles, float).reshape(-1, 3),
-        circle_heights=jnp.ones(len(circles)),
-        extent=jnp.array(extent),
-        starts=jnp.zeros((1, 2)),
-        goals=jnp.zeros((1, 2)),
-    )
-
-
-FAR_BOX, FAR_CIRCLE = [1000.0, 1000.0, 0.0, 0.01, 0.01], [1000.0, 1000.0, 0.01]
-POST = world([FAR_BOX], [[2.0, 1.0, 0.3]])
-SLAT = world([[2.0, 1.0, 0.5, 0.8, 0.05]], [FAR_CIRCLE])
+POST, SLAT = world(circles=[[2.0, 1.0, 0.3]]), world([[2.0, 1.0, 0.5, 0.8, 0.05]])
 
 
 # ----------------------------------------------------------------------------------------------------------- the lag
@@ -214,5 +200,5 @@ def test_it_collides_exactly_when_a_disc_overlaps_a_solid(solids):
 
 def test_outside_the_walls_counts_as_a_collision():
     poses = jnp.array([[-4.99, 0.0, 0.0], [-5.01, 0.0, 0.0], [0.0, 4.99, 0.0], [0.0, 5.01, 0.0], [20.0, 0.0, 0.0]])
-    nothing = world([FAR_BOX], [FAR_CIRCLE])
+    nothing = world()
     np.testing.assert_array_equal(touches(Robot(), nothing, poses), [False, True, False, True, True])

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import rooms
 
 from cuelearner_envs.anymal.environment import LeggedNavigation
 from cuelearner_envs.navigation.config import NavigationConfig, make_environment
@@ -12,24 +13,15 @@ from cuelearner_envs.navigation.geometry import line_clearance
 from cuelearner_envs.navigation.layouts import BOXES, CIRCLES
 from cuelearner_envs.navigation.roadmap import RoadMapTeacher, SidedTeacher, make_sided_teacher
 from cuelearner_envs.navigation.sides import closed, heading, passed
-from cuelearner_envs.navigation.world import FAR_AWAY, World
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import episodes, rollout
 from cuelearner_jax.policies import Taught
 from cuelearner_jax.tasks.navigation import make_teacher
 
 # A corridor of 20 m by 4.6 m with a box in the middle, a circle at x = 5 and the walls of all worlds.
-WALLS = [[10.1, 0, 0, 0.1, 2.5], [-10.1, 0, 0, 0.1, 2.5], [0, 2.4, 0, 10.2, 0.1], [0, -2.4, 0, 10.2, 0.1]]
-FAR = [FAR_AWAY, FAR_AWAY]
-WORLD = World(
-    boxes=jnp.array([*WALLS, [0, 0.1, 0.3, 0.4, 0.3], *[[*FAR, 0, 0.01, 0.01]] * (BOXES - 5)], jnp.float32),
-    box_heights=jnp.ones(BOXES),
-    circles=jnp.array([[5.0, 0.0, 0.4], *[[*FAR, 0.01]] * (CIRCLES - 1)]),
-    circle_heights=jnp.ones(CIRCLES),
-    extent=jnp.array([20.0, 4.6]),
-    starts=jnp.tile(jnp.array([[-6.0, 0.0]]), (16, 1)),
-    goals=jnp.tile(jnp.array([[8.0, 0.0]]), (16, 1)),
-)
+BOX, CIRCLE, SIZE = [0, 0.1, 0.3, 0.4, 0.3], [5.0, 0.0, 0.4], (20.0, 4.6)
+STARTS, GOALS = [[-6.0, 0.0]] * 16, [[8.0, 0.0]] * 16
+WORLD = rooms.world([*rooms.walls(*SIZE), BOX], [CIRCLE], SIZE, STARTS, GOALS, rows=(BOXES, CIRCLES))
 passes = jax.jit(passed)
 
 STEPS = [  # ahead, before, after, (passed on the left, on the right)
