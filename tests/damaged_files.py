@@ -12,7 +12,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 import functools
-import hashlib
 import io
 import json
 import shutil
@@ -150,20 +149,9 @@ def _sign(name: str) -> Callable[[Path], None]:
     return lambda folder: probes.edit_json(folder / name, lambda values: None)
 
 
-def _sign_contract(folder: Path) -> None:
-    """Writes the digests of an export's files anew."""
-    path = folder / runner.CONTRACT
-    contract = json.loads(path.read_text())
-    contract.pop(runner.DIGEST, None)
-    if isinstance(files := contract.get("files"), dict):
-        there = {name: folder / name for name in files if "/" not in name and (folder / name).is_file()}
-        files |= {name: hashlib.sha256(path.read_bytes()).hexdigest() for name, path in there.items()}
-    path.write_text(json.dumps({**contract, runner.DIGEST: runner.digest(contract)}))
-
-
 KINDS = {
     "policy": Kind(_policy, _acts, _sign("policy.json")),
-    **{name: Kind(functools.partial(_exported, name), _decides, _sign_contract) for name in runner.RUNNERS},
+    **{name: Kind(functools.partial(_exported, name), _decides, probes.edit_contract) for name in runner.RUNNERS},
     "lines of labels": Kind(_labels, _labels_read),
     "table of labels": Kind(_labels_in_parquet, _labels_read),
     "teacher": Kind(_teacher, _teacher_read, _sign(teachers.ABOUT)),

@@ -4,6 +4,7 @@ In the manner of bsuite's and rejax's probes: each isolates one thing that a lea
 """
 
 import dataclasses
+import hashlib
 import json
 import math
 from dataclasses import dataclass
@@ -19,6 +20,7 @@ from cuelearner_jax import asking
 from cuelearner_jax.agents import ddqn
 from cuelearner_jax.config import Scalars, Schedule, Sizes, digest
 from cuelearner_jax.environment import Aims, Features, Quantity, WholeObservations
+from cuelearner_jax.export import runner
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.loop import make_program
 from cuelearner_jax.run_config import RunConfig
@@ -261,3 +263,14 @@ def edit_json(path, change):
     sealed = values.pop("digest", None) is not None
     change(values)
     path.write_text(json.dumps({**values, "digest": digest(values)} if sealed else values))
+
+
+def edit_contract(folder, change=lambda contract: None):
+    """Rewrites an export's contract by a function of its values, with the digests of the files as they are now."""
+    contract = json.loads((folder / runner.CONTRACT).read_text())
+    contract.pop(runner.DIGEST, None)
+    change(contract)
+    if isinstance(files := contract.get("files"), dict):
+        there = {name: folder / name for name in files if "/" not in name and (folder / name).is_file()}
+        files |= {name: hashlib.sha256(path.read_bytes()).hexdigest() for name, path in there.items()}
+    (folder / runner.CONTRACT).write_text(json.dumps({**contract, runner.DIGEST: runner.digest(contract)}))

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from cuelearner_jax.runs import sweep
+from cuelearner_jax.storage import results
 
 SMALL = [
     *("--agent.q-layers", "16", "--sizes.feedback-layers", "16", "--agent.directions", "36"),
@@ -17,6 +18,13 @@ SMALL = [
 ]
 SWEEP = ["sweep", "billiards", "--preset", "quickstart", *SMALL, "--seeds", "2", "--labels", "10", "20"]
 SWEEP += ["--guidance", "none", "relative"]
+
+
+def rows(*folders):
+    """What runs measured and learned, lane by lane and step by step."""
+    names = ("guidance", "labels", "seed", "step", "reward", "train_loss", "guide_reward")
+    found = [{name: row.get(name) for name in names} for row in results.read(folders).to_pylist()]
+    return sorted(found, key=lambda row: tuple(str(row[name]).zfill(6) for name in names[:4]))
 
 
 def listing(folder: Path) -> dict[str, tuple[int, int]]:

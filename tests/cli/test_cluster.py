@@ -8,12 +8,11 @@ import time
 from pathlib import Path
 
 import pytest
-from small_runs import SMALL
+from small_runs import SMALL, rows
 
 from cuelearner_jax.cli import main
 from cuelearner_jax.runs import cluster
 from cuelearner_jax.runs.shards import Shard
-from cuelearner_jax.storage import results
 
 ENTRY = [str(Path(sys.executable).with_name("cuelearner"))]
 SWEEP = ["sweep", "billiards", "--preset", "quickstart", *SMALL, "--schedule.total-steps", "800", "--guidance", "none"]
@@ -36,12 +35,6 @@ exec "$@"
 SCONTROL = """#!/bin/sh
 echo "$@" >> "$FAKE_SLURM/asked"
 """
-
-
-def rows(folder):
-    names = ("guidance", "labels", "seed", "step", "reward", "train_loss", "guide_reward")
-    found = [{name: row.get(name) for name in names} for row in results.read([folder]).to_pylist()]
-    return sorted(found, key=lambda row: (row["seed"], row["step"]))
 
 
 @pytest.fixture(scope="module")

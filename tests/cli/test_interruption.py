@@ -5,20 +5,14 @@ import time
 from pathlib import Path
 
 import pytest
-from small_runs import SMALL
+from small_runs import SMALL, rows
 
 from cuelearner_jax.cli import main
-from cuelearner_jax.storage import results
 
 ENTRY = [str(Path(sys.executable).with_name("cuelearner"))]
 STEPS = 1200
 LONG = [*SMALL, "--schedule.total-steps", str(STEPS), "--guidance", "none", "--seeds", "2"]
 COMMAND = ["sweep", "billiards", "--preset", "quickstart", *LONG]
-
-
-def rows(folder):
-    table = results.read(folder).to_pylist()
-    return [{name: row[name] for name in ("seed", "step", "labels", "reward", "scored", "train_loss")} for row in table]
 
 
 def start_and_wait_for(folder, step, *options):

@@ -10,22 +10,15 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from small_runs import SMALL
+from small_runs import SMALL, rows
 
 from cuelearner_jax.cli import main
 from cuelearner_jax.runs.shards import Shard
-from cuelearner_jax.storage import results
 
 ENTRY = [str(Path(sys.executable).with_name("cuelearner"))]
 SWEEP = ["sweep", "billiards", "--preset", "quickstart", *SMALL, "--seeds", "3", "--first-seed", "7"]
 SWEEP += ["--guidance", "none"]
 TESTS = Path(__file__).parents[1]
-
-
-def rows(*folders):
-    names = ("guidance", "labels", "seed", "step", "reward", "train_loss", "guide_reward")
-    found = [{name: row.get(name) for name in names} for row in results.read(folders).to_pylist()]
-    return sorted(found, key=lambda row: tuple(str(row[name]).zfill(6) for name in names[:4]))
 
 
 @pytest.fixture(scope="module")

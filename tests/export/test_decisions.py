@@ -15,7 +15,7 @@ import json_ways
 import numpy as np
 import onnxruntime
 import pytest
-from probes import AGENT, SCALARS, SIZES, Aimed, Expert, Window, WindowConfig, long_but, make_task
+from probes import AGENT, SCALARS, SIZES, Aimed, Expert, Window, WindowConfig, edit_contract, long_but, make_task
 
 import cuelearner_jax as cl
 from cuelearner_jax.api.acting import CallablePolicy
@@ -140,15 +140,6 @@ def copied(folder, tmp_path):
     return shutil.copytree(folder, tmp_path / "copy", ignore=shutil.ignore_patterns("__pycache__"))
 
 
-def sealed(folder, change):
-    """The contract changed by somebody who writes the digests anew."""
-    told = json.loads((folder / runner.CONTRACT).read_text())
-    told.pop(runner.DIGEST)
-    change(told)
-    told["files"] = {name: hashlib.sha256((folder / name).read_bytes()).hexdigest() for name in told["files"]}
-    (folder / runner.CONTRACT).write_text(json.dumps({**told, runner.DIGEST: runner.digest(told)}))
-
-
 def test_a_folder_that_is_damaged_or_changed_is_refused(folder, tmp_path):
     there = copied(folder / "numpy", tmp_path)
     for name in ("decision.npz", "golden.npz", "decide.py", runner.CONTRACT):
@@ -209,7 +200,7 @@ def test_an_artefact_is_a_file_that_the_contract_lists(folder, tmp_path, name):
         for other in ("decision.npz", "other.npz"):
             if not (place / other).exists():
                 shutil.copy(folder / "numpy" / "decision.npz", place / other)
-    sealed(there, lambda told: told["artefact"].update(file=name))
+    edit_contract(there, lambda told: told["artefact"].update(file=name))
     with pytest.raises(UserError, match="makes no sense"):
         contract.checked(there)
 
@@ -227,7 +218,7 @@ def test_golden_cases_and_graphs_that_make_no_sense_are_refused_in_one_line(fold
         {"obs": obs.astype(object), "actions": actions},
     ):
         np.savez(there / runner.GOLDEN, **spoiled)
-        sealed(there, lambda told: None)
+        edit_contract(there)
         with pytest.raises(UserError, match="makes no sense"):
             contract.checked(there)
     np.savez(there / runner.GOLDEN, obs=obs, actions=actions)
@@ -242,7 +233,7 @@ def test_golden_cases_and_graphs_that_make_no_sense_are_refused_in_one_line(fold
     ):
         change()
         np.savez(there / "decision.npz", **{**arrays, "graph": np.frombuffer(json.dumps(graph).encode(), np.uint8)})
-        sealed(there, lambda told: None)
+        edit_contract(there)
         with pytest.raises(UserError, match=r"makes no sense|golden cases differ|no finite numbers"):
             contract.checked(there)
 
@@ -262,7 +253,7 @@ def test_a_compiled_decision_that_calls_back_into_python_is_refused(folder, tmp_
     )  # as a name of what is called stands there
     changed = dataclasses.replace(exported, mlir_module_serialized=called)
     (there / "decision.stablehlo").write_bytes(changed.serialize())
-    sealed(there, lambda told: None)
+    edit_contract(there)
     with pytest.raises(UserError, match="calls Python functions"):
         contract.checked(there)
 
@@ -290,7 +281,7 @@ def test_a_decision_that_is_another_one_is_found_by_its_golden_cases(folder, tmp
         obs, actions = golden["obs"], golden["actions"]
     actions[5] = -actions[5]
     np.savez(there / runner.GOLDEN, obs=obs, actions=actions)
-    sealed(there, lambda told: None)
+    edit_contract(there)
     with pytest.raises(UserError, match="golden cases differ by"):
         contract.checked(there)
 
@@ -298,11 +289,11 @@ def test_a_decision_that_is_another_one_is_found_by_its_golden_cases(folder, tmp
 def test_what_this_program_cannot_run_is_told_in_one_line(folder, tmp_path):
     there = copied(folder / "stablehlo", tmp_path)
     (there / "decision.stablehlo").write_bytes((there / "decision.stablehlo").read_bytes()[:3000])
-    sealed(there, lambda told: told["artefact"].update(jax="0.99.1"))
+    edit_contract(there, lambda told: told["artefact"].update(jax="0.99.1"))
     with pytest.raises(UserError, match=r"exported with JAX 0\.99\.1, and JAX .* cannot call it") as refused:
         contract.checked(there)
     assert "\n" not in str(refused.value)
-    sealed(there, lambda told: told.update(version=runner.VERSION + 1))
+    edit_contract(there, lambda told: told.update(version=runner.VERSION + 1))
     with pytest.raises(UserError, match="newer cuelearner"):
         contract.checked(there)
 
@@ -421,7 +412,7 @@ def test_what_declares_more_than_a_decision_has_is_refused_before_it_is_unpacked
     there = copied(folder / "numpy", tmp_path)
     monkeypatch.setattr(runner, "LARGEST_FILE", 200_000)  # bytes, unpacked
     np.savez_compressed(there / "golden.npz", obs=np.zeros((50_000, 2)), actions=np.zeros((1, 2)))
-    sealed(there, lambda told: None)
+    edit_contract(there)
     monkeypatch.setattr(runner, "RUNNERS", dict.fromkeys(runner.RUNNERS, lambda *_: lambda batch: batch))
     monkeypatch.setattr(np, "load", None)
     with pytest.raises(UserError, match=r"golden.npz declares more than 200,000 bytes"):

@@ -10,9 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
-from PIL import Image, ImageSequence
+from pictures import film, is_colour
 
 from cuelearner_envs.billiards import Table, drawing, trace
 
@@ -45,10 +44,6 @@ def drawn(draw):
     return axes, image, pixel
 
 
-def is_colour(found, name, tolerance=0.02):
-    return np.abs(np.asarray(found) - to_rgb(name)).max() < tolerance
-
-
 def test_balls_lie_where_they_are_and_a_pocketed_one_not_on_the_cloth():
     off = 0.6 * 0.02  # beside the number, inside the ball
     positions = np.array([[-0.2, 0.0], [0.2, 0.1]])
@@ -62,7 +57,7 @@ def test_balls_lie_where_they_are_and_a_pocketed_one_not_on_the_cloth():
 
     axes, image, pixel = drawn(lambda axes: drawing.draw_table(axes, TABLE, positions, np.array([False, True])))
     assert is_colour(pixel(0.2, 0.1 + off), drawing.CLOTH)
-    rows, _ = np.nonzero(np.abs(image - to_rgb(drawing.TARGETS[0])).max(axis=-1) < 0.02)
+    rows, _ = np.nonzero(is_colour(image, drawing.TARGETS[0]))
     edge = image.shape[0] - axes.transData.transform((0, -0.2))[1]
     assert len(rows) > 50
     assert rows.min() > edge  # all of the ball is below the table
@@ -121,17 +116,7 @@ def test_still_is_a_picture_and_repeats(shot, tmp_path, suffix):
     image = imageio.imread(files[0])[..., :3] / 255
     assert image.shape[1] == 1280
     for name, least in ((drawing.CLOTH, 0.3), (drawing.ARROW, 1e-4), (drawing.TARGETS[0], 1e-3)):
-        assert np.mean(np.abs(image - to_rgb(name)).max(axis=-1) < 0.02) > least
-
-
-def film(file):
-    """Pictures of a GIF and how long each stands [s]."""
-    with Image.open(file) as image:
-        pictures, durations = [], []
-        for frame in ImageSequence.Iterator(image):
-            pictures.append(np.asarray(frame.convert("RGB")) / 255)
-            durations.append(frame.info["duration"] / 1000)
-    return pictures, np.array(durations)
+        assert is_colour(image, name).mean() > least
 
 
 def test_gif_has_the_frames_of_the_shot_and_lasts_as_long(shot, tmp_path):
@@ -147,7 +132,7 @@ def test_gif_has_the_frames_of_the_shot_and_lasts_as_long(shot, tmp_path):
         assert durations[0] == pytest.approx(drawing.HOLD_BEFORE, abs=1.1 * FRAME)
 
     def share(picture, name):
-        return np.mean(np.abs(picture - to_rgb(name)).max(axis=-1) < 0.06)
+        return is_colour(picture, name, 0.06).mean()
 
     assert share(pictures[0], drawing.ARROW) > 1e-4  # before the shot only
     assert share(pictures[-1], drawing.ARROW) < 2e-5

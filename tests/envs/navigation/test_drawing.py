@@ -14,7 +14,7 @@ import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
-from PIL import Image, ImageSequence
+from pictures import film, is_colour
 from rooms import room
 
 from cuelearner_envs.navigation import drawing, scan
@@ -42,10 +42,6 @@ ENVIRONMENTS = {
 def records():
     """Frames and rewards of walking straight to the goal, by how the episodes end."""
     return {name: record(env, Heuristic(env), jax.random.key(1), STEPS) for name, env in ENVIRONMENTS.items()}
-
-
-def is_colour(found, name, tolerance=0.02):
-    return np.abs(np.asarray(found) - to_rgb(name)).max(axis=-1) < tolerance
 
 
 def looker(image, strip):
@@ -241,16 +237,6 @@ def test_overview_has_a_panel_of_each_world(tmp_path):
 
 
 # --- films -----------------------------------------------------------------------------------------------------------
-
-
-def film(file):
-    """Pictures of a GIF and how long each stands [s]."""
-    with Image.open(file) as image:
-        pictures, durations = [], []
-        for frame in ImageSequence.Iterator(image):
-            pictures.append(np.asarray(frame.convert("RGB")) / 255)
-            durations.append(frame.info["duration"] / 1000)
-    return pictures, np.array(durations)
 
 
 def test_gif_shows_each_step_and_then_the_end(records, tmp_path):
