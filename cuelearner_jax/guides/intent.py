@@ -6,8 +6,7 @@ the likelihood of the teacher's words, summed over what may have been meant. (In
 says: Baker, Saxe, Tenenbaum, "Action understanding as inverse planning", Cognition 2009.) A pass of refinement goes by
 at most eps toward the likeliest aim and ends there, so precision is the aim's and not the label's. Where the teacher
 seems to mean none of them (`aim_doubt`), actions stay as they are: the same bad shot again and again is worse than the
-agent's own. With `aim_share` below 1 the nearest of the aims about as likely is taken, which earned more by itself on
-the regulation table, and less on the easy one; agents did not learn faster from it (docs/results/bootstrapping.md).
+agent's own.
 """
 
 from __future__ import annotations
