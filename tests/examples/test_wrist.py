@@ -15,7 +15,7 @@ from cuelearner_jax.export import runner
 from cuelearner_jax.feedback.answers import RELATIVE
 from cuelearner_jax.labelling import controls
 from cuelearner_jax.spaces import from_json
-from cuelearner_jax.storage import guides
+from cuelearner_jax.storage import results
 from cuelearner_jax.tasks import registry
 from cuelearner_jax.testing import check_environment, check_space, check_task
 from examples.wrist import TASK, WRIST, LidConfig, Lids
@@ -62,7 +62,7 @@ def run(tmp_path_factory):
 
 
 def test_labels_lead_a_wrist_and_a_gripper_to_lids(run):
-    measured = guides.read_guides([run], None)
+    measured = results.read_guides([run])
     assert measured is not None
     assert measured["guide_turned"].to_pylist()[-1] > 0.5  # by chance 0.02
 

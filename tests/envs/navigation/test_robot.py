@@ -200,5 +200,5 @@ def test_it_collides_exactly_when_a_disc_overlaps_a_solid(solids):
 
 def test_outside_the_walls_counts_as_a_collision():
     poses = jnp.array([[-4.99, 0.0, 0.0], [-5.01, 0.0, 0.0], [0.0, 4.99, 0.0], [0.0, 5.01, 0.0], [20.0, 0.0, 0.0]])
-    nothing = world()
+    nothing = world(extent=(10.0, 10.0))
     np.testing.assert_array_equal(touches(Robot(), nothing, poses), [False, True, False, True, True])
