@@ -39,6 +39,7 @@ SURE = 5.0  # what the evidence of all must exceed, against no change [nats]
 SPREADS = 1.0  # standard errors by which held-out answers must be predicted better
 LARGEST = 3  # changes at once
 SETTLED, SETTLING = 10.0, 6  # samples that must count in the end, for each unknown and one; rounds for these at most
+MOSTLY = 0.75  # share of answers about something else, above which the policy does not explain them
 APART = 2.5  # [eps]: a policy from which teachers differ by more, as a rule, is not explained
 
 CHANGED, UNCHANGED, UNEXPLAINED = "changed", "nothing changed", "none of these"
@@ -226,7 +227,7 @@ class Calibration:
             self.chosen, best, after = (), none, before
         rho, width = (best.nuisance @ GRID)[:2]
         corrected = [one.name for one in best.family if not one.of_teacher]
-        unexplained = not best.family and (rho > 0.5 or width > APART)
+        unexplained = not best.family and (rho > MOSTLY or width > APART)
         verdict = CHANGED if corrected else (UNEXPLAINED if unexplained else UNCHANGED)
         evidence = {names: fit.evidence - none.evidence for names, fit in self.fits.items()}
         apart = float(self.space.to_unit(width * self.eps * np.log(3), np))
