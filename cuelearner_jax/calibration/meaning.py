@@ -38,8 +38,12 @@ class Meaning:
         """Return what the policy does in each situation, seen as it was before the changes of each theta."""
         number, count = len(thetas), len(obs)
         theta, rows = np.repeat(thetas, count, 0), np.tile(obs, (number, 1))
-        portion = ROWS_CPU if jax.default_backend() == "cpu" else ROWS
-        found = in_portions(partial(_meant, family, self.policy), portion, theta, rows)
+        if is_python(self.policy):
+            before = in_portions(partial(_seen, family), CHEAP, theta, rows)
+            found = np.asarray(self.policy.act(jax.random.key(0), None, jnp.asarray(before)))
+        else:
+            portion = ROWS_CPU if jax.default_backend() == "cpu" else ROWS
+            found = in_portions(partial(_meant, family, self.policy), portion, theta, rows)
         user_code.check_actions(found, named(self.policy))
         return found.reshape(number, count, self.space.size)
 
@@ -65,6 +69,13 @@ class Meaning:
         return in_portions(partial(_right, family), CHEAP, theta, rows).reshape(meant.shape)
 
 
+def is_python(policy: Any) -> bool:
+    """Return whether plain Python acts. It may compute with JAX itself, and would wait for itself if compiled in."""
+    while (base := getattr(policy, "base", None)) is not None:
+        policy = base
+    return bool(getattr(policy, "on_host", False))
+
+
 def in_portions(program: Callable[..., Any], portion: int, *rows: Floats) -> Floats:
     """Return a program's rows of any number of rows; each call sees as many, so that it is compiled once."""
     count = len(rows[0])
@@ -79,8 +90,12 @@ def in_portions(program: Callable[..., Any], portion: int, *rows: Floats) -> Flo
 
 @partial(jax.jit, static_argnums=0)
 def _meant(family: Family, policy: Any, theta: Any, obs: Any) -> Any:
-    obs = jax.vmap(partial(seen, family))(theta, obs) if family else obs
-    return policy.act(jax.random.key(0), None, obs)
+    return policy.act(jax.random.key(0), None, _seen(family, theta, obs))
+
+
+@partial(jax.jit, static_argnums=0)
+def _seen(family: Family, theta: Any, obs: Any) -> Any:
+    return jax.vmap(partial(seen, family))(theta, obs) if family else obs
 
 
 @partial(jax.jit, static_argnums=0)

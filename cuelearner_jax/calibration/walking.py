@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from cuelearner_jax.calibration.meaning import is_python
 from cuelearner_jax.config import Scalars
 from cuelearner_jax.devices import portions
 from cuelearner_jax.environment import Environment
@@ -36,7 +37,7 @@ class Walk:
         k_start, *keys = jax.random.split(key, 1 + (BETWEEN if self.states is not None else BEFORE))
         if self.states is None or len(self.obs) != count:
             self.states, self.obs = _start(self.env, jax.random.split(k_start, count))
-        act = jax.jit(policy.act)
+        act = policy.act if is_python(policy) else jax.jit(policy.act)
         for k_step in keys:
             k_act, k_env = jax.random.split(k_step)
             action = act(k_act, self.states, self.obs)
