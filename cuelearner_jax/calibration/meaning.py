@@ -17,7 +17,7 @@ from cuelearner_jax.policies import named
 from cuelearner_jax.spaces import Space
 
 Floats = np.ndarray
-ROWS_CPU, ROWS = 64, 2048  # observations that a policy sees at once
+ROWS_CPU, ROWS_PYTHON, ROWS = 64, 512, 2048  # observations that a policy sees at once
 CHEAP = 4096  # rows of what is computed without the policy
 
 
@@ -40,7 +40,8 @@ class Meaning:
         theta, rows = np.repeat(thetas, count, 0), np.tile(obs, (number, 1))
         if is_python(self.policy):
             before = in_portions(partial(_seen, family), CHEAP, theta, rows)
-            found = np.asarray(self.policy.act(jax.random.key(0), None, jnp.asarray(before)))
+            act = partial(self.policy.act, jax.random.key(0), None)
+            found = in_portions(lambda seen: act(jnp.asarray(seen)), ROWS_PYTHON, before)
         else:
             portion = ROWS_CPU if jax.default_backend() == "cpu" else ROWS
             found = in_portions(partial(_meant, family, self.policy), portion, theta, rows)
