@@ -75,6 +75,8 @@ def test_training_is_compiled_once():
     group = group_of(1)
     clock = place(group.mesh, start_clock(), SHARED)
     (state,) = group.start()
-    for _ in range(2):
+    compiled = []
+    for _ in range(2):  # other tests may have compiled the same program for more lanes
         clock, state, _ = group.program.train(Window(), CONFIG.settings, clock, state, 4)
-    assert compilations(group.program.train) == [1]
+        compiled.append(compilations(group.program.train))
+    assert compiled[0] == compiled[1]
