@@ -46,8 +46,8 @@ quickstart: $(VENV)/.installed
 smoke: $(VENV)/.installed
 	$(BIN)/python experiments/billiards_bootstrapping.py --scale smoke --pieces easy/frame --resume
 	$(BIN)/python experiments/navigation_bootstrapping.py --scale smoke --pieces clutter/frame --resume
-	$(BIN)/python experiments/adaptation_billiards.py --scale smoke --pieces unchanged tilted_table --resume
-	$(BIN)/python experiments/adaptation_navigation.py --scale smoke --pieces unchanged turned_lidar corridor_left --resume
+	$(BIN)/python experiments/adaptation_billiards.py --scale smoke --pieces unchanged/none tilted_table --resume
+	$(BIN)/python experiments/adaptation_navigation.py --scale smoke --pieces unchanged/none turned_lidar corridor_left --resume
 
 test: $(VENV)/.tested
 	$(PYTEST) -m "not long"

@@ -14,14 +14,17 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import _coach as coach
 import _residual as residual
 import _trajectories as trajectories
+import jax.numpy as jnp
 import numpy as np
 from _finetuning import FineTuning, every
 from _pieces import chosen, listed
 
 from cuelearner_jax.adaptation import adapting
-from cuelearner_jax.adaptation.judging import Judging
+from cuelearner_jax.adaptation.adapting import Adapted
+from cuelearner_jax.adaptation.judging import Judging, judged_by_labels
 from cuelearner_jax.adaptation.lanes import Adaptation, product, side_by_side
 from cuelearner_jax.cli import main as cuelearner
 from cuelearner_jax.config import GuideSizes
@@ -42,11 +45,11 @@ SCHEMA = tables.Schema(
     mark="base",
     required=("task", "world", "method", "variant", "split", "base", "labels", "steps"),
     strings=("task", "world", "method", "variant", "split", "commit", "versions", "hardware", "command"),
-    integers=("base", "labels", "steps"),
+    integers=("base", "label_seed", "labels", "steps"),
     remedy="is damaged: delete its folder and run the piece again",
 )
+UNREWARDED = "unrewarded_"  # columns of the same models where held-out answers judge, in place of episodes
 UNCHANGED = "unchanged"  # the world that the base agents were trained in
-SEED = 0  # of labels, fits and fine-tuning; the base agents have seeds of their own
 JUDGED = 500  # environments at most in which it is decided whether a model is used
 Row = dict[str, Any]
 
@@ -80,8 +83,10 @@ class Piece(NamedTuple):
     steps: int = 0  # of fine-tuning
     every: int = 0  # of them between two measurements
     split: str = "validation"  # of the episodes; settings are chosen on "tuning"
-    bases: int | None = None  # at most so many
-    judge_by: str = "reward"  # a model that is worse by this on tuning episodes is not used
+    seeds: int = 1  # of labels, fits and fine-tuning, for each base agent
+    judge_by: str = (
+        "reward"  # a model that is worse by this on tuning episodes is not used; "labels": no reward is seen
+    )
     judge_bounds: tuple[float, ...] = ()  # shares of the bound within which the model is tried too
     robot: str | None = None  # what acts there, where that is changed
     ways: bool = False  # keep some ways that are walked before and after, for a picture?
@@ -104,7 +109,7 @@ class Piece(NamedTuple):
     @property
     def lanes(self) -> int:
         """For each base agent."""
-        return max(1, len(self.labels)) * max(1, len(self.rates)) * max(1, len(self.noises_deg))
+        return self.seeds * max(1, len(self.labels)) * max(1, len(self.rates)) * max(1, len(self.noises_deg))
 
 
 class Scale(NamedTuple):
@@ -113,7 +118,8 @@ class Scale(NamedTuple):
     about: str
     envs: int  # of an evaluation
     steps: int  # of each of them
-    bases: int | None = None
+    tuning_bases: int = 4  # the first of the run; settings are chosen on them, and the others are reported
+    seeds: int | None = None  # of labels, at most so many
     labels: Mapping[int, int] | None = None  # budgets that are kept, and what they become
     settings: Mapping[str, Any] = {}
     tuned_steps: tuple[int, int] | None = None  # steps of fine-tuning, and between two measurements
@@ -194,7 +200,7 @@ def by_labels(kind: Any, bench: Bench) -> Iterator[Row]:
     scalars = bench.scalars()
     options = bench.set(f"{kind.name}.", kind.config()) if kind.config else None
     guidance = kind.make(sizes, spaces_of(env), options)
-    lanes = product(len(bench.seeds), (SEED,), piece.labels, (piece.bound_deg,))
+    lanes = product(len(bench.seeds), range(piece.seeds), piece.labels, (piece.bound_deg,))
     envs = min(bench.envs, JUDGED)
     judge = Judging(bench.env("tuning"), envs, envs * bench.steps, piece.judge_by, bounds=piece.judge_bounds)
     of = Adaptation(guidance, sizes, scalars, env, bench.agents)
@@ -204,15 +210,30 @@ def by_labels(kind: Any, bench: Bench) -> Iterator[Row]:
         "within_deg": found.judged.within_deg,
         "judged_before": found.judged.before,
         "judged_after": found.judged.after,
+        "rewarded_steps": found.judged.rewarded_steps.astype(float),
         "eps_deg": scalars.eps_deg,
     }
     shown = bench.env(piece.split)
     metrics = bench.measured(found.policy(shown))
+    if guidance.form is not None and guidance.form.by_eps:
+        told |= {f"{UNREWARDED}{name}": values for name, values in unrewarded(bench, found).items()}
     if piece.ways:
-        last = len(bench.seeds) * (len(piece.labels) - 1)  # the first base with the largest budget
+        last = len(bench.seeds) * piece.seeds * (len(piece.labels) - 1)  # the first base with the largest budget
         policies = {"before": bench.agents.lane(0), "after": found.policy(shown).lane(last)}
         trajectories.write(bench.folder, shown, policies, piece.split, bench.steps)
-    yield {"base": bench.seeds[lanes.base], "labels": lanes.budget, "steps": 0, **told, **metrics}
+    which = {"base": bench.seeds[lanes.base], "label_seed": lanes.seed, "labels": lanes.budget}
+    yield {**which, "steps": 0, **told, **metrics}
+
+
+def unrewarded(bench: Bench, found: Adapted) -> Row:
+    """Whether models are used where their held-out answers judge, and metrics (lanes,) of these policies."""
+    judged = judged_by_labels(found.of, found.block)
+    model = found.block.guide.model
+    guide = found.block.guide.replace(model=model.replace(fitted=jnp.asarray(judged.used)))
+    bound = actions_of(found.of.env).from_unit(jnp.asarray(found.lanes.bound_deg))  # episodes may have narrowed it
+    block = found.block.replace(guide=guide, bound=bound)
+    policy = found.of.policy(block, bench.env(bench.piece.split))
+    return {"used": judged.used.astype(float), **bench.measured(policy)}
 
 
 def by_residuals(bench: Bench) -> Iterator[Row]:
@@ -234,10 +255,11 @@ def fine_tuned(bench: Bench) -> Iterator[Row]:
         scalars=bench.set("scalars.", bench.config.scalars),
         schedule=bench.set("schedule.", dataclasses.replace(bench.config.schedule, learn_after=1_000)),
     )
-    lanes = every(len(bench.seeds), (SEED,), piece.rates, piece.noises_deg)
+    lanes = every(len(bench.seeds), range(piece.seeds), piece.rates, piece.noises_deg)
     tuning = FineTuning(own, env, bench.agents, lanes)
     shown = bench.env(piece.split)
-    settings = {"learning_rate": lanes.learning_rate, "noise_deg": lanes.noise_deg, "base": bench.seeds[lanes.base]}
+    settings = {"learning_rate": lanes.learning_rate, "noise_deg": lanes.noise_deg}
+    settings |= {"base": bench.seeds[lanes.base], "label_seed": lanes.seed}
     while True:
         failed = tuning.failed.astype(float)
         metrics = bench.measured(tuning.policy(shown))
@@ -251,12 +273,17 @@ def _kind(name: str) -> Callable[[Bench], Iterator[Row]]:
     return lambda bench: by_labels(guidances.find(bench.piece.settings.get("guidance", name)), bench)
 
 
+def coached(bench: Bench) -> Iterator[Row]:
+    """Deep COACH of a correction that begins at nothing."""
+    yield from by_labels(coach.KIND, bench)
+
+
 METHODS: dict[str, Callable[[Bench], Iterator[Row]]] = {
     "none": measured_as_they_are,
     "teacher": corrected,
     "relative": _kind("relative"),
     "intent": _kind("intent"),
-    "dcoach": _kind("dcoach"),
+    "dcoach": coached,
     "residual": by_residuals,
     "finetuning": fine_tuned,
 }
@@ -270,9 +297,23 @@ def scaled(piece: Piece, scale: Scale) -> Piece | None:
         if not labels:
             return None
     steps, between = scale.tuned_steps if scale.tuned_steps and piece.steps else (piece.steps, piece.every)
-    few = [count for count in (piece.bases, scale.bases) if count]
-    settings = {**piece.settings, **scale.settings}
-    return piece._replace(labels=labels, steps=steps, every=between, settings=settings, bases=min(few) if few else None)
+    settings, seeds = {**piece.settings, **scale.settings}, min(piece.seeds, scale.seeds or piece.seeds)
+    return piece._replace(labels=labels, steps=steps, every=between, settings=settings, seeds=seeds)
+
+
+def bases_of(piece: Piece, scale: Scale, seeds: tuple[int, ...]) -> tuple[int, ...]:
+    """The base agents of a piece: settings are chosen on others than those that are reported.
+
+    Raises UserError where none is left.
+    """
+    if piece.split == "tuning" and piece.world == UNCHANGED:  # which are finished is asked of all
+        return seeds
+    if len(seeds) <= scale.tuning_bases:
+        raise UserError(
+            f"the run has {len(seeds)} agents, and settings are chosen on the first {scale.tuning_bases}: "
+            "give --bases a run of more"
+        )
+    return seeds[: scale.tuning_bases] if piece.split == "tuning" else seeds[scale.tuning_bases :]
 
 
 def opened(folder: Path, study: Study, piece: Piece, scale: Scale, out: Path) -> Bench:
@@ -287,7 +328,8 @@ def opened(folder: Path, study: Study, piece: Piece, scale: Scale, out: Path) ->
     own = {name.partition(".")[2]: value for name, value in piece.settings.items() if name.startswith("task.")}
     world = dataclasses.replace(world, **own)
     env = environment(source.task.name, world, "training", piece.robot)
-    policies, seeds = several(source, world, "agent", None, None, source.grid.seeds[: piece.bases], env=env)
+    chosen_seeds = bases_of(piece, scale, source.grid.seeds)
+    policies, seeds = several(source, world, "agent", None, None, chosen_seeds, env=env)
     agents = side_by_side(policies)
     if scale.directions:
         agents = agents.replace(

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from _adaptation import JUDGED, SCHEMA, UNCHANGED, Study
+from _adaptation import JUDGED, SCHEMA, UNCHANGED, UNREWARDED, Study
 
-from cuelearner_jax.report.statistics import interquartile_mean, interval
+from cuelearner_jax.report.statistics import drawn, interquartile_mean, interval_of_groups
 from cuelearner_jax.storage import table as tables
 
 NAMES = {
@@ -22,8 +22,8 @@ NAMES = {
     "dcoach": "deep COACH",
     "finetuning": "RL fine-tuning",
 }
+BY_LABELS = "judged by labels"  # a variant: held-out answers say whether a model is used
 GAIN = 0.95  # of a gain, after how many labels it is asked for
-DRAWS = 2_000
 Row = dict[str, Any]
 
 
@@ -39,7 +39,7 @@ class Line(NamedTuple):
     variant: str
     after: int  # labels, or steps of fine-tuning
     bases: np.ndarray  # (bases,), ascending
-    columns: dict[str, np.ndarray]  # metrics (bases,)
+    columns: dict[str, np.ndarray]  # metrics (bases, label seeds)
     path: str  # of the piece, in its study
     command: str  # that ran it
 
@@ -71,23 +71,29 @@ def lines(rows: Sequence[Row], world: str, split: str = "validation", least: flo
             found.setdefault((row["method"], row["variant"], row["labels"] or row["steps"], settings), []).append(row)
     result = []
     for (method, variant, after, settings), several in found.items():
-        own = sorted(several, key=lambda row: row["base"])
+        own = sorted(several, key=lambda row: (row["base"], row.get("label_seed") or 0))
+        bases = np.unique([row["base"] for row in own])
         numbers = [name for name, value in own[0].items() if isinstance(value, float)]
         columns = {name: np.array([np.nan if row[name] is None else row[name] for row in own]) for name in numbers}
-        told = ", ".join([variant] * bool(variant) + [f"{value:g}" for value in settings if value is not None])
+        columns = {name: values.reshape(len(bases), -1) for name, values in columns.items()}
+        told = [variant] * bool(variant) + [f"{value:g}" for value in settings if value is not None]
         path = f"{world}/{method}-{variant}" if variant else f"{world}/{method}"
-        bases, command = np.array([row["base"] for row in own]), own[0].get("command") or ""
-        result.append(Line(method, told, after, bases, columns, path, command))
+        command = own[0].get("command") or ""
+        apart = {name.removeprefix(UNREWARDED): columns.pop(name) for name in numbers if name.startswith(UNREWARDED)}
+        result.append(Line(method, ", ".join(told), after, bases, columns, path, command))
+        if apart:
+            result.append(Line(method, ", ".join([*told, BY_LABELS]), after, bases, apart, path, command))
     order = list(NAMES)
     return sorted(result, key=lambda line: (order.index(line.method), line.variant, line.after))
 
 
 def spread(values: np.ndarray, digits: int = 3) -> str:
-    """The interquartile mean over bases with its interval."""
-    own = values[np.isfinite(values)]
+    """The interquartile mean over bases with its interval; `values` (bases, label seeds), or (bases,)."""
+    values = values.reshape(len(values), -1)
+    own = values[np.isfinite(values).all(-1)]
     if not len(own):
         return "none"
-    found = interval(own)
+    found = interval_of_groups(own)
     estimate = f"{float(found.estimate):.{digits}f}"
     if len(own) == 1:
         return estimate
@@ -107,7 +113,7 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 def matched(line: Line, other: Line, name: str) -> tuple[np.ndarray, np.ndarray]:
     """A metric of two lines over the bases that both have."""
     _, mine, its = np.intersect1d(line.bases, other.bases, return_indices=True)
-    return line.columns[name][mine], other.columns[name][its]
+    return line.columns[name][mine], other.columns[name][its]  # of each (bases, label seeds)
 
 
 def tuned(rows: Sequence[Row], world: str) -> set[int]:
@@ -129,17 +135,21 @@ def rewarded_steps(line: Line, start: Line, study: Study) -> int | None:
 
     Of fine-tuning those it learned from. Of a model of labels those by which its use was decided, on tuning episodes:
     of the base and of the model within each bound that was tried. Where an outcome decided, an episode counts until its
-    end, which is taken from the validation episodes.
+    end. Rows that do not tell it are counted here, with episodes as long as those of validation.
     """
     if line.method == "finetuning":
         return line.after
+    if line.variant.endswith(BY_LABELS):
+        return 0
+    if "rewarded_steps" in line.columns:
+        return round(int(line.columns["rewarded_steps"].mean()), -3)
     if "used" not in line.columns or not line.command:
         return None
     words = [*line.command.split(), ""]
     known = dict(itertools.pairwise(words))
     scale = study.scales[known.get("--scale", "paper")]
     episodes = min(int(known.get("--envs", scale.envs)), JUDGED)
-    tried = 1 + next(len(piece.judge_bounds) for piece in study.pieces if piece.path == line.path)
+    tried = 1 + next((len(piece.judge_bounds) for piece in study.pieces if piece.path == line.path), 0)
     if "duration" not in line.columns:
         return episodes * scale.steps * (1 + tried)
     lengths = [float(np.mean(of.columns["duration"])) / PERIOD_S for of in (start, line)]
@@ -150,11 +160,11 @@ def recovered(now: np.ndarray, before: np.ndarray, whole: np.ndarray) -> str:
     """The share of a loss that has come back, in percent: a ratio of interquartile means over the same agents.
 
     Args:
-        now, before, whole: (bases,) after, not adapted, and what could come back.
+        now, before, whole: (bases, label seeds or 1) after, not adapted, and what could come back.
     """
-    draws = np.random.default_rng(0).integers(0, len(now), (DRAWS, len(now)))
-    draws = np.concatenate([np.arange(len(now))[None], draws])
-    after, start, most = (interquartile_mean(values[draws], axis=1) for values in (now, before, whole))
+    draws = drawn(*now.shape)
+    several = (np.broadcast_to(values, now.shape) for values in (now, before, whole))
+    after, start, most = (interquartile_mean(values[draws].mean(-1), axis=1) for values in several)
     lost = most - start
     if lost[0] <= 0:
         return ""
@@ -190,15 +200,15 @@ def reached(curves: np.ndarray, after: Sequence[int], reference: np.ndarray, own
     """When a method's curve has made `GAIN` of a gain.
 
     Args:
-        curves: (bases, points) of the method, the first at 0 labels or steps.
+        curves: (bases, label seeds, points) of the method, the first at 0 labels or steps.
         after: labels or steps of the points.
-        reference: (bases, 2): another method's first and last point; its gain is meant unless the `own` one is.
+        reference: (bases, label seeds, 2): another method's first and last point; its gain is meant unless the `own`
+            one is.
         own: is the method's own gain meant?
     """
-    random = np.random.default_rng(0)
-    draws = np.concatenate([np.arange(len(curves))[None], random.integers(0, len(curves), (DRAWS, len(curves)))])
-    means = interquartile_mean(curves[draws], axis=1)
-    gains = means[:, [0, -1]] if own else interquartile_mean(reference[draws], axis=1)
+    means = interquartile_mean(curves[drawn(*curves.shape[:2])].mean(2), axis=1)
+    others = interquartile_mean(reference[drawn(*reference.shape[:2])].mean(2), axis=1)
+    gains = means[:, [0, -1]] if own else others
     found = [
         _crossing(curve, after, first + GAIN * (last - first)) if last > first else np.inf
         for curve, (first, last) in zip(means, gains, strict=True)

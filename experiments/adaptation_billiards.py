@@ -19,8 +19,10 @@ from _pieces import option
 from billiards_bootstrapping import SCALES as TRAINING
 
 BOUNDS_DEG = {"turned_strike": 1.0, "shifted_balls": 0.3, "tilted_table": 0.3}
-BUDGETS = (25, 50, 100, 250, 500)
-TUNED, TUNING_BASES = (250,), 4
+PLAYED = {UNCHANGED: 1.0, **BOUNDS_DEG}
+BUDGETS = (50, 100, 250)
+LABEL_SEEDS = 4
+TUNED = (250,)
 BY_LABELS = ("relative", "residual", "dcoach")
 LEAST = 0.395  # reward of a base agent in the unchanged world, on tuning episodes: others are no finished agents
 
@@ -30,6 +32,7 @@ ASKED: Mapping[str, Any] = {
     "scalars.answer": "nearest",
     "scalars.nearest_aim_deg": 0.1,
     "scalars.nearest_share": 0.9,
+    "scalars.eps_deg": 0.1,
 }
 TURN: Mapping[str, Any] = {"guidance": "offset"}  # recorded as `sizes.sees_turn`
 LEARNING: Mapping[str, Any] = {"task.teacher": "local_search", "sizes.num_envs": 10, "agent.replay_capacity": 100_000}
@@ -37,72 +40,45 @@ STEPS, EVERY = 60_000, 10_000
 # As chosen on tuning episodes, see docs/results/adaptation.md.
 SLOW: Mapping[str, Any] = {"scalars.feedback_learning_rate": 3e-4}
 FAST: Mapping[str, Any] = {"scalars.feedback_learning_rate": 3e-3}
+RAW: Mapping[str, Any] = {"sizes.frame": "raw"}
+ONCE: Mapping[str, Any] = {"scalars.k_max": 1, "scalars.refined_fraction": 0.0}
 SHARE_60: Mapping[str, Any] = {"scalars.nearest_share": 0.6}
 # Step size and noise [deg] of fine-tuning: swept in one world, a tenth of the step size of training in the others.
 LEARNED: dict[str, tuple[float, float]] = {"turned_strike": (0.05, 0.6)}
 LEARNED_ELSEWHERE = (0.01, 0.3)
 BEST: dict[tuple[str, str], Mapping[str, Any]] = {
-    **{(world, "relative"): {**TURN, **SLOW} for world in BOUNDS_DEG},
+    **{(world, "relative"): {**TURN, **SLOW} for world in PLAYED},
     ("tilted_table", "relative"): {**TURN, **SLOW, **SHARE_60},
     ("tilted_table", "teacher"): SHARE_60,
-    **{(world, "residual"): TURN for world in BOUNDS_DEG},
-    **{(world, "dcoach"): FAST for world in BOUNDS_DEG},
+    **{(world, "residual"): TURN for world in PLAYED},
+    **{(world, "dcoach"): FAST for world in PLAYED},
 }
 
-# Settings that are compared on tuning episodes, by method.
+# Settings that are compared on tuning episodes, by method: as many of each.
 COMPARED: dict[str, dict[str, Mapping[str, Any]]] = {
     "relative": {
-        "nearest": {},
-        "best": {"scalars.answer": "best"},
-        "share-60": SHARE_60,
-        "raw": {"sizes.frame": "raw"},
-        "eps-05": {"scalars.eps_deg": 0.05},
-        "eps-30": {"scalars.eps_deg": 0.3},
-        "aim-25": {"scalars.nearest_aim_deg": 0.25},
-        "slow": SLOW,
         "turn": TURN,
         "turn-slow": {**TURN, **SLOW},
-        "turn-best": {**TURN, "scalars.answer": "best"},
-        "turn-share-60": {**TURN, **SHARE_60},
-        "turn-aim-25": {**TURN, "scalars.nearest_aim_deg": 0.25},
-        "turn-eps-20": {**TURN, "scalars.eps_deg": 0.2},
-        "turn-few-steps": {**TURN, "sizes.fit_steps": 400},
-        "turn-small": {**TURN, "sizes.feedback_layers": (64, 64)},
-        "turn-members": {**TURN, "sizes.ensemble": 5},
+        "turn-share-60": {**TURN, **SLOW, **SHARE_60},
+        "raw": RAW,
     },
-    "residual": {
-        "three-times": {},
-        "turn": TURN,
-        "once": {"scalars.k_max": 1, "scalars.refined_fraction": 0.0},
-        "slow": SLOW,
-    },
-    "dcoach": {
-        "default": {},
-        "fast": FAST,
-        "slow": {"scalars.feedback_learning_rate": 1e-4},
-    },
-    "teacher": {
-        "nearest": {},
-        "best": {"scalars.answer": "best"},
-        "share-60": SHARE_60,
-        "aim-25": {"scalars.nearest_aim_deg": 0.25},
-    },
+    "residual": {"turn": TURN, "turn-slow": {**TURN, **SLOW}, "three-times": {}, "once": ONCE},
+    "dcoach": {"default": {}, "slow": SLOW, "fast": FAST, "fast-large": {**FAST, "scalars.eps_deg": 0.3}},
 }
-SWEPT_RATES, SWEPT_NOISES_DEG = (0.001, 0.01, 0.05, 0.1), (0.0, 0.15, 0.6)
+SWEPT_RATES, SWEPT_NOISES_DEG = (0.01, 0.05), (0.15, 0.6)
 
 
 def compared(world: str, bound: float) -> list[Piece]:
-    """Every method with every setting that is tried."""
+    """Every method with every setting that is tried; fine-tuning's are lanes of one piece."""
     pieces = [
         Piece(
             world,
             method,
             variant,
             bound,
-            () if method == "teacher" else TUNED,
+            TUNED,
             {**ASKED, **settings},
             split="tuning",
-            bases=TUNING_BASES,
             minutes=4,
             serves=f"settings of {method}",
         )
@@ -110,29 +86,33 @@ def compared(world: str, bound: float) -> list[Piece]:
         for variant, settings in variants.items()
     ]
     swept = {"rates": SWEPT_RATES, "noises_deg": SWEPT_NOISES_DEG, "steps": 20_000, "every": 5_000}
-    learns = Piece(world, "finetuning", settings=LEARNING, split="tuning", bases=TUNING_BASES, minutes=8, **swept)
+    learns = Piece(world, "finetuning", settings=LEARNING, split="tuning", minutes=8, **swept)
     return [*pieces, learns._replace(serves="settings of finetuning")]
 
 
 def reported(world: str, bound: float) -> list[Piece]:
-    """The figure of a world."""
+    """The figure of a world: every method, and relative labels whose answers were shuffled.
+
+    Of the unchanged world too, where nothing is to be gained: what do methods do to a policy that is right?
+    """
     serves = "reward as a share of the original"
     asked = {"bound_deg": bound, "serves": serves}
+    learned: dict[str, Any] = {**asked, "labels": BUDGETS, "seeds": LABEL_SEEDS, "minutes": 8}
     best = {method: {**ASKED, **BEST.get((world, method), {})} for method in ("teacher", *BY_LABELS)}
     rate, noise = LEARNED.get(world, LEARNED_ELSEWHERE)
     learns = {"rates": (rate,), "noises_deg": (noise,), "steps": STEPS, "every": EVERY}
     return [
         Piece(world, "none", minutes=1, serves=serves),
         Piece(world, "teacher", minutes=2, settings=best["teacher"], **asked),
-        *(Piece(world, method, labels=BUDGETS, settings=best[method], minutes=8, **asked) for method in BY_LABELS),
-        Piece(world, "finetuning", settings=LEARNING, minutes=15, serves=serves, **learns),
+        *(Piece(world, method, settings=best[method], **learned) for method in BY_LABELS),
+        Piece(world, "relative", "shuffled", settings={**best["relative"], "scalars.answer": "shuffled"}, **learned),
+        Piece(world, "finetuning", settings=LEARNING, minutes=20, seeds=LABEL_SEEDS, serves=serves, **learns),
     ]
 
 
 PIECES = (
-    Piece(UNCHANGED, "none", minutes=1, serves="what is whole"),
     Piece(UNCHANGED, "none", split="tuning", minutes=1, serves="which agents are finished"),
-    *(piece for world, bound in BOUNDS_DEG.items() for piece in reported(world, bound)),
+    *(piece for world, bound in PLAYED.items() for piece in reported(world, bound)),
     *(piece for world, bound in BOUNDS_DEG.items() for piece in compared(world, bound)),
 )
 
@@ -148,7 +128,8 @@ SCALES = {
         "seconds a piece on a CPU, to see that everything runs",
         envs=4,
         steps=3,
-        bases=2,
+        tuning_bases=1,
+        seeds=2,
         labels={25: 5, 50: 10, 250: 10},
         settings=SMALL,
         tuned_steps=(40, 20),
@@ -166,7 +147,6 @@ SCALES = {
         "a minute a piece on an accelerator, to see where it goes",
         envs=100,
         steps=20,
-        bases=4,
         labels={100: 100, 250: 250, 500: 500},
         tuned_steps=(10_000, 2_500),
     ),

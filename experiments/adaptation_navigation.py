@@ -19,36 +19,30 @@ from _pieces import option
 from navigation_bootstrapping import SCALES as TRAINING
 
 LIDAR, ROOMS, QUADRUPED = "turned_lidar", "rooms", "anymal"
-LIDAR_BOUND_DEG, ROOMS_BOUNDS_DEG, SIDE_BOUND_DEG = 60.0, (60.0, 180.0), 60.0
-BUDGETS = (50, 100, 250, 500)
-TUNED, TUNING_BASES = (250,), 4
+LIDAR_BOUND_DEG, ROOMS_BOUND_DEG, SIDE_BOUND_DEG = 60.0, 180.0, 60.0
+BUDGETS = (50, 100, 250)
+LABEL_SEEDS = 4
+TUNED = (250,)
 
 FRAME: Mapping[str, Any] = {"sizes.frame": "action"}
 TURN: Mapping[str, Any] = {**FRAME, "guidance": "offset"}  # recorded as `sizes.sees_turn`
 ROOMY: Mapping[str, Any] = {**FRAME, "scalars.eps_deg": 20.0}  # in rooms small turns lead nowhere
 SIDED: Mapping[str, Any] = {**TURN, "scalars.eps_deg": 20.0}
+SLOWLY: Mapping[str, Any] = {**FRAME, "scalars.eps_deg": 20.0, "scalars.feedback_learning_rate": 3e-4}
+SHUFFLED: Mapping[str, Any] = {"scalars.answer": "shuffled"}
 NARROWER = (0.5, 0.25)  # shares of a bound that are tried on tuning episodes
 LEARNING: Mapping[str, Any] = {"sizes.num_envs": 10, "agent.replay_capacity": 50_000}
 # As chosen by tuning/turned_lidar/finetuning: a tenth of the step size of training.
 RATES, NOISES_DEG, STEPS, EVERY = (0.0001,), (0.0,), 20_000, 5_000
 
-# Settings that are compared on tuning episodes, by world and method.
-RELATIVE: dict[str, Mapping[str, Any]] = {
-    "frame": FRAME,
-    "raw": {"sizes.frame": "raw"},
-    "eps-5": {**FRAME, "scalars.eps_deg": 5.0},
-    "eps-10": {**FRAME, "scalars.eps_deg": 10.0},
-    "eps-20": {**FRAME, "scalars.eps_deg": 20.0},
-    "turn": TURN,
-    "turn-5": {**TURN, "scalars.eps_deg": 5.0},
-    "turn-10": {**TURN, "scalars.eps_deg": 10.0},
-    "turn-20": {**TURN, "scalars.eps_deg": 20.0},
-    "turn-raw": {**TURN, "sizes.frame": "raw", "scalars.eps_deg": 10.0},
-    "turn-slow": {**TURN, "scalars.eps_deg": 10.0, "scalars.feedback_learning_rate": 3e-4},
-    "turn-small": {**TURN, "scalars.eps_deg": 10.0, "sizes.feedback_layers": (64, 64)},
-    "turn-members": {**TURN, "scalars.eps_deg": 10.0, "sizes.ensemble": 5},
-}
-OTHERS: dict[str, dict[str, Mapping[str, Any]]] = {
+# Settings that are compared on tuning episodes, by method: as many of each.
+COMPARED: dict[str, dict[str, Mapping[str, Any]]] = {
+    "relative": {
+        "frame": FRAME,
+        "turn-5": {**TURN, "scalars.eps_deg": 5.0},
+        "turn-10": {**TURN, "scalars.eps_deg": 10.0},
+        "turn-20": {**TURN, "scalars.eps_deg": 20.0},
+    },
     "residual": {
         "three-times": FRAME,
         "turn": TURN,
@@ -56,9 +50,10 @@ OTHERS: dict[str, dict[str, Mapping[str, Any]]] = {
         "raw": {"sizes.frame": "raw"},
     },
     "dcoach": {
-        "frame": {**FRAME, "scalars.eps_deg": 20.0},
+        "default": {**FRAME, "scalars.eps_deg": 20.0},
+        "slow": SLOWLY,
+        "fast": {**FRAME, "scalars.eps_deg": 20.0, "scalars.feedback_learning_rate": 3e-3},
         "raw": {"sizes.frame": "raw", "scalars.eps_deg": 20.0},
-        "slow": {**FRAME, "scalars.eps_deg": 20.0, "scalars.feedback_learning_rate": 3e-4},
     },
 }
 # In rooms: what helps, each by itself and together. A round is 50 questions, so that a thousand are 20 fits.
@@ -94,7 +89,7 @@ IN_ROOMS: dict[str, dict[str, Mapping[str, Any]]] = {
 }
 BEST_IN_ROOMS = SIDED_INTENT = IN_ROOMS["intent"]["members"]
 FARTHER_IN_ROOMS = IN_ROOMS["intent"]["look-ahead-only"]
-SWEPT_RATES, SWEPT_NOISES_DEG = (0.0001, 0.001, 0.01), (0.0, 5.0, 20.0)
+SWEPT_RATES, SWEPT_NOISES_DEG = (0.0001, 0.001), (0.0, 5.0)
 
 
 def compared(world: str, bound: float, judge_by: str, methods: Mapping[str, Mapping[str, Any]]) -> list[Piece]:
@@ -108,7 +103,6 @@ def compared(world: str, bound: float, judge_by: str, methods: Mapping[str, Mapp
             TUNED,
             settings,
             split="tuning",
-            bases=TUNING_BASES,
             judge_by=judge_by,
             minutes=5,
             serves=f"settings of {method}",
@@ -118,27 +112,36 @@ def compared(world: str, bound: float, judge_by: str, methods: Mapping[str, Mapp
     ]
 
 
-def lidar() -> list[Piece]:
-    """The table of the turned lidar."""
-    world, serves, bound = LIDAR, "success with a turned lidar", LIDAR_BOUND_DEG
-    asked = {"bound_deg": bound, "labels": BUDGETS, "settings": FRAME, "judge_by": "success", "serves": serves}
+def every_method(world: str) -> list[Piece]:
+    """Every method in a world, and relative labels whose answers were shuffled."""
+    serves, bound = "success with a turned lidar", LIDAR_BOUND_DEG
+    asked = {"bound_deg": bound, "labels": BUDGETS, "seeds": LABEL_SEEDS, "judge_by": "success", "serves": serves}
     learns = {"settings": LEARNING, "rates": RATES, "noises_deg": NOISES_DEG, "steps": STEPS, "every": EVERY}
-    swept = {"settings": LEARNING, "rates": SWEPT_RATES, "noises_deg": SWEPT_NOISES_DEG}
     return [
         Piece(world, "none", minutes=2, serves=serves),
+        Piece(world, "relative", settings=FRAME, minutes=15, **asked),
+        Piece(world, "relative", "narrowed", settings=FRAME, minutes=18, judge_bounds=NARROWER, **asked),
+        Piece(world, "relative", "shuffled", settings={**FRAME, **SHUFFLED}, minutes=15, **asked),
+        Piece(world, "dcoach", settings=SLOWLY, minutes=15, **asked),
+        Piece(world, "residual", settings=TURN, minutes=15, **asked),
+        Piece(world, "finetuning", minutes=25, seeds=LABEL_SEEDS, serves=serves, **learns),
+    ]
+
+
+def lidar() -> list[Piece]:
+    """The table of the turned lidar, and of no change as its control; with what was compared."""
+    world, serves, bound = LIDAR, "success with a turned lidar", LIDAR_BOUND_DEG
+    swept = {"settings": LEARNING, "rates": SWEPT_RATES, "noises_deg": SWEPT_NOISES_DEG}
+    return [
+        *every_method(UNCHANGED),
+        *every_method(world),
         Piece(world, "teacher", bound_deg=bound, minutes=4, serves=serves),
-        Piece(world, "relative", minutes=15, **asked),
-        Piece(world, "relative", "narrowed", minutes=18, judge_bounds=NARROWER, **asked),
-        Piece(world, "dcoach", minutes=15, **{**asked, "settings": OTHERS["dcoach"]["slow"]}),
-        Piece(world, "residual", minutes=15, **{**asked, "settings": TURN}),
-        Piece(world, "finetuning", minutes=25, serves=serves, **learns),
-        *compared(world, bound, "success", {"relative": RELATIVE, **OTHERS, "intent": {"members": SIDED_INTENT}}),
+        *compared(world, bound, "success", COMPARED),
         *compared(world, 180.0, "success", {"intent": {"members-180": SIDED_INTENT}}),
         Piece(
             world,
             "finetuning",
             split="tuning",
-            bases=TUNING_BASES,
             steps=20_000,
             every=5_000,
             minutes=20,
@@ -149,24 +152,23 @@ def lidar() -> list[Piece]:
 
 
 def rooms() -> list[Piece]:
-    """The table of the rooms: unadapted, and learned and by the road map within either bound.
+    """The table of the rooms: unadapted, by the road map, and learned.
 
     The paper's labels, refined in the action frame; then read as intent among the ways that the lidar sees, asked in
-    situations farther apart, and with look-ahead too.
+    situations farther apart, and with look-ahead too; the last with answers shuffled as well.
     """
-    pieces = [Piece(ROOMS, "none", minutes=2, serves="success in rooms")]
-    for bound in ROOMS_BOUNDS_DEG:
-        asked = {"variant": f"{bound:g}", "bound_deg": bound, "serves": "success in rooms"}
-        pieces.append(Piece(ROOMS, "teacher", minutes=5, settings=ROOMY, **asked))
-        pieces.append(
-            Piece(ROOMS, "relative", labels=(250, 500, 1_000), settings=ROOMY, judge_by="success", minutes=20, **asked)
-        )
-        for name, settings in (("members", BEST_IN_ROOMS), ("look-ahead", FARTHER_IN_ROOMS)):
-            asked |= {"variant": f"{bound:g}-{name}", "settings": settings, "judge_by": "success"}
-            pieces.append(Piece(ROOMS, "intent", labels=(250, 500, 1_000), minutes=15, **asked))
-    tried = compared(ROOMS, 180.0, "success", {"relative": RELATIVE})
-    ablation = compared(ROOMS, 180.0, "success", IN_ROOMS)
-    return [*pieces, *tried, *(piece._replace(labels=(250, 1_000)) for piece in ablation)]
+    asked = {"bound_deg": ROOMS_BOUND_DEG, "serves": "success in rooms"}
+    learned = {**asked, "labels": (250, 1_000), "seeds": LABEL_SEEDS, "judge_by": "success", "minutes": 25}
+    pieces = [
+        Piece(ROOMS, "none", minutes=2, serves="success in rooms"),
+        Piece(ROOMS, "teacher", "180", minutes=5, settings=ROOMY, **asked),
+        Piece(ROOMS, "relative", "180", settings=ROOMY, **learned),
+        Piece(ROOMS, "intent", "180-members", settings=BEST_IN_ROOMS, **learned),
+        Piece(ROOMS, "intent", "180-look-ahead", settings=FARTHER_IN_ROOMS, **learned),
+        Piece(ROOMS, "intent", "180-look-ahead-shuffled", settings={**FARTHER_IN_ROOMS, **SHUFFLED}, **learned),
+    ]
+    ablation = compared(ROOMS, ROOMS_BOUND_DEG, "success", IN_ROOMS)
+    return [*pieces, *(piece._replace(labels=(250, 1_000)) for piece in ablation)]
 
 
 def sides() -> list[Piece]:
@@ -180,14 +182,16 @@ def sides() -> list[Piece]:
         asked = {"bound_deg": SIDE_BOUND_DEG, "settings": SIDED, "judge_by": judge_by, "serves": serves}
         wide = {**asked, "variant": "180", "bound_deg": 180.0, "settings": SIDED_INTENT}
         farther = {**wide, "variant": "180-look-ahead", "settings": {**SIDED_INTENT, **LOOK_AHEAD}}
+        shuffled = {**wide, "variant": "180-shuffled", "settings": {**SIDED_INTENT, **SHUFFLED}}
         pieces += [
             Piece(world, "none", minutes=2, serves=serves),
             Piece(world, "teacher", minutes=4, **asked),
-            Piece(world, "relative", labels=(100, 250, 500), ways=True, minutes=12, **asked),
-            Piece(world, "intent", labels=(100, 250, 500, 1_000), ways=True, minutes=12, **wide),
-            Piece(world, "intent", labels=(250, 500, 1_000), minutes=15, **farther),
+            Piece(world, "relative", labels=(100, 250), seeds=LABEL_SEEDS, ways=True, minutes=25, **asked),
+            Piece(world, "intent", labels=(100, 250, 1_000), seeds=LABEL_SEEDS, ways=True, minutes=25, **wide),
+            Piece(world, "intent", labels=(250, 1_000), seeds=LABEL_SEEDS, minutes=25, **farther),
+            Piece(world, "intent", labels=(250, 1_000), seeds=LABEL_SEEDS, minutes=25, **shuffled),
         ]
-    tried = {"relative": RELATIVE, "intent": {"members": SIDED_INTENT}}
+    tried = {"relative": COMPARED["relative"], "intent": {"members": SIDED_INTENT}}
     freely = {
         "members-180": SIDED_INTENT,
         "active-180": {**SIDED_INTENT, **ACTIVE},
@@ -218,7 +222,6 @@ def quadruped() -> list[Piece]:
 
 
 UNADAPTED = [
-    Piece(UNCHANGED, "none", minutes=2, serves="what is whole"),
     Piece(UNCHANGED, "none", split="tuning", minutes=2, serves="which agents are finished"),
 ]
 PIECES = tuple(
@@ -239,7 +242,8 @@ SCALES = {
         "seconds a piece on a CPU, to see that everything runs",
         envs=4,
         steps=0,
-        bases=2,
+        tuning_bases=1,
+        seeds=2,
         labels={50: 5, 250: 10},
         settings=SMALL,
         tuned_steps=(40, 20),
@@ -258,7 +262,6 @@ SCALES = {
         "minutes a piece on an accelerator, to see where it goes",
         envs=200,
         steps=0,
-        bases=4,
         labels={100: 100, 250: 250, 500: 500, 1_000: 1_000},
         tuned_steps=(10_000, 2_500),
     ),

@@ -38,7 +38,7 @@ from _adaptation_tables import (
     tuned,
 )
 from _trajectories import FILE, draw
-from adaptation_billiards import BOUNDS_DEG, LEAST
+from adaptation_billiards import BOUNDS_DEG, LEAST, PLAYED
 from adaptation_navigation import STUDY
 from bootstrapping_page import rendered
 from matplotlib.figure import Figure
@@ -90,11 +90,12 @@ def billiards(rows: Sequence[Row], folder: Path, seen: str) -> str:
     original = f"The base agents: {len(whole.bases)}, of a reward of {spread(whole.columns['reward'])} unchanged."
     parts, curves = [original], {}
     study = adaptation_billiards.STUDY
-    for world, bound in BOUNDS_DEG.items():
+    for world, bound in {**BOUNDS_DEG, UNCHANGED: PLAYED[UNCHANGED]}.items():
         known = lines(rows, world, least=LEAST)
-        if not known:
+        if len(known) < (2 if world == UNCHANGED else 1):  # there the other methods are a control
             continue
-        chosen_on, start = tuned(rows, world), next(line for line in known if line.method == "none")
+        start = next(line for line in known if line.method == "none")
+        chosen_on = tuned(rows, world) & set(start.bases)
         cells = []
         for line in shown(known):
             shares = share(line, whole)
@@ -104,6 +105,8 @@ def billiards(rows: Sequence[Row], folder: Path, seen: str) -> str:
         held = ["of the original, held-out agents [%]"] if chosen_on else []
         header = ["", *AMOUNTS, "reward", "of the original [%]", *held, "models used"]
         parts.append(f"**{world}**, bound {bound:g} degrees:\n\n{table(header, cells)}")
+        if world == UNCHANGED:
+            continue
         curves[world] = curve_points(known, "reward", whole)
         parts.append(_gains(curves[world]))
     if any(curves.values()):
@@ -116,7 +119,7 @@ def _used(line: Line) -> str:
     return f"{100 * line.columns['used'].mean():.0f}%" if "used" in line.columns else ""
 
 
-# method and variant -> labels or steps, values (bases, points)
+# method and variant -> labels or steps, values (bases, label seeds, points)
 Points = dict[tuple[str, str], tuple[list[int], np.ndarray]]
 
 
@@ -138,7 +141,7 @@ def curve_points(known: Sequence[Line], metric: str, whole: Line | None = None) 
             for line in sorted(own, key=lambda line: line.after)
         ]
         if len({len(column) for column in columns}) == 1:
-            found[kind] = sorted(line.after for line in own), np.stack(columns, axis=1)
+            found[kind] = sorted(line.after for line in own), np.stack(np.broadcast_arrays(*columns), axis=-1)
     return found
 
 
@@ -146,7 +149,7 @@ def _gains(points: Points) -> str:
     """When each method has made its own gain, and that of relative labels."""
     if (CURVES[0], "") not in points:
         return ""
-    reference = points[CURVES[0], ""][1][:, [0, -1]]
+    reference = points[CURVES[0], ""][1][..., [0, -1]]
     rows = []
     for (method, variant), (labels, values) in points.items():
         if len(values) != len(reference):
@@ -164,7 +167,7 @@ def figure(curves: dict[str, Points], stem: Path, ylabel: str, level: tuple[floa
     drawn = Figure(figsize=(3.2 * len(curves) + 0.6, 3.2), layout="constrained")
     for axes, (world, points) in zip(drawn.subplots(1, len(curves), squeeze=False)[0], curves.items(), strict=True):
         for (method, variant), (labels, values) in points.items():
-            low, middle, high = np.quantile(values, [0.25, 0.5, 0.75], axis=0)
+            low, middle, high = np.quantile(values.mean(1), [0.25, 0.5, 0.75], axis=0)
             colour = COLOURS.get(method) or colour_of(method)
             x = np.maximum(labels, 10)  # the first point, of no labels, at the left end
             style = {"color": colour, "linestyle": "--" if variant else "-", "marker": "o", "markersize": 3}
@@ -196,7 +199,7 @@ def outcomes(rows: Sequence[Row], world: str, whole: Line | None) -> str:
         return ""
     teachers = [line for line in known if line.method == "teacher"]
     most = whole or max(teachers, key=lambda line: float(np.mean(line.columns["success"])), default=None)
-    chosen_on, cells = tuned(rows, world), []
+    chosen_on, cells = tuned(rows, world) & set(start.bases), []
     for line in ([whole] if whole else []) + shown(known):
         name, back, used = "unchanged world" if line is whole else line.name, "", amounts(line, start, STUDY)
         if most is not None and line is not start and line is not most:
@@ -222,6 +225,8 @@ def lidar(rows: Sequence[Row], folder: Path, seen: str) -> str:
     if points:
         figure({world: points}, folder / "lidar", "success", None)
         text += f"\n\n{_gains(points)}\n\n![success with a turned lidar]({seen}/lidar.png)"
+    if len(lines(rows, UNCHANGED)) > 1:
+        text += f"\n\nThe same methods in the unchanged world:\n\n{outcomes(rows, UNCHANGED, None)}"
     return text.strip()
 
 

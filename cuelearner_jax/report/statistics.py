@@ -105,6 +105,30 @@ def interval(
     return Interval(estimate, np.asarray(bounds.low), np.asarray(bounds.high))
 
 
+def drawn(
+    groups: int, members: int, resamples: int = RESAMPLES, seed: int = 0
+) -> tuple[Int[np.ndarray, "draws groups 1"], Int[np.ndarray, "draws groups members"]]:
+    """Indices of a bootstrap over groups and over the members of each, such as agents with several seeds of labels.
+
+    The first draw is the data as they are. Index an array (groups, members, ...) with both.
+    """
+    random = np.random.default_rng(seed)
+    outer = random.integers(0, groups, (resamples, groups))
+    inner = random.integers(0, members, (resamples, groups, members))
+    outer = np.concatenate([np.arange(groups)[None], outer])
+    own = np.broadcast_to(np.arange(members), (1, groups, members))
+    return outer[..., None], np.concatenate([own, inner])
+
+
+def interval_of_groups(values: Float[np.ndarray, "groups members"], seed: int = 0) -> Interval:
+    """The interquartile mean over the groups' means, with a 95% interval that draws groups and members of each."""
+    if values.shape[1] == 1:
+        return interval(values[:, 0], seed=seed)
+    means = interquartile_mean(values[drawn(*values.shape, seed=seed)].mean(-1), axis=1)
+    lower, upper = np.quantile(means[1:], [0.025, 0.975]) if len(values) > 1 else (np.nan, np.nan)
+    return Interval(means[0], np.asarray(lower), np.asarray(upper))
+
+
 def curve(
     steps: Int[np.ndarray, "steps"], *strata: Float[np.ndarray, "seeds steps"], confidence: float = 0.95, seed: int = 0
 ) -> Curve:

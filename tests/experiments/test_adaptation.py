@@ -12,6 +12,7 @@ import pytest
 from cuelearner_jax.adaptation.adapting import check_amounts
 from cuelearner_jax.agents import ddqn
 from cuelearner_jax.config import GuideSizes, check_guide
+from cuelearner_jax.errors import UserError
 from cuelearner_jax.feedback.answers import check_teacher
 from cuelearner_jax.guides import intent
 from cuelearner_jax.run_config import GROUPS, check
@@ -122,7 +123,8 @@ def test_the_teacher_of_billiards_knows_the_nearest_good_shot(modules):
     for piece in data.PIECES:
         if piece.method in ("relative", "teacher") and piece.split != "tuning":
             bench = bench_of(modules, data.STUDY, piece)
-            world = task.scenario(piece.world).applied(bench.config.task)
+            world = bench.config.task
+            world = world if piece.world == "unchanged" else task.scenario(piece.world).applied(world)
             world = dataclasses.replace(world, teacher=piece.settings["task.teacher"])
             scalars = bench.scalars()
             assert (scalars.eps_deg, scalars.tau_max_deg) == (0.1, 180.0)
@@ -171,9 +173,37 @@ def test_tables_say_what_rows_say(modules, recorded):
     ]
     assert all(line.bases.tolist() == [0, 1, 2] for line in known)  # the fourth is no finished agent
     whole = found.lines(rows, "unchanged", least=0.4)[0]
-    np.testing.assert_allclose(found.share(known[2], whole), 0.9)
+    np.testing.assert_allclose(found.share(known[2], whole), [[0.9]] * 3)
     assert found.percent(found.share(known[2], whole)) == "90.0 [90.0, 90.0]"
     assert len(found.lines(rows, "tilted_table")[0].bases) == 4
+
+
+def test_settings_are_chosen_on_other_agents_than_are_reported(modules):
+    known = modules["_adaptation"]
+    scale = known.Scale("", envs=1, steps=1, tuning_bases=2)
+    pieces = {split: known.Piece("rooms", "relative", split=split) for split in ("tuning", "validation")}
+    assert known.bases_of(pieces["tuning"], scale, (5, 6, 7, 8)) == (5, 6)
+    assert known.bases_of(pieces["validation"], scale, (5, 6, 7, 8)) == (7, 8)
+    finished = known.Piece("unchanged", "none", split="tuning")
+    assert known.bases_of(finished, scale, (5, 6)) == (5, 6)
+    with pytest.raises(UserError, match="the first 2: give --bases a run of more"):
+        known.bases_of(pieces["validation"], scale, (5, 6))
+
+
+def test_seeds_of_labels_are_members_of_their_agent_and_labels_judge_in_lines_of_their_own(modules, tmp_path):
+    """Agents 0 and 1 with two seeds each; of agent 1's second the model is not used where labels judge."""
+    row = {"base": np.array([0, 0, 1, 1]), "label_seed": np.array([0, 1, 0, 1]), "labels": 50, "used": 1.0}
+    row |= {"reward": np.array([0.1, 0.3, 0.5, 0.5]), "rewarded_steps": 20_000.0}
+    row |= {"unrewarded_reward": np.array([0.1, 0.3, 0.5, 0.2]), "unrewarded_used": np.array([1.0, 1, 1, 0])}
+    wrote(modules, tmp_path / "relative", [row], world="tilted_table", method="relative")
+    found = modules["_adaptation_tables"]
+    rewarded, judged = found.lines(found.read(tmp_path), "tilted_table")
+    np.testing.assert_array_equal(rewarded.columns["reward"], [[0.1, 0.3], [0.5, 0.5]])
+    np.testing.assert_array_equal(judged.columns["reward"], [[0.1, 0.3], [0.5, 0.2]])
+    assert (rewarded.name, judged.name) == ("relative labels", "relative labels (judged by labels)")
+    study = modules["adaptation_billiards"].STUDY
+    assert [found.rewarded_steps(line, rewarded, study) for line in (rewarded, judged)] == [20_000, 0]
+    assert found.spread(rewarded.columns["reward"]).startswith("0.350 [0.1")  # the mean over agents of means over seeds
 
 
 def test_a_gain_is_made_where_lines_between_points_say(modules, recorded):
@@ -184,7 +214,7 @@ def test_a_gain_is_made_where_lines_between_points_say(modules, recorded):
     points = page.curve_points(known, "reward", found.lines(rows, "unchanged", least=0.4)[0])
     labels, values = points["relative", ""]
     assert labels == [0, 100, 200]
-    reference = values[:, [0, -1]]
+    reference = values[..., [0, -1]]
     made = found.reached(values, labels, reference, own=True)
     assert made.estimate == pytest.approx(100 + 100 * 0.28 / 0.3)
     assert (made.lower, made.upper) == pytest.approx((made.estimate, made.estimate))  # all agents are alike
@@ -197,8 +227,8 @@ def test_a_gain_is_made_where_lines_between_points_say(modules, recorded):
 def test_rewarded_steps_are_those_that_the_use_of_a_model_was_decided_by(modules):
     """Two policies of 200 x 50 shots; in navigation 500 episodes at most, each until its end, for every bound tried."""
     found, line = modules["_adaptation_tables"], modules["_adaptation_tables"].Line
-    ten = {"used": np.ones(2), "duration": np.full(2, 10.0)}
-    start = line("none", "", 0, np.arange(2), {"duration": np.full(2, 20.0)}, "turned_lidar/none", "")
+    ten = {"used": np.ones(2), "duration": np.full((2, 1), 10.0)}
+    start = line("none", "", 0, np.arange(2), {"duration": np.full((2, 1), 20.0)}, "turned_lidar/none", "")
     command = "experiments/adaptation_navigation.py --bases runs/navigation --envs 1000 --pieces turned_lidar"
     steps = {}
     for variant in ("", "narrowed"):
@@ -215,11 +245,10 @@ def test_rewarded_steps_are_those_that_the_use_of_a_model_was_decided_by(modules
 
 def test_what_has_come_back_is_a_ratio_with_an_interval(modules):
     found = modules["_adaptation_tables"]
-    before, whole = np.full(8, 0.8), np.full(8, 1.0)
-    assert found.recovered(np.full(8, 0.9), before, whole) == "50 [50, 50]"
-    middle, lower, upper = (
-        int(part.strip("[],")) for part in found.recovered(np.linspace(0.8, 1, 8), before, whole).split()
-    )
+    before, whole = np.full((8, 1), 0.8), np.full((8, 1), 1.0)
+    assert found.recovered(np.full((8, 1), 0.9), before, whole) == "50 [50, 50]"
+    now = np.linspace(0.8, 1, 8)[:, None]
+    middle, lower, upper = (int(part.strip("[],")) for part in found.recovered(now, before, whole).split())
     assert (middle, lower < 40, upper > 60) == (50, True, True)
     assert found.recovered(before, whole, before) == ""  # nothing was lost
 
@@ -229,7 +258,9 @@ def test_agents_that_settings_were_chosen_on_are_told_from_the_others(modules):
     rows = [{"base": base, "split": "tuning", "world": "rooms"} for base in (1, 2)]
     rows += [{"base": 3, "split": "validation", "world": "rooms"}, {"base": 4, "split": "tuning", "world": "lidar"}]
     assert found.tuned(rows, "rooms") == {1, 2}
-    line = found.Line("intent", "", 250, np.array([1, 2, 3, 4]), {"success": np.array([0.1, 0.1, 0.6, 0.6])}, "", "")
+    line = found.Line(
+        "intent", "", 250, np.array([1, 2, 3, 4]), {"success": np.array([[0.1], [0.1], [0.6], [0.6]])}, "", ""
+    )
     assert found.held_out(line, "success", {1, 2}) == "60.0 [60.0, 60.0]"
     assert found.held_out(line, "success", {1, 2, 3, 4}) == ""
 

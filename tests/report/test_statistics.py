@@ -70,6 +70,20 @@ def test_equal_seeds_have_no_width_and_a_single_seed_no_interval():
     assert np.isnan(single.upper).all()
 
 
+def test_groups_are_drawn_and_members_of_each_too():
+    """Agents that differ, with seeds that do not, are an ordinary bootstrap; seeds that differ widen the interval."""
+    agents = np.random.default_rng(0).normal(size=(12, 1))
+    alike = statistics.interval_of_groups(np.repeat(agents, 4, axis=1))
+    ordinary = statistics.interval(agents[:, 0])
+    assert alike.estimate == pytest.approx(float(ordinary.estimate))
+    assert alike.upper - alike.lower == pytest.approx(float(ordinary.upper - ordinary.lower), rel=0.1)
+    spread = statistics.interval_of_groups(agents + np.array([[-3.0, -1.0, 1.0, 3.0]]))
+    assert spread.estimate == pytest.approx(float(ordinary.estimate))
+    assert spread.upper - spread.lower > 1.3 * (alike.upper - alike.lower)
+    same = statistics.interval_of_groups(np.tile([[0.0, 2.0]], (1, 1)))
+    assert (float(same.estimate), bool(np.isnan(same.lower))) == (1.0, True)  # one agent has no interval
+
+
 def test_missing_values_are_refused():
     with pytest.raises(ValueError, match="NaN"):
         statistics.interval(np.array([[1.0], [np.nan]]))
