@@ -34,8 +34,8 @@ from probes import files_of
 from small_runs import SWEEP
 
 from cuelearner_jax.cli import main
-from cuelearner_jax.runs import sweep
 from cuelearner_jax.storage import results
+from cuelearner_jax.studies import train
 
 RUNS = {"finished": None, "stopped": 5}  # at which look at Ctrl-C the run is stopped
 VOLATILE = ("wall_s", "commit", "command", "folder", "run")
@@ -149,7 +149,7 @@ def make_runs(folder: Path, finished: Path | None = None) -> None:
             shutil.copytree(finished, folder / name / "run")
             continue
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(sweep, "interruptible", partial(_stopping_at, looks))
+            patch.setattr(train, "interruptible", partial(_stopping_at, looks))
             status, _, told = _called([*SWEEP, "--out", str(folder / name / "run")])
         assert status == (130 if looks else 0), told
 

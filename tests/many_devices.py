@@ -14,9 +14,10 @@ import probes
 
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.loop import start_clock
-from cuelearner_jax.runs import lanes, sweep
+from cuelearner_jax.runs import lanes
 from cuelearner_jax.runs.grid import Grid
 from cuelearner_jax.runs.order import Order
+from cuelearner_jax.studies import train
 from cuelearner_jax.terminal import Interrupted
 
 CONFIG = probes.config(
@@ -42,13 +43,13 @@ def run(out: Path, stop_at: int | None = None, **options) -> None:
     def interruptible():
         yield Event()
 
-    usual, sweep.interruptible = sweep.interruptible, interruptible
+    usual, train.interruptible = train.interruptible, interruptible
     try:
-        sweep.run(Order(probes.make_task(), CONFIG, GRID, out, **options))
+        train.run(Order(probes.make_task(), CONFIG, GRID, out, **options))
     except Interrupted:
         assert stop_at is not None
     finally:
-        sweep.interruptible = usual
+        train.interruptible = usual
 
 
 def communication() -> list[str]:
@@ -56,8 +57,7 @@ def communication() -> list[str]:
     env = probes.Window()
     group = lanes.LaneGroup(CONFIG, env, guidances.make("relative", CONFIG.sizes, env), GRID)
     (block,) = group.start()
-    train = group.program.train
-    text = train.lower(env, CONFIG.settings, start_clock(), block, 4).compile().as_text()
+    text = group.program.train.lower(env, CONFIG.settings, start_clock(), block, 4).compile().as_text()
     assert "while" in text
     assert len(block.key.sharding.device_set) == jax.device_count()
     return re.findall(r"all-reduce|all-gather|all-to-all|collective-permute|reduce-scatter", text)

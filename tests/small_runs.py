@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from cuelearner_jax.runs import sweep
 from cuelearner_jax.storage import results
+from cuelearner_jax.studies import train
 
 SMALL = [
     *("--agent.q-layers", "16", "--sizes.feedback-layers", "16", "--agent.directions", "36"),
@@ -60,5 +60,5 @@ def stopping_at(when=None, evaluating=None):
         yield Event()
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sweep, "interruptible", interruptible)
+        patch.setattr(train, "interruptible", interruptible)
         yield

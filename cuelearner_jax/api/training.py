@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 import warnings
 from collections.abc import Sequence
-from typing import Any
 
 import jax
 import numpy as np
@@ -15,21 +15,23 @@ from cuelearner_jax import config as configuration
 from cuelearner_jax import user_code
 from cuelearner_jax.api import arguments
 from cuelearner_jax.api.acting import CallablePolicy
+from cuelearner_jax.api.feedback import label_path
 from cuelearner_jax.api.worlds import World, a_world
-from cuelearner_jax.devices import SHARED, lane_mesh, place
 from cuelearner_jax.environment import view_of
 from cuelearner_jax.errors import UserError, closest
 from cuelearner_jax.evaluate import SPLITS
-from cuelearner_jax.guides import registry
+from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.policies import Agent
-from cuelearner_jax.run_config import RunConfig, check
+from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs import failures
-from cuelearner_jax.runs.grid import LARGEST_SEED, Grid, check_grid
-from cuelearner_jax.runs.lanes import LaneGroup
-from cuelearner_jax.runs.memory_report import memory_report
-from cuelearner_jax.runs.training import Training, mean_of_finite
-from cuelearner_jax.terminal import progress_bars
+from cuelearner_jax.runs.grid import LARGEST_SEED, Grid
+from cuelearner_jax.runs.order import TrainRequest
+from cuelearner_jax.runs.training import Training
+from cuelearner_jax.storage import label_files
+from cuelearner_jax.studies import train as study
 from cuelearner_jax.types import Teacher
+
+SEEDS, LABELS = 8, (100,)  # where a configuration comes without them
 
 
 @dataclasses.dataclass(frozen=True)
@@ -77,22 +79,25 @@ def train(
     config: RunConfig | str = "quickstart",
     *,
     guidance: Sequence[str] = (),
-    labels: Sequence[int] = (100,),
-    seeds: int | Sequence[int] = 8,
+    labels: Sequence[int] | str | os.PathLike[str] | None = None,
+    seeds: int | Sequence[int] | None = None,
     split: str = "validation",
     progress: bool = True,
 ) -> Run:
     """Trains seeds x label budgets x kinds of guidance, as `cuelearner sweep` does: the same numbers.
 
-    Warns of lanes that stopped being finite: their agents stay as they last were, their rows have no metrics.
+    What is left out is as the preset has it. Warns of lanes that stopped being finite: their agents stay as they last
+    were, their rows have no metrics.
 
     Args:
         world: where.
-        teacher: who answers; needed by kinds of guidance that ask.
+        teacher: who answers; needed by kinds of guidance that ask, unless a label file answers.
         config: everything else, or the name of one of the task's presets; its world is the one given.
-        guidance: kinds of guidance (default: all that the world can have with what is given).
-        labels: label budgets.
-        seeds: their number (0, 1, ...), or the seeds.
+        guidance: kinds of guidance (default: the preset's, of these what can be had without a teacher if there is none;
+            with a configuration, all that the world can have).
+        labels: label budgets, or a label file in place of the teacher, with as many as its shortest seed has (default:
+            the preset's budgets; with a configuration, 100).
+        seeds: their number (0, 1, ...), or the seeds (default: the preset's; with a configuration, 8).
         split: episodes of the evaluations: "validation", or "tuning" for choosing settings.
         progress: show progress bars on standard error.
 
@@ -103,45 +108,45 @@ def train(
     if arguments.optional(arguments.teacher, "teacher", teacher) is not None:
         user_code.answers_in("teacher", teacher, world.env)
     guidance = [arguments.text("guidance", kind) for kind in arguments.several("guidance", guidance, "kinds")]
-    budgets = tuple(arguments.budget("labels", one) for one in arguments.several("labels", labels, "label budgets"))
+    file = label_path(labels) if isinstance(labels, str | os.PathLike) else None
     arguments.text("split", split, SPLITS)
     arguments.flag("progress", progress)
-    run_config = dataclasses.replace(_config(world, config), task=world.config)
-    check(run_config)
-    world.task.check_evaluations(run_config)
-    asked = guidance or registry.possible(world.env, taught=teacher is not None)
-    names = tuple(registry.resolve(kind).name for kind in asked)
-    grid = Grid(names, _seeds(seeds), budgets)
-    check_grid(grid)
-    mesh = lane_mesh()
-    env = place(mesh, world.env, SHARED)
-    kinds = [run_config.guide_in(env, kind) for kind in names]
-    asking = [kind.name for kind in kinds if kind.asks]
-    if asking and teacher is None:
-        raise UserError(f"guidance {asking[0]!r} asks a teacher: give one, for instance teacher_of(world)")
-    groups = [LaneGroup(run_config, env, kind, grid) for kind in kinds]
-    for group in groups:
-        memory_report(group)
-    examined, rows, trainings = world.environment(split), [], {}
-    with progress_bars(shown=progress) as bars:
-        for group in groups:
-            training = Training(group, examined, split)
-            training.begin()
-            bar = bars.add_task(group.guidance.name, total=run_config.schedule.total_steps, note="")
-            while not training.done:
-                if not training.labelled:
-                    asked = bars.add_task(f"{group.guidance.name}: labels", total=group.rounds, note="")
-                    for done in training.label_rounds(place(mesh, teacher, SHARED)):
-                        bars.update(asked, completed=done)
-                for row in training.stretches():
-                    rows.append(_table(group, row))
-                    bars.update(bar, completed=training.step, note=f"reward {mean_of_finite(row['reward'])}")
-            trainings[group.guidance.name] = training
-    table = pa.concat_tables(rows, promote_options="permissive")
-    failed = failures.summary(table)
+    request = _suggested(world, config, taught=teacher is not None or file is not None)
+    grid = request.grid
+    if guidance:
+        grid = dataclasses.replace(grid, guidance=tuple(guidance))
+    if file is not None:
+        grid = dataclasses.replace(grid, labels=(label_files.read(file).budget,))
+    elif labels is not None:
+        asked = arguments.several("labels", labels, "label budgets")
+        grid = dataclasses.replace(grid, labels=tuple(arguments.budget("labels", one) for one in asked))
+    if seeds is not None:
+        grid = dataclasses.replace(grid, seeds=_seeds(seeds))
+    request = dataclasses.replace(request, grid=grid, labels_from=file, split=split)
+    found = study.in_memory(request, world.env, world.environment(split), teacher, progress)
+    failed = failures.summary(found.results)
     if failed:
         warnings.warn(f"{failed}: leave out the rows with failed = 1", stacklevel=2)
-    return Run(world, run_config, table, trainings)
+    return Run(world, found.request.config, found.results, found.trainings)
+
+
+def _suggested(world: World, config: RunConfig | str, taught: bool) -> TrainRequest:
+    """What holds where nothing else is given, in this world."""
+    task = world.task
+    if isinstance(config, RunConfig):
+        groups = ("sizes", "scalars", "schedule", "agent", "arbiter")
+        settled = {name: configuration.settled(getattr(config, name), name) for name in groups}
+        config = dataclasses.replace(config, task=world.config, **settled)
+        kinds = guidances.possible(world.env, taught=taught)
+        return TrainRequest(task, config, Grid(kinds, tuple(range(SEEDS)), LABELS))
+    if not isinstance(config, str):
+        raise arguments.refused("config", config, "a RunConfig, or the name of a preset")
+    if config not in task.presets:
+        raise UserError(f"config: unknown preset {config!r}{closest(config, task.presets)}")
+    request = study.suggested(task, task.presets[config])
+    possible = guidances.possible(world.env, taught=taught)
+    grid = dataclasses.replace(request.grid, guidance=tuple(kind for kind in request.grid.guidance if kind in possible))
+    return dataclasses.replace(request, config=dataclasses.replace(request.config, task=world.config), grid=grid)
 
 
 def _seeds(seeds: int | Sequence[int]) -> tuple[int, ...]:
@@ -149,27 +154,3 @@ def _seeds(seeds: int | Sequence[int]) -> tuple[int, ...]:
     if isinstance(seeds, list | tuple | range | np.ndarray):
         return tuple(arguments.seed("seeds", seed) for seed in arguments.several("seeds", seeds, "seeds"))
     return tuple(range(arguments.whole("seeds", seeds, 1, LARGEST_SEED)))
-
-
-def _config(world: World, config: RunConfig | str) -> RunConfig:
-    if isinstance(config, RunConfig):
-        groups = ("sizes", "scalars", "schedule", "agent", "arbiter")
-        return dataclasses.replace(
-            config, **{name: configuration.settled(getattr(config, name), name) for name in groups}
-        )
-    presets = world.task.presets
-    if not isinstance(config, str):
-        raise arguments.refused("config", config, "a RunConfig, or the name of a preset")
-    if config not in presets:
-        raise UserError(f"config: unknown preset {config!r}{closest(config, presets)}")
-    return presets[config].config
-
-
-def _table(group: LaneGroup, row: dict[str, Any]) -> pa.Table:
-    """The columns of one evaluation, with a row for each lane."""
-    lanes = len(group.seeds)
-    columns = {name: np.broadcast_to(np.asarray(value), (lanes,)) for name, value in row.items()}
-    names = pa.array([group.guidance.name] * lanes)
-    return pa.table(
-        {"guidance": names, **{name: pa.array(values, from_pandas=True) for name, values in columns.items()}}
-    )

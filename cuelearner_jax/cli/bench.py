@@ -15,7 +15,7 @@ import tyro
 from jax.sharding import Mesh
 
 from cuelearner_jax.cli.parsing import out, parse, preset_of, task_of
-from cuelearner_jax.cli.shared_options import RunT, as_kept, parts_of, preset_kinds
+from cuelearner_jax.cli.shared_options import RunT, as_kept, parts_of
 from cuelearner_jax.devices import lane_mesh
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.run_config import RunConfig, check
@@ -23,6 +23,7 @@ from cuelearner_jax.runs import speed
 from cuelearner_jax.runs.grid import LARGEST_SEED
 from cuelearner_jax.runs.memory_report import memory_report
 from cuelearner_jax.storage.provenance import provenance
+from cuelearner_jax.studies.train import preset_kinds
 from cuelearner_jax.task import Task, shape_of
 from cuelearner_jax.tasks import registry
 from cuelearner_jax.terminal import Interrupted, console, interruptible, progress_bars

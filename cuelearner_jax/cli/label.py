@@ -16,7 +16,7 @@ import numpy as np
 from cuelearner_jax import config as configuration
 from cuelearner_jax.adaptation import adapting
 from cuelearner_jax.cli.parsing import PAPER, about, check_numbers, code_of, out, parse, preset_of, taken, task_of
-from cuelearner_jax.cli.shared_options import Flag, Lane, TaskT, asking_kind, preset_kinds
+from cuelearner_jax.cli.shared_options import Flag, Lane, TaskT, asking_kind
 from cuelearner_jax.config import GuideScalars, GuideSizes
 from cuelearner_jax.environment import actions_of, offers
 from cuelearner_jax.errors import UserError
@@ -31,6 +31,7 @@ from cuelearner_jax.runs.grid import LARGEST_SEED
 from cuelearner_jax.runs.trained import PolicySource
 from cuelearner_jax.storage import label_files
 from cuelearner_jax.storage.folders import claimed
+from cuelearner_jax.studies.train import preset_kinds
 from cuelearner_jax.task import Task, shape_of
 from cuelearner_jax.tasks import registry
 from cuelearner_jax.terminal import Interrupted, console, interruptible

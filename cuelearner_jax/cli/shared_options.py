@@ -18,7 +18,8 @@ from cuelearner_jax.runs.grid import Grid
 from cuelearner_jax.runs.order import Order
 from cuelearner_jax.runs.shards import Shard
 from cuelearner_jax.runs.trained import PolicySource
-from cuelearner_jax.task import Preset, Task, shape_of
+from cuelearner_jax.studies.train import suggested
+from cuelearner_jax.task import Task
 
 TaskT = TypeVar("TaskT")
 RunT = TypeVar("RunT", bound=RunConfig)
@@ -112,17 +113,17 @@ class Training(Generic[RunT]):
 
 
 def asked_of_preset(
-    arguments: list[str], command: str, kind: Any, suggested: Callable[[Preset, tuple[str, ...]], dict[str, Any]]
+    arguments: list[str], command: str, kind: Any, options: Callable[[Grid], dict[str, Any]]
 ) -> tuple[Task, Any]:
     """Return the task and the options of a command that trains. Raises UserError for what there is not.
 
-    `kind` is generic in the run's configuration; `suggested` gives options that hold where none are typed.
+    `kind` is generic in the run's configuration; `options` are of what the preset compares, where none are typed.
     """
     task, rest = task_of(arguments, command, kind)
     name, preset, rest = preset_of(task, rest)
-    kinds = preset_kinds(task, preset)
-    config, run_type, rest = parts_of(preset.config, rest, kinds)
-    default = kind[run_type](config, out=Path("runs") / f"{task.name}-{name}", **suggested(preset, kinds))
+    request = suggested(task, preset)
+    config, run_type, rest = parts_of(request.config, rest, request.grid.guidance)
+    default = kind[run_type](config, out=Path("runs") / f"{task.name}-{name}", **options(request.grid))
     return task, parse(kind[run_type], rest, f"{command} {task.name}", default, about(kind, task))
 
 
@@ -166,11 +167,6 @@ def named_kinds(arguments: list[str]) -> tuple[str, ...]:
         if argument == "--guidance":
             return tuple(takewhile(lambda word: not word.startswith("-"), arguments[place + 1 :]))
     return ()
-
-
-def preset_kinds(task: Task, preset: Preset) -> tuple[str, ...]:
-    """The kinds of guidance that a preset compares: those it names, or all that the task can have."""
-    return preset.guidance or guidances.possible(shape_of(task, preset.config.task), taught=task.teacher is not None)
 
 
 def asking_kind(kinds: tuple[str, ...]) -> str:

@@ -7,12 +7,12 @@ from typing import Any, Generic, Literal
 
 from cuelearner_jax.cli.parsing import out
 from cuelearner_jax.cli.shared_options import RunT, Training, asked_of_preset
-from cuelearner_jax.runs import cluster, sweep
+from cuelearner_jax.runs import cluster
 from cuelearner_jax.runs.cluster import Job
 from cuelearner_jax.runs.grid import Grid, seeds_of
 from cuelearner_jax.runs.order import Plan, planned
 from cuelearner_jax.runs.shards import Shard
-from cuelearner_jax.task import Preset
+from cuelearner_jax.studies import train
 
 
 @dataclass(frozen=True)
@@ -42,12 +42,8 @@ OPTIONS = {"sweep": Sweep}
 
 
 def run(arguments: list[str]) -> None:
-    """Runs the command. Raises what `sweep.run` and `cluster.submit` raise."""
-
-    def suggested(preset: Preset, kinds: tuple[str, ...]) -> dict[str, Any]:
-        return {"guidance": kinds, **{name: getattr(preset, name) for name in ("labels", "seeds", "first_seed")}}
-
-    task, asked = asked_of_preset(arguments, "sweep", Sweep, suggested)
+    """Runs the command. Raises what `studies.train.run` and `cluster.submit` raise."""
+    task, asked = asked_of_preset(arguments, "sweep", Sweep, _options)
     grid = Grid(asked.guidance, seeds_of(asked.first_seed, asked.seeds), asked.labels)
     cluster.check(asked.cluster, asked.shards, asked.job, asked.shard, asked.overwrite, asked.out)
     if asked.cluster:
@@ -59,5 +55,11 @@ def run(arguments: list[str]) -> None:
         cluster.submit(asked.shards, asked.job, asked.out, arguments, plan, out.print)
         return
     shard = Shard.parse(asked.shard) if asked.shard else None
-    sweep.run(asked.order(task, grid, shard))
+    train.run(asked.order(task, grid, shard))
     out.print(asked.done)
+
+
+def _options(grid: Grid) -> dict[str, Any]:
+    """The options of what a preset compares."""
+    seeds = {"seeds": len(grid.seeds), "first_seed": grid.seeds[0]}
+    return {"guidance": grid.guidance, "labels": grid.labels, **seeds}

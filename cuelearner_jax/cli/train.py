@@ -7,8 +7,8 @@ from typing import Generic
 
 from cuelearner_jax.cli.parsing import check_numbers, out
 from cuelearner_jax.cli.shared_options import RunT, Training, asked_of_preset, asking_kind
-from cuelearner_jax.runs import sweep
 from cuelearner_jax.runs.grid import LARGEST_SEED, Grid
+from cuelearner_jax.studies import train
 
 
 @dataclass(frozen=True)
@@ -27,13 +27,13 @@ OPTIONS = {"train": Train}
 
 
 def run(arguments: list[str]) -> None:
-    """Runs the command. Raises what `sweep.run` raises."""
+    """Runs the command. Raises what `studies.train.run` raises."""
     task, asked = asked_of_preset(
         arguments,
         "train",
         Train,
-        lambda preset, kinds: {"guidance": asking_kind(kinds), "labels": preset.labels[0]},
+        lambda grid: {"guidance": asking_kind(grid.guidance), "labels": grid.labels[0]},
     )
     check_numbers(asked, seed=(0, LARGEST_SEED - 1))
-    sweep.run(asked.order(task, Grid((asked.guidance,), (asked.seed,), (asked.labels,))))
+    train.run(asked.order(task, Grid((asked.guidance,), (asked.seed,), (asked.labels,))))
     out.print(asked.done)

@@ -1,12 +1,12 @@
-"""What is asked of a sweep, and whether it makes sense: nothing here writes anything."""
+"""What is asked of a training, and whether it makes sense: nothing here writes anything."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from cuelearner_jax import config as configuration
 from cuelearner_jax import run_config
@@ -23,20 +23,28 @@ from cuelearner_jax.storage import formats, label_files, results, tracking
 from cuelearner_jax.storage.folders import CONFIG, check_folder
 from cuelearner_jax.task import Task, shape_of
 
+RequestT = TypeVar("RequestT", bound="TrainRequest")
+
 
 @dataclass(frozen=True)
-class Order:
-    """What is asked for: a grid of runs of one task in one folder."""
+class TrainRequest:
+    """What training is asked for: a grid of runs of one task."""
 
     task: Task
     config: RunConfig
     grid: Grid
+    labels_from: Path | None = field(default=None, kw_only=True)  # a label file in place of the teacher
+    split: str = field(default="validation", kw_only=True)  # episodes of the evaluations
+
+
+@dataclass(frozen=True)
+class Order(TrainRequest):
+    """The same in a folder."""
+
     out: Path
     resume: bool = False
     overwrite: bool = False
-    labels_from: Path | None = None  # a label file in place of the teacher
     shard: Shard | None = None  # its share of the seeds alone, in its own folder below `out`
-    split: str = "validation"  # episodes of the evaluations
     track: str | None = None  # where it can be followed, see `storage.tracking`
 
 
@@ -54,13 +62,28 @@ class Plan:
         return all((self.order.out / kind / results.PARQUET).exists() for kind in self.order.grid.guidance)
 
 
+def checked(request: RequestT) -> RequestT:
+    """The request with its kinds by their names, wherever it is carried out. Raises UserError for what cannot be."""
+    run_config.check(request.config)
+    names = tuple(guidances.resolve(kind).name for kind in request.grid.guidance)  # code is loaded here
+    request = dataclasses.replace(request, grid=dataclasses.replace(request.grid, guidance=names))
+    check_grid(request.grid)
+    request.task.check_evaluations(request.config)
+    return request
+
+
+def labels_of(request: TrainRequest) -> label_files.LabelFile | None:
+    """The labels in place of the teacher's; None: it is asked. Raises UserError for labels that do not fit."""
+    if request.labels_from is None:
+        return None
+    config = request.config
+    return read_labels(request.labels_from, request.task, config.task, config.sizes, config.scalars, request.grid)
+
+
 def planned(order: Order) -> Plan:
     """What `run` does with an order. Raises UserError for what it would refuse, but for too little memory."""
-    run_config.check(order.config)
     tracking.check(order.track)
-    names = tuple(guidances.resolve(kind).name for kind in order.grid.guidance)  # code is loaded here
-    order = dataclasses.replace(order, grid=dataclasses.replace(order.grid, guidance=names))
-    check_grid(order.grid)
+    order = checked(order)
     piece, sweep = None, order.out
     if order.shard:
         piece = order.shard.described(order.grid.seeds)
@@ -69,12 +92,9 @@ def planned(order: Order) -> Plan:
         grid = dataclasses.replace(order.grid, seeds=order.shard.seeds(order.grid.seeds))
         order = dataclasses.replace(order, grid=grid, out=folder, resume=order.resume or begun)
     env = shape_of(order.task, order.config.task)
-    order.task.check_evaluations(order.config)
     for kind in order.grid.guidance:
         order.config.guide_in(env, kind)
-    config, labels = order.config, None
-    if order.labels_from:
-        labels = read_labels(order.labels_from, order.task, config.task, config.sizes, config.scalars, order.grid)
+    labels = labels_of(order)
     described = describe(order.task, order.config, order.grid, order.split, order.labels_from, piece)
     if order.shard:
         order.shard.check_sweep(sweep, described, defaults(order.task))

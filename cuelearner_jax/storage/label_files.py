@@ -82,6 +82,11 @@ class LabelFile(NamedTuple):
     session: dict[str, Any] | None = None  # how a page asked, see `labelling.session`
     said: dict[str, int] | None = None  # rows of each kind (`SAID`), those that no longer stand included
 
+    @property
+    def budget(self) -> int:
+        """The labels that each of its seeds has at least."""
+        return int(np.unique(self.seeds, return_counts=True)[1].min())
+
 
 class LabelWriter(tables.TableWriter):
     """Appends rows to `labels.jsonl` of a folder; each is on the disk when the call returns.

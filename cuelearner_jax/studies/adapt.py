@@ -162,7 +162,7 @@ def suggested(
     if labels_from is not None:
         file = label_files.read(labels_from)
         eps_deg = file.eps if eps_deg is None else eps_deg
-        labels = (int(np.unique(file.seeds, return_counts=True)[1].min()),)
+        labels = (file.budget,)
     sizes = sizes or replace(adapting.SIZES, **{"frame": source.config.sizes.frame, **rules.sizes})
     if scalars is None:
         eps_deg = rules.eps_deg if eps_deg is None else eps_deg

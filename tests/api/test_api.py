@@ -13,14 +13,17 @@ import pytest
 
 import cuelearner_jax as cl
 from cuelearner_jax import loop
+from cuelearner_jax.api import training
 from cuelearner_jax.config import GuideSizes
+from cuelearner_jax.errors import UserError
 from cuelearner_jax.policies import Agent, Uniform
-from cuelearner_jax.runs import sweep
 from cuelearner_jax.runs.grid import Grid
 from cuelearner_jax.runs.order import Order
 from cuelearner_jax.spaces import DIRECTIONS
 from cuelearner_jax.storage import label_files, results
+from cuelearner_jax.studies import train
 from cuelearner_jax.task import Task
+from cuelearner_jax.tasks import registry
 from cuelearner_jax.types import Label
 
 TASK = dataclasses.replace(probes.make_task(), presets={})
@@ -93,7 +96,7 @@ def test_a_world_by_name():
 
 def test_a_policy_of_a_run_acts_on_one_observation_and_on_many(tmp_path):
     folder = tmp_path / "run"
-    sweep.run(Order(TASK, probes.CONFIG, Grid(("none",), (3, 5), ()), folder))
+    train.run(Order(TASK, probes.CONFIG, Grid(("none",), (3, 5), ()), folder))
     loaded = cl.load_policy(folder, seed=5, task=TASK)
     many = loaded(SEEN)
     np.testing.assert_allclose(np.linalg.norm(many, axis=-1), 1, atol=1e-6)
@@ -178,17 +181,46 @@ def test_training_from_python_gives_what_the_command_gives(tmp_path):
     kinds = ["none", "relative"]
     run = cl.train(WORLD, TEACHER, probes.CONFIG, guidance=kinds, labels=[10], seeds=[3, 5], progress=False)
     grid = Grid(("none", "relative"), (3, 5), (10,))
-    sweep.run(Order(TASK, probes.CONFIG, grid, tmp_path / "run"))
+    train.run(Order(TASK, probes.CONFIG, grid, tmp_path / "run"))
     columns = ("guidance", "labels", "seed", "step", "reward", "train_loss", "guide_reward")
-    recorded = results.read(tmp_path / "run").to_pylist()
-    one, other = (
-        sorted(tuple(str(row[name]) for name in columns) for row in rows)
-        for rows in (run.results.to_pylist(), recorded)
-    )
-    assert one == other
+    assert rows_of(run.results.to_pylist(), columns) == rows_of(results.read(tmp_path / "run").to_pylist(), columns)
     assert run.policy(guidance="none", seed=5)(SEEN).shape == (200, 2)
     with pytest.raises(cl.UserError, match="no lane with seed 9"):
         run.policy(seed=9)
+
+
+def test_what_is_left_out_of_a_training_is_as_the_preset_has_it(monkeypatch):
+    """In Python as on the command line: the kinds that can be had, the budgets and the seeds."""
+    asked = []
+
+    def in_memory(request, *others):
+        asked.append(request)
+        raise UserError("enough")
+
+    monkeypatch.setattr(training.study, "in_memory", in_memory)
+    preset = registry.find("billiards").presets["quickstart"]
+    world = cl.make("billiards", table="one_ball")
+    teacher = cl.teacher_of(world)
+    for given, options in ((teacher, {}), (None, {}), (teacher, {"labels": [20], "seeds": 2})):
+        with pytest.raises(UserError, match="enough"):
+            cl.train(world, given, **options)
+    whole, untaught, less = (request.grid for request in asked)
+    seeds = tuple(range(preset.first_seed, preset.first_seed + preset.seeds))
+    assert (whole.guidance, whole.labels, whole.seeds) == (preset.guidance, preset.labels, seeds)
+    assert untaught.guidance == ("none",)
+    assert (less.guidance, less.labels, less.seeds) == (preset.guidance, (20,), (0, 1))
+    assert all(request.config == dataclasses.replace(preset.config, task=world.config) for request in asked)
+
+
+def test_a_label_file_answers_in_place_of_a_teacher(tmp_path):
+    """Trained on the labels of a run, an agent is what the command makes of `--labels-from`."""
+    grid = Grid(("relative",), (3,), (10,))
+    train.run(Order(TASK, probes.CONFIG, grid, tmp_path / "asked"))
+    path = tmp_path / "asked" / "relative" / "labels.parquet"
+    train.run(Order(TASK, probes.CONFIG, grid, tmp_path / "given", labels_from=path))
+    run = cl.train(WORLD, None, probes.CONFIG, guidance=["relative"], labels=path, seeds=[3], progress=False)
+    columns = ("labels", "step", "reward", "train_loss")
+    assert rows_of(run.results.to_pylist(), columns) == rows_of(results.read(tmp_path / "given").to_pylist(), columns)
 
 
 def test_chance_is_a_policy_too():

@@ -13,12 +13,12 @@ import pytest
 import cuelearner_jax as cl
 from cuelearner_jax.cli import dispatch
 from cuelearner_jax.errors import NotFinite, UserError
-from cuelearner_jax.runs import cluster, lanes, sweep, trained
+from cuelearner_jax.runs import cluster, lanes, trained
 from cuelearner_jax.runs.cluster import Job
 from cuelearner_jax.runs.grid import Grid, load
 from cuelearner_jax.runs.order import Order, Plan
 from cuelearner_jax.storage import results
-from cuelearner_jax.studies import evaluate
+from cuelearner_jax.studies import evaluate, train
 
 CONFIG = probes.config(
     sizes={"feedback_layers": (8,), "fit_steps": 20, "lanes_per_block": 3},
@@ -52,13 +52,13 @@ def sickened(start):
 def ended(tmp_path_factory):
     """Two folders: of a sweep whose seed 5 fails, and of one that nothing befell; and what the first one told."""
     base = tmp_path_factory.mktemp("failing")
-    sweep.run(order(base / "healthy"))
+    train.run(order(base / "healthy"))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(lanes.LaneGroup, "start", sickened(lanes.LaneGroup.start))
         told = []
         patch.setattr("cuelearner_jax.runs.runner.console", type("Told", (), {"print": staticmethod(told.append)}))
         with pytest.raises(NotFinite) as raised:
-            sweep.run(order(base / "sick"))
+            train.run(order(base / "sick"))
     return base / "sick", base / "healthy", told, str(raised.value)
 
 
@@ -88,7 +88,7 @@ def test_the_same_is_said_by_every_resume_and_nothing_is_changed(ended):
     sick, _, _, last = ended
     before = {name: found for name, found in probes.files_of(sick).items() if name.name != ".lock"}
     with pytest.raises(NotFinite) as again:
-        sweep.run(order(sick, resume=True))
+        train.run(order(sick, resume=True))
     assert str(again.value) == last
     assert {name: found for name, found in probes.files_of(sick).items() if name.name != ".lock"} == before
 
@@ -113,7 +113,7 @@ def test_evaluation_leaves_it_out_and_says_so(ended, capsys):
 
 
 def test_status_one_and_one_line(ended, capsys, monkeypatch):
-    monkeypatch.setattr(dispatch, "_dispatch", lambda arguments: sweep.run(order(ended[0], resume=True)))
+    monkeypatch.setattr(dispatch, "_dispatch", lambda arguments: train.run(order(ended[0], resume=True)))
     assert dispatch.main(["sweep"]) == 1
     assert capsys.readouterr().err.strip().splitlines()[-1] == ended[3]
 
@@ -130,7 +130,7 @@ def test_diverging_from_the_command_line_and_from_python(tmp_path):
     wild = dataclasses.replace(CONFIG, agent=dataclasses.replace(CONFIG.agent, learning_rate=1e9))
     grid = Grid(("none",), seeds=(3, 5, 8), labels=())
     with pytest.raises(NotFinite, match="3 of 3 lanes failed"):
-        sweep.run(Order(TASK, wild, grid, tmp_path / "run"))
+        train.run(Order(TASK, wild, grid, tmp_path / "run"))
     _, config, grid = load(tmp_path / "run", {TASK.name: TASK}.__getitem__)
     source = trained.PolicySource(TASK, config, grid, tmp_path / "run")
     with pytest.raises(UserError, match="all of these lanes failed"):

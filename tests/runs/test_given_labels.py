@@ -7,11 +7,11 @@ import probes
 import pytest
 
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.runs import sweep
 from cuelearner_jax.runs.grid import Grid
 from cuelearner_jax.runs.order import Order, read_labels
 from cuelearner_jax.spaces import DIRECTIONS
 from cuelearner_jax.storage import label_files
+from cuelearner_jax.studies import train
 
 TASK = {"name": "window", "half_width_deg": 28.0}
 EPS = probes.CONFIG.scalars.eps_deg
@@ -118,11 +118,11 @@ RUN = probes.config(sizes=SMALL, schedule={"total_steps": 16, "guidance_until": 
 
 def test_demonstrations_are_written_and_taken_again_by_their_own_kind_alone(tmp_path):
     grid, task = Grid(("demonstration",), (4,), (10,)), probes.make_task()
-    sweep.run(Order(task, RUN, grid, tmp_path / "asked"))
+    train.run(Order(task, RUN, grid, tmp_path / "asked"))
     path = tmp_path / "asked" / "demonstration" / "labels.parquet"
     file = label_files.read(path)
     assert (file.answers, file.eps, file.labels.answer.shape) == ("demonstration", None, (10, 2))
-    sweep.run(Order(task, RUN, grid, tmp_path / "given", labels_from=path))
+    train.run(Order(task, RUN, grid, tmp_path / "given", labels_from=path))
     again = label_files.read(tmp_path / "given" / "demonstration" / "labels.parquet")
     np.testing.assert_array_equal(again.labels.answer, file.labels.answer)
     for other in ("relative", "scalar", "dcoach"):
@@ -144,5 +144,5 @@ def test_the_nearest_good_action_is_refused_where_the_teacher_knows_the_best_one
     config = dataclasses.replace(RUN, scalars=dataclasses.replace(RUN.scalars, answer="nearest"))
     order = Order(probes.make_task(), config, Grid(("relative",), (4,), (10,)), tmp_path / "run")
     with pytest.raises(UserError, match=r"give --scalars\.answer best"):
-        sweep.run(order)
+        train.run(order)
     assert not (tmp_path / "run").exists()

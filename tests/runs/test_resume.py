@@ -17,7 +17,7 @@ from cuelearner_jax.asking import label_slots
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.loop import make_program, start_clock
-from cuelearner_jax.runs import lane_checkpoints, lanes, runner, sweep, training
+from cuelearner_jax.runs import lane_checkpoints, lanes, runner, training
 from cuelearner_jax.runs.grid import Grid, config_hash
 from cuelearner_jax.runs.lane_checkpoints import items
 from cuelearner_jax.runs.order import Order
@@ -26,6 +26,7 @@ from cuelearner_jax.storage import formats, label_files, lines, results
 from cuelearner_jax.storage import table as tables
 from cuelearner_jax.storage.checkpoint import checkpoints
 from cuelearner_jax.storage.folders import prepare_folder
+from cuelearner_jax.studies import train
 from cuelearner_jax.terminal import Interrupted
 
 # Bootstraps and is paced, so that target network, next observations, Adam's moments and what each arm has earned are in
@@ -90,7 +91,7 @@ def killed_at(when, method):
 
 
 def run(out, **options):
-    sweep.run(Order(TASK, CONFIG, GRID, out, **options))
+    train.run(Order(TASK, CONFIG, GRID, out, **options))
 
 
 def newest(out, kind, grid=GRID):
@@ -327,7 +328,7 @@ def test_what_a_kill_can_tear_is_written_anew(stopped, whole, tmp_path, damage):
 
 def test_a_block_filled_up_with_repeats_has_a_row_for_each_seed(whole, tmp_path):
     out = tmp_path / "run"
-    sweep.run(Order(TASK, CONFIG, Grid(("none",), (3, 5, 7), ()), out))  # blocks of 3, 5 and of 7, 7
+    train.run(Order(TASK, CONFIG, Grid(("none",), (3, 5, 7), ()), out))  # blocks of 3, 5 and of 7, 7
     table = rows(out)
     assert [row["seed"] for row in table if row["step"] == 96] == [3, 5, 7]
     expected = [row for row in rows(whole) if row["guidance"] == "none"]
@@ -354,8 +355,8 @@ def test_labels_of_a_file_are_used_exactly(tmp_path):
     task = probes.make_task()
     object.__setattr__(task, "teacher", refuse)
     with stopping_at(2), pytest.raises(Interrupted):
-        sweep.run(Order(task, CONFIG, grid, out, labels_from=path))
-    sweep.run(Order(task, CONFIG, grid, out, labels_from=path, resume=True))
+        train.run(Order(task, CONFIG, grid, out, labels_from=path))
+    train.run(Order(task, CONFIG, grid, out, labels_from=path, resume=True))
     state, _ = newest(out, "relative", grid)
     labels = jax.tree.map(lambda *leaves: np.concatenate(leaves), *(block.guide.labels for block in state["rest"]))
     for lane, (seed, budget) in enumerate([(1, 35), (0, 35), (1, 60), (0, 60)]):
@@ -374,7 +375,7 @@ def test_the_labels_that_a_run_wrote_give_its_guidance_again(whole, tmp_path):
     counts = [int((written.seeds == seed).sum()) for seed in GRID.seeds]
     assert all(50 < count < 60 for count in counts)
     grid = Grid(("relative",), GRID.seeds, (min(counts),))
-    sweep.run(Order(TASK, CONFIG, grid, tmp_path / "run", labels_from=whole / "relative" / "labels.parquet"))
+    train.run(Order(TASK, CONFIG, grid, tmp_path / "run", labels_from=whole / "relative" / "labels.parquet"))
     again = label_files.read(tmp_path / "run" / "relative" / "labels.parquet")
     for seed in GRID.seeds:
         mine, theirs = (file.labels.obs[file.seeds == seed][: min(counts)] for file in (again, written))
@@ -464,7 +465,7 @@ def test_a_folder_that_another_process_used_in_the_meantime_is_left_alone(stoppe
         yield
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sweep, "claimed", late)
+        patch.setattr(train, "claimed", late)
         with pytest.raises(UserError, match=says):
             run(other, resume=resume)
     assert formats.read("config", other / "config.json")["scalars"]["eps_deg"] == 1.0

@@ -13,11 +13,11 @@ from cuelearner_jax import run_config
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.runs import grid as runs
-from cuelearner_jax.runs import sweep
 from cuelearner_jax.runs.grid import Grid
 from cuelearner_jax.runs.order import Order
 from cuelearner_jax.storage import formats, room
 from cuelearner_jax.storage.folders import check_folder, prepare_folder
+from cuelearner_jax.studies import train
 
 ROOT = Path(__file__).resolve().parents[2]
 TASK = probes.make_task()
@@ -193,7 +193,7 @@ def test_grids_that_make_no_sense_are_refused(grid, message, tmp_path):
     with pytest.raises(UserError, match=message):
         runs.check_grid(grid)
     with pytest.raises(UserError, match=message):
-        sweep.run(Order(TASK, probes.CONFIG, grid, tmp_path / "run"))
+        train.run(Order(TASK, probes.CONFIG, grid, tmp_path / "run"))
     assert list(tmp_path.iterdir()) == []
 
 
@@ -212,7 +212,7 @@ def test_lanes_are_seeds_times_budgets_and_one_a_seed_without_labels():
     assert seeds.dtype == budgets.dtype == np.int32
 
 
-# The same through `sweep.run`: nothing is changed on disk by what is refused.
+# The same through `studies.train.run`: nothing is changed on disk by what is refused.
 
 
 @pytest.mark.parametrize(
@@ -229,7 +229,7 @@ def test_lanes_are_seeds_times_budgets_and_one_a_seed_without_labels():
 def test_a_refused_run_changes_nothing(out, config, grid, options, message):
     before = probes.files_of(out.parent)
     with pytest.raises(UserError, match=message):
-        sweep.run(Order(TASK, config, grid, out, split="tuning", **options))
+        train.run(Order(TASK, config, grid, out, split="tuning", **options))
     assert probes.files_of(out.parent) == before
 
 
@@ -240,7 +240,7 @@ def test_a_missing_teacher_is_said_before_anything_is_deleted(out):
     task = TASK.__class__(**{**TASK.__dict__, "teacher": no_teacher})
     before = probes.files_of(out.parent)
     with pytest.raises(UserError, match="no teacher"):
-        sweep.run(Order(task, probes.CONFIG, GRID, out, overwrite=True, split="tuning"))
+        train.run(Order(task, probes.CONFIG, GRID, out, overwrite=True, split="tuning"))
     assert probes.files_of(out.parent) == before
 
 

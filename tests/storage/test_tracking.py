@@ -10,10 +10,10 @@ from probes import config, make_task
 from tensorboardX.proto.event_pb2 import Event
 
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.runs import sweep
 from cuelearner_jax.runs.grid import Grid
 from cuelearner_jax.runs.order import Order
 from cuelearner_jax.storage import results, tracking
+from cuelearner_jax.studies import train
 
 ROW = {
     "seed": np.array([1, 2, 1, 2]),
@@ -50,7 +50,7 @@ def test_means_over_the_seeds_of_each_budget_leave_out_failed_lanes():
 
 def test_a_followed_run_has_its_results_as_points_for_tensorboard(tmp_path):
     order = Order(make_task(), config(schedule={"total_steps": 32}), Grid(("none",), (0, 1), (0,)), tmp_path / "run")
-    sweep.run(Order(**{**vars(order), "track": "tensorboard"}))
+    train.run(Order(**{**vars(order), "track": "tensorboard"}))
     table = results.read(tmp_path / "run").to_pylist()
     wanted = {
         ("reward/labels_0", step): np.mean([row["reward"] for row in table if row["step"] == step])

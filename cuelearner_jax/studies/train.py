@@ -1,0 +1,152 @@
+"""Training as one request, which the command line and Python fill alike: kinds of guidance x seeds x label budgets.
+
+Kinds are trained in turn, the lanes of a kind (seeds x label budgets) side by side.
+
+    request = suggested(task, preset)    # what the preset compares, where nothing else is given
+    run(Order(request.task, request.config, request.grid, out))    # in a folder, resumable
+    found = in_memory(request, env, examined, teacher)    # for Python
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+import pyarrow as pa
+
+from cuelearner_jax.devices import SHARED, lane_mesh, place
+from cuelearner_jax.environment import Environment
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.feedback.answers import check_teacher
+from cuelearner_jax.guides import registry as guidances
+from cuelearner_jax.runs import failures
+from cuelearner_jax.runs.grid import Grid, defaults, seeds_of
+from cuelearner_jax.runs.lane_checkpoints import check_standing
+from cuelearner_jax.runs.lanes import LaneGroup
+from cuelearner_jax.runs.memory_report import memory_report
+from cuelearner_jax.runs.order import Order, TrainRequest, checked, labels_of, planned
+from cuelearner_jax.runs.runner import Runner
+from cuelearner_jax.runs.training import Training, mean_of_finite
+from cuelearner_jax.storage import formats
+from cuelearner_jax.storage.folders import CONFIG, check_folder, claimed, prepare_folder
+from cuelearner_jax.task import Preset, Task, shape_of
+from cuelearner_jax.terminal import console, interruptible, progress_bars
+from cuelearner_jax.types import Teacher
+
+
+def preset_kinds(task: Task, preset: Preset) -> tuple[str, ...]:
+    """The kinds of guidance that a preset compares: those it names, or all that the task can have."""
+    return preset.guidance or guidances.possible(shape_of(task, preset.config.task), taught=task.teacher is not None)
+
+
+def suggested(task: Task, preset: Preset) -> TrainRequest:
+    """What a preset compares: its kinds of guidance, label budgets and seeds."""
+    seeds = seeds_of(preset.first_seed, preset.seeds)
+    return TrainRequest(task, preset.config, Grid(preset_kinds(task, preset), seeds, preset.labels))
+
+
+def _groups(request: TrainRequest, env: Any, tell: Callable[[str], None]) -> list[LaneGroup]:
+    """The lanes of each kind in an environment, or in its shape; `tell` takes what memory they need.
+
+    Raises UserError for too little memory.
+    """
+    config = request.config
+    groups = [LaneGroup(config, env, config.guide_in(env, kind), request.grid) for kind in request.grid.guidance]
+    for group in groups:
+        tell(memory_report(group))
+    return groups
+
+
+def run(order: Order) -> None:
+    """Trains every lane of the grid and leaves the results in the order's folder.
+
+    With a shard, trains its share of the seeds alone, from wherever that stands.
+
+    Raises:
+        UserError: bad configuration, a folder in use, too little memory; nothing has been changed then.
+        Interrupted: Ctrl-C or SIGTERM; everything is saved.
+        NotFinite: all is done, but some lanes stopped being finite.
+    """
+    plan = planned(order)
+    order = plan.order
+    task, config = order.task, order.config
+    _groups(order, shape_of(task, config.task), console.print)  # before anything is made that has a size
+    mesh = lane_mesh()
+    env = place(mesh, task.environment(config.task), SHARED)
+    groups = _groups(order, env, lambda told: None)
+    asked = any(group.guidance.asks for group in groups) and plan.labels is None
+    teacher = place(mesh, task.make_teacher(config.task, env), SHARED) if asked else None
+    if asked:
+        check_teacher(teacher, config.scalars)
+    examined = task.environment(config.task, order.split)
+    with claimed(order.out), interruptible() as stopping, progress_bars() as bars:
+        # Nobody else can change it any more.
+        check_folder(order.out, plan.described, order.resume, order.overwrite, defaults(task))
+        for group in groups if order.resume else ():
+            check_standing(group, order.out / group.guidance.name, given=plan.labels is not None)
+        prepare_folder(order.out, plan.described, order.overwrite and not order.resume)
+        # Rows of what was begun earlier and of what comes now are of one configuration, as config.json tells it.
+        described = formats.read("config", order.out / CONFIG)
+        for group in groups:
+            Runner(group, examined, order, described, stopping, bars).run(teacher, plan.labels)
+    failures.check(order.out, [order.out / group.guidance.name for group in groups])
+
+
+class Trained(NamedTuple):
+    """What a training in memory has led to."""
+
+    request: TrainRequest
+    results: pa.Table  # a row a lane and evaluation: guidance, labels, seed, step, wall_s, failed and metrics
+    trainings: dict[str, Training]  # by kind of guidance, at their end
+
+
+def in_memory(
+    request: TrainRequest, env: Environment, examined: Environment, teacher: Teacher | None, progress: bool = True
+) -> Trained:
+    """Trains every lane of the grid; nothing is written.
+
+    Args:
+        request: what is asked for.
+        env, examined: of the request's world, for learning and for evaluations.
+        teacher: who answers; None where nothing is asked of one.
+        progress: show progress bars on standard error.
+
+    Raises:
+        UserError: a configuration that makes no sense, no teacher where one is asked, or too little memory.
+    """
+    request = checked(request)
+    labels, mesh = labels_of(request), lane_mesh()
+    groups = _groups(request, place(mesh, env, SHARED), lambda told: None)
+    asking = [group.guidance.name for group in groups if group.guidance.asks]
+    if asking and teacher is None and labels is None:
+        raise UserError(f"guidance {asking[0]!r} asks a teacher: give one, for instance teacher_of(world)")
+    if asking and labels is None:
+        teacher = place(mesh, teacher, SHARED)
+        check_teacher(teacher, request.config.scalars)
+    rows, trainings = [], {}
+    with progress_bars(shown=progress) as bars:
+        for group in groups:
+            name, training = group.guidance.name, Training(group, examined, request.split)
+            training.begin()
+            if not training.labelled and labels is not None:
+                training.take(labels)
+            bar = bars.add_task(name, total=request.config.schedule.total_steps, note="")
+            if not training.labelled:
+                assert teacher is not None  # asked for above
+                asked = bars.add_task(f"{name}: labels", total=group.rounds, note="")
+                for done in training.label_rounds(teacher):
+                    bars.update(asked, completed=done)
+            for row in training.stretches():
+                rows.append(_table(group, row))
+                bars.update(bar, completed=training.step, note=f"reward {mean_of_finite(row['reward'])}")
+            trainings[name] = training
+    return Trained(request, pa.concat_tables(rows, promote_options="permissive"), trainings)
+
+
+def _table(group: LaneGroup, row: dict[str, Any]) -> pa.Table:
+    """The columns of one evaluation, with a row for each lane."""
+    names = pa.array([group.guidance.name] * len(group.seeds))
+    columns = {name: np.broadcast_to(np.asarray(value), len(names)) for name, value in row.items()}
+    told = {name: pa.array(values, from_pandas=True) for name, values in columns.items()}
+    return pa.table({"guidance": names, **told})
