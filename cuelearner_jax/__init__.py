@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from cuelearner_jax.api.feedback import FeedbackModel, Labels, ask, fit_feedback, refine
     from cuelearner_jax.api.training import Run, train
     from cuelearner_jax.api.worlds import World, make, teacher_of
+    from cuelearner_jax.calibration import Distortion, Unknown
     from cuelearner_jax.errors import UserError
 
 __version__ = "0.1.0"
@@ -34,9 +35,11 @@ __version__ = "0.1.0"
 _PLACES = {
     "AdaptedPolicy": "api.adaptation",
     "CallablePolicy": "api.acting",
+    "Distortion": "calibration",
     "FeedbackModel": "api.feedback",
     "Labels": "api.feedback",
     "Run": "api.training",
+    "Unknown": "calibration",
     "UserError": "errors",
     "World": "api.worlds",
     "adapt": "api.adaptation",
@@ -55,9 +58,11 @@ _PLACES = {
 __all__ = [
     "AdaptedPolicy",
     "CallablePolicy",
+    "Distortion",
     "FeedbackModel",
     "Labels",
     "Run",
+    "Unknown",
     "UserError",
     "World",
     "adapt",

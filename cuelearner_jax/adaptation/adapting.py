@@ -21,11 +21,12 @@ from jaxtyping import Array
 from cuelearner_jax import user_code
 from cuelearner_jax.adaptation.judging import Judge, Judged, Judging
 from cuelearner_jax.adaptation.lanes import Adaptation, Lanes, LaneState, ask_round, begin, blame, rounds, take_labels
+from cuelearner_jax.calibration import Result
 from cuelearner_jax.config import GuideSizes, Scalars
 from cuelearner_jax.devices import BY_LANE, SHARED, lane_mesh, place
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import Tell, untold
-from cuelearner_jax.policies import Guided, Policy, named
+from cuelearner_jax.policies import Policy, named
 from cuelearner_jax.spaces import DIRECTIONS, Space
 from cuelearner_jax.types import Label, Teacher
 
@@ -42,16 +43,22 @@ class Adapted:
 
     of: Adaptation
     lanes: Lanes
-    block: LaneState
+    block: Any  # `LaneState`, or `calibrated.Evidence`
     judged: Judged
     curve: list[dict[str, Any]]  # a row a measurement: "asked" (lanes,) labels so far, and metrics (lanes,) by name
+    results: tuple[Result, ...] = ()  # of calibration, a lane each: what changed
 
     @property
     def labels(self) -> Label:
         """All lanes' labels (lanes, slots, ...), as NumPy arrays."""
-        return jax.device_get(self.block.guide.labels)
+        return jax.device_get(self.block.labels)
 
-    def policy(self, env: Any) -> Guided:
+    @property
+    def failed(self) -> np.ndarray:
+        """Lanes (lanes,) whose model is no longer finite."""
+        return np.asarray(self.block.failed)
+
+    def policy(self, env: Any) -> Any:
         """The lanes' policies in a world."""
         return self.of.policy(self.block, env)
 

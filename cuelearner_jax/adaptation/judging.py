@@ -83,7 +83,10 @@ def check_bounds(shares: tuple[float, ...], by: str) -> None:
 
 
 class Judge:
-    """Measures the lanes of an adaptation on the way, and says in the end what is used of them."""
+    """Measures the lanes of an adaptation on the way, and says in the end what is used of them.
+
+    A block of lanes is a `LaneState`, or what else has `base`, `bound`, `asked`, `corrects` and `failed`.
+    """
 
     def __init__(self, of: Adaptation, lanes: Lanes, how: Judging, mesh: Mesh, watch: Callable[[str], Tell]) -> None:
         """`mesh`: devices that share the lanes; `watch`: by what is being done, who is told how far it is."""
@@ -91,19 +94,19 @@ class Judge:
         self.mesh = mesh if mesh.size > 1 else None
         self.curve: list[dict[str, np.ndarray]] = []
 
-    def measure_if_due(self, block: LaneState, asked: int) -> None:
+    def measure_if_due(self, block: Any, asked: int) -> None:
         """Adds a row to the curve after so many labels."""
         if self.how.every and asked % self.how.every == 0:
-            self._add(block)
+            self.measure(block)
 
-    def judged(self, block: LaneState) -> tuple[Judged, LaneState]:
+    def judged(self, block: Any) -> tuple[Judged, Any]:
         """What is used of the finished lanes, and these within the bounds that are used.
 
         Raises UserError if there is no such metric, or labels cannot judge.
         """
         how, lanes = self.how, self.lanes
         found = judged_by_labels(self.of, block) if how.by == LABELS else None
-        after = self._add(block) if how.env is not None else None
+        after = self.measure(block) if how.env is not None else None
         if found is not None:
             return found, block
         assert after is not None  # a metric is of episodes
@@ -114,12 +117,12 @@ class Judge:
         played = self._played(after) + self._played(bases)[own]
         block, after, more = self._narrowed(block, after)
         before, worth = np.asarray(bases.means[how.by])[own], np.asarray(after.means[how.by])
-        usable = ~np.asarray(block.failed) & np.asarray(block.guide.model.fitted)
+        usable = ~np.asarray(block.failed) & np.asarray(block.corrects)
         used = usable & (worth >= before)  # NaN is worth less than anything
         difference = mean_interval(np.asarray(after.each[how.by]) - np.asarray(bases.each[how.by])[own]).T
         return Judged(how.by, before, worth, used, bounds_of(self.of, block), difference, played + more), block
 
-    def _narrowed(self, block: LaneState, after: Rolled) -> tuple[LaneState, Rolled, np.ndarray]:
+    def _narrowed(self, block: Any, after: Rolled) -> tuple[Any, Rolled, np.ndarray]:
         """Lanes within the share of their bounds with which they are worth most, what they are worth so, and the
         rewarded steps (lanes,) that it took to know."""
         bound, played, by = block.bound, np.zeros(self.lanes.number, int), self.how.by
@@ -136,13 +139,14 @@ class Judge:
             bound = jnp.where(jnp.asarray(better), tried.bound, bound)
         return block.replace(bound=bound), after, played
 
-    def _add(self, block: LaneState) -> Rolled:
+    def measure(self, block: Any) -> Rolled:
+        """Plays the lanes as they are, and adds a row to the curve."""
         found = self._rolled(self._policy(block), "the adapted policy")
-        asked, failed = np.asarray(block.guide.asked), np.asarray(block.failed)
+        asked, failed = np.asarray(block.asked), np.asarray(block.failed)
         self.curve.append({"asked": asked, "failed": failed, **found.means})
         return found
 
-    def _policy(self, block: LaneState) -> PolicyBlock:
+    def _policy(self, block: Any) -> PolicyBlock:
         return self.of.policy(block, self.how.env)
 
     def _rolled(self, policy: PolicyBlock, what: str) -> Rolled:
@@ -204,6 +208,6 @@ def _predicted(of: Adaptation, block: LaneState) -> tuple[Array, Array]:
     return each_lane(one)(block)
 
 
-def bounds_of(of: Adaptation, block: LaneState) -> np.ndarray:
+def bounds_of(of: Adaptation, block: Any) -> np.ndarray:
     """The bounds (lanes,) of a block, in the unit of the space."""
     return actions_of(of.env).to_unit(np.asarray(block.bound), np)

@@ -97,6 +97,21 @@ class LaneState(struct.PyTreeNode):
     key: PRNGKeyArray
     failed: Bool[Array, ""]  # did its model stop being finite? It stays as it was before then
 
+    @property
+    def asked(self) -> Int[Array, "*lanes"]:
+        """Questions so far."""
+        return self.guide.asked
+
+    @property
+    def corrects(self) -> Bool[Array, "*lanes"]:
+        """Whether there is anything that could be used."""
+        return self.guide.model.fitted
+
+    @property
+    def labels(self) -> Label:
+        """What was answered."""
+        return self.guide.labels
+
 
 class Adaptation(struct.PyTreeNode):
     """What lanes share: a kind of guidance, a world to ask in, and the policies that are corrected."""

@@ -1,7 +1,8 @@
 """Policies as plain values and arrays, and back.
 
 A policy's values are those of its `describe()`. Kept are an `agent` with its `params`; `guided` with its `model` and,
-where there is one, its `bound`; `uniform`; `heuristic`; and the name of `code`, as package.module:NAME.
+where there is one, its `bound`; `calibrated` with the `theta` of its unknowns; `uniform`; `heuristic`; and the name of
+`code`, as package.module:NAME.
 
 Code is never loaded because a file names it: whoever opens the policy gives it again.
 """
@@ -14,8 +15,10 @@ import jax
 import jax.numpy as jnp
 
 from cuelearner_jax import config as configuration
+from cuelearner_jax.adaptation import changes as own_changes
 from cuelearner_jax.agents.protocol import AgentFunctions
 from cuelearner_jax.agents.registry import AGENTS
+from cuelearner_jax.calibration import Calibrated
 from cuelearner_jax.config import Frame, GuideSizes, Scalars, check_guide, check_part
 from cuelearner_jax.environment import Spaces, offers, spaces_of, view_of
 from cuelearner_jax.errors import UserError
@@ -24,7 +27,8 @@ from cuelearner_jax.guides.base import NAME, Guide
 from cuelearner_jax.policies import Agent, Guided, Heuristic, describe, layers, uniform_in
 from cuelearner_jax.run_config import kind_from_json, part_from_json
 
-KINDS = ("agent", "uniform", "heuristic", "guided", "code")
+CORRECTED = ("guided", "calibrated")  # policies of another one's actions
+KINDS = ("agent", "uniform", "heuristic", *CORRECTED, "code")
 PARTS = ((GuideSizes, "sizes"), (Scalars, "scalars"))  # of a guided policy's values
 DERIVED = ("clip_radius_deg", "fitted")  # of a description: the other values and the arrays say them already
 MOST_LAYERS = 16  # of a policy that was adapted again and again
@@ -45,6 +49,8 @@ def to_json(policy: Any, named: str | None = None) -> dict[str, Any]:
             raise UserError("a policy under a guidance of unknown sizes cannot be kept in a folder: give them as sizes")
         if layer["policy"] == "code":
             layer["named"] = named or "code"
+        for change in layer.get("changes", ()):
+            change.pop("value")
         for name in DERIVED:
             layer.pop(name, None)
     return described
@@ -59,10 +65,10 @@ def check(values: dict[str, Any]) -> None:
     """
     for depth, layer in enumerate(layers(values)):
         kind = layer["policy"]
-        if kind not in (KINDS if depth else ("guided",)) or depth >= MOST_LAYERS:
+        if kind not in (KINDS if depth else CORRECTED) or depth >= MOST_LAYERS:
             raise ValueError(f"{kind!r} is no policy here")
-        if (kind == "guided") != isinstance(layer.get("base"), dict):
-            raise ValueError(f"a policy of kind {kind} has a base, or a guided one has none")
+        if (kind in CORRECTED) != isinstance(layer.get("base"), dict):
+            raise ValueError(f"a policy of kind {kind} has a base, or one that corrects has none")
         if kind == "agent":
             check_part(part_from_json(AGENTS, layer["agent"]), "agent")
             if set(layer) != {"policy", "agent", "frame"} or layer["frame"] not in get_args(Frame):
@@ -75,6 +81,10 @@ def check(values: dict[str, Any]) -> None:
             if not NAME.fullmatch(layer["guidance"]) or type(layer["bounded"]) is not bool:
                 raise ValueError(f"a guidance is called {layer['guidance']!r}, and bounded {layer['bounded']!r}")
             kind_from_json(layer["guidance"], layer["options"])
+        if kind == "calibrated":
+            told = [*layer["distortions"], *(change[part] for change in layer["changes"] for part in ("name", "unit"))]
+            if not all(isinstance(name, str) for name in (layer["code"], layer["guidance"], *told)):
+                raise TypeError("changes are told by names and units")
 
 
 def arrays_of(policy: Any) -> Any:
@@ -85,6 +95,8 @@ def arrays_of(policy: Any) -> Any:
     if kind == "guided":
         bound = {} if policy.bound is None else {"bound": policy.bound}
         return {"base": arrays_of(policy.base), "model": policy.model, **bound}
+    if kind == "calibrated":
+        return {"base": arrays_of(policy.base), "theta": policy.theta}
     return {}
 
 
@@ -101,6 +113,8 @@ def shapes_of(values: dict[str, Any], env: Any, rows: int | None = None) -> Any:
         if values["policy"] == "guided":
             bound = {"bound": jnp.zeros(())} if values["bounded"] else {}
             return {"base": one(values["base"]), "model": _guidance(values, env).init(jax.random.key(0)), **bound}
+        if values["policy"] == "calibrated":
+            return {"base": one(values["base"]), "theta": jnp.zeros(len(values["changes"]))}
         return {}
 
     leading = () if rows is None else (rows,)
@@ -108,8 +122,14 @@ def shapes_of(values: dict[str, Any], env: Any, rows: int | None = None) -> Any:
     return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct((*leading, *leaf.shape), leaf.dtype), shapes)
 
 
-def from_json(values: dict[str, Any], arrays: Any, env: Any, code: Any = None) -> Any:
-    """The policy of plain values and arrays, in a world; `code`: the policy that stands for code in it.
+def from_json(values: dict[str, Any], arrays: Any, env: Any, code: Any = None, changes: Any = None) -> Any:
+    """The policy of plain values and arrays, in a world.
+
+    Args:
+        values, arrays: of the policy.
+        env: the world.
+        code: the policy that stands for code in it; None: none was given.
+        changes: the user's own distortions in it, as `changes.family_of` takes them; None: none were given.
 
     Raises:
         UserError: the policy's code was not given, or it needs what the environment has not.
@@ -125,9 +145,12 @@ def from_json(values: dict[str, Any], arrays: Any, env: Any, code: Any = None) -
             raise UserError("the policy is the task's heuristic, and this world has none: choose another world")
         return Heuristic(view_of(env))
     if kind == "guided":
-        base = from_json(values["base"], arrays["base"], env, code)
+        base = from_json(values["base"], arrays["base"], env, code, changes)
         sizes, scalars = (configuration.from_json(of, values[part]) for of, part in PARTS)
         return Guided(base, arrays["model"], view_of(env), scalars, _guidance(values, env), arrays.get("bound"), sizes)
+    if kind == "calibrated":
+        base = from_json(values["base"], arrays["base"], env, code, changes)
+        return Calibrated(base, arrays["theta"], own_changes.rebuilt(values, env, changes), values["code"])
     if kind != "code":
         raise ValueError(f"{kind!r} is no policy")
     if code is None:

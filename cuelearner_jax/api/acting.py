@@ -124,6 +124,7 @@ def load_policy(
     bound_deg: float | None = None,
     seed: int | None = None,
     base: Any = None,
+    changes: Any = None,
     task: Task | str | None = None,
     world: World | None = None,
 ) -> CallablePolicy:
@@ -138,6 +139,7 @@ def load_policy(
         bound_deg: of a policy folder: its bound [deg] (default: the largest).
         seed: its seed (default: the first).
         base: the policy that was adapted, where it is code: the folder names it, and does not hold it.
+        changes: the distortions of your own that calibration corrected: the folder names them, and does not hold them.
         task: needed for a run of a task from outside the package, whose code is not loaded because a file names it.
         world: where it is to act, for policies that look at more than observations (default: as it was trained).
 
@@ -160,7 +162,7 @@ def load_policy(
     if not path.exists():
         raise UserError(f"folder {path} does not exist: give the folder of a run, or of an adapted policy")
     find = lambda name: task if task and task.name == name else registry.find(name)  # noqa: E731
-    source = trained.PolicySource.of_folder(path, find, code)
+    source = trained.PolicySource.of_folder(path, find, code, changes)
     known, name = source.task, policy or source.default_policy
     changed = world.config if world else source.config.task
     source.check(name, changed)

@@ -19,6 +19,7 @@ from cuelearner_jax.api import arguments
 from cuelearner_jax.api.acting import CallablePolicy, as_policy, as_policy_in, source_of
 from cuelearner_jax.api.feedback import Labels, diverged, given_settings, label_path, labels_of, rows_of
 from cuelearner_jax.api.worlds import World
+from cuelearner_jax.calibration import Estimate, Result
 from cuelearner_jax.config import GuideSizes, Scalars
 from cuelearner_jax.environment import Environment, actions_of
 from cuelearner_jax.errors import UserError
@@ -33,14 +34,15 @@ from cuelearner_jax.types import Label, Teacher
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class AdaptedPolicy(CallablePolicy):
-    """A policy under a feedback model, within a bound; or the policy as it was, where the model is not `used`."""
+    """A policy under a feedback model, within a bound, or behind what changed in its world (guidance "calibration");
+    or the policy as it was, where neither is `used`."""
 
     outcome: AdaptedStudy
     named: str | None  # the base, as Python calls it; None: its world has no name either
 
     @property
     def used(self) -> bool:
-        """Is the model used? Not if it made the policy worse."""
+        """Is the model used? Not if it made the policy worse, or where calibration finds no change."""
         return bool(self.outcome.found.judged.used[0])
 
     @property
@@ -63,7 +65,23 @@ class AdaptedPolicy(CallablePolicy):
     @property
     def labels(self) -> Labels:
         """What was answered (of relative feedback)."""
-        return labels_of(jax.tree.map(lambda leaf: leaf[0], self.outcome.found.block.guide.labels))
+        return labels_of(jax.tree.map(lambda leaf: leaf[0], self.outcome.found.labels))
+
+    @property
+    def result(self) -> Result | None:
+        """What calibration found: its verdict, and an estimate with its interval of each unknown; None: a model was
+        fitted."""
+        return next(iter(self.outcome.found.results), None)
+
+    @property
+    def estimates(self) -> tuple[Estimate, ...]:
+        """Of each unknown of calibration (name, unit, mean, low, high, changed); empty: a model was fitted."""
+        return self.result.estimates if self.result else ()
+
+    @property
+    def words(self) -> list[str]:
+        """What `cuelearner adapt` prints of it, line by line."""
+        return study.sentences(self.outcome.found)
 
     @user_code.told
     def save(self, folder: str | Path, overwrite: bool = False) -> None:
@@ -89,7 +107,7 @@ def adapt(
     world: World | Environment,
     teacher: Teacher | None = None,
     *,
-    labels: int | Labels | str | os.PathLike[str] = 500,
+    labels: int | Labels | str | os.PathLike[str] | None = None,
     bound_deg: float | None = None,
     eps_deg: float | None = None,
     guidance: str | None = None,
@@ -99,6 +117,7 @@ def adapt(
     judge_by: str | None = None,
     judge_episodes: int = 100,
     judge_bounds: Sequence[float] | None = None,
+    changes: Any = None,
 ) -> AdaptedPolicy:
     """Corrects a finished policy by labels about what it does in a (changed) world: what `cuelearner adapt` does.
 
@@ -111,7 +130,8 @@ def adapt(
             that `jax.jit` made is compiled in).
         world: where it acts; a bare environment will do.
         teacher: who answers; None where labels are given.
-        labels: number of questions; or labels that are there already: arrays, or a label file.
+        labels: number of questions (default: 500, of calibration 100); or labels that are there already: arrays, or a
+            label file.
         bound_deg: how far corrections may lead from the policy's own actions [deg] (default: the scenario's, of labels
             that are there already as far as they reach, or else 45).
         eps_deg: strength of an answer [deg] (default: as labels, scenario or training had it).
@@ -124,6 +144,8 @@ def adapt(
         judge_episodes: that many tuning episodes, each of 100 steps where the task does not count episodes.
         judge_bounds: shares of the bound, such as (0.5, 0.25), within which the model is tried on these episodes too;
             it is used within what is worth most (default: the scenario's, or none).
+        changes: of guidance "calibration": what may have changed, as `Distortion`s of your own, or a function of the
+            environment that returns them (default: what the world declares).
 
     Raises:
         UserError: settings that make no sense, or with which the fit diverges.
@@ -156,13 +178,13 @@ def adapt(
         user_code.answers_in("teacher", arguments.teacher("teacher", teacher), env)
     elif file is None and rows is None:
         raise UserError("labels are asked of a teacher: give one, for instance teacher_of(world), or labels")
-    subject = Subject(source, BaseLanes(source.default_policy), own, teacher=teacher, rows=rows)
+    subject = Subject(source, BaseLanes(source.default_policy), own, teacher=teacher, rows=rows, changes=changes)
     outcome = study.run(subject, request, note=partial(warnings.warn, stacklevel=5))
-    if outcome.found.block.failed.any():
+    if outcome.found.failed.any():
         blame(outcome.found.of, teacher, outcome.found.block)
         raise diverged()
     if not outcome.found.judged.used.all():
-        warnings.warn(study.sentences(outcome.found)[0], stacklevel=3)
+        warnings.warn(study.sentences(outcome.found)[-1], stacklevel=3)
     adapted = outcome.found.policy(env).lane(0)
     named = _called(policy) if isinstance(world, World) else None
     trained = RunConfig(source.config.task)
@@ -193,6 +215,8 @@ def _given(labels: Any, world: Any) -> tuple[int | None, Path | None, Label | No
         if isinstance(world, World):
             return None, path, None
         return None, None, label_files.read(path).labels  # a bare environment has no name that a file could hold
+    if labels is None:
+        return None, None, None
     if not isinstance(labels, tuple):
         return arguments.budget("labels", labels), None, None
     return None, None, rows_of(labels)

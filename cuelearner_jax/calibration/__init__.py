@@ -1,6 +1,14 @@
 """Calibration: relative answers read as evidence of what changed in the world."""
 
-from cuelearner_jax.calibration.calibrating import CHANGED, UNCHANGED, UNEXPLAINED, Calibration, Result, calibrate
+from cuelearner_jax.calibration.calibrating import (
+    CHANGED,
+    UNCHANGED,
+    UNEXPLAINED,
+    Calibration,
+    Estimate,
+    Result,
+    calibrate,
+)
 from cuelearner_jax.calibration.corrected import Calibrated
 from cuelearner_jax.calibration.families import Distortion, Unknown, declared
 from cuelearner_jax.calibration.walking import Walk
@@ -12,6 +20,7 @@ __all__ = [
     "Calibrated",
     "Calibration",
     "Distortion",
+    "Estimate",
     "Result",
     "Unknown",
     "Walk",

@@ -6,12 +6,14 @@ from functools import partial
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from cuelearner_jax.calibration.families import Family, acted, seen, unknowns_of
-from cuelearner_jax.policies import SHARED, PolicyNode, describe
+from cuelearner_jax.guides.calibration import KIND
+from cuelearner_jax.policies import BY_LANE, SHARED, PolicyNode, describe
 from cuelearner_jax.types import EnvState
 
 
@@ -19,8 +21,9 @@ class Calibrated(PolicyNode):
     """Another policy's actions, behind the changes of a family; with all unknowns at zero that policy's own."""
 
     base: Any  # a policy
-    theta: Float[Array, " unknowns"]  # in their units
+    theta: Float[Array, " unknowns"]  # in their units; of a block (lanes, unknowns)
     family: Family = struct.field(pytree_node=False)
+    named: str = struct.field(pytree_node=False, default="")  # code of the family; empty: the world declares it
 
     def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
         """The base's actions, corrected."""
@@ -29,11 +32,12 @@ class Calibrated(PolicyNode):
 
     @property
     def axes(self) -> Calibrated:
-        """Each lane has its own base; what changed is one for all."""
-        return self.replace(base=self.base.axes, theta=SHARED)
+        """Each lane has its own base, and what changed where there is more than one."""
+        return self.replace(base=self.base.axes, theta=SHARED if jnp.ndim(self.theta) == 1 else BY_LANE)
 
     def describe(self) -> dict[str, Any]:
-        """What has changed, by how much and in which unit, and the base."""
-        values = zip(unknowns_of(self.family), np.asarray(self.theta).tolist(), strict=True)
+        """What has changed, by how much (of a block a value a lane) and in which unit, and the base."""
+        values = zip(unknowns_of(self.family), np.asarray(self.theta).T.tolist(), strict=True)
         changes = [{"name": one.name, "value": value, "unit": one.unit} for one, value in values]
-        return {"policy": "calibrated", "changes": changes, "base": describe(self.base)}
+        distortions = {"distortions": [one.name for one in self.family], "changes": changes, "code": self.named}
+        return {"policy": "calibrated", "guidance": KIND.name, **distortions, "base": describe(self.base)}

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Generic
 
+from cuelearner_jax.adaptation import changes
 from cuelearner_jax.cli.parsing import about, code_of, out, parse, source_of, taken
 from cuelearner_jax.cli.shared_options import Flag, KindsT, TaskT, kinds_type, unprefixed
 from cuelearner_jax.errors import NotFinite, UserError
@@ -25,7 +26,8 @@ class Adapt(AdaptRequest[TaskT, KindsT], Generic[TaskT, KindsT]):
     out: Path
     """The policy folder that is written."""
     overwrite: Flag[bool] = False
-    """Delete the policy folder that is there."""
+    """Delete the policy folder that is there. (Beside all these: --changes package.module:NAME gives calibration
+    distortions of your own in place of those that the world declares.)"""
     base: BaseLanes = field(default_factory=BaseLanes)
 
 
@@ -37,6 +39,7 @@ FIRST = {"scenario": "NAME", "guidance": "KIND", "judge_by": "METRIC", "labels_f
 def run(arguments: list[str]) -> None:
     """Runs the command. Raises UserError for what cannot be adapted, NotFinite if a model could not be fitted."""
     source, code, named, rest = _source(arguments)
+    changed, _ = taken(arguments, "--changes", "package.module:NAME")
     first = {name: taken(rest, f"--{name.replace('_', '-')}", wanted)[0] for name, wanted in FIRST.items()}
     file = Path(first["labels_from"]) if first["labels_from"] else None
     default = adapt.suggested(source, **{**first, "labels_from": file})
@@ -50,6 +53,8 @@ def run(arguments: list[str]) -> None:
     asked = parse(kind, rest, f"adapt {source.folder}", default, about(Adapt, source.task, policies=True))
     asked = replace(asked, kinds=vars(asked.kinds))
     subject = Subject(source.on(asked.robot), asked.base, code, named)
+    if changed is not None and (adapt.reads_evidence(asked) or source.adapted is None):  # else the folder's code
+        subject = subject._replace(changes=changes.load(changed), changes_named=changed)
     with (
         policy_folders.place_of(asked.out, asked.overwrite) as place,
         progress_bars(shown=console.is_terminal) as bars,
@@ -59,7 +64,7 @@ def run(arguments: list[str]) -> None:
     for line in adapt.sentences(outcome.found):
         out.print(line)
     out.print(f"wrote {asked.out} (measure it with: cuelearner evaluate {asked.out})")
-    if outcome.found.block.failed.any():
+    if outcome.found.failed.any():
         raise NotFinite("a fit is no longer finite, its model is not used: lower --scalars.feedback-learning-rate")
 
 

@@ -19,6 +19,7 @@ import tyro
 from rich.console import Console
 
 from cuelearner_jax import plugins
+from cuelearner_jax.adaptation import changes
 from cuelearner_jax.cli.dispatch import HELP, HELP_ALL
 from cuelearner_jax.errors import UserError, closest, no_space
 from cuelearner_jax.guides import registry as guidances
@@ -222,7 +223,8 @@ def preset_of(task: Task, arguments: list[str], default: str = PAPER) -> tuple[s
 def source_of(arguments: list[str], command: str, kind: type) -> tuple[PolicySource, list[str]]:
     """The run folder, policy folder or task named first, and the other arguments.
 
-    --task makes a task from outside known, --agent and --arbiter those of a run, and --base the code in a policy.
+    --task makes a task from outside known, --agent and --arbiter those of a run, --base and --changes the code in a
+    policy.
 
     Raises:
         UserError: there is no such folder or task, or it cannot be had.
@@ -231,6 +233,8 @@ def source_of(arguments: list[str], command: str, kind: type) -> tuple[PolicySou
     known = None if given is None else registry.resolve(given)
     reference, rest = taken(rest, "--base", "package.module:NAME")
     code = None if reference is None else code_of(reference)
+    named, rest = taken(rest, "--changes", "package.module:NAME")
+    changed = None if named is None else changes.load(named)
     for name, parts in PARTS.items():
         reference, rest = taken(rest, f"--{name}", "package.module:NAME")
         if reference is not None:
@@ -245,7 +249,10 @@ def source_of(arguments: list[str], command: str, kind: type) -> tuple[PolicySou
         whole.check_not_aside(folder)
         holds = (folder / "config.json").exists() or policy_folders.is_one(folder)
         if holds or (folder.exists() and name not in registry.names()):
-            return _of_folder(folder, known, code), rest
+            source = _of_folder(folder, known, code, changed)
+            if named is not None and source.adapted is None and command != "adapt":
+                raise UserError(f"{folder} is a run, without changes in its policies: leave out --changes")
+            return source, rest
         if known is not None:
             raise UserError(f"{name!r} is no run folder of the task {known.name}: give one, or leave it out")
         if ":" not in name and name not in registry.names():
@@ -290,9 +297,9 @@ def code_of(reference: str) -> Any:
     return policy_of(plugins.load(reference, object, "a policy"))
 
 
-def _of_folder(folder: Path, known: Task | None, code: Any) -> PolicySource:
+def _of_folder(folder: Path, known: Task | None, code: Any, changed: Any) -> PolicySource:
     """A run or policy folder. Raises UserError if it is none, or of another task than the one named beside it."""
-    source = PolicySource.of_folder(folder, registry.find, code)
+    source = PolicySource.of_folder(folder, registry.find, code, changed)
     if known is not None and known.name != source.task.name:
         what = "a run" if source.grid else "a policy"
         raise UserError(f"{folder} is {what} of {source.task.name}, not of {known.name}: leave out --task")

@@ -39,6 +39,7 @@ class Kind:
     colour: str | None = None  # in figures
     config: type | None = None  # a frozen dataclass of the options that this kind alone has; None: it has none
     sees_base: bool = False  # does it look at what a finished policy did? Then it serves adaptation alone
+    by_evidence: bool = False  # does `calibration` read its answers? Then it has no model, and serves adaptation alone
 
     def __post_init__(self) -> None:
         if not NAME.fullmatch(self.name):
@@ -48,6 +49,11 @@ class Kind:
     def asks(self) -> bool:
         """Whether it asks a teacher."""
         return self.form is not None
+
+    @property
+    def adapts_only(self) -> bool:
+        """Whether it corrects finished policies alone."""
+        return self.sees_base or self.by_evidence
 
     def make(self, sizes: GuideSizes, spaces: Spaces, options: Any = None) -> Guide:
         """The guide for an environment's spaces; `options`: a `config` (None: its defaults)."""

@@ -13,13 +13,13 @@ from typing import Any
 from cuelearner_jax.config import GuideSizes
 from cuelearner_jax.environment import offers, spaces_of
 from cuelearner_jax.errors import UserError, closest
-from cuelearner_jax.guides import dcoach, demonstration, intent, offset, relative, scalar, untaught
+from cuelearner_jax.guides import calibration, dcoach, demonstration, intent, offset, relative, scalar, untaught
 from cuelearner_jax.guides.base import Guide, Kind
 from cuelearner_jax.plugins import load
 
 ENTRY_POINTS = "cuelearner.guidances"
 
-_TAUGHT = (demonstration.KIND, scalar.KIND, dcoach.KIND, offset.KIND)
+_TAUGHT = (demonstration.KIND, scalar.KIND, dcoach.KIND, offset.KIND, calibration.KIND)
 _BUILT_IN = (untaught.NONE, relative.KIND, intent.KIND, untaught.HEURISTIC, *_TAUGHT)
 _KINDS: dict[str, Kind] = {kind.name: kind for kind in _BUILT_IN}
 
@@ -68,7 +68,7 @@ def named(text: str) -> str:
 
 def possible(env: Any, taught: bool) -> tuple[str, ...]:
     """Names of the kinds that an agent can be trained with; `taught`: is there a teacher to ask?"""
-    trained = (kind for kind in known() if not kind.sees_base and (taught or not kind.asks))
+    trained = (kind for kind in known() if not kind.adapts_only and (taught or not kind.asks))
     return tuple(kind.name for kind in trained if all(offers(env, need) for need in kind.needs))
 
 

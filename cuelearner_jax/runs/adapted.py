@@ -11,14 +11,14 @@ import jax
 import numpy as np
 
 from cuelearner_jax import config as configuration
-from cuelearner_jax.adaptation import stored
+from cuelearner_jax.adaptation import calibrated, stored
 from cuelearner_jax.adaptation.adapting import Adapted
 from cuelearner_jax.adaptation.judging import SPLIT
 from cuelearner_jax.adaptation.lanes import Lanes
 from cuelearner_jax.environment import actions_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.feedback.forms import AnswerForm
-from cuelearner_jax.policies import Common, Guided, lanes_in, layers
+from cuelearner_jax.policies import Common, lanes_in, layers
 from cuelearner_jax.runs.grid import LARGEST_BUDGET, LARGEST_SEED, world_of
 from cuelearner_jax.storage import formats, label_files, policy_folders, results
 from cuelearner_jax.storage import table as tables
@@ -29,8 +29,8 @@ from cuelearner_jax.types import Label
 
 COLUMNS = {"base": int, "seeds": int, "labels": int, "bounds_deg": float, "used": bool}  # of the lanes
 CONVENTIONS = {
-    "action": "unit vector: the base policy's, refined by the model until a pass turns it by less than tau, within the "
-    "bound",
+    "action": "the base policy's, refined by the model until a pass moves it by less than tau, within the bound; or, "
+    "calibrated, of the observation as it was before the changes, led back to what it meant",
     "angles": "degrees where a name ends in _deg, else radians; counterclockwise positive",
 }
 
@@ -45,6 +45,7 @@ class AdaptedLanes:
     used: np.ndarray  # (lanes,) bool
     rows: int | None  # base policies, of which lanes have one each; None: they share one
     code: Any  # the policy that stands for code, or None
+    changes: Any = None  # the user's own distortions, as `changes.family_of` takes them, or None
 
     @property
     def guidance(self) -> str:
@@ -54,14 +55,19 @@ class AdaptedLanes:
     @property
     def kinds(self) -> tuple[str, ...]:
         """The kinds of guidance that the policy is under, the last first."""
-        return tuple(layer["guidance"] for layer in layers(self.values["policy"]) if layer["policy"] == "guided")
+        return tuple(layer["guidance"] for layer in layers(self.values["policy"]) if "guidance" in layer)
 
-    def policy(self, env: Any) -> Guided:
+    @property
+    def bounds_deg(self) -> np.ndarray:
+        """How far lanes may lead from what was adapted, in the space's unit; 0: there is no bound."""
+        return self.lanes.bound_deg * bool(self.values["policy"].get("bounded"))
+
+    def policy(self, env: Any) -> Any:
         """A block of the lanes' policies. Raises UserError if it cannot be had."""
         values, arrays = self.values["policy"], self._arrays(env)
-        base = stored.from_json(values["base"], arrays["base"], env, self.code)
+        base = stored.from_json(values["base"], arrays["base"], env, self.code, self.changes)
         base = Common(base) if self.rows is None else base.lane(self.lanes.base)
-        made = stored.from_json({**values, "base": {"policy": "uniform"}}, arrays, env)
+        made = stored.from_json({**values, "base": {"policy": "uniform"}}, arrays, env, changes=self.changes)
         return replace(made, base=base)
 
     def base(self, env: Any) -> Any:
@@ -78,13 +84,16 @@ class AdaptedLanes:
         return policy_folders.read_arrays(self.folder, like, self.values)
 
 
-def open_folder(folder: Path, find: Callable[[str], Task], code: Any = None) -> tuple[Task, Any, AdaptedLanes]:
+def open_folder(
+    folder: Path, find: Callable[[str], Task], code: Any = None, changes: Any = None
+) -> tuple[Task, Any, AdaptedLanes]:
     """The task, the world (a configuration) and the lanes of a policy folder.
 
     Args:
         folder: the folder.
         find: as `grid.load` has it.
         code: the policy that stands for code in it; None: none was given.
+        changes: the user's own distortions in it, as `changes.family_of` takes them; None: none were given.
 
     Raises:
         UserError: it cannot be read, is damaged, or of a task that is not known.
@@ -99,7 +108,7 @@ def open_folder(folder: Path, find: Callable[[str], Task], code: Any = None) -> 
         raise error if str(path) in str(error) else UserError(f"{path}: {error}") from error
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise formats.damaged("policy", path) from error
-    return task, world, AdaptedLanes(folder, values, lanes, used, values["rows"], code)
+    return task, world, AdaptedLanes(folder, values, lanes, used, values["rows"], code, changes)
 
 
 def _lanes(told: dict[str, Any], rows: int | None) -> tuple[Lanes, np.ndarray]:
@@ -168,6 +177,7 @@ def write(
             "difference": [_plain(ends) for ends in judged.difference],
             "rewarded_steps": judged.rewarded_steps.tolist(),
         },
+        **({"calibration": calibrated.to_json(adapted.results)} if adapted.results else {}),
         **{name: value for name, value in (used or {}).items() if value},
         "observation": [quantity._asdict() for quantity in env.observation],
         "conventions": CONVENTIONS,

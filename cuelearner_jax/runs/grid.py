@@ -62,8 +62,8 @@ def check_grid(grid: Grid, adapts: bool = False) -> None:
     """Raises UserError for a grid that makes no sense; `adapts`: a finished policy is adapted, no agent trained."""
     kinds = [guidances.find(kind) for kind in grid.guidance]
     for kind in kinds:
-        if kind.sees_base and not adapts:
-            raise UserError(f"guidance {kind.name!r} looks at what a finished policy did: give it to `adapt` alone")
+        if kind.adapts_only and not adapts:
+            raise UserError(f"guidance {kind.name!r} corrects a finished policy: give it to `adapt` alone")
     if not grid.guidance or len(set(grid.guidance)) < len(grid.guidance):
         raise UserError("--guidance: give each kind once, and at least one")
     if not grid.seeds or len(set(grid.seeds)) < len(grid.seeds) or not all(0 <= s < LARGEST_SEED for s in grid.seeds):

@@ -107,8 +107,10 @@ class PolicySource:
         return cls(task, config, grid, folder, pieces)
 
     @classmethod
-    def of_folder(cls, folder: Path, find: Callable[[str], Task], code: Any = None) -> PolicySource:
-        """A run's or a policy folder's. `code`: the policy that stands for code in the latter, named by the user.
+    def of_folder(
+        cls, folder: Path, find: Callable[[str], Task], code: Any = None, changes: Any = None
+    ) -> PolicySource:
+        """A run's or a policy folder's. `code`, `changes`: the code in the latter, named by the user (`open_folder`).
 
         Raises UserError if it is neither, cannot be read, or no code is asked for where some is given.
         """
@@ -117,7 +119,7 @@ class PolicySource:
             if code is not None:
                 raise UserError(f"{folder} is a run, without code in its policies: leave out --base")
             return run
-        task, world, lanes = open_folder(folder, find, code)
+        task, world, lanes = open_folder(folder, find, code, changes)
         return cls(task, RunConfig(world), None, folder, adapted=lanes)
 
     @property
@@ -205,7 +207,7 @@ class Block(NamedTuple):
     guidance: str
     seeds: np.ndarray  # (lanes,)
     budgets: np.ndarray  # (lanes,)
-    bounds: np.ndarray  # (lanes,) [deg]; of a run 0
+    bounds: np.ndarray  # (lanes,) [deg]; 0: there is none
     step: int
     policy: Any  # a block, or `Common`
     failed: np.ndarray  # (lanes,) bool
@@ -224,7 +226,7 @@ def blocks_of(
         kept = source.adapted
         if kinds and kept.guidance not in kinds:
             raise UserError(f"{source.folder} is under {kept.guidance} guidance: leave out --guidance")
-        columns = (kept.lanes.seed, kept.lanes.budget, kept.lanes.bound_deg)
+        columns = (kept.lanes.seed, kept.lanes.budget, kept.bounds_deg)
         policy = make(name, source.config, view, teacher, adapted=kept)
         return [Block(kept.guidance, *columns, 0, policy, np.zeros(kept.lanes.number, bool))]
     loaded = source.load(kinds)
@@ -306,8 +308,9 @@ def several(
             known_seeds, known_budgets, known_bounds = (listed(values.tolist()) for values in known.values())
             of, bounds, others = "run", "", ""
             if source.grid is None:
-                unit = actions_of(view).unit
-                of, bounds, others = "folder", f" within {bound:g} {unit}", f" within {known_bounds} {unit}"
+                unit, of = actions_of(view).unit, "folder"
+                if bound or bound_deg is not None:
+                    bounds, others = f" within {bound:g} {unit}", f" within {known_bounds} {unit}"
             raise UserError(
                 f"no lane with seed {seed} and {budget} labels{bounds}: the {of} has seeds {known_seeds} "
                 f"and labels {known_budgets}{others}"

@@ -14,14 +14,17 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Generic, NamedTuple, TypeVar
 
+import jax.numpy as jnp
 import numpy as np
 
 from cuelearner_jax import user_code
-from cuelearner_jax.adaptation import adapting, judging, stored
+from cuelearner_jax.adaptation import adapting, calibrated, changes, judging, stored
 from cuelearner_jax.adaptation.adapting import Adapted
+from cuelearner_jax.adaptation.calibrated import Calibrating
 from cuelearner_jax.adaptation.judging import Judging
 from cuelearner_jax.adaptation.lanes import Adaptation, begin, one_each, product, side_by_side
 from cuelearner_jax.asking import label_slots
+from cuelearner_jax.calibration import Calibrated, declared
 from cuelearner_jax.config import GuideSizes, Scalars, check_guide, check_part
 from cuelearner_jax.environment import Environment, actions_of, spaces_of
 from cuelearner_jax.errors import UserError, closest
@@ -112,6 +115,8 @@ class Subject(NamedTuple):
     named: str | None = None  # package.module:NAME of the code, that policy or what the source's folder holds
     teacher: Teacher | None = None  # None: the task's own
     rows: Label | None = None  # labels (labels, ...) in place of questions; None: none
+    changes: Any = None  # what may have changed, as `changes.family_of` takes it; None: what the world declares
+    changes_named: str = "code"  # package.module:NAME of these
 
 
 class AdaptedStudy(NamedTuple):
@@ -154,22 +159,30 @@ def suggested(
         UserError: there is no such scenario or label file.
     """
     rules = source.task.scenario(scenario) if scenario else AS_IT_IS
+    kind = guidances.resolve(guidance or rules.guidance or AdaptRequest.guidance)
     if guidance not in (None, rules.guidance):
         rules = replace(rules, guidance=None, sizes={}, scalars={}, options={})  # which are for the suggested kind
+        if kind.by_evidence:
+            rules = replace(rules, bound_deg=None, judge_by=None, judge_bounds=())
     if judge_by == judging.LABELS:
         rules = replace(rules, judge_bounds=())  # which are tried on episodes
-    labels = AdaptRequest.labels
+    labels = (calibrated.USUAL,) if kind.by_evidence else AdaptRequest.labels
     if labels_from is not None:
         file = label_files.read(labels_from)
         eps_deg = file.eps if eps_deg is None else eps_deg
         labels = (file.budget,)
-    sizes = sizes or replace(adapting.SIZES, **{"frame": source.config.sizes.frame, **rules.sizes})
+    frame, settling = {"frame": source.config.sizes.frame}, adapting.settling
+    if kind.by_evidence:
+        frame, settling = {}, calibrated.settling
+    sizes = sizes or replace(adapting.SIZES, **{**frame, **rules.sizes})
     if scalars is None:
         eps_deg = rules.eps_deg if eps_deg is None else eps_deg
-        scalars = replace(adapting.settling(source.config.scalars, eps_deg), **rules.scalars)
+        scalars = replace(settling(source.config.scalars, eps_deg), **rules.scalars)
+    elif kind.by_evidence:
+        scalars = scalars if eps_deg is None else replace(scalars, eps_deg=eps_deg)
     else:
-        scalars = adapting.settling(scalars, eps_deg)
-    kind = guidances.resolve(guidance or rules.guidance or AdaptRequest.guidance)
+        scalars = settling(scalars, eps_deg)
+    by = judging.LABELS if kind.by_evidence else AdaptRequest.judge_by
     own = source.config.kinds.get(kind.name) or (kind.config and kind.config())
     return AdaptRequest(
         task=rules.applied(source.config.task),
@@ -178,12 +191,17 @@ def suggested(
         guidance=guidance or rules.guidance or AdaptRequest.guidance,
         scenario=scenario,
         labels_from=labels_from,
-        judge_by=judge_by or rules.judge_by or AdaptRequest.judge_by,
+        judge_by=judge_by or rules.judge_by or by,
         judge_bounds=rules.judge_bounds,
         sizes=sizes,
         scalars=scalars,
         kinds={kind.name: replace(own, **rules.options)} if own else {},
     )
+
+
+def reads_evidence(request: AdaptRequest[Any, Any]) -> bool:
+    """Return whether answers are read as evidence of what changed, see `calibrated`."""
+    return guidances.resolve(request.guidance).by_evidence
 
 
 def run(
@@ -201,6 +219,10 @@ def run(
     kind = guidances.resolve(request.guidance)
     if not kind.asks:
         raise UserError(f"guidance {kind.name!r} asks nothing that could be learned from: choose another kind")
+    if subject.changes is not None and not kind.by_evidence:
+        raise UserError(f"changes is given, but guidance {kind.name!r} knows none: give guidance calibration")
+    if kind.by_evidence:
+        calibrated.check_unused(sizes, scalars, bound_deg=request.bound_deg, judge_bounds=request.judge_bounds)
     env = task.environment(request.task)
     for name, options in request.kinds.items():
         check_part(options, name)
@@ -211,7 +233,7 @@ def run(
         raise UserError("several base policies are adapted each with its own seed: leave out --seeds and --first-seed")
     seeds = seeds_of(request.first_seed, request.seeds) if shared else seeds
     rows, request = _rows(subject, request, guidance, env, bases, seeds)
-    if note_of := adapting.check_amounts(actions_of(env), request.bound_deg, scalars):
+    if not kind.by_evidence and (note_of := adapting.check_amounts(actions_of(env), request.bound_deg, scalars)):
         note(note_of)
     varied = seeds, request.labels, request.bound_deg
     lanes = product(1, *varied) if shared else one_each(*varied)
@@ -220,12 +242,33 @@ def run(
     if rows is None:
         teacher = subject.teacher or task.make_teacher(request.task, env)
         check_teacher(teacher, scalars)
-    of = Adaptation(guidance, sizes, scalars, env, bases)
-    if subject.policy is None or subject.named:  # it is to be kept in a folder
-        stored.to_json(of.policy(begin(of, lanes)))
     if rows is not None:
         rows = label_files.for_lanes(rows, lanes.seed, lanes.budget, label_slots(int(lanes.budget.max()), sizes))
-    return AdaptedStudy(adapting.adapt(of, lanes, how, teacher, rows, watch=watch), subject, request, origin)
+    kept = subject.policy is None or subject.named  # in a folder
+    if kind.by_evidence:
+        of = Calibrating(guidance, sizes, scalars, env, bases, *_family(subject, request, kind.name, env))
+        if kept:
+            stored.to_json(Calibrated(bases, jnp.zeros((lanes.number, 0)), (), of.named))
+        found = calibrated.adapt(of, lanes, how, teacher, rows, watch)
+    else:
+        of = Adaptation(guidance, sizes, scalars, env, bases)
+        if kept:
+            stored.to_json(of.policy(begin(of, lanes)))
+        found = adapting.adapt(of, lanes, how, teacher, rows, watch=watch)
+    return AdaptedStudy(found, subject, request, origin)
+
+
+def _family(subject: Subject, request: AdaptRequest, kind: str, env: Environment) -> tuple[Any, str]:
+    """What may have changed, and the code of it. Raises UserError for what makes no sense."""
+    options = request.kinds.get(kind)
+    asked = {} if options is None else dataclasses.asdict(options)
+    if subject.changes is None:
+        return declared(env, **asked), ""
+    if given := [name for name, value in asked.items() if value]:
+        raise UserError(f"{kind}.{given[0]} is about changes that the world declares: leave it out beside changes")
+    family = changes.family_of(subject.changes, env)
+    changes.check_acts(family, env)
+    return family, subject.changes_named
 
 
 def _bases(subject: Subject, request: AdaptRequest, env: Any) -> tuple[Any, tuple[int, ...], dict[str, Any]]:
@@ -261,6 +304,10 @@ def _rows(
     task, path, rows, space = subject.source.task, request.labels_from, subject.rows, actions_of(env)
     grid = Grid((guidance.name,), seeds, request.labels)
     check_grid(grid, adapts=True)
+    if guidance.kind.by_evidence:
+        if (least := min(request.labels)) < calibrated.LEAST:
+            raise UserError(f"labels is {least}: give at least {calibrated.LEAST}, of which some are held out")
+        request = replace(request, bound_deg=(space.reach,))  # there is none
     file, form = None, guidance.form
     assert form is not None  # it asks
     if path is not None:
@@ -311,6 +358,8 @@ def _worth(difference: np.ndarray, steps: np.ndarray) -> str:
 
 def sentences(found: Adapted) -> list[str]:
     """What adaptation has led to, a line for each budget and bound."""
+    if found.results:
+        return calibrated.sentences(found)
     lanes, judged, lines = found.lanes, found.judged, []
     unit = actions_of(found.of.env).unit
     for bound, budget in sorted({*zip(lanes.bound_deg.tolist(), lanes.budget.tolist(), strict=True)}):

@@ -130,7 +130,7 @@ def run(
         for bound, budget in sorted(set(zip(block.bounds.tolist(), block.budgets.tolist(), strict=True))):
             own = (block.budgets == budget) & (block.bounds == bound)
             mine, apart = ({metric: np.asarray(of[metric])[place[own]] for metric in of} for of in (means, each))
-            bounded = bound if source.adapted is not None and block.guidance != "-" else None
+            bounded = bound or None
             variant = block.guidance, budget, block.step, block.seeds[own]
             rows.append(Measured(*variant, mine, apart, bounded, is_shared, unit))
     return rows

@@ -1,0 +1,90 @@
+"""What may have changed: derived from what a world declares, or distortions of the user's own."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from cuelearner_jax import plugins
+from cuelearner_jax.calibration import Distortion, declared
+from cuelearner_jax.calibration.families import Family, acted, check_family, seen, unknowns_of
+from cuelearner_jax.environment import Environment, actions_of
+from cuelearner_jax.errors import UserError, shown
+
+SITUATIONS = 8  # in which no change must change nothing
+SAME = 1e-4  # by which an entry may differ then
+
+
+def load(reference: str) -> Any:
+    """Return the changes that `package.module:NAME` leads to. Raises UserError if there are none."""
+    found = plugins.load(reference, object, "changes of the world")
+    if not (isinstance(found, Distortion | list | tuple) or callable(found)):
+        raise UserError(f"{reference} is {shown(found)}: {WANTED}")
+    return found
+
+
+WANTED = "give a cuelearner_jax.Distortion, several, or a function of the environment that returns them"
+
+
+def family_of(given: Any, env: Any) -> Family:
+    """Return distortions that a user gives.
+
+    Args:
+        given: a distortion, a list of them, or a function of the environment that returns one of these.
+        env: the environment, or its view.
+
+    Raises:
+        UserError: it is something else, or a family that makes no sense.
+    """
+    if callable(given):
+        given = given(env)
+    several = (given,) if isinstance(given, Distortion) else given
+    if not isinstance(several, list | tuple) or not all(isinstance(one, Distortion) for one in several):
+        raise UserError(f"changes is {shown(given)}: {WANTED}")
+    return check_family(several)
+
+
+def check_acts(family: Family, env: Environment) -> None:
+    """Raises UserError unless distortions fit a world, and change nothing where their unknowns are zero."""
+    k_reset, k_action = jax.random.split(jax.random.key(0))
+    space, keys = actions_of(env), jax.random.split(k_reset, SITUATIONS)
+    obs, actions = jax.vmap(env.reset)(keys)[1], space.sample(k_action, (SITUATIONS,))
+    for one in family:
+        nothing = jnp.zeros(len(one.unknowns))
+        for name, given, found in (
+            ("sees", obs, jax.vmap(lambda row, one=one, none=nothing: seen((one,), none, row))(obs)),
+            ("acts", actions, jax.vmap(lambda row, one=one, none=nothing: acted((one,), none, row, False))(actions)),
+        ):
+            if found.shape != given.shape:
+                raise UserError(f"distortion {one.name!r}: {name} returns {found.shape[1:]}: give {given.shape[1:]}")
+            if not np.allclose(np.asarray(found), np.asarray(given), atol=SAME, rtol=SAME):
+                raise UserError(f"distortion {one.name!r}: {name} changes rows though all of its unknowns are zero")
+
+
+def rebuilt(layer: dict[str, Any], env: Any, changes: Any = None) -> Family:
+    """Return the distortions of a stored policy.
+
+    Args:
+        layer: what the file says of the policy.
+        env: where it acts.
+        changes: code of the user's own distortions, as `family_of` takes it; None: none was named.
+
+    Raises:
+        UserError: code that was not given, or distortions that this world or code does not have.
+    """
+    code, names = layer["code"], layer["distortions"]
+    if code and changes is None:
+        raise UserError(
+            f"this policy corrects changes of code, {code}, which is not loaded because a file names it: add "
+            f"--changes {code} (from Python changes=...) if you trust that code"
+        )
+    known = {one.name: one for one in (family_of(changes, env) if code else declared(env, gains=True))}
+    if missing := [name for name in names if name not in known]:
+        raise UserError(f"this policy corrects {missing[0]!r}, which {code or 'this world'} lacks: give its own")
+    family = tuple(known[name] for name in names)
+    if [one.name for one in unknowns_of(family)] != [one["name"] for one in layer["changes"]]:
+        raise UserError(f"the unknowns of {', '.join(names)} are others than this policy's: give the code that made it")
+    return family

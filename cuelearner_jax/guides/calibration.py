@@ -1,0 +1,32 @@
+"""Calibration as a kind of guidance: relative answers as evidence of what changed in the world.
+
+No network is fitted and no action refined: `cuelearner_jax.calibration` reads the answers, outside compiled programs.
+"""
+
+from __future__ import annotations
+
+from cuelearner_jax.config.parts import part
+from cuelearner_jax.feedback.answers import RELATIVE
+from cuelearner_jax.guides.base import Kind
+from cuelearner_jax.guides.untaught import Untaught
+
+
+@part
+class Config:
+    """Which changes are derived from what the world declares; see `calibration.families.declared`."""
+
+    gains: bool = False
+    """Also ask whether lengths that are seen, and the actions of a box, were scaled."""
+    teacher_bias: bool = False
+    """A constant difference between answers and policy is the teacher's own: it is told and not corrected."""
+
+
+KIND = Kind(
+    "calibration",
+    "relative feedback for adaptation: what changed in the world, with an interval",
+    Untaught,
+    form=RELATIVE,
+    colour="#B15928",
+    config=Config,
+    by_evidence=True,
+)
