@@ -246,10 +246,10 @@ class Task:
             raise UserError(f"unknown engine {name!r}{closest(name, engines)}")
         return engines[name]
 
-    def pictures(self) -> Pictures:
-        """How the first body is drawn. Raises UserError if nothing draws it."""
+    def pictures(self, otherwise: str = "evaluate it instead") -> Pictures:
+        """How the first body is drawn. Raises UserError, with what to do `otherwise`, if nothing draws it."""
         if self.bodies[0].pictures is None:
-            raise UserError(f"{self.name} has no pictures of {self.bodies[0].name}: evaluate it instead")
+            raise UserError(f"{self.name} has no pictures of {self.bodies[0].name}: {otherwise}")
         return self.bodies[0].pictures()
 
     def scenario(self, name: str) -> Scenario:

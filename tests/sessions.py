@@ -20,26 +20,26 @@ OWN = "page_task:TASK"  # as commands name it
 ENV = page_task.TASK.environment(probes.CONFIG.task)
 
 
-def plan(labels=20, kind="relative", base=None, **others):
+def plan(labels=20, kind="relative", base=None, config=probes.CONFIG, **others):
     """Of a session on the bandit."""
     guidance = guidances.make(kind, probes.SIZES, ENV)
-    return Plan(page_task.TASK, probes.CONFIG, guidance, base or Base(Uniform(), "uniform"), labels, **others)
+    return Plan(page_task.TASK, config, guidance, base or Base(Uniform(), "uniform"), labels, **others)
 
 
-def expert(item):
+def expert(item, eps_deg=probes.SCALARS.eps_deg):
     """What the expert answers: which way its best action lies, unless it is within half of eps (by angles)."""
     best = np.asarray(ENV.best(item.guide.obs), float)
     cross = item.action[0] * best[1] - item.action[1] * best[0]
     apart = np.degrees(np.arctan2(cross, item.action @ best))
-    return np.array([0.0 if abs(apart) <= probes.SCALARS.eps_deg / 2 else np.sign(apart)], np.float32)
+    return np.array([0.0 if abs(apart) <= eps_deg / 2 else np.sign(apart)], np.float32)
 
 
-def give(session, count):
+def give(session, count, eps_deg=probes.SCALARS.eps_deg):
     """Answers so many questions; returns the items."""
     items = []
     for _ in range(count):
         items.append(session.item)
-        assert session.answer(session.number, expert(session.item))
+        assert session.answer(session.number, expert(session.item, eps_deg))
     return items
 
 
@@ -55,11 +55,11 @@ def settled(session, fits=None):
 
 
 @contextlib.contextmanager
-def served(folder, *more):
+def served(folder, *more, task=OWN):
     """The command in a process of its own, once it has told its address: the process and that."""
     paths = os.pathsep.join([str(TESTS), str(TESTS.parent), str(TESTS.parent / "envs")])
     env = {**os.environ, "PYTHONPATH": paths, "PYTHONUNBUFFERED": "1"}
-    command = [sys.executable, "-m", "cuelearner_jax.cli", "label", OWN, "--out", str(folder), "--labels", "20", *more]
+    command = [sys.executable, "-m", "cuelearner_jax.cli", "label", task, "--out", str(folder), "--labels", "20", *more]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     with subprocess.Popen(command, env=env, **pipes) as process:
         try:

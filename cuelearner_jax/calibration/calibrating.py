@@ -10,6 +10,7 @@ found = calibration.result()    # found.words(), found.estimates, found.policy
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from copy import copy
 from typing import Any, NamedTuple
 
 import jax
@@ -108,6 +109,12 @@ class Calibration:
         self.answers: Answers | None = None
         self.scales: dict[str, float] = {}
         self.fits: dict[tuple[str, ...], Fit] = {}
+
+    def copy(self, random: np.random.Generator) -> Calibration:
+        """Return what is known now, to choose questions by while this one goes on; `random`: of these questions."""
+        other = copy(self)
+        other.fits, other.random = {names: copy(fit) for names, fit in self.fits.items()}, random
+        return other
 
     @property
     def asked(self) -> int:

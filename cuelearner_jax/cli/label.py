@@ -14,10 +14,12 @@ import jax
 import numpy as np
 
 from cuelearner_jax import config as configuration
-from cuelearner_jax.adaptation import adapting
+from cuelearner_jax.adaptation import adapting, calibrated, changes
+from cuelearner_jax.calibration import declared
+from cuelearner_jax.calibration.families import Family
 from cuelearner_jax.cli.parsing import PAPER, about, check_numbers, code_of, out, parse, preset_of, taken, task_of
 from cuelearner_jax.cli.shared_options import Flag, Lane, TaskT, asking_kind
-from cuelearner_jax.config import GuideScalars, GuideSizes
+from cuelearner_jax.config import GuideScalars, GuideSizes, Scalars
 from cuelearner_jax.environment import actions_of, offers
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides import registry as guidances
@@ -41,6 +43,7 @@ REACH = 1.5  # of questions near an aim: from the aim, in turns by eps
 PRESET = "quickstart"  # where none is given and chance is asked about: what is labelled trains in minutes
 PRACTICE = len(controls.PRACTICE)  # questions
 MOST_LABELS = 100_000
+UNDRAWN = "a person cannot label what nobody draws; give its Body `pictures` with a `sketch`, or another --robot"
 
 
 @dataclass(frozen=True)
@@ -75,6 +78,8 @@ class Label(Generic[TaskT]):
     policy."""
     questions: Literal["uniform", "near_aims"] = UNIFORM
     """Without a policy: actions of any direction, or near what a player may aim at (where the task has aims)."""
+    changes: str | None = None
+    """Of guidance calibration: package.module:NAME of distortions of your own (default: what the world declares)."""
     practice: Flag[bool] = True
     """Begin a new file with three questions for practice, which are not saved."""
     port: int = 0
@@ -105,12 +110,14 @@ def run(arguments: list[str]) -> None:
     source = _source(task, named)
     world = source.config.task if source else preset.config.task
     world = changed.applied(world) if changed else world
+    by_evidence = _reads_evidence(rest)
     sizes, scalars, bound = preset.config.sizes, preset.config.scalars, None
     if named is not None:  # as `adapt` corrects it
         frame = source.config.sizes.frame if source else sizes.frame
-        sizes = dataclasses.replace(adapting.SIZES, frame=frame)
-        scalars = adapting.settling(scalars, changed.eps_deg if changed else None)
-        bound = changed.bound_deg if changed else None
+        sizes = adapting.SIZES if by_evidence else dataclasses.replace(adapting.SIZES, frame=frame)
+        settling = calibrated.settling if by_evidence else adapting.settling
+        scalars = settling(scalars, changed.eps_deg if changed else None)
+        bound = changed.bound_deg if changed and not by_evidence else None
     default = kind(
         world,
         _part(GuideSizes, sizes),
@@ -118,7 +125,7 @@ def run(arguments: list[str]) -> None:
         Path("labels") / task.name,
         guidance=asking_kind(preset_kinds(task, preset)) if named is None else KIND.name,
         bound_deg=bound,
-        labels=max(preset.labels) if named is None else Label.labels,
+        labels=max(preset.labels) if named is None else calibrated.USUAL if by_evidence else Label.labels,
         questions=NEAR_AIMS if named is None and task.near_aims else UNIFORM,
     )
     asked = parse(kind, rest, f"label {task.name}", default, about(Label, task, preset=usual))
@@ -132,6 +139,12 @@ def run(arguments: list[str]) -> None:
     if finished is None:
         raise Interrupted(f"stopped; every answer is in {asked.out}: the same command goes on")
     out.print(f"done: {finished.line}\nnext: {finished.following}")
+
+
+def _reads_evidence(arguments: list[str]) -> bool:
+    """Is calibration asked for? Raises UserError for a kind that is not known."""
+    name, _ = taken(arguments, "--guidance", ", ".join(kind.name for kind in guidances.known()))
+    return name is not None and guidances.resolve(name).by_evidence
 
 
 def planned(
@@ -151,6 +164,8 @@ def planned(
     if merged.sizes.candidates > 1:
         raise UserError("--sizes.candidates is above 1, but a page asks in situations as they come: leave it out")
     robot, task = _robot(task, asked.robot), task.on(asked.robot)
+    if task.pictures(UNDRAWN).sketch is None:
+        raise UserError(f"{task.name} has no sketch of a situation to label by: {UNDRAWN}")
     env = shape_of(task, asked.task)
     space = actions_of(env)
     if asked.bound_deg is not None and not 0 < asked.bound_deg <= space.reach:
@@ -158,6 +173,8 @@ def planned(
             f"--bound-deg is {asked.bound_deg:g}: give a number above 0 and up to {space.reach:g} ({space.unit})"
         )
     guidance = merged.guide_in(env, guidances.named(asked.guidance))
+    if guidance.kind.by_evidence:
+        _check_evidence(asked, named)
     if guidance.kind.sees_base:
         raise UserError(f"guidance {guidance.name!r} is for `adapt --labels-from` alone: leave out --guidance here")
     if guidance.form is None:
@@ -167,7 +184,21 @@ def planned(
     wanted = asked.labels, asked.seed, asked.who.strip(), asked.bound_deg, robot
     if asked.again is not None:
         return _second(Plan(task, merged, guidance, Base(uniform_in(env), ""), *wanted), asked, named)
-    return Plan(task, merged, guidance, _base(task, asked, named, source, env), *wanted)
+    family = _family(asked, env) if guidance.kind.by_evidence else ()
+    return Plan(task, merged, guidance, _base(task, asked, named, source, env), *wanted, family=family)
+
+
+def _check_evidence(asked: Label[Any], named: str | None) -> None:
+    """Raises UserError for what calibration cannot ask about, or has no use for."""
+    if named is None or asked.again is not None:
+        raise UserError("calibration asks about a policy: name one after the task, and leave out --again")
+    scalars = dataclasses.replace(Scalars(), **dataclasses.asdict(asked.scalars))
+    calibrated.check_unused(asked.sizes, scalars, bound_deg=asked.bound_deg)
+
+
+def _family(asked: Label[Any], env: Any) -> Family:
+    """What may have changed. Raises UserError for changes that make no sense."""
+    return declared(env) if asked.changes is None else changes.family_of(changes.load(asked.changes), env)
 
 
 def _robot(task: Task, name: str | None) -> str:
@@ -287,7 +318,7 @@ def _following(task: Task, preset: str, config: RunConfig, asked: Any, policy: s
     words = ["adapt", policy, *(["--task", name] if not Path(policy).exists() else [])]
     words += [] if asked.scenario is None else ["--scenario", asked.scenario]
     words += [] if asked.robot is None else ["--robot", asked.robot]
-    words += ["--guidance", asked.guidance, *given]
+    words += ["--guidance", asked.guidance, *([] if asked.changes is None else ["--changes", asked.changes]), *given]
     words += _differing("task", task.config, config.task, asked.task)
     return shlex.join(["cuelearner", *words, "--out", f"policies/{Path(out).name}"])
 

@@ -20,7 +20,7 @@ from cuelearner_jax.asking import GuideState
 from cuelearner_jax.guides.fitting import held_out
 from cuelearner_jax.labelling.plan import Plan
 from cuelearner_jax.labelling.programs import Agreement, Programs, agreement
-from cuelearner_jax.types import GuidanceModel, Label
+from cuelearner_jax.types import Label
 
 # A fit computes in its own thread alone, which makes way for whoever answers.
 ALONE = {"xla_cpu_multi_thread_eigen": False}
@@ -37,11 +37,12 @@ def _step_back() -> None:
 class Fitted(NamedTuple):
     """A model, and what is known of it."""
 
-    model: GuidanceModel
+    model: Any  # a `GuidanceModel`, or an `evidence.Theory`
     labels: int = 0  # that it was fitted to
     number: int = 0  # of the fit, from 1; 0: there was none
     quality: Agreement | None = None  # with the labels that it was not trained on
     problem: str = ""  # why there is none of the last fit: the one before it stays
+    told: tuple[str, ...] = ()  # of calibration, line by line: what changed
 
 
 class Learner:
@@ -54,7 +55,12 @@ class Learner:
         self.running = False
         self._lock = threading.Lock()
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="fit", initializer=_step_back)
-        lowered = programs.fit.lower(env, plan.config.scalars, *self._given(blank.labels, 0))  # pyright: ignore[reportFunctionMemberAccess]
+        self.prepare()
+
+    def prepare(self) -> None:
+        """Compiles the fit."""
+        given = self._given(self._blank.labels, 0)
+        lowered = self._programs.fit.lower(self._env, self._plan.config.scalars, *given)  # pyright: ignore[reportFunctionMemberAccess]
         self._fit = lowered.compile(compiler_options=ALONE if jax.default_backend() == "cpu" else None)
 
     def _given(self, labels: Label, count: int) -> tuple[GuideState, PRNGKeyArray, jax.Array]:

@@ -34,6 +34,7 @@ class Page:
         """
         self.session, self._pages, self._finish = session, pages, finish
         self.form, self.space = session.plan.form, session.space
+        self._by_evidence = session.plan.guidance.kind.by_evidence
         self.controls = controls.controls(self.form, self.space)
         self._said: dict[int, float] = {}  # of the question on the screen, by the number of the cue
         self._said_of = session.number
@@ -44,7 +45,8 @@ class Page:
         script = (HERE / "page.js").read_text() + f"cue.keys = {json.dumps(keys)}; cue.again = {json.dumps(again)};"
         script = script.replace("</", "<\\/")  # which would end it
         ui.add_head_html(f"<script>{script}</script>")
-        with ui.element("main").classes("label-page"):
+        rows = len(self.space.cues) if len(self.space.cues) > 1 and self.form.by_eps else 0  # of cues to be picked
+        with ui.element("main").classes("label-page").style(f"--rows: {rows}"):
             with ui.column().classes("w-full gap-2"):
                 self._practice()
                 ui.label(session.plan.task.wants(session.plan.config.task)).classes("note")
@@ -85,9 +87,10 @@ class Page:
         self._pressable, self._picks = [], {}
         for number, cue in enumerate(self.space.cues):
             if picks := [control for control in own if control.cue == number]:
-                ui.label(cue.name)
-                with ui.element("div").classes("answers"):
-                    self._picks |= {control: self._button(control) for control in picks}
+                with ui.element("div").classes("cue"):  # a row each, so that all lie above the fold
+                    ui.label(cue.name)
+                    with ui.element("div").classes("answers"):
+                        self._picks |= {control: self._button(control) for control in picks}
         with ui.element("div").classes("answers"):
             self._pressable += [self._button(control) for control in own if control.cue is None]
             self._pressable.append(self._button(self.controls["unsure"]).classes("wide"))
@@ -102,13 +105,14 @@ class Page:
         self._left = ui.label()
         ui.separator()
         self._model = ui.label()
-        self._quality = ui.label()
+        self._quality = ui.label().classes("told")
         ui.separator()
         self._words = ui.label()
         with ui.element("div").classes("hide-small"):
             turned = [one for one in self.controls.values() if one.colour in ("left", "right") and one.cue is None]
             swatches = {"asked": "the action in question", **{one.colour: one.words for one in turned}}
-            for name, about in {**swatches, "refined": "what the model makes of it"}.items():
+            refined = "the policy as corrected so far" if self._by_evidence else "what the model makes of it"
+            for name, about in {**swatches, "refined": refined}.items():
                 ui.html(f'<span class=swatch style="background:var(--{name})"></span>{about}', sanitize=False)
             ui.label(self.session.legend).classes("text-caption")
         with ui.element("div").classes("tools"):
@@ -257,12 +261,13 @@ class Page:
         self._pace.text = f"{status.per_minute:.0f} labels a minute" if status.per_minute else "no labels yet"
         self._left.text = _left(status.minutes_left)
         newest = status.newest
-        fitted = f"model {newest.number}, of {newest.labels} labels" if newest.number else "no model yet"
-        self._model.text = f"{fitted}; fitting the next" if status.fitting else fitted
+        what, doing = ("estimate", "reading") if self._by_evidence else ("model", "fitting")
+        fitted = f"{what} {newest.number}, of {newest.labels} labels" if newest.number else f"no {what} yet"
+        self._model.text = f"{fitted}; {doing} the next" if status.fitting else fitted
         if newest.problem:
             self._model.text = f"{fitted}; {newest.problem}"
         apart = f"agrees with labels kept apart: {newest.quality}" if newest.quality else ""
-        self._quality.text = apart
+        self._quality.text = "\n".join(newest.told) or apart
         place = "/".join(self.session.place.parts[-2:])
         self._saved.text = f"{place}: {status.answered + status.unsure} answers saved"
         self._trouble.text = status.trouble

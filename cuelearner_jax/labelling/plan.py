@@ -9,6 +9,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from cuelearner_jax.calibration.families import Family
 from cuelearner_jax.config import to_json
 from cuelearner_jax.feedback.forms import AnswerForm
 from cuelearner_jax.guides.base import Guide
@@ -55,6 +56,7 @@ class Plan:
     robot: str = ""  # its body and what that walks by, where it is not the task's own
     again: tuple[np.ndarray, ...] = ()  # actions that another session of this seed asked about: they are asked again
     again_of: str = ""  # digest of its file
+    family: Family = ()  # of calibration: what may have changed
 
     @property
     def form(self) -> AnswerForm:

@@ -24,6 +24,7 @@ from cuelearner_jax.asking import GuideState
 from cuelearner_jax.environment import actions_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.labelling import controls
+from cuelearner_jax.labelling.evidence import PROGRAMS, EvidenceLearner
 from cuelearner_jax.labelling.learner import Fitted, Learner
 from cuelearner_jax.labelling.plan import Plan
 from cuelearner_jax.labelling.programs import advance, begin, keys_of, lived, programs
@@ -99,12 +100,14 @@ class Session:
         self._writer = label_files.LabelWriter(folder, *named, written_by=provenance())
         tell("making the world")
         self.env = plan.task.environment(plan.config.task)
-        self._programs = programs(plan.guidance)
+        by_evidence = plan.guidance.kind.by_evidence
+        self._programs = PROGRAMS if by_evidence else programs(plan.guidance)
         self._keys = keys_of(plan.seed)
         slots = asking.label_slots(plan.labels, plan.config.sizes)
         start = asking.start(plan.guidance, self.env, slots, plan.labels, self._keys.model, self._keys.start)
         tell("preparing the model")
-        self._learner = Learner(plan, self.env, self._programs, start, self._keys.session)
+        learner = EvidenceLearner if by_evidence else Learner
+        self._learner = learner(plan, self.env, self._programs, start, self._keys.session)
         self._bound = None if plan.bound_deg is None else space.from_unit(plan.bound_deg)
         self._acting = threading.Lock()  # one answer at a time; whoever waits for an item holds no other lock
         self._lock = threading.RLock()

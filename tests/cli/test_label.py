@@ -80,11 +80,23 @@ def test_the_page_is_served_to_who_knows_its_address_until_ctrl_c(tmp_path, refu
         (["--again", "nothing"], "no label file at nothing"),
         (["--questions", "near_aims"], "--questions is near_aims, but wandering has no aims in this world"),
         (["--scalars.eps-deg", "-1"], "eps_deg"),
+        (["--guidance", "calibration"], "calibration asks about a policy: name one after the task"),
     ],
 )
 def test_what_makes_no_sense_is_refused(more, says, refused, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     refused(["label", OWN, "--out", "labels", *more], says, tmp_path)
+
+
+def test_a_task_that_nobody_draws_is_refused_before_anything_is_made(refused, tmp_path, monkeypatch):
+    pytest.importorskip("nicegui")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    bare = "import dataclasses, page_task\nTASK = dataclasses.replace(page_task.TASK, bodies=("
+    bare += "page_task.TASK.bodies[0].__class__('point', '', page_task._world),), name='undrawn')\n"
+    (tmp_path / "undrawn.py").write_text(bare)
+    says = "has no pictures of point: a person cannot label what nobody draws; give its Body `pictures`"
+    refused(["label", "undrawn:TASK", "--out", "labels"], says, tmp_path)
 
 
 def test_a_port_in_use_is_refused_before_anything_is_made(refused, tmp_path):
@@ -141,6 +153,23 @@ def test_the_next_command_has_the_options_that_labels_depend_on(monkeypatch, tmp
     assert words[:5] == ["cuelearner", "adapt", *POLICY, "--scenario", "turned_lidar"]
     assert "--task.lidar-rotation-deg" not in words
     assert asked.labels == 500
+    asked, _, commands = asked_for(monkeypatch, "navigation", *policy, "--guidance", "calibration")
+    assert (asked.labels, asked.bound_deg, asked.scalars.eps_deg) == (100, None, 2.0)
+    words = shlex.split(commands.following(7))
+    assert words[words.index("--guidance") + 1] == "calibration"
+
+
+def test_calibration_is_planned_with_what_may_have_changed(refused, tmp_path, monkeypatch):
+    pytest.importorskip("nicegui")
+    asks = [OWN, "page_task:left_of", "--guidance", "calibration"]
+    found, plan, _ = asked_for(monkeypatch, *asks, "--out", str(tmp_path))
+    assert [one.name for one in plan.family] == ["direction: change"]
+    assert found.sizes.labels_per_round == 10
+    monkeypatch.chdir(tmp_path)
+    for option, value in (("--bound-deg", "20"), ("--sizes.fit-steps", "7"), ("--scalars.k-max", "7")):
+        name = option.removeprefix("--").replace("-", "_")
+        command = ["label", *asks, option, value, "--out", "labels"]
+        refused(command, f"{name} is {float(value):g}" if "bound" not in name else "leave bound_deg out", tmp_path)
 
 
 def test_set_up_installs_what_the_page_needs():

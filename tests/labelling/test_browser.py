@@ -74,6 +74,16 @@ def test_every_key_is_in_the_file_once(browser, tmp_path):
     assert all(0 <= row["seconds"] < 60 for row in rows)
 
 
+def test_the_buttons_of_three_cues_lie_above_the_fold(browser, tmp_path):
+    with served(tmp_path / "labels", task="box_task:TASK") as (_, address):
+        page = entered(browser, address)
+        ends = "() => [...document.querySelectorAll('.answers button')].map(one => one.getBoundingClientRect().bottom)"
+        found = page.evaluate(ends)
+        assert len(found) == 3 * 4 + 3
+        assert max(found) <= 800
+        assert page.evaluate("() => document.querySelector('svg.scene').getBoundingClientRect().height") > 300
+
+
 def test_pointing_shows_what_to_do_instead(browser, tmp_path):
     folder = tmp_path / "labels"
     with served(folder, "--no-practice", "--guidance", "demonstration") as (process, address):

@@ -1,0 +1,81 @@
+"""A session of calibration: its questions narrow the estimate, which the page shows, and a restart goes on."""
+
+import dataclasses
+import re
+
+import numpy as np
+import probes
+import pytest
+from sessions import ENV, expert, give, settled
+
+from cuelearner_jax.calibration import declared
+from cuelearner_jax.labelling.plan import Base
+from cuelearner_jax.policies import Opaque
+
+STRAIGHT = Base(Opaque(lambda obs: obs, on_host=True), "straight")  # the expert means 0.6 rad, 34.4 degrees, beside
+EPS_DEG = 5.0
+CONFIG = dataclasses.replace(probes.CONFIG, scalars=dataclasses.replace(probes.SCALARS, eps_deg=EPS_DEG))
+SETTINGS = {"kind": "calibration", "base": STRAIGHT, "config": CONFIG, "family": declared(ENV), "labels": 30}
+LINE = re.compile(r"direction: turn: (\S+) \[(\S+), (\S+)\] degrees")
+
+
+def estimate(status):
+    """Mean, lower and upper end of what the page tells."""
+    found = LINE.match(status.newest.told[0])
+    assert found, status.newest.told
+    return [float(number) for number in found.groups()]
+
+
+def test_the_estimate_narrows_the_policy_follows_and_a_restart_goes_on(opened):
+    session = opened(**SETTINGS)
+    assert session.status().newest.told == ()
+    ends = []
+    for number in (1, 2):
+        give(session, 10, EPS_DEG)
+        mean, low, high = estimate(settled(session, fits=number))
+        assert low < -34.4 < high
+        ends.append(high - low)
+    assert ends[1] < ends[0]
+    assert abs(mean + 34.4) < 12
+    item = session.item
+    best = np.asarray(ENV.best(item.guide.obs))
+    assert float(item.refined @ best) > np.cos(np.deg2rad(12))
+    session.close()
+    again = opened(**SETTINGS)
+    assert again.number == 20
+    np.testing.assert_allclose(again.item.guide.obs, item.guide.obs, atol=1e-6)
+    mean, low, high = estimate(again.status())
+    assert again.status().newest.labels == 20
+    assert low < -34.4 < high
+
+
+def test_an_answer_taken_back_is_forgotten_and_a_policy_that_is_right_is_told_to_be(opened):
+    right = Base(Opaque(lambda obs: np.asarray(ENV.best(obs)), on_host=True), "right")
+    session = opened(**{**SETTINGS, "base": right})
+    give(session, 9, EPS_DEG)
+    wrong = expert(session.item, EPS_DEG) + (1.0 if expert(session.item, EPS_DEG)[0] <= 0 else -1.0)
+    assert session.answer(session.number, wrong)
+    settled(session, fits=1)
+    assert session.undo(session.number)
+    give(session, 11, EPS_DEG)
+    status = settled(session, fits=2)
+    assert status.newest.labels == 20
+    known = session._learner._known.answers
+    np.testing.assert_array_equal(known.answer, np.asarray(session._labels().answer)[:20])
+    assert status.newest.told == ("no change seen yet",)
+
+
+def test_the_page_shows_the_estimate(opened):
+    pytest.importorskip("nicegui")
+    from page_user import shown
+
+    session = opened(**SETTINGS)
+    give(session, 10, EPS_DEG)
+    settled(session, fits=1)
+
+    async def acts(user, pages):
+        await user.should_see("estimate 1, of 10 labels")
+        await user.should_see("direction: turn: ")
+        await user.should_see("the policy as corrected so far")
+
+    shown(session, acts)
