@@ -61,6 +61,7 @@ class Experiment(NamedTuple):
     scales: Mapping[str, Scale]
     report: Mapping[str, Sequence[str]]  # options of `cuelearner report` at scales that are reported, by world
     metric: Sequence[str] = ()  # options of it at every scale
+    folder: str = ""  # of what is run, below runs/ (default: the task's name and what it is about)
 
 
 def scaled(piece: Piece, scale: Scale) -> Piece | None:
@@ -155,10 +156,11 @@ def run(experiment: Experiment, about: str, arguments: Sequence[str] | None = No
     parser = argparse.ArgumentParser(
         description=about, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
     )
+    folder = Path("runs") / (experiment.folder or f"{experiment.task}_bootstrapping")
     scales = "; ".join(f"{name}: {scale.about}" for name, scale in experiment.scales.items())
     parser.add_argument("--scale", choices=list(experiment.scales), default="paper", help=scales)
     parser.add_argument("--pieces", nargs="+", default=[], metavar="NAME", help="these alone, or all below a folder")
-    parser.add_argument("--out", type=Path, default=Path(f"runs/{experiment.task}_bootstrapping"), help="folder")
+    parser.add_argument("--out", type=Path, default=folder, help="folder")
     parser.add_argument("--resume", action="store_true", help="go on with pieces that were begun, leave finished ones")
     parser.add_argument("--list", action="store_true", help="list the pieces and stop")
     parser.add_argument("--report", action="store_true", help="report on what there is, and run nothing")
