@@ -9,7 +9,8 @@ import pytest
 NOTEBOOK = Path(__file__).resolve().parents[2] / "examples" / "quickstart.ipynb"
 LESS = """KINDS = ("relative",)
 SEEDS, LABELS, STEPS = 1, 10, 200
-NETWORKS = {"q_layers": (8,), "feedback_layers": (8,), "directions": 36, "fit_steps": 20}"""
+NETWORKS = {"feedback_layers": (8,), "fit_steps": 20}
+AGENT = {"q_layers": (8,), "directions": 36, "coarse_directions": 0}"""
 
 
 @pytest.mark.long
