@@ -1,4 +1,4 @@
-"""A policy folder of the bandit, as `adapt` writes it, of an agent and a guide that learned nothing."""
+"""Policy folders of the bandit, as `adapt` writes them, of an agent and a guide, or changes, that learned nothing."""
 
 import dataclasses
 
@@ -7,8 +7,10 @@ import numpy as np
 import probes
 
 from cuelearner_jax.adaptation.adapting import Adapted
+from cuelearner_jax.adaptation.calibrated import Calibrating, Evidence
 from cuelearner_jax.adaptation.judging import Judged
 from cuelearner_jax.adaptation.lanes import Adaptation, Lanes, begin
+from cuelearner_jax.calibration.families import declared, unknowns_of
 from cuelearner_jax.config import GuideSizes
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides import registry as guidances
@@ -35,12 +37,18 @@ def agent():
     return Agent(functions.init(jax.random.key(4))[0], functions, ENV)
 
 
-def write(folder, overwrite=False, origin="run"):
+def write(folder, overwrite=False, origin="run", calibrated=False):
     """Writes the folder; `origin`: what policy.json says was adapted."""
-    guidance = guidances.make("relative", SIZES, ENV)
-    of = Adaptation(guidance, SIZES, probes.SCALARS, ENV, Common(agent()))
+    kind, family = ("calibration", (declared(ENV),)) if calibrated else ("relative", ())
+    guidance = guidances.make(kind, SIZES, ENV)
+    of = (Calibrating if calibrated else Adaptation)(guidance, SIZES, probes.SCALARS, ENV, Common(agent()), *family)
     worth = np.zeros(2), np.ones(2), np.ones(2, bool), np.full(2, 45.0)
     judged = Judged("reward", *worth, difference=np.ones((2, 3)), rewarded_steps=np.zeros(2, int))
-    found = Adapted(of, LANES, begin(of, LANES), judged, [])
+    block = begin(of, LANES)
+    if calibrated:
+        yes = np.ones(2, bool)
+        theta = np.zeros((2, len(unknowns_of(of.family))), np.float32)
+        block = Evidence(LANES.base, theta, block.labels, block.asked, block.bound, yes, ~yes)
+    found = Adapted(of, LANES, block, judged, [])
     with policy_folders.place_of(folder, overwrite) as place:
         adapted.write(place, found, TASK, probes.CONFIG.task, {"folder": origin})

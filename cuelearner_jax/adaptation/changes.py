@@ -85,6 +85,7 @@ def rebuilt(layer: dict[str, Any], env: Any, changes: Any = None) -> Family:
     if missing := [name for name in names if name not in known]:
         raise UserError(f"this policy corrects {missing[0]!r}, which {code or 'this world'} lacks: give its own")
     family = tuple(known[name] for name in names)
-    if [one.name for one in unknowns_of(family)] != [one["name"] for one in layer["changes"]]:
+    told = [(one["name"], one["unit"]) for one in layer["changes"]]
+    if [(one.name, one.unit) for one in unknowns_of(family)] != told:
         raise UserError(f"the unknowns of {', '.join(names)} are others than this policy's: give the code that made it")
     return family

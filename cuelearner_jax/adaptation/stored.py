@@ -24,6 +24,7 @@ from cuelearner_jax.environment import Spaces, offers, spaces_of, view_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.guides.base import NAME, Guide
+from cuelearner_jax.guides.calibration import KIND
 from cuelearner_jax.policies import Agent, Guided, Heuristic, describe, layers, uniform_in
 from cuelearner_jax.run_config import kind_from_json, part_from_json
 
@@ -83,7 +84,7 @@ def check(values: dict[str, Any]) -> None:
             kind_from_json(layer["guidance"], layer["options"])
         if kind == "calibrated":
             told = [*layer["distortions"], *(change[part] for change in layer["changes"] for part in ("name", "unit"))]
-            if not all(isinstance(name, str) for name in (layer["code"], layer["guidance"], *told)):
+            if layer["guidance"] != KIND.name or not all(isinstance(name, str) for name in (layer["code"], *told)):
                 raise TypeError("changes are told by names and units")
 
 

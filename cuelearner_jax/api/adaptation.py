@@ -140,7 +140,7 @@ def adapt(
         scalars: of the fitting, of refinement and of the teacher's faults.
         seed: of everything random.
         judge_by: the metric by which it is judged, or "labels": by the prediction of held-out ones (default: the
-            scenario's, or "reward").
+            scenario's, or "reward"; of calibration "labels").
         judge_episodes: that many tuning episodes, each of 100 steps where the task does not count episodes.
         judge_bounds: shares of the bound, such as (0.5, 0.25), within which the model is tried on these episodes too;
             it is used within what is worth most (default: the scenario's, or none).

@@ -35,8 +35,8 @@ class Evaluate(EvaluateRequest[TaskT], Generic[TaskT]):
     """Another run folder, policy folder or policy, measured on the same episodes; its default policy where that is a
     folder. The table then shows both and the difference."""
     out: Path | None = None
-    """Also write the measurements to this JSON file. (Beside all these: --base package.module:NAME gives the code of a
-    policy folder that has some, --agent and --arbiter that of a run's own parts.)"""
+    """Also write the measurements to this JSON file. (Beside all these: --base and --changes package.module:NAME give
+    the code of a policy folder that has some, --agent and --arbiter that of a run's own parts.)"""
 
 
 OPTIONS = {"evaluate": Evaluate}

@@ -107,7 +107,7 @@ def run(arguments: list[str]) -> None:
     kind = Label[task.config]  # pyright: ignore[reportInvalidTypeArguments]
     scenario, _ = taken(rest, "--scenario", ", ".join(task.scenarios) or "none")
     changed = task.scenario(scenario) if scenario else None
-    source = _source(task, named)
+    source = _source(task, named, taken(rest, "--changes", "package.module:NAME")[0])
     world = source.config.task if source else preset.config.task
     world = changed.applied(world) if changed else world
     by_evidence = _reads_evidence(rest)
@@ -230,14 +230,18 @@ def _second(plan: Plan, asked: Label[Any], named: str | None) -> Plan:
     return dataclasses.replace(plan, base=base, seed=seed, labels=wanted, again=again, again_of=digest)
 
 
-def _source(task: Task, named: str | None) -> PolicySource | None:
-    """The folder that holds the policy; None: it is chance, or code. Raises UserError if it is of another task."""
+def _source(task: Task, named: str | None, changed: str | None) -> PolicySource | None:
+    """The folder that holds the policy; None: it is chance, or code. Raises UserError if it is of another task.
+
+    `changed`: code of the distortions that it corrects, if any.
+    """
     if named is None or (REFERENCE.fullmatch(named) and not Path(named).exists()):
         return None
     folder = Path(named)
     if not folder.is_dir():
         raise UserError(f"no policy at {named}: give a run folder, a policy folder or package.module:NAME")
-    found = PolicySource.of_folder(folder, lambda name: task if task.name == name else registry.find(name))
+    own = None if changed is None else changes.load(changed)
+    found = PolicySource.of_folder(folder, lambda name: task if task.name == name else registry.find(name), changes=own)
     if found.task.name != task.name:
         raise UserError(f"{folder} is of {found.task.name}, not of {task.name}: give one of the same task")
     return found

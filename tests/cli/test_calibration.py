@@ -161,6 +161,28 @@ def test_seeds_and_budgets_are_lanes_and_rewards_may_judge(calibrated, tmp_path,
     np.testing.assert_array_equal(lane(SEEN), alone(SEEN))  # whatever else runs beside
 
 
+@pytest.mark.long
+def test_several_agents_are_calibrated_each_with_its_seed_and_again(home, tmp_path):
+    run, out, again = home / "run", tmp_path / "out", tmp_path / "again"
+    sweep = ["sweep", "own_askew:TASK", "--guidance", "none", "--seeds", "2", "--schedule.total-steps", "960"]
+    assert main([*sweep, "--schedule.eval-every", "960", "--schedule.checkpoint-every", "960", "--out", str(run)]) == 0
+    ask = ["--guidance", "calibration", "--scenario", "aslant", "--labels", "30"]
+    assert main(["adapt", str(run), *ask, "--base.seeds", "1", "0", "--out", str(out)]) == 0
+    values = json.loads((out / "policy.json").read_text())
+    assert (values["lanes"]["seeds"], values["lanes"]["base"], values["rows"]) == ([1, 0], [0, 1], 2)
+    task = {"task": "own_askew:TASK"}
+    for seed, found in zip((1, 0), values["calibration"], strict=True):
+        better, base = (cl.load_policy(out, policy=name, seed=seed, **task)(SEEN) for name in ("adapted", "base"))
+        np.testing.assert_array_equal(base, cl.load_policy(run, seed=seed, **task)(SEEN))
+        turn = found["estimates"][0]["mean"] if found["changes"] else 0.0
+        wanted = rotate(jnp.asarray(base), -jnp.deg2rad(turn))
+        np.testing.assert_allclose(better, wanted, atol=1e-5)
+    assert main(["adapt", str(out), *TASK, *ask, "--base.seeds", "0", "--out", str(again)]) == 0
+    moved = cl.load_policy(again, policy="base", **task)(SEEN)
+    np.testing.assert_allclose(moved, cl.load_policy(out, seed=0, **task)(SEEN), atol=1e-6)
+    assert main(["evaluate", str(again), *TASK, "--compare", "base", "--steps", "400", "--envs", "20"]) == 0
+
+
 def test_no_change_is_said_and_the_policy_stays(home):
     world = cl.make("own_askew:TASK")
     with pytest.warns(UserWarning, match="ask for no change. The policy stays as it was"):
