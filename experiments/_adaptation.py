@@ -23,9 +23,11 @@ from _finetuning import FineTuning, every
 from _pieces import chosen, listed
 
 from cuelearner_jax.adaptation import adapting
+from cuelearner_jax.adaptation import calibrated as calibration
 from cuelearner_jax.adaptation.adapting import Adapted
-from cuelearner_jax.adaptation.judging import Judging, judged_by_labels
+from cuelearner_jax.adaptation.judging import LABELS, Judging, judged_by_labels
 from cuelearner_jax.adaptation.lanes import Adaptation, product, side_by_side
+from cuelearner_jax.calibration import UNEXPLAINED, declared
 from cuelearner_jax.cli import main as cuelearner
 from cuelearner_jax.config import GuideSizes
 from cuelearner_jax.environment import actions_of, spaces_of
@@ -39,6 +41,7 @@ from cuelearner_jax.storage import table as tables
 from cuelearner_jax.storage.provenance import provenance
 from cuelearner_jax.task import Task
 from cuelearner_jax.tasks import registry
+from cuelearner_jax.types import Label
 
 SCHEMA = tables.Schema(
     stem="adaptation",
@@ -48,6 +51,7 @@ SCHEMA = tables.Schema(
     integers=("base", "label_seed", "labels", "steps"),
     remedy="is damaged: delete its folder and run the piece again",
 )
+SHUFFLED = "shuffled"
 UNREWARDED = "unrewarded_"  # columns of the same models where held-out answers judge, in place of episodes
 UNCHANGED = "unchanged"  # the world that the base agents were trained in
 JUDGED = 500  # environments at most in which it is decided whether a model is used
@@ -273,6 +277,37 @@ def _kind(name: str) -> Callable[[Bench], Iterator[Row]]:
     return lambda bench: by_labels(guidances.find(bench.piece.settings.get("guidance", name)), bench)
 
 
+def calibrated(bench: Bench) -> Iterator[Row]:
+    """By what answers tell of the world: held-out answers judge. Variant `SHUFFLED`: with answers of other rows."""
+    piece, env = bench.piece, bench.env("training")
+    kind, scalars = guidances.find("calibration"), calibration.settling(bench.scalars(), None)
+    guidance = kind.make(adapting.SIZES, spaces_of(env), None)
+    lanes = product(len(bench.seeds), range(piece.seeds), piece.labels, (actions_of(env).reach,))
+    of = calibration.Calibrating(guidance, adapting.SIZES, scalars, env, bench.agents, declared(env))
+    how = Judging(None, by=LABELS)
+    found = calibration.adapt(of, lanes, how, bench.task.make_teacher(bench.world, env))
+    if piece.variant == SHUFFLED:
+        found = calibration.adapt(of, lanes, how, labels=shuffled(found.block.labels))
+    told = {"used": found.judged.used.astype(float), "rewarded_steps": 0.0}
+    unexplained = [result.verdict == UNEXPLAINED for result in found.results]
+    told["unexplained"] = np.array(unexplained, float)
+    for place, estimate in enumerate(found.results[0].estimates):
+        for end in ("mean", "low", "high"):
+            own = [getattr(result.estimates[place], end) for result in found.results]
+            told[f"{estimate.name} {end}"] = np.array(own)
+    which = {"base": bench.seeds[lanes.base], "label_seed": lanes.seed, "labels": lanes.budget}
+    yield {**which, "steps": 0, **told, **bench.measured(found.policy(bench.env(piece.split)))}
+
+
+def shuffled(labels: Label) -> Label:
+    """Labels (lanes, slots, ...) with answers of other rows of their lane."""
+    random, answers = np.random.default_rng(0), np.array(labels.answer)
+    for lane, valid in enumerate(np.asarray(labels.valid)):
+        rows = np.flatnonzero(valid)
+        answers[lane, rows] = answers[lane, random.permutation(rows)]
+    return labels.replace(answer=jnp.asarray(answers))
+
+
 def coached(bench: Bench) -> Iterator[Row]:
     """Deep COACH of a correction that begins at nothing."""
     yield from by_labels(coach.KIND, bench)
@@ -283,6 +318,7 @@ METHODS: dict[str, Callable[[Bench], Iterator[Row]]] = {
     "teacher": corrected,
     "relative": _kind("relative"),
     "intent": _kind("intent"),
+    "calibration": calibrated,
     "dcoach": coached,
     "residual": by_residuals,
     "finetuning": fine_tuned,

@@ -18,6 +18,7 @@ NAMES = {
     "teacher": "the teacher itself, within the bound",
     "relative": "relative labels",
     "intent": "relative labels, read as intent",
+    "calibration": "relative labels, read as evidence of what changed",
     "residual": "residual, optimal corrections",
     "dcoach": "deep COACH",
     "finetuning": "RL fine-tuning",

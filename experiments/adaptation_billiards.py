@@ -21,6 +21,7 @@ from billiards_bootstrapping import SCALES as TRAINING
 BOUNDS_DEG = {"turned_strike": 1.0, "shifted_balls": 0.3, "tilted_table": 0.3}
 PLAYED = {UNCHANGED: 1.0, **BOUNDS_DEG}
 BUDGETS = (50, 100, 250)
+EVIDENCE = (50, 100)  # of calibration
 LABEL_SEEDS = 4
 TUNED = (250,)
 BY_LABELS = ("relative", "residual", "dcoach")
@@ -41,6 +42,7 @@ STEPS, EVERY = 60_000, 10_000
 SLOW: Mapping[str, Any] = {"scalars.feedback_learning_rate": 3e-4}
 FAST: Mapping[str, Any] = {"scalars.feedback_learning_rate": 3e-3}
 RAW: Mapping[str, Any] = {"sizes.frame": "raw"}
+SHUFFLED: Mapping[str, Any] = {"scalars.answer": "shuffled"}
 ONCE: Mapping[str, Any] = {"scalars.k_max": 1, "scalars.refined_fraction": 0.0}
 SHARE_60: Mapping[str, Any] = {"scalars.nearest_share": 0.6}
 # Step size and noise [deg] of fine-tuning: swept in one world, a tenth of the step size of training in the others.
@@ -98,6 +100,7 @@ def reported(world: str, bound: float) -> list[Piece]:
     serves = "reward as a share of the original"
     asked = {"bound_deg": bound, "serves": serves}
     learned: dict[str, Any] = {**asked, "labels": BUDGETS, "seeds": LABEL_SEEDS, "minutes": 8}
+    read = {**learned, "labels": EVIDENCE, "seeds": 2, "minutes": 15}
     best = {method: {**ASKED, **BEST.get((world, method), {})} for method in ("teacher", *BY_LABELS)}
     rate, noise = LEARNED.get(world, LEARNED_ELSEWHERE)
     learns = {"rates": (rate,), "noises_deg": (noise,), "steps": STEPS, "every": EVERY}
@@ -105,7 +108,9 @@ def reported(world: str, bound: float) -> list[Piece]:
         Piece(world, "none", minutes=1, serves=serves),
         Piece(world, "teacher", minutes=2, settings=best["teacher"], **asked),
         *(Piece(world, method, settings=best[method], **learned) for method in BY_LABELS),
-        Piece(world, "relative", "shuffled", settings={**best["relative"], "scalars.answer": "shuffled"}, **learned),
+        Piece(world, "relative", "shuffled", settings={**best["relative"], **SHUFFLED}, **learned),
+        Piece(world, "calibration", settings=ASKED, **read),
+        Piece(world, "calibration", "shuffled", settings=ASKED, **read),
         Piece(world, "finetuning", settings=LEARNING, minutes=20, seeds=LABEL_SEEDS, serves=serves, **learns),
     ]
 

@@ -117,11 +117,14 @@ def every_method(world: str) -> list[Piece]:
     serves, bound = "success with a turned lidar", LIDAR_BOUND_DEG
     asked = {"bound_deg": bound, "labels": BUDGETS, "seeds": LABEL_SEEDS, "judge_by": "success", "serves": serves}
     learns = {"settings": LEARNING, "rates": RATES, "noises_deg": NOISES_DEG, "steps": STEPS, "every": EVERY}
+    read: dict[str, Any] = {"labels": (50, 250), "seeds": 2, "judge_by": "labels", "minutes": 20, "serves": serves}
     return [
         Piece(world, "none", minutes=2, serves=serves),
         Piece(world, "relative", settings=FRAME, minutes=15, **asked),
         Piece(world, "relative", "narrowed", settings=FRAME, minutes=18, judge_bounds=NARROWER, **asked),
         Piece(world, "relative", "shuffled", settings={**FRAME, **SHUFFLED}, minutes=15, **asked),
+        Piece(world, "calibration", **read),
+        Piece(world, "calibration", "shuffled", **read),
         Piece(world, "dcoach", settings=SLOWLY, minutes=15, **asked),
         Piece(world, "residual", settings=TURN, minutes=15, **asked),
         Piece(world, "finetuning", minutes=25, seeds=LABEL_SEEDS, serves=serves, **learns),
