@@ -22,6 +22,7 @@ import jax
 import numpy as np
 
 from cuelearner_jax.adaptation.adapting import settling
+from cuelearner_jax.agents.choice import best_near_peaks
 from cuelearner_jax.calibration.calibrating import Result, calibrate
 from cuelearner_jax.calibration.families import declared
 from cuelearner_jax.calibration.walking import Walk
@@ -30,6 +31,7 @@ from cuelearner_jax.environment import actions_of
 from cuelearner_jax.evaluate import episodes, evaluate_policy
 from cuelearner_jax.policies import policy_of
 from cuelearner_jax.runs.trained import PolicySource, several
+from cuelearner_jax.spaces.directions import evenly_spaced
 from cuelearner_jax.storage.provenance import provenance
 from cuelearner_jax.tasks import registry
 
@@ -41,6 +43,7 @@ WORLDS = {
 METRIC = {"billiards": "reward", "navigation": "success"}
 LABELS = (10, 25, 50, 100)
 ENVS = 200
+COARSE, PEAKS = 450, 8  # of the shipped network's search: directions of a first look, and maxima that are looked at
 
 
 class World(NamedTuple):
@@ -72,7 +75,9 @@ def bases_of(task: Any, folder: Path | None) -> tuple[Any, Scalars, dict[int, An
             raise SystemExit("give --bases a run folder of navigation")
         own = task.config(teacher="learned")
         network = task.make_teacher(own, task.environment(own))
-        return own, Scalars(), {0: policy_of(jax.jit(jax.vmap(lambda obs: network.best_action(None, obs))))}
+        values, shots = network.teacher.values, evenly_spaced(network.teacher.directions)
+        greedy = lambda obs: best_near_peaks(values, values, shots, obs, COARSE, PEAKS)  # noqa: E731
+        return own, Scalars(), {0: policy_of(jax.jit(greedy))}
     source = PolicySource.of_run(folder, registry.find)
     assert source.grid is not None
     env = task.environment(source.config.task)

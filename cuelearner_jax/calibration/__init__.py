@@ -11,6 +11,7 @@ from cuelearner_jax.calibration.calibrating import (
 )
 from cuelearner_jax.calibration.corrected import Calibrated
 from cuelearner_jax.calibration.families import Distortion, Unknown, declared
+from cuelearner_jax.calibration.simulated import simulated
 from cuelearner_jax.calibration.walking import Walk
 
 __all__ = [
@@ -26,4 +27,5 @@ __all__ = [
     "Walk",
     "calibrate",
     "declared",
+    "simulated",
 ]

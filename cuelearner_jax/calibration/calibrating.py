@@ -24,6 +24,7 @@ from cuelearner_jax.calibration.likelihood import GRID
 from cuelearner_jax.calibration.meaning import Meaning
 from cuelearner_jax.calibration.posterior import HELD_OUT, Answers, Fit
 from cuelearner_jax.calibration.questions import Questions, choose, drawn, ties
+from cuelearner_jax.calibration.response import Responses
 from cuelearner_jax.calibration.scales import scales_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.policies import in_space, policy_of
@@ -32,11 +33,13 @@ from cuelearner_jax.spaces import Space, said
 Floats = np.ndarray
 Given = Array | np.ndarray  # what is taken
 BATCH = 10  # questions between two fits
-CHOICE = 6  # situations of which one is asked about
-ROUNDS = 3  # of samples, where there were none
+CHOICE = 8  # situations of which one is asked about
+LOOKS = 4  # nodes at which the policy is asked in each situation to choose from
+FRESH = 3  # nodes after each batch
+ROUNDS = 4  # of samples, where there were none
 LEAST = 20  # answers that two changes at once are asked of
 DOUBT = 2.0  # what the evidence of each change must exceed [nats]
-SURE = 5.0  # what the evidence of all must exceed, against no change [nats]
+SURE = 4.0  # what the evidence of all must exceed, against no change [nats]
 SPREADS = 1.0  # standard errors by which held-out answers must be predicted better
 LARGEST = 3  # changes at once
 SETTLED, SETTLING = 10.0, 6  # samples that must count in the end, for each unknown and one; rounds for these at most
@@ -114,6 +117,8 @@ class Calibration:
         """Return what is known now, to choose questions by while this one goes on; `random`: of these questions."""
         other = copy(self)
         other.fits, other.random = {names: copy(fit) for names, fit in self.fits.items()}, random
+        if self.scales:
+            other.responses = copy(self.responses)
         return other
 
     @property
@@ -125,12 +130,15 @@ class Calibration:
         """Return what to ask in some of n situations, n at least `count`; more give better questions."""
         obs = np.asarray(obs, np.float32)
         self._scaled(obs)
-        best = self.best
         fits = list(self.fits.values()) or [self._new(names) for names in self._singles()]
-        theta = np.zeros(0) if best is None else best.interval()[0][: best.changes]
-        doubt = ties(self.meaning, () if best is None else best.sees, theta, obs, self.eps)
         draws = drawn(fits, self._odds(fits), self.random)
-        return choose(draws, self.meaning, obs, doubt, count, self.eps, self.random)
+        places = np.concatenate([fit.places(thetas) for fit, thetas in draws])
+        response = self.responses.of(obs, self.responses.covering(places, LOOKS))
+        chosen = choose(draws, response, count, self.random)
+        best = self.best
+        theta = np.zeros(0) if best is None else best.interval()[0][: best.changes]
+        asks = () if best is None else best.asks
+        return chosen._replace(doubt=ties(self.meaning, asks, theta, obs[chosen.index], self.eps))
 
     def learn(
         self,
@@ -153,6 +161,8 @@ class Calibration:
     def _scaled(self, obs: Floats) -> None:
         if not self.scales:
             self.scales = scales_of(self.meaning, self.family, obs, self.eps)
+            asks = tuple(one for one in self.family if one.asks)
+            self.responses = Responses(self.meaning, asks, self.scales, self.eps)
 
     def _singles(self) -> list[tuple[str, ...]]:
         return [(one.name,) for one in self.family]
@@ -160,26 +170,33 @@ class Calibration:
     def _new(self, names: tuple[str, ...]) -> Fit:
         family = tuple(one for one in self.family if one.name in names)
         number = sum(1 << place for place, one in enumerate(self.family) if one.name in names)
-        return Fit(family, self.scales, self.meaning, self.eps, self.seed * 1000 + number)
+        return Fit(family, self.scales, self.responses, self.seed * 1000 + number)
 
     def _fit(self, names: tuple[str, ...]) -> Fit:
         """The fit of some changes to all answers so far."""
         assert self.answers is not None
         rounds = 1 if names in self.fits else ROUNDS
         fit = self.fits.setdefault(names, self._new(names))
-        fit.learn(self.answers, rounds)
+        fit.learn(self.answers, self.response, rounds)
         return fit
 
     def _compare(self) -> None:
         """Fit no change, each change, and what the best asks for beside it."""
+        assert self.answers is not None
+        if self.fits:
+            fits = list(self.fits.values())
+            draws = drawn(fits, self._odds(fits), self.random)
+            places = np.concatenate([fit.places(thetas) for fit, thetas in draws])
+            self.responses.drawn(places, FRESH, self.random)
+        self.response = self.responses.of(self.answers.obs)
         self._fit(())
         for names in self._singles():
             self._fit(names)
         path: list[tuple[str, ...]] = [()]
         for size in range(1, 1 + (min(LARGEST, len(self.family)) if self.asked >= LEAST else 1)):
             wider = [self._named({*path[-1], one.name}) for one in self.family if one.name not in path[-1]]
-            fits = {names: self._fit(names) if size > 1 else self.fits[names] for names in wider}
-            path.append(max(wider, key=lambda names: self._score(fits[names])))
+            scores = [self._score(self._fit(names) if size > 1 else self.fits[names]) for names in wider]
+            path.append(wider[int(np.argmax(scores))])
             if size > 1 and self._score(self.fits[path[-1]]) <= self._score(self.fits[path[-2]]):
                 break
         self._choose(max(path, key=lambda names: self._score(self.fits[names])))
@@ -204,10 +221,11 @@ class Calibration:
         return fit.evidence - DOUBT * len(fit.family)
 
     def _odds(self, fits: list[Fit]) -> Floats:
-        """Of fits that know all answers; before the first answer all are as likely."""
-        if not self.asked:
+        """Of fits that know as many answers as any; before the first answer all are as likely."""
+        known = [0 if fit.answers is None else len(fit.answers.obs) for fit in fits]
+        if not max(known):
             return np.zeros(len(fits))
-        return np.array([self._score(fit) if fit.answers is self.answers else -np.inf for fit in fits])
+        return np.array([self._score(fit) if n == max(known) else -np.inf for fit, n in zip(fits, known, strict=True)])
 
     @property
     def best(self) -> Fit | None:

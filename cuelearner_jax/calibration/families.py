@@ -34,16 +34,23 @@ class Unknown(NamedTuple):
 
 
 Undoing = Callable[[Float[Array, " unknowns"], Float[Array, " size"]], Float[Array, " size"]]
+Planning = Callable[[Float[Array, " unknowns"], Float[Array, " obs"], Float[Array, " action"]], Float[Array, " action"]]
 
 
 class Distortion(NamedTuple):
-    """One way in which a world may have changed. Both functions take the unknowns in their units, and one row."""
+    """One way in which a world may have changed. All functions take the unknowns in their units, and one row."""
 
     name: str
     unknowns: tuple[Unknown, ...]
     sees: Undoing | None = None  # (unknowns, observation) -> observation before the change
     acts: Undoing | None = None  # (unknowns, meant action) -> action that leads to it after the change
+    plans: Planning | None = None  # (unknowns, observation, meant action) -> the same; see `simulated.simulated`
     of_teacher: bool = False  # a fault of the answers, which is told and not corrected
+
+    @property
+    def asks(self) -> bool:
+        """Whether the policy, or a simulator, has to be asked anew when the unknowns change."""
+        return self.sees is not None or self.plans is not None
 
 
 Family = tuple[Distortion, ...]
@@ -59,6 +66,15 @@ def seen(family: Family, theta: Float[Array, " unknowns"], obs: Float[Array, " o
     for distortion, values in _parts(family, theta):
         obs = obs if distortion.sees is None else distortion.sees(values, obs)
     return obs
+
+
+def planned(
+    family: Family, theta: Float[Array, " unknowns"], obs: Float[Array, " obs"], action: Float[Array, " action"]
+) -> Float[Array, " action"]:
+    """Return the action that leads after changes of the physics to what `action` meant; `obs`: before the changes."""
+    for distortion, values in _parts(family, theta):
+        action = action if distortion.plans is None else distortion.plans(values, obs, action)
+    return action
 
 
 def acted(
@@ -90,8 +106,8 @@ def check_family(family: Sequence[Distortion]) -> Family:
     for distortion in family:
         if not distortion.unknowns:
             raise UserError(f"distortion {distortion.name!r} has no unknowns: give at least one")
-        if distortion.sees is None and distortion.acts is None:
-            raise UserError(f"distortion {distortion.name!r} changes nothing: give `sees` or `acts`")
+        if not distortion.asks and distortion.acts is None:
+            raise UserError(f"distortion {distortion.name!r} changes nothing: give `sees`, `acts` or `plans`")
     for taken in (names, [distortion.name for distortion in family]):
         if twice := sorted({name for name in taken if taken.count(name) > 1}):
             raise UserError(f"{twice[0]!r} stands twice in a family: give each name once")

@@ -3,7 +3,8 @@
 An answer about an action is, with probability 1 - rho, an ordered logistic in the way from the action to what is meant:
 "already right" near it, with a width w. With probability rho, it is about something else: more and less are then as
 likely. An action far from what is meant tells nothing either: who looks for the nearest good action finds another
-one there. How near and how far that is, rho and w are not known; they are values of a grid with a prior.
+one there. How near and how far that is, rho and w are not known; they are values of a grid with a prior. Where the
+policy itself is not sure what it means, its spread adds to the width.
 """
 
 from __future__ import annotations
@@ -22,45 +23,60 @@ FAR = (10.0, 40.0)  # how far an answer is about what is meant [eps]
 ZERO = (1 / 3, 0.06)  # share of "already right" in answers about something else: careless ones; about other actions
 GRID = np.array(list(product(RHO, WIDTH, RIGHT, FAR, ZERO)))  # (grid, 5)
 LOG_PRIOR = np.log((1 - GRID[:, 0]) / (1 - GRID[:, 0]).sum())  # (grid,)
-
-Floats = np.ndarray
+LOGISTIC = np.pi**2 / 3  # variance of a logistic distribution of width 1
 
 
 def chances(
-    offset: Float[Array, "*n"], answer: Float[Array, "*n"] | float, doubt: Float[Array, "*n"]
+    offset: Float[Array, "*n"],
+    spread: Float[Array, "*n"],
+    answer: Float[Array, "*n"] | float,
+    doubt: Float[Array, "*n"] | float = 0.0,
 ) -> Float[Array, "*n grid"]:
     """Return the probability of an answer about one cue, for each point of the grid.
 
     Args:
-        offset: how far it is from the action to what is meant [eps].
+        offset: how far it is from the action to what is meant, on average [eps].
+        spread: standard deviation of that [eps].
         answer: -1, 0 or 1.
         doubt: probability that the situation itself makes the answer one about something else.
     """
-    offset, answer = offset[..., None], jnp.broadcast_to(jnp.asarray(answer), offset.shape)[..., None]
-    of_grid = (jnp.asarray(part, jnp.float32).reshape(*[1] * (offset.ndim - 1), -1) for part in GRID.T)
-    rho, width, right, far, zero = of_grid
+    shape = jnp.shape(offset)
+    offset, spread, answer, doubt = (
+        jnp.broadcast_to(jnp.asarray(part, jnp.float32), shape)[..., None, None, None, None, None]
+        for part in (offset, spread, answer, doubt)
+    )
+    # An axis each, so that what depends on few of them is computed once.
+    axes = np.meshgrid(RHO, WIDTH, RIGHT, FAR, ZERO, indexing="ij", sparse=True)
+    rho, width, right, far, zero = (part.astype(np.float32)[(None,) * len(shape)] for part in axes)
+    variance = jnp.square(spread)
+    width = jnp.sqrt(jnp.square(width) + variance / LOGISTIC)
     more = jax.nn.sigmoid((offset - right) / width)
     less = jax.nn.sigmoid((-offset - right) / width)
     told = jnp.where(answer > 0, more, jnp.where(answer < 0, less, 1 - more - less))
-    sound = (1 - rho) * (1 - doubt[..., None]) * jnp.exp(-jnp.square(offset / far))
+    reach = jnp.square(far) + 2 * variance
+    near = far / jnp.sqrt(reach) * jnp.exp(-jnp.square(offset) / reach)  # the mean over the spread
+    sound = (1 - rho) * (1 - doubt) * near
     other = jnp.where(answer == 0, zero, (1 - zero) / 2)
-    return sound * jnp.maximum(told, 0.0) + (1 - sound) * other
+    chance = sound * jnp.maximum(told, 0.0) + (1 - sound) * other
+    return jnp.reshape(chance, (*shape, len(GRID)))
 
 
-@jax.jit
 def log_chances(
-    offset: Float[Array, "n cues"],
+    offset: Float[Array, "*samples n cues"],
+    spread: Float[Array, "*samples n cues"],
     answer: Float[Array, "n cues"],
     told: Float[Array, "n cues"],
     doubt: Float[Array, " n"],
-) -> Float[Array, "n grid"]:
+) -> Float[Array, "*samples n grid"]:
     """Return the logarithm of the probability of each answer, for each point of the grid.
 
     Args:
         offset: how far it is from the asked action to what is meant, along each cue [eps].
+        spread: standard deviation of that [eps].
         answer: -1, 0 or 1 for each cue.
         told: 1 where something was said of a cue, else 0.
         doubt: of each answer's situation, see `chances`.
     """
-    each = jnp.log(chances(offset, answer, jnp.broadcast_to(doubt[:, None], offset.shape)))
-    return jnp.sum(each * told[..., None], 1)
+    answer, told, doubt = (jnp.broadcast_to(part, offset.shape) for part in (answer, told, doubt[:, None]))
+    each = jnp.log(chances(offset, spread, answer, doubt))
+    return jnp.sum(each * told[..., None], -2)

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from cuelearner_jax import user_code
-from cuelearner_jax.calibration.families import Family, acted, seen
+from cuelearner_jax.calibration.families import Family, acted, planned, seen
 from cuelearner_jax.policies import named
 from cuelearner_jax.spaces import Space
 
@@ -42,6 +42,7 @@ class Meaning:
             before = in_portions(partial(_seen, family), CHEAP, theta, rows)
             act = partial(self.policy.act, jax.random.key(0), None)
             found = in_portions(lambda seen: act(jnp.asarray(seen)), ROWS_PYTHON, before)
+            found = in_portions(partial(_planned, family), CHEAP, theta, before, found)
         else:
             portion = ROWS_CPU if jax.default_backend() == "cpu" else ROWS
             found = in_portions(partial(_meant, family, self.policy), portion, theta, rows)
@@ -91,7 +92,13 @@ def in_portions(program: Callable[..., Any], portion: int, *rows: Floats) -> Flo
 
 @partial(jax.jit, static_argnums=0)
 def _meant(family: Family, policy: Any, theta: Any, obs: Any) -> Any:
-    return policy.act(jax.random.key(0), None, _seen(family, theta, obs))
+    before = _seen(family, theta, obs)
+    return _planned(family, theta, before, policy.act(jax.random.key(0), None, before))
+
+
+@partial(jax.jit, static_argnums=0)
+def _planned(family: Family, theta: Any, before: Any, action: Any) -> Any:
+    return jax.vmap(partial(planned, family))(theta, before, action) if family else action
 
 
 @partial(jax.jit, static_argnums=0)

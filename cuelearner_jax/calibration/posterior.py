@@ -7,22 +7,24 @@ their likelihood. The mean weight is the family's evidence, by which families ar
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 from scipy.special import logsumexp
 from scipy.stats import qmc, t
 
 from cuelearner_jax.calibration.families import Family, unknowns_of
-from cuelearner_jax.calibration.likelihood import GRID, LOG_PRIOR, log_chances
-from cuelearner_jax.calibration.meaning import CHEAP, Meaning, in_portions
+from cuelearner_jax.calibration.likelihood import LOG_PRIOR, log_chances
+from cuelearner_jax.calibration.meaning import in_portions
+from cuelearner_jax.calibration.response import Response, Responses
 
 Floats = np.ndarray
 PRIOR_FREEDOM, KERNEL_FREEDOM = 5, 5  # of Student's t: changes may be larger than thought
-SEEING = 24  # samples of a round for each unknown that changes what is seen; the policy is asked about each
-ACTING = 16  # samples of the other unknowns with each of them; the policy is not asked again
-ALONE = 256  # samples of a round where no unknown changes what is seen
+SAMPLES = 96  # of a round for each unknown
+PORTION = 32  # samples that are weighed at once
 ENOUGH, MORE = 6.0, 4  # samples that must count, for each unknown and one; rounds that are added for these at most
 ANEW = 0.15  # share of the samples of a round that are drawn from the prior again
 FIRST, CLOSER = 2, 0.1  # rounds of the prior, and of one with so much smaller changes: they stay
@@ -92,18 +94,8 @@ class Kernels(NamedTuple):
 class Round(NamedTuple):
     """Samples of one round, and where they were drawn."""
 
-    proposals: tuple[Kernels | Prior, Kernels | Prior]  # of what changes the observation, of the rest
-    seeing: Float[Floats, "seeing unknowns"]
-    acting: Float[Floats, "seeing acting unknowns"]
-    meant: Float[Floats, "seeing labels action"]
-    offset: Float[Floats, "samples labels cues"]  # from asked actions to those that the teacher would call right [eps]
-    log_each: Float[Floats, "samples labels grid"]  # logarithm of each answer's probability
-
-    def thetas(self) -> Floats:
-        """Return all samples (seeing * acting, unknowns)."""
-        wide = np.broadcast_to(self.seeing[:, None], (*self.acting.shape[:2], self.seeing.shape[1]))
-        both = np.concatenate([wide, self.acting], -1)
-        return both.reshape(both.shape[0] * both.shape[1], both.shape[2])
+    proposal: Kernels | Prior
+    theta: Float[Floats, "samples unknowns"]
 
 
 class Fit:
@@ -112,40 +104,32 @@ class Fit:
     Args:
         family: what may have changed; empty: nothing.
         scales: of its unknowns, in their units.
-        meaning: the policy.
-        eps: strength of an answer, as `space.log` counts.
+        responses: the policy.
         seed: of the samples.
     """
 
-    def __init__(self, family: Family, scales: dict[str, float], meaning: Meaning, eps: float, seed: int) -> None:
-        self.sees = tuple(one for one in family if one.sees is not None)
-        self.rest = tuple(one for one in family if one.sees is None)
-        self.family, self.meaning, self.eps = (*self.sees, *self.rest), meaning, eps
-        self.random = np.random.default_rng(seed)
-        self.changes = len(unknowns_of(self.sees))  # unknowns that change what is seen; they come first
-        priors = [_prior(part, scales) for part in (self.sees, self.rest)]
-        self.priors = (priors[0], priors[1])
+    def __init__(self, family: Family, scales: dict[str, float], responses: Responses, seed: int) -> None:
+        self.asks = tuple(one for one in family if one.asks)
+        self.family = (*self.asks, *(one for one in family if not one.asks))
+        self.responses, self.random = responses, np.random.default_rng(seed)
+        self.changes = len(unknowns_of(self.asks))  # unknowns that change what is seen; they come first
+        self.columns = [responses.names.index(one.name) for one in unknowns_of(self.asks)]
+        self.prior = _prior(self.family, scales)
         self.rounds: list[Round] = []
         self.answers: Answers | None = None
-        self.asked_policy = 0  # rows that the policy was asked about
 
     @property
     def unknowns(self) -> int:
         """Number of unknowns."""
         return len(unknowns_of(self.family))
 
-    def learn(self, answers: Answers, rounds: int = 1) -> None:
-        """Take the answers so far, of which those known before come first, and add rounds of samples."""
-        before = 0 if self.answers is None else len(self.answers.obs)
-        self.answers = answers
-        if len(answers.obs) > before:
-            fresh = Answers(*(rows[before:] for rows in answers))
-            self.rounds = [self._extended(one, fresh) for one in self.rounds]
+    def learn(self, answers: Answers, response: Response, rounds: int = 1) -> None:
+        """Take all answers so far, and what the policy does where they were given; add rounds of samples."""
+        self.answers, self.response = answers, response
         if self.rounds:
-            self._weigh()
+            self._weigh(self.rounds)
         for _ in range(max(rounds if self.unknowns else 0, 1 - len(self.rounds))):
-            self._add(self._proposals())
-            self._weigh()
+            self._add()
         self.refine(ENOUGH * (1 + self.unknowns), MORE)
 
     def refine(self, enough: float, most: int) -> None:
@@ -153,90 +137,100 @@ class Fit:
         for _ in range(most if self.unknowns else 0):
             if self.effective >= enough:
                 return
-            self._add(self._proposals())
-            self._weigh()
+            self._add()
 
     def draw(self, random: np.random.Generator, count: int) -> Float[Floats, "count unknowns"]:
         """Return samples of the posterior; before the first answer, of the prior."""
         if self.answers is None:
-            parts = [random.permutation(prior.draw(random, count)) for prior in self.priors]
-            return np.concatenate(parts, -1)
+            return random.permutation(self.prior.draw(random, count))
         return self.theta[random.choice(len(self.theta), count, p=self.weight)]
 
-    def _extended(self, one: Round, answers: Answers) -> Round:
-        """A round with what its samples make of more answers."""
-        self.asked_policy += len(one.seeing) * len(answers.obs)
-        meant = self.meaning.actions(self.sees, one.seeing, answers.obs)
-        thetas = one.thetas()
-        every = np.repeat(meant, one.acting.shape[1], 0)
-        offset = self.meaning.offsets(self.family, thetas, every, answers.action) / self.eps
-        number, count, cues = offset.shape
-        rows = [np.tile(part, (number, *[1] * (part.ndim - 1))) for part in answers[2:]]
-        log_each = in_portions(log_chances, CHEAP, offset.reshape(-1, cues), *rows)
-        log_each = log_each.reshape(number, count, -1)
-        grown = zip(one[3:], (meant, offset, log_each), strict=True)
-        return Round(*one[:3], *(np.concatenate(pair, 1) for pair in grown))
+    def places(self, theta: Float[Floats, "n unknowns"]) -> Float[Floats, "n all"]:
+        """Return where samples lie among the nodes of `responses`."""
+        found = np.zeros((len(theta), len(self.responses.names)))
+        found[:, self.columns] = theta[:, : self.changes] / self.responses.scale[self.columns]
+        return found
 
-    def _add(self, proposals: tuple[Kernels | Prior, Kernels | Prior]) -> None:
+    def right(self, theta: Floats, response: Response) -> tuple[Floats, Floats]:
+        """Return the actions (samples, n, action) that the teacher would call right, and their spread in cues [eps]."""
+        meaning, (mean, spread) = self.responses.meaning, response.at(self.places(theta))
+        meant = np.asarray(
+            meaning.space.exp(response.centre[None], jnp.asarray(mean * self.responses.eps, jnp.float32))
+        )
+        return meaning.right(self.family, theta, meant), spread
+
+    def _offsets(self, theta: Floats) -> tuple[Floats, Floats]:
+        """From asked actions to what the teacher would call right, on average, and the spread [eps]."""
         assert self.answers is not None
-        changes, others = self.changes, self.unknowns - self.changes
-        copies = (ACTING if changes else ALONE) if others else 1
-        seeing = proposals[0].draw(self.random, SEEING * changes or 1)
-        acting = self.random.permutation(proposals[1].draw(self.random, len(seeing) * copies))
-        acting = acting.reshape(len(seeing), copies, others)
-        empty = np.zeros((len(seeing), 0, self.meaning.space.size))
-        samples, cues = len(seeing) * copies, len(self.meaning.space.cues)
-        offset, log_each = np.zeros((samples, 0, cues)), np.zeros((samples, 0, len(GRID)), np.float32)
-        drawn = Round(proposals, seeing, acting, empty, offset, log_each)
-        self.rounds = [*self.rounds[:FIRST], *self.rounds[FIRST:][1 - KEPT :], self._extended(drawn, self.answers)]
+        right, spread = self.right(theta, self.response)
+        none = np.zeros((len(theta), 0))
+        return self.responses.meaning.offsets((), none, right, self.answers.action) / self.responses.eps, spread
 
-    def _proposals(self) -> tuple[Kernels | Prior, Kernels | Prior]:
+    def _add(self) -> None:
+        proposal = self._proposal()
+        drawn = Round(proposal, proposal.draw(self.random, SAMPLES * self.unknowns or 1))
+        kept = [*self.rounds[:FIRST], *self.rounds[FIRST:][1 - KEPT :]]
+        dropped = sum(len(one.theta) for one in self.rounds) - sum(len(one.theta) for one in kept)
+        first = sum(len(one.theta) for one in self.rounds[:FIRST])
+        if self.rounds:
+            stays = np.r_[0:first, first + dropped : len(self.theta)]
+            self.theta, self.offset = self.theta[stays], self.offset[stays]
+            self.log_likelihood = self.log_likelihood[stays]
+        self.rounds = [*kept, drawn]
+        self._weigh([drawn], fresh=False)
+
+    def _proposal(self) -> Kernels | Prior:
         """Where to draw next: the prior, then close to no change, then near what the answers so far leave likely."""
-        if len(self.rounds) < FIRST:
-            return self.priors if not self.rounds else (self.priors[0].closer(), self.priors[1].closer())
+        if len(self.rounds) < FIRST or not self.unknowns:
+            return self.prior if not self.rounds else self.prior.closer()
         enough = min(0.25 * len(self.log_weight), ENOUGH * (1 + self.unknowns))
         # As long as few samples have all of the weight, the best are where to look, however they were found.
         weight = self.weight if self.effective >= enough else tempered(self.log_density, enough)
-        columns = (self.theta[:, : self.changes], self.theta[:, self.changes :])
-        found = [self._kernels(theta, prior, weight) for theta, prior in zip(columns, self.priors, strict=True)]
-        return found[0], found[1]
-
-    def _kernels(self, theta: Floats, prior: Prior, weight: Floats) -> Kernels | Prior:
-        size = theta.shape[1]
-        if not size:
-            return prior
-        centres = theta[self.random.choice(len(theta), 32, p=weight)]
-        away = theta - weight @ theta
+        size = self.unknowns
+        centres = self.theta[self.random.choice(len(self.theta), 32, p=weight)]
+        away = self.theta - weight @ self.theta
         width = (1 / np.square(weight).sum()) ** (-1 / (size + 4))
-        spread = (away * weight[:, None]).T @ away * width**2 + np.diag(np.square(1e-3 * prior.scale))
-        return Kernels(centres, np.linalg.cholesky(spread), prior)
+        spread = (away * weight[:, None]).T @ away * width**2 + np.diag(np.square(1e-3 * self.prior.scale))
+        return Kernels(centres, np.linalg.cholesky(spread), self.prior)
 
-    def _weigh(self) -> None:
-        """Weights of all samples under all answers."""
-        assert self.answers is not None
-        self.theta = np.concatenate([one.thetas() for one in self.rounds])
-        self.offset = np.concatenate([one.offset for one in self.rounds])  # [eps]
-        self.log_each = np.concatenate([one.log_each for one in self.rounds])
-        self.log_likelihood = self.log_each.sum(1, dtype=np.float64) + LOG_PRIOR  # (samples, grid)
+    def _weigh(self, rounds: list[Round], fresh: bool = True) -> None:
+        """Weigh the samples of rounds by all answers; `fresh`: these rounds are all, else they are new."""
+        theta = np.concatenate([one.theta for one in rounds])
+        offset, spread = self._offsets(theta)
+        found = self._log_each(offset, spread, summed=True)
+        if fresh or len(self.rounds) == 1:
+            self.theta, self.offset, self.log_likelihood = theta, offset, found
+        else:
+            self.theta = np.concatenate([self.theta, theta])
+            self.offset = np.concatenate([self.offset, offset])  # [eps]
+            self.log_likelihood = np.concatenate([self.log_likelihood, found])
         prior, drawn = self._log_densities()
         self.log_origin = prior - drawn
         self.log_density = logsumexp(self.log_likelihood, axis=1) + prior
         self.log_weight = self.log_density - drawn
 
+    def _log_each(self, offset: Floats, spread: Floats, summed: bool) -> Floats:
+        """Logarithm of each answer's probability (samples, n, grid), or of all answers' and the grid's prior."""
+        assert self.answers is not None
+        count = offset.shape[1]
+        size = 1 << max(4, (count - 1).bit_length())  # few sizes, few programs
+        answer, told, doubt = (
+            np.pad(np.asarray(rows, np.float32), [(0, size - count)] + [(0, 0)] * (rows.ndim - 1))
+            for rows in self.answers[2:]
+        )
+        padded = [np.pad(part, ((0, 0), (0, size - count), (0, 0))) for part in (offset, spread)]
+        program = _summed if summed else _each
+        found = in_portions(lambda *rows: program(*rows, answer, told, doubt), PORTION, *padded)
+        return found + LOG_PRIOR if summed else found[:, :count]
+
     def _log_densities(self) -> tuple[Floats, Floats]:
         """Logarithm of the density of each sample: under the prior, and in the mixture of all proposals."""
-        columns = (self.theta[:, : self.changes], self.theta[:, self.changes :])
-        counts = [one.acting.shape[0] * one.acting.shape[1] for one in self.rounds]
         if not self.unknowns:
             return np.zeros(len(self.theta)), np.zeros(len(self.theta))
-        drawn = [
-            sum(q.log_density(part) for q, part in zip(one.proposals, columns, strict=True) if part.shape[1])
-            + np.log(count / sum(counts))
-            for one, count in zip(self.rounds, counts, strict=True)
-        ]
-        prior = sum(p.log_density(part) for p, part in zip(self.priors, columns, strict=True) if part.shape[1])
-        possible = [p.allows(part) for p, part in zip(self.priors, columns, strict=True)]
-        return np.where(np.all(possible, axis=0), prior, -np.inf), logsumexp(np.array(drawn), axis=0)
+        counts = np.array([len(one.theta) for one in self.rounds])
+        drawn = [one.proposal.log_density(self.theta) for one in self.rounds] + np.log(counts / counts.sum())[:, None]
+        prior = np.where(self.prior.allows(self.theta), self.prior.log_density(self.theta), -np.inf)
+        return prior, logsumexp(drawn, axis=0)
 
     @property
     def evidence(self) -> float:
@@ -263,14 +257,15 @@ class Fit:
 
     def predicted(self) -> Float[Floats, " n"]:
         """Return the logarithm of the probability of each answer, given those of the other four fifths."""
-        count = self.log_each.shape[1]
+        log_each = self._log_each(*self._offsets(self.theta), summed=False)
+        count = log_each.shape[1]
         found = np.zeros(count)
         joint = self.log_likelihood + self.log_origin[:, None]
         for fold in range(min(HELD_OUT, count)):
             held = np.arange(fold, count, HELD_OUT)
-            rest = joint - self.log_each[:, held].sum(1, dtype=np.float64)
+            rest = joint - log_each[:, held].sum(1, dtype=np.float64)
             rest = rest - logsumexp(rest)
-            found[held] = [logsumexp(rest + self.log_each[:, label]) for label in held]
+            found[held] = [logsumexp(rest + log_each[:, label]) for label in held]
         return found
 
     def interval(self, share: float = 0.95) -> tuple[Floats, Floats, Floats]:
@@ -283,6 +278,16 @@ class Fit:
 def _prior(family: Family, scales: dict[str, float]) -> Prior:
     unknowns = unknowns_of(family)
     return Prior(np.array([scales[one.name] for one in unknowns]), np.array([one.most for one in unknowns]))
+
+
+@jax.jit
+def _each(*rows: Any) -> Any:
+    return log_chances(*rows)
+
+
+@jax.jit
+def _summed(*rows: Any) -> Any:
+    return jnp.sum(log_chances(*rows), 1)
 
 
 def tempered(log_weight: Floats, enough: float) -> Floats:

@@ -13,6 +13,7 @@ from cuelearner_jax.calibration.families import Family
 from cuelearner_jax.calibration.likelihood import chances
 from cuelearner_jax.calibration.meaning import Meaning
 from cuelearner_jax.calibration.posterior import Fit
+from cuelearner_jax.calibration.response import Response
 
 Floats = np.ndarray
 ANSWERS = (-1.0, 0.0, 1.0)
@@ -60,52 +61,37 @@ def drawn(
     return [(fit, fit.draw(random, count)) for fit, count in zip(fits, counts.tolist(), strict=True) if count]
 
 
-def meant_by(
-    draws: list[tuple[Fit, Floats]], meaning: Meaning, obs: Float[Floats, "n obs"]
-) -> Float[Floats, "draws n action"]:
-    """Return what the teacher would call right in each situation under each draw."""
-    found = []
-    for fit, thetas in draws:
-        unique, where = np.unique(thetas[:, : fit.changes], axis=0, return_inverse=True)
-        meant = meaning.actions(fit.sees, unique, obs)[where.ravel()]
-        found.append(meaning.right(fit.family, thetas, meant))
-    return np.concatenate(found)
-
-
 def choose(
     draws: list[tuple[Fit, Floats]],
-    meaning: Meaning,
-    obs: Float[Floats, "n obs"],
-    doubt: Float[Floats, " n"],
+    response: Response,
     count: int,
-    eps: float,
     random: np.random.Generator,
 ) -> Questions:
     """Return `count` questions: of each share of the situations, the one that is expected to tell most.
 
     Args:
         draws: what may have changed.
-        meaning: the policy.
-        obs: situations to choose from, at least `count`.
-        doubt: of these, see `ties`.
+        response: what the policy does in the situations to choose from, at least `count`.
         count: number of questions.
-        eps: strength of an answer, as `space.log` counts.
         random: of answers that are imagined.
     """
-    right = meant_by(draws, meaning, obs)
+    meaning, eps = draws[0][0].responses.meaning, draws[0][0].responses.eps
+    found = [fit.right(thetas, response) for fit, thetas in draws]
+    right, spread = (np.concatenate(parts) for parts in zip(*found, strict=True))
     nuisance = np.concatenate([np.tile(fit.nuisance, (len(thetas), 1)) for fit, thetas in draws])
     middle = _medoid(meaning, right, eps)
     away = meaning.offsets((), np.zeros((len(right), 0)), right, middle) / eps  # (draws, n, cues)
     centre = np.median(away, 0)
-    spread = np.clip(1.5 * np.median(np.abs(away - centre), 0), LEAST_SPREAD, WIDEST)
-    turns = centre[None] + TURNS[:, None, None] * spread[None]  # (turns, n, cues)
+    width = np.clip(1.5 * np.median(np.abs(away - centre), 0), LEAST_SPREAD, WIDEST)
+    turns = centre[None] + TURNS[:, None, None] * width[None]  # (turns, n, cues)
     apart = away[:, None] - turns[None]
-    chance = np.stack([np.asarray(_chances(apart[..., cue], nuisance, doubt)) for cue in range(apart.shape[-1])])
-    shares = np.array_split(np.arange(len(obs)), count)
-    index, turn, worth = _told_most(chance, shares, random)
+    spread = np.broadcast_to(spread[:, None], apart.shape)
+    of_cues = [_chances(apart[..., cue], spread[..., cue], nuisance) for cue in range(apart.shape[-1])]
+    shares = np.array_split(np.arange(right.shape[1]), count)
+    index, turn, worth = _told_most(np.stack([np.asarray(one) for one in of_cues]), shares, random)
     turned = np.stack([turns[turn[:, cue], index, cue] for cue in range(turns.shape[-1])], -1)
     action = np.asarray(meaning.space.exp(middle[index], jnp.asarray(turned * eps, jnp.float32)))
-    return Questions(index, action, doubt[index], worth)
+    return Questions(index, action, np.zeros(count), worth)
 
 
 def _told_most(
@@ -143,11 +129,10 @@ def _medoid(meaning: Meaning, right: Float[Floats, "draws n action"], eps: float
 
 @jax.jit
 def _chances(
-    offset: Float[Array, "draws turns n"], nuisance: Float[Array, "draws grid"], doubt: Float[Array, " n"]
+    offset: Float[Array, "draws turns n"], spread: Float[Array, "draws turns n"], nuisance: Float[Array, "draws grid"]
 ) -> Float[Array, "answers draws turns n"]:
     """Probability of each answer about one cue under each draw."""
-    doubt = jnp.broadcast_to(doubt, offset.shape)
-    return jnp.stack([jnp.einsum("dtng,dg->dtn", chances(offset, h, doubt), nuisance) for h in ANSWERS])
+    return jnp.stack([jnp.einsum("dtng,dg->dtn", chances(offset, spread, h), nuisance) for h in ANSWERS])
 
 
 def _entropy(chance: Float[Floats, "answers *n"]) -> Float[Floats, "*n"]:

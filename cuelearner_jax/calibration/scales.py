@@ -37,6 +37,6 @@ def scales_of(meaning: Meaning, family: Family, obs: Float[Floats, "n obs"], eps
 
 
 def _seen_by(meaning: Meaning, family: Family, thetas: Floats, obs: Floats) -> Floats:
-    if family[0].sees is not None:
+    if family[0].asks:
         return meaning.actions(family, thetas, obs)
     return np.broadcast_to(meaning.actions((), thetas[:1, :0], obs), (len(thetas), len(obs), meaning.space.size))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import jax
@@ -15,7 +16,8 @@ from cuelearner_jax.environment import Environment
 from cuelearner_jax.feedback.answers import relative_answer
 from cuelearner_jax.types import EnvState, Teacher
 
-BEFORE, BETWEEN = 12, 4  # steps before the first questions, and between two batches
+BEFORE = 12  # steps before the first questions
+EACH, APART = 4, 2  # situations of each environment's walk between two batches, and steps between them
 
 
 class Walk:
@@ -33,16 +35,21 @@ class Walk:
         self.obs: Any = None
 
     def situations(self, key: PRNGKeyArray, policy: Any, count: int) -> tuple[EnvState, Float[Array, "count obs"]]:
-        """Walk on with a policy, and return where `count` environments are then."""
-        k_start, *keys = jax.random.split(key, 1 + (BETWEEN if self.states is not None else BEFORE))
-        if self.states is None or len(self.obs) != count:
-            self.states, self.obs = _start(self.env, jax.random.split(k_start, count))
-        act = policy.act if is_python(policy) else jax.jit(policy.act)
-        for k_step in keys:
+        """Walk on with a policy, and return `count` situations on the way."""
+        envs, steps = -(-count // EACH), EACH * APART
+        k_start, *keys = jax.random.split(key, 1 + steps + (BEFORE if self.states is None else 0))
+        if self.states is None or len(self.obs) != envs:
+            self.states, self.obs = _start(self.env, jax.random.split(k_start, envs))
+        act = policy.act if is_python(policy) else partial(_act, policy)
+        met = []
+        for number, k_step in enumerate(keys):
             k_act, k_env = jax.random.split(k_step)
             action = act(k_act, self.states, self.obs)
-            self.states, self.obs = _step(self.env, jax.random.split(k_env, count), self.states, action)
-        return self.states, self.obs
+            self.states, self.obs = _step(self.env, jax.random.split(k_env, envs), self.states, action)
+            if (len(keys) - 1 - number) % APART == 0 and len(keys) - number <= steps:
+                met.append((self.states, self.obs))
+        # Those of one environment stand side by side, so that one question comes from few of them.
+        return jax.tree.map(lambda *rows: jnp.stack(rows, 1).reshape(-1, *rows[0].shape[1:])[:count], *met)
 
     def answers(
         self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"], actions: Float[Array, "n action"]
@@ -50,6 +57,11 @@ class Walk:
         """The teacher's answers; NaN where it says nothing."""
         keys = jax.random.split(key, len(obs))
         return _answers(self.env, self.teacher, self.scalars, keys, states, obs, actions)
+
+
+@jax.jit
+def _act(policy: Any, key: Any, states: Any, obs: Any) -> Any:
+    return policy.act(key, states, obs)
 
 
 @jax.jit

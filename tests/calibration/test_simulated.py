@@ -1,0 +1,55 @@
+"""A change of the physics is compensated by what the simulator shows, and no change changes nothing."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import struct
+
+from cuelearner_jax.calibration.corrected import Calibrated
+from cuelearner_jax.calibration.families import Unknown
+from cuelearner_jax.calibration.simulated import simulated
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.policies import policy_of
+from cuelearner_jax.spaces import DIRECTIONS, Box
+from cuelearner_jax.spaces.directions import difference, from_angle, rotate
+from cuelearner_jax.types import Step
+
+WIDE = 0.02  # of the window that earns [rad]
+
+
+class Windy(struct.PyTreeNode):
+    """One shot at an angle; the wind turns what is shot by an amount that depends on where it stands."""
+
+    wind: object = 0.0
+
+    def step(self, key, state, action):
+        """Pays 1 within the window round the angle of the state."""
+        flown = rotate(action, self.wind * (1 + state))
+        hit = jnp.abs(difference(flown, from_angle(state))) < WIDE
+        nothing = jnp.zeros(())
+        return state, Step(nothing, nothing, nothing, hit.astype(jnp.float32), nothing, nothing, {}, {})
+
+
+POLICY = policy_of(lambda obs: np.asarray(from_angle(obs[:, 0]), np.float32))
+UNKNOWN = (Unknown("wind", "rad"),)
+
+
+def windy(reach=6.0, space=DIRECTIONS, tried=13):
+    return simulated("wind", UNKNOWN, lambda theta: Windy(theta[0]), lambda obs: obs[0], space, reach, tried)
+
+
+@pytest.mark.parametrize("wind", [0.0, 0.03, -0.02])
+def test_the_action_to_give_earns_what_the_meant_one_did(wind):
+    obs = jnp.linspace(0.0, 1.0, 5)[:, None]
+    corrected = Calibrated(POLICY, jnp.array([wind]), (windy(),))
+    turned = difference(POLICY.act(None, None, obs), corrected.act(None, None, obs))
+    np.testing.assert_allclose(turned, -wind * (1 + obs[:, 0]), atol=0.01)
+    if wind == 0:
+        np.testing.assert_array_equal(turned, 0)
+
+
+def test_several_cues_and_even_numbers_are_refused():
+    with pytest.raises(UserError, match="one cue"):
+        windy(space=Box((0.0, 0.0), (1.0, 1.0)))
+    with pytest.raises(UserError, match="odd"):
+        windy(tried=12)
