@@ -19,12 +19,15 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
+from cuelearner_envs.billiards.environment import Balls
 from cuelearner_jax.adaptation.adapting import settling
 from cuelearner_jax.agents.choice import best_near_peaks
 from cuelearner_jax.calibration.calibrating import Result, calibrate
-from cuelearner_jax.calibration.families import declared
+from cuelearner_jax.calibration.families import Distortion, Unknown, declared
+from cuelearner_jax.calibration.simulated import simulated
 from cuelearner_jax.calibration.walking import Walk
 from cuelearner_jax.config import Scalars
 from cuelearner_jax.environment import actions_of
@@ -36,13 +39,24 @@ from cuelearner_jax.storage.provenance import provenance
 from cuelearner_jax.tasks import registry
 
 UNCHANGED = "unchanged"
+# A scenario, whose teacher and answers hold, and what else changes; a noisy lidar is no change of the family.
+SCENES: dict[str, tuple[str, dict[str, Any]]] = {
+    "turned_strike": ("turned_strike", {}),
+    "shifted_balls": ("shifted_balls", {}),
+    "turned_and_shifted": ("turned_strike", {"observation_bias": (0.0071, 0.0071)}),
+    "tilted_table": ("tilted_table", {}),
+    "turned_lidar": ("turned_lidar", {}),
+    "noisy_lidar": ("turned_lidar", {"lidar_rotation_deg": 0.0, "lidar_dropout": 0.3}),
+}
+LIKE = {"billiards": "turned_strike", "navigation": "turned_lidar"}
 WORLDS = {
-    "billiards": (UNCHANGED, "turned_strike", "shifted_balls", "tilted_table"),
-    "navigation": (UNCHANGED, "turned_lidar"),
+    "billiards": (UNCHANGED, "turned_strike", "shifted_balls", "turned_and_shifted", "tilted_table"),
+    "navigation": (UNCHANGED, "turned_lidar", "noisy_lidar"),
 }
 METRIC = {"billiards": "reward", "navigation": "success"}
 LABELS = (10, 25, 50, 100)
 ENVS = 200
+REACH_DEG = 0.6  # how far a tilt may bend a shot
 COARSE, PEAKS = 450, 8  # of the shipped network's search: directions of a first look, and maxima that are looked at
 
 
@@ -56,16 +70,43 @@ class World(NamedTuple):
     teacher: Any
 
 
-def world_of(task: Any, name: str, own: Any, scalars: Scalars, split: str, mistakes: float) -> World:
-    """The world of a scenario, its teacher, and answers as the scenario has them."""
-    like = {"billiards": "turned_strike", "navigation": "turned_lidar"}[task.name]
-    rules = task.scenario(like if name == UNCHANGED else name)
-    applied = rules.applied(own)
+def world_of(task: Any, name: str, own: Any, scalars: Scalars, split: str, faults: dict[str, float]) -> World:
+    """The world of a scene, its teacher, and answers as its scenario has them; `faults`: of the teacher."""
+    scenario, more = SCENES.get(name, (LIKE[task.name], {}))
+    rules = task.scenario(scenario)
+    applied = dataclasses.replace(rules.applied(own), **more)
     config = dataclasses.replace(own, **({"teacher": applied.teacher} if task.name == "billiards" else {}))
     config = config if name == UNCHANGED else applied
-    scalars = dataclasses.replace(settling(scalars, rules.eps_deg), mistake_probability=mistakes, **rules.scalars)
+    scalars = dataclasses.replace(settling(scalars, rules.eps_deg), **{**rules.scalars, **faults})
     env = task.environment(config)
     return World(config, env, task.environment(config, split), scalars, task.make_teacher(config, env))
+
+
+def family_of(task: Any, own: Any, world: World, tilt: bool) -> tuple[Distortion, ...]:
+    """What may have changed, as the world declares it; `tilt`: and the table, as a simulator has it."""
+    if not tilt:
+        return declared(world.env)
+    known, space = task.environment(own), actions_of(world.env)
+
+    def env_of(theta: Any) -> Any:
+        return known.replace(table=known.table.replace(acceleration=theta))
+
+    def state_of(obs: Any) -> Balls:
+        balls = obs.reshape(-1, 3)
+        return Balls(balls[:, :2], balls[:, 2] > 0, jnp.zeros((), jnp.int32))
+
+    unknowns = (Unknown("tilt x", "m/s^2"), Unknown("tilt y", "m/s^2"))
+    return (*declared(world.env), simulated("table: tilt", unknowns, env_of, state_of, space, REACH_DEG))
+
+
+def shuffled(answers: Any) -> Any:
+    """A teacher whose answers of a batch are given to each other's questions: a control."""
+
+    def mixed(key: Any, states: Any, obs: Any, actions: Any) -> Any:
+        found = answers(key, states, obs, actions)
+        return jax.random.permutation(jax.random.fold_in(key, 1), found)
+
+    return mixed
 
 
 def bases_of(task: Any, folder: Path | None) -> tuple[Any, Scalars, dict[int, Any]]:
@@ -109,16 +150,20 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=1, help="of labels, for each base")
     parser.add_argument("--most-bases", type=int, default=8)
     parser.add_argument("--mistakes", type=float, default=0.0, help="probability that a cue's answer is reversed")
+    parser.add_argument("--bias-deg", type=float, default=0.0, help="of everything that the teacher means")
+    parser.add_argument("--shuffled", action="store_true", help="control: answers stand beside other questions")
+    parser.add_argument("--first-seed", type=int, default=0)
     parser.add_argument("--steps", type=int, default=10_000, help="of an evaluation; 0: none")
     parser.add_argument("--split", choices=("tuning", "validation"), default="tuning", help="of its episodes")
     parser.add_argument("--out", type=Path, help="write all rows to this JSON file")
     asked = parser.parse_args()
     task = registry.find(asked.task)
     own, scalars, bases = bases_of(task, asked.bases)
+    faults = {"mistake_probability": asked.mistakes, "teacher_bias_deg": asked.bias_deg}
     rows: list[dict[str, Any]] = []
     for name in asked.worlds or WORLDS[asked.task]:
-        world = world_of(task, name, own, scalars, asked.split, asked.mistakes)
-        family, space = declared(world.env), actions_of(world.env)
+        world = world_of(task, name, own, scalars, asked.split, faults)
+        family, space = family_of(task, own, world, name == "tilted_table"), actions_of(world.env)
         for base, policy in list(bases.items())[: asked.most_bases]:
             if asked.steps:
                 rows.append(
@@ -126,15 +171,18 @@ def main() -> None:
                 )
                 print(rows[-1], flush=True)
             for labels in asked.labels:
-                for seed in range(asked.seeds):
-                    start, walk = time.time(), Walk(world.env, world.teacher, world.scalars)
+                for seed in range(asked.first_seed, asked.first_seed + asked.seeds):
+                    start, used, walk = time.time(), time.process_time(), Walk(world.env, world.teacher, world.scalars)
                     key = jax.random.fold_in(jax.random.key(seed), labels)
+                    answers = shuffled(walk.answers) if asked.shuffled else walk.answers
                     found = calibrate(
-                        policy, family, walk.situations, walk.answers, labels, key,
+                        policy, family, walk.situations, answers, labels, key,
                         space=space, eps_deg=world.scalars.eps_deg,
                     )  # fmt: skip
                     row = {"world": name, "base": base, "labels": labels, "seed": seed, **told(found)}
-                    row["seconds"] = round(time.time() - start, 1)
+                    row["seconds"], row["cpu_seconds"] = (
+                        round(now - then, 1) for now, then in ((time.time(), start), (time.process_time(), used))
+                    )
                     if asked.steps:
                         row["worth"] = worth(world, found.policy, asked.split, asked.steps)
                     rows.append(row)

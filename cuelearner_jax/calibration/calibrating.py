@@ -112,13 +112,13 @@ class Calibration:
         self.answers: Answers | None = None
         self.scales: dict[str, float] = {}
         self.fits: dict[tuple[str, ...], Fit] = {}
+        self.ready: list[Responses] = []  # none before the first situations
 
     def copy(self, random: np.random.Generator) -> Calibration:
         """Return what is known now, to choose questions by while this one goes on; `random`: of these questions."""
         other = copy(self)
         other.fits, other.random = {names: copy(fit) for names, fit in self.fits.items()}, random
-        if self.scales:
-            other.responses = copy(self.responses)
+        other.ready = [copy(one) for one in self.ready]
         return other
 
     @property
@@ -159,10 +159,15 @@ class Calibration:
         self._compare()
 
     def _scaled(self, obs: Floats) -> None:
-        if not self.scales:
-            self.scales = scales_of(self.meaning, self.family, obs, self.eps)
+        self.scales = self.scales or scales_of(self.meaning, self.family, obs, self.eps)
+        if not self.ready:
             asks = tuple(one for one in self.family if one.asks)
-            self.responses = Responses(self.meaning, asks, self.scales, self.eps)
+            self.ready = [Responses(self.meaning, asks, self.scales, self.eps)]
+
+    @property
+    def responses(self) -> Responses:
+        """The policy at nodes, once the first situations were seen."""
+        return self.ready[0]
 
     def _singles(self) -> list[tuple[str, ...]]:
         return [(one.name,) for one in self.family]

@@ -10,7 +10,7 @@ from cuelearner_jax.calibration.calibrating import CHANGED, UNCHANGED, UNEXPLAIN
 from cuelearner_jax.calibration.families import declared
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.policies import policy_of
-from cuelearner_jax.spaces import DIRECTIONS, Choices
+from cuelearner_jax.spaces import DIRECTIONS, Choices, Space
 from cuelearner_jax.spaces.directions import rotate
 
 EPS_DEG = 2.0
@@ -28,7 +28,7 @@ def asked(meant, labels=50, wrong=0.0, policy=POLICY, family=FAMILY, seed=0):
     return calibrate(policy, family, situations, answers, labels, key, space=DIRECTIONS, eps_deg=EPS_DEG)
 
 
-def missed(found, meant, space=DIRECTIONS):
+def missed(found, meant, space: Space = DIRECTIONS):
     """Mean distance from the corrected policy to what is meant, in the space's unit."""
     _, obs = situations(jax.random.key(99), None, 200)
     away = jnp.abs(space.log(found.policy.act(jax.random.key(0), None, obs), meant(obs)))

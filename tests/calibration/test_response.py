@@ -1,6 +1,7 @@
 """Between the nodes at which a policy was asked: exact where the policy is smooth, unsure where it jumps."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -66,5 +67,5 @@ def test_spread_is_a_mean_over_what_may_be_meant(answer):
     offset, spread = 1.5, 2.0
     draws = offset + spread * np.random.default_rng(0).standard_normal(20_000)
     sampled = jax.jit(jax.vmap(lambda one: chances(one, 0.0 * one, answer)))(np.float32(draws)).mean(0)
-    found = chances(np.float32(offset) + np.zeros(1), np.float32(spread) + np.zeros(1), answer)[0]
+    found = chances(jnp.array([offset]), jnp.array([spread]), answer)[0]
     np.testing.assert_allclose(found, sampled, atol=0.03)

@@ -1,5 +1,8 @@
 """A change of the physics is compensated by what the simulator shows, and no change changes nothing."""
 
+from typing import Any
+
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -20,7 +23,7 @@ WIDE = 0.02  # of the window that earns [rad]
 class Windy(struct.PyTreeNode):
     """One shot at an angle; the wind turns what is shot by an amount that depends on where it stands."""
 
-    wind: object = 0.0
+    wind: Any = 0.0
 
     def step(self, key, state, action):
         """Pays 1 within the window round the angle of the state."""
@@ -34,7 +37,7 @@ POLICY = policy_of(lambda obs: np.asarray(from_angle(obs[:, 0]), np.float32))
 UNKNOWN = (Unknown("wind", "rad"),)
 
 
-def windy(reach=6.0, space=DIRECTIONS, tried=13):
+def windy(reach=6.0, space: Any = DIRECTIONS, tried=13):
     return simulated("wind", UNKNOWN, lambda theta: Windy(theta[0]), lambda obs: obs[0], space, reach, tried)
 
 
@@ -42,7 +45,8 @@ def windy(reach=6.0, space=DIRECTIONS, tried=13):
 def test_the_action_to_give_earns_what_the_meant_one_did(wind):
     obs = jnp.linspace(0.0, 1.0, 5)[:, None]
     corrected = Calibrated(POLICY, jnp.array([wind]), (windy(),))
-    turned = difference(POLICY.act(None, None, obs), corrected.act(None, None, obs))
+    key = jax.random.key(0)
+    turned = difference(POLICY.act(key, None, obs), corrected.act(key, None, obs))
     np.testing.assert_allclose(turned, -wind * (1 + obs[:, 0]), atol=0.01)
     if wind == 0:
         np.testing.assert_array_equal(turned, 0)
