@@ -33,8 +33,8 @@ from cuelearner_jax.spaces import Space, said
 Floats = np.ndarray
 Given = Array | np.ndarray  # what is taken
 BATCH = 10  # questions between two fits
-CHOICE = 8  # situations of which one is asked about
-LOOKS = 4  # nodes at which the policy is asked in each situation to choose from
+CHOICE = 6  # situations of which one is asked about
+LOOKS = 6  # nodes at which the policy is asked in each situation to choose from
 FRESH = 3  # nodes after each batch
 ROUNDS = 4  # of samples, where there were none
 LEAST = 20  # answers that two changes at once are asked of

@@ -92,10 +92,12 @@ class Kernels(NamedTuple):
 
 
 class Round(NamedTuple):
-    """Samples of one round, and where they were drawn."""
+    """Samples of one round, where they were drawn, and what answers make of them."""
 
     proposal: Kernels | Prior
     theta: Float[Floats, "samples unknowns"]
+    offset: Float[Floats, "samples n cues"]  # from asked actions to what the teacher would call right [eps]
+    log_likelihood: Float[Floats, "samples grid"]  # with the prior of the grid
 
 
 class Fit:
@@ -126,8 +128,9 @@ class Fit:
     def learn(self, answers: Answers, response: Response, rounds: int = 1) -> None:
         """Take all answers so far, and what the policy does where they were given; add rounds of samples."""
         self.answers, self.response = answers, response
+        self.rounds = [self._round(one.proposal, one.theta) for one in self.rounds]
         if self.rounds:
-            self._weigh(self.rounds)
+            self._weigh()
         for _ in range(max(rounds if self.unknowns else 0, 1 - len(self.rounds))):
             self._add()
         self.refine(ENOUGH * (1 + self.unknowns), MORE)
@@ -166,18 +169,15 @@ class Fit:
         none = np.zeros((len(theta), 0))
         return self.responses.meaning.offsets((), none, right, self.answers.action) / self.responses.eps, spread
 
+    def _round(self, proposal: Kernels | Prior, theta: Floats) -> Round:
+        offset, spread = self._offsets(theta)
+        return Round(proposal, theta, offset, self._log_each(offset, spread, summed=True))
+
     def _add(self) -> None:
         proposal = self._proposal()
-        drawn = Round(proposal, proposal.draw(self.random, SAMPLES * self.unknowns or 1))
-        kept = [*self.rounds[:FIRST], *self.rounds[FIRST:][1 - KEPT :]]
-        dropped = sum(len(one.theta) for one in self.rounds) - sum(len(one.theta) for one in kept)
-        first = sum(len(one.theta) for one in self.rounds[:FIRST])
-        if self.rounds:
-            stays = np.r_[0:first, first + dropped : len(self.theta)]
-            self.theta, self.offset = self.theta[stays], self.offset[stays]
-            self.log_likelihood = self.log_likelihood[stays]
-        self.rounds = [*kept, drawn]
-        self._weigh([drawn], fresh=False)
+        drawn = self._round(proposal, proposal.draw(self.random, SAMPLES * self.unknowns or 1))
+        self.rounds = [*self.rounds[:FIRST], *self.rounds[FIRST:][1 - KEPT :], drawn]
+        self._weigh()
 
     def _proposal(self) -> Kernels | Prior:
         """Where to draw next: the prior, then close to no change, then near what the answers so far leave likely."""
@@ -193,17 +193,9 @@ class Fit:
         spread = (away * weight[:, None]).T @ away * width**2 + np.diag(np.square(1e-3 * self.prior.scale))
         return Kernels(centres, np.linalg.cholesky(spread), self.prior)
 
-    def _weigh(self, rounds: list[Round], fresh: bool = True) -> None:
-        """Weigh the samples of rounds by all answers; `fresh`: these rounds are all, else they are new."""
-        theta = np.concatenate([one.theta for one in rounds])
-        offset, spread = self._offsets(theta)
-        found = self._log_each(offset, spread, summed=True)
-        if fresh or len(self.rounds) == 1:
-            self.theta, self.offset, self.log_likelihood = theta, offset, found
-        else:
-            self.theta = np.concatenate([self.theta, theta])
-            self.offset = np.concatenate([self.offset, offset])  # [eps]
-            self.log_likelihood = np.concatenate([self.log_likelihood, found])
+    def _weigh(self) -> None:
+        """Weights of all samples under all answers."""
+        self.theta, self.offset, self.log_likelihood = map(np.concatenate, list(zip(*self.rounds, strict=True))[1:])
         prior, drawn = self._log_densities()
         self.log_origin = prior - drawn
         self.log_density = logsumexp(self.log_likelihood, axis=1) + prior
@@ -213,7 +205,7 @@ class Fit:
         """Logarithm of each answer's probability (samples, n, grid), or of all answers' and the grid's prior."""
         assert self.answers is not None
         count = offset.shape[1]
-        size = 1 << max(4, (count - 1).bit_length())  # few sizes, few programs
+        size = 1 << max(6, (count - 1).bit_length())  # few sizes, few programs
         answer, told, doubt = (
             np.pad(np.asarray(rows, np.float32), [(0, size - count)] + [(0, 0)] * (rows.ndim - 1))
             for rows in self.answers[2:]

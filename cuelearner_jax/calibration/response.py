@@ -19,7 +19,7 @@ from cuelearner_jax.calibration.meaning import Meaning
 Floats = np.ndarray
 AXIS = (0.35, 1.2)  # where the first nodes stand on either side of no change, in prior scales
 MOST = 28  # nodes
-CLIP = 20.0  # [eps]: beyond, an action is another one
+CLIP = 10.0  # [eps]: beyond, an action is another one
 TREND = 100.0  # variance of the trend, in that of the rest
 LENGTHS, NUGGETS = (0.15, 0.5, 2.0), (1e-3, 0.1, 0.6)  # in prior scales; as shares of the variance
 LEAST = 0.05  # [eps]: a policy that is smoother has that size
