@@ -39,8 +39,7 @@ FRESH = 3  # nodes after each batch
 ROUNDS = 4  # of samples, where there were none
 LEAST = 20  # answers that two changes at once are asked of
 DOUBT = 2.0  # what the evidence of each change must exceed [nats]
-SURE = 4.0  # what the evidence of all must exceed, against no change [nats]
-SPREADS = 1.0  # standard errors by which held-out answers must be predicted better
+SURE = 3.0  # what the evidence of all must exceed, against no change [nats]
 LARGEST = 3  # changes at once
 SETTLED, SETTLING = 10.0, 6  # samples that must count in the end, for each unknown and one; rounds for these at most
 MOSTLY = 0.75  # share of answers about something else, above which the policy does not explain them
@@ -209,10 +208,14 @@ class Calibration:
     def _settle(self) -> None:
         """Choose anew among what differs from the chosen changes by one, with enough samples of each."""
         near = {self._named({one.name} ^ set(self.chosen)) for one in self.family} | {self.chosen}
-        current = [names for names in self.fits if self.fits[names].answers is self.answers]
+        current = self._current()
         for names in near & set(current):
             self.fits[names].refine(SETTLED * (1 + self.fits[names].unknowns), SETTLING)
         self._choose(max(current, key=lambda names: self._score(self.fits[names])))
+
+    def _current(self) -> list[tuple[str, ...]]:
+        """Changes that were fitted to all answers."""
+        return [names for names, fit in self.fits.items() if fit.answers is self.answers]
 
     def _choose(self, best: tuple[str, ...]) -> None:
         gain = self._score(self.fits[best]) - self._score(self.fits[()])
@@ -252,14 +255,14 @@ class Calibration:
         best, none = self.fits[self.chosen], self.fits[()]
         before, after = none.predicted(), best.predicted()
         gain = after - before
-        holds = bool(best.family) and gain.mean() > SPREADS * gain.std() / np.sqrt(len(gain))
+        holds = bool(best.family) and gain.mean() > 0
         if not holds:
             self.chosen, best, after = (), none, before
         rho, width = (best.nuisance @ GRID)[:2]
         corrected = [one.name for one in best.family if not one.of_teacher]
         unexplained = not best.family and (rho > MOSTLY or width > APART)
         verdict = CHANGED if corrected else (UNEXPLAINED if unexplained else UNCHANGED)
-        evidence = {names: fit.evidence - none.evidence for names, fit in self.fits.items()}
+        evidence = {names: self.fits[names].evidence - none.evidence for names in self._current()}
         apart = float(self.space.to_unit(width * self.eps * np.log(3), np))
         more = self._more(best) if corrected else None
         estimates = tuple(estimate for one in self.family for estimate in self._estimates(one))
@@ -268,8 +271,7 @@ class Calibration:
 
     def _estimates(self, distortion: Distortion) -> list[Estimate]:
         names = self._named({*self.chosen, distortion.name})
-        current = [known for known, fit in self.fits.items() if fit.answers is self.answers]
-        fit = self.fits[names if names in current else (distortion.name,)]
+        fit = self.fits[names if names in self._current() else (distortion.name,)]
         rows = zip(unknowns_of(fit.family), *fit.interval(), strict=True)
         changed = distortion.name in self.chosen
         own = [one.name for one in distortion.unknowns]

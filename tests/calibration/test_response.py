@@ -68,4 +68,4 @@ def test_spread_is_a_mean_over_what_may_be_meant(answer):
     draws = offset + spread * np.random.default_rng(0).standard_normal(20_000)
     sampled = jax.jit(jax.vmap(lambda one: chances(one, 0.0 * one, answer)))(np.float32(draws)).mean(0)
     found = chances(jnp.array([offset]), jnp.array([spread]), answer)[0]
-    np.testing.assert_allclose(found, sampled, atol=0.03)
+    np.testing.assert_allclose(found, sampled, atol=0.05)  # of the normal spread, a logistic one is made
