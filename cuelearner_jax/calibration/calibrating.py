@@ -40,6 +40,7 @@ ROUNDS = 4  # of samples, where there were none
 LEAST = 20  # answers that two changes at once are asked of
 DOUBT = 2.0  # what the evidence of each change must exceed [nats]
 SURE = 3.0  # what the evidence of all must exceed, against no change [nats]
+LOOSE = 10.0  # what it must exceed where answers and corrected policy differ so much that evidence means little
 LARGEST = 3  # changes at once
 SETTLED, SETTLING = 10.0, 6  # samples that must count in the end, for each unknown and one; rounds for these at most
 MOSTLY = 0.75  # share of answers about something else, above which the policy does not explain them
@@ -219,7 +220,7 @@ class Calibration:
 
     def _choose(self, best: tuple[str, ...]) -> None:
         gain = self._score(self.fits[best]) - self._score(self.fits[()])
-        self.chosen = best if gain > SURE - DOUBT else ()
+        self.chosen = best if gain > (SURE if _explains(self.fits[best]) else LOOSE) - DOUBT else ()
 
     def _named(self, names: set[str]) -> tuple[str, ...]:
         """Names in the order of the family."""
@@ -260,8 +261,7 @@ class Calibration:
             self.chosen, best, after = (), none, before
         rho, width = (best.nuisance @ GRID)[:2]
         corrected = [one.name for one in best.family if not one.of_teacher]
-        unexplained = not best.family and (rho > MOSTLY or width > APART)
-        verdict = CHANGED if corrected else (UNEXPLAINED if unexplained else UNCHANGED)
+        verdict = CHANGED if corrected else (UNCHANGED if best.family or _explains(best) else UNEXPLAINED)
         evidence = {names: self.fits[names].evidence - none.evidence for names in self._current()}
         apart = float(self.space.to_unit(width * self.eps * np.log(3), np))
         more = self._more(best) if corrected else None
@@ -288,6 +288,12 @@ class Calibration:
         spread = np.sqrt((weight * np.square(offset - (weight * offset).sum(0))).sum(0))
         ratio = float(np.median(spread)) / 0.5
         return max(0, int(np.ceil(self.asked * (ratio**2 - 1))))
+
+
+def _explains(fit: Fit) -> bool:
+    """Return whether most answers are about what the fit says, and near it."""
+    rho, width = (fit.nuisance @ GRID)[:2]
+    return bool(rho <= MOSTLY and width <= APART)
 
 
 Situations = Callable[[PRNGKeyArray, Any, int], tuple[Any, Any]]  # (key, policy, count) -> states, observations
