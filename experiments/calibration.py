@@ -99,16 +99,6 @@ def family_of(task: Any, own: Any, world: World, tilt: bool) -> tuple[Distortion
     return (*declared(world.env), simulated("table: tilt", unknowns, env_of, state_of, space, REACH_DEG))
 
 
-def shuffled(answers: Any) -> Any:
-    """A teacher whose answers of a batch are given to each other's questions: a control."""
-
-    def mixed(key: Any, states: Any, obs: Any, actions: Any) -> Any:
-        found = answers(key, states, obs, actions)
-        return jax.random.permutation(jax.random.fold_in(key, 1), found)
-
-    return mixed
-
-
 def bases_of(task: Any, folder: Path | None) -> tuple[Any, Scalars, dict[int, Any]]:
     """The task's configuration, the scalars and the base policies by their seeds."""
     if folder is None:
@@ -149,9 +139,10 @@ def main() -> None:
     parser.add_argument("--labels", nargs="+", type=int, default=LABELS)
     parser.add_argument("--seeds", type=int, default=1, help="of labels, for each base")
     parser.add_argument("--most-bases", type=int, default=8)
-    parser.add_argument("--mistakes", type=float, default=0.0, help="probability that a cue's answer is reversed")
+    parser.add_argument(
+        "--mistakes", type=float, default=0.0, help="probability that an answer is reversed; 0.5: control"
+    )
     parser.add_argument("--bias-deg", type=float, default=0.0, help="of everything that the teacher means")
-    parser.add_argument("--shuffled", action="store_true", help="control: answers stand beside other questions")
     parser.add_argument("--first-seed", type=int, default=0)
     parser.add_argument("--steps", type=int, default=10_000, help="of an evaluation; 0: none")
     parser.add_argument("--split", choices=("tuning", "validation"), default="tuning", help="of its episodes")
@@ -174,9 +165,8 @@ def main() -> None:
                 for seed in range(asked.first_seed, asked.first_seed + asked.seeds):
                     start, used, walk = time.time(), time.process_time(), Walk(world.env, world.teacher, world.scalars)
                     key = jax.random.fold_in(jax.random.key(seed), labels)
-                    answers = shuffled(walk.answers) if asked.shuffled else walk.answers
                     found = calibrate(
-                        policy, family, walk.situations, answers, labels, key,
+                        policy, family, walk.situations, walk.answers, labels, key,
                         space=space, eps_deg=world.scalars.eps_deg,
                     )  # fmt: skip
                     row = {"world": name, "base": base, "labels": labels, "seed": seed, **told(found)}
