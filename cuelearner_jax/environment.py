@@ -41,7 +41,7 @@ class Features(NamedTuple):
 
 @runtime_checkable
 class View(Protocol):
-    """What a policy looks at: the observation, and of the optional members `features`, `aims`, `heuristic`, `mirror`.
+    """What a policy looks at: the observation, and optional members such as `features`, `aims`, `heuristic`, `mirror`.
 
     Every environment is one; one whose episodes need more than that (generated worlds, say) offers `view()`.
     """
@@ -134,6 +134,10 @@ class OptionalMembers(Protocol):
         """
         ...
 
+    def rule(self, obs: Float[Array, " obs"]) -> Float[Array, " aims"]:
+        """log-weights of the aims by a rule that somebody wrote by hand: what labels about aims must surpass."""
+        ...
+
 
 class Described:
     """Mixed into an environment: what follows from its `observation`."""
@@ -168,7 +172,7 @@ class WholeObservations(Described):
 
 
 def offers(env: Any, name: str) -> bool:
-    """Has an environment the optional member `name` (`heuristic`, `mirror`, `features`, `aims`)?"""
+    """Has an environment the optional member `name` (`heuristic`, `mirror`, `features`, `aims`, `rule`)?"""
     return getattr(env, name, None) is not None
 
 

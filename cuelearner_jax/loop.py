@@ -24,7 +24,7 @@ from cuelearner_jax import asking
 from cuelearner_jax.agents.networks import all_finite
 from cuelearner_jax.agents.protocol import AgentFunctions, AgentOptions
 from cuelearner_jax.agents.replay import Memory, RingBuffer, buffer_for, stored_step
-from cuelearner_jax.arbiters.protocol import Arbiter, ArbiterOptions, Outcome
+from cuelearner_jax.arbiters.protocol import Arbiter, ArbiterOptions, Chooses, HasCritic, Known, Outcome
 from cuelearner_jax.asking import GuideState, Stream, label_slots
 from cuelearner_jax.config import Scalars, Schedule, Sizes, static
 from cuelearner_jax.devices import (
@@ -45,6 +45,7 @@ from cuelearner_jax.types import EnvState, Label, Params, Step, Teacher
 
 _Parts = tuple[AgentOptions, ArbiterOptions, bool]  # their floats None; does anything bootstrap?
 
+APART = 1 << 30  # folded into a key whose other uses count from 0
 PROGRAMS_KEPT = 8  # compiled ones that a process holds for its next runs
 
 
@@ -224,10 +225,13 @@ class Lane(NamedTuple):
         params, training = self.learner.init(k_agent)
         env_state, obs = jax.vmap(env.reset)(jax.random.split(k_env, self.sizes.num_envs))
         replay = self.buffer.empty(self.learner.options.replay_capacity)
+        arbiter = self.arbiter.init(self.sizes.num_envs)
+        if isinstance(self.arbiter, HasCritic):
+            arbiter = self.arbiter.with_critic(arbiter, self.learner.init(jax.random.fold_in(k_agent, APART)))
         return TrainState(
             agent=AgentState(params, training, replay, env_state, obs),
             guide=asking.start(self.guidance, env, slots, budget, k_guidance, k_ask, self.sizes),
-            arbiter=self.arbiter.init(self.sizes.num_envs),
+            arbiter=arbiter,
             key=key,
             failed=jnp.array(False),
         )
@@ -290,6 +294,9 @@ class Lane(NamedTuple):
             lambda: actions_of(env).sample(key, (self.sizes.num_envs,)),
             lambda: self.learner.explore(env, settings.agent, agent.params, agent.obs, key),
         )
+        if isinstance(self.arbiter, Chooses):
+            refined = self._chosen(self.arbiter, env, settings, clock, state, base, key)
+            return Acted(refined.actions, refined.passes, jax.vmap(env.remember)(agent.env, agent.obs))
         guided = self.arbiter.guided(state.arbiter)
         refined: Refined = jax.lax.cond(
             guides(clock, schedule),
@@ -297,6 +304,27 @@ class Lane(NamedTuple):
             lambda: untouched(base),
         )
         return Acted(refined.actions, refined.passes, jax.vmap(env.remember)(agent.env, agent.obs))
+
+    def _chosen(
+        self,
+        arbiter: Chooses,
+        env: Environment,
+        settings: Settings,
+        clock: Clock,
+        state: TrainState,
+        base: Float[Array, "num_envs action"],
+        key: PRNGKeyArray,
+    ) -> Refined:
+        """What an arbiter chooses in place of the agent's own actions, until the cut-off."""
+        agent, schedule, model = state.agent, settings.schedule, state.guide.model
+        steps = jnp.asarray(schedule.learned_from(clock.step), jnp.float32)
+        known = Known(env, self.learner, agent.params, self.guidance, model, settings.scalars, steps)
+        learns, own = clock.step >= schedule.random_steps, jax.random.fold_in(key, APART)
+        return jax.lax.cond(
+            clock.step < schedule.guidance_until,
+            lambda: arbiter.choose(state.arbiter, settings.arbiter, known, agent.obs, base, learns, own),
+            lambda: untouched(base),
+        )
 
     def absorb(
         self, settings: Settings, clock: Clock, state: TrainState, key: PRNGKeyArray, acted: Acted, step: Step
@@ -325,25 +353,31 @@ class Lane(NamedTuple):
         filled, agent = clock.step + self.sizes.num_envs, state.agent
         memory = Memory(env, self.buffer, agent.replay, filled, self.sizes.num_envs, self.bootstraps)
 
-        def update(learned: tuple[Any, Any], index: Array) -> tuple[tuple[Any, Any], tuple[Array, Array]]:
+        def update(learned: tuple[Any, Any], key: PRNGKeyArray, index: Array) -> tuple[tuple[Any, Any], Any]:
             count, own = clock.update + index + 1, jax.random.fold_in(key, index)
             params, training, loss, norm = self.learner.update(
                 env, settings.agent, settings.scalars, count, *learned, memory, own
             )
             return (params, training), (loss, norm)
 
-        def updates() -> tuple[tuple[Any, Any], Array, Array]:
-            learned = (agent.params, agent.training)
-            learned, (losses, norms) = jax.lax.scan(update, learned, jnp.arange(self.sizes.num_envs))
+        def updates(learned: tuple[Any, Any], key: PRNGKeyArray) -> tuple[tuple[Any, Any], Array, Array]:
+            one = lambda learned, index: update(learned, key, index)  # noqa: E731
+            learned, (losses, norms) = jax.lax.scan(one, learned, jnp.arange(self.sizes.num_envs))
             return learned, losses.mean(), all_finite((losses, norms))
 
-        (params, training), loss, finite = jax.lax.cond(
-            filled >= settings.schedule.learn_after,
-            updates,
-            lambda: ((agent.params, agent.training), jnp.zeros(()), jnp.array(True)),
-        )
-        agent = agent.replace(params=params, training=training)
-        return state.replace(agent=agent, failed=state.failed | ~finite), {"loss": loss}
+        def updated(learned: tuple[Any, Any], key: PRNGKeyArray) -> tuple[tuple[Any, Any], Array, Array]:
+            return jax.lax.cond(
+                filled >= settings.schedule.learn_after,
+                lambda: updates(learned, key),
+                lambda: (learned, jnp.zeros(()), jnp.array(True)),
+            )
+
+        (params, training), loss, finite = updated((agent.params, agent.training), key)
+        state = state.replace(agent=agent.replace(params=params, training=training))
+        if isinstance(self.arbiter, HasCritic):
+            critic, _, also = updated(self.arbiter.critic(state.arbiter), jax.random.fold_in(key, APART))
+            finite, state = finite & also, state.replace(arbiter=self.arbiter.with_critic(state.arbiter, critic))
+        return state.replace(failed=state.failed | ~finite), {"loss": loss}
 
 
 def guides(clock: Clock, schedule: Schedule) -> Bool[Array, ""]:

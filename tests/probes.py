@@ -79,8 +79,15 @@ class Aimed(Window):
     order = (0, 1, 2, 3)
     possible = (True, True, True, False)
 
+    @property
+    def turns(self):
+        return jnp.array((-1.0, 0.6, 2.5, -2.2))[jnp.array(self.order)]
+
+    def rule(self, obs):
+        return -2.0 * jnp.abs(self.turns)  # the second, then the first, ...
+
     def aims(self, obs):
-        turns = jnp.array((-1.0, 0.6, 2.5, -2.2))[jnp.array(self.order)]
+        turns = self.turns
         found = from_angle(jnp.arctan2(obs[1], obs[0])[None] + turns)
         features = jnp.stack([jnp.cos(turns), jnp.sin(turns), turns, jnp.broadcast_to(obs[0], turns.shape)], -1)
         return Aims(found, features, jnp.array(self.possible)[jnp.array(self.order)])

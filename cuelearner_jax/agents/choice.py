@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from cuelearner_jax.devices import portions
+
+ChoiceT = TypeVar("ChoiceT", bound=Any)  # an action, or a record of actions
 
 
 def best_of(
@@ -56,8 +59,6 @@ def looked_at(options: int, coarse: int, peaks: int) -> int:
     return coarse + peaks * (2 * options // coarse - 1) if coarse else options
 
 
-def each_in_portions(
-    choose: Callable[[Array], Array], obs: Float[Array, "n obs"], looked: int
-) -> Float[Array, "n action"]:
-    """A choice in each situation, as many at once as values of `looked` actions each fit."""
+def each_in_portions(choose: Callable[[Array], ChoiceT], obs: Float[Array, "n obs"], looked: int) -> ChoiceT:
+    """A choice in each situation (leading axis: n), as many at once as values of `looked` actions each fit."""
     return jax.lax.map(choose, obs, batch_size=max(1, min(len(obs), portions().actions // looked)))

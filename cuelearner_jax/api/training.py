@@ -7,7 +7,6 @@ import os
 import warnings
 from collections.abc import Sequence
 
-import jax
 import numpy as np
 import pyarrow as pa
 
@@ -21,7 +20,6 @@ from cuelearner_jax.environment import view_of
 from cuelearner_jax.errors import UserError, closest
 from cuelearner_jax.evaluate import SPLITS
 from cuelearner_jax.guides import registry as guidances
-from cuelearner_jax.policies import Agent
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs import failures
 from cuelearner_jax.runs.grid import LARGEST_SEED, Grid
@@ -66,9 +64,7 @@ class Run:
         found = np.flatnonzero((group.seeds == wanted) & (group.budgets == budget))
         if not len(found):
             raise UserError(f"no lane with seed {wanted} and {budget} labels was trained")
-        params = [block.agent.params for block in training.blocks]
-        joined = jax.tree.map(lambda *leaves: np.concatenate([np.asarray(leaf) for leaf in leaves]), *params)
-        agents = Agent(joined, self.config.agent_in(group.env), view_of(group.env))
+        agents = training.policies(view_of(group.env))
         return CallablePolicy(agents.lane(int(found[0])), self.world.observation)
 
 

@@ -1,1 +1,1 @@
-"""When the guide's action is executed in place of the agent's: the protocol, whole episodes, paced episodes."""
+"""Who acts in which episode: the protocol, guided and paced episodes, labels as a prior, a critic that compares."""

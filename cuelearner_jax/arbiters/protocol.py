@@ -8,9 +8,13 @@ from __future__ import annotations
 
 from typing import Any, ClassVar, NamedTuple, Protocol, runtime_checkable
 
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from cuelearner_jax.config import Scalars
+from cuelearner_jax.agents.protocol import AgentFunctions
+from cuelearner_jax.config import GuideScalars, Scalars
+from cuelearner_jax.guides.base import Guide
+from cuelearner_jax.guides.refining import Refined
+from cuelearner_jax.types import GuidanceModel, Params
 
 
 class Outcome(NamedTuple):
@@ -43,6 +47,94 @@ class Arbiter(Protocol):
             outcome: of the step.
             key: of this step.
         """
+        ...
+
+
+class Known(NamedTuple):
+    """A lane's parts, and what they have learned, for an arbiter that chooses by them."""
+
+    env: Any  # or its view
+    agent: AgentFunctions
+    params: Params  # of the agent
+    guide: Guide
+    model: GuidanceModel
+    scalars: GuideScalars
+    steps: Float[Array, ""]  # that the agent has learned from
+
+
+@runtime_checkable
+class Chooses(Arbiter, Protocol):
+    """An arbiter that chooses by what agent and guide say of actions, also in the random steps."""
+
+    def choose(
+        self,
+        state: Any,
+        options: Any,
+        known: Known,
+        obs: Float[Array, "num_envs obs"],
+        base: Float[Array, "num_envs action"],
+        learns: Bool[Array, ""],
+        key: PRNGKeyArray,
+    ) -> Refined:
+        """What to execute in place of the agent's actions until the cut-off.
+
+        Args:
+            state: of the arbiter.
+            options: see `follow`.
+            known: the lane's parts.
+            obs: to act on.
+            base: the agent's own actions, in the random steps uniform ones.
+            learns: are the random steps over?
+            key: of this step.
+
+        Returns:
+            The actions, and a pass for each that is not the agent's own.
+        """
+        ...
+
+
+@runtime_checkable
+class HasCritic(Arbiter, Protocol):
+    """An arbiter with a second agent, which learns from the same replay and never acts."""
+
+    def critic(self, state: Any) -> tuple[Params, Any]:
+        """Its parameters, and what learning keeps beside them (`AgentFunctions.init`)."""
+        ...
+
+    def with_critic(self, state: Any, critic: tuple[Params, Any]) -> Any:
+        """The state with another critic; `state` may be that of `init`, which has none."""
+        ...
+
+
+@runtime_checkable
+class Finishes(Arbiter, Protocol):
+    """An arbiter that acts in the finished policy too, by one of several arms, whichever validates best."""
+
+    @property
+    def arms(self) -> tuple[str, ...]:
+        """Names of the arms; of arms that validate alike the first acts."""
+        ...
+
+    @property
+    def judge_steps(self) -> int:
+        """Steps in which each arm is validated, in episodes that no figure is of."""
+        ...
+
+    def arm(self, state: Any) -> Any:
+        """The number of the arm that acts in the finished policy, of a block of lanes one each (lanes,).
+
+        Shapes in place of the state's arrays will do, of which the arm is the shape.
+        """
+        ...
+
+    def with_arm(self, state: Any, arm: Int[Array, "*lanes"]) -> Any:
+        """The state in which another arm acts."""
+        ...
+
+    def act(
+        self, arm: Int[Array, ""], options: Any, known: Known, obs: Float[Array, "n obs"], key: PRNGKeyArray
+    ) -> Float[Array, "n action"]:
+        """Actions of the finished policy by one of the arms."""
         ...
 
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from cuelearner_jax.arbiters import episodes, paced
+from cuelearner_jax.arbiters import by_value, episodes, paced, prior
 from cuelearner_jax.arbiters.protocol import ArbiterOptions
 from cuelearner_jax.plugins import PartRegistry
 
-ARBITERS = PartRegistry[ArbiterOptions]("arbiter", episodes.Config, paced.Config)
+ARBITERS = PartRegistry[ArbiterOptions]("arbiter", episodes.Config, paced.Config, prior.Config, by_value.Config)

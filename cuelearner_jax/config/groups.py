@@ -9,7 +9,9 @@ billiards hyper-parameters of the paper (appendix) and of its public code. What 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
+
+import jax.numpy as jnp
 
 from cuelearner_jax.config.parts import POSITIVE, SHARE, Bounds, Layers, register
 
@@ -132,6 +134,10 @@ class Schedule:
     """Steps between two checkpoints, which is what a killed run may lose."""
     guide_eval_every: Annotated[int, Bounds(0)] = 0
     """Labels between two evaluations of the guide alone (0: after the last label alone)."""
+
+    def learned_from(self, step: Any) -> Any:
+        """Return of so many steps those after which gradient steps followed; numbers, or traced ones."""
+        return jnp.maximum(step - self.learn_after, 0)
 
 
 for _group in (GuideScalars, TeacherFaults, Scalars, Schedule):

@@ -5,6 +5,7 @@ What a teacher *said* (its answer, kept in labels) and what a network *predicts*
 
 from __future__ import annotations
 
+import dataclasses
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -58,6 +59,13 @@ class Kind:
     def make(self, sizes: GuideSizes, spaces: Spaces, options: Any = None) -> Guide:
         """The guide for an environment's spaces; `options`: a `config` (None: its defaults)."""
         return self.guide(self, sizes, spaces, self.config() if options is None and self.config else options)
+
+
+class Candidates(NamedTuple):
+    """The actions of one situation among which a guide chooses."""
+
+    actions: Float[Array, "candidates action"]
+    possible: Bool[Array, " candidates"]  # False: not to be done here
 
 
 class Footprint(NamedTuple):
@@ -174,6 +182,29 @@ class Guide:
         """
         refines = jax.random.bernoulli(key, scalars.refined_fraction)
         return self.act(model, env, obs[None], base[None], refines[None], scalars).actions[0]
+
+    def candidates(self, env: Any, obs: Float[Array, " obs"]) -> Candidates | None:
+        """The actions of one situation among which the teacher chooses, by this kind; here None: all of the space."""
+        return None
+
+    def log_p(
+        self,
+        model: GuidanceModel,
+        env: Any,
+        obs: Float[Array, " obs"],
+        actions: Float[Array, "m action"],
+        scalars: GuideScalars,
+    ) -> Float[Array, " m"]:
+        """log p(action | labels) of each action in one situation, up to a constant.
+
+        Here the less one pass of `act` changes an action, the likelier it is: a Laplace distribution of scale eps. All
+        actions are alike to a guide that leaves actions as they are, such as one whose model is not fitted.
+        """
+        space, rows = self.spaces.actions, len(actions)
+        once = dataclasses.replace(scalars, k_max=1)
+        seen, everywhere = jnp.broadcast_to(obs, (rows, *obs.shape)), jnp.ones(rows, bool)
+        moved = self.act(model, env, seen, actions, everywhere, once).actions
+        return -space.distance(actions, moved) / space.from_unit(scalars.eps_deg)
 
     def disagreement(
         self, model: GuidanceModel, env: Any, obs: Float[Array, "n obs"], actions: Float[Array, "n action"]

@@ -24,14 +24,14 @@ from cuelearner_jax.config import GuideScalars
 from cuelearner_jax.config.parts import Bounds, Layers, part
 from cuelearner_jax.environment import Aims
 from cuelearner_jax.feedback.answers import RELATIVE
-from cuelearner_jax.guides.base import Footprint, Guide, Kind
+from cuelearner_jax.guides.aims import SPREAD, log_density, open_aims
+from cuelearner_jax.guides.base import Candidates, Footprint, Guide, Kind
 from cuelearner_jax.guides.fitting import fit_model
 from cuelearner_jax.guides.model import GuideModel, ensemble
 from cuelearner_jax.guides.refining import Refined
 from cuelearner_jax.spaces import Space, said
 from cuelearner_jax.types import GuidanceModel, Label, Params
 
-SPREAD = 1 / 180  # of the space's reach: how far what a teacher means may lie from the aim that describes it
 ELSEWHERE = 360  # evenly spaced actions that stand for "it means none of these"
 SLIPS = 0.02  # share of answers that say nothing: any of the words
 WORDS = 3
@@ -170,9 +170,7 @@ class Intent(Guide):
     ) -> Refined:
         """By at most eps a pass toward the likeliest aim, in active rows of a fitted model that is sure enough."""
         space, aims = self.spaces.actions, jax.vmap(env.aims)(obs)
-        share = self.network.predict(env, model.params, aims.features, aims.possible)
-        if aims.open is not None:
-            share = share.at[:, :-1].multiply(aims.open)
+        share = self.shares(model, env, aims)
         find = partial(followed, space, doubt=self.options.aim_doubt)
         goals, sure = jax.vmap(find)(share, aims.actions, actions)
 
@@ -180,6 +178,28 @@ class Intent(Guide):
             return space.approach(current, goals, space.from_unit(scalars.eps_deg)) - current
 
         return self.refined(phi, actions, active & sure & model.fitted, scalars)
+
+    def shares(self, model: GuidanceModel, env: Any, aims: Aims) -> Float[Array, "n aims_and_none"]:
+        """Probability that each of the aims (n, aims) is meant and may be followed; last, that none is meant."""
+        share = self.network.predict(env, model.params, aims.features, aims.possible)
+        return share if aims.open is None else share.at[:, :-1].multiply(aims.open)
+
+    def candidates(self, env: Any, obs: Float[Array, " obs"]) -> Candidates:
+        """The aims that may be followed."""
+        return open_aims(env.aims(obs))
+
+    def log_p(
+        self,
+        model: GuidanceModel,
+        env: Any,
+        obs: Float[Array, " obs"],
+        actions: Float[Array, "m action"],
+        scalars: GuideScalars,
+    ) -> Float[Array, " m"]:
+        """log of the density of actions round the aims (`log_density`); before the first fit all aims are alike."""
+        aims: Aims = jax.vmap(env.aims)(obs[None])
+        share = self.shares(model, env, aims)[0]
+        return log_density(self.spaces.actions, aims.actions[0], share, actions)
 
     def disagreement(
         self, model: GuidanceModel, env: Any, obs: Float[Array, "n obs"], actions: Float[Array, "n action"]

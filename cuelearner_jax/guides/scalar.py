@@ -23,6 +23,8 @@ from cuelearner_jax.guides.model import GuideModel, guide_model
 from cuelearner_jax.guides.refining import Refined
 from cuelearner_jax.types import GuidanceModel
 
+LEAST = 0.01  # that an action is called good: the model's values are no probabilities, and may be 0 or less
+
 
 @part
 class Config:
@@ -63,6 +65,18 @@ class Scalar(Guide):
         value = lambda obs, actions: self.network.predict(env, model.params, obs, actions)[:, 0]  # noqa: E731
         chosen = best_of(value, self.spaces.actions.spread(self.options.guide_directions), obs)
         return Refined(jnp.where(guided[:, None], chosen, actions), guided.astype(jnp.int32))
+
+    def log_p(
+        self,
+        model: GuidanceModel,
+        env: Any,
+        obs: Float[Array, " obs"],
+        actions: Float[Array, "m action"],
+        scalars: GuideScalars,
+    ) -> Float[Array, " m"]:
+        """log of the probability that the teacher calls an action good; 0 of all before the first fit."""
+        good = jnp.clip(self.network.predict(env, model.params, obs, actions)[:, 0], LEAST, 1.0)
+        return jnp.where(model.fitted, jnp.log(good), 0.0)
 
     def question(
         self,

@@ -4,6 +4,7 @@ A policy's `act` sees many environments at once. Its `axes` say which of its lea
 (`evaluate.watched_lanes` maps over them); what lanes share is there once.
 """
 
+from cuelearner_jax.policies.finished import Arbitrated, acting, arbiter_of, finished
 from cuelearner_jax.policies.layers import (
     Agent,
     Common,
@@ -26,6 +27,7 @@ __all__ = [
     "BY_LANE",
     "SHARED",
     "Agent",
+    "Arbitrated",
     "Common",
     "Corrected",
     "Guided",
@@ -39,8 +41,11 @@ __all__ = [
     "Teaching",
     "Uniform",
     "acted",
+    "acting",
+    "arbiter_of",
     "best_actions",
     "describe",
+    "finished",
     "in_space",
     "lanes_in",
     "layers",

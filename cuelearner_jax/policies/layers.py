@@ -139,13 +139,13 @@ class Guided(PolicyNode):
 
     def describe(self) -> dict[str, Any]:
         """The guidance, its sizes (None: not known) and scalars, how far it leads at most, and the base."""
-        scalars = _part(Scalars, self.scalars)
+        scalars = plain_part(Scalars, self.scalars)
         space = self.guidance.spaces.actions
         bound = space.reach if self.bound is None else float(space.to_unit(np.max(self.bound), np))
         return {
             "policy": "guided",
             "guidance": self.guidance.name,
-            "sizes": None if self.sizes is None else _part(GuideSizes, self.sizes),
+            "sizes": None if self.sizes is None else plain_part(GuideSizes, self.sizes),
             "options": kind_to_json(self.guidance.options),
             "scalars": scalars,
             "bounded": self.bound is not None,
@@ -210,7 +210,7 @@ class Corrected(PolicyNode):
         return {"policy": "corrected", "asks": True, "base": describe(self.base)}
 
 
-def _part(kind: type, values: Any) -> dict[str, Any]:
+def plain_part(kind: type, values: Any) -> dict[str, Any]:
     """The fields of a configuration class that an instance has, of it or of a class with more or fewer."""
     plain = lambda value: value.item() if hasattr(value, "item") else value  # noqa: E731
     names = [field.name for field in dataclasses.fields(kind) if hasattr(values, field.name)]

@@ -10,8 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 import pyarrow.compute as pc
 
+from cuelearner_jax.arbiters.protocol import Arbiter
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.loop import Clock, TrainState, start_clock
+from cuelearner_jax.policies import acting
 from cuelearner_jax.runs.lanes import LaneGroup
 from cuelearner_jax.storage import formats, label_files, results
 from cuelearner_jax.storage import table as tables
@@ -20,10 +22,10 @@ from cuelearner_jax.storage.checkpoint import Checkpoints, checkpoints
 DUE = "due.json"  # beside a checkpoint whose evaluation was ended: the columns that its row will have beside that
 
 
-def items(blocks: list[TrainState], clock: Clock, wall: float) -> dict[str, Any]:
+def items(blocks: list[TrainState], clock: Clock, wall: float, arbiter: Arbiter) -> dict[str, Any]:
     """A run's state as the items of a checkpoint: acting needs the first alone; the last says how lanes are cut."""
     return {
-        "policy": [{"params": block.agent.params, "guidance": block.guide.model} for block in blocks],
+        "policy": [acting(arbiter, block.agent.params, block.guide.model, block.arbiter) for block in blocks],
         "rest": [
             block.replace(agent=block.agent.replace(params=None), guide=block.guide.replace(model=None), failed=None)
             for block in blocks
@@ -54,7 +56,7 @@ def _shapes(group: LaneGroup, saved: Checkpoints) -> tuple[dict[str, Any], dict[
     """
     clock, count, size = _clock(saved, len(group.seeds))
     cut = np.minimum(np.arange(count * size), len(group.seeds) - 1).reshape(count, size)
-    return clock, items(group.shapes_of(cut), jax.eval_shape(start_clock), 0.0)
+    return clock, items(group.shapes_of(cut), jax.eval_shape(start_clock), 0.0, group.arbiter)
 
 
 def restore_blocks(group: LaneGroup, saved: Checkpoints) -> tuple[list[TrainState], Clock, float]:
@@ -136,11 +138,11 @@ def restore_policies(folder: Path, like: Any, lanes: int) -> tuple[dict[str, Any
 
     Args:
         folder: of one kind of guidance.
-        like: shapes of one lane's {"params": ..., "guidance": ...}.
+        like: shapes of what one lane acts with (`policies.acting`).
         lanes: their number.
 
     Returns:
-        {"params": ..., "guidance": ..., "failed": ...}, leading axis: lanes; their step.
+        What they act with, and "failed"; leading axis: lanes; their step.
 
     Raises UserError if there is no readable checkpoint.
     """

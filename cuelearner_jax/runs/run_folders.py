@@ -14,6 +14,7 @@ from jaxtyping import PRNGKeyArray
 
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides.base import Guide
+from cuelearner_jax.policies import acting, arbiter_of
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs import shards
 from cuelearner_jax.runs.grid import Grid, defaults, load
@@ -38,7 +39,7 @@ class RunLanes:
     guidance: Guide
     seeds: np.ndarray  # (lanes,)
     budgets: np.ndarray  # (lanes,)
-    policies: Any  # {"params", "guidance"}, leading axis: lanes
+    policies: Any  # what they act with, see `policies.acting`, leading axis: lanes
     step: int
 
 
@@ -72,12 +73,13 @@ def lanes_of(task: Task, config: RunConfig, pieces: tuple[Piece, ...], kind: str
     sweep, some of which may not have begun? Raises UserError if no piece has a checkpoint, or one is damaged.
     """
     env = shape_of(task, config.task)
-    guidance = config.guide_in(env, kind)
+    guidance, arbiter = config.guide_in(env, kind), arbiter_of(config)
 
-    def acting(key: PRNGKeyArray) -> dict[str, Any]:
-        return {"params": config.agent_in(env).init(key)[0], "guidance": guidance.init(key)}
+    def lane(key: PRNGKeyArray) -> dict[str, Any]:
+        state = arbiter.init(config.sizes.num_envs)
+        return acting(arbiter, config.agent_in(env).init(key)[0], guidance.init(key), state)
 
-    like = jax.eval_shape(acting, jax.random.key(0))
+    like = jax.eval_shape(lane, jax.random.key(0))
     found: dict[int, list[RunLanes]] = {}
     told = shards.missing([piece.folder / CONFIG for piece in pieces]) if sweep else []
     for folder, grid in pieces:

@@ -35,13 +35,17 @@ class Runner:
         self,
         group: LaneGroup,
         examined: Environment,
+        judged: Environment | None,
         order: Order,
         described: dict[str, Any],
         stopping: threading.Event,
         bars: Progress,
     ) -> None:
-        """Nothing is done yet; `described` is what config.json says, `stopping` is set by Ctrl-C."""
-        self.training = Training(group, examined, order.split, self._end_if_asked)
+        """Nothing is done yet; `described` is what config.json says, `stopping` is set by Ctrl-C.
+
+        For `examined` and `judged` see `Training`.
+        """
+        self.training = Training(group, examined, order.split, self._end_if_asked, judged)
         self.group, self.order, self.described = group, order, described
         self.stopping, self.bars = stopping, bars
         self.name = group.guidance.name
@@ -100,7 +104,7 @@ class Runner:
 
     def _save(self, saved: Checkpoints) -> None:
         now = self.training
-        saved.save(now.round + now.step, items(now.blocks, now.clock, now.wall))
+        saved.save(now.round + now.step, items(now.blocks, now.clock, now.wall, self.group.arbiter))
 
     def _interrupted(self, where: str = "") -> Interrupted:
         return Interrupted(

@@ -9,10 +9,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from cuelearner_jax.arbiters.protocol import Finishes
 from cuelearner_jax.environment import actions_of, offers, spaces_of, view_of
 from cuelearner_jax.errors import UserError, closest, listed
 from cuelearner_jax.guides import registry as guidances
-from cuelearner_jax.policies import Agent, Corrected, Guided, Heuristic, Policy, Taught, uniform_in
+from cuelearner_jax.policies import Corrected, Guided, Heuristic, Policy, Taught, arbiter_of, finished, uniform_in
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs.adapted import AdaptedLanes, open_folder
 from cuelearner_jax.runs.failures import without_failed
@@ -79,7 +80,7 @@ def make(
         assert adapted is not None
         return adapted.policy(view) if name == "adapted" else adapted.base(view)
     assert lanes is not None
-    agent = Agent(lanes.policies["params"], config.agent_in(view), view)
+    agent = finished(config, lanes.guidance, view, lanes.step, lanes.policies)
     if name == "agent":
         return agent
     if name == "corrected":
@@ -167,7 +168,7 @@ class PolicySource:
             raise UserError(
                 f"the {what}'s observations have {size} entries, this world's {after.obs_size}: keep its structure"
             )
-        if policy in ("agent", "corrected"):
+        if policy in ("agent", "corrected") and not isinstance(arbiter_of(self.config), Finishes):
             return
         chosen = next((value for name, value in lanes.items() if name.endswith("guidance") and value), None)
         if not self._weighs_aims((chosen,) if isinstance(chosen, str) else chosen):

@@ -10,12 +10,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from cuelearner_jax.arbiters.protocol import Finishes
 from cuelearner_jax.asking import blame, label_slots
-from cuelearner_jax.devices import SHARED, place
+from cuelearner_jax.devices import BY_LANE, SHARED, place
 from cuelearner_jax.environment import Environment, view_of
 from cuelearner_jax.evaluate import Tell, episodes, untold
 from cuelearner_jax.loop import Clock, TrainState, start_clock
-from cuelearner_jax.policies import Agent, Guided, PolicyBlock, uniform_in
+from cuelearner_jax.policies import Guided, PolicyBlock, acting, finished, uniform_in
+from cuelearner_jax.runs.judging import Returns, judges_envs, judges_episodes, score
 from cuelearner_jax.runs.lanes import LaneGroup
 from cuelearner_jax.storage import label_files
 from cuelearner_jax.types import Label, Teacher
@@ -28,15 +30,26 @@ class Training:
     `due` too.
     """
 
-    def __init__(self, group: LaneGroup, examined: Environment, split: str, tell: Tell = untold) -> None:
+    def __init__(
+        self,
+        group: LaneGroup,
+        examined: Environment,
+        split: str,
+        tell: Tell = untold,
+        judged: Environment | None = None,
+    ) -> None:
         """At the beginning.
 
         Args:
             group: the lanes.
             examined, split: environment and episodes of evaluations, see `evaluate.SPLITS`.
             tell: called while evaluations run; what it raises ends them.
+            judged: environment in which an arbiter's arms are validated, see `judging`; None: there are no arms.
         """
         self.group, self.split, self.tell = group, split, tell
+        self.judged = (
+            None if judged is None else place(group.mesh, Returns(judged, group.config.scalars.discount), SHARED)
+        )
         self.examined = place(group.mesh, examined, SHARED)
         self.clock: Clock = place(group.mesh, start_clock(), SHARED)
         self.blocks: list[TrainState] = []
@@ -145,11 +158,39 @@ class Training:
         group = self.group
         own = {"seed": group.seeds, "labels": group.budgets, "step": self.step, "wall_s": self.wall}
         own["failed"] = self.failed.astype(float)
-        return {**own, **self._measured(self._agent)}
+        judged = self._judge()
+        return {**own, **judged, **self._measured(lambda lane: self._policy(lane, view_of(self.examined)))}
 
-    def _agent(self, lane: TrainState) -> PolicyBlock:
-        """A block's agents, who look at the examined world."""
-        return Agent(lane.agent.params, self.group.config.agent_in(self.group.env), view_of(self.examined))
+    def policies(self, view: Any) -> PolicyBlock:
+        """The finished policies of all lanes as they stand, for a world of that view."""
+        known = [acting(self.group.arbiter, lane.agent.params, lane.guide.model, lane.arbiter) for lane in self.blocks]
+        joined = jax.tree.map(lambda *leaves: np.concatenate([np.asarray(leaf) for leaf in leaves]), *known)
+        return finished(self.group.config, self.group.guidance, view, self.step, joined)
+
+    def _policy(self, lane: TrainState, view: Any, **arm: Any) -> PolicyBlock:
+        """A block's finished policies; `arm`: the one by which all lanes act, in place of that which validated best."""
+        group = self.group
+        known = {**acting(group.arbiter, lane.agent.params, lane.guide.model, lane.arbiter), **arm}
+        return finished(group.config, group.guidance, view, self.step, known)
+
+    def _judge(self) -> dict[str, np.ndarray]:
+        """Let the arm that validates best act in each lane; columns (lanes,): its number, and the scores of all."""
+        group, arbiter, world = self.group, self.group.arbiter, self.judged
+        if world is None or not isinstance(arbiter, Finishes):
+            return {}
+        bootstraps, view = group.config.bootstraps, view_of(world.env)
+        size = (judges_envs(bootstraps), arbiter.judge_steps)
+        scores = []
+        for arm in map(jnp.asarray, range(len(arbiter.arms))):
+            policy_of = lambda lane, arm=arm: self._policy(lane, view, arm=arm)  # noqa: E731
+            found = group.evaluate(policy_of, world, judges_episodes(), *size, self.blocks, self.tell)
+            scores.append(score(found, bootstraps))
+        best = np.argmax(np.nan_to_num(np.stack(scores), nan=-np.inf), axis=0).astype(np.int32)
+        for block, rows in enumerate(group.cut):
+            chosen, lanes = place(group.mesh, jnp.asarray(best[rows]), BY_LANE), self.blocks[block]
+            self.blocks[block] = lanes.replace(arbiter=arbiter.with_arm(lanes.arbiter, chosen))
+        judged = {f"judged_{name}": values for name, values in zip(arbiter.arms, scores, strict=True)}
+        return self._of_finite({"arm": best.astype(float), **judged})
 
     def guide_alone(self) -> dict[str, np.ndarray]:
         """Metrics (lanes,) of uniform actions under guidance; for unguided lanes that is chance.

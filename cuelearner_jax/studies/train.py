@@ -22,6 +22,7 @@ from cuelearner_jax.feedback.answers import check_teacher
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.runs import failures
 from cuelearner_jax.runs.grid import Grid, defaults, seeds_of
+from cuelearner_jax.runs.judging import judges_world
 from cuelearner_jax.runs.lane_checkpoints import check_standing
 from cuelearner_jax.runs.lanes import LaneGroup
 from cuelearner_jax.runs.memory_report import memory_report
@@ -80,6 +81,7 @@ def run(order: Order) -> None:
     if asked:
         check_teacher(teacher, config.scalars)
     examined = task.environment(config.task, order.split)
+    judged = judges_world(config, lambda split: task.environment(config.task, split))
     with claimed(order.out), interruptible() as stopping, progress_bars() as bars:
         # Nobody else can change it any more.
         check_folder(order.out, plan.described, order.resume, order.overwrite, defaults(task))
@@ -89,7 +91,7 @@ def run(order: Order) -> None:
         # Rows of what was begun earlier and of what comes now are of one configuration, as config.json tells it.
         described = formats.read("config", order.out / CONFIG)
         for group in groups:
-            Runner(group, examined, order, described, stopping, bars).run(teacher, plan.labels)
+            Runner(group, examined, judged, order, described, stopping, bars).run(teacher, plan.labels)
     failures.check(order.out, [order.out / group.guidance.name for group in groups])
 
 
@@ -124,10 +126,11 @@ def in_memory(
     if asking and labels is None:
         teacher = place(mesh, teacher, SHARED)
         check_teacher(teacher, request.config.scalars)
+    judged = judges_world(request.config, lambda split: request.task.environment(request.config.task, split))
     rows, trainings = [], {}
     with progress_bars(shown=progress) as bars:
         for group in groups:
-            name, training = group.guidance.name, Training(group, examined, request.split)
+            name, training = group.guidance.name, Training(group, examined, request.split, judged=judged)
             training.begin()
             if not training.labelled and labels is not None:
                 training.take(labels)

@@ -98,7 +98,7 @@ def newest(out, kind, grid=GRID):
     """The newest checkpoint's arrays and number."""
     env = TASK.environment(CONFIG.task)
     group = lanes.LaneGroup(CONFIG, env, guidances.make(kind, CONFIG.sizes, env), grid)
-    like = items(group.shapes_of(group.cut), jax.eval_shape(start_clock), 0.0)
+    like = items(group.shapes_of(group.cut), jax.eval_shape(start_clock), 0.0, group.arbiter)
     with checkpoints(out / kind / "checkpoints", read_only=True) as saved:
         found = saved.restore(like)
         del found["clock"]["wall_s"]
@@ -194,8 +194,8 @@ def test_a_checkpoint_whose_lanes_had_another_state_is_refused_before_anything_i
     before = probes.files_of(out)
     of_now = lane_checkpoints.items
 
-    def of_a_newer_program(blocks, clock, wall):
-        made = of_now(blocks, clock, wall)
+    def of_a_newer_program(blocks, clock, wall, arbiter):
+        made = of_now(blocks, clock, wall, arbiter)
         return {**made, "rest": [block.replace(arbiter=(block.arbiter, block.failed)) for block in made["rest"]]}
 
     monkeypatch.setattr(lane_checkpoints, "items", of_a_newer_program)

@@ -134,6 +134,11 @@ class Unequal(Aimed):
         return super().aims(obs)._replace(possible=jnp.ones(3, bool))
 
 
+class Unruly(Aimed):
+    def rule(self, obs):
+        return super().rule(obs)[:3]
+
+
 class Pointless(Aimed):
     possible = (False, False, False, False)
 
@@ -193,6 +198,7 @@ BROKEN = {
     "features": (Narrow(), "`features` of 8 actions"),
     "features of an action": (Confused(), "`features` hold in `own` what hangs on the action"),
     "aims": (Unequal(), "give a row of each, and a bool, for every aim"),
+    "rule": (Unruly(), "give a finite one for each"),
     "possible aims": (Pointless(), "no aim was possible in any step"),
     "sample": (Loose(), "what its actions' `sample` draws is no action of the space"),
     "shape of samples": (Short(), "`sample` gives shape (3,) for 3 actions of 2"),

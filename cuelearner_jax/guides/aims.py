@@ -1,0 +1,102 @@
+"""Aims as a distribution over actions, and the kinds that choose among aims without a label: controls of `intent`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from cuelearner_jax.config import GuideScalars
+from cuelearner_jax.environment import Aims
+from cuelearner_jax.guides.base import Candidates, Kind
+from cuelearner_jax.guides.refining import Refined
+from cuelearner_jax.guides.untaught import Untaught
+from cuelearner_jax.spaces import DIRECTIONS, Space
+from cuelearner_jax.types import GuidanceModel
+
+SPREAD = 1 / 180  # of the space's reach: how far what a teacher means may lie from the aim that describes it
+LEAST = 1e-12  # of a probability whose logarithm is taken
+
+
+def open_aims(aims: Aims) -> Candidates:
+    """The aims that are possible and may be followed."""
+    return Candidates(aims.actions, aims.possible if aims.open is None else aims.possible & aims.open)
+
+
+def log_density(
+    space: Space, aims: Float[Array, "aims action"], share: Float[Array, " aims_and_none"], actions: Float[Array, "m a"]
+) -> Float[Array, " m"]:
+    """log of the probability density of actions, of which all alike have 0.
+
+    What is meant lies round one of the aims, along each cue with a logistic error of `SPREAD`, or, with the last
+    probability of `share`, anywhere: no action is ruled out.
+    """
+    # The range of a cue in spreads: directions reach to either side of any of them.
+    extent = (2.0 if space == DIRECTIONS else 1.0) / SPREAD
+    off = space.to_unit(space.log(actions[:, None], aims[None])) / (SPREAD * space.reach)
+    each = extent * jax.nn.sigmoid(off) * jax.nn.sigmoid(-off)  # of a logistic distribution
+    near = each[..., 0] if len(space.cues) == 1 else each.prod(-1)
+    return jnp.log(jnp.maximum(jnp.sum(share[None, :-1] * near, -1) + share[-1], LEAST))
+
+
+def log_weights(env: Any, obs: Float[Array, " obs"], by_rule: bool) -> tuple[Aims, Float[Array, " aims"]]:
+    """The aims of a situation with log-weights: the task's own, or the same for all."""
+    aims = env.aims(obs)
+    weights = env.rule(obs) if by_rule else jnp.zeros(len(aims.possible))
+    return aims, jnp.where(open_aims(aims).possible, weights, -jnp.inf)
+
+
+class AnyAim(Untaught):
+    """A guide to whom all aims are alike: what `intent` is before its first label."""
+
+    by_rule = False
+
+    def candidates(self, env: Any, obs: Float[Array, " obs"]) -> Candidates:
+        """The aims that may be followed."""
+        return open_aims(env.aims(obs))
+
+    def log_p(
+        self,
+        model: GuidanceModel,
+        env: Any,
+        obs: Float[Array, " obs"],
+        actions: Float[Array, "m action"],
+        scalars: GuideScalars,
+    ) -> Float[Array, " m"]:
+        """log of the density of actions (`log_density`), where "none of the aims" weighs as much as one of them."""
+        aims, weights = log_weights(env, obs, self.by_rule)
+        share = jax.nn.softmax(jnp.append(weights, 0.0))
+        return log_density(self.spaces.actions, aims.actions, share, actions)
+
+    def act(
+        self,
+        model: GuidanceModel,
+        env: Any,
+        obs: Float[Array, "n obs"],
+        actions: Float[Array, "n action"],
+        active: Bool[Array, " n"],
+        scalars: GuideScalars,
+    ) -> Refined:
+        """Of the aims with the largest weight the nearest in active rows; where there is none, the action itself."""
+
+        def one(obs: Array, action: Array) -> tuple[Array, Array]:
+            aims, weights = log_weights(env, obs, self.by_rule)
+            off = self.spaces.actions.distance(action[None], aims.actions)
+            index = jnp.argmin(jnp.where(weights >= weights.max(), off, jnp.inf))
+            return aims.actions[index], weights.max() > -jnp.inf
+
+        goals, there = jax.vmap(one)(obs, actions)
+        moved = active & there
+        return Refined(jnp.where(moved[:, None], goals, actions), moved.astype(jnp.int32))
+
+
+class Rule(AnyAim):
+    """A guide that weighs aims by the task's own rule."""
+
+    by_rule = True
+
+
+ANY_AIM = Kind("any_aim", "any of the task's aims, without a label", AnyAim, needs=("aims",), colour="#999933")
+RULE = Kind("rule", "the task's own rule among its aims", Rule, needs=("aims", "rule"), colour="#882255")

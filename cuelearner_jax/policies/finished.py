@@ -1,0 +1,92 @@
+"""The policy that a lane is trained for: the agent alone, or with an arbiter that acts in the finished policy too."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+
+from cuelearner_jax.arbiters.protocol import Arbiter, Finishes, Known
+from cuelearner_jax.config import Scalars
+from cuelearner_jax.guides.base import Guide
+from cuelearner_jax.policies.layers import Agent, plain_part
+from cuelearner_jax.policies.node import BY_LANE, SHARED, PolicyNode, describe
+from cuelearner_jax.run_config import RunConfig, kind_to_json
+from cuelearner_jax.types import EnvState, GuidanceModel, Params
+
+
+class Arbitrated(PolicyNode):
+    """A finished agent whose arbiter chooses with it, by the arm that validated best."""
+
+    base: Agent
+    model: GuidanceModel
+    scalars: Scalars
+    options: Any  # of the arbiter
+    arm: Int[Array, "*lanes"]
+    steps: Float[Array, ""]  # that the agent has learned from
+    arbiter: Finishes = struct.field(pytree_node=False)
+    guide: Guide = struct.field(pytree_node=False)
+
+    def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
+        """The arm's choice."""
+        agent = self.base
+        known = Known(agent.view, agent.functions, agent.params, self.guide, self.model, self.scalars, self.steps)
+        return self.arbiter.act(self.arm, self.options, known, obs, key)
+
+    @property
+    def axes(self) -> Arbitrated:
+        """Each lane has its own agent, model and arm; an arm that stands alone is for all lanes."""
+        arm = SHARED if jnp.ndim(self.arm) == 0 else BY_LANE
+        shared = dict.fromkeys(("scalars", "options", "steps"), SHARED)
+        return self.replace(base=self.base.axes, model=BY_LANE, arm=arm, **shared)
+
+    def describe(self) -> dict[str, Any]:
+        """The arbiter and its arm (of a block, each lane's), the guidance, what was learned from, and the agent."""
+        arms = [self.arbiter.arms[int(arm)] for arm in np.ravel(np.asarray(self.arm))]
+        return {
+            "policy": "arbitrated",
+            "arbiter": {"name": self.options.NAME, **plain_part(type(self.options), self.options)},
+            "arm": arms[0] if np.ndim(self.arm) == 0 else arms,
+            "steps_learned_from": float(self.steps),
+            "guidance": self.guide.name,
+            "options": kind_to_json(self.guide.options),
+            "scalars": plain_part(Scalars, self.scalars),
+            "fitted": bool(np.all(self.model.fitted)),
+            "base": describe(self.base),
+        }
+
+
+def arbiter_of(config: RunConfig) -> Arbiter:
+    """The arbiter of a run."""
+    return config.arbiter.make(config.bootstraps)
+
+
+def acting(arbiter: Arbiter, params: Params, model: GuidanceModel, state: Any) -> dict[str, Any]:
+    """What of a lane its finished policy acts with: that of a checkpoint which `finished` reads.
+
+    `state`: the arbiter's, of which one that acts in the finished policy keeps the arm.
+    """
+    arm = {"arm": arbiter.arm(state)} if isinstance(arbiter, Finishes) else {}
+    return {"params": params, "guidance": model, **arm}
+
+
+def finished(config: RunConfig, guide: Guide, view: Any, step: int, known: Mapping[str, Any]) -> Agent | Arbitrated:
+    """The policy that lanes are trained for, as they stand after so many steps.
+
+    Args:
+        config: of the run.
+        guide: of their kind of guidance.
+        view: of where the policy acts.
+        step: environment steps of each lane.
+        known: what they act with (`acting`), leading axis: lanes; an arm may be one for all lanes.
+    """
+    agent = Agent(known["params"], config.agent_in(view), view)
+    arbiter = arbiter_of(config)
+    if not isinstance(arbiter, Finishes):
+        return agent
+    steps, arm = jnp.asarray(config.schedule.learned_from(step), jnp.float32), jnp.asarray(known["arm"])
+    return Arbitrated(agent, known["guidance"], config.scalars, config.arbiter, arm, steps, arbiter, guide)

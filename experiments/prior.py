@@ -1,0 +1,255 @@
+"""What labels add to the agent's choice, beside the same choice without labels.
+
+    python experiments/prior.py --list
+    python experiments/prior.py --scale start --out FOLDER                 # before the first step: minutes on two cores
+    python experiments/prior.py --out FOLDER --pieces regulation --minutes 9      # on an accelerator; again to go on
+
+Every piece is a sweep with a folder of its own, all in one process, and resumed where it stands: with --minutes the
+process saves and ends in time, so that an hour can be had in parts. Last come a table and FOLDER/prior.json, which hold
+for each variant the mean over its seeds with its 95% bootstrap interval, which arm acts, and what was paid: labels, and
+rewarded steps with those in which arms were validated.
+
+Beside labels stand their controls: `any_aim` (all aims alike), `rule` (written by hand), `shuffled` (labels with each
+other's answers), and `none` (the agent alone). `cage` has no arm but the prior's, `paced` and `papers` are the ways
+that were there before, `by_value` has a second critic compare.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import json
+import os
+import signal
+import threading
+from collections import defaultdict
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from _pieces import Options, Piece, Scale, chosen, folder_at, listed, scaled, sweep_command
+
+from cuelearner_jax.arbiters.prior import ARMS
+from cuelearner_jax.cli import main as cuelearner
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.evaluate import mean_interval
+from cuelearner_jax.signals import Interrupted
+from cuelearner_jax.storage import formats, results
+from cuelearner_jax.storage.provenance import provenance
+
+TASKS = {"regulation": "billiards", "easy": "billiards", "halls": "navigation", "rooms": "navigation"}
+METRIC = {"billiards": "reward", "navigation": "success"}
+LEVEL = 0.9  # of success, to which steps are counted
+SEEDS = 8
+FEW, FORMS = (25, 100), ("relative", "demonstration", "scalar")
+MILLION: Options = {
+    "schedule.total-steps": 1_000_000,
+    "schedule.guidance-until": 1_000_000,
+    "schedule.eval-every": 50_000,
+    "schedule.checkpoint-every": 250_000,
+    "agent.replay-capacity": 1_000_000,
+}
+HALLS: Options = {
+    "preset": "paper",
+    "schedule.total-steps": 100_000,
+    "schedule.guidance-until": 100_000,
+    "schedule.eval-every": 10_000,
+    "schedule.checkpoint-every": 50_000,
+}
+SEEN: Options = {"sizes.frame": "action"}
+PRIOR: Options = {"arbiter": "prior", "arbiter.judge-steps": 4_000}
+# Returns reach 10 and episodes 200 steps; ways lie 5 degrees apart.
+PRIOR_OF_WAYS: Options = {
+    **PRIOR,
+    "arbiter.beta": 1.0,
+    "arbiter.trust-after": 20_000,
+    "arbiter.near-deg": 5.0,
+    "arbiter.judge-steps": 20_000,
+}
+CAGE: Options = {"arbiter.own-share": 0.0, "arbiter.near-share": 0.0}
+SHUFFLED: Options = {"scalars.answer": "shuffled"}
+
+
+def variants(
+    world: str, options: Options, prior: Options, few: tuple[int, ...], many: int, minutes: int
+) -> list[Piece]:
+    """Labels as a prior in one world, its controls, its ablation, and the other arbiters."""
+    shaped, by_value, paced = {**options, **prior}, {**options, "arbiter": "by_value"}, {**options, "arbiter": "paced"}
+    budgets, most = (*few, many), few[-1:]
+    rows: list[tuple[str, str, tuple[int, ...], Options, str]] = [
+        ("alone", "none", (), {**options, "arbiter": "episodes"}, "the agent alone"),
+        ("prior", "intent", budgets, shaped, "labels about aims"),
+        ("prior", "any_aim", (), shaped, "control: all aims alike"),
+        ("prior", "rule", (), shaped, "control: aims by hand"),
+        ("shuffled", "intent", budgets[:2], {**shaped, **SHUFFLED}, "control: shuffled answers"),
+        *(("prior", kind, most, shaped, f"labels of the form {kind}") for kind in FORMS),
+        ("cage", "intent", most, {**shaped, **CAGE}, "aims alone"),
+        ("cage", "any_aim", (), {**shaped, **CAGE}, "aims alone, without labels"),
+        ("by_value", "intent", most, by_value, "a second critic compares"),
+        ("by_value", "rule", (), by_value, "a second critic compares, without labels"),
+        ("paced", "intent", most, paced, "guidance while it pays"),
+    ]
+    return [Piece(world, run, kind, (kind,), labels, SEEDS, own, minutes, why) for run, kind, labels, own, why in rows]
+
+
+REGULATION: Options = {"preset": "regulation", **MILLION}
+EASY: Options = {"preset": "easy", **MILLION}
+WALKED = {name: {**HALLS, **SEEN, "task.style": style} for name, style in (("halls", "clutter"), ("rooms", "rooms"))}
+PAPERS: Options = {**HALLS, "sizes.frame": "raw", "arbiter": "episodes"}
+PIECES = (
+    *variants("regulation", REGULATION, PRIOR, FEW, 500, 9),
+    *variants("easy", EASY, PRIOR, FEW, 500, 9),
+    *variants("halls", WALKED["halls"], PRIOR_OF_WAYS, (25, 50), 100, 9),
+    Piece("halls", "papers", "relative", ("relative",), (500,), SEEDS, PAPERS, 9, "500 labels in the paper's way"),
+    *variants("rooms", WALKED["rooms"], PRIOR_OF_WAYS, (50, 100), 500, 9),
+)
+
+TINY: Options = {
+    "agent.q-layers": 16,
+    "agent.directions": 36,
+    "agent.coarse-directions": 0,
+    "agent.replay-capacity": 10_000,
+    "schedule.total-steps": 100,
+    "schedule.eval-every": 100,
+    "schedule.checkpoint-every": 100,
+}
+SCALES = {
+    "paper": Scale("what the figures are of"),
+    # The agent has learned nothing: its own network has no say, and may be as small as it likes.
+    "start": Scale(
+        "before the first step of training alone",
+        seeds=4,
+        labels={25: 25, 50: 50, 100: 100},
+        options={**TINY, "schedule.guide-eval-every": 0},
+    ),
+    "smoke": Scale(
+        "seconds a piece on a CPU, to see that everything runs",
+        seeds=1,
+        labels={25: 10, 50: 10, 100: 20},
+        options={
+            **TINY,
+            "sizes.num-envs": 10,
+            "sizes.fit-steps": 20,
+            "sizes.feedback-layers": 16,
+            "schedule.random-steps": 20,
+            "schedule.learn-after": 20,
+            "schedule.guidance-until": 100,
+            "schedule.guide-eval-every": 0,
+            "schedule.eval-steps": 200,
+            "schedule.eval-envs": 10,
+        },
+        instead={"arbiter.judge-steps": 200, "arbiter.trust-after": 50},
+    ),
+}
+
+
+def rows_of(out: Path, pieces: Sequence[Piece]) -> list[dict[str, Any]]:
+    """What pieces have come to so far: a row for each variant and evaluation, over its seeds."""
+    found = []
+    for piece in pieces:
+        try:
+            rows = results.read(out / piece.path).to_pylist()
+        except UserError:  # not begun
+            continue
+        arbiter = formats.read("config", out / piece.path / "config.json")["arbiter"]
+        judged = len(ARMS) * arbiter.get("judge_steps", 0)
+        groups = defaultdict(list)
+        for row in rows:
+            groups[row["labels"], row["step"]].append(row)
+        for (labels, step), own in sorted(groups.items()):
+            mean, low, high = mean_interval(np.array([row[METRIC[TASKS[piece.world]]] for row in own])).tolist()
+            row = {"world": piece.world, "run": piece.run, "guidance": piece.kinds[0], "labels": labels, "step": step}
+            row |= {"seeds": len(own), "mean": mean, "low": low, "high": high, "rewarded_steps": step + judged}
+            if judged:
+                row["arms"] = {arm: sum(one["arm"] == number for one in own) for number, arm in enumerate(ARMS)}
+                row["judged"] = {arm: float(np.mean([one[f"judged_{arm}"] for one in own])) for arm in ARMS}
+            found.append(row)
+    return found
+
+
+def steps_to(level: float, rows: Sequence[dict[str, Any]]) -> float:
+    """Steps after which the mean curve first reaches a level, on straight lines between evaluations; inf: never."""
+    for before, after in itertools.pairwise(rows):
+        if before["mean"] >= level:
+            return before["step"]
+        if after["mean"] >= level:
+            share = (level - before["mean"]) / (after["mean"] - before["mean"])
+            return before["step"] + share * (after["step"] - before["step"])
+    return rows[-1]["step"] if rows and rows[-1]["mean"] >= level else float("inf")
+
+
+def table(rows: Sequence[dict[str, Any]]) -> str:
+    """One line a variant: at the start, after a tenth and at the end, and in navigation the steps to the level."""
+    groups = defaultdict(list)
+    for row in rows:
+        groups[row["world"], row["run"], row["guidance"], row["labels"]].append(row)
+    lines = [f"{'world':<11}{'run':<10}{'guidance':<14}{'labels':>7}  metric at steps"]
+    for (world, run, guidance, labels), own in groups.items():
+        last = own[-1]["step"]
+        shown = [row for row in own if row["step"] in (0, last // 10, last)]
+        cells = [f"{row['step']:>9,}: {row['mean']:.3f} [{row['low']:.3f}, {row['high']:.3f}]" for row in shown]
+        if METRIC[TASKS[world]] == "success":
+            cells.append(f"{LEVEL:.0%} after {steps_to(LEVEL, own):,.0f}")
+        lines.append(f"{world:<11}{run:<10}{guidance:<14}{labels:>7}  " + "  ".join(cells))
+    return "\n".join(lines)
+
+
+def interrupting(minutes: float) -> threading.Timer:
+    """A timer that asks this process to save and to end, as Ctrl-C does."""
+    timer = threading.Timer(60 * minutes, lambda: os.kill(os.getpid(), signal.SIGINT))
+    timer.daemon = True
+    return timer
+
+
+def trained(pieces: Sequence[Piece], scale: Scale, out: Path, minutes: float | None) -> int:
+    """Run pieces, each from where it stands; the status of the first that did not end well."""
+    timer = interrupting(minutes) if minutes else None
+    if timer:
+        timer.start()
+    try:
+        for piece in filter(None, (scaled(piece, scale) for piece in pieces)):
+            if status := cuelearner(sweep_command(TASKS[piece.world], piece, out, resume=True)):
+                return status
+    except KeyboardInterrupt:  # between two pieces
+        return Interrupted.status
+    finally:
+        if timer:
+            timer.cancel()
+    return 0
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run, then tell; returns the exit status, 0 also where the time was up."""
+    about = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=about, allow_abbrev=False)
+    scales = "; ".join(f"{name}: {scale.about}" for name, scale in SCALES.items())
+    parser.add_argument("--scale", choices=list(SCALES), default="paper", help=scales)
+    parser.add_argument("--pieces", nargs="+", default=[], metavar="NAME", help="these alone, or all below a folder")
+    parser.add_argument("--out", type=Path, default=Path("runs/prior"), help="folder")
+    parser.add_argument("--minutes", type=float, help="save and end after so many; the same command goes on")
+    parser.add_argument("--list", action="store_true", help="list the pieces and stop")
+    parser.add_argument("--report", action="store_true", help="tell what there is, and run nothing")
+    asked = parser.parse_args(arguments)
+    experiment = argparse.Namespace(pieces=PIECES)
+    try:
+        pieces = chosen(experiment, asked.pieces)
+    except ValueError as error:
+        parser.error(str(error))
+    if asked.list:
+        print(listed(pieces))
+        return 0
+    out = folder_at(asked.out, asked.scale)
+    status = 0 if asked.report else trained(pieces, SCALES[asked.scale], out, asked.minutes)
+    if status == Interrupted.status and asked.minutes:
+        print("the time is up: the same command goes on")
+        status = 0
+    if rows := rows_of(out, PIECES):
+        told = {**provenance(), "scale": asked.scale, "rows": rows}
+        (out / "prior.json").write_text(json.dumps(told, indent=1) + "\n")
+        print(table(rows))
+    return status
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
