@@ -136,7 +136,7 @@ SCALES = {
             "schedule.learn-after": 20,
             "schedule.guidance-until": 100,
             "schedule.guide-eval-every": 0,
-            "schedule.eval-steps": 200,
+            "schedule.eval-steps": 2_000,
             "schedule.eval-envs": 10,
         },
         instead={"arbiter.judge-steps": 200, "arbiter.trust-after": 50},
