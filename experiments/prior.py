@@ -126,7 +126,7 @@ SCALES = {
     "smoke": Scale(
         "seconds a piece on a CPU, to see that everything runs",
         seeds=1,
-        labels={25: 10, 50: 10, 100: 20},
+        labels={25: 10, 50: 15, 100: 20},
         options={
             **TINY,
             "sizes.num-envs": 10,
