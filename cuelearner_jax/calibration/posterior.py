@@ -13,8 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
-from scipy.special import logsumexp
-from scipy.stats import qmc, t
+from scipy.special import gammaln, logsumexp, stdtrit
 
 from cuelearner_jax.calibration.families import Family, unknowns_of
 from cuelearner_jax.calibration.likelihood import LOG_PRIOR, log_chances
@@ -42,6 +41,12 @@ class Answers(NamedTuple):
     doubt: Float[Floats, " n"]  # probability that the situation is one of a tie, see `questions.ties`
 
 
+def log_student(x: Floats, freedom: float) -> Floats:
+    """The logarithm of the density of Student's t, entry by entry."""
+    norm = gammaln((freedom + 1) / 2) - gammaln(freedom / 2) - 0.5 * np.log(freedom * np.pi)
+    return norm - (freedom + 1) / 2 * np.log1p(np.square(x) / freedom)
+
+
 class Prior(NamedTuple):
     """Student's t of each unknown's scale; what makes sense is a part of it."""
 
@@ -52,12 +57,14 @@ class Prior(NamedTuple):
         """Return samples (count, unknowns), evenly spread."""
         if not len(self.scale):
             return np.zeros((count, 0))
+        from scipy.stats import qmc  # takes seconds to load, and a stored policy needs none of it
+
         even = qmc.Halton(len(self.scale), rng=random).random(count)
-        return t.ppf(np.clip(even, 1e-4, 1 - 1e-4), PRIOR_FREEDOM) * self.scale
+        return stdtrit(PRIOR_FREEDOM, np.clip(even, 1e-4, 1 - 1e-4)) * self.scale
 
     def log_density(self, theta: Floats) -> Floats:
         """Return the logarithm of the density of rows (n,)."""
-        return t.logpdf(theta / self.scale, PRIOR_FREEDOM).sum(-1) - np.log(self.scale).sum()
+        return log_student(theta / self.scale, PRIOR_FREEDOM).sum(-1) - np.log(self.scale).sum()
 
     def closer(self) -> Prior:
         """Return the same of changes that are much smaller."""
@@ -86,7 +93,7 @@ class Kernels(NamedTuple):
         """Return the logarithm of the density of rows (n,)."""
         inverse = np.linalg.inv(self.shape)
         away = (theta[:, None] - self.centres[None]) @ inverse.T
-        each = t.logpdf(away, KERNEL_FREEDOM).sum(-1) + np.log(np.abs(np.diag(inverse))).sum()
+        each = log_student(away, KERNEL_FREEDOM).sum(-1) + np.log(np.abs(np.diag(inverse))).sum()
         near = logsumexp(each, axis=1) - np.log(len(self.centres))
         return np.logaddexp(np.log1p(-ANEW) + near, np.log(ANEW) + self.prior.log_density(theta))
 
