@@ -139,9 +139,7 @@ def main() -> None:
     parser.add_argument("--labels", nargs="+", type=int, default=LABELS)
     parser.add_argument("--seeds", type=int, default=1, help="of labels, for each base")
     parser.add_argument("--most-bases", type=int, default=8)
-    parser.add_argument(
-        "--mistakes", type=float, default=0.0, help="that an answer is reversed; 0.5: a control"
-    )
+    parser.add_argument("--mistakes", type=float, default=0.0, help="that an answer is reversed; 0.5: a control")
     parser.add_argument("--bias-deg", type=float, default=0.0, help="of everything that the teacher means")
     parser.add_argument("--first-seed", type=int, default=0)
     parser.add_argument("--steps", type=int, default=10_000, help="of an evaluation; 0: none")

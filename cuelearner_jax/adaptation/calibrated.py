@@ -197,13 +197,13 @@ def _judged(
 
 
 def _used(family: Family, thetas: list[Theta]) -> Family:
-    """The distortions of which any lane has an unknown; first those that change what is seen, as `Fit` has them."""
+    """The distortions of which any lane has an unknown; first those that ask anew, as `Fit` has them."""
     names = {name for theta in thetas for name in theta}
 
     def corrects(one: Distortion) -> bool:
         return not one.of_teacher and any(unknown.name in names for unknown in one.unknowns)
 
-    return tuple(sorted(filter(corrects, family), key=lambda one: one.sees is None))
+    return tuple(sorted(filter(corrects, family), key=lambda one: not one.asks))
 
 
 def _stacked(family: Family, thetas: list[Theta]) -> Float[Array, "lanes unknowns"]:

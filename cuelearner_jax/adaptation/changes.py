@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import jax
@@ -10,7 +11,7 @@ import numpy as np
 
 from cuelearner_jax import plugins
 from cuelearner_jax.calibration import Distortion, declared
-from cuelearner_jax.calibration.families import Family, acted, check_family, seen, unknowns_of
+from cuelearner_jax.calibration.families import Family, acted, check_family, planned, seen, unknowns_of
 from cuelearner_jax.environment import Environment, actions_of
 from cuelearner_jax.errors import UserError, shown
 
@@ -55,8 +56,9 @@ def check_acts(family: Family, env: Environment) -> None:
     for one in family:
         nothing = jnp.zeros(len(one.unknowns))
         for name, given, found in (
-            ("sees", obs, jax.vmap(lambda row, one=one, none=nothing: seen((one,), none, row))(obs)),
-            ("acts", actions, jax.vmap(lambda row, one=one, none=nothing: acted((one,), none, row, False))(actions)),
+            ("sees", obs, jax.vmap(partial(seen, (one,), nothing))(obs)),
+            ("acts", actions, jax.vmap(partial(acted, (one,), nothing, corrects=False))(actions)),
+            ("plans", actions, jax.vmap(partial(planned, (one,), nothing))(obs, actions)),
         ):
             if found.shape != given.shape:
                 raise UserError(f"distortion {one.name!r}: {name} returns {found.shape[1:]}: give {given.shape[1:]}")

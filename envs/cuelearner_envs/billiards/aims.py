@@ -52,7 +52,7 @@ def aims_of(table: Table, obs: Float[Array, " obs"]) -> Aims:
 
 
 def rule_of(aims: Aims) -> Float[Array, " aims"]:
-    """log-weights of the aims by a rule of three numbers, all of which count alike; nothing was fitted.
+    """log-weights of the aims by a rule of three numbers, all of which count alike. Chosen by hand on tuning episodes.
 
     By what factor an error of the aim grows on its way to the mouth (its logarithm); by how many ball diameters another
     ball stands in the cue ball's way; whether the cue ball goes on into a pocket.
