@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from _adaptation import JUDGED, SCHEMA, UNCHANGED, UNREWARDED, Study
+from _adaptation import SCHEMA, UNCHANGED, Study
+from _adaptation_methods import JUDGED, UNREWARDED
 
 from cuelearner_jax.report.statistics import drawn, interquartile_mean, interval_of_groups
 from cuelearner_jax.storage import table as tables

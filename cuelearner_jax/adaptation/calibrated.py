@@ -83,7 +83,8 @@ def check_unused(sizes: GuideSizes, scalars: Scalars, **others: Any) -> None:
                 others[f"{name}.{entry.name}"] = () if value == getattr(plain, entry.name) else value
     for name, value in others.items():
         if value not in ((), None):
-            raise UserError(f"{name} is {value}, but calibration fits no model and has no bound: leave {name} out")
+            given = " ".join(map(str, value)) if isinstance(value, tuple) else value
+            raise UserError(f"{name} is {given}, but calibration fits no model and has no bound: leave {name} out")
     if scalars.answer == "shuffled":
         raise UserError("scalars.answer is shuffled, a control of models: give best or nearest to calibration")
 

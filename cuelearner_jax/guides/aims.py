@@ -41,17 +41,17 @@ def log_density(
     return jnp.log(jnp.maximum(jnp.sum(share[None, :-1] * near, -1) + share[-1], LEAST))
 
 
-def log_weights(env: Any, obs: Float[Array, " obs"], by_rule: bool) -> tuple[Aims, Float[Array, " aims"]]:
-    """The aims of a situation with log-weights: the task's own, or the same for all."""
-    aims = env.aims(obs)
-    weights = env.rule(obs) if by_rule else jnp.zeros(len(aims.possible))
-    return aims, jnp.where(open_aims(aims).possible, weights, -jnp.inf)
-
-
 class AnyAim(Untaught):
     """A guide to whom all aims are alike: what `intent` is before its first label."""
 
-    by_rule = False
+    def preference(self, env: Any, obs: Float[Array, " obs"], aims: Aims) -> Float[Array, " aims"]:
+        """log-weights of a situation's aims: the same for all."""
+        return jnp.zeros(len(aims.possible))
+
+    def weighed(self, env: Any, obs: Float[Array, " obs"]) -> tuple[Aims, Float[Array, " aims"]]:
+        """A situation's aims, and their log-weights: minus infinity of those that may not be followed."""
+        aims = env.aims(obs)
+        return aims, jnp.where(open_aims(aims).possible, self.preference(env, obs, aims), -jnp.inf)
 
     def candidates(self, env: Any, obs: Float[Array, " obs"]) -> Candidates:
         """The aims that may be followed."""
@@ -66,7 +66,7 @@ class AnyAim(Untaught):
         scalars: GuideScalars,
     ) -> Float[Array, " m"]:
         """log of the density of actions (`log_density`), where "none of the aims" weighs as much as one of them."""
-        aims, weights = log_weights(env, obs, self.by_rule)
+        aims, weights = self.weighed(env, obs)
         share = jax.nn.softmax(jnp.append(weights, 0.0))
         return log_density(self.spaces.actions, aims.actions, share, actions)
 
@@ -82,7 +82,7 @@ class AnyAim(Untaught):
         """Of the aims with the largest weight the nearest in active rows; where there is none, the action itself."""
 
         def one(obs: Array, action: Array) -> tuple[Array, Array]:
-            aims, weights = log_weights(env, obs, self.by_rule)
+            aims, weights = self.weighed(env, obs)
             off = self.spaces.actions.distance(action[None], aims.actions)
             index = jnp.argmin(jnp.where(weights >= weights.max(), off, jnp.inf))
             return aims.actions[index], weights.max() > -jnp.inf
@@ -95,7 +95,9 @@ class AnyAim(Untaught):
 class Rule(AnyAim):
     """A guide that weighs aims by the task's own rule."""
 
-    by_rule = True
+    def preference(self, env: Any, obs: Float[Array, " obs"], aims: Aims) -> Float[Array, " aims"]:
+        """log-weights of a situation's aims, as the rule has them."""
+        return env.rule(obs)
 
 
 ANY_AIM = Kind("any_aim", "any of the task's aims, without a label", AnyAim, needs=("aims",), colour="#999933")
