@@ -90,13 +90,16 @@ def test_what_makes_no_sense_is_refused(more, says, refused, tmp_path, monkeypat
 
 def test_a_task_that_nobody_draws_is_refused_before_anything_is_made(refused, tmp_path, monkeypatch):
     pytest.importorskip("nicegui")
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.syspath_prepend(tmp_path)
+    code, work = tmp_path / "code", tmp_path / "work"  # Python may write the module's bytecode beside it
+    code.mkdir()
+    work.mkdir()
+    monkeypatch.chdir(work)
+    monkeypatch.syspath_prepend(code)
     bare = "import dataclasses, page_task\nTASK = dataclasses.replace(page_task.TASK, bodies=("
     bare += "page_task.TASK.bodies[0].__class__('point', '', page_task._world),), name='undrawn')\n"
-    (tmp_path / "undrawn.py").write_text(bare)
+    (code / "undrawn.py").write_text(bare)
     says = "has no pictures of point: a person cannot label what nobody draws; give its Body `pictures`"
-    refused(["label", "undrawn:TASK", "--out", "labels"], says, tmp_path)
+    refused(["label", "undrawn:TASK", "--out", "labels"], says, work)
 
 
 def test_a_port_in_use_is_refused_before_anything_is_made(refused, tmp_path):
