@@ -117,6 +117,7 @@ class Task:
     scenarios: dict[str, Scenario] = field(default_factory=dict)
     labels_hold: tuple[str, ...] = ()  # fields of the configuration that labels of another world may differ in
     origin: str = ""  # "package.module:name" where it was taken from outside, by whoever resolved that
+    default: Any = None  # the configuration that holds where nothing is given; None: `config()`
 
     def __post_init__(self) -> None:
         """Raises ValueError for the first thing that cannot be."""
@@ -150,17 +151,21 @@ class Task:
             if unknown := sorted(set(given) - {entry.name for entry in dataclasses.fields(group)}):
                 raise ValueError(f"{called} {verb} {unknown[0]!r}, no field of {group.__name__}")
         try:
-            for base in [preset.config.task for preset in self.presets.values()] or [self.config()]:
+            for base in [preset.config.task for preset in self.presets.values()] or [self.plain()]:
                 scenario.applied(base)
         except Exception as error:
             raise ValueError(f"{called} makes no configuration ({error})") from error
+
+    def plain(self) -> Any:
+        """Return the configuration that holds where nothing is given."""
+        return self.config() if self.default is None else self.default
 
     def configured(self, scenario: str | None = None, **changes: Any) -> Any:
         """The task's configuration in a changed world, with fields changed.
 
         Raises UserError for no such scenario or field, or a value that its field cannot hold.
         """
-        config = self.config()
+        config = self.plain()
         if scenario is not None:
             config = self.scenario(scenario).applied(config)
         values = check_types(config, "task", **changes) if changes else {}
@@ -172,7 +177,7 @@ class Task:
 
     def start(self) -> RunConfig:
         """The configuration that a policy is taken to be trained with where no folder says so."""
-        return self.presets[self.first_preset()].config if self.presets else RunConfig(self.config())
+        return self.presets[self.first_preset()].config if self.presets else RunConfig(self.plain())
 
     def environment(self, config: Any, split: str = "training") -> Environment:
         """The world of a configuration with the first body in it, for the episodes of a split.

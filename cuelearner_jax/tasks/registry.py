@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import importlib
 from importlib.metadata import EntryPoint, entry_points
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from cuelearner_jax import plugins
 from cuelearner_jax.errors import UserError, closest
@@ -22,6 +22,9 @@ BUILT_IN = {
     "billiards": "cuelearner_jax.tasks.billiards:BILLIARDS",
     "navigation": "cuelearner_jax.tasks.navigation:NAVIGATION",
 }
+# Environments of other libraries, named FAMILY:ENVIRONMENT: a function from the environment's name to a task, which
+# bears the family's name. The family's own task, by which its folders are read, is built in.
+FAMILIES: dict[str, str] = {}
 
 _registered: dict[str, Task] = {}
 
@@ -34,8 +37,7 @@ def names() -> tuple[str, ...]:
 def find(name: str) -> Task:
     """The task called `name`. Raises UserError if there is none, or an installed package's cannot be had."""
     if name in BUILT_IN:
-        module, _, attribute = BUILT_IN[name].partition(":")
-        return getattr(importlib.import_module(module), attribute)
+        return _built_in(BUILT_IN[name])
     if name in _registered:
         return _registered[name]
     installed = _installed()
@@ -60,7 +62,8 @@ def register(task: Task) -> Task:
 
 
 def resolve(text: str) -> Task:
-    """The task that the user names: by its name, or from outside as package.module:name, which registers it.
+    """The task that the user names: by its name, as FAMILY:ENVIRONMENT (`FAMILIES`), or from outside as
+    package.module:name, which registers it.
 
     The current folder counts as a place to import from, after all others.
 
@@ -69,9 +72,18 @@ def resolve(text: str) -> Task:
     """
     if ":" not in text:
         return find(text)
+    family, _, environment = text.partition(":")
+    if family in FAMILIES:
+        return _built_in(FAMILIES[family])(environment)
     task = dataclasses.replace(_loaded(text), origin=text)
     installed = _installed().get(task.name)
     return find(task.name) if installed and installed.value == text else register(task)
+
+
+def _built_in(reference: str) -> Any:
+    """Return what the package itself has under module:NAME."""
+    module, _, attribute = reference.partition(":")
+    return getattr(importlib.import_module(module), attribute)
 
 
 def _loaded(reference: str) -> Task:
