@@ -30,7 +30,7 @@ def supply_joint_types() -> None:
     from gymnasium_robotics.utils import mujoco_utils
 
     own: Any = mujoco.mjtJoint
-    if np.int32(int(own.mjJNT_HINGE)) == own.mjJNT_HINGE or isinstance(mujoco_utils.mujoco, _View):
+    if np.int32(int(own.mjJNT_HINGE)) in (own.mjJNT_HINGE,) or isinstance(mujoco_utils.mujoco, _View):
         return
     mujoco_utils.mujoco = _View(mujoco)  # pyright: ignore[reportAttributeAccessIssue]
 
