@@ -16,7 +16,6 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from cuelearner_jax.spaces import DIRECTIONS, Space
 from cuelearner_jax.types import EnvState, Step
 
-
 OWN = "own"
 
 

@@ -158,7 +158,9 @@ def _arguments(text: str) -> dict[str, Any]:
     except ValueError:
         found = None
     if not isinstance(found, dict):
-        raise UserError(f"task.arguments is {shown(text)}: give arguments by name as JSON, such as " + '\'{"size": 3}\'')
+        raise UserError(
+            f"task.arguments is {shown(text)}: give arguments by name as JSON, such as " + "'{\"size\": 3}'"
+        )
     return found
 
 
@@ -239,7 +241,11 @@ def task_from(
         raise UserError(f"environment {name} has no limit of steps: give max_steps, after which episodes are truncated")
     fetch = fetch_layout.layout_of(name) if factory is None else None
     slices = _named(name, slices, observation or fetch, units or {})
-    words = cues.split(";") if isinstance(cues, str) else [pair if isinstance(pair, str) else ",".join(pair) for pair in cues]
+    words = (
+        cues.split(";")
+        if isinstance(cues, str)
+        else [pair if isinstance(pair, str) else ",".join(pair) for pair in cues]
+    )
     names: tuple[str, ...] = ()
     if not words and fetch and len(actions.low) == len(fetch_layout.CUES):
         words, names = list(fetch_layout.CUES), fetch_layout.CUE_NAMES

@@ -102,7 +102,7 @@ class GymnasiumTask(WholeObservations, struct.PyTreeNode):
         seeds = np.asarray(seed)
         requests = [Request(int(one)) for one in seeds.ravel()]
         obs, place = self._carried(requests)[::7]
-        return obs.reshape(*seeds.shape, -1), place.reshape(*seeds.shape, 2)
+        return obs.reshape((*seeds.shape, -1)), place.reshape((*seeds.shape, 2))
 
     def _step_here(self, *given: Any) -> tuple[np.ndarray, ...]:
         """Step on the host: any leading axes."""
@@ -116,7 +116,7 @@ class GymnasiumTask(WholeObservations, struct.PyTreeNode):
             for row in range(len(seeds))
         ]
         found = self._carried(requests)
-        return tuple(column.reshape(*shape, *column.shape[1:]) for column in found)
+        return tuple(column.reshape((*shape, *column.shape[1:])) for column in found)
 
     def _carried(self, requests: list[Request]) -> tuple[np.ndarray, ...]:
         """What requests led to, column by column; NaN once an environment has failed, which `user_code` tells."""

@@ -176,7 +176,7 @@ class Instances:
         if one is not None:
             try:
                 one.env.close()
-            except Exception:  # noqa: S110 (what closing raises changes nothing: it is given up)
+            except Exception:
                 pass
 
     def close(self) -> None:

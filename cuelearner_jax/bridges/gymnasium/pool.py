@@ -32,13 +32,19 @@ class Process:
     def __init__(self, whose: str, sent: bytes) -> None:
         """Begin it. `sent`: the arguments of `Instances`, pickled."""
         ours, theirs = socket.socketpair()
-        command = [sys.executable, "-m", "cuelearner_jax.bridges.gymnasium.worker", str(theirs.fileno()), str(os.getpid())]
+        command = [
+            sys.executable,
+            "-m",
+            "cuelearner_jax.bridges.gymnasium.worker",
+            str(theirs.fileno()),
+            str(os.getpid()),
+        ]
         package = os.path.dirname(os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__)))))
         paths = os.pathsep.join([package, *filter(None, [os.environ.get("PYTHONPATH")])])
         environ = {**os.environ, "PYTHONPATH": paths}
         self.whose = whose
         # What an environment prints is no output of ours.
-        self.child = subprocess.Popen(  # noqa: S603 (our own program)
+        self.child = subprocess.Popen(
             command, pass_fds=(theirs.fileno(),), stdin=subprocess.DEVNULL, stdout=2, env=environ
         )
         theirs.close()
@@ -56,7 +62,7 @@ class Process:
     def receive(self, count: int) -> list[Went | str] | None:
         """Return what orders led to; None: the process is gone."""
         try:
-            return pickle.loads(self.link.recv_bytes())  # noqa: S301 (from our own child)
+            return pickle.loads(self.link.recv_bytes())
         except (EOFError, OSError):
             return None
 
@@ -180,9 +186,7 @@ class Pool:
             assert request.history is not None
             replay = np.array(request.history[: request.steps])
             self.replays += request.steps
-        return Order(
-            slot.number, request.seed, request.place, request.action, request.next_seed, replay, request.steps
-        )
+        return Order(slot.number, request.seed, request.place, request.action, request.next_seed, replay, request.steps)
 
     def _stand(self, slot: Slot, place: bytes) -> None:
         before = self._standing.get(slot.place)

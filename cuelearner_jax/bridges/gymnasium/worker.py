@@ -45,7 +45,7 @@ def _begun(link: Connection) -> Any:
 
     sent = link.recv_bytes()
     try:
-        return Instances(*pickle.loads(sent))  # noqa: S301 (from our own parent)
+        return Instances(*pickle.loads(sent))
     except Exception as caught:
         error = caught if isinstance(caught, UserError) else raised_by("the environment's code, when loaded,", caught)
         words = str(error)
