@@ -8,10 +8,11 @@ import webbrowser
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any, Generic, Literal
+from typing import Annotated, Any, Generic, Literal
 
 import jax
 import numpy as np
+import tyro
 
 from cuelearner_jax import config as configuration
 from cuelearner_jax.adaptation import adapting, calibrated, changes
@@ -66,7 +67,9 @@ class Label(Generic[TaskT]):
     """A name for you, written beside each label."""
     seed: int = 0
     """Seed of the situations; the labels are this seed's."""
-    bound_deg: float | None = None
+    one_cue: Flag[bool] = False
+    """Of several cues: one press, about whichever comes to mind, is the answer; of the others nothing is said."""
+    bound_deg: Annotated[float | None, tyro.conf.arg(aliases=("--bound",))] = None
     """Ask about actions within this of the policy's own alone [deg] (default: the scenario's, or wherever the guidance
     leads)."""
     again: Path | None = None
@@ -181,11 +184,15 @@ def planned(
         asking = [kind.name for kind in guidances.known() if kind.asks]
         raise UserError(f"guidance {guidance.name!r} asks for no labels: give --guidance {' or '.join(asking)}")
     controls.check(guidance.form, space)
+    if asked.one_cue and not (guidance.form.by_eps and len(space.cues) > 1):
+        raise UserError("--one-cue is for relative answers about several cues: leave it out")
     wanted = asked.labels, asked.seed, asked.who.strip(), asked.bound_deg, robot
     if asked.again is not None:
-        return _second(Plan(task, merged, guidance, Base(uniform_in(env), ""), *wanted), asked, named)
+        plan = Plan(task, merged, guidance, Base(uniform_in(env), ""), *wanted, one_cue=asked.one_cue)
+        return _second(plan, asked, named)
     family = _family(asked, env) if guidance.kind.by_evidence else ()
-    return Plan(task, merged, guidance, _base(task, asked, named, source, env), *wanted, family=family)
+    base = _base(task, asked, named, source, env)
+    return Plan(task, merged, guidance, base, *wanted, family=family, one_cue=asked.one_cue)
 
 
 def _check_evidence(asked: Label[Any], named: str | None) -> None:

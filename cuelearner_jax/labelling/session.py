@@ -36,6 +36,7 @@ from cuelearner_jax.task import shape_of
 from cuelearner_jax.types import Label, Reel, Sketch
 
 RECENT = 50  # answers by which the pace is told
+KEPT = 20  # questions back whose pictures are still there; those of earlier ones are made anew where undo leads there
 NUMBERS = 2**31  # of questions: those of practice count down to 0, and their random numbers are the last ones
 
 
@@ -228,6 +229,11 @@ class Session:
         return self._pictures.legend
 
     @property
+    def films(self) -> bool:
+        """Is there a film of where an action leads?"""
+        return self._pictures.reel is not None
+
+    @property
     def item(self) -> Item | None:
         """The question of the moment; None: all are answered, or the work is finished."""
         with self._lock:
@@ -271,6 +277,8 @@ class Session:
         with self._lock:
             self.number, self._since = number, time.monotonic()
             self._furthest = max(self._furthest, number)
+            if passed := self._items.get(number - KEPT):
+                self._items[passed.number] = passed._replace(sketch=None, trails=None)
             self._next = self._ahead.submit(self._ensure, number + 1)
 
     def undo(self, number: int) -> bool:
