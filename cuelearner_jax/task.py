@@ -75,6 +75,13 @@ class Body:
     # a folder of the user's -> the body with what lies there; raises UserError if that is not for it; None: takes none
     made_of: Callable[[Path], Body] | None = None
     digest: str = ""  # of what lies in that folder
+    # configuration -> the environment with zeros in place of what files hold, of which a policy needs shapes and view
+    # alone; None: as `environment` has it
+    layout: Callable[[Any], Environment] | None = None
+
+    def shaped(self, config: Any) -> Environment:
+        """The environment of a configuration, as far as shapes and views depend on it."""
+        return self.environment(config, "training") if self.layout is None else self.layout(config)
 
 
 @dataclass(frozen=True)
@@ -193,7 +200,7 @@ class Task:
 
     def view(self, config: Any) -> View:
         """What policies look at in a configuration; worlds that no policy looks at are not generated."""
-        make = lambda: self.bodies[0].environment(config, "training")  # noqa: E731
+        make = lambda: self.bodies[0].shaped(config)  # noqa: E731
         if not offers(jax.eval_shape(make), "view"):
             return self.environment(config)
         return jax.jit(lambda: view_of(make()))()
@@ -270,4 +277,4 @@ class Task:
 
 def shape_of(task: Task, config: Any) -> Any:
     """The environment of a configuration with shapes in place of arrays: costs next to nothing."""
-    return jax.eval_shape(lambda: task.bodies[0].environment(config, "training"))
+    return jax.eval_shape(lambda: task.bodies[0].shaped(config))
