@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import shlex
 import webbrowser
 from dataclasses import dataclass, field
@@ -32,16 +33,18 @@ from cuelearner_jax.policies import NearAims, uniform_in
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs.grid import LARGEST_SEED
 from cuelearner_jax.runs.trained import PolicySource
+from cuelearner_jax.spaces import cues_from
 from cuelearner_jax.storage import label_files
 from cuelearner_jax.storage.folders import claimed
 from cuelearner_jax.studies.train import preset_kinds
 from cuelearner_jax.task import Task, shape_of
-from cuelearner_jax.tasks import registry
+from cuelearner_jax.tasks import logs, registry
 from cuelearner_jax.terminal import Interrupted, console, interruptible
 
-UNIFORM, NEAR_AIMS = "uniform", "near_aims"
+UNIFORM, NEAR_AIMS, PROPOSED = "uniform", "near_aims", "proposed"
 REACH = 1.5  # of questions near an aim: from the aim, in turns by eps
 PRESET = "quickstart"  # where none is given and chance is asked about: what is labelled trains in minutes
+WORDS = 'words such as "left,right;up,down"'
 PRACTICE = len(controls.PRACTICE)  # questions
 MOST_LABELS = 100_000
 UNDRAWN = "a person cannot label what nobody draws; give its Body `pictures` with a `sketch`, or another --robot"
@@ -49,10 +52,10 @@ UNDRAWN = "a person cannot label what nobody draws; give its Body `pictures` wit
 
 @dataclass(frozen=True)
 class Label(Generic[TaskT]):
-    """Label actions of chance, or of a policy, in a browser.
+    """Label actions of chance, of a policy, or recorded ones, in a browser.
 
     A policy is named after the task: a run folder, a policy folder, or package.module:NAME of a function of
-    observations."""
+    observations. In place of a task a folder of situations may be named: its recorded actions are asked about."""
 
     task: TaskT
     sizes: GuideSizes
@@ -67,6 +70,8 @@ class Label(Generic[TaskT]):
     """A name for you, written beside each label."""
     seed: int = 0
     """Seed of the situations; the labels are this seed's."""
+    cues: str = ""
+    """Words for more and less of each entry of an action, as "left,right;up,down" (default: the task's)."""
     one_cue: Flag[bool] = False
     """Of several cues: one press, about whichever comes to mind, is the answer; of the others nothing is said."""
     bound_deg: Annotated[float | None, tyro.conf.arg(aliases=("--bound",))] = None
@@ -79,8 +84,9 @@ class Label(Generic[TaskT]):
     robot: str | None = None
     """Another robot, see above (default: the task's own); with a folder, as anymal:FOLDER, one with your own walking
     policy."""
-    questions: Literal["uniform", "near_aims"] = UNIFORM
-    """Without a policy: actions of any direction, or near what a player may aim at (where the task has aims)."""
+    questions: Literal["uniform", "near_aims", "proposed"] = UNIFORM
+    """Without a policy: any actions, those near what a player may aim at (where the task has aims), or those that a
+    recording proposes."""
     changes: str | None = None
     """Of guidance calibration: package.module:NAME of distortions of your own (default: what the world declares)."""
     practice: Flag[bool] = True
@@ -103,9 +109,10 @@ def run(arguments: list[str]) -> None:
         Interrupted: Ctrl-C or SIGTERM; every answer is saved.
     """
     server, typed = _server(), list(arguments)
-    task, rest = task_of(arguments, "label", Label)
+    task, rest = _task_named(arguments)
     named, rest = (rest[0], rest[1:]) if rest and not rest[0].startswith("-") else (None, rest)
-    usual = PAPER if named is not None else PRESET
+    finished_policy = named is not None or task.proposed is not None  # is it one that labels are to correct?
+    usual = PAPER if finished_policy else PRESET
     chosen, preset, rest = preset_of(task, rest, usual)
     kind = Label[task.config]  # pyright: ignore[reportInvalidTypeArguments]
     scenario, _ = taken(rest, "--scenario", ", ".join(task.scenarios) or "none")
@@ -113,9 +120,11 @@ def run(arguments: list[str]) -> None:
     source = _source(task, named, taken(rest, "--changes", "package.module:NAME")[0])
     world = source.config.task if source else preset.config.task
     world = changed.applied(world) if changed else world
+    if (cues := taken(rest, "--cues", WORDS)[0]) is not None:
+        world = with_cues(task, world, cues)
     by_evidence = _reads_evidence(rest)
     sizes, scalars, bound = preset.config.sizes, preset.config.scalars, None
-    if named is not None:  # as `adapt` corrects it
+    if finished_policy:  # as `adapt` corrects it
         frame = source.config.sizes.frame if source else sizes.frame
         sizes = adapting.SIZES if by_evidence else dataclasses.replace(adapting.SIZES, frame=frame)
         settling = calibrated.settling if by_evidence else adapting.settling
@@ -129,7 +138,7 @@ def run(arguments: list[str]) -> None:
         guidance=asking_kind(preset_kinds(task, preset)) if named is None else KIND.name,
         bound_deg=bound,
         labels=max(preset.labels) if named is None else calibrated.USUAL if by_evidence else Label.labels,
-        questions=NEAR_AIMS if named is None and task.near_aims else UNIFORM,
+        questions=UNIFORM if named is not None else _usual_questions(task),
     )
     asked = parse(kind, rest, f"label {task.name}", default, about(Label, task, preset=usual))
     plan = planned(task, preset.config, asked, named, source)
@@ -142,6 +151,53 @@ def run(arguments: list[str]) -> None:
     if finished is None:
         raise Interrupted(f"stopped; every answer is in {asked.out}: the same command goes on")
     out.print(f"done: {finished.line}\nnext: {finished.following}")
+
+
+def _task_named(arguments: list[str]) -> tuple[Task, list[str]]:
+    """The task named first, or that of a folder of situations, and the other arguments.
+
+    Raises UserError if it cannot be had.
+    """
+    folder = arguments[0].removeprefix("logs:") if arguments else ""
+    recorded = folder and folder not in registry.names() and (Path(folder).exists() or folder != arguments[0])
+    if not recorded:
+        return task_of(arguments, "label", Label)
+    rest = arguments[1:]
+    bounds = {name: _numbers(rest, f"--task.{name}") for name in ("low", "high")}
+    actions = taken(rest, "--task.actions", "box, directions or choices")[0] or "box"
+    cues = taken(rest, "--cues", WORDS)[0] or ""
+
+    def note(words: str) -> None:
+        console.print(words.replace("give low and high", "give --task.low and --task.high"))
+
+    return logs.task_of(folder, cues, **bounds, actions=actions, note=note), rest
+
+
+def _numbers(arguments: list[str], option: str) -> list[float] | None:
+    """The numbers behind an option; None: it is not given. Raises UserError for what is no number."""
+    if option not in arguments:
+        return None
+    behind = arguments[arguments.index(option) + 1 :]
+    given = list(itertools.takewhile(lambda word: not word.startswith("--"), behind))
+    try:
+        return [float(word) for word in given]
+    except ValueError:
+        raise UserError(f"{option} is {' '.join(given)!r}: give a number for each entry of an action") from None
+
+
+def with_cues(task: Task, config: Any, cues: str) -> Any:
+    """The configuration of a task with other words for its cues. Raises UserError for a task whose cues are its own."""
+    fields = {entry.name for entry in dataclasses.fields(config)}
+    if not {"cues", "cue_names"} <= fields:
+        raise UserError(f"--cues names cues, and {task.name} has its own: leave it out")
+    found = dataclasses.replace(config, cues=tuple(",".join(cue.words) for cue in cues_from(cues)))
+    shape_of(task, found)  # tells of cues that do not fit
+    return found
+
+
+def _usual_questions(task: Task) -> Literal["uniform", "near_aims", "proposed"]:
+    """What people are asked about where neither a policy is named nor anything else is said."""
+    return PROPOSED if task.proposed is not None else NEAR_AIMS if task.near_aims else UNIFORM
 
 
 def _reads_evidence(arguments: list[str]) -> bool:
@@ -266,6 +322,10 @@ def _base(task: Task, asked: Label[Any], named: str | None, source: PolicySource
             return Base(code_of(named), named)
         if asked.questions == UNIFORM:
             return Base(uniform_in(env), UNIFORM)
+        if asked.questions == PROPOSED:
+            if task.proposed is None:
+                raise UserError(f"--questions is {PROPOSED}, but {task.name} is no recording: give {UNIFORM}")
+            return Base(task.proposed(task.environment(asked.task)), PROPOSED)
         if not offers(env, "aims"):
             raise UserError(f"--questions is {NEAR_AIMS}, but {task.name} has no aims in this world: give {UNIFORM}")
         reach = float(actions_of(env).from_unit(REACH * asked.scalars.eps_deg))

@@ -120,15 +120,17 @@ def answers(form: AnswerForm, space: Space, one_cue: bool = False) -> tuple[Cont
     )
 
 
-def controls(form: AnswerForm, space: Space, one_cue: bool = False, films: bool = True) -> dict[str, Control]:
+def controls(
+    form: AnswerForm, space: Space, one_cue: bool = False, films: bool = True, simulated: bool = True
+) -> dict[str, Control]:
     """Everything that can be pressed, by name; a key that an answer has is no other control's.
 
-    `films`: is there a film of where an action leads?
+    `films`: is there a film of a situation? `simulated`: of where any action leads from there?
     """
     own, filmed = answers(form, space, one_cue), ()
     if films:
-        filmed = FILM, CORRECTED
-    if films and form.by_eps and len(space.cues) == 1:
+        filmed = (FILM, CORRECTED) if simulated else (FILM,)
+    if films and simulated and form.by_eps and len(space.cues) == 1:
         filmed += tuple(
             Control(f"film-{control.colour}", f"film of {control.words}", _cases(key))
             for control, key in ((own[0], "q"), (own[2], "e"))
@@ -191,7 +193,7 @@ def help_lines(form: AnswerForm, space: Space, known: Iterable[Control]) -> list
 
 def hint(number: int, known: Mapping[str, Control]) -> str:
     """What a person is to try at a question of practice, counted from 0."""
-    film = f" {known['film'].shown} shows a film of where the action leads." if "film" in known else ""
+    film = f" {known['film'].shown} shows a film." if "film" in known else ""
     told = {name: known[name].shown or known[name].words for name in ("unsure", "undo")}
     return PRACTICE[min(number, len(PRACTICE) - 1)].format(film=film, **told)
 

@@ -36,7 +36,8 @@ class Page:
         self.form, self.space = session.plan.form, session.space
         self._by_evidence = session.plan.guidance.kind.by_evidence
         self._one_cue = session.plan.one_cue
-        self.controls = controls.controls(self.form, self.space, self._one_cue, session.films)
+        films = session.films, session.simulates
+        self.controls = controls.controls(self.form, self.space, self._one_cue, *films)
         self._said: dict[int, float] = {}  # of the question on the screen, by the number of the cue
         self._said_of = session.number
         self._loop = asyncio.get_running_loop()

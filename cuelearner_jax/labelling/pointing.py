@@ -115,14 +115,14 @@ def from_foot(sketch: Sketch, ways: Sequence[Direction | None], shares: np.ndarr
 
 
 def change_words(space: Space, change: np.ndarray) -> str:
-    """Return a change (cues,) in the words of the cues, as "left by 12%, open by 30%"; `change` in the space's unit."""
+    """Return a change (cues,) in the words of the cues, as "left by 12%, open by 30% of the range".
+
+    `change` is in the space's unit.
+    """
+    scale, unit = (100, "%") if space.unit == SHARE else (1, f" {space.unit}")
     told = [
-        f"{cue.words[0 if part > 0 else 1]} by {_amount(abs(part), cue.unit)}"
+        f"{cue.words[0 if part > 0 else 1]} by {scale * abs(part):.2g}{unit}"
         for cue, part in zip(space.cues, np.asarray(change, float), strict=True)
         if abs(part) >= 0.005 * space.reach
     ]
-    return ", ".join(told) or "as it is"
-
-
-def _amount(value: float, unit: str) -> str:
-    return f"{100 * value:.0f}% of its range" if unit == SHARE else f"{value:.2g} {unit}"
+    return f"{', '.join(told)}{' of the range' if space.unit == SHARE else ''}" if told else "as it is"

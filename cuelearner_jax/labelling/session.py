@@ -124,7 +124,7 @@ class Session:
         tell("preparing questions")
         self._ensure(self.number)
         self._ensure(self.number + 1)
-        self.film(self.number, self._items[self.number].action)
+        self.films = self.film(self.number, self._items[self.number].action) is not None  # are there any?
         self._next: Future[None] = self._ahead.submit(self._ensure, self.number + 1)
         self._since = time.monotonic()
 
@@ -229,9 +229,9 @@ class Session:
         return self._pictures.legend
 
     @property
-    def films(self) -> bool:
-        """Is there a film of where an action leads?"""
-        return self._pictures.reel is not None
+    def simulates(self) -> bool:
+        """Is a film what any action would lead to?"""
+        return self._pictures.simulates
 
     @property
     def item(self) -> Item | None:

@@ -121,5 +121,5 @@ def test_the_picture_of_an_action_that_is_no_arrow_says_what_it_is():
         "fingers -1. The correction: as it is"
     )
     told = view.note(item._replace(refined=np.float32([0.1, 1.0, -0.5])), RELATIVE, EPS, GRIPPER)
-    assert told.endswith("The correction: right by 20% of its range, open by 25% of its range")
+    assert told.endswith("The correction: right by 20%, open by 25% of the range")
     assert probes.SCALARS.eps_deg != EPS
