@@ -58,11 +58,11 @@ class Pictures(NamedTuple):
     # (environment, state, action (action,)): what the action leads to, to be seen in the sketch of the state
     # None, or no reel: there is none
     reel: Callable[[Any, EnvState, Float[Array, " action"]], Reel | None] | None = None
-    simulates: bool = True  # is a reel what the action would lead to? False: what was recorded, whatever the action is
     # (environment, state, actions (n, action)): SVG elements of where each of the actions leads, to be seen in the
     # sketch of the state; they take their colour from the group around them
     trails: Callable[[Any, EnvState, Float[Array, "n action"]], list[str]] | None = None
     legend: str = ""  # what the trails mean, for a person
+    simulates: bool = True  # is a reel what the action would lead to? False: what was recorded, whatever the action is
 
 
 @dataclass(frozen=True)

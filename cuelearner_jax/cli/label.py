@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import shlex
 import webbrowser
 from dataclasses import dataclass, field
@@ -19,8 +18,9 @@ from cuelearner_jax import config as configuration
 from cuelearner_jax.adaptation import adapting, calibrated, changes
 from cuelearner_jax.calibration import declared
 from cuelearner_jax.calibration.families import Family
-from cuelearner_jax.cli.parsing import PAPER, about, check_numbers, code_of, out, parse, preset_of, taken, task_of
+from cuelearner_jax.cli.parsing import PAPER, about, check_numbers, code_of, out, parse, preset_of, taken
 from cuelearner_jax.cli.shared_options import Flag, Lane, TaskT, asking_kind
+from cuelearner_jax.cli.situations import WORDS, task_named, with_cues
 from cuelearner_jax.config import GuideScalars, GuideSizes, Scalars
 from cuelearner_jax.environment import actions_of, offers
 from cuelearner_jax.errors import UserError
@@ -33,18 +33,16 @@ from cuelearner_jax.policies import NearAims, uniform_in
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs.grid import LARGEST_SEED
 from cuelearner_jax.runs.trained import PolicySource
-from cuelearner_jax.spaces import cues_from
 from cuelearner_jax.storage import label_files
 from cuelearner_jax.storage.folders import claimed
 from cuelearner_jax.studies.train import preset_kinds
 from cuelearner_jax.task import Task, shape_of
-from cuelearner_jax.tasks import logs, registry
+from cuelearner_jax.tasks import registry
 from cuelearner_jax.terminal import Interrupted, console, interruptible
 
 UNIFORM, NEAR_AIMS, PROPOSED = "uniform", "near_aims", "proposed"
 REACH = 1.5  # of questions near an aim: from the aim, in turns by eps
 PRESET = "quickstart"  # where none is given and chance is asked about: what is labelled trains in minutes
-WORDS = 'words such as "left,right;up,down"'
 PRACTICE = len(controls.PRACTICE)  # questions
 MOST_LABELS = 100_000
 UNDRAWN = "a person cannot label what nobody draws; give its Body `pictures` with a `sketch`, or another --robot"
@@ -109,7 +107,7 @@ def run(arguments: list[str]) -> None:
         Interrupted: Ctrl-C or SIGTERM; every answer is saved.
     """
     server, typed = _server(), list(arguments)
-    task, rest = _task_named(arguments)
+    task, rest = task_named(arguments, "label", Label)
     named, rest = (rest[0], rest[1:]) if rest and not rest[0].startswith("-") else (None, rest)
     finished_policy = named is not None or task.proposed is not None  # is it one that labels are to correct?
     usual = PAPER if finished_policy else PRESET
@@ -151,48 +149,6 @@ def run(arguments: list[str]) -> None:
     if finished is None:
         raise Interrupted(f"stopped; every answer is in {asked.out}: the same command goes on")
     out.print(f"done: {finished.line}\nnext: {finished.following}")
-
-
-def _task_named(arguments: list[str]) -> tuple[Task, list[str]]:
-    """The task named first, or that of a folder of situations, and the other arguments.
-
-    Raises UserError if it cannot be had.
-    """
-    folder = arguments[0].removeprefix("logs:") if arguments else ""
-    recorded = folder and folder not in registry.names() and (Path(folder).exists() or folder != arguments[0])
-    if not recorded:
-        return task_of(arguments, "label", Label)
-    rest = arguments[1:]
-    bounds = {name: _numbers(rest, f"--task.{name}") for name in ("low", "high")}
-    actions = taken(rest, "--task.actions", "box, directions or choices")[0] or "box"
-    cues = taken(rest, "--cues", WORDS)[0] or ""
-
-    def note(words: str) -> None:
-        console.print(words.replace("give low and high", "give --task.low and --task.high"))
-
-    return logs.task_of(folder, cues, **bounds, actions=actions, note=note), rest
-
-
-def _numbers(arguments: list[str], option: str) -> list[float] | None:
-    """The numbers behind an option; None: it is not given. Raises UserError for what is no number."""
-    if option not in arguments:
-        return None
-    behind = arguments[arguments.index(option) + 1 :]
-    given = list(itertools.takewhile(lambda word: not word.startswith("--"), behind))
-    try:
-        return [float(word) for word in given]
-    except ValueError:
-        raise UserError(f"{option} is {' '.join(given)!r}: give a number for each entry of an action") from None
-
-
-def with_cues(task: Task, config: Any, cues: str) -> Any:
-    """The configuration of a task with other words for its cues. Raises UserError for a task whose cues are its own."""
-    fields = {entry.name for entry in dataclasses.fields(config)}
-    if not {"cues", "cue_names"} <= fields:
-        raise UserError(f"--cues names cues, and {task.name} has its own: leave it out")
-    found = dataclasses.replace(config, cues=tuple(",".join(cue.words) for cue in cues_from(cues)))
-    shape_of(task, found)  # tells of cues that do not fit
-    return found
 
 
 def _usual_questions(task: Task) -> Literal["uniform", "near_aims", "proposed"]:
@@ -380,6 +336,8 @@ def _following(task: Task, preset: str, config: RunConfig, asked: Any, policy: s
     if asked.again is not None:
         return shlex.join(["cuelearner", "labels", "inspect", str(asked.again), out])
     given = ["--labels-from", out, "--labels", str(labels)]
+    if policy is None and asked.questions == PROPOSED:
+        return f'cl.correct(policy, "{out}")  # in Python, after: import cuelearner_jax as cl'
     if policy is None:
         words = ["train", name, "--preset", preset, "--guidance", asked.guidance, *given]
         parts = ("task", task.config), ("sizes", GuideSizes), ("scalars", GuideScalars)

@@ -119,10 +119,14 @@ def change_words(space: Space, change: np.ndarray) -> str:
 
     `change` is in the space's unit.
     """
-    scale, unit = (100, "%") if space.unit == SHARE else (1, f" {space.unit}")
+    of_range = space.unit == SHARE
     told = [
-        f"{cue.words[0 if part > 0 else 1]} by {scale * abs(part):.2g}{unit}"
+        f"{cue.words[0 if part > 0 else 1]} by {_amount(abs(part), space.unit)}"
         for cue, part in zip(space.cues, np.asarray(change, float), strict=True)
         if abs(part) >= 0.005 * space.reach
     ]
-    return f"{', '.join(told)}{' of the range' if space.unit == SHARE else ''}" if told else "as it is"
+    return f"{', '.join(told)}{' of the range' if of_range else ''}" if told else "as it is"
+
+
+def _amount(value: float, unit: str) -> str:
+    return f"{100 * value:.0f}%" if unit == SHARE else f"{value:.2g} {unit}"
