@@ -27,14 +27,14 @@ def task_named(arguments: list[str], command: str, kind: type) -> tuple[Task, li
     if not recorded:
         return task_of(arguments, command, kind)
     rest = arguments[1:]
-    bounds = {name: _numbers(rest, f"--task.{name}") for name in ("low", "high")}
+    low, high = (_numbers(rest, f"--task.{name}") for name in ("low", "high"))
     actions = taken(rest, "--task.actions", "box, directions or choices")[0] or "box"
     cues = taken(rest, "--cues", WORDS)[0] or ""
 
     def note(words: str) -> None:
         console.print(words.replace("give low and high", "give --task.low and --task.high"))
 
-    return logs.task_of(folder, cues, **bounds, actions=actions, note=note), rest
+    return logs.task_of(folder, cues, low, high, actions, note=note), rest
 
 
 def _numbers(arguments: list[str], option: str) -> list[float] | None:

@@ -118,9 +118,8 @@ def _cues(item: Item, space: Space, answers: Sequence[Control]) -> list[str]:
     assert item.sketch is not None
     ways, middle = pointing.ways_of(space, item.sketch), space.middle()
     parts = pointing.answers_drawn(item.sketch, ways, answers)
-    shown = {"asked": item.action, "refined": item.refined} if middle is not None else {}
-    for name, action in shown.items():
-        if action is not None:
+    for name, action in (("asked", item.action), ("refined", item.refined)):
+        if action is not None and middle is not None:
             shares = np.asarray(space.to_unit(space.log(middle, action))) / (space.reach / 2)
             parts.append(pointing.from_foot(item.sketch, ways, shares, name))
     return parts
