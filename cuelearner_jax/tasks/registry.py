@@ -21,11 +21,15 @@ GROUP = "cuelearner.tasks"  # of entry points: the task's name = "package.module
 BUILT_IN = {
     "billiards": "cuelearner_jax.tasks.billiards:BILLIARDS",
     "gymnasium": "cuelearner_jax.tasks.gymnasium:GYMNASIUM",
+    "logs": "cuelearner_jax.tasks.logs:LOGS",
     "navigation": "cuelearner_jax.tasks.navigation:NAVIGATION",
 }
 # Environments of other libraries, named FAMILY:ENVIRONMENT: a function from the environment's name to a task, which
 # bears the family's name. The family's own task, by which its folders are read, is built in.
-FAMILIES: dict[str, str] = {"gymnasium": "cuelearner_jax.tasks.gymnasium:task_of"}
+FAMILIES: dict[str, str] = {
+    "gymnasium": "cuelearner_jax.tasks.gymnasium:task_of",
+    "logs": "cuelearner_jax.tasks.logs:task_of",
+}
 
 _registered: dict[str, Task] = {}
 
