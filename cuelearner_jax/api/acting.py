@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from cuelearner_jax.config import LARGEST_FLOAT
 from cuelearner_jax.environment import Quantity, actions_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.policies import Policy, acted, in_space, named
+from cuelearner_jax.policies.foreign import ONNX
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs import trained
 from cuelearner_jax.spaces import DIRECTIONS, Space
@@ -85,10 +87,12 @@ class CallablePolicy:
 
 
 def as_policy(given: Any, name: str = "policy") -> Policy:
-    """Anything that acts as a policy: a `CallablePolicy`, or what `policies.policy_of` takes.
+    """Anything that acts as a policy: a `CallablePolicy`, a folder of ours, or what `policies.policy_of` takes.
 
     Raises UserError, which says the argument's name, for what is none of them.
     """
+    if isinstance(given, str | os.PathLike) and not str(given).endswith(ONNX):
+        given = load_policy(given)
     return given.policy if isinstance(given, CallablePolicy) else arguments.policy(name, given)
 
 

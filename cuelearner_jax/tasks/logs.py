@@ -33,6 +33,7 @@ from cuelearner_jax.guides.relative import KIND
 from cuelearner_jax.policies import PolicyNode
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.spaces import DIRECTIONS, Box, Choices, Space, cues_from
+from cuelearner_jax.spaces.box import SHARE
 from cuelearner_jax.spaces.choices import STEPS
 from cuelearner_jax.storage import situations
 from cuelearner_jax.storage.situations import Situations
@@ -74,6 +75,8 @@ class LogsConfig:
     """Words for more and less of each entry, as "left,right" (default: "more,less")."""
     cue_names: tuple[str, ...] = ()
     """A name for each cue (default: its words)."""
+    keys: tuple[str, ...] = ()
+    """Keys for more and less of each cue, as "q,a" (default: arrows for left and right, or letters of the words)."""
     centre: tuple[float, ...] = ()
     """What networks subtract of each entry of an observation (default: nothing)."""
     spread: tuple[float, ...] = ()
@@ -84,10 +87,14 @@ def space_of(config: LogsConfig) -> Space:
     """The actions of a configuration. Raises UserError for bounds or cues that fit no space."""
     if config.actions == "directions":
         return DIRECTIONS
-    if config.actions == "choices":
-        order = cues_from(config.cues, config.cue_names, STEPS) if config.cues else ()
-        return Choices(len(config.low), *order)
-    return Box(config.low, config.high, cues_from(config.cues, config.cue_names) if config.cues else ())
+    unit = STEPS if config.actions == "choices" else SHARE
+    cues = cues_from(config.cues, config.cue_names, unit) if config.cues else ()
+    if cues and config.keys:
+        pairs = [tuple(pair.split(",")) for pair in config.keys]
+        if len(pairs) != len(cues) or not all(len(pair) == 2 and all(pair) for pair in pairs):
+            raise UserError(f"task.keys is {config.keys}: give two keys for each cue, as q,a")
+        cues = tuple(dataclasses.replace(cue, keys=pair) for cue, pair in zip(cues, pairs, strict=True))
+    return Choices(len(config.low), *cues) if config.actions == "choices" else Box(config.low, config.high, cues)
 
 
 class Layout(WholeObservations, struct.PyTreeNode):
@@ -385,6 +392,7 @@ LOGS = Task(
     config=LogsConfig,
     bodies=(BODY,),
     # A label is of what was seen and proposed, wherever that lies now.
-    labels_hold=("path", "digest", "rows", "order", "cues", "cue_names", "centre", "spread"),
+    labels_hold=("path", "digest", "rows", "order", "cues", "cue_names", "keys", "centre", "spread"),
+    files=lambda config: {"path": config.digest} if config.path else {},
     judge_by=lambda config: LABELS,
 )
