@@ -47,6 +47,7 @@ class CallablePolicy:
     asks: bool = False  # does it ask a teacher, who looks at the true state?
     trained: RunConfig | None = None  # with which configuration; None: no folder says so
     actions: Space = DIRECTIONS  # in which it acts
+    world: World | None = None  # where it was corrected, or loaded for; None: nothing says so
 
     def __post_init__(self) -> None:
         """Raises UserError for a policy that is none, or a description of observations that is none."""
@@ -173,4 +174,6 @@ def load_policy(
     shape = shape_of(known, changed)
     bound_deg = arguments.optional(arguments.amount, "bound_deg", bound_deg, actions_of(shape))
     found = trained.one_policy(source, changed, name, guidance, labels, seed, bound_deg)
-    return CallablePolicy(found, shape.observation, trained.POLICIES[name].taught, source.config, actions_of(shape))
+    where = world or World(known, changed)
+    taught = trained.POLICIES[name].taught
+    return CallablePolicy(found, shape.observation, taught, source.config, actions_of(shape), where)
