@@ -118,6 +118,8 @@ class Task:
     labels_hold: tuple[str, ...] = ()  # fields of the configuration that labels of another world may differ in
     origin: str = ""  # "package.module:name" where it was taken from outside, by whoever resolved that
     default: Any = None  # the configuration that holds where nothing is given; None: `config()`
+    # configuration -> the metric that adapted policies are judged by where nothing else says
+    judge_by: Callable[[Any], str] = lambda config: "reward"
 
     def __post_init__(self) -> None:
         """Raises ValueError for the first thing that cannot be."""

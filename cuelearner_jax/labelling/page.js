@@ -60,17 +60,24 @@ const cue = {
     const scene = cue.scene();
     if (!scene || +scene.dataset.item !== film.item) return;
     const movers = Object.fromEntries([...scene.querySelectorAll(".mover")].map(one => [one.dataset.mover, one]));
-    const show = places => Object.entries(movers).forEach(([name, mover]) => cue.place(mover, places[name]));
-    const run = ++cue.playing, start = performance.now(), last = film.frames.length - 1;
+    const photo = scene.querySelector("image.photo");
+    if (photo && !photo.dataset.stands) photo.dataset.stands = photo.getAttribute("href");
+    const show = (places, picture) => {
+      Object.entries(movers).forEach(([name, mover]) => cue.place(mover, places[name]));
+      if (photo && picture && photo.getAttribute("href") !== picture) photo.setAttribute("href", picture);
+    };
+    const run = ++cue.playing, start = performance.now();
+    const last = Math.max(film.frames.length, film.pictures.length) - 1;
     const words = document.querySelector(".film-words");
     if (words) words.textContent = "";
     const tick = now => {
       if (run !== cue.playing || !scene.isConnected) return;
       const at = Math.floor((now - start) / 1000 / film.period);
-      show(film.frames[Math.max(0, Math.min(at, last))]);
+      const frame = Math.max(0, Math.min(at, last));
+      show(film.frames[frame] || {}, film.pictures[frame]);
       if (at >= last && words) words.textContent = film.words;
       if (at * film.period < last * film.period + 1.0) requestAnimationFrame(tick);
-      else show(JSON.parse(scene.dataset.places));
+      else show(JSON.parse(scene.dataset.places), photo && photo.dataset.stands);
     };
     requestAnimationFrame(tick);
   },

@@ -112,7 +112,7 @@ def _arrows(item: Item, form: AnswerForm, eps_deg: float) -> list[str]:
 
 def film(item: Item, reel: Reel) -> str:
     """A film for the page's script, as JSON."""
-    return json.dumps({"item": item.number, "period": reel.period, "frames": reel.frames, "words": reel.words})
+    return json.dumps({"item": item.number, **reel._asdict()})
 
 
 def _moved(sketch: Sketch, name: str) -> str:
