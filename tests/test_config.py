@@ -123,7 +123,7 @@ def test_bootstraps_with_a_discount():
 
 
 def test_scalars_and_schedule_are_trees_of_their_numbers_and_sizes_are_not():
-    words = {"answer": "nearest"}
+    words = {"answer": "nearest", "says": "worst"}
     assert len(jax.tree.leaves(Scalars())) == len(dataclasses.fields(Scalars)) - len(words)
     for name, word in words.items():  # part of the program
         other = dataclasses.replace(Scalars(), **{name: word})

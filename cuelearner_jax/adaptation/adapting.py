@@ -143,6 +143,8 @@ def check_amounts(space: Space, bounds: Sequence[float], scalars: Scalars) -> st
         raise UserError(f"bound_deg is {given}: give a number above 0 and up to {space.reach:g} ({space.unit})")
     if len(set(bounds)) < len(bounds):
         raise UserError(f"bound_deg is {given}: give each bound once")
+    if eps < space.grain:
+        raise UserError(f"scalars.eps_deg is {eps:g} {space.unit}: give at least {space.grain:g}, the smallest change")
     if eps > min(bounds):
         raise UserError(
             f"labels of {eps:g} {space.unit} say nothing within a bound of {min(bounds):g}: give a smaller "
@@ -161,6 +163,11 @@ def check_amounts(space: Space, bounds: Sequence[float], scalars: Scalars) -> st
     )
 
 
+def usual_bound(space: Space) -> float:
+    """How far corrections may lead where nobody says how far, in the space's unit: a quarter of its reach."""
+    return max(BOUND * space.reach, space.grain)
+
+
 def reach(space: Space, policy: Policy, obs: Any, action: Any) -> float:
     """The distance within which 95% of actions (labels, action) lie from a policy's own, in the space's unit."""
     away = _distances(space, policy, jnp.asarray(obs), jnp.asarray(action))
@@ -174,10 +181,11 @@ def _distances(space: Space, policy: Any, obs: Array, action: Array) -> Array:
 
 
 def plain_scalars(space: Space) -> Scalars:
-    """Default scalars in a space's unit: as much of its reach as they are of a half turn."""
+    """Default scalars in a space's unit: as much of its reach as they are of a half turn, eps at least its grain."""
     names = ("eps_deg", "tau_deg", "tau_max_deg", "scalar_within_deg", "nearest_aim_deg")
     share = space.reach / DIRECTIONS.reach
-    return replace(Scalars(), **{name: getattr(Scalars, name) * share for name in names})
+    scalars = replace(Scalars(), **{name: getattr(Scalars, name) * share for name in names})
+    return replace(scalars, eps_deg=max(scalars.eps_deg, space.grain)) if space.grain else scalars
 
 
 def settling(scalars: Scalars, eps_deg: float | None) -> Scalars:

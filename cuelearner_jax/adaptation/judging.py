@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
 from cuelearner_jax.adaptation.lanes import Adaptation, Lanes, LaneState
 from cuelearner_jax.asking import fitted_labels
@@ -25,7 +25,6 @@ from cuelearner_jax.errors import UserError, closest
 from cuelearner_jax.evaluate import Rolled, Tell, episodes, mean_interval, watched_lanes
 from cuelearner_jax.policies import PolicyBlock
 from cuelearner_jax.spaces import said
-from cuelearner_jax.types import Label
 
 HELD_OUT = 5  # every fifth label
 LABELS = "labels"  # what is judged by, in place of a metric
@@ -184,7 +183,7 @@ def judged_by_labels(of: Adaptation, block: LaneState) -> Judged:
 
 @jax.jit
 def _predicted(of: Adaptation, block: LaneState) -> tuple[Array, Array]:
-    """Shares (lanes,) of held-out answers that are 0, and that a model of the others predicts."""
+    """Shares (lanes,) of what held-out answers say of a cue that is 0, and that a model of the others says too."""
     guidance, env, space = of.guidance, of.env, actions_of(of.env)
     one_pass = dataclasses.replace(of.scalars, k_max=1, tau_max_deg=space.reach)
 
@@ -194,16 +193,13 @@ def _predicted(of: Adaptation, block: LaneState) -> tuple[Array, Array]:
         held = labels.valid & (jnp.arange(labels.valid.shape[0]) % HELD_OUT == HELD_OUT - 2)
         others = labels.replace(valid=labels.valid & ~held)
         model = guidance.fit(key, env, others, guidance.init(key), of.scalars)
-        right, zero = _right(labels, guidance.moved_on(model, env, labels, held, one_pass).actions)
-        count = jnp.maximum(held.sum(), 1)
-        return jnp.sum(zero, where=held) / count, jnp.where(held.any(), jnp.sum(right, where=held) / count, jnp.nan)
-
-    def _right(labels: Label, moved: Float[Array, "n action"]) -> tuple[Array, Array]:
-        """Shares (n,) of what was said of each label that the model says too, and that is "already right"."""
+        moved = guidance.moved_on(model, env, labels, held, one_pass).actions
         moves = space.log(labels.action, moved) / space.from_unit(of.scalars.eps_deg)
-        told = said(labels.answer)
-        share = lambda flags: jnp.mean(flags, -1, where=told)  # noqa: E731
-        return share(jnp.round(jnp.clip(moves, -1, 1)) == labels.answer), share(labels.answer == 0)
+        told = said(labels.answer) & held[:, None]  # words about one cue each; of the other cues nothing is compared
+        count = jnp.maximum(told.sum(), 1)
+        share = lambda flags: jnp.sum(flags, where=told) / count  # noqa: E731
+        right = share(jnp.round(jnp.clip(moves, -1, 1)) == labels.answer)
+        return share(labels.answer == 0), jnp.where(told.any(), right, jnp.nan)
 
     return each_lane(one)(block)
 

@@ -148,7 +148,7 @@ def ask(
     labels, seed = arguments.budget("labels", labels), arguments.seed("seed", seed)
     a_world("world", world)
     space = actions_of(world.env)
-    bound = arguments.optional(arguments.amount, "bound_deg", bound_deg, space) or adapting.BOUND * space.reach
+    bound = arguments.optional(arguments.amount, "bound_deg", bound_deg, space) or adapting.usual_bound(space)
     sizes, scalars = settings(space, *given_settings(space, sizes, scalars, eps_deg))
     teacher = arguments.teacher("teacher", teacher, space)
     check_teacher(teacher, scalars)

@@ -147,8 +147,16 @@ class Calibration:
         answer: Float[Given, "n cues"],
         doubt: Float[Given, " n"] | None = None,
     ) -> None:
-        """Take answers (-1, 0, 1 or `UNSAID`, a cue each) and fit what may have changed to all so far."""
+        """Take answers (-1, 0, 1 or `UNSAID`, a cue each) and fit what may have changed to all so far.
+
+        An answer that says nothing of any cue is none.
+        """
         obs, action, answer = (np.asarray(rows, np.float32) for rows in (obs, action, answer))
+        there = np.asarray(said(jnp.asarray(answer)) & np.isfinite(answer)).any(-1)
+        obs, action, answer = obs[there], action[there], answer[there]
+        if not len(obs):
+            return
+        doubt = None if doubt is None else np.asarray(doubt)[there]
         self._scaled(obs)
         if doubt is None:
             doubt = ties(self.meaning, (), np.zeros(0), obs, self.eps)

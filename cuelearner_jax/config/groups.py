@@ -85,6 +85,9 @@ class TeacherFaults:
     answer: Literal["best", "nearest", "shuffled"] = "best"
     """What it has in mind: its best action, or of those that it holds for good the nearest to the one asked about.
     shuffled, a control: best, but models are fitted to labels that have each other's answers."""
+    says: Literal["all", "worst", "one"] = "all"
+    """Relative feedback of several cues speaks of all of them, of the one whose difference is largest, or of one at
+    random; of the others nothing is said, which does not mean "already right"."""
     nearest_share: Annotated[float, SHARE] = 0.6
     """Good is an action worth at least this share of the best one."""
     nearest_aim_deg: Annotated[float, Bounds(0)] = 1.0

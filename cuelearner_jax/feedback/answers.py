@@ -99,7 +99,8 @@ def human_answer(
 ) -> tuple[Float[Array, " cues"], Bool[Array, ""]]:
     """The answer of somebody with the faults of `scalars` who would do `best`: (h of each cue, answered).
 
-    Mistakes and silence come upon each cue by itself; one of whose cues nothing is said did not answer.
+    Mistakes and silence come upon each cue by itself. `scalars.says` decides of which cues anything is said: of the
+    others h is `UNSAID`. Who says nothing of any cue did not answer.
     """
     mistaken, spoken = _slips(key, scalars, (len(space.cues),))
     believed = biased(space, best, space.from_unit(scalars.teacher_bias_deg))
@@ -108,7 +109,21 @@ def human_answer(
     h = jnp.where(mistaken, -h, h)
     if len(space.cues) == 1:  # of one cue, nothing said is no answer
         return h, spoken[0]
+    spoken = spoken & _spoken_of(key, space.log(action, believed), scalars.says)
     return jnp.where(spoken | ~jnp.isfinite(h), h, UNSAID), spoken.any()
+
+
+def _spoken_of(key: PRNGKeyArray, off: Float[Array, " cues"], says: str) -> Bool[Array, " cues"]:
+    """Of which cues a teacher speaks: of all, of the one with the largest difference (ties: the first), or of any one.
+
+    Cues of one space count in one unit, so the largest difference is also the largest in units of eps.
+    """
+    if says == "all":
+        return jnp.ones(off.shape, bool)
+    number = jnp.arange(len(off))
+    if says == "worst":
+        return number == jnp.argmax(jnp.abs(off))
+    return number == jax.random.randint(jax.random.fold_in(key, len(off)), (), 0, len(off))
 
 
 def demonstrated(

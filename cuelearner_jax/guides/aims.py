@@ -30,14 +30,21 @@ def log_density(
 ) -> Float[Array, " m"]:
     """log of the probability density of actions, of which all alike have 0.
 
-    What is meant lies round one of the aims, along each cue with a logistic error of `SPREAD`, or, with the last
-    probability of `share`, anywhere: no action is ruled out.
+    What is meant lies round one of the aims, along each cue with a logistic error of `SPREAD` (of choices it is the
+    aim itself), or, with the last probability of `share`, anywhere: no action is ruled out.
     """
+    if space.grain:
+        same = space.distance(actions[:, None], aims[None]) < space.grain
+        return _log_mixed(share, 1.0 * len(space.spread(1)) * same)
     # The range of a cue in spreads: directions reach to either side of any of them.
     extent = (2.0 if space == DIRECTIONS else 1.0) / SPREAD
     off = space.to_unit(space.log(actions[:, None], aims[None])) / (SPREAD * space.reach)
     each = extent * jax.nn.sigmoid(off) * jax.nn.sigmoid(-off)  # of a logistic distribution
     near = each[..., 0] if len(space.cues) == 1 else each.prod(-1)
+    return _log_mixed(share, near)
+
+
+def _log_mixed(share: Float[Array, " aims_and_none"], near: Float[Array, "m aims"]) -> Float[Array, " m"]:
     return jnp.log(jnp.maximum(jnp.sum(share[None, :-1] * near, -1) + share[-1], LEAST))
 
 

@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from cuelearner_jax.config import GuideScalars, GuideSizes
 from cuelearner_jax.environment import Spaces
+from cuelearner_jax.errors import UserError
 from cuelearner_jax.feedback.forms import AnswerForm
 from cuelearner_jax.guides.fitting import Lesson, fit_least_squares, lessons
 from cuelearner_jax.guides.model import GuideModel, guide_model
@@ -90,6 +91,14 @@ class Guide:
     sizes: GuideSizes
     spaces: Spaces
     options: Any = None  # a `Kind.config`
+
+    def __post_init__(self) -> None:
+        """Raises UserError for a kind whose answers say which way, in a space where there is no way."""
+        if self.form is not None and self.form.by_eps and not self.spaces.actions.cues:
+            raise UserError(
+                f"guidance {self.name!r} asks which way to change an action, and the {self.spaces.actions.name} have "
+                "no order: give them one (`Choices(count, order)`), or guidance demonstration or scalar"
+            )
 
     @property
     def name(self) -> str:

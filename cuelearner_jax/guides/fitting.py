@@ -38,22 +38,35 @@ def lessons(
     scalars: GuideScalars,
     space: Space | None = None,
 ) -> Lesson:
-    """Labels (slots, ...) with what their answers mean to a network; `space`: of answers that may leave cues out."""
+    """Labels (slots, ...) with what their answers mean to a network; `space`: of answers that may leave cues out.
+
+    A label that says nothing of any cue is none.
+    """
     targets = jax.vmap(lambda label: target(label, scalars))(labels)
     # Rounded here, whatever is computed of them next: fused with that, their last bits would hang on the compiler.
     rows = Lesson(labels.obs, labels.action, jax.lax.optimization_barrier(targets), labels.valid)
     if space is None or len(space.cues) == 1:
         return rows
-    return rows.replace(said=said(labels.answer), space=space)
+    told = said(labels.answer)
+    return rows.replace(valid=labels.valid & told.any(-1), said=told, space=space)
 
 
 def squared(rows: Lesson, predicted: Float[Array, "n outputs"]) -> Float[Array, " n"]:
-    """Squared errors of predictions; along the cues of which something was said, where a label leaves some out."""
+    """Squared errors of predictions, L = |f - y|^2 (paper, Eq. 3).
+
+    Where labels may leave cues out, L is the sum over the cues of which something was said of (d log (f - y))^2, the
+    error along that cue in the space's unit. A cue of which nothing was said adds nothing, whatever is predicted.
+    """
     off = predicted - rows.target
     if rows.said is None:
         return jnp.sum(jnp.square(off), -1)
-    assert rows.space is not None  # `lessons` gives both
-    return jnp.sum(jnp.square(jax.vmap(rows.space.along)(rows.action, off)), -1, where=rows.said)
+    return jnp.sum(jnp.square(along_cues(rows, off)), -1, where=rows.said)
+
+
+def along_cues(rows: Lesson, vectors: Float[Array, "n action"]) -> Float[Array, "n cues"]:
+    """What vectors added to the actions of lessons, which say of which cues they speak, change along each cue."""
+    assert rows.space is not None  # `lessons` gives it with `said`
+    return jax.vmap(rows.space.along)(rows.action[..., : rows.space.size], vectors)
 
 
 def optimizer(scalars: GuideScalars) -> optax.GradientTransformation:

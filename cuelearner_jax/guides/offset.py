@@ -6,6 +6,12 @@ from them. So a correction has two parts: one of the turn alone, a smoothing spl
 with B-splines and penalties", Statistical Science 1996), and a network's, which sees the turn beside situation and
 action and is fitted to what the spline leaves. The network counts as much as held-out labels say that it should
 (stacked regressions: Breiman, Machine Learning 1996): by nothing, where it predicts them no better.
+
+With a_0 what the policy did, t = log(a_0, a) / eps the turn so far along each cue, m_c a spline for each cue c:
+
+    m_c = argmin over m of sum over labels that speak of c of (h_c - m(t_c))^2 + ROUGHNESS |m''|^2 + RIDGE |m|^2
+    phi(s, a) = exp(a, eps m(t)) - a + eps w f(s, a, t),   w in [0, 1] the share of the network f
+    a <- clip(retract(a + phi(s, a)), a_0, tau_max), until a pass moves a by less than tau, K_max passes at most
 """
 
 from __future__ import annotations
@@ -14,18 +20,19 @@ from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from cuelearner_jax.config import GuideScalars
 from cuelearner_jax.feedback.answers import RELATIVE
-from cuelearner_jax.guides.base import Kind
-from cuelearner_jax.guides.fitting import fit_least_squares, held_out, lessons
+from cuelearner_jax.guides.base import Guide, Kind
+from cuelearner_jax.guides.fitting import Lesson, along_cues, fit_least_squares, held_out
 from cuelearner_jax.guides.model import GuideModel, guide_model
 from cuelearner_jax.guides.refining import Refined
 from cuelearner_jax.guides.relative import Relative
-from cuelearner_jax.spaces import Space, check_directions
+from cuelearner_jax.spaces import Space
 from cuelearner_jax.types import GuidanceModel, Label, Params
 
 KNOTS = 13  # evenly spaced, from the largest turn that was asked about on one side to that on the other
@@ -34,10 +41,10 @@ RIDGE = 0.3  # the same of its squared heights: what nothing was asked about is 
 
 
 class Spline(struct.PyTreeNode):
-    """A function of the turn: straight lines between knots, level beyond them."""
+    """A function of the turn: straight lines between knots, level beyond them. Of several cues each has its own."""
 
-    heights: Float[Array, " knots"]  # in units of eps, counterclockwise
-    reach: Float[Array, ""]  # turn of the outermost knots, in units of eps
+    heights: Float[Array, "*cues knots"]  # in units of eps; of directions counterclockwise
+    reach: Float[Array, "*cues"]  # turn of the outermost knots, in units of eps
 
 
 class TwoParts(struct.PyTreeNode):
@@ -50,9 +57,9 @@ class TwoParts(struct.PyTreeNode):
 
 def turned(
     space: Space, first: Float[Array, "n action"], actions: Float[Array, "n action"], eps: Float[Array, ""]
-) -> Float[Array, " n"]:
-    """How far actions lie from what they were first, counterclockwise, in units of eps."""
-    return space.log(first, actions)[..., 0] / eps
+) -> Float[Array, "n cues"]:
+    """How far actions lie from what they were first along each cue, in units of eps."""
+    return space.log(first, actions) / eps
 
 
 def _hats(turns: Float[Array, " n"], reach: Float[Array, ""]) -> Float[Array, "n knots"]:
@@ -81,11 +88,27 @@ def smoothed(turns: Float[Array, " n"], wanted: Float[Array, " n"], valid: Bool[
     return Spline(jnp.linalg.solve(normal, hats.T @ jnp.where(valid, wanted, 0.0)), reach)
 
 
+def smoothed_cues(
+    turns: Float[Array, "n cues"], wanted: Float[Array, "n cues"], counts: Bool[Array, "n cues"]
+) -> Spline:
+    """`smoothed` for each cue by itself; a spline of one cue has no axis of cues."""
+    if turns.shape[1] == 1:
+        return smoothed(turns[:, 0], wanted[:, 0], counts[:, 0])
+    return jax.vmap(smoothed, 1)(turns, wanted, counts)
+
+
+def heights_of(spline: Spline, turns: Float[Array, "n cues"]) -> Float[Array, "n cues"]:
+    """`height` along each cue."""
+    if turns.shape[1] == 1:
+        return height(spline, turns[:, 0])[:, None]
+    return jax.vmap(height, (0, 1), 1)(spline, turns)
+
+
 def vectors(
-    space: Space, heights: Float[Array, " n"], actions: Float[Array, "n action"], eps: Float[Array, ""]
+    space: Space, heights: Float[Array, "n cues"], actions: Float[Array, "n action"], eps: Float[Array, ""]
 ) -> Float[Array, "n action"]:
     """Corrections as vectors to be added to actions, in units of eps."""
-    return (space.toward(actions, heights[:, None], eps) - actions) / eps
+    return (space.exp(actions, heights * eps) - actions) / eps
 
 
 def share_of(
@@ -104,18 +127,20 @@ class Offset(Relative):
     Members of an ensemble disagree about actions as if they had not been turned.
     """
 
-    def __post_init__(self) -> None:
-        """Raises UserError for actions other than directions: an action may have turned along one cue alone."""
-        check_directions(self.spaces.actions, "guidance 'offset'", "give guidance 'relative'")
-
     @cached_property
     def network(self) -> GuideModel:
-        """The network, or ensemble, that sees the turn beside situation and action."""
-        return guide_model(self.sizes, self.spaces, beside=1)
+        """The network, or ensemble, that sees the turns beside situation and action."""
+        return guide_model(self.sizes, self.spaces, beside=self.cues)
+
+    @property
+    def cues(self) -> int:
+        """Number of cues, along each of which an action may have turned."""
+        return len(self.spaces.actions.cues)
 
     def init(self, key: PRNGKeyArray) -> GuidanceModel:
         """A model that corrects nothing."""
-        spline = Spline(jnp.zeros(KNOTS), jnp.ones(()))
+        each = () if self.cues == 1 else (self.cues,)
+        spline = Spline(jnp.zeros((*each, KNOTS)), jnp.ones(each))
         return GuidanceModel(TwoParts(spline, self.network.init(key), jnp.zeros(())), jnp.array(False))
 
     def fit(
@@ -123,18 +148,19 @@ class Offset(Relative):
     ) -> GuidanceModel:
         """The spline of the training labels, then the network of what it leaves, then the network's share."""
         assert labels.base is not None  # `asking` keeps it for a kind that `sees_base`
-        space, rows = self.spaces.actions, lessons(labels, self.target, scalars)
+        space, rows = self.spaces.actions, Guide.lessons(self, labels, scalars)
         eps = space.from_unit(scalars.eps_deg)
         asked = space.retract(rows.action + rows.target)
         turns = turned(space, labels.base, rows.action, eps)
-        training = rows.valid & ~held_out(len(rows.valid))
-        spline = smoothed(turns, turned(space, rows.action, asked, eps), training)
-        left = rows.target / eps - vectors(space, height(spline, turns), rows.action, eps)
-        rows = rows.replace(action=jnp.concatenate([rows.action, turns[:, None]], -1), target=left)
+        training = jnp.broadcast_to((rows.valid & ~held_out(len(rows.valid)))[:, None], turns.shape)
+        training = training if rows.said is None else training & rows.said
+        spline = smoothed_cues(turns, turned(space, rows.action, asked, eps), training)
+        left = rows.target / eps - vectors(space, heights_of(spline, turns), rows.action, eps)
+        rows = rows.replace(action=jnp.concatenate([rows.action, turns], -1), target=left)
         predict = partial(self.network.predict, env)
         model = fit_least_squares(key, rows, scalars, init=self.network.init, apply=predict, sizes=self.sizes)
         predicted = predict(model.params, rows.obs, rows.action)
-        share = share_of(left, predicted, rows.valid & held_out(len(rows.valid)))
+        share = share_of(_told(rows, left), _told(rows, predicted), rows.valid & held_out(len(rows.valid)))
         return GuidanceModel(TwoParts(spline, model.params, share), model.fitted)
 
     def onward(
@@ -153,8 +179,8 @@ class Offset(Relative):
 
         def phi(current: Float[Array, "n action"]) -> Float[Array, "n action"]:
             turns = turned(space, first, current, eps)
-            seen = jnp.concatenate([current, turns[:, None]], -1)
-            of_turn = vectors(space, height(known.spline, turns), current, eps)
+            seen = jnp.concatenate([current, turns], -1)
+            of_turn = vectors(space, heights_of(known.spline, turns), current, eps)
             return eps * (of_turn + known.share * self.network.predict(env, known.network, obs, seen))
 
         return self.refined(phi, actions, active & model.fitted, scalars)
@@ -182,8 +208,13 @@ class Offset(Relative):
         self, model: GuidanceModel, env: Any, obs: Float[Array, "n obs"], actions: Float[Array, "n action"]
     ) -> Float[Array, " n"]:
         """Variance of the members' corrections, summed over their entries."""
-        seen = jnp.concatenate([actions, jnp.zeros((len(actions), 1))], -1)
+        seen = jnp.concatenate([actions, jnp.zeros((len(actions), self.cues))], -1)
         return self.network.disagreement(env, model.params.network, obs, seen)
+
+
+def _told(rows: Lesson, values: Float[Array, "n action"]) -> Float[Array, "n entries"]:
+    """Vectors along the cues of which labels speak; the vectors themselves where a label says all that there is."""
+    return values if rows.said is None else jnp.where(rows.said, along_cues(rows, values), 0.0)
 
 
 KIND = Kind(

@@ -11,7 +11,7 @@ from importlib import metadata
 from typing import Any
 
 from cuelearner_jax.config import GuideSizes
-from cuelearner_jax.environment import offers, spaces_of
+from cuelearner_jax.environment import actions_of, offers, spaces_of
 from cuelearner_jax.errors import UserError, closest
 from cuelearner_jax.guides import aims, calibration, dcoach, demonstration, intent, offset, relative, scalar, untaught
 from cuelearner_jax.guides.base import Guide, Kind
@@ -69,7 +69,9 @@ def named(text: str) -> str:
 def possible(env: Any, taught: bool) -> tuple[str, ...]:
     """Names of the kinds that an agent can be trained with; `taught`: is there a teacher to ask?"""
     trained = (kind for kind in known() if not kind.adapts_only and (taught or not kind.asks))
-    return tuple(kind.name for kind in trained if all(offers(env, need) for need in kind.needs))
+    cues = actions_of(env).cues
+    said = (kind for kind in trained if cues or kind.form is None or not kind.form.by_eps)
+    return tuple(kind.name for kind in said if all(offers(env, need) for need in kind.needs))
 
 
 def make(name: str, sizes: GuideSizes, env: Any, options: Any = None) -> Guide:

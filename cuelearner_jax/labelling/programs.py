@@ -119,7 +119,7 @@ class _Holds:
 def faultless(scalars: Scalars) -> Scalars:
     """The same without the faults of a simulated teacher, who looks at one action alone."""
     none = {"mistake_probability": 0.0, "silence_probability": 0.0, "indifference_deg": 0.0, "teacher_bias_deg": 0.0}
-    return dataclasses.replace(scalars, answer="best", **none)
+    return dataclasses.replace(scalars, answer="best", says="all", **none)
 
 
 def as_teacher(

@@ -28,6 +28,7 @@ class Choices(Space):
     order: Cue | None = None  # whose unit is "steps"
 
     name = "choices"
+    grain = 1.0
     about = "vectors with a single 1 among zeros"
 
     def __post_init__(self) -> None:
@@ -49,8 +50,8 @@ class Choices(Space):
 
     @property
     def reach(self) -> float:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Steps from the first choice to the last."""
-        return float(self.count - 1)
+        """Steps from the first choice to the last; without an order any two are 1 apart."""
+        return float(self.count - 1) if self.cues else 1.0
 
     def sample(self, key: PRNGKeyArray, shape: tuple[int, ...] = ()) -> Float[Array, "*shape action"]:
         """Draw each choice as often."""

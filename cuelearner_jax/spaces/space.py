@@ -45,6 +45,7 @@ class Space:
     size: int  # entries of an action
     cues: tuple[Cue, ...]  # none: nobody can say in which way an action should change
     reach: float  # the largest change along a cue that means anything, in `unit`
+    grain: float = 0.0  # the smallest, in `unit`; 0: however small a change is, it is one
 
     def __init_subclass__(cls) -> None:
         """Make a space of one's own known to `spaces.from_json`, by its name."""

@@ -319,7 +319,7 @@ def _rows(
         file = label_files.LabelFile({}, form.name, space, eps, np.full(len(rows.obs), seeds[0]), rows)
     if request.bound_deg:
         return file, request
-    widest = adapting.BOUND * space.reach
+    widest = adapting.usual_bound(space)
     if file is not None:
         if lanes_in(bases) is not None:
             raise UserError("labels of several base policies reach differently far: give --bound-deg")

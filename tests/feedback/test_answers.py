@@ -8,12 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 import probes
 import pytest
+from box_task import SMALL
 from flax import struct
 
 from cuelearner_jax.config import Scalars
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.feedback.answers import DEMONSTRATION, RELATIVE, SCALAR, check_teacher
-from cuelearner_jax.spaces import directions
+from cuelearner_jax.feedback.answers import DEMONSTRATION, RELATIVE, SCALAR, check_teacher, human_answer
+from cuelearner_jax.spaces import UNSAID, directions
 from cuelearner_jax.types import ValuesDirections
 
 FORMS = {"relative": RELATIVE, "demonstration": DEMONSTRATION, "scalar": SCALAR}
@@ -123,3 +124,58 @@ def test_who_knows_the_best_action_alone_cannot_tell_the_nearest_good_one():
     with pytest.raises(UserError, match=r"give --scalars\.answer best") as refusal:
         check_teacher(probes.Expert(ENV), nearest)
     assert "\n" not in str(refusal.value)
+
+
+@pytest.mark.parametrize(
+    ("change", "all_cues", "worst"),
+    [
+        ((0.2, -0.3, 0.1), (1, -1, 1), (None, -1, None)),
+        ((0.3, -0.3, 0.1), (1, -1, 1), (1, None, None)),  # as far along both: the first
+        ((0.02, -0.01, 0.04), (0, 0, 0), (None, None, 0)),  # all are right: the worst is, and of the others not a word
+        ((0.0, 0.0, 0.0), (0, 0, 0), (0, None, None)),
+        ((0.02, 0.0, -0.3), (0, 0, -1), (None, None, -1)),
+    ],
+)
+def test_a_teacher_of_the_worst_cue_says_nothing_of_the_others(change, all_cues, worst):
+    """Differences in quarters of eps and more of a box whose ranges are 2, 4 and 2: shares, not metres, decide."""
+    action = jnp.array([0.0, 2.0, -1.0])
+    best = SMALL.exp(action, jnp.array(change, jnp.float32))
+    key = jax.random.key(0)
+    for says, expected in (("all", all_cues), ("worst", worst)):
+        scalars = dataclasses.replace(SCALARS, eps_deg=0.1, says=says)
+        answer, answered = human_answer(key, SMALL, action, best, scalars)
+        np.testing.assert_array_equal(answer, [UNSAID if h is None else h for h in expected])
+        assert bool(answered)
+
+
+def test_a_teacher_of_one_cue_speaks_of_each_as_often_and_rightly():
+    action = jnp.array([0.0, 2.0, -1.0])
+    best = SMALL.exp(action, jnp.array([0.2, -0.3, 0.0]))
+    scalars = dataclasses.replace(SCALARS, eps_deg=0.1, says="one")
+    keys = jax.random.split(jax.random.key(0), 900)
+    answers, answered = jax.vmap(lambda key: human_answer(key, SMALL, action, best, scalars))(keys)
+    told = np.asarray(answers) != UNSAID
+    assert answered.all()
+    np.testing.assert_array_equal(told.sum(1), 1)
+    np.testing.assert_allclose(told.mean(0), 1 / 3, atol=0.07)  # standard deviation 0.016
+    for cue, h in enumerate((1, -1, 0)):
+        np.testing.assert_array_equal(np.asarray(answers)[told[:, cue], cue], h)
+
+
+def test_faults_come_upon_the_cue_that_is_spoken_of():
+    action = jnp.array([0.0, 2.0, -1.0])
+    best = SMALL.exp(action, jnp.array([0.2, -0.3, 0.0]))
+    keys = jax.random.split(jax.random.key(0), 600)
+
+    def said(**faults):
+        scalars = dataclasses.replace(SCALARS, eps_deg=0.1, says="worst", **faults)
+        return map(np.asarray, jax.vmap(lambda key: human_answer(key, SMALL, action, best, scalars))(keys))
+
+    answers, answered = said(mistake_probability=0.3)
+    assert answered.all()
+    assert (answers[:, 1] == 1).mean() == pytest.approx(0.3, abs=0.08)  # standard deviation 0.019
+    answers, answered = said(silence_probability=0.3)
+    assert answered.mean() == pytest.approx(0.7, abs=0.08)
+    np.testing.assert_array_equal((answers == UNSAID).all(1), ~answered)
+    answers, _ = said(teacher_bias_deg=0.3)  # differences are then 0.5, 0 and 0.3
+    np.testing.assert_array_equal(answers[0], [1, UNSAID, UNSAID])

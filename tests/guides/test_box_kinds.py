@@ -68,6 +68,14 @@ def test_a_share_of_mistakes_and_of_silence_is_survived():
     assert np.median(after) < 0.1
 
 
+@pytest.mark.long
+@pytest.mark.parametrize("says", ["worst", "one"])
+def test_who_speaks_of_one_cue_at_a_time_leads_there_in_rounds(says):
+    """What is asked about follows what is done, so the worst cue of one round is another one in the next."""
+    first, after = away("relative", says=says)
+    assert np.median(after) < 0.4 * np.median(first)
+
+
 def test_a_constant_bias_of_the_teacher_is_learned_along_every_entry():
     """A teacher who holds everything for 0.1 more than it is leads there."""
     _, after = away("demonstration", teacher_bias_deg=0.1)

@@ -230,7 +230,6 @@ def test_a_label_file_holds_answers_about_a_box(form, tmp_path):
 @pytest.mark.parametrize(
     ("what", "planar"),
     [
-        ("guidance 'offset'", lambda: registry.make("offset", probes.SIZES, Reach())),
         ("agent.coarse_directions", lambda: ddqn.Config(coarse_directions=36).make("raw", spaces_of(Reach()))),
         ("to_brax", lambda: brax.to_brax(Reach())),
     ],

@@ -1,0 +1,224 @@
+"""Every kind in boxes of 1, 3 and 7 entries and in ordered choices, where a policy misses its goal by a constant.
+
+Teachers speak of all cues, of the worst one or of one at random: a cue of which nothing is said teaches nothing.
+"""
+
+import dataclasses
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import probes
+import pytest
+
+from cuelearner_jax.adaptation import adapting
+from cuelearner_jax.config import GuideSizes
+from cuelearner_jax.environment import Quantity, Spaces, WholeObservations
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.feedback.answers import human_answer
+from cuelearner_jax.guides import registry
+from cuelearner_jax.guides.aims import log_density
+from cuelearner_jax.guides.fitting import Lesson, fit_least_squares, lessons, squared
+from cuelearner_jax.guides.relative import KIND as RELATIVE
+from cuelearner_jax.spaces import UNSAID, Box, Choices, Cue
+from cuelearner_jax.types import Label
+
+GEARS = Choices(9, Cue("gear", ("higher", "lower"), ("PageUp", "PageDown"), "steps"))
+FRUIT = Choices(3)
+SPACES = {
+    "1": Box((-2.0,), (2.0,)),
+    "3": Box((-1.0, 0.0, -2.0), (1.0, 4.0, 0.0)),
+    "7": Box((-1.0,) * 7, tuple(1.0 + 0.5 * entry for entry in range(7))),
+    "gears": GEARS,
+}
+SIZES = GuideSizes(feedback_layers=(32, 32), fit_steps=300, fit_batch_size=32)
+KEY = jax.random.key(5)
+COUNT = 64
+
+
+class Anywhere(WholeObservations):
+    """Observations of two entries; nothing else is asked of a world where labels are given."""
+
+    observation = (Quantity("context", 2, "1"),)
+
+    def __init__(self, space):
+        self.actions = space
+
+
+def goal(space, obs):
+    """Where the teacher wants actions: the middle, or a little away from it by what is seen."""
+    change = 2.0 * jnp.sign(obs[0]) if space.grain else jnp.resize(0.1 * obs, len(space.cues))
+    middle = jnp.eye(space.size)[space.size // 2] if space.grain else space.spread(1)[0]
+    return space.exp(middle, jnp.broadcast_to(change, (len(space.cues),)))
+
+
+def missing(space, obs):
+    """What the policy does: two steps, or a fifth of each range, to one side of the goal or the other."""
+    sides = jnp.where(jnp.arange(len(space.cues)) % 2, -1.0, 1.0)
+    return space.exp(goal(space, obs), sides * (2.0 if space.grain else 0.2))
+
+
+def scalars_of(space, **faults):
+    eps = 1.0 if space.grain else 0.08
+    plain = dataclasses.replace(
+        adapting.plain_scalars(space), feedback_learning_rate=1e-2, max_grad_norm=10.0, k_max=20
+    )
+    most = 4.0 if space.grain else 0.4  # as far as the labels reach
+    return dataclasses.replace(plain, eps_deg=eps, tau_deg=eps / 20, tau_max_deg=most, **faults)
+
+
+def told(space, scalars, form, count):
+    """Labels about actions that lie uniformly round the policy's own, with the answers of a teacher of the goal."""
+    k_obs, k_turn, k_say = jax.random.split(KEY, 3)
+    obs = jax.random.uniform(k_obs, (count, 2), minval=-1.0)
+    base = jax.vmap(partial(missing, space))(obs)
+    most = 4.0 if space.grain else 0.4
+    action = space.exp(base, jax.random.uniform(k_turn, (count, len(space.cues)), minval=-most, maxval=most))
+    best = jax.vmap(partial(goal, space))(obs)
+    say = jax.vmap(lambda key, action, best: human_answer(key, space, action, best, scalars))
+    answer, answered = say(jax.random.split(k_say, count), action, best)
+    if form == "demonstration":
+        answer, answered = best, jnp.ones(count, bool)
+    if form == "scalar":
+        within = 0.5 if space.grain else 0.08
+        answer, answered = (space.distance(action, best) <= within)[:, None] * 1.0, jnp.ones(count, bool)
+    return Label(obs, action, answer, answered, base)
+
+
+def left(kind, name, labels=200, **faults):
+    """Mean distance from the goal of what a guide makes of the policy's actions, as a share of the policy's own."""
+    space = SPACES[name]
+    env, scalars = Anywhere(space), scalars_of(space, **faults)
+    guide = registry.make(kind, SIZES, env)
+    rows = told(space, scalars, guide.form.name, labels)
+    model = jax.jit(lambda rows: guide.fit(KEY, env, rows, guide.init(KEY), scalars))(rows)
+    obs = jax.random.uniform(jax.random.key(77), (COUNT, 2), minval=-1.0)
+    first, goals = (jax.vmap(partial(which, space))(obs) for which in (missing, goal))
+    acted = jax.jit(lambda: guide.act(model, env, obs, first, jnp.ones(COUNT, bool), scalars).actions)()
+    np.testing.assert_allclose(space.retract(acted), acted, atol=1e-5)
+    within = dataclasses.replace(scalars, tau_max_deg=0.5 * scalars.eps_deg if not space.grain else 1.0)
+    near = guide.act(model, env, obs[:4], first[:4], jnp.ones(4, bool), within).actions
+    if kind != "scalar":
+        assert np.abs(space.log(first[:4], near)).max() <= within.tau_max_deg + 1e-5  # tau_max holds along every cue
+    away = lambda actions: float(np.abs(space.log(actions, goals)).mean())  # noqa: E731
+    return away(acted) / away(first)
+
+
+def long(*values):
+    return pytest.param(*values, marks=pytest.mark.long)
+
+
+@pytest.mark.parametrize(
+    ("kind", "space", "says", "most"),
+    [
+        ("relative", "3", "one", 0.4),
+        ("relative", "gears", "all", 0.1),
+        ("offset", "3", "worst", 0.2),
+        long("relative", "1", "all", 0.2),
+        long("relative", "7", "all", 0.3),
+        long("offset", "1", "all", 0.15),
+        long("offset", "3", "all", 0.1),
+        long("offset", "3", "one", 0.2),
+        long("offset", "7", "one", 0.3),
+        long("offset", "gears", "all", 0.1),
+        long("dcoach", "1", "all", 0.9),
+        long("dcoach", "7", "all", 0.9),
+        long("dcoach", "gears", "all", 0.8),
+        long("demonstration", "1", "all", 0.1),
+        long("demonstration", "7", "all", 0.1),
+        long("demonstration", "gears", "all", 0.1),
+        long("scalar", "1", "all", 0.6),
+        long("scalar", "gears", "all", 0.6),
+    ],
+)
+def test_a_kind_leads_a_policy_that_misses_toward_its_goal(kind, space, says, most):
+    assert left(kind, space, says=says) < most
+
+
+def test_a_cue_of_which_nothing_is_said_adds_nothing_to_the_loss():
+    """Ranges 2, 4, 2: errors of 0.2 and 0.4 of said entries are 0.1 of the range each; the other one does not count."""
+    space = SPACES["3"]
+    obs, action = jnp.zeros((2, 2)), jnp.tile(space.spread(1), (2, 1))
+    answer = jnp.array([[1.0, UNSAID, 0.0], [UNSAID, -1.0, UNSAID]])
+    labels = Label(obs, action, answer, jnp.ones(2, bool))
+    scalars = scalars_of(space)
+    guide = RELATIVE.make(SIZES, Spaces(2, space))
+    rows = lessons(labels, guide.target, scalars, space)
+    eps = scalars.eps_deg
+    np.testing.assert_allclose(rows.target, [[2 * eps, 0, 0], [0, -4 * eps, 0]], atol=1e-6)
+    off = jnp.array([[0.2, 77.0, 0.0], [-5.0, 0.4, 3.0]])
+    np.testing.assert_allclose(squared(rows, rows.target + off), [0.1**2, 0.1**2], rtol=1e-3)
+    gradient = jax.grad(lambda predicted: squared(rows, predicted).sum())(rows.target + off)
+    np.testing.assert_array_equal(gradient == 0, [[False, True, True], [True, False, True]])
+    np.testing.assert_allclose(gradient[0, 0], 2 * 0.2 / 2**2, rtol=1e-3)  # d/dx (x / range)^2
+
+
+def test_what_a_network_predicts_of_an_unsaid_cue_changes_no_fit():
+    space, scalars = SPACES["3"], scalars_of(SPACES["3"], says="one")
+    rows = RELATIVE.make(SIZES, Spaces(2, space)).lessons(told(space, scalars, "relative", 20), scalars)
+    other = rows.replace(target=jnp.where(rows.said, rows.target, 99.0))
+    fit = jax.jit(
+        lambda rows: fit_least_squares(
+            KEY,
+            rows,
+            scalars,
+            init=lambda key: jax.random.normal(key, (2, 3)),
+            apply=lambda params, obs, action: obs @ params,
+            sizes=dataclasses.replace(SIZES, fit_steps=40),
+        )
+    )
+    np.testing.assert_array_equal(fit(rows).params, fit(other).params)
+
+
+def test_a_label_that_says_nothing_of_any_cue_is_none():
+    space = SPACES["3"]
+    labels = told(space, scalars_of(space), "relative", 10)
+    silent = labels.replace(answer=jnp.full((10, 3), UNSAID))
+    guide = RELATIVE.make(SIZES, Spaces(2, space))
+    assert not guide.lessons(silent, scalars_of(space)).valid.any()
+    assert not bool(guide.fit(KEY, None, silent, guide.init(KEY), scalars_of(space)).fitted)
+
+
+def test_lessons_of_one_cue_count_whole():
+    lesson = Lesson(jnp.zeros((1, 2)), jnp.zeros((1, 1)), jnp.zeros((1, 1)), jnp.ones(1, bool))
+    assert float(squared(lesson, jnp.array([[3.0]]))[0]) == 9.0
+
+
+@pytest.mark.parametrize("kind", ["relative", "offset", "dcoach", "calibration"])
+def test_a_kind_of_cues_refuses_choices_without_an_order_in_one_line(kind):
+    with pytest.raises(UserError, match="have no order: give them one") as refusal:
+        registry.make(kind, SIZES, Anywhere(FRUIT))
+    assert "\n" not in str(refusal.value)
+    assert kind not in registry.possible(Anywhere(FRUIT), taught=True)
+    assert {"demonstration", "scalar", "none"} <= set(registry.possible(Anywhere(FRUIT), taught=True))
+
+
+def test_answers_too_weak_to_move_a_choice_are_refused_and_never_the_default():
+    assert adapting.plain_scalars(GEARS).eps_deg == 1.0
+    assert adapting.usual_bound(Choices(3, GEARS.order)) == 1.0
+    weak = dataclasses.replace(scalars_of(GEARS), eps_deg=0.3, tau_deg=0.01)
+    with pytest.raises(UserError, match=r"scalars\.eps_deg is 0\.3 steps: give at least 1"):
+        adapting.check_amounts(GEARS, [2.0], weak)
+    assert FRUIT.reach == 1.0
+
+
+@pytest.mark.parametrize("space", [GEARS, FRUIT], ids=["ordered", "not ordered"])
+def test_the_density_of_aims_among_choices_is_one_on_average(space):
+    every, share = jnp.eye(space.count), jnp.array([0.7, 0.3])
+    density = np.exp(log_density(space, every[1:2], share, every))
+    assert density.mean() == pytest.approx(1.0, rel=1e-5)
+    np.testing.assert_allclose(density, 0.3 + 0.7 * space.count * (np.arange(space.count) == 1), rtol=1e-5)
+
+
+def test_directions_are_asked_of_as_before():
+    """One cue: whatever a teacher says of several, an answer is the same number from the same key."""
+    env = probes.Window()
+    scalars = dataclasses.replace(probes.SCALARS, mistake_probability=0.3, silence_probability=0.3)
+    action, best = env.reset(KEY)[1], env.best(env.reset(KEY)[1])
+    for key in jax.random.split(KEY, 8):
+        said = [
+            human_answer(key, SPACES["1"], action[:1], best[:1], dataclasses.replace(scalars, says=says))
+            for says in ("all", "worst", "one")
+        ]
+        assert len({(float(h[0]), bool(answered)) for h, answered in said}) == 1
