@@ -98,7 +98,9 @@ class BraxView(envs.Env):
         )
 
     def step(self, state: State, action: Float[Array, " n"]) -> State:
-        """Executes the action that `action` in [-1, 1]^n stands for (`to_brax`). A finished episode stays as it is until a wrapper begins another.
+        """Executes the action that `action` stands for, see `to_brax`.
+
+        A finished episode stays as it is until a wrapper begins another.
 
         Returns:
             `obs` is our `Step.final_obs`, `done` is `terminated` and `info["truncation"]` is `truncated`, as 0 or 1.

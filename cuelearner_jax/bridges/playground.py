@@ -25,7 +25,7 @@ def suite() -> ModuleType:
         from mujoco_playground import dm_control_suite  # takes seconds to load
     except ModuleNotFoundError:
         raise UserError(
-            "MuJoCo Playground is not installed: install the extra, for instance pip install 'cuelearner-jax[playground]'"
+            "tasks of playground need the extra `playground`: pip install 'cuelearner-jax[playground]'"
         ) from None
     return dm_control_suite
 

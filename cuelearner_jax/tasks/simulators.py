@@ -51,11 +51,11 @@ def environment_of(family: str, config: SimulatorConfig, simulator: Callable[[],
     if not isinstance(config.environment, str) or not config.environment:
         raise UserError(f"task.environment is {shown(config.environment)}: name the task {family}:ENVIRONMENT")
     layout = config.layout
-    sound = layout.sizes and len(layout.sizes) == len(layout.slices) and min(layout.sizes) > 0 and layout.entries
-    if not sound:
-        raise UserError(
-            f"the layout of {family}:{config.environment} is not whole: name the task {family}:{config.environment}"
-        )
+    _check_row("slices", layout.slices, str)
+    _check_row("slice_sizes", layout.sizes, int)
+    _check_row("entries", layout.entries, str)
+    if len(layout.sizes) != len(layout.slices):
+        raise UserError(f"task.slice_sizes is {shown(layout.sizes)}: give a number for each of task.slices")
     return JaxEnvironment(
         max_steps=jnp.array(config.max_steps, jnp.int32),
         simulator=simulator,
@@ -64,6 +64,14 @@ def environment_of(family: str, config: SimulatorConfig, simulator: Callable[[],
         to_action=None,
         heuristic=None,
     )
+
+
+def _check_row(name: str, values: Any, kind: type) -> None:
+    """Raise UserError unless a field holds words, or numbers above 0."""
+    row = isinstance(values, tuple) and len(values) > 0
+    if not row or not all(type(value) is kind and value and (kind is str or value > 0) for value in values):
+        what = "names" if kind is str else "whole numbers above 0"
+        raise UserError(f"task.{name} is {shown(values)}: give {what}, or name the task FAMILY:ENVIRONMENT")
 
 
 def described(family: str, name: str, simulator: Any) -> dict[str, Any]:
@@ -76,10 +84,10 @@ def check_layout(family: str, name: str, layout: Layout, simulator: Any) -> None
     """Raise UserError unless a simulator has the layout of a configuration."""
     found = layout_of(simulator, name)
     if found != layout:
-        wanted = f"observations {layout.sizes} and {len(layout.entries)} action entries"
         raise UserError(
-            f"{family}:{name} has observations {found.sizes} and {len(found.entries)} action entries, the configuration "
-            f"{wanted}: name the task {family}:{name}, with the version of the simulator that the policy was trained in"
+            f"{family}:{name} has observations of {sum(found.sizes)} entries and actions of {len(found.entries)}, the "
+            f"configuration {sum(layout.sizes)} and {len(layout.entries)}, or other names: name the task "
+            f"{family}:{name}, and install the {family} of the policy"
         )
 
 
