@@ -1,6 +1,6 @@
 """A brax environment as a task of one's own: an inverted pendulum on a cart, pushed right or left.
 
-`brax:inverted_pendulum` is that environment by name. A task of one's own adds words for the push and the obvious action.
+`brax:inverted_pendulum` is that environment by name. This task adds words for the push and the obvious action.
 Nobody answers here, so kinds of guidance that ask a teacher are refused; the obvious action, pushing to where the pole
 leans, can guide. Run in the folder above this one:
 

@@ -21,7 +21,7 @@ def numeric(task):
             yield field.name, value
 
 
-OWN = [name for name in registry.BUILT_IN if name not in registry.FAMILIES]  # tests/tasks/test_simulators.py has these
+OWN = [name for name in registry.BUILT_IN if name not in registry.FAMILIES]  # tests/bridges/test_by_name.py has these
 FIELDS = [(name, *field) for name in OWN for field in numeric(registry.find(name))]
 
 
