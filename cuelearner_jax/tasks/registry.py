@@ -23,12 +23,16 @@ BUILT_IN = {
     "gymnasium": "cuelearner_jax.tasks.gymnasium:GYMNASIUM",
     "logs": "cuelearner_jax.tasks.logs:LOGS",
     "navigation": "cuelearner_jax.tasks.navigation:NAVIGATION",
+    "brax": "cuelearner_jax.tasks.brax:BRAX",
+    "playground": "cuelearner_jax.tasks.playground:PLAYGROUND",
 }
 # Environments of other libraries, named FAMILY:ENVIRONMENT: a function from the environment's name to a task, which
 # bears the family's name. The family's own task, by which its folders are read, is built in.
 FAMILIES: dict[str, str] = {
     "gymnasium": "cuelearner_jax.tasks.gymnasium:task_of",
     "logs": "cuelearner_jax.tasks.logs:task_of",
+    "brax": "cuelearner_jax.tasks.brax:task_of",
+    "playground": "cuelearner_jax.tasks.playground:task_of",
 }
 
 _registered: dict[str, Task] = {}
