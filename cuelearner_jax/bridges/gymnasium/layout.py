@@ -5,7 +5,7 @@ Loads neither JAX nor Gymnasium: a worker process begins quickly.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -80,7 +80,7 @@ class NoVector(Exception):
 def flatten(leaves: tuple[Leaf, ...], obs: Any) -> np.ndarray:
     """Return an observation as a vector (obs,) of float32. Raises NoVector where it is none of its space's."""
     parts = [_vector(leaf, obs) for leaf in leaves]
-    return np.concatenate(parts, dtype=np.float32, casting="unsafe") if len(parts) > 1 else parts[0].astype(np.float32)
+    return np.concatenate(parts, dtype=np.float32, casting="unsafe") if len(parts) > 1 else np.float32(parts[0])
 
 
 def _vector(leaf: Leaf, obs: Any) -> np.ndarray:
@@ -139,8 +139,10 @@ def actions_of(whose: str, space: Any) -> Actions:
     return Actions(tuple(low.tolist()), tuple(high.tolist()))
 
 
-def to_action(space: Any, vector: np.ndarray) -> Any:
-    """Return what the environment takes for a vector (action,)."""
+def action_maker(space: Any) -> Callable[[np.ndarray], Any]:
+    """Return what makes an action of the environment of a vector (action,)."""
     if type(space).__name__ == "Discrete":
-        return int(np.argmax(vector)) + int(space.start)
-    return vector.reshape(space.shape).astype(space.dtype)
+        start = int(space.start)
+        return lambda vector: int(vector.argmax()) + start
+    shape, dtype = space.shape, space.dtype
+    return lambda vector: vector.reshape(shape).astype(dtype)
