@@ -112,10 +112,10 @@ class GymnasiumTask(WholeObservations, struct.PyTreeNode):
         history, actions = history.reshape(-1, *history.shape[-2:]), actions.reshape(-1, actions.shape[-1])
         places = [row.tobytes() for row in np.ascontiguousarray(places).reshape(-1, 2)]
         # What is no action is not executed, and what comes of nothing stays nothing.
-        sound = np.isfinite(actions).all(-1).tolist()
+        acts: Any = np.isfinite(actions).all(-1).tolist()
         requests = [
             Request(*row) if sound and row[1] != NOWHERE else None
-            for sound, *row in zip(sound, seeds, places, steps, history, actions, next_seeds, strict=True)
+            for sound, *row in zip(acts, seeds, places, steps, history, actions, next_seeds, strict=True)
         ]
         found = self._carried(requests)
         return tuple(column.reshape((*shape, *column.shape[1:])) for column in found)

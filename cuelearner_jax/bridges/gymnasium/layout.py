@@ -80,7 +80,7 @@ class NoVector(Exception):
 def flatten(leaves: tuple[Leaf, ...], obs: Any) -> np.ndarray:
     """Return an observation as a vector (obs,) of float32. Raises NoVector where it is none of its space's."""
     parts = [_vector(leaf, obs) for leaf in leaves]
-    return np.concatenate(parts, dtype=np.float32, casting="unsafe") if len(parts) > 1 else np.float32(parts[0])
+    return np.concatenate(parts, dtype=np.float32, casting="unsafe") if len(parts) > 1 else parts[0].astype(np.float32)
 
 
 def _vector(leaf: Leaf, obs: Any) -> np.ndarray:
