@@ -131,3 +131,13 @@ class Forgetful(Adder):
     def step(self, action):
         obs, *rest = super().step(action)
         return obs + np.random.default_rng().uniform(size=2), *rest
+
+
+def limited(start=0.0, render_mode=None):
+    """`Adder` with a limit of steps that Gymnasium knows."""
+    return gymnasium.wrappers.TimeLimit(Adder(start, render_mode), 6)
+
+
+def reach():
+    """`Reach` with a limit of steps that Gymnasium knows."""
+    return gymnasium.wrappers.TimeLimit(Reach(), 12)
