@@ -384,6 +384,7 @@ PICTURES = Pictures(
     question=_question,
     sketch=_sketch,
     reel=_reel,
+    simulates=False,
 )
 BODY = Body("recording", "situations as they were recorded", _environment, pictures=lambda: PICTURES, filled=filled)
 LOGS = Task(
@@ -391,6 +392,7 @@ LOGS = Task(
     about="recorded situations, without a simulator: name their folder, as logs:FOLDER",
     config=LogsConfig,
     bodies=(BODY,),
+    proposed=Recorded,
     # A label is of what was seen and proposed, wherever that lies now.
     labels_hold=("path", "digest", "rows", "order", "cues", "cue_names", "keys", "centre", "spread"),
     files=lambda config: {"path": config.digest} if config.path else {},

@@ -6,7 +6,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import enum
+import io
 import types
 from typing import Any
 
@@ -14,7 +16,9 @@ from typing import Any
 def register() -> None:
     """Register the environments of gymnasium_robotics with Gymnasium, so that these work beside the MuJoCo here."""
     import gymnasium
-    import gymnasium_robotics
+
+    with contextlib.redirect_stderr(io.StringIO()):  # it prints a notice about other environments of its own
+        import gymnasium_robotics
 
     gymnasium.register_envs(gymnasium_robotics)
     supply_joint_types()
