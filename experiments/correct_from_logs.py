@@ -2,8 +2,8 @@
 
     python experiments/correct_from_logs.py --out docs/data/correct_from_logs.csv
 
-200 simulated answers of all cues about recorded situations: in rounds, about actions refined by the model so far, as the
-labelling page asks; or about the policy's actions moved at random within the bound, all at once. Judged on situations
+200 simulated answers of all cues about recorded situations: in rounds, about actions refined by the model so far, as
+the labelling page asks; or about the policy's actions moved at random within the bound, all at once. Judged on situations
 that were not recorded. The control has each label answered by another label's answer. A few minutes on 2 cores.
 """
 

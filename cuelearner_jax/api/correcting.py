@@ -97,7 +97,7 @@ def correct(
     if (
         before is not None
         and not isinstance(labels, str | os.PathLike)
-        and (space, cues, low, high) == (None, "", None, None)
+        and not any(map(_is_told, (space, cues, low, high)))
     ):
         space = logs.space_of(before)  # of a policy that was corrected before
     found = _given(labels, space, cues, low, high)
@@ -160,7 +160,7 @@ def agreement(
 
 def _given(labels: Any, space: Any, cues: Any, low: Any, high: Any) -> GivenLabels:
     """Checked labels with their space. Raises UserError for what makes no sense."""
-    told = [name for name, value in (("cues", cues), ("low", low), ("high", high)) if value not in ("", None, ())]
+    told = [name for name, value in (("cues", cues), ("low", low), ("high", high)) if _is_told(value)]
     if space is not None and told:
         raise UserError(f"{told[0]} is given beside space, which says it already: leave out one of them")
     arguments.optional(arguments.instance, "space", space, Space, "a space of actions")
@@ -179,9 +179,13 @@ def _given(labels: Any, space: Any, cues: Any, low: Any, high: Any) -> GivenLabe
             raise UserError(
                 f"low and high bound {len(low)} and {len(high)} entries, actions have {size}: give one an entry"
             )
-        space = Box(tuple(map(float, low)), tuple(map(float, high)), cues_from(cues) if cues else ())
+        space = Box(tuple(map(float, low)), tuple(map(float, high)), cues_from(cues) if _is_told(cues) else ())
     given.check(rows, Spaces(rows.obs.shape[1], space), RELATIVE)
     return GivenLabels(rows, space, None)
+
+
+def _is_told(value: Any) -> bool:
+    return value is not None and not (isinstance(value, str | tuple | list) and not value)
 
 
 def _numbers(name: str, value: Any) -> list[float]:
