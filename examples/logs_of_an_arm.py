@@ -94,4 +94,4 @@ def main(folder="runs/arm", situations=200, rounds=(0.2, 0.08, 0.04)):
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:2])
+    main(sys.argv[1] if len(sys.argv) > 1 else "runs/arm")

@@ -56,8 +56,8 @@ def correct(
     eps: float | None = None,
     guidance: str = KIND.name,
     cues: str | Sequence[Any] = "",
-    low: Sequence[float] | None = None,
-    high: Sequence[float] | None = None,
+    low: Sequence[float] | np.ndarray | None = None,
+    high: Sequence[float] | np.ndarray | None = None,
     space: Space | None = None,
     changes: Any = None,
     sizes: GuideSizes | None = None,
@@ -92,7 +92,11 @@ def correct(
             "policy is None: give the policy whose actions the labels are about; of the answers alone, without a base, "
             "cl.fit_feedback makes a model"
         )
-    policy = load_policy(policy) if isinstance(policy, str | os.PathLike) and not str(policy).endswith(ONNX) else policy
+    policy = (
+        load_policy(Path(policy))
+        if isinstance(policy, str | os.PathLike) and not str(policy).endswith(ONNX)
+        else policy
+    )
     before = _recording_of(policy)
     if (
         before is not None
@@ -223,7 +227,8 @@ def world_of(found: GivenLabels, before: LogsConfig | None = None) -> World:
     """
     config, size = found.config, found.rows.obs.shape[1]
     if config is None or sum(config.entries) != size:
-        config = LogsConfig(entries=(size,), **logs.scales_of(np.asarray(found.rows.obs)))
+        centre, spread = logs.scales_of(np.asarray(found.rows.obs))
+        config = LogsConfig(entries=(size,), centre=centre, spread=spread)
     if before is not None:
         if logs.space_of(before) != found.space:
             raise UserError(

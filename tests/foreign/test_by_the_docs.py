@@ -9,6 +9,8 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 import recorded_situations as recorded
 
@@ -70,14 +72,20 @@ QUICK = (*SMALL, "--sizes.fit-batch-size", "32")
 
 @pytest.fixture
 def place(tmp_path, monkeypatch):
-    """A folder with the policy and recorded situations in it; returns the policy."""
+    """A folder with the policy and recorded situations in it, in which it acted; returns the policy."""
     (tmp_path / "my_arm.py").write_text(MODULE)
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.delitem(sys.modules, "my_arm", raising=False)
-    recorded.write(tmp_path / "situations", rows=60)
+    observations, _ = recorded.write(tmp_path / "situations", rows=150)
     from my_arm import POLICY
 
+    table = tmp_path / "situations/situations.parquet"
+    columns = pq.read_table(table).to_pydict()
+    columns |= {
+        f"action.{name}": values for name, values in zip(recorded.ENTRIES, acted(POLICY, observations).T, strict=True)
+    }
+    pq.write_table(pa.table(columns), table)
     return POLICY
 
 
@@ -107,18 +115,17 @@ def in_file(folder, policy, wanted, count, seed):
     label_files.write_file(folder / "labels.parquet", file, "more")
 
 
-def on_page(folder, policy, wanted, count):
-    """Has a script answer on the page, by the page's command; the questions are about the policy."""
+def on_page(folder, wanted, count):
+    """Has a script answer on the page, by the page's command; what was recorded is what the policy proposed."""
     pytest.importorskip("nicegui")
     from page_answers import labelled
 
     space = Box(recorded.LOW, recorded.HIGH)
     bounds = ["--task.low", *map(str, recorded.LOW), "--task.high", *map(str, recorded.HIGH)]
-    command, *rest = COMMANDS["label"][1:]
-    rest[rest.index("--labels") + 1] = str(count)
-    how = [*bounds, *QUICK, "--scalars.eps-deg", str(EPS), "--bound-deg", "0.25", "--no-practice"]
+    how = [*bounds, *QUICK, *FAST, "--scalars.eps-deg", str(EPS), "--bound-deg", "0.25", "--no-practice"]
+    assert COMMANDS["label"][COMMANDS["label"].index("--labels") + 1] == str(count)
     ask = lambda obs, action: told(space, wanted, obs[None], action[None])[0]  # noqa: E731
-    assert labelled([command, "my_arm:POLICY", *rest, *how], ask) == folder
+    assert labelled([*COMMANDS["label"][1:], *how], ask) == folder
 
 
 @pytest.mark.parametrize("labels", ["file", pytest.param("page", marks=pytest.mark.long)])
@@ -129,7 +136,7 @@ def test_the_commands_of_the_page_correct_a_policy_of_pytorch(labels, place, tmp
     if labels == "file":
         in_file(folder, policy, wanted, 150, 0)
     else:
-        on_page(folder, policy, wanted, 150)
+        on_page(folder, wanted, 150)
     in_file(Path("labels/others"), policy, wanted, 60, 1)
     assert main([*COMMANDS["adapt"], *QUICK, *FAST]) == 0
     capsys.readouterr()
