@@ -38,7 +38,7 @@ from cuelearner_jax.tasks.logs import LogsConfig
 from cuelearner_jax.types import Label
 
 
-class _Given(NamedTuple):
+class GivenLabels(NamedTuple):
     """Labels, and what they say of themselves."""
 
     rows: Label
@@ -56,8 +56,8 @@ def correct(
     eps: float | None = None,
     guidance: str = KIND.name,
     cues: str | Sequence[Any] = "",
-    low: Sequence[float] | None = None,
-    high: Sequence[float] | None = None,
+    low: Sequence[float] | np.ndarray | None = None,
+    high: Sequence[float] | np.ndarray | None = None,
     space: Space | None = None,
     changes: Any = None,
     sizes: GuideSizes | None = None,
@@ -92,19 +92,23 @@ def correct(
             "policy is None: give the policy whose actions the labels are about; of the answers alone, without a base, "
             "cl.fit_feedback makes a model"
         )
-    policy = load_policy(policy) if isinstance(policy, str | os.PathLike) and not str(policy).endswith(ONNX) else policy
+    policy = (
+        load_policy(Path(policy))
+        if isinstance(policy, str | os.PathLike) and not str(policy).endswith(ONNX)
+        else policy
+    )
     before = _recording_of(policy)
     if (
         before is not None
         and not isinstance(labels, str | os.PathLike)
-        and (space, cues, low, high) == (None, "", None, None)
+        and not any(map(_is_told, (space, cues, low, high)))
     ):
         space = logs.space_of(before)  # of a policy that was corrected before
     found = _given(labels, space, cues, low, high)
     eps = arguments.optional(arguments.amount, "eps", eps, found.space)
     if found.eps is not None and eps is not None and not np.isclose(eps, found.eps, rtol=1e-6):
         raise UserError(f"{labels} holds answers of {found.eps:g} {found.space.unit}: leave out eps")
-    world = _world(found, before)
+    world = world_of(found, before)
     own = as_policy(policy)
     CallablePolicy(in_space(own, found.space), actions=found.space)(found.rows.obs)  # what is no action is told here
     return adapt(
@@ -158,16 +162,16 @@ def agreement(
     return study.agreement(in_space(own, found.space), found.rows, found.space, strength, base)
 
 
-def _given(labels: Any, space: Any, cues: Any, low: Any, high: Any) -> _Given:
+def _given(labels: Any, space: Any, cues: Any, low: Any, high: Any) -> GivenLabels:
     """Checked labels with their space. Raises UserError for what makes no sense."""
-    told = [name for name, value in (("cues", cues), ("low", low), ("high", high)) if value not in ("", None, ())]
+    told = [name for name, value in (("cues", cues), ("low", low), ("high", high)) if _is_told(value)]
     if space is not None and told:
         raise UserError(f"{told[0]} is given beside space, which says it already: leave out one of them")
     arguments.optional(arguments.instance, "space", space, Space, "a space of actions")
     if isinstance(labels, str | os.PathLike):
         if told or space is not None:
             raise UserError(f"{labels} says its own space of actions: leave out {told[0] if told else 'space'}")
-        return _of_file(label_path(labels))
+        return of_file(label_path(labels))
     rows = rows_of(labels)
     if space is None:
         size = rows.action.shape[1]
@@ -179,16 +183,20 @@ def _given(labels: Any, space: Any, cues: Any, low: Any, high: Any) -> _Given:
             raise UserError(
                 f"low and high bound {len(low)} and {len(high)} entries, actions have {size}: give one an entry"
             )
-        space = Box(tuple(map(float, low)), tuple(map(float, high)), cues_from(cues) if cues else ())
+        space = Box(tuple(map(float, low)), tuple(map(float, high)), cues_from(cues) if _is_told(cues) else ())
     given.check(rows, Spaces(rows.obs.shape[1], space), RELATIVE)
-    return _Given(rows, space, None)
+    return GivenLabels(rows, space, None)
+
+
+def _is_told(value: Any) -> bool:
+    return value is not None and not (isinstance(value, str | tuple | list) and not value)
 
 
 def _numbers(name: str, value: Any) -> list[float]:
     return arguments.numbers(name, value).reshape(-1).tolist()
 
 
-def _of_file(path: Path) -> _Given:
+def of_file(path: Path) -> GivenLabels:
     """The labels of a file's first seed. Raises UserError for a file of other answers."""
     file = label_files.read(path)
     if file.answers != RELATIVE.name:
@@ -203,7 +211,7 @@ def _of_file(path: Path) -> _Given:
             config = configuration.from_json(LogsConfig, values)
         except (TypeError, UserError) as error:
             raise UserError(f"{path} does not say of which situations its labels are: write it anew") from error
-    return _Given(rows, file.space, file.eps, config)
+    return GivenLabels(rows, file.space, file.eps, config)
 
 
 def _recording_of(policy: Any) -> LogsConfig | None:
@@ -212,23 +220,24 @@ def _recording_of(policy: Any) -> LogsConfig | None:
     return config if isinstance(config, LogsConfig) else None
 
 
-def _world(found: _Given, before: LogsConfig | None) -> World:
+def world_of(found: GivenLabels, before: LogsConfig | None = None) -> World:
     """The situations of labels as a world of the task `logs`, which names no folder.
 
     Networks of a policy that was corrected `before` keep their view. Raises UserError where that cannot be.
     """
     config, size = found.config, found.rows.obs.shape[1]
     if config is None or sum(config.entries) != size:
-        config = LogsConfig(entries=(size,), **logs.scales_of(np.asarray(found.rows.obs)))
+        centre, spread = logs.scales_of(np.asarray(found.rows.obs))
+        config = LogsConfig(entries=(size,), centre=centre, spread=spread)
     if before is not None:
         if logs.space_of(before) != found.space:
             raise UserError(
                 "the policy was corrected with other bounds or cues before: leave out cues, low, high and space"
             )
         config = before if sum(before.entries) == size else config
-    config = dataclasses.replace(
-        config, path="", digest="", order="recorded", rows=len(found.rows.obs), **_as_values(found.space)
-    )
+    values = {} if logs.space_of(config) == found.space else _as_values(found.space)
+    plain = {"path": "", "digest": "", "order": "recorded", "rows": len(found.rows.obs)}
+    config = dataclasses.replace(config, **plain, **values)
     if logs.space_of(config).to_json() != found.space.to_json():
         raise UserError(f"the space {found.space.name!r} is none that a recording can have: give a box with plain cues")
     filled = lambda config, split: logs.filled(config, found.rows.obs, found.rows.action)  # noqa: E731
