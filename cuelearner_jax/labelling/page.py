@@ -14,7 +14,7 @@ from nicegui.events import GenericEventArguments
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.labelling import controls, view
 from cuelearner_jax.labelling.controls import Control
-from cuelearner_jax.labelling.session import Session, Status
+from cuelearner_jax.labelling.session import Item, Session, Status
 from cuelearner_jax.spaces import UNSAID
 
 HERE = Path(__file__).parent
@@ -40,6 +40,7 @@ class Page:
         self.controls = controls.controls(self.form, self.space, self._one_cue, *films)
         self._said: dict[int, float] = {}  # of the question on the screen, by the number of the cue
         self._said_of = session.number
+        self._drawn: Item | None = None  # what the page shows
         self._loop = asyncio.get_running_loop()
         self._client = ui.context.client
         ui.add_css((HERE / "page.css").read_text())
@@ -241,8 +242,10 @@ class Page:
         status, item = self.session.status(), self.session.item
         plan = self.session.plan
         how = self.form, plan.config.scalars.eps_deg, self.space
-        self._scene.content = "" if item is None else view.picture(item, *how, self._one_cue)
-        self._note.text = "" if item is None else view.note(item, *how)
+        if item is not self._drawn:  # what was picked of cues changes nothing in it
+            self._drawn = item
+            self._scene.content = "" if item is None else view.picture(item, *how, self._one_cue)
+            self._note.text = "" if item is None else view.note(item, *how)
         if self._said_of != self.session.number:
             self._said, self._said_of = {}, self.session.number
         picked = {one.name for one in self._picks if one.answer == (self._said.get(one.cue, UNSAID),)}
