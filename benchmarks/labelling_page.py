@@ -122,7 +122,8 @@ def moved(page: Page, item: int, seconds: float = 30.0) -> None:
 
 def press(page: Page, presses: Presses) -> None:
     """Presses keys, one after the other."""
-    for key in presses.keys:
+    for number, key in enumerate(presses.keys):
+        time.sleep(0.05 if number else 0.0)  # nobody presses two at once
         page.keyboard.press(key)
 
 

@@ -77,13 +77,13 @@ class Body:
     # a folder of the user's -> the body with what lies there; raises UserError if that is not for it; None: takes none
     made_of: Callable[[Path], Body] | None = None
     digest: str = ""  # of what lies in that folder
-    # configuration -> the environment with zeros in place of what files hold, of which a policy needs shapes and view
-    # alone; None: as `environment` has it
-    layout: Callable[[Any], Environment] | None = None
+    # (configuration, observations (n, obs), actions (n, action)) -> the environment with these in place of what files
+    # hold; without them (None) of zeros, as far as shapes and views depend on it; None: as `environment` has it
+    filled: Callable[[Any, Any, Any], Environment] | None = None
 
     def shaped(self, config: Any) -> Environment:
         """The environment of a configuration, as far as shapes and views depend on it."""
-        return self.environment(config, "training") if self.layout is None else self.layout(config)
+        return self.environment(config, "training") if self.filled is None else self.filled(config, None, None)
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from cuelearner_jax import config as configuration
 from cuelearner_jax.adaptation import adapting, calibrated, changes
 from cuelearner_jax.calibration import declared
 from cuelearner_jax.calibration.families import Family
-from cuelearner_jax.cli.parsing import PAPER, about, check_numbers, code_of, out, parse, preset_of, taken
+from cuelearner_jax.cli.parsing import PAPER, about, check_numbers, code_of, is_code, out, parse, preset_of, taken
 from cuelearner_jax.cli.shared_options import Flag, Lane, TaskT, asking_kind
 from cuelearner_jax.cli.situations import WORDS, task_named, with_cues
 from cuelearner_jax.config import GuideScalars, GuideSizes, Scalars
@@ -28,7 +28,6 @@ from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.guides.relative import KIND
 from cuelearner_jax.labelling import controls
 from cuelearner_jax.labelling.plan import Base, Plan
-from cuelearner_jax.plugins import REFERENCE
 from cuelearner_jax.policies import NearAims, uniform_in
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs.grid import LARGEST_SEED
@@ -254,7 +253,7 @@ def _source(task: Task, named: str | None, changed: str | None) -> PolicySource 
 
     `changed`: code of the distortions that it corrects, if any.
     """
-    if named is None or (REFERENCE.fullmatch(named) and not Path(named).exists()):
+    if named is None or is_code(named):
         return None
     folder = Path(named)
     if not folder.is_dir():

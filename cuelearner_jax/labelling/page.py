@@ -172,6 +172,8 @@ class Page:
         elif pressed is not None and pressed.cue is not None and pressed.answer is not None and pressed.picks:
             if taken := number == self.session.number:
                 self._said[pressed.cue] = pressed.answer[0]  # until the answer is sent
+                self._mark()
+                return
         else:
             try:
                 if name == "undo":
@@ -248,12 +250,7 @@ class Page:
             self._note.text = "" if item is None else view.note(item, *how)
         if self._said_of != self.session.number:
             self._said, self._said_of = {}, self.session.number
-        picked = {one.name for one in self._picks if one.answer == (self._said.get(one.cue, UNSAID),)}
-        for control, button in self._picks.items():
-            button.classes(**{"add" if control.name in picked else "remove": "picked"})
-        if self._picks:
-            with self._client:
-                ui.run_javascript(f"cue.mark({json.dumps(sorted(picked))})")
+        self._mark()
         if "film-refined" in self._tools:
             self._tools["film-refined"].set_visibility(item is not None and item.refined is not None)
         self._practising.set_visibility(item is not None and item.number < 0)
@@ -269,6 +266,15 @@ class Page:
         for button in self._pressable:
             button.set_enabled(item is not None)
         self._tell(status)
+
+    def _mark(self) -> None:
+        """Shows what was picked of several cues."""
+        picked = {one.name for one in self._picks if one.answer == (self._said.get(one.cue, UNSAID),)}
+        for control, button in self._picks.items():
+            button.classes(**{"add" if control.name in picked else "remove": "picked"})
+        if self._picks:
+            with self._client:
+                ui.run_javascript(f"cue.mark({json.dumps(sorted(picked))})")
 
     def _tell(self, status: Status) -> None:
         unsure = f", {status.unsure} not known" if status.unsure else ""

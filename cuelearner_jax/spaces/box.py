@@ -73,6 +73,10 @@ class Box(Space):
         bounded = jnp.clip(vector, _row(self.low, vector), _row(self.high, vector))
         return jnp.where(jnp.isfinite(vector), bounded, jnp.nan)
 
+    def outward(self, vector: Vectors, action: Vectors) -> Float[Array, "... action"]:
+        """Return a vector given in shares of the ranges as a vector to be added to the action."""
+        return vector * _row(self._range, vector)
+
     def spread(self, count: int) -> Float[Array, "count action"]:
         """Return `count` vectors that fill the box evenly and reach its bounds, the same ones each time.
 

@@ -25,15 +25,19 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from cuelearner_jax import pictures
 from cuelearner_jax.adaptation.adapting import plain_scalars
-from cuelearner_jax.environment import Quantity, WholeObservations
+from cuelearner_jax.adaptation.judging import LABELS
+from cuelearner_jax.config import Sizes
+from cuelearner_jax.environment import Features, Quantity, WholeObservations
 from cuelearner_jax.errors import UserError, closest
+from cuelearner_jax.guides.relative import KIND
 from cuelearner_jax.policies import PolicyNode
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.spaces import DIRECTIONS, Box, Choices, Space, cues_from
+from cuelearner_jax.spaces.box import SHARE
 from cuelearner_jax.spaces.choices import STEPS
 from cuelearner_jax.storage import situations
 from cuelearner_jax.storage.situations import Situations
-from cuelearner_jax.task import Body, Pictures, Preset, Task
+from cuelearner_jax.task import PAPER, Body, Pictures, Preset, Task
 from cuelearner_jax.terminal import console
 from cuelearner_jax.types import Reel, Sketch, Step
 
@@ -41,6 +45,8 @@ NAME = "logs"
 Actions = Literal["box", "directions", "choices"]
 Order = Literal["shuffled", "recorded"]
 CLIP_FRAMES, CLIP_PERIOD = 60, 0.1  # of a clip, at most; between two of them [s]
+FARTHEST = 5.0  # spreads from the centre, beyond which entries of an observation look alike to networks
+FRAME = "action"  # in which networks see: by `Layout.features`
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,23 +75,43 @@ class LogsConfig:
     """Words for more and less of each entry, as "left,right" (default: "more,less")."""
     cue_names: tuple[str, ...] = ()
     """A name for each cue (default: its words)."""
+    keys: tuple[str, ...] = ()
+    """Keys for more and less of each cue, as "q,a" (default: arrows for left and right, or letters of the words)."""
+    centre: tuple[float, ...] = ()
+    """What networks subtract of each entry of an observation (default: nothing)."""
+    spread: tuple[float, ...] = ()
+    """What networks divide the rest by (default: nothing)."""
 
 
 def space_of(config: LogsConfig) -> Space:
     """The actions of a configuration. Raises UserError for bounds or cues that fit no space."""
     if config.actions == "directions":
         return DIRECTIONS
-    if config.actions == "choices":
-        order = cues_from(config.cues, config.cue_names, STEPS) if config.cues else ()
-        return Choices(len(config.low), *order)
-    return Box(config.low, config.high, cues_from(config.cues, config.cue_names) if config.cues else ())
+    unit = STEPS if config.actions == "choices" else SHARE
+    cues = cues_from(config.cues, config.cue_names, unit) if config.cues else ()
+    if cues and config.keys:
+        pairs = [tuple(pair.split(",")) for pair in config.keys]
+        if len(pairs) != len(cues) or not all(len(pair) == 2 and all(pair) for pair in pairs):
+            raise UserError(f"task.keys is {config.keys}: give two keys for each cue, as q,a")
+        cues = tuple(dataclasses.replace(cue, keys=pair) for cue, pair in zip(cues, pairs, strict=True))
+    return Choices(len(config.low), *cues) if config.actions == "choices" else Box(config.low, config.high, cues)
 
 
 class Layout(WholeObservations, struct.PyTreeNode):
-    """What policies look at of recorded situations: how they are made up."""
+    """What policies look at of recorded situations: how they are made up, and how networks see them."""
 
     observation: tuple[Quantity, ...] = struct.field(pytree_node=False)
     actions: Space = struct.field(pytree_node=False)
+    centre: Float[Array, " obs"]
+    scale: Float[Array, " obs"]
+
+    def features(self, obs: Float[Array, " obs"], actions: Float[Array, "*n action"]) -> Features:
+        """The observation and the actions, each entry of the order of one."""
+        own = jnp.clip((obs - self.centre) / self.scale, -FARTHEST, FARTHEST)
+        if not isinstance(self.actions, Box):
+            return Features(own, jnp.asarray(actions))
+        middle = jnp.broadcast_to(self.actions.spread(1)[0], jnp.shape(actions))
+        return Features(own, 2 * self.actions.log(middle, actions))
 
 
 class Place(struct.PyTreeNode):
@@ -109,7 +135,7 @@ class Logs(Layout):
 
     def view(self) -> Layout:
         """The same without the situations."""
-        return Layout(self.observation, self.actions)
+        return Layout(self.observation, self.actions, self.centre, self.scale)
 
     def reset(self, key: PRNGKeyArray) -> tuple[Place, Float[Array, " obs"]]:
         """A random situation."""
@@ -192,11 +218,27 @@ def task_of(
         high=tuple(map(float, high)),
         cues=tuple(",".join(cue.words) for cue in pairs),
         cue_names=names if pairs else (),
+        **scales_of(found.observations),
     )
     _check_actions(path, found, space_of(config))
-    scalars = plain_scalars(space_of(config))
-    preset = Preset("labels about recorded situations", RunConfig(config, scalars=scalars), ("relative",), (200,))
-    return dataclasses.replace(LOGS, default=config, presets={"paper": preset})
+    return configured(config)
+
+
+def configured(config: LogsConfig, body: Body | None = None) -> Task:
+    """The task of a configuration, with other situations in it where a `body` holds some."""
+    sizes, scalars = Sizes(frame=FRAME), plain_scalars(space_of(config))
+    run = RunConfig(config, sizes, scalars)
+    preset = Preset("labels about recorded situations", run, (KIND.name,), (200,))
+    return dataclasses.replace(LOGS, default=config, presets={PAPER: preset}, bodies=(body or BODY,))
+
+
+def scales_of(observations: Float[np.ndarray, "n obs"]) -> dict[str, tuple[float, ...]]:
+    """`centre` and `spread` of a configuration: mean and standard deviation of each entry, 1 where it never changes."""
+    rounded = lambda values: tuple(float(f"{value:.6g}") for value in values)  # noqa: E731
+    with np.errstate(over="ignore"):
+        spread = observations.std(0, dtype=np.float64)
+    still = ~(spread > 1e-6 * np.maximum(np.abs(observations).max(0), 1e-12))
+    return {"centre": rounded(observations.mean(0, dtype=np.float64)), "spread": rounded(np.where(still, 1.0, spread))}
 
 
 def bounds_of(
@@ -243,19 +285,26 @@ def _read(path: Path) -> Situations:
     return situations.read(path)
 
 
-def _layout(config: LogsConfig) -> Logs:
-    """Zeros in place of the situations."""
-    space = space_of(config)
-    if len(config.names) != len(config.entries) or min(config.entries, default=0) < 1 or config.rows < 1:
+def filled(config: LogsConfig, observations: Any = None, actions: Any = None) -> Logs:
+    """The environment of situations (n, obs) and (n, action) in their order; of zeros where none are given.
+
+    Raises UserError for a configuration that describes none.
+    """
+    space, size = space_of(config), sum(config.entries)
+    sound = len(config.names) == len(config.entries) and min(config.entries, default=0) > 0 and config.rows > 0
+    if not sound or not all(len(part) in (0, size) for part in (config.centre, config.spread)):
         raise UserError(
-            "task.names, task.entries or task.rows describe no situations: give `cuelearner label` a folder"
+            "task.names, entries, rows, centre or spread describe no situations: give the folder by logs:FOLDER"
         )
-    slices = tuple(
-        Quantity(name, size, "1", "as recorded") for name, size in zip(config.names, config.entries, strict=True)
-    )
-    rows, size = config.rows, sum(config.entries)
-    zeros = jnp.zeros((rows, size)), jnp.zeros((rows, space.size)), jnp.zeros(rows, jnp.int32)
-    return Logs(slices, space, *zeros, config.path)
+    if not all(value > 0 for value in config.spread):
+        raise UserError(f"task.spread is {config.spread}: give a number above 0 for each entry of an observation")
+    slices = (Quantity(name, size, "1", "as recorded") for name, size in zip(config.names, config.entries, strict=True))
+    if observations is None:
+        observations, actions = jnp.zeros((config.rows, size)), jnp.zeros((config.rows, space.size))
+    centre = jnp.asarray(config.centre or (0.0,) * size, jnp.float32)
+    scale = jnp.asarray(config.spread or (1.0,) * size, jnp.float32)
+    rows, recorded, places = jnp.asarray(observations), jnp.asarray(actions), jnp.arange(len(observations))
+    return Logs(tuple(slices), space, centre, scale, rows, recorded, places, config.path)
 
 
 def _environment(config: LogsConfig, split: str) -> Logs:
@@ -265,7 +314,7 @@ def _environment(config: LogsConfig, split: str) -> Logs:
     """
     if not config.path:
         raise UserError("no situations are given: name their folder, as logs:FOLDER or by --task.path")
-    found, layout = _read(Path(config.path)), _layout(config)
+    found, layout = _read(Path(config.path)), filled(config)
     if config.digest not in ("", found.digest):
         raise UserError(f"{config.path} holds other situations than it did: give the folder as it was, or label anew")
     if (found.observations.shape[1], found.actions.shape[1]) != (layout.obs_size, layout.actions.size):
@@ -276,11 +325,8 @@ def _environment(config: LogsConfig, split: str) -> Logs:
     places = np.arange(len(found.observations))
     if config.order == "shuffled":
         places = np.random.default_rng(0).permutation(places)
-    return layout.replace(
-        rows=jnp.asarray(found.observations[places]),
-        recorded=jnp.asarray(found.actions[places]),
-        places=jnp.asarray(places, jnp.int32),
-    )
+    made = filled(config, found.observations[places], found.actions[places])
+    return made.replace(places=jnp.asarray(places, jnp.int32))
 
 
 # --- pictures --------------------------------------------------------------------------------------------------------
@@ -340,7 +386,7 @@ PICTURES = Pictures(
     reel=_reel,
     simulates=False,
 )
-BODY = Body("recording", "situations as they were recorded", _environment, pictures=lambda: PICTURES, layout=_layout)
+BODY = Body("recording", "situations as they were recorded", _environment, pictures=lambda: PICTURES, filled=filled)
 LOGS = Task(
     name=NAME,
     about="recorded situations, without a simulator: name their folder, as logs:FOLDER",
@@ -348,5 +394,7 @@ LOGS = Task(
     bodies=(BODY,),
     proposed=Recorded,
     # A label is of what was seen and proposed, wherever that lies now.
-    labels_hold=("path", "digest", "rows", "order", "cues", "cue_names"),
+    labels_hold=("path", "digest", "rows", "order", "cues", "cue_names", "keys", "centre", "spread"),
+    files=lambda config: {"path": config.digest} if config.path else {},
+    judge_by=lambda config: LABELS,
 )

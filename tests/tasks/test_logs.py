@@ -112,6 +112,18 @@ def test_a_configuration_is_plain_and_describes_the_layout_without_the_folder(fo
     assert shape_of(logs.LOGS, config).rows.shape == (12, 4)
 
 
+def test_networks_see_entries_of_the_order_of_one(folder):
+    observations, _ = recorded.arrays()
+    task = logs.task_of(folder, CUES, **BOUNDS)
+    view = task.view(task.plain())
+    first = jnp.asarray(observations[0])
+    seen = np.asarray(jax.vmap(lambda obs: view.features(obs, jnp.asarray(recorded.HIGH)).own)(jnp.asarray(observations)))
+    np.testing.assert_allclose(seen.mean(0), 0.0, atol=1e-5)
+    np.testing.assert_allclose(seen.std(0), 1.0, atol=1e-5)
+    np.testing.assert_allclose(view.features(first, jnp.asarray(recorded.HIGH)).turned, 1.0, atol=1e-6)
+    np.testing.assert_allclose(view.features(first, jnp.asarray([recorded.LOW] * 2)).turned, -1.0, atol=1e-6)
+
+
 def test_other_situations_in_the_folder_are_refused(folder):
     config = logs.task_of(folder, CUES, **BOUNDS).plain()
     logs._read.cache_clear()
