@@ -171,7 +171,7 @@ class Page:
             why = "a window lies over the question: close it first"
         elif pressed is not None and pressed.cue is not None and pressed.answer is not None and pressed.picks:
             if taken := number == self.session.number:
-                self._said[pressed.cue] = pressed.answer[0]  # until the answer is sent
+                self._said_about(number)[pressed.cue] = pressed.answer[0]  # until the answer is sent
                 self._mark()
                 return
         else:
@@ -248,8 +248,7 @@ class Page:
             self._drawn = item
             self._scene.content = "" if item is None else view.picture(item, *how, self._one_cue)
             self._note.text = "" if item is None else view.note(item, *how)
-        if self._said_of != self.session.number:
-            self._said, self._said_of = {}, self.session.number
+        self._said_about(self.session.number)
         self._mark()
         if "film-refined" in self._tools:
             self._tools["film-refined"].set_visibility(item is not None and item.refined is not None)
@@ -266,6 +265,12 @@ class Page:
         for button in self._pressable:
             button.set_enabled(item is not None)
         self._tell(status)
+
+    def _said_about(self, number: int) -> dict[int, float]:
+        """What was picked of a question's cues; of another than the one before nothing."""
+        if self._said_of != number:
+            self._said, self._said_of = {}, number
+        return self._said
 
     def _mark(self) -> None:
         """Shows what was picked of several cues."""
