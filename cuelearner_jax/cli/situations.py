@@ -54,6 +54,7 @@ def with_cues(task: Task, config: Any, cues: str) -> Any:
     fields = {entry.name for entry in dataclasses.fields(config)}
     if not {"cues", "cue_names"} <= fields:
         raise UserError(f"--cues names cues, and {task.name} has its own: leave it out")
-    found = dataclasses.replace(config, cues=tuple(",".join(cue.words) for cue in cues_from(cues)))
+    own = {"keys": ()} if "keys" in fields else {}  # of the words that go
+    found = dataclasses.replace(config, cues=tuple(",".join(cue.words) for cue in cues_from(cues)), **own)
     shape_of(task, found)  # tells of cues that do not fit
     return found

@@ -14,7 +14,7 @@ from nicegui.events import GenericEventArguments
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.labelling import controls, view
 from cuelearner_jax.labelling.controls import Control
-from cuelearner_jax.labelling.session import Session, Status
+from cuelearner_jax.labelling.session import Item, Session, Status
 from cuelearner_jax.spaces import UNSAID
 
 HERE = Path(__file__).parent
@@ -40,6 +40,7 @@ class Page:
         self.controls = controls.controls(self.form, self.space, self._one_cue, *films)
         self._said: dict[int, float] = {}  # of the question on the screen, by the number of the cue
         self._said_of = session.number
+        self._drawn: Item | None = None  # what the page shows
         self._loop = asyncio.get_running_loop()
         self._client = ui.context.client
         ui.add_css((HERE / "page.css").read_text())
@@ -170,7 +171,9 @@ class Page:
             why = "a window lies over the question: close it first"
         elif pressed is not None and pressed.cue is not None and pressed.answer is not None and pressed.picks:
             if taken := number == self.session.number:
-                self._said[pressed.cue] = pressed.answer[0]  # until the answer is sent
+                self._said_about(number)[pressed.cue] = pressed.answer[0]  # until the answer is sent
+                self._mark()
+                return
         else:
             try:
                 if name == "undo":
@@ -241,16 +244,12 @@ class Page:
         status, item = self.session.status(), self.session.item
         plan = self.session.plan
         how = self.form, plan.config.scalars.eps_deg, self.space
-        self._scene.content = "" if item is None else view.picture(item, *how, self._one_cue)
-        self._note.text = "" if item is None else view.note(item, *how)
-        if self._said_of != self.session.number:
-            self._said, self._said_of = {}, self.session.number
-        picked = {one.name for one in self._picks if one.answer == (self._said.get(one.cue, UNSAID),)}
-        for control, button in self._picks.items():
-            button.classes(**{"add" if control.name in picked else "remove": "picked"})
-        if self._picks:
-            with self._client:
-                ui.run_javascript(f"cue.mark({json.dumps(sorted(picked))})")
+        if item is not self._drawn:  # what was picked of cues changes nothing in it
+            self._drawn = item
+            self._scene.content = "" if item is None else view.picture(item, *how, self._one_cue)
+            self._note.text = "" if item is None else view.note(item, *how)
+        self._said_about(self.session.number)
+        self._mark()
         if "film-refined" in self._tools:
             self._tools["film-refined"].set_visibility(item is not None and item.refined is not None)
         self._practising.set_visibility(item is not None and item.number < 0)
@@ -266,6 +265,21 @@ class Page:
         for button in self._pressable:
             button.set_enabled(item is not None)
         self._tell(status)
+
+    def _said_about(self, number: int) -> dict[int, float]:
+        """What was picked of a question's cues; of another than the one before nothing."""
+        if self._said_of != number:
+            self._said, self._said_of = {}, number
+        return self._said
+
+    def _mark(self) -> None:
+        """Shows what was picked of several cues."""
+        picked = {one.name for one in self._picks if one.answer == (self._said.get(one.cue, UNSAID),)}
+        for control, button in self._picks.items():
+            button.classes(**{"add" if control.name in picked else "remove": "picked"})
+        if self._picks:
+            with self._client:
+                ui.run_javascript(f"cue.mark({json.dumps(sorted(picked))})")
 
     def _tell(self, status: Status) -> None:
         unsure = f", {status.unsure} not known" if status.unsure else ""
