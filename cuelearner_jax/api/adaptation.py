@@ -199,9 +199,7 @@ def _source(policy: Any, world: Any) -> PolicySource:
     if isinstance(world, World):
         return source_of(policy, world)
     if hasattr(world, "observation_space"):
-        raise UserError(
-            "world is an environment of Gymnasium: give cl.from_gymnasium(...) of its id, class or function"
-        )
+        raise UserError("world is an environment of Gymnasium: give cl.from_gymnasium(its id, class or function)")
     if isinstance(world, type) or not all(callable(getattr(world, name, None)) for name in ("reset", "step")):
         raise arguments.refused("world", world, "a world, as cl.make gives it, or an environment")
     task = Task("environment", "a bare environment", _Bare, (Body("own", "", lambda config, split: world),))

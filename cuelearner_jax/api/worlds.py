@@ -124,7 +124,7 @@ def from_gymnasium(
             environment when it is called with `arguments`.
         num_envs: environments that step together in training.
         max_steps: an episode is truncated after so many (default: as the environment says).
-        cues: words for more and less of each entry of an action, "left,right;up,down;open,close" (default: "more,less").
+        cues: words for more and less of each entry of an action, "left,right;up,down" (default: "more,less").
         observation: a name, a number of entries and a unit for each slice of the flattened observation,
             [("gripper", 3, "m"), ("goal", 3, "m")] (default: its entries by the names of its space).
         units: instead: units of slices by name; those in "m" and "rad" may have shifted, for calibration.

@@ -32,7 +32,7 @@ from cuelearner_jax.errors import UserError, raised_by, shown
 from cuelearner_jax.plugins import REFERENCE
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.spaces import Box, Choices, Space, cues_from
-from cuelearner_jax.task import Body, Preset, Task
+from cuelearner_jax.task import Body, Pictures, Preset, Task
 from cuelearner_jax.tasks import fetch_layout
 
 FAMILY = "gymnasium"
@@ -172,9 +172,15 @@ def _judge_by(config: GymnasiumConfig) -> str:
     return SUCCESS if config.succeeds else "reward"
 
 
+def _pictures() -> Pictures:
+    from cuelearner_jax.tasks import gymnasium_pictures  # Pillow's loading is not for every command
+
+    return gymnasium_pictures.PICTURES
+
+
 def body(factory: Callable[..., Any] | None = None) -> Body:
     """Return what acts in the task."""
-    return Body(FAMILY, "Gymnasium's own simulation", partial(make_environment, factory))
+    return Body(FAMILY, "Gymnasium's own simulation", partial(make_environment, factory), pictures=_pictures)
 
 
 GYMNASIUM = Task(
@@ -191,7 +197,8 @@ GYMNASIUM = Task(
 def task_of(name: str) -> Task:
     """Return the task of an environment: an id of Gymnasium's registry, or package.module:NAME, which is imported.
 
-    Raises UserError if it cannot be had. Call it with what a caller or the command line names, never with a file's word.
+    Call it with what a caller or the command line names, never with what a file says. Raises UserError if the
+    environment cannot be had.
     """
     return task_from(plugins.load(name, object, "an environment") if REFERENCE.fullmatch(name) else name, called=name)
 

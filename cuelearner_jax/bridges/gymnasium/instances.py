@@ -7,6 +7,7 @@ it went comes to another name, and is told.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -45,6 +46,15 @@ class Went(NamedTuple):
     place: bytes  # where the instance stands now
 
 
+class Shot(NamedTuple):
+    """What an instance is to be filmed at."""
+
+    slot: int
+    seed: int  # of the episode
+    actions: np.ndarray  # (steps, action) from its beginning
+    first: int  # pictures from after so many of these on
+
+
 class Running:
     """One instance and where it stands."""
 
@@ -53,7 +63,7 @@ class Running:
         self.env, self.whose = env, whose
         self.leaves = leaves_of(whose, env.observation_space)
         actions_of(whose, env.action_space)
-        self.seed, self.steps, self.total, self.place = 0, 0, 0.0, b""
+        self.seed, self.steps, self.total, self.place = -1, 0, 0.0, b""
 
     def reset(self, seed: int) -> np.ndarray:
         """Begin an episode. Raises UserError for what the environment raises, or gives that is no observation."""
@@ -67,7 +77,7 @@ class Running:
         return obs
 
     def step(self, action: np.ndarray, max_steps: int) -> tuple[np.ndarray, float, bool, bool, float]:
-        """Execute an action (action,). Returns observation, reward, terminated, truncated, success. Raises as `reset`."""
+        """Execute an action (action,). Return observation, reward, terminated, truncated, success. Raise as `reset`."""
         self.steps += 1
         when = f"step {self.steps} of the episode with seed {self.seed}"
         try:
@@ -102,9 +112,28 @@ class Running:
                     break
                 start += leaf.size
             raise UserError(
-                f"environment {self.whose} gave an observation {leaf.name!r} that is not finite in {when}: mend it first"
+                f"environment {self.whose} gave an observation {leaf.name!r} that is not finite in {when}: mend that"
             )
         return obs
+
+    def picture(self) -> np.ndarray:
+        """Return what `render` gives, (height, width, 3) uint8. Raises UserError where that is no picture."""
+        try:
+            found = self.env.render()
+        except Exception as error:
+            words = " ".join(str(error).split())[:160]
+            raise UserError(
+                f"environment {self.whose} cannot be drawn ({type(error).__name__}: {words}): if that is of OpenGL, "
+                "set MUJOCO_GL to egl or osmesa"
+            ) from error
+        if isinstance(found, list) and found:
+            found = found[-1]
+        if not isinstance(found, np.ndarray) or found.dtype != np.uint8 or found.shape[2:] != (3,) or not found.size:
+            raise UserError(
+                f"environment {self.whose} gives no pictures: let it take render_mode='rgb_array', and render return "
+                "uint8 (height, width, 3)"
+            )
+        return np.ascontiguousarray(found)
 
 
 class Instances:
@@ -114,13 +143,17 @@ class Instances:
         """`make` gives an environment; `size`: entries of an observation, as the task has them (0: whatever it is)."""
         self.make, self.whose, self.max_steps, self.size = make, whose, max_steps, size
         self.running: dict[int, Running] = {}
+        self.filmed: dict[int, np.ndarray] = {}  # actions (steps, action) of the episodes that are filmed
 
-    def carry_out(self, orders: Sequence[Order]) -> list[Went | str]:
-        """Carry out orders; the words of an error in place of what failed, whose instance is then dropped."""
-        found: list[Went | str] = []
+    def carry_out(self, orders: Sequence[Order | Shot]) -> list[Any]:
+        """Carry out orders; the words of an error in place of what failed, whose instance is then dropped.
+
+        Returns a `Went` an order, pictures [(height, width, 3) uint8] a shot.
+        """
+        found: list[Any] = []
         for order in orders:
             try:
-                found.append(self._one(order))
+                found.append(self._filmed(order) if isinstance(order, Shot) else self._one(order))
             except UserError as error:
                 self.drop(order.slot)
                 found.append(str(error))
@@ -140,7 +173,7 @@ class Instances:
         return Went(obs, final_obs, reward, terminated, truncated, success, total, one.place)
 
     def _go(self, one: Running, order: Order) -> None:
-        """Make an instance stand where an order says. Raises UserError for an environment that does not repeat itself."""
+        """Make an instance stand where an order says. Raises UserError if the environment does not repeat itself."""
         assert order.replay is not None
         one.reset(order.seed)
         for action in order.replay:
@@ -151,6 +184,23 @@ class Instances:
                 f"{len(order.replay)} actions it came elsewhere than before: let it draw from its own np_random alone, "
                 "and reset everything in reset(seed=...)"
             )
+
+    def _filmed(self, shot: Shot) -> list[np.ndarray]:
+        """Pictures of an episode; where it ends before its actions do, as many as there are."""
+        one = self._instance(shot.slot)
+        before = self.filmed.get(shot.slot, shot.actions[:0])
+        goes_on = one.seed == shot.seed and len(before) <= shot.first and len(before) == one.steps
+        if not goes_on or not np.array_equal(before, shot.actions[: len(before)]):
+            one.reset(shot.seed)
+        frames = [one.picture()] if one.steps >= shot.first else []
+        for action in shot.actions[one.steps :]:
+            *_, terminated, truncated, _ = one.step(action, self.max_steps)
+            if one.steps >= shot.first:
+                frames.append(one.picture())
+            if terminated or truncated:
+                break
+        self.filmed[shot.slot] = shot.actions[: one.steps]
+        return frames
 
     def _instance(self, slot: int) -> Running:
         if slot not in self.running:
@@ -174,10 +224,8 @@ class Instances:
         """Close an instance, if there is one."""
         one = self.running.pop(slot, None)
         if one is not None:
-            try:
+            with contextlib.suppress(Exception):  # it is given up, whatever closing raises
                 one.env.close()
-            except Exception:
-                pass
 
     def close(self) -> None:
         """Close all."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import atexit
+import contextlib
 import os
 import pickle
 import socket
@@ -10,17 +11,21 @@ import subprocess
 import sys
 import threading
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from ctypes.util import find_library
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from cuelearner_jax.bridges.gymnasium.instances import Instances, Order, Went
+from cuelearner_jax.bridges.gymnasium.instances import Instances, Order, Shot, Went
 from cuelearner_jax.bridges.gymnasium.source import Source
 from cuelearner_jax.errors import UserError
 
+WORKER = "cuelearner_jax.bridges.gymnasium.worker"
+PACKAGES = Path(__file__).parents[3]  # from where this package is imported
 MOST_POOLS = 8  # that are open at once
 MOST_INSTANCES = 1024  # of a pool, beyond those that one call needs
 RECENT = 16  # calls: an instance that was used within so many is still wanted
@@ -29,20 +34,17 @@ RECENT = 16  # calls: an instance that was used within so many is still wanted
 class Process:
     """Instances in a process of their own."""
 
-    def __init__(self, whose: str, sent: bytes) -> None:
-        """Begin it. `sent`: the arguments of `Instances`, pickled."""
+    def __init__(self, sent: bytes, more: Mapping[str, str]) -> None:
+        """Begin it.
+
+        Args:
+            sent: the arguments of `Instances`, pickled.
+            more: variables of its environment beside ours.
+        """
         ours, theirs = socket.socketpair()
-        command = [
-            sys.executable,
-            "-m",
-            "cuelearner_jax.bridges.gymnasium.worker",
-            str(theirs.fileno()),
-            str(os.getpid()),
-        ]
-        package = os.path.dirname(os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__)))))
-        paths = os.pathsep.join([package, *filter(None, [os.environ.get("PYTHONPATH")])])
-        environ = {**os.environ, "PYTHONPATH": paths}
-        self.whose = whose
+        command = [sys.executable, "-m", WORKER, str(theirs.fileno()), str(os.getpid())]
+        paths = os.pathsep.join([str(PACKAGES), *filter(None, [os.environ.get("PYTHONPATH")])])
+        environ = {**os.environ, "PYTHONPATH": paths, **more}
         # What an environment prints is no output of ours.
         self.child = subprocess.Popen(
             command, pass_fds=(theirs.fileno(),), stdin=subprocess.DEVNULL, stdout=2, env=environ
@@ -52,14 +54,12 @@ class Process:
         self.link.send([entry or os.getcwd() for entry in sys.path])
         self.link.send_bytes(sent)
 
-    def send(self, orders: Sequence[Order]) -> None:
+    def send(self, orders: Sequence[Order | Shot]) -> None:
         """Give orders, to be answered by `receive`."""
-        try:
+        with contextlib.suppress(OSError):  # `receive` tells
             self.link.send_bytes(pickle.dumps(orders, pickle.HIGHEST_PROTOCOL))
-        except OSError:  # `receive` tells
-            pass
 
-    def receive(self, count: int) -> list[Went | str] | None:
+    def receive(self, count: int) -> list[Any] | None:
         """Return what orders led to; None: the process is gone."""
         try:
             return pickle.loads(self.link.recv_bytes())
@@ -82,13 +82,13 @@ class Here:
     def __init__(self, instances: Instances) -> None:
         """Keep them."""
         self.instances = instances
-        self.found: list[Went | str] = []
+        self.found: list[Any] = []
 
-    def send(self, orders: Sequence[Order]) -> None:
+    def send(self, orders: Sequence[Order | Shot]) -> None:
         """Carry out orders."""
         self.found = self.instances.carry_out(orders)
 
-    def receive(self, count: int) -> list[Went | str] | None:
+    def receive(self, count: int) -> list[Any] | None:
         """Return what they led to."""
         return self.found
 
@@ -168,17 +168,20 @@ class Pool:
                 slot.used = self.calls
             chosen.append(slot)
         free = iter(sorted((slot for slot in self.slots if slot.used < self.calls), key=lambda slot: slot.used))
-        taken = []
-        for request, slot in zip(requests, chosen, strict=True):
-            if slot is None:
-                slot = next(free, None)
-                wanted = slot is not None and slot.place and slot.used > self.calls - RECENT
-                if slot is None or (wanted and request.steps and len(self.slots) < MOST_INSTANCES):
-                    slot = Slot(len(self.slots))
-                    self.slots.append(slot)
-                slot.used = self.calls
-            taken.append(slot)
-        return taken
+        return [
+            self._vacated(request, free) if slot is None else slot
+            for request, slot in zip(requests, chosen, strict=True)
+        ]
+
+    def _vacated(self, request: Request, free: Iterator[Slot]) -> Slot:
+        """The instance that was used least recently, or a new one, where a state that is still wanted would be lost."""
+        slot = next(free, None)
+        wanted = slot is not None and slot.place and slot.used > self.calls - RECENT
+        if slot is None or (wanted and request.steps and len(self.slots) < MOST_INSTANCES):
+            slot = Slot(len(self.slots))
+            self.slots.append(slot)
+        slot.used = self.calls
+        return slot
 
     def _order(self, request: Request, slot: Slot) -> Order:
         replay = None
@@ -201,10 +204,11 @@ class Pool:
     def _host(self, number: int) -> Process | Here:
         if number not in self.hosts:
             arguments = self.source.arguments_of_instances()
-            if self.source.hosts == 1:
+            if self.source.plays_here:
                 self.hosts[number] = Here(Instances(*arguments))
             else:
-                self.hosts[number] = Process(self.source.name, self.source.pickled(arguments))
+                drawing = _without_screen() if self.source.drawn else {}
+                self.hosts[number] = Process(self.source.pickled(arguments), drawing)
         return self.hosts[number]
 
     def _lost(self, number: int) -> str:
@@ -216,9 +220,19 @@ class Pool:
             if slot.number % self.source.hosts == number:
                 self._stand(slot, b"")
         return (
-            f"environment {self.source.name}: a process that played it ended (exit status {gone.child.returncode}): see "
-            "what it wrote on standard error, or give processes 1 to have it played in this process"
+            f"environment {self.source.name}: a process that played it ended (exit status {gone.child.returncode}): "
+            "see what it wrote on standard error, or give processes 1 to have it played in this process"
         )
+
+    def filmed(self, slot: int, seed: int, actions: np.ndarray, first: int) -> list[np.ndarray]:
+        """Return pictures of an episode from step `first` on. Raises UserError if there are none."""
+        with self.lock:
+            host = self._host(0)
+            host.send([Shot(slot, seed, np.asarray(actions, np.float32), first)])
+            (found,) = host.receive(1) or [self._lost(0)]
+            if isinstance(found, str):
+                raise UserError(found)
+            return found
 
     def close(self) -> None:
         """End all processes and close all instances."""
@@ -226,6 +240,13 @@ class Pool:
             for host in self.hosts.values():
                 host.close()
             self.hosts, self.slots, self._standing = {}, [], {}
+
+
+def _without_screen() -> dict[str, str]:
+    """What lets MuJoCo draw where there is no screen, and nobody has said how."""
+    if "MUJOCO_GL" in os.environ or "DISPLAY" in os.environ or sys.platform != "linux":
+        return {}
+    return {"MUJOCO_GL": "osmesa" if find_library("OSMesa") else "egl"}
 
 
 _pools: OrderedDict[Source, Pool] = OrderedDict()

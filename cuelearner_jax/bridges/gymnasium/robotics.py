@@ -6,7 +6,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import enum
+import io
 import types
 from typing import Any
 
@@ -14,7 +16,9 @@ from typing import Any
 def register() -> None:
     """Register the environments of gymnasium_robotics with Gymnasium, so that these work beside the MuJoCo here."""
     import gymnasium
-    import gymnasium_robotics
+
+    with contextlib.redirect_stderr(io.StringIO()):  # it prints a notice about other environments of its own
+        import gymnasium_robotics
 
     gymnasium.register_envs(gymnasium_robotics)
     supply_joint_types()
@@ -25,11 +29,12 @@ def supply_joint_types() -> None:
 
     Does nothing where the members do so by themselves.
     """
-    import mujoco
+    import mujoco as library
     import numpy as np
     from gymnasium_robotics.utils import mujoco_utils
 
-    own: Any = mujoco.mjtJoint
+    mujoco: Any = library  # whose members a type checker does not know
+    own = mujoco.mjtJoint
     if np.int32(int(own.mjJNT_HINGE)) in (own.mjJNT_HINGE,) or isinstance(mujoco_utils.mujoco, _View):
         return
     mujoco_utils.mujoco = _View(mujoco)  # pyright: ignore[reportAttributeAccessIssue]

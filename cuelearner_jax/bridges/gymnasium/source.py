@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from importlib import import_module
 from importlib.util import find_spec
 from typing import Any
 
 from cuelearner_jax.errors import UserError, closest
 
+DRAWN = "render_mode"
 MISSING = "Gymnasium is not installed: pip install 'cuelearner-jax[gymnasium]'"
 
 
@@ -26,16 +27,24 @@ class Source:
     processes: int  # 0: one for each processor; 1: this one
     size: int = 0  # entries of an observation; 0: not known yet
     factory: Callable[..., Any] | None = None  # None: by the id
+    drawn: bool = False  # are its instances drawn? Then one process plays them
 
     @property
     def hosts(self) -> int:
         """Processes that play."""
-        return self.processes or max(1, cores())
+        return 1 if self.drawn else self.processes or cores()
+
+    @property
+    def plays_here(self) -> bool:
+        """Whether instances are played in this process. What is drawn is not: OpenGL and threads do not go together."""
+        return self.hosts == 1 and not self.drawn
 
     @property
     def make(self) -> Callable[[], Any]:
         """What gives one instance, called with nothing."""
         named = json.loads(self.arguments)
+        if self.drawn and (self.factory is None or _takes(self.factory, DRAWN)):
+            named[DRAWN] = "rgb_array"
         if self.factory is not None:
             return partial(made_by, self.factory, named)
         return partial(made, self.name, named, self.max_steps)
@@ -58,6 +67,15 @@ class Source:
                 f"environment {self.name} cannot be sent to another process ({type(error).__name__}: {error}): give a "
                 "function or class of a module, or processes 1"
             ) from error
+
+
+def _takes(factory: Callable[..., Any], name: str) -> bool:
+    """Whether a function or class can be given an argument of that name."""
+    try:
+        parameters = inspect.signature(factory).parameters
+    except (TypeError, ValueError):
+        return False
+    return name in parameters or any(one.kind is one.VAR_KEYWORD for one in parameters.values())
 
 
 def cores() -> int:
@@ -121,9 +139,3 @@ def made_by(factory: Callable[..., Any], arguments: dict[str, Any]) -> Any:
             "class or function that gives a gymnasium.Env"
         )
     return env
-
-
-def imported(reference: str) -> Any:
-    """Return what `package.module:NAME` names. Only for what a caller or the command line names."""
-    module, _, name = reference.partition(":")
-    return getattr(import_module(module), name)
