@@ -1,13 +1,13 @@
 """Fetch whose camera stands 3 cm from where the arm believes, corrected by 100 labels of a teacher who sees the truth.
 
-    python experiments/fetch_hand_eye.py --out runs/fetch [--scale paper] [--pieces FetchPush-v4/calibration] [--resume]
+    python experiments/fetch_hand_eye.py --out runs/fetch [--scale paper] [--pieces FetchPush-v4/calibration/0] [--resume]
 
 FetchReach and FetchPush of gymnasium_robotics (the extra `gymnasium`), played by scripted policies. A teacher of all
 cues, of the worst one or of one at random answers; no rewarded step is taken: held-out labels judge. Controls: the
 policy as it was, and models of labels that have each other's answers. Label seeds play episodes of their own, and each
 of these is played by the policy as it was too, with the camera in its place and displaced. `--split tuning` plays
-episodes, and asks with label seeds, on which nothing is reported. OUT/ENVIRONMENT/KIND.json grows as it measures.
-At the scale `paper` a piece takes about a quarter of an hour of one core; `--list` names them.
+episodes, and asks with label seeds, on which nothing is reported. OUT/ENVIRONMENT/KIND/SEED.json grows as it measures.
+At the scale `paper` a piece takes some minutes of one core; `--list` names them.
 """
 
 from __future__ import annotations
@@ -52,7 +52,6 @@ class Scale(NamedTuple):
     """How much is asked and played."""
 
     labels: int
-    seeds: int  # of labels, each with its own policy
     episodes: int  # of each seed
 
 
@@ -63,10 +62,11 @@ class Condition(NamedTuple):
     shuffled: bool = False  # a control: labels have each other's answers
 
 
-SCALES = {"smoke": Scale(20, 1, 2), "quick": Scale(50, 2, 20), "paper": Scale(100, 4, 50)}
+SCALES = {"smoke": Scale(20, 2), "quick": Scale(50, 20), "paper": Scale(100, 50)}
 CONDITIONS = (*(Condition(says) for says in SAYS), Condition("all", shuffled=True))
 KINDS = ("base", "calibration", "relative", "offset")  # "base": the policy as it was, unchanged and displaced
-PIECES = tuple(f"{environment}/{kind}" for environment in SCRIPTS for kind in KINDS)
+SEEDS = range(4)  # of labels, each with its own policy
+PIECES = tuple(f"{environment}/{kind}/{seed}" for environment in SCRIPTS for kind in KINDS for seed in SEEDS)
 
 
 def hand_eye(environment: str, offset: Sequence[float]) -> Any:
@@ -141,28 +141,27 @@ def adapted(environment: str, kind: str, condition: Condition, labels: int, seed
 
 def measured(piece: str, scale: Scale, split: str, known: Sequence[Row]) -> Iterator[Row]:
     """All measurements of a piece but the known ones, each as soon as it is there."""
-    environment, kind = piece.split("/")
-    done = {(row["what"], row["says"], row["shuffled"], row["seed"]) for row in known}
-    for number in range(scale.seeds):
-        first = FIRST_EPISODE[split] + number * scale.episodes
-        episodes, seed = range(first, first + scale.episodes), FIRST_SEED[split] + number
-        if kind == "base":
-            script = in_space(policy_of(jax.jit(SCRIPTS[environment])), world_of(environment).env.actions)
-            for what, offset in (("unchanged", (0.0, 0.0, 0.0)), ("displaced", OFFSET)):
-                if (what, "", False, seed) not in done:
-                    success = played(environment, script, offset, episodes)
-                    yield {"what": what, "says": "", "shuffled": False, "seed": seed, "success": success}
+    environment, kind, number = piece.split("/")
+    done = {(row["what"], row["says"], row["shuffled"]) for row in known}
+    first = FIRST_EPISODE[split] + int(number) * scale.episodes
+    episodes, seed = range(first, first + scale.episodes), FIRST_SEED[split] + int(number)
+    if kind == "base":
+        script = in_space(policy_of(jax.jit(SCRIPTS[environment])), world_of(environment).env.actions)
+        for what, offset in (("unchanged", (0.0, 0.0, 0.0)), ("displaced", OFFSET)):
+            if (what, "", False) not in done:
+                success = played(environment, script, offset, episodes)
+                yield {"what": what, "says": "", "shuffled": False, "seed": seed, "success": success}
+        return
+    for condition in CONDITIONS:
+        if (kind, *condition) in done:
             continue
-        for condition in CONDITIONS:
-            if (kind, *condition, seed) in done:
-                continue
-            policy = adapted(environment, kind, condition, scale.labels, seed)
-            told = {"used": policy.used, "judged": [round(value, 4) for value in policy.judged[1:]]}
-            if kind == "calibration":
-                told["estimates"] = [one.words() for one in policy.estimates if one.changed]
-            success = played(environment, policy.policy, OFFSET, episodes)
-            row = {"what": kind, "says": condition.says, "shuffled": condition.shuffled, "seed": seed}
-            yield {**row, **told, "rewarded_steps": policy.rewarded_steps, "success": success}
+        policy = adapted(environment, kind, condition, scale.labels, seed)
+        told: Row = {"used": policy.used, "judged": [round(value, 4) for value in policy.judged[1:]]}
+        if kind == "calibration":
+            told["estimates"] = [one.words() for one in policy.estimates if one.changed]
+        success = played(environment, policy.policy, OFFSET, episodes)
+        row = {"what": kind, "says": condition.says, "shuffled": condition.shuffled, "seed": seed}
+        yield {**row, **told, "rewarded_steps": policy.rewarded_steps, "success": success}
 
 
 def run(piece: str, scale: str, split: str, out: Path, resume: bool) -> None:
