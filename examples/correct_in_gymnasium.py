@@ -2,9 +2,9 @@
 
     python examples/correct_in_gymnasium.py
 
-A hand is to go where a thing lies; the policy's actions are off by the same three numbers everywhere. A teacher, a NumPy
-function too, says of each action "left" or "right", "up" or "down", "ahead" or "back", 200 times. Prints the mean error
-of the action before and after, and of a model of answers that were shuffled. A minute on 2 cores; needs the extra
+A hand is to go where a thing lies; the policy's actions are off by the same three numbers everywhere. A teacher,
+another NumPy function, says of 200 actions "left" or "right", "up" or "down", "ahead" or "back". Prints the mean error
+of actions before and after, and that of a model of answers that were shuffled. A minute on 2 cores; needs the extra
 `gymnasium`.
 """
 

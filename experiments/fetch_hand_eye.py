@@ -1,6 +1,6 @@
 """Fetch whose camera stands 3 cm from where the arm believes, corrected by 100 labels of a teacher who sees the truth.
 
-    python experiments/fetch_hand_eye.py --out runs/fetch [--scale paper] [--pieces FetchPush-v4/calibration/0] [--resume]
+    python experiments/fetch_hand_eye.py --out runs/fetch [--pieces FetchPush-v4/calibration/0] [--resume]
 
 FetchReach and FetchPush of gymnasium_robotics (the extra `gymnasium`), played by scripted policies. A teacher of all
 cues, of the worst one or of one at random answers; no rewarded step is taken: held-out labels judge. Controls: the
