@@ -1,6 +1,10 @@
 """Calibration as a kind of guidance: relative answers as evidence of what changed in the world.
 
 No network is fitted and no action refined: `cuelearner_jax.calibration` reads the answers, outside compiled programs.
+With theta what changed, a*(theta) the action that the policy means behind that change, in any space with cues:
+
+    P(theta | labels) ~ P(theta) prod over labels, and cues they speak of, of P(h_c | log(a, a*(s, theta))_c / eps)
+    a = a*(s, mean of theta), where the evidence says that anything changed
 """
 
 from __future__ import annotations

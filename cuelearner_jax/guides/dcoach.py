@@ -2,7 +2,12 @@
 
 Source: Perez-Dattari, Celemin, Ruiz-del-Solar, Kober, "Interactive learning with corrective feedback for policies based
 on deep neural networks" (ISER 2018), Algorithm 1: of a correction h the target a + e h, a gradient step on it, and one
-on a minibatch of a replay of the newest corrections (their code: 200 of them, minibatches of 50). Here e is eps.
+on a minibatch of a replay of the newest corrections (their code: 200 of them, minibatches of 50). Here e is eps, and
+the sum is `exp` of the space, along the cues of which the label speaks:
+
+    y = exp(a, eps h)
+    pi <- pi - Adam(grad of sum over those cues of (d log (pi(s) - y))^2)
+    a <- clip(retract(pi(s)), a, tau_max)
 
 What differs, and why: corrections come in rounds, so a round's are learned one after the other at its end
 (`--sizes.labels-per-round 1` learns each at once). "Already right" is an answer here where silence is meant there, and

@@ -4,7 +4,11 @@ Source: paper, section V-A ("train an auxiliary policy that imitates the human t
 about what the policy itself would do, once there is one (DAgger: Ross, Gordon, Bagnell, 2011). On raw observations the
 policy sees nothing else. In the action's frame it sees the situation from some direction and says which way its action
 lies from there. It is taught from all directions, for what is to be done depends on none; and it looks again from the
-action that it came to, until that settles: from there it sees best.
+action that it came to, until that settles: from there it sees best. Of a label (s, a, a*), in any space:
+
+    pi = argmin over f of sum over labels of |f(s) - a*|^2,      a <- clip(retract(pi(s)), a, tau_max)
+
+and in the action's frame, where pi(s, a) = a + f(s, a), as many passes as `relative` may take.
 """
 
 from __future__ import annotations

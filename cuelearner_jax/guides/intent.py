@@ -6,7 +6,10 @@ the likelihood of the teacher's words, summed over what may have been meant. (In
 says: Baker, Saxe, Tenenbaum, "Action understanding as inverse planning", Cognition 2009.) A pass of refinement goes by
 at most eps toward the likeliest aim and ends there, so precision is the aim's and not the label's. Where the teacher
 seems to mean none of them (`aim_doubt`), actions stay as they are: the same bad shot again and again is worse than the
-agent's own.
+agent's own. With g_i the aims of s, p their weights by the network, and each cue of which a label speaks by itself:
+
+    P(h | s, a) = sum over i of p_i(s) prod over cues of P(h_c | log(a, g_i)_c)                          (`likelihood`)
+    p = argmax of sum over labels of log P(h | s, a),      a <- approach(a, likeliest g_i, eps)                 (`act`)
 """
 
 from __future__ import annotations

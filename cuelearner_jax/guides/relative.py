@@ -1,7 +1,14 @@
 """The paper's method: a model phi(s, a) of relative feedback ("more left", "more right") that refines actions.
 
-Source: paper, Eqs. 2 to 4. The network predicts corrections in units of eps, so that a small eps fits as easily as a
-large one.
+Source: paper, Eqs. 2 to 5, written with `log` and `exp` of the space, so that they hold in boxes of any size, for
+directions and for choices in a row. Of a label (s, a, h), h of each cue in {-1, 0, 1} or not said:
+
+    y = exp(a, eps h) - a                                                        (`target`; h of an unsaid cue is 0)
+    phi = argmin over f of sum over labels, and cues of which they speak, of (d log (f(s, a) - y))^2        (`fit`)
+    a <- clip(retract(a + phi(s, a)), a_0, tau_max), until a pass moves a by less than tau, K_max passes at most (`act`)
+
+The network predicts corrections in units of eps, so that a small eps fits as easily as a large one. A cue of which
+nothing was said adds no loss: "not said" is no "right".
 """
 
 from __future__ import annotations

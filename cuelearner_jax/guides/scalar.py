@@ -2,7 +2,13 @@
 
 Source: paper, section V-A and appendix; its public code fits a network like the agent's to labels of 1 and 0, and has
 the network's own argmax labelled. Hardly any uniform action is good, so a model that is asked about its own choices
-alone may never see one: a share `explored_fraction` of the questions stays about base actions.
+alone may never see one: a share `explored_fraction` of the questions stays about base actions. Of a label (s, a, g), g
+1 for a good action and 0 for another, in any space:
+
+    v = argmin over f of sum over labels of (f(s, a) - g)^2
+    a <- argmax over `space.spread(guide_directions)` of v(s, a)
+
+Of choices these are all there are. In a box they thin out with its size: give more `guide_directions`.
 """
 
 from __future__ import annotations

@@ -371,6 +371,16 @@ def test_any_function_is_corrected(capsys):
     assert all(rate in (0.0, 0.25, 0.5, 0.75, 1.0) for rate in rates)
 
 
+@pytest.mark.long
+def test_a_constant_error_in_a_gymnasium_class_of_ones_own_falls_to_a_fifth():
+    pytest.importorskip("gymnasium")
+    from examples.correct_in_gymnasium import main as correct
+
+    found = correct()
+    assert found["corrected"] < 0.2 * found["as it was"]
+    assert found["answers shuffled"] > 0.5 * found["as it was"]
+
+
 def test_the_shots_that_the_page_on_billiards_shows_are_won(capsys):
     (shown,) = re.findall(
         r"```python\n(.*?)```", (ROOT / "docs" / "billiards.md").read_text(encoding="utf-8"), re.DOTALL
