@@ -147,7 +147,7 @@ def entries_of(simulator: Any, size: int) -> tuple[str, ...]:
     if model is None or model.nu != size:
         return plain
     joints = [int(model.actuator_trnid[index, 0]) for index in range(size)]
-    named = [model.actuator(i).name or (joints[i] >= 0 and model.joint(joints[i]).name) for i in range(size)]
+    named = [model.actuator(i).name or (model.joint(joints[i]).name if joints[i] >= 0 else "") for i in range(size)]
     return tuple(named) if all(named) and len(set(named)) == size else plain
 
 
