@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from cuelearner_jax.api.exporting import export_policy, load_exported
     from cuelearner_jax.api.feedback import FeedbackModel, Labels, ask, fit_feedback, refine
     from cuelearner_jax.api.training import Run, train
-    from cuelearner_jax.api.worlds import World, make, teacher_of
+    from cuelearner_jax.api.worlds import World, from_gymnasium, make, teacher_of
     from cuelearner_jax.calibration import Distortion, Unknown
     from cuelearner_jax.errors import UserError
 
@@ -46,6 +46,7 @@ _PLACES = {
     "ask": "api.feedback",
     "export_policy": "api.exporting",
     "fit_feedback": "api.feedback",
+    "from_gymnasium": "api.worlds",
     "load_exported": "api.exporting",
     "load_policy": "api.acting",
     "make": "api.worlds",
@@ -69,6 +70,7 @@ __all__ = [
     "ask",
     "export_policy",
     "fit_feedback",
+    "from_gymnasium",
     "load_exported",
     "load_policy",
     "make",

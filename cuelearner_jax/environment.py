@@ -16,6 +16,8 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from cuelearner_jax.spaces import DIRECTIONS, Space
 from cuelearner_jax.types import EnvState, Step
 
+OWN = "own"
+
 
 class Quantity(NamedTuple):
     """One slice of an observation."""
@@ -24,7 +26,9 @@ class Quantity(NamedTuple):
     size: int  # entries
     unit: str  # of an entry, as "m", "rad" or "1" for a pure number
     about: str = ""  # what it is, where from and in which order, in a few words
-    kind: str = ""  # "beams" at equal angles, counterclockwise, or "directions", unit vectors: what a sensor turns with
+    # "beams" at equal angles, counterclockwise, or "directions", unit vectors: what a sensor turns with; "own": what a
+    # robot measures of itself, which no displaced sensor shifts
+    kind: str = ""
     step_deg: float = 0.0  # of beams: the angle between two neighbours
 
 

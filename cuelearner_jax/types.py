@@ -6,7 +6,7 @@ Directions are unit vectors in the plane; angles are radians, counterclockwise p
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 from flax import struct
@@ -84,7 +84,7 @@ class GuidanceModel(struct.PyTreeNode):
 
 
 class Sketch(NamedTuple):
-    """A situation as lines for a browser: SVG in a frame of its own, [m], y down.
+    """A situation as lines or a picture for a browser: SVG in a frame of its own, y down [m; pixels of a picture].
 
     Colours that hang on light or dark are the page's: `var(--floor)`, `var(--solid)`, `var(--low)`, `var(--ink)`,
     `var(--free)`, `var(--hit)`, `var(--goal)`, `var(--body)`.
@@ -99,11 +99,15 @@ class Sketch(NamedTuple):
     turn: float  # counterclockwise angle on the screen of an action of angle 0 [deg]
     aim: float = 0.0  # length of a thin line that goes on from the arrow [m]
     words: str = ""  # about the situation, in a few words
+    # Of each cue, which way more of it points on the screen: x to the right, y down; None: nowhere. None given: by the
+    # words of the cues (`labelling.pointing`)
+    points: tuple[tuple[float, float] | None, ...] = ()
 
 
 class Reel(NamedTuple):
-    """What an action leads to, as places of a sketch's movers."""
+    """What an action leads to, as places of a sketch's movers, or as pictures in the place of a sketch's picture."""
 
     period: float  # between two frames [s]
     frames: list[dict[str, tuple[float, float, float] | None]]  # of each mover, as `Sketch.places`; None: not seen
     words: str = ""  # how it ended
+    pictures: Sequence[str] = ()  # one a frame, as data URIs; see `pictures.clip`

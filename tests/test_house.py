@@ -14,7 +14,7 @@ ROWS = [
     ["errors", "signals"],
     ["user_code"],
     ["types", "spaces", "plugins"],
-    ["environment"],
+    ["environment", "pictures"],
     ["config", "devices", "terminal"],
     ["storage"],
     ["agents"],
@@ -41,7 +41,7 @@ ROWS = [
     ["cli"],
 ]
 ROW = {room: number for number, row in enumerate(ROWS) for room in row}
-FOR_TASKS = {"errors", "types", "spaces", "environment"}  # what a task may know of the method
+FOR_TASKS = {"errors", "types", "spaces", "environment", "pictures"}  # what a task may know of the method
 # Of guidance; "heuristic" names a member and a policy too.
 KINDS = {"relative", "intent", "demonstration", "scalar", "dcoach"}
 

@@ -105,7 +105,7 @@ class AdaptedPolicy(CallablePolicy):
 def adapt(
     policy: Any,
     world: World | Environment,
-    teacher: Teacher | None = None,
+    teacher: Teacher | Any = None,
     *,
     labels: int | Labels | str | os.PathLike[str] | None = None,
     bound_deg: float | None = None,
@@ -129,7 +129,8 @@ def adapt(
         policy: what is to be corrected: a policy, or any function of a batch of observations (NumPy in, NumPy out; one
             that `jax.jit` made is compiled in).
         world: where it acts; a bare environment will do.
-        teacher: who answers; None where labels are given.
+        teacher: who answers: a teacher, or a function of observations (NumPy in, NumPy out) or another policy, which
+            teaches what it does itself; None where labels are given.
         labels: number of questions (default: 500, of calibration 100); or labels that are there already: arrays, or a
             label file.
         bound_deg: how far corrections may lead from the policy's own actions [deg] (default: the scenario's, of labels
@@ -175,7 +176,8 @@ def adapt(
     )
     own = as_policy_in(policy, env)
     if teacher is not None:
-        user_code.answers_in("teacher", arguments.teacher("teacher", teacher), env)
+        teacher = arguments.teacher("teacher", teacher, space)
+        user_code.answers_in("teacher", teacher, env)
     elif file is None and rows is None:
         raise UserError("labels are asked of a teacher: give one, for instance teacher_of(world), or labels")
     subject = Subject(source, BaseLanes(source.default_policy), own, teacher=teacher, rows=rows, changes=changes)
@@ -196,6 +198,8 @@ def _source(policy: Any, world: Any) -> PolicySource:
     """Where a policy comes from: its task, and what it was trained with. Raises UserError for what is no world."""
     if isinstance(world, World):
         return source_of(policy, world)
+    if hasattr(world, "observation_space"):
+        raise UserError("world is an environment of Gymnasium: give cl.from_gymnasium(its id, class or function)")
     if isinstance(world, type) or not all(callable(getattr(world, name, None)) for name in ("reset", "step")):
         raise arguments.refused("world", world, "a world, as cl.make gives it, or an environment")
     task = Task("environment", "a bare environment", _Bare, (Body("own", "", lambda config, split: world),))

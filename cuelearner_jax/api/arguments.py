@@ -20,7 +20,7 @@ from jaxtyping import Float, PRNGKeyArray
 
 from cuelearner_jax.config import LARGEST_FLOAT, plain, settled
 from cuelearner_jax.errors import UserError, closest, shown
-from cuelearner_jax.policies import Policy, policy_of
+from cuelearner_jax.policies import Policy, Teaching, in_space, policy_of
 from cuelearner_jax.runs.grid import LARGEST_BUDGET, LARGEST_SEED
 from cuelearner_jax.spaces import Space
 from cuelearner_jax.types import Teacher
@@ -184,12 +184,17 @@ def policy(name: str, value: Any) -> Policy:
         raise UserError(f"{name}: {error}") from error
 
 
-def teacher(name: str, value: Any) -> Teacher:
-    """Who answers."""
-    leaf = any(leaf is value for leaf in jax.tree.leaves(value))  # no pytree: it cannot be given to a program
-    if isinstance(value, type) or leaf or not callable(getattr(value, "best_action", None)):
-        raise refused(name, value, "a teacher, for instance teacher_of(world)")
-    return value
+def teacher(name: str, value: Any, space: Space) -> Teacher:
+    """Who answers: a teacher, or whatever acts as a policy in a space of actions, which teaches what it does itself."""
+    if callable(getattr(value, "best_action", None)):
+        # A class, or what is no pytree, cannot be given to a program.
+        if isinstance(value, type) or any(leaf is value for leaf in jax.tree.leaves(value)):
+            raise refused(name, value, "a teacher, for instance teacher_of(world)")
+    elif isinstance(value, type) or not (callable(value) or hasattr(value, "act")):
+        raise refused(name, value, "a teacher, for instance teacher_of(world), or a function of observations (n, obs)")
+    else:
+        value = Teaching(policy(name, getattr(value, "policy", value)))
+    return value.replace(policy=in_space(value.policy, space)) if isinstance(value, Teaching) else value
 
 
 def settings(name: str, value: Any, kind: type[KindT]) -> KindT:

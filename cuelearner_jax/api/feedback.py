@@ -118,7 +118,7 @@ def fit_feedback(
 def ask(
     policy: Any,
     world: World,
-    teacher: Teacher,
+    teacher: Teacher | Any,
     *,
     labels: int,
     bound_deg: float | None = None,
@@ -132,7 +132,7 @@ def ask(
     Args:
         policy: what is to be corrected: a policy, or any function of a batch of observations in NumPy.
         world: where it acts.
-        teacher: who answers.
+        teacher: who answers; a function of observations, or another policy, teaches what it does itself.
         labels: number of questions.
         bound_deg: refined actions that are asked about stay within this of the policy's own, in the space's unit
             (default: a quarter of its reach, 45 degrees).
@@ -150,7 +150,8 @@ def ask(
     space = actions_of(world.env)
     bound = arguments.optional(arguments.amount, "bound_deg", bound_deg, space) or adapting.BOUND * space.reach
     sizes, scalars = settings(space, *given_settings(space, sizes, scalars, eps_deg))
-    check_teacher(arguments.teacher("teacher", teacher), scalars)
+    teacher = arguments.teacher("teacher", teacher, space)
+    check_teacher(teacher, scalars)
     adapting.check_amounts(space, [bound], scalars)
     env, guidance = world.env, KIND.make(sizes, spaces_of(world.env))
     user_code.answers_in("teacher", teacher, env)

@@ -71,7 +71,7 @@ class Run:
 @user_code.told
 def train(
     world: World,
-    teacher: Teacher | None = None,
+    teacher: Teacher | Any = None,
     config: RunConfig | str = "quickstart",
     *,
     guidance: Sequence[str] = (),
@@ -87,7 +87,8 @@ def train(
 
     Args:
         world: where.
-        teacher: who answers; needed by kinds of guidance that ask, unless a label file answers.
+        teacher: who answers (a function of observations, or another policy, teaches what it does itself); needed by
+            kinds of guidance that ask, unless a label file answers.
         config: everything else, or the name of one of the task's presets; its world is the one given.
         guidance: kinds of guidance (default: the preset's, of these what can be had without a teacher if there is none;
             with a configuration, all that the world can have).
@@ -101,7 +102,8 @@ def train(
         UserError: settings that make no sense, no teacher where one is asked, or too little memory.
     """
     a_world("world", world)
-    if arguments.optional(arguments.teacher, "teacher", teacher) is not None:
+    teacher = arguments.optional(arguments.teacher, "teacher", teacher, world.actions)
+    if teacher is not None:
         user_code.answers_in("teacher", teacher, world.env)
     guidance = [arguments.text("guidance", kind) for kind in arguments.several("guidance", guidance, "kinds")]
     file = label_path(labels) if isinstance(labels, str | os.PathLike) else None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from typing import Any
 
@@ -12,6 +13,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from cuelearner_jax import user_code
 from cuelearner_jax.api import arguments
+from cuelearner_jax.api import arguments as checks
 from cuelearner_jax.config import settled
 from cuelearner_jax.environment import Environment, Quantity, actions_of
 from cuelearner_jax.evaluate import SPLITS
@@ -98,6 +100,55 @@ def make(name: str | Task, *, scenario: str | None = None, robot: str | None = N
     task = task.on(arguments.optional(arguments.text, "robot", robot))
     arguments.optional(arguments.text, "scenario", scenario)
     return World(task, task.configured(scenario, **changes), scenario)
+
+
+@user_code.told
+def from_gymnasium(
+    env: str | Any,
+    *,
+    num_envs: int = 8,
+    max_steps: int | None = None,
+    cues: str | Sequence[Any] = (),
+    observation: Sequence[Any] | None = None,
+    units: Mapping[str, str] | None = None,
+    processes: int = 0,
+    **arguments: Any,
+) -> World:
+    """A world of a Gymnasium environment; `gymnasium:FetchReach-v4` names the same in `make` and to every command.
+
+    One instance is made here and plays an episode, to see how observations and actions are made up. Training, roll-outs
+    and evaluation play as many as they need in processes, each an exact function of its seed and the actions so far.
+
+    Args:
+        env: an id of Gymnasium's registry (gymnasium_robotics' included), or a class or function that gives an
+            environment when it is called with `arguments`.
+        num_envs: environments that step together in training.
+        max_steps: an episode is truncated after so many (default: as the environment says).
+        cues: words for more and less of each entry of an action, "left,right;up,down" (default: "more,less").
+        observation: a name, a number of entries and a unit for each slice of the flattened observation,
+            [("gripper", 3, "m"), ("goal", 3, "m")] (default: its entries by the names of its space).
+        units: instead: units of slices by name; those in "m" and "rad" may have shifted, for calibration.
+        processes: that play (0: one for each processor; 1: none, they are played in this process).
+        arguments: of the environment.
+
+    Raises:
+        UserError: Gymnasium is not installed, the environment cannot be made, or its spaces are none that are served.
+    """
+    from cuelearner_jax.tasks import gymnasium
+
+    count = checks.whole("num_envs", num_envs, 1, 100_000)
+    limit = checks.optional(checks.whole, "max_steps", max_steps, 1, 1_000_000)
+    task = gymnasium.task_from(
+        env,
+        arguments,
+        num_envs=count,
+        max_steps=limit,
+        processes=checks.whole("processes", processes, 0, gymnasium.MOST_PROCESSES),
+        cues=cues,
+        observation=observation,
+        units=units,
+    )
+    return World(task, task.plain())
 
 
 def a_world(name: str, value: Any) -> World:

@@ -9,8 +9,20 @@ from cuelearner_jax.spaces.box import Box
 from cuelearner_jax.spaces.choices import Choices
 from cuelearner_jax.spaces.directions import DIRECTIONS, check_directions
 from cuelearner_jax.spaces.space import KNOWN, UNSAID, Cue, Space, said
+from cuelearner_jax.spaces.words import cues_from
 
-__all__ = ["DIRECTIONS", "UNSAID", "Box", "Choices", "Cue", "Space", "check_directions", "from_json", "said"]
+__all__ = [
+    "DIRECTIONS",
+    "UNSAID",
+    "Box",
+    "Choices",
+    "Cue",
+    "Space",
+    "check_directions",
+    "cues_from",
+    "from_json",
+    "said",
+]
 
 
 def from_json(about: Any) -> Space:

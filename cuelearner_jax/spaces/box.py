@@ -80,7 +80,7 @@ class Box(Space):
         quasirandom sequences", 2018); of one entry they are evenly spaced.
         """
         if count == 1:
-            return self._at(jnp.full((1, self.size), 0.5))
+            return self.middle()[None]
         ratio = 2.0
         for _ in range(64):  # the root of x^(size + 1) = x + 1
             ratio = (1 + ratio) ** (1 / (self.size + 1))
@@ -88,6 +88,10 @@ class Box(Space):
         places = np.arange(count)[:, None] * steps % 1.0 if self.size > 1 else np.arange(float(count))[:, None]
         places = (places - places.min(0)) / np.ptp(places, 0)
         return self._at(jnp.asarray(places, jnp.float32))
+
+    def middle(self) -> Float[Array, " action"]:
+        """Return the vector halfway between the bounds."""
+        return self._at(jnp.full((self.size,), 0.5))
 
     def _at(self, shares: Float[Array, "... action"]) -> Float[Array, "... action"]:
         return _row(self.low, shares) + _row(self._range, shares) * shares

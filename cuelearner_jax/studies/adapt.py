@@ -182,7 +182,7 @@ def suggested(
         scalars = scalars if eps_deg is None else replace(scalars, eps_deg=eps_deg)
     else:
         scalars = settling(scalars, eps_deg)
-    by = judging.LABELS if kind.by_evidence else AdaptRequest.judge_by
+    by = judging.LABELS if kind.by_evidence else source.task.judge_by(source.config.task)
     own = source.config.kinds.get(kind.name) or (kind.config and kind.config())
     return AdaptRequest(
         task=rules.applied(source.config.task),

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 GROUP = "cuelearner.tasks"  # of entry points: the task's name = "package.module:name"
 BUILT_IN = {
     "billiards": "cuelearner_jax.tasks.billiards:BILLIARDS",
+    "gymnasium": "cuelearner_jax.tasks.gymnasium:GYMNASIUM",
+    "logs": "cuelearner_jax.tasks.logs:LOGS",
     "navigation": "cuelearner_jax.tasks.navigation:NAVIGATION",
     "brax": "cuelearner_jax.tasks.brax:BRAX",
     "playground": "cuelearner_jax.tasks.playground:PLAYGROUND",
@@ -29,6 +31,8 @@ BUILT_IN = {
 FAMILIES: dict[str, str] = {
     "brax": "cuelearner_jax.tasks.brax:task_of",
     "playground": "cuelearner_jax.tasks.playground:task_of",
+    "gymnasium": "cuelearner_jax.tasks.gymnasium:task_of",
+    "logs": "cuelearner_jax.tasks.logs:task_of",
 }
 
 _registered: dict[str, Task] = {}
@@ -75,8 +79,6 @@ def resolve(text: str) -> Task:
     Raises:
         UserError: no such task, or its code cannot be loaded.
     """
-    if text in FAMILIES:
-        raise UserError(f"{text} is a family of tasks: name one of its environments, as {text}:NAME")
     if ":" not in text:
         return find(text)
     family, _, environment = text.partition(":")

@@ -99,13 +99,14 @@ def test_what_policies_look_at_needs_no_simulator(monkeypatch):
 @pytest.mark.parametrize(
     ("name", "says"),
     [
-        ("brax", "brax is a family of tasks: name one of its environments, as brax:NAME"),
         ("brax:pushr", "brax has no environment 'pushr', did you mean 'pusher'?"),
     ],
 )
 def test_a_name_that_is_none_is_refused_in_one_line(name, says, capsys):
     with pytest.raises(UserError, match=re.escape(says)):
         cl.make(name)
+    assert main(["train", "brax", "--out", "nowhere"]) == 2
+    assert "brax is a family of tasks: name one of its environments, as brax:NAME" in capsys.readouterr().err
     assert main(["train", name, "--out", "nowhere"]) == 2
     assert says in capsys.readouterr().err
 

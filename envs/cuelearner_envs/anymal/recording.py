@@ -15,7 +15,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, PRNGKeyArray
 
-from cuelearner_envs import film
 from cuelearner_envs.anymal import model as robot
 from cuelearner_envs.anymal.environment import LeggedNavigation
 from cuelearner_envs.anymal.judged import Course
@@ -23,6 +22,7 @@ from cuelearner_envs.anymal.scene import AZIMUTH, Picture, Studio, above, beside
 from cuelearner_envs.navigation.lidar import BEAM_ANGLES
 from cuelearner_envs.navigation.recording import ENDS
 from cuelearner_envs.navigation.world import World
+from cuelearner_jax import pictures
 from cuelearner_jax.types import Policy
 
 VIEW = (400, 400)  # width and height of each view [dots]; a film shows two side by side
@@ -92,9 +92,9 @@ def still(frames: Sequence[LeggedFrame], file: str | os.PathLike[str]) -> None:
 def animate(frames: Sequence[LeggedFrame], file: str | os.PathLike[str]) -> None:
     """A film in real time: the hall from above on the left, the robot from the side on the right."""
     fps = 10.0 if str(file).endswith(".gif") else 25.0
-    film.check(file, fps)
+    pictures.check_film(file, fps)
     specimen = next(_pictures(frames[:1], fps))
-    film.write(file, fps, partial(_pictures, frames), film.palette_of(specimen, COLOURS))
+    pictures.write_film(file, fps, partial(_pictures, frames), pictures.palette_of(specimen, COLOURS))
 
 
 def portrait(file: str | os.PathLike[str]) -> None:

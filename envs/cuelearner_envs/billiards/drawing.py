@@ -21,9 +21,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, FancyArrowPatch, FancyBboxPatch, Rectangle
 
-from cuelearner_envs import film
 from cuelearner_envs.billiards.physics import Trajectory, positions_at
 from cuelearner_envs.billiards.table import Table, corner_gap, cushions, pockets
+from cuelearner_jax import pictures
 
 CLOTH, CUSHION, RAIL, RAIL_EDGE, HOLE = "#2f7f5f", "#1d5741", "#6d4a32", "#4b3222", "#15110e"
 ARROW = "#ffd84d"
@@ -118,12 +118,12 @@ def animate(
     Raises:
         ValueError: if the name of the file ends otherwise, there are no shots, or a rate is not positive.
     """
-    film.check(file, fps)
+    pictures.check_film(file, fps)
     if not shots or speed <= 0:
         raise ValueError("an animation needs at least one shot and a positive speed")
     # The first picture shows every ball and the arrow.
-    palette = film.palette_of(next(_frames(table, shots, fps, speed)), 255)
-    film.write(file, fps, lambda rate: _frames(table, shots, rate, speed), palette)
+    palette = pictures.palette_of(next(_frames(table, shots, fps, speed)), 255)
+    pictures.write_film(file, fps, lambda rate: _frames(table, shots, rate, speed), palette)
 
 
 # --- the parts of a drawing ------------------------------------------------------------------------------------------

@@ -22,11 +22,11 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, FancyArrowPatch, Polygon, Rectangle
 
-from cuelearner_envs import film
 from cuelearner_envs.navigation.lidar import BEAM_ANGLES
 from cuelearner_envs.navigation.recording import Frame
 from cuelearner_envs.navigation.robot import Robot
 from cuelearner_envs.navigation.world import FAR_AWAY, World
+from cuelearner_jax import pictures
 
 # Okabe and Ito's palette, as in the figures of results: told apart with any colour vision.
 BODY, GOAL, CRASH, ARROW, BEAMS, HITS = "#0072B2", "#009E73", "#D55E00", "#E69F00", "#56B4E9", "#CC79A7"
@@ -132,12 +132,12 @@ def animate(robot: Robot, frames: Sequence[Frame], file: str | os.PathLike[str],
     Raises:
         ValueError: if the name of the file ends otherwise, there are no frames, or the rate is not positive.
     """
-    film.check(file, fps)
+    pictures.check_film(file, fps)
     if not frames:
         raise ValueError("an animation needs at least one frame")
     exactly = (BODY, GOAL, CRASH, ARROW, HITS, FLOOR, "#ffffff")
-    palette = film.palette_of(_specimen(robot, frames), 88, exactly)
-    film.write(file, fps, lambda rate: _pictures(robot, frames, round(HOLD_AFTER * rate)), palette)
+    palette = pictures.palette_of(_specimen(robot, frames), 88, exactly)
+    pictures.write_film(file, fps, lambda rate: _pictures(robot, frames, round(HOLD_AFTER * rate)), palette)
 
 
 def overview(

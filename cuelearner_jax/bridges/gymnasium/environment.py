@@ -1,0 +1,146 @@
+"""A Gymnasium environment as one of ours: a pure function of the seed of an episode and the actions so far."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jaxtyping import Array, Float, Int, PRNGKeyArray, UInt
+
+from cuelearner_jax import user_code
+from cuelearner_jax.bridges.gymnasium.instances import PLACE_BYTES
+from cuelearner_jax.bridges.gymnasium.pool import Request, pool_of
+from cuelearner_jax.bridges.gymnasium.source import Source
+from cuelearner_jax.environment import Quantity, WholeObservations
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.spaces import Space
+from cuelearner_jax.types import Step
+
+SUCCESS, RETURN = "success", "return"
+NOWHERE = bytes(PLACE_BYTES)
+
+
+class Episode(struct.PyTreeNode):
+    """All that an episode depends on, and the name of where it stands (see `instances`)."""
+
+    seed: UInt[Array, ""]
+    steps: Int[Array, ""]  # taken so far
+    actions: Float[Array, "max_steps action"]  # taken so far; rows from `steps` on mean nothing
+    place: UInt[Array, "2"]
+
+
+class GymnasiumTask(WholeObservations, struct.PyTreeNode):
+    """The environment (`cuelearner_jax.environment.Environment`). Nothing of Gymnasium is loaded until it is reset.
+
+    A step leaves the compiled program (`jax.pure_callback`): an instance that stands where the state says executes the
+    action. Where none does, one is reset to the episode's seed and repeats the actions so far.
+    """
+
+    source: Source = struct.field(pytree_node=False)
+    observation: tuple[Quantity, ...] = struct.field(pytree_node=False)
+    actions: Space = struct.field(pytree_node=False)
+    succeeds: bool = struct.field(pytree_node=False, default=False)  # does it tell of success?
+    refusal: str = struct.field(pytree_node=False, default="")  # why it cannot be made; empty: it can
+
+    def reset(self, key: PRNGKeyArray) -> tuple[Episode, Float[Array, " obs"]]:
+        """Begin an episode with a seed drawn from the key. Raises UserError where the environment cannot be made."""
+        self._check()
+        seed = _seed(key)
+        shapes = (self._vector, jax.ShapeDtypeStruct((2,), jnp.uint32))
+        obs, place = jax.pure_callback(self._reset_here, shapes, seed, vmap_method="broadcast_all")
+        blank = jnp.zeros((self.source.max_steps, self.actions.size), jnp.float32)
+        return Episode(seed, jnp.zeros((), jnp.int32), blank, place), obs
+
+    def step(self, key: PRNGKeyArray, state: Episode, action: Float[Array, " action"]) -> tuple[Episode, Step]:
+        """Execute an action. Where that ends the episode, another begins with a seed drawn from the key."""
+        self._check()
+        next_seed, number, flag = _seed(key), jax.ShapeDtypeStruct((), jnp.float32), jax.ShapeDtypeStruct((), jnp.bool_)
+        place = jax.ShapeDtypeStruct((2,), jnp.uint32)
+        shapes = (self._vector, self._vector, number, flag, flag, number, number, place)
+        action = jnp.asarray(action, jnp.float32)
+        given = (state.seed, state.steps, state.actions, state.place, action, next_seed)
+        found = jax.pure_callback(self._step_here, shapes, *given, vmap_method="broadcast_all")
+        obs, final_obs, reward, terminated, truncated, success, total, place = found
+        ended = terminated | truncated
+        after = Episode(
+            jnp.where(ended, next_seed, state.seed),
+            jnp.where(ended, 0, state.steps + 1),
+            state.actions.at[state.steps].set(action),
+            place,
+        )
+        outcome = {SUCCESS: success} if self.succeeds else {}
+        outcome[RETURN] = total
+        step = Step(
+            obs=obs,
+            final_obs=final_obs,
+            aftermath=final_obs,
+            reward=reward,
+            terminated=terminated,
+            truncated=truncated,
+            metrics={},
+            outcome=outcome,
+        )
+        return after, step
+
+    def _check(self) -> None:
+        if self.refusal:
+            raise UserError(self.refusal)
+
+    @property
+    def _vector(self) -> jax.ShapeDtypeStruct:
+        return jax.ShapeDtypeStruct((self.obs_size,), jnp.float32)
+
+    @property
+    def _whose(self) -> str:
+        return f"environment {self.source.name}"
+
+    def _reset_here(self, seed: Any) -> tuple[np.ndarray, np.ndarray]:
+        """Reset on the host: any leading axes."""
+        seeds = np.asarray(seed)
+        requests = [Request(int(one)) for one in seeds.ravel()]
+        obs, place = self._carried(requests)[::7]
+        return obs.reshape((*seeds.shape, -1)), place.reshape((*seeds.shape, 2))
+
+    def _step_here(self, *given: Any) -> tuple[np.ndarray, ...]:
+        """Step on the host: any leading axes."""
+        seeds, steps, history, places, actions, next_seeds = map(np.asarray, given)
+        shape = seeds.shape
+        seeds, steps, next_seeds = (column.ravel().tolist() for column in (seeds, steps, next_seeds))
+        history, actions = history.reshape(-1, *history.shape[-2:]), actions.reshape(-1, actions.shape[-1])
+        places = np.ascontiguousarray(places).reshape(-1, 2)
+        requests = [
+            Request(seeds[row], places[row].tobytes(), steps[row], history[row], actions[row], next_seeds[row])
+            for row in range(len(seeds))
+        ]
+        found = self._carried(requests)
+        return tuple(column.reshape((*shape, *column.shape[1:])) for column in found)
+
+    def _carried(self, requests: list[Request]) -> tuple[np.ndarray, ...]:
+        """What requests led to, column by column; NaN once an environment has failed, which `user_code` tells."""
+        rows = len(requests)
+        obs, final_obs = np.full((2, rows, self.obs_size), np.nan, np.float32)
+        reward, success, total = np.full((3, rows), np.nan, np.float32)
+        terminated, truncated = np.zeros((2, rows), bool)
+        place = np.zeros((rows, 2), np.uint32)
+        # What is no action is not executed, and what comes of nothing stays nothing.
+        acts = [one.action is None or (one.place != NOWHERE and np.isfinite(one.action).all()) for one in requests]
+        went = []
+        if not user_code.is_waiting():
+            try:
+                went = pool_of(self.source).carry_out([one for one, sound in zip(requests, acts, strict=True) if sound])
+            except UserError as error:
+                user_code.leave(self._whose, error)
+        for row, one in zip(np.flatnonzero(acts), went, strict=False):
+            obs[row], final_obs[row], reward[row] = one.obs, one.final_obs, one.reward
+            terminated[row], truncated[row] = one.terminated, one.truncated
+            success[row], total[row] = one.success, one.total
+            place[row] = np.frombuffer(one.place, np.uint32)
+        return obs, final_obs, reward, terminated, truncated, success, total, place
+
+
+def _seed(key: PRNGKeyArray) -> UInt[Array, ""]:
+    """A seed below 2^31, which every environment takes."""
+    return jax.random.bits(key, (), jnp.uint32) >> 1

@@ -1,0 +1,141 @@
+"""Where instances come from: an environment of Gymnasium's registry by its id, or the user's own class or function."""
+
+from __future__ import annotations
+
+import inspect
+import json
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from importlib.util import find_spec
+from typing import Any
+
+from cuelearner_jax.errors import UserError, closest
+
+DRAWN = "render_mode"
+MISSING = "Gymnasium is not installed: pip install 'cuelearner-jax[gymnasium]'"
+
+
+@dataclass(frozen=True)
+class Source:
+    """What makes instances, and how many processes play them. Hashable: compiled programs hold it."""
+
+    name: str  # an id of Gymnasium's registry, or what the user's code is called
+    arguments: str  # of the environment, by name, as JSON
+    max_steps: int  # an episode is truncated after so many
+    processes: int  # 0: one for each processor; 1: this one
+    size: int = 0  # entries of an observation; 0: not known yet
+    factory: Callable[..., Any] | None = None  # None: by the id
+    drawn: bool = False  # are its instances drawn? Then one process plays them
+
+    @property
+    def hosts(self) -> int:
+        """Processes that play."""
+        return 1 if self.drawn else self.processes or cores()
+
+    @property
+    def plays_here(self) -> bool:
+        """Whether instances are played in this process. What is drawn is not: OpenGL and threads do not go together."""
+        return self.hosts == 1 and not self.drawn
+
+    @property
+    def make(self) -> Callable[[], Any]:
+        """What gives one instance, called with nothing."""
+        named = json.loads(self.arguments)
+        if self.drawn and (self.factory is None or _takes(self.factory, DRAWN)):
+            named[DRAWN] = "rgb_array"
+        if self.factory is not None:
+            return partial(made_by, self.factory, named)
+        return partial(made, self.name, named, self.max_steps)
+
+    def arguments_of_instances(self) -> tuple[Any, ...]:
+        """What `Instances` takes."""
+        return self.make, self.name, self.max_steps, self.size
+
+    def pickled(self, arguments: tuple[Any, ...]) -> bytes:
+        """Pickle what a process is sent, code of `__main__` and local functions included.
+
+        Raises UserError for code that cannot be sent.
+        """
+        import cloudpickle  # Gymnasium needs it too
+
+        try:
+            return cloudpickle.dumps(arguments)
+        except Exception as error:
+            raise UserError(
+                f"environment {self.name} cannot be sent to another process ({type(error).__name__}: {error}): give a "
+                "function or class of a module, or processes 1"
+            ) from error
+
+
+def _takes(factory: Callable[..., Any], name: str) -> bool:
+    """Whether a function or class can be given an argument of that name."""
+    try:
+        parameters = inspect.signature(factory).parameters
+    except (TypeError, ValueError):
+        return False
+    return name in parameters or any(one.kind is one.VAR_KEYWORD for one in parameters.values())
+
+
+def cores() -> int:
+    """Return the number of processors that this process may use."""
+    affinity = getattr(os, "sched_getaffinity", None)
+    return len(affinity(0)) if affinity else os.cpu_count() or 1
+
+
+def check_installed() -> None:
+    """Raises UserError unless Gymnasium is installed."""
+    if find_spec("gymnasium") is None:
+        raise UserError(MISSING)
+
+
+def known(name: str) -> Any:
+    """Return the specification that Gymnasium's registry has of an id, without importing what the id names.
+
+    Raises UserError for an id that is not there.
+    """
+    check_installed()
+    if ":" in name:
+        raise UserError(
+            f"the id {name!r} would import code: only its caller may name that, as gymnasium:{name} in place of TASK"
+        )
+    import gymnasium
+
+    if name not in gymnasium.registry and find_spec("gymnasium_robotics") is not None:
+        from cuelearner_jax.bridges.gymnasium.robotics import register
+
+        register()
+    if name in gymnasium.registry:
+        return gymnasium.registry[name]
+    try:
+        return gymnasium.spec(name)  # an id without its version
+    except Exception as error:
+        if not isinstance(error, gymnasium.error.Error):
+            raise
+        raise UserError(
+            f"Gymnasium has no environment {name!r}{closest(name, gymnasium.registry)[:300]}"
+            if gymnasium.registry
+            else f"Gymnasium has no environment {name!r}"
+        ) from error
+
+
+def made(name: str, arguments: dict[str, Any], max_steps: int) -> Any:
+    """Return an environment of Gymnasium's registry. Raises UserError for an id that is not there."""
+    spec = known(name)
+    import gymnasium
+
+    limited = {"max_episode_steps": max_steps} if max_steps else {}
+    return gymnasium.make(spec, **limited, **arguments)
+
+
+def made_by(factory: Callable[..., Any], arguments: dict[str, Any]) -> Any:
+    """Return an environment of the user's code. Raises UserError for what is none."""
+    env = factory(**arguments)
+    wanted = ("reset", "step", "observation_space", "action_space")
+    if lacking := [name for name in wanted if not hasattr(env, name)]:
+        raise UserError(
+            f"{getattr(factory, '__qualname__', factory)} gave a {type(env).__name__} without {lacking[0]!r}: give a "
+            "class or function that gives a gymnasium.Env"
+        )
+    return env

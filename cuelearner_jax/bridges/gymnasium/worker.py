@@ -1,0 +1,71 @@
+"""A process that plays instances for the pool: reads orders from a socket until that is closed.
+
+The process is begun as a program of its own, not as a copy of its parent: a copy of a process with threads may hang,
+and a script of the user's is not run a second time.
+"""
+
+from __future__ import annotations
+
+import os
+import pickle
+import signal
+import sys
+import threading
+import time
+from multiprocessing.connection import Connection
+from typing import Any
+
+LOOKED = 1.0  # from one look at the parent to the next [s]
+
+
+def main(descriptor: int, parent: int) -> None:
+    """Serve until the pool closes its end, or its process is gone."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # an interrupt is for the process that waits, which then ends this one
+    threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
+    link = Connection(descriptor)
+    instances: Any = None
+    try:
+        path = link.recv()
+        sys.path[:] = path
+        instances = _begun(link)
+        while True:
+            orders = link.recv()
+            link.send_bytes(pickle.dumps(instances.carry_out(orders), pickle.HIGHEST_PROTOCOL))
+    except (EOFError, OSError):
+        pass
+    finally:
+        if instances is not None:
+            instances.close()
+
+
+def _begun(link: Connection) -> Any:
+    """The instances of what the pool sends; an error is its answer to every order."""
+    from cuelearner_jax.bridges.gymnasium.instances import Instances
+    from cuelearner_jax.errors import UserError, raised_by
+
+    sent = link.recv_bytes()
+    try:
+        return Instances(*pickle.loads(sent))
+    except Exception as caught:
+        error = caught if isinstance(caught, UserError) else raised_by("the environment's code, when loaded,", caught)
+        words = str(error)
+
+    class Failed:
+        def carry_out(self, orders: Any) -> list[str]:
+            return [words for _ in orders]
+
+        def close(self) -> None:
+            pass
+
+    return Failed()
+
+
+def _end_with(parent: int) -> None:
+    """End this process once its parent is gone, in the middle of a step too."""
+    while os.getppid() == parent:
+        time.sleep(LOOKED)
+    os._exit(1)
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[1]), int(sys.argv[2]))

@@ -1,0 +1,218 @@
+"""Pictures of RGB frames or image files: for the labelling page, as a still and as a film (GIF or MP4)."""
+
+from __future__ import annotations
+
+import base64
+import io
+import os
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import imageio.v2 as imageio
+import numpy as np
+from jaxtyping import UInt8
+from PIL import Image, ImageOps
+
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.types import Reel, Sketch
+
+Picture = UInt8[np.ndarray, "height width 3"]
+Source = np.ndarray | bytes  # a `Picture`, or the bytes of a PNG or JPEG file
+KINDS = (".gif", ".mp4")
+SHOWN = {"PNG": "image/png", "JPEG": "image/jpeg"}  # formats of files that are read: their media types
+LARGEST = 1280  # longest side of a picture on the page, of a film there half of it [pixels]
+SHEET = 6  # frames of a film that its still shows
+TURNED = 0x0112  # the EXIF tag that says how a camera was held
+
+
+def sketch(image: Source, words: str = "") -> Sketch:
+    """Return a picture as the sketch of a situation; its frame counts in pixels.
+
+    Args:
+        image: RGB uint8 (height, width, 3), or the bytes of a PNG or JPEG file.
+        words: about the situation, in a few words.
+
+    Raises:
+        UserError: the image is neither.
+    """
+    uri, (width, height) = _uri(image, LARGEST)
+    still = f'<image class="photo" href="{uri}" width="{width}" height="{height}"/>'
+    foot, reach = (width / 2, height / 2), (0.0, min(width, height) / 4)
+    return Sketch((0.0, 0.0, width, height), still, {}, {}, foot, reach, 0.0, words=words)
+
+
+def clip(frames: Sequence[Source], period: float, words: str = "") -> Reel:
+    """Return a short film of pictures, to be seen in the place of a sketch's picture.
+
+    Args:
+        frames: pictures as `sketch` takes them, all of one size.
+        period: between two of them [s].
+        words: how the film ends.
+
+    Raises:
+        UserError: there is no frame, one is no picture, their sizes differ, or the period is not positive.
+    """
+    if not period > 0 or not len(frames):
+        raise UserError(f"a clip of {len(frames)} frames every {period:g} s: give at least one, and a positive period")
+    found = [_uri(frame, LARGEST // 2) for frame in frames]
+    if len({size for _, size in found}) > 1:
+        raise UserError(f"the frames of a clip differ in size ({found[0][1]} and others): give frames of one size")
+    return Reel(period, [], words, [uri for uri, _ in found])
+
+
+def still(frames: Sequence[Source], file: str | os.PathLike[str]) -> None:
+    """Write up to six frames of a film, the first and the last among them, as one PNG.
+
+    Raises UserError if there is no frame, or one is no picture.
+    """
+    if not len(frames):
+        raise UserError("there is no frame to draw: give at least one")
+    chosen = [
+        pixels(frames[number]) for number in np.unique(np.linspace(0, len(frames) - 1, SHEET).round().astype(int))
+    ]
+    height, width = chosen[0].shape[:2]
+    columns = min(3, len(chosen))
+    sheet = Image.new("RGB", (columns * width, -(-len(chosen) // columns) * height), "white")
+    for number, frame in enumerate(chosen):
+        sheet.paste(Image.fromarray(frame), (number % columns * width, number // columns * height))
+    sheet.save(file, format="PNG")
+
+
+def animate(frames: Sequence[Source], file: str | os.PathLike[str], fps: float = 25.0) -> None:
+    """Write all frames as a film; its name ends in .gif or .mp4.
+
+    Raises UserError if there is no frame, one is no picture, or the name ends otherwise.
+    """
+    if not len(frames):
+        raise UserError("there is no frame to draw: give at least one")
+    try:
+        check_film(file, fps)
+    except ValueError as error:
+        raise UserError(str(error)) from error
+
+    def even(rate: float) -> Iterator[Picture]:
+        for number in range(max(1, round(len(frames) * rate / fps))):
+            frame = pixels(frames[min(int(number * fps / rate), len(frames) - 1)])
+            yield frame[: len(frame) // 2 * 2, : frame.shape[1] // 2 * 2]  # as codecs want them
+
+    specimen = np.concatenate([pixels(frames[number]) for number in (0, len(frames) // 2, -1)])
+    write_film(file, fps, even, palette_of(specimen, 256))
+
+
+def pixels(image: Source) -> Picture:
+    """Return a picture as RGB uint8 (height, width, 3). Raises UserError if it is none."""
+    return image if isinstance(image, np.ndarray) and _checked(image) else np.asarray(_opened(image)[0].convert("RGB"))
+
+
+def _checked(image: np.ndarray) -> bool:
+    if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3 or not image.size:
+        raise UserError(f"a picture is {image.dtype} {image.shape}: give uint8 (height, width, 3), red, green and blue")
+    return True
+
+
+def _opened(image: Any) -> tuple[Image.Image, str]:
+    """The image of a file's bytes, the way up that its camera tells, and its format."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", Image.DecompressionBombWarning)
+            found = Image.open(io.BytesIO(image), formats=tuple(SHOWN))
+            kind = found.format or ""
+            if found.getexif().get(TURNED, 1) != 1:
+                found, kind = ImageOps.exif_transpose(found), ""  # not as it is stored
+            found.load()
+    except Exception as error:  # Pillow raises many kinds for damaged files
+        raise UserError(f"a picture cannot be read ({error}): give the bytes of a PNG or JPEG file") from error
+    return found, kind
+
+
+def _uri(image: Source, largest: int) -> tuple[str, tuple[int, int]]:
+    """A picture as a data URI, its longer side at most `largest`, and its width and height [pixels]."""
+    if isinstance(image, np.ndarray):
+        _checked(image)
+        found, kind = Image.fromarray(image), ""
+    else:
+        found, kind = _opened(image)
+    data = image if isinstance(image, bytes) else b""
+    if kind not in SHOWN or max(found.size) > largest:
+        found = found.convert("RGB")
+        found.thumbnail((largest, largest))
+        file, kind = io.BytesIO(), "JPEG"
+        found.save(file, format=kind, quality=92, subsampling=0)
+        data = file.getvalue()
+    return f"data:{SHOWN[kind]};base64,{base64.b64encode(data).decode()}", found.size
+
+
+def write_film(
+    file: str | os.PathLike[str], fps: float, pictures: Callable[[float], Iterator[Picture]], palette: Sequence[int]
+) -> None:
+    """Write a film of pictures that are made one by one: GIF with one exact palette, or MP4.
+
+    Args:
+        file: a name that ends in .gif or .mp4.
+        fps: pictures a second; a GIF counts in hundredths of a second and takes the nearest rate it can have.
+        pictures: makes them for the rate that it gets.
+        palette: a GIF's colours, see `palette_of`.
+
+    Raises:
+        ValueError: if the name ends otherwise or the rate is not positive.
+    """
+    check_film(file, fps)
+    if Path(file).suffix.lower() == ".gif":
+        delay = max(2, round(100 / fps))  # [1/100 s]; viewers slow down what is faster
+        _write_gif(file, pictures(100 / delay), 10 * delay, palette)
+    else:
+        _write_mp4(file, pictures(fps), fps)
+
+
+def check_film(file: str | os.PathLike[str], fps: float) -> None:
+    """Raises ValueError if such a film can't be written."""
+    if Path(file).suffix.lower() not in KINDS:
+        raise ValueError(f"cannot animate to {file}: give a name that ends in .gif or .mp4")
+    if fps <= 0:
+        raise ValueError(f"cannot animate at {fps} pictures a second: give a positive fps")
+
+
+def palette_of(specimen: Picture, colours: int, exactly: Sequence[str] = ()) -> list[int]:
+    """Red, green and blue of so many colours of a picture after those that must be exact (at most 256 in all).
+
+    Quantizing merges what is rare; few colours mean fewer shades at the edges and a smaller file.
+    """
+    from matplotlib.colors import to_rgb
+
+    shades = Image.fromarray(specimen).quantize(colors=colours, kmeans=1, dither=Image.Dither.NONE).getpalette() or []
+    return [round(255 * part) for name in exactly for part in to_rgb(name)] + shades
+
+
+def _write_mp4(file: str | os.PathLike[str], pictures: Iterator[Picture], fps: float) -> None:
+    # Codecs want even sides, which the drawings have; imageio would otherwise scale to multiples of 16.
+    writer: Any = imageio.get_writer(file, format="FFMPEG", fps=fps, macro_block_size=2, quality=8)  # pyright: ignore
+    with writer, warnings.catch_warnings():
+        # JAX warns of any fork; this one becomes ffmpeg at once.
+        warnings.filterwarnings("ignore", message=r"os\.fork", category=RuntimeWarning)
+        for picture in pictures:
+            writer.append_data(picture)
+
+
+def _write_gif(
+    file: str | os.PathLike[str], pictures: Iterator[Picture], milliseconds: int, palette: Sequence[int]
+) -> None:
+    from scipy.spatial import KDTree
+
+    tree = KDTree(np.reshape(palette, (-1, 3)))
+    nearest = np.full(1 << 24, -1, np.int16)  # place in the palette, for each colour that was met so far
+
+    def indexed(picture: np.ndarray) -> Image.Image:
+        # Pillow's own search is quicker still, but inexact: white turns grey.
+        keys = picture.astype(np.uint32) @ np.array([1 << 16, 1 << 8, 1], np.uint32)
+        new = np.unique(keys[nearest[keys] < 0])
+        if len(new):
+            nearest[new] = tree.query(np.stack([new >> 16, new >> 8 & 255, new & 255], axis=-1))[1]
+        image = Image.fromarray(nearest[keys].astype(np.uint8))
+        image.putpalette(list(palette))
+        return image
+
+    rest = (indexed(picture) for picture in pictures)
+    options: dict[str, Any] = {"duration": milliseconds, "loop": 0, "optimize": False}
+    next(rest).save(file, save_all=True, append_images=rest, **options)

@@ -1,0 +1,68 @@
+"""Cues from the words of a person: "left,right;up,down;open,close"."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from cuelearner_jax.errors import UserError, shown
+from cuelearner_jax.spaces.box import KEYS, SHARE
+from cuelearner_jax.spaces.space import Cue
+
+LONGEST = 40  # characters of a word
+ARROWS = {"left": "ArrowLeft", "right": "ArrowRight", "up": "ArrowUp", "down": "ArrowDown"}
+HELD = {"left": "a", "right": "d"}  # what stands for two of these arrows too
+
+
+def cues_from(words: Any, names: Sequence[str] = (), unit: str = SHARE) -> tuple[Cue, ...]:
+    """Return cues by their words, each with keys of its own.
+
+    Keys are arrows for left, right, up and down, or else a letter of the word that is free.
+
+    Args:
+        words: "left,right;up,down", or pairs of words; the first of a pair asks for more of an entry, the second for
+            less.
+        names: of the cues; none given: "left or right" and so on.
+        unit: of a change.
+
+    Raises:
+        UserError: the words are no pairs, or not as many as there are names.
+    """
+    pairs = _pairs(words)
+    if names and len(names) != len(pairs):
+        raise UserError(
+            f"cues are {len(pairs)} pairs of words for {len(names)} entries of an action: give one an entry"
+        )
+    taken = {HELD[word] for pair in pairs for word in pair if word in HELD}
+    cues = []
+    for number, pair in enumerate(pairs):
+        keys = []
+        for word, spare in zip(pair, KEYS[number % len(KEYS)], strict=True):
+            key = ARROWS.get(word.lower())
+            if key is None or key in taken:
+                letters = (letter for letter in word.lower() if letter.isascii() and letter.isalpha())
+                free = (letter for letter in (*letters, spare, *"".join(KEYS), *"zxcvbnmws") if letter not in taken)
+                key = next(free, "")
+            if not key:
+                raise UserError(f"{len(pairs)} cues need more keys than there are: give at most {len(KEYS)}")
+            taken.add(key)
+            keys.append(key)
+        cues.append(Cue(names[number] if names else " or ".join(pair), pair, (keys[0], keys[1]), unit))
+    return tuple(cues)
+
+
+def _pairs(words: Any) -> list[tuple[str, str]]:
+    given = words.split(";") if isinstance(words, str) else words
+    try:
+        pairs = [tuple(part.split(",")) if isinstance(part, str) else tuple(part) for part in given]
+        pairs = [tuple(" ".join(word.split()) for word in pair) for pair in pairs]
+    except (TypeError, AttributeError):
+        pairs = []
+    sound = all(len(pair) == 2 and pair[0] != pair[1] and all(map(_is_word, pair)) for pair in pairs)
+    if not pairs or not sound:
+        raise UserError(f'cues is {shown(words)}: give two words for each entry of an action, as "left,right;up,down"')
+    return [(pair[0], pair[1]) for pair in pairs]
+
+
+def _is_word(word: str) -> bool:
+    return 0 < len(word) <= LONGEST and word.isprintable()

@@ -1,0 +1,388 @@
+"""Any environment of Gymnasium as a task: `gymnasium:FetchReach-v4`, or a class or function of the user's own.
+
+    task = task_of("FetchReach-v4")
+    env = task.environment(task.plain())
+
+A configuration says how observations and actions are made up: a policy is loaded without its environment, and reading
+a folder imports no code but that of Gymnasium's own registry.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+from cuelearner_envs.bounds import MOST_STEPS, check_number
+from cuelearner_jax import plugins
+from cuelearner_jax.adaptation.adapting import plain_scalars
+from cuelearner_jax.agents import ddqn
+from cuelearner_jax.arbiters import paced
+from cuelearner_jax.bridges.gymnasium.environment import SUCCESS, GymnasiumTask
+from cuelearner_jax.bridges.gymnasium.instances import SUCCESS as TELLS
+from cuelearner_jax.bridges.gymnasium.instances import Running
+from cuelearner_jax.bridges.gymnasium.layout import Actions, actions_of
+from cuelearner_jax.bridges.gymnasium.source import Source, check_installed, known
+from cuelearner_jax.config import Schedule, Sizes
+from cuelearner_jax.environment import Quantity
+from cuelearner_jax.errors import UserError, raised_by, shown
+from cuelearner_jax.plugins import REFERENCE
+from cuelearner_jax.run_config import RunConfig
+from cuelearner_jax.spaces import Box, Choices, Space, cues_from
+from cuelearner_jax.task import Body, Pictures, Preset, Task
+from cuelearner_jax.tasks import fetch_layout
+
+FAMILY = "gymnasium"
+NUM_ENVS = 8
+TRIED = 100  # steps of an episode, to see whether the environment tells of success
+MOST_PROCESSES = 256
+UNKNOWN_UNIT = "as given"
+
+
+@dataclass(frozen=True)
+class GymnasiumConfig:
+    """One environment of Gymnasium. Every field is an option `--task.…`, the line below it its help.
+
+    The fields from `slices` on say what policies look at, so that a stored policy is read without the environment.
+    """
+
+    environment: str = ""
+    """Its id in Gymnasium's registry, or what code makes it; gymnasium:NAME fills this, and the layout below."""
+    arguments: str = "{}"
+    """Arguments of the environment, by name, as JSON."""
+    max_steps: int = 1
+    """Steps after which an episode is truncated, if the environment does not end it before."""
+    processes: int = 0
+    """Processes that play it (0: one for each processor; 1: none, it is played where it is trained)."""
+    slices: tuple[str, ...] = ()
+    """Layout: names of an observation's slices."""
+    slice_sizes: tuple[int, ...] = ()
+    """Layout: numbers in each slice."""
+    units: tuple[str, ...] = ()
+    """Layout: unit of each slice; those in m or rad may shift, for calibration."""
+    slice_kinds: tuple[str, ...] = ()
+    """Layout: own, for a slice that a robot measures of itself, or beams, or directions."""
+    low: tuple[float, ...] = ()
+    """Layout: lower bounds of actions."""
+    high: tuple[float, ...] = ()
+    """Layout: upper bounds of actions."""
+    choices: int = 0
+    """Layout: number of actions to choose from (0: actions lie between the bounds)."""
+    cues: tuple[str, ...] = ()
+    """Layout: words for more and less of each entry of an action, as "left,right" (default: "more,less")."""
+    cue_names: tuple[str, ...] = ()
+    """Layout: a name for each cue (default: its words)."""
+    succeeds: bool = False
+    """Layout: whether the environment tells of success."""
+
+    @property
+    def observation(self) -> tuple[Quantity, ...]:
+        """The slices. Raises UserError where their columns do not fit together."""
+        rows = self.slices, self.slice_sizes, self.units, self.slice_kinds
+        if not self.slices or len({len(row) for row in rows}) > 1 or not all(size > 0 for size in self.slice_sizes):
+            raise UserError(
+                f"task.slices is {shown(self.slices)} of task.slice_sizes {shown(self.slice_sizes)}: give a name, a "
+                f"size, a unit and a kind for each slice, or name the task {FAMILY}:ENVIRONMENT, which fills them"
+            )
+        known = {quantity.name: quantity.about for quantity in fetch_layout.layout_of(self.environment) or ()}
+        return tuple(
+            Quantity(name, size, unit, known.get(name, ""), kind) for name, size, unit, kind in zip(*rows, strict=True)
+        )
+
+    @property
+    def space(self) -> Space:
+        """The space of actions. Raises UserError where none fits."""
+        return space_of(Actions(self.low, self.high, self.choices), self.cues, self.cue_names)
+
+
+def space_of(actions: Actions, cues: Sequence[str] = (), cue_names: Sequence[str] = ()) -> Space:
+    """Return the space of actions. Raises UserError for bounds or cues that fit none."""
+    if actions.choices:
+        if cues:
+            raise UserError(
+                f"cues is {shown(tuple(cues))}, but actions are choices without an order: leave it out, and choose a "
+                "guidance without relative answers"
+            )
+        return Choices(actions.choices)
+    if cues and len(cues) != actions.size:
+        raise UserError(
+            f"cues are {len(cues)} pairs of words, and an action has {actions.size} entries: give a pair for each"
+        )
+    return Box(actions.low, actions.high, cues_from(cues, cue_names) if cues else ())
+
+
+def _refusal(config: GymnasiumConfig) -> str:
+    """Why a configuration out of a file makes no environment: it names code."""
+    if ":" not in config.environment:
+        return ""
+    return (
+        f"environment {config.environment} is code, which no file may import: name it anew, as "
+        f"{FAMILY}:{config.environment} in place of the task, or by cl.from_gymnasium"
+    )
+
+
+def make_environment(factory: Callable[..., Any] | None, config: GymnasiumConfig, split: str) -> GymnasiumTask:
+    """Return the environment of a configuration; nothing of Gymnasium is loaded until it is reset.
+
+    Args:
+        factory: makes it; None: Gymnasium's registry.
+        config: the configuration.
+        split: whatever it is, episodes differ by their keys alone.
+
+    Raises:
+        UserError: a value that makes none.
+    """
+    if not config.environment:
+        raise UserError(f"task.environment is empty: name the task {FAMILY}:ENVIRONMENT, as {FAMILY}:FetchReach-v4")
+    check_number("max_steps", config.max_steps, 1, MOST_STEPS, whole=True)
+    check_number("processes", config.processes, 0, MOST_PROCESSES, whole=True)
+    check_number("choices", config.choices, 0, MOST_STEPS, whole=True)
+    observation = config.observation
+    size = sum(quantity.size for quantity in observation)
+    _arguments(config.arguments)
+    return GymnasiumTask(
+        source=Source(config.environment, config.arguments, config.max_steps, config.processes, size, factory),
+        observation=observation,
+        actions=config.space,
+        succeeds=config.succeeds,
+        refusal="" if factory else _refusal(config),
+    )
+
+
+def _arguments(text: str) -> dict[str, Any]:
+    try:
+        found = json.loads(text)
+    except ValueError:
+        found = None
+    if not isinstance(found, dict):
+        raise UserError(
+            f"task.arguments is {shown(text)}: give arguments by name as JSON, such as " + "'{\"size\": 3}'"
+        )
+    return found
+
+
+def _longest(config: GymnasiumConfig) -> int:
+    return config.max_steps
+
+
+def _judge_by(config: GymnasiumConfig) -> str:
+    return SUCCESS if config.succeeds else "reward"
+
+
+def _pictures() -> Pictures:
+    from cuelearner_jax.tasks import gymnasium_pictures  # Pillow's loading is not for every command
+
+    return gymnasium_pictures.PICTURES
+
+
+def body(factory: Callable[..., Any] | None = None) -> Body:
+    """Return what acts in the task."""
+    return Body(FAMILY, "Gymnasium's own simulation", partial(make_environment, factory), pictures=_pictures)
+
+
+GYMNASIUM = Task(
+    name=FAMILY,
+    about="any environment of Gymnasium, as gymnasium:FetchReach-v4; of your own, as gymnasium:package.module:NAME",
+    config=GymnasiumConfig,
+    bodies=(body(),),
+    longest=_longest,
+    judge_by=_judge_by,
+    labels_hold=("arguments", "max_steps", "processes", "succeeds"),  # a label is about what one observation shows
+)
+
+
+def task_of(name: str) -> Task:
+    """Return the task of an environment: an id of Gymnasium's registry, or package.module:NAME, which is imported.
+
+    Call it with what a caller or the command line names, never with what a file says. Raises UserError if the
+    environment cannot be had.
+    """
+    return task_from(plugins.load(name, object, "an environment") if REFERENCE.fullmatch(name) else name, called=name)
+
+
+def task_from(
+    given: Any,
+    arguments: Mapping[str, Any] | None = None,
+    *,
+    called: str | None = None,
+    num_envs: int = NUM_ENVS,
+    max_steps: int | None = None,
+    processes: int = 0,
+    cues: Any = (),
+    observation: Sequence[Any] | None = None,
+    units: Mapping[str, str] | None = None,
+) -> Task:
+    """Return an environment as a task. One instance is made, and plays an episode, to see how it is made up.
+
+    Args:
+        given: an id of Gymnasium's registry, or a class or function that gives an environment.
+        arguments: of the environment, by name.
+        called: what code is called in messages and files (default: module:NAME of it).
+        num_envs, max_steps, processes, cues, observation, units: as `cl.from_gymnasium` has them.
+
+    Raises:
+        UserError: it cannot be made, or its spaces are none that are served.
+    """
+    check_installed()
+    factory = None if isinstance(given, str) else given
+    if factory is not None and not callable(factory):
+        raise UserError(
+            f"env is {shown(given)}: give an id of Gymnasium's registry, or a class or function that gives environments"
+        )
+    name = given if isinstance(given, str) else called or _called(given)
+    if factory is None and not max_steps:
+        max_steps = known(name).max_episode_steps
+    try:
+        text = json.dumps(dict(arguments or {}))
+    except (TypeError, ValueError) as error:
+        raise UserError(
+            f"the arguments of {name} cannot be kept in a file ({error}): give a function that makes the environment "
+            "with them"
+        ) from error
+    source = Source(name, text, max_steps or 0, 1, factory=factory)
+    actions, slices, limit, succeeds = _seen(source)
+    if not max_steps and not limit:
+        raise UserError(f"environment {name} has no limit of steps: give max_steps, after which episodes are truncated")
+    fetch = fetch_layout.layout_of(name) if factory is None else None
+    slices = _named(name, slices, observation or fetch, units or {})
+    words = (
+        cues.split(";")
+        if isinstance(cues, str)
+        else [pair if isinstance(pair, str) else ",".join(pair) for pair in cues]
+    )
+    names: tuple[str, ...] = ()
+    if not words and fetch and len(actions.low) == len(fetch_layout.CUES):
+        words, names = list(fetch_layout.CUES), fetch_layout.CUE_NAMES
+    config = GymnasiumConfig(
+        environment=name,
+        arguments=text,
+        max_steps=max_steps or limit,
+        processes=processes,
+        slices=tuple(quantity.name for quantity in slices),
+        slice_sizes=tuple(quantity.size for quantity in slices),
+        units=tuple(quantity.unit for quantity in slices),
+        slice_kinds=tuple(quantity.kind for quantity in slices),
+        low=actions.low,
+        high=actions.high,
+        choices=actions.choices,
+        cues=tuple(words),
+        cue_names=names,
+        succeeds=succeeds,
+    )
+    config.space  # noqa: B018 (cues that do not fit are told here)
+    return dataclasses.replace(
+        GYMNASIUM,
+        about=f"Gymnasium's {name}",
+        default=config,
+        bodies=(body(factory),),
+        presets=presets(config, num_envs),
+    )
+
+
+def _called(code: Any) -> str:
+    """How a file names code, which nothing is imported by."""
+    inner = getattr(code, "func", code)
+    return f"{getattr(inner, '__module__', '')}:{getattr(inner, '__qualname__', type(inner).__name__)}"
+
+
+def _seen(source: Source) -> tuple[Actions, list[Quantity], int, bool]:
+    """How an environment is made up: actions, slices of an observation, its limit of steps (0: none), and whether it
+    tells of success within an episode."""
+    whose = f"environment {source.name}"
+    try:
+        env = source.make()
+    except UserError:
+        raise
+    except Exception as error:
+        raise raised_by(f"{whose}, while it was made,", error) from error
+    try:
+        actions = actions_of(whose, env.action_space)
+        one = Running(env, source.name)
+        slices = [Quantity(leaf.name, leaf.size, UNKNOWN_UNIT) for leaf in one.leaves if leaf.size]
+        if not slices:
+            raise UserError(f"{whose}: an observation has no entries: give one with some")
+        limit = _limit(env)
+        one.reset(0)
+        env.action_space.seed(0)
+        succeeds = False
+        for _ in range(min(limit or TRIED, TRIED)):
+            _, _, ended, cut, info = env.step(env.action_space.sample())
+            succeeds = succeeds or any(name in info for name in TELLS)
+            if ended or cut or succeeds:
+                break
+    except UserError:
+        raise
+    except Exception as error:
+        raise raised_by(f"{whose}, in its first episode,", error) from error
+    finally:
+        env.close()
+    return actions, slices, limit, succeeds
+
+
+def _limit(env: Any) -> int:
+    """Steps after which an environment truncates an episode; 0: it does not say."""
+    spec = getattr(env, "spec", None)
+    limit = getattr(spec, "max_episode_steps", None)
+    while not limit and env is not None:
+        limit, env = getattr(env, "_max_episode_steps", None), getattr(env, "env", None)
+    return int(limit or 0)
+
+
+def _named(
+    name: str, slices: list[Quantity], given: Sequence[Any] | None, units: Mapping[str, str]
+) -> tuple[Quantity, ...]:
+    """The slices with the names and units that the caller, or this package, knows."""
+    if given is not None:
+        try:
+            found = tuple(one if isinstance(one, Quantity) else Quantity(*one) for one in given)
+            total = sum(quantity.size for quantity in found)
+        except TypeError as error:
+            raise UserError(
+                f'observation is {shown(given)}: give (name, entries, unit) for each slice, as ("goal", 3, "m")'
+            ) from error
+        wanted = sum(quantity.size for quantity in slices)
+        if total != wanted:
+            raise UserError(f"observation names {total} entries, and {name} has {wanted}: name each entry once")
+    else:
+        found = tuple(slices)
+    known = {quantity.name for quantity in found}
+    if unknown := sorted(set(units) - known):
+        raise UserError(f"units names {unknown[0]!r}, and the slices are {', '.join(sorted(known))}: name one of them")
+    return tuple(quantity._replace(unit=units.get(quantity.name, quantity.unit)) for quantity in found)
+
+
+def presets(config: GymnasiumConfig, num_envs: int = NUM_ENVS) -> dict[str, Preset]:
+    """Return the presets of one environment."""
+    every = num_envs * -(-1_000 // num_envs)
+    eval_envs = 10
+    run = RunConfig(
+        config,
+        Sizes(num_envs=num_envs, feedback_layers=(64, 64), fit_steps=400, fit_batch_size=64),
+        dataclasses.replace(plain_scalars(config.space), discount=0.95, max_grad_norm=10.0),
+        Schedule(
+            total_steps=6 * every,
+            random_steps=500,
+            learn_after=500,
+            guidance_until=3 * every,
+            eval_every=every,
+            eval_steps=eval_envs * config.max_steps,
+            eval_envs=eval_envs,
+            checkpoint_every=2 * every,
+        ),
+        ddqn.Config(
+            q_layers=(128, 128),
+            directions=256,
+            target_directions=64,
+            batch_size=64,
+            replay_capacity=num_envs * -(-50_000 // num_envs),
+            optimizer="adam",
+            learning_rate=0.001,
+            polyak=0.05,
+        ),
+        paced.Config(),
+    )
+    about = f"small networks, {6 * every:,} steps a seed"
+    return {"quickstart": Preset(about, run, guidance=("none", "relative"), labels=(100,), seeds=1)}
