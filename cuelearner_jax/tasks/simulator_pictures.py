@@ -87,10 +87,14 @@ def _held(env: JaxEnvironment, state: Running, action: Float[Array, " action"]) 
 def _clip(env: JaxEnvironment, state: Running, action: Any) -> list[Frame]:
     """Pictures from a state on while an action is held, up to the end of the episode."""
     poses, ended = jax.device_get(_held(env, state, jax.numpy.asarray(action)))
-    whole = np.flatnonzero(ended)[0] if ended.any() else HELD
-    return drawn(
-        env, [jax.device_get(pose_of(state)), *(jax.tree.map(lambda leaf: leaf[i], poses) for i in range(whole))]
-    )
+    whole = int(np.flatnonzero(ended)[0]) if ended.any() else HELD
+    return drawn(env, [jax.device_get(pose_of(state)), *_rows(poses, whole)])
+
+
+def _rows(poses: Pose, count: int) -> list[Pose]:
+    """The first poses of many."""
+    mocap = [None] * count if poses.mocap is None else poses.mocap
+    return [Pose(poses.qpos[number], mocap[number]) for number in range(count)]
 
 
 def reel(env: JaxEnvironment, state: Running, action: Float[Array, " action"]) -> Reel:
@@ -117,7 +121,7 @@ def record(env: JaxEnvironment, policy: Any, key: PRNGKeyArray, steps: int) -> t
 
     poses, rewards = jax.device_get(play(env, key))
     user_code.tell()
-    return drawn(env, [jax.tree.map(lambda leaf: leaf[i], poses) for i in range(steps)]), rewards.tolist()
+    return drawn(env, _rows(poses, steps)), rewards.tolist()
 
 
 def question(env: JaxEnvironment, state: Running, obs: Any, action: Any, file: Path) -> None:

@@ -17,6 +17,7 @@ from cuelearner_jax.cli import main
 from cuelearner_jax.config import GuideSizes
 from cuelearner_jax.environment import spaces_of
 from cuelearner_jax.errors import UserError
+from cuelearner_jax.policies import uniform_in
 from cuelearner_jax.spaces import Box
 from cuelearner_jax.storage import results
 from cuelearner_jax.task import shape_of
@@ -227,3 +228,30 @@ def test_the_command_line_trains_on_real_physics(name, tmp_path):
     assert all(np.isfinite(row["reward"]) for row in rows)
     first = {row["seed"]: row["reward"] for row in rows}
     assert first[0] != first[1]
+
+
+@pytest.mark.long
+def test_pictures_are_of_the_models_bodies(tmp_path):
+    """The pendulum moves, and the film begins where the episode does."""
+    world = cl.make("brax:inverted_pendulum", backend="positional", max_steps=50)
+    drawn = world.task.pictures()
+    state, obs = world.reset(jax.random.key(0))
+    first = drawn.sketch(world.env, state)
+    assert first.box[2:] == (480, 360)
+    found = drawn.reel(world.env, state, jnp.ones(1))
+    assert len(found.pictures) == 6
+    assert len(set(found.pictures)) == 6
+    frames, rewards = drawn.record(world.env, uniform_in(world.env), jax.random.key(0), 4)
+    assert len(frames) == len(rewards) == 4
+    assert np.abs(frames[0].astype(int) - frames[3].astype(int)).max() > 50
+    drawn.still(world.env, frames, tmp_path / "still.png")
+    drawn.question(world.env, state, obs, jnp.ones(1), tmp_path / "question.png")
+    assert (tmp_path / "still.png").stat().st_size > 1000
+    assert (tmp_path / "question.png").stat().st_size > 1000
+
+
+def test_a_simulator_without_bodies_is_not_drawn():
+    world = cl.make("brax:fast")
+    state, _ = world.reset(jax.random.key(0))
+    with pytest.raises(UserError, match="has no MuJoCo model to draw: evaluate a policy in it instead"):
+        world.task.pictures().sketch(world.env, state)
