@@ -127,6 +127,7 @@ class Task:
     presets: dict[str, Preset] = field(default_factory=dict)
     scenarios: dict[str, Scenario] = field(default_factory=dict)
     labels_hold: tuple[str, ...] = ()  # fields of the configuration that labels of another world may differ in
+    named: str = ""  # how a command names it, where not by its name alone: "gymnasium:FetchReach-v4"
     origin: str = ""  # "package.module:name" where it was taken from outside, by whoever resolved that
     default: Any = None  # the configuration that holds where nothing is given; None: `config()`
     # configuration -> the metric that adapted policies are judged by where nothing else says

@@ -20,12 +20,12 @@ from cuelearner_jax.agents.protocol import AgentFunctions
 from cuelearner_jax.agents.registry import AGENTS
 from cuelearner_jax.calibration import Calibrated
 from cuelearner_jax.config import Frame, GuideSizes, Scalars, check_guide, check_part
-from cuelearner_jax.environment import Spaces, offers, spaces_of, view_of
+from cuelearner_jax.environment import Spaces, actions_of, offers, spaces_of, view_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.guides.base import NAME, Guide
 from cuelearner_jax.guides.calibration import KIND
-from cuelearner_jax.policies import Agent, Guided, Heuristic, describe, layers, uniform_in
+from cuelearner_jax.policies import Agent, Guided, Heuristic, describe, in_space, layers, uniform_in
 from cuelearner_jax.run_config import kind_from_json, part_from_json
 
 CORRECTED = ("guided", "calibrated")  # policies of another one's actions
@@ -159,7 +159,7 @@ def from_json(values: dict[str, Any], arrays: Any, env: Any, code: Any = None, c
             f"this policy is made of code, {values['named']}, which is not loaded because a file names it: add "
             f"--base {values['named']} if you trust that code"
         )
-    return code
+    return in_space(code, actions_of(env))
 
 
 def _agent(values: dict[str, Any], spaces: Spaces) -> AgentFunctions:

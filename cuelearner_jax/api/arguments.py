@@ -20,7 +20,7 @@ from jaxtyping import Float, PRNGKeyArray
 
 from cuelearner_jax.config import LARGEST_FLOAT, plain, settled
 from cuelearner_jax.errors import UserError, closest, shown
-from cuelearner_jax.policies import Policy, Teaching, in_space, policy_of
+from cuelearner_jax.policies import Policy, policy_of, teaching
 from cuelearner_jax.runs.grid import LARGEST_BUDGET, LARGEST_SEED
 from cuelearner_jax.spaces import Space
 from cuelearner_jax.types import Teacher
@@ -186,15 +186,16 @@ def policy(name: str, value: Any) -> Policy:
 
 def teacher(name: str, value: Any, space: Space) -> Teacher:
     """Who answers: a teacher, or whatever acts as a policy in a space of actions, which teaches what it does itself."""
-    if callable(getattr(value, "best_action", None)):
-        # A class, or what is no pytree, cannot be given to a program.
-        if isinstance(value, type) or any(leaf is value for leaf in jax.tree.leaves(value)):
-            raise refused(name, value, "a teacher, for instance teacher_of(world)")
-    elif isinstance(value, type) or not (callable(value) or hasattr(value, "act")):
-        raise refused(name, value, "a teacher, for instance teacher_of(world), or a function of observations (n, obs)")
-    else:
-        value = Teaching(policy(name, getattr(value, "policy", value)))
-    return value.replace(policy=in_space(value.policy, space)) if isinstance(value, Teaching) else value
+    answers, acts = (callable(getattr(value, verb, None)) for verb in ("best_action", "act"))
+    leaf = answers and any(leaf is value for leaf in jax.tree.leaves(value))  # no pytree: no program can be given it
+    if isinstance(value, type) or leaf or not (answers or acts or callable(value)):
+        raise refused(name, value, "a teacher, for instance teacher_of(world), or a function of observations")
+    if acts and not answers:
+        value = getattr(value, "policy", value)  # of a `CallablePolicy`, which stands above this file
+    try:
+        return teaching(value, space)
+    except UserError as error:
+        raise UserError(f"{name}: {error}") from error
 
 
 def settings(name: str, value: Any, kind: type[KindT]) -> KindT:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Annotated, Any, Generic
 
 from cuelearner_jax.adaptation import changes
-from cuelearner_jax.cli.parsing import about, code_of, out, parse, source_of, taken
+from cuelearner_jax.cli.parsing import TASK_OPTIONS, about, code_of, out, parse, source_of, taken
 from cuelearner_jax.cli.shared_options import Flag, KindsT, TaskT, kinds_type, unprefixed
 from cuelearner_jax.errors import NotFinite, UserError
 from cuelearner_jax.plugins import REFERENCE
@@ -75,8 +75,8 @@ def _source(arguments: list[str]) -> tuple[PolicySource, Any, str | None, list[s
     """
     if arguments and REFERENCE.fullmatch(arguments[0]) and not Path(arguments[0]).exists():
         named, rest = arguments[0], arguments[1:]
-        if not any(word.split("=")[0] == "--task" for word in rest):
-            raise UserError(f"{named} is to act in some task: name it, as --task navigation")
+        if not any(word.split("=")[0] in TASK_OPTIONS for word in rest):
+            raise UserError(f"{named} is to act in some task: name it, as --task navigation or --env gymnasium:NAME")
         source, rest = source_of(rest, "adapt", Adapt)
         return source, code_of(named), named, rest
     named, _ = taken(arguments, "--base", "package.module:NAME")

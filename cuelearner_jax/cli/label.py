@@ -332,7 +332,7 @@ def _following(task: Task, preset: str, config: RunConfig, asked: Any, policy: s
 
     `asked` are the options of `cuelearner label` as they were used, `config` the preset's configuration.
     """
-    name, out = task.origin or task.name, str(asked.out)
+    name, out = task.origin or task.named or task.name, str(asked.out)
     if asked.again is not None:
         return shlex.join(["cuelearner", "labels", "inspect", str(asked.again), out])
     given = ["--labels-from", out, "--labels", str(labels)]

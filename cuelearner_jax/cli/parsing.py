@@ -21,15 +21,18 @@ from rich.console import Console
 from cuelearner_jax import plugins
 from cuelearner_jax.adaptation import changes
 from cuelearner_jax.cli.dispatch import HELP, HELP_ALL
+from cuelearner_jax.environment import actions_of
 from cuelearner_jax.errors import UserError, closest, no_space
 from cuelearner_jax.guides import registry as guidances
-from cuelearner_jax.policies import policy_of
+from cuelearner_jax.policies import policy_of, teaching
 from cuelearner_jax.run_config import PARTS
 from cuelearner_jax.runs.trained import POLICIES, PolicySource
 from cuelearner_jax.storage import policy_folders, whole
-from cuelearner_jax.task import PAPER, Preset, Task
+from cuelearner_jax.task import PAPER, Preset, Task, shape_of
 from cuelearner_jax.tasks import registry
 from cuelearner_jax.terminal import PLAIN
+
+TASK_OPTIONS = ("--task", "--env")  # two names of one option
 
 
 class _Output(Console):
@@ -195,8 +198,12 @@ def taken(arguments: list[str], option: str, choices: str) -> tuple[str | None, 
 
 
 def task_of(arguments: list[str], command: str, kind: type) -> tuple[Task, list[str]]:
-    """The task named first, or by --task, and the other arguments. Raises UserError if it cannot be had."""
+    """The task named first, or by --task or --env, and the other arguments. Raises UserError if it cannot be had.
+
+    --teacher makes code its teacher.
+    """
     given, rest = _task_option(arguments)
+    teacher, rest = taken(rest, "--teacher", "package.module:NAME")
     if given is None:
         if not rest or rest[0] in HELP:
             told = _tasks(HELP_ALL in rest)
@@ -206,7 +213,7 @@ def task_of(arguments: list[str], command: str, kind: type) -> tuple[Task, list[
         given, rest = rest[0], rest[1:]
     elif rest and not rest[0].startswith("-"):
         raise UserError(f"the task is named twice, {rest[0]!r} and {given!r}: name it once")
-    return registry.resolve(given), rest
+    return _taught(registry.resolve(given), teacher), rest
 
 
 def preset_of(task: Task, arguments: list[str], default: str = PAPER) -> tuple[str, Preset, list[str]]:
@@ -225,13 +232,15 @@ def preset_of(task: Task, arguments: list[str], default: str = PAPER) -> tuple[s
 def source_of(arguments: list[str], command: str, kind: type) -> tuple[PolicySource, list[str]]:
     """The run folder, policy folder or task named first, and the other arguments.
 
-    --task makes a task from outside known, --agent and --arbiter those of a run, --base and --changes the code in a
-    policy.
+    --task, or --env, makes a task from outside known, and an environment of a library the world of a folder;
+    --teacher makes code its teacher; --agent and --arbiter make those of a run known, --base and --changes the code in
+    a policy.
 
     Raises:
         UserError: there is no such folder or task, or it cannot be had.
     """
     given, rest = _task_option(arguments)
+    teacher, rest = taken(rest, "--teacher", "package.module:NAME")
     known = None if given is None else registry.resolve(given)
     reference, rest = taken(rest, "--base", "package.module:NAME")
     code = None if reference is None else code_of(reference)
@@ -254,7 +263,7 @@ def source_of(arguments: list[str], command: str, kind: type) -> tuple[PolicySou
             source = _of_folder(folder, known, code, changed)
             if named is not None and source.adapted is None and command != "adapt":
                 raise UserError(f"{folder} is a run, without changes in its policies: leave out --changes")
-            return source, rest
+            return dataclasses.replace(source, task=_taught(source.task, teacher)), rest
         if known is not None:
             raise UserError(f"{name!r} is no run folder of the task {known.name}: give one, or leave it out")
         if ":" not in name and name not in registry.names():
@@ -264,7 +273,7 @@ def source_of(arguments: list[str], command: str, kind: type) -> tuple[PolicySou
     if code is not None:
         raise UserError("--base names the code in a policy folder: give that folder, or leave it out")
     _, preset, rest = preset_of(known, rest)
-    return PolicySource(known, preset.config, None, Path(known.name)), rest
+    return PolicySource(_taught(known, teacher), preset.config, None, Path(known.name)), rest
 
 
 def world_of(source: PolicySource, arguments: list[str]) -> Any:
@@ -291,7 +300,25 @@ def about(kind: type, task: Task, policies: bool = False, preset: str = PAPER) -
 
 
 def _task_option(arguments: list[str]) -> tuple[str | None, list[str]]:
-    return taken(arguments, "--task", f"{', '.join(registry.names())}, or package.module:name")
+    choices = f"{', '.join(registry.names())}, or package.module:name"
+    found, rest = [], arguments
+    for option in TASK_OPTIONS:
+        given, rest = taken(rest, option, choices)
+        found += [] if given is None else [given]
+    if len(found) > 1:
+        raise UserError(f"the task is named twice, {found[0]!r} and {found[1]!r}: name it once")
+    return (found or [None])[0], rest
+
+
+def _taught(task: Task, reference: str | None) -> Task:
+    """The task with the teacher that `package.module:NAME` leads to: a teacher, or what acts as a policy.
+
+    Raises UserError if there is none.
+    """
+    if reference is None:
+        return task
+    code = plugins.load(reference, object, "a teacher")
+    return dataclasses.replace(task, teacher=lambda config, env: teaching(code, actions_of(env)))
 
 
 def code_of(reference: str) -> Any:
@@ -300,11 +327,23 @@ def code_of(reference: str) -> Any:
 
 
 def _of_folder(folder: Path, known: Task | None, code: Any, changed: Any) -> PolicySource:
-    """A run or policy folder. Raises UserError if it is none, or of another task than the one named beside it."""
+    """A run or policy folder; of a family of tasks in the environment that is named beside it.
+
+    Raises UserError if it is none, of another task than the one named beside it, or of other observations or actions.
+    """
     source = PolicySource.of_folder(folder, registry.find, code, changed)
     if known is not None and known.name != source.task.name:
         what = "a run" if source.grid else "a policy"
         raise UserError(f"{folder} is {what} of {source.task.name}, not of {known.name}: leave out --task")
+    if known is not None and known.named:
+        before, now = (shape_of(known, config) for config in (source.config.task, known.plain()))
+        if (before.obs_size, actions_of(before).size) != (now.obs_size, actions_of(now).size):
+            raise UserError(
+                f"{folder} acts on observations of {before.obs_size} entries with actions of "
+                f"{actions_of(before).size}, {known.named} has {now.obs_size} and {actions_of(now).size}: name another"
+            )
+        world = dataclasses.replace(source.config, task=known.plain())
+        source = dataclasses.replace(source, task=known, config=world)
     return source
 
 
@@ -318,7 +357,8 @@ def _tasks(whole: bool) -> str:
             told.append(f"task {name}: {error}\n")
             continue
         told.append(f"task {name}: {task.about}" + (f"\n\n{_choices(task)}\n" if whole else ""))
-    return "\n".join([*told, "a task of your own: package.module:NAME, also as --task package.module:NAME"])
+    own = "a task of your own: package.module:NAME, also as --task package.module:NAME (--env names a task as well)"
+    return "\n".join([*told, own])
 
 
 def _choices(task: Task, preset: str = PAPER) -> str:

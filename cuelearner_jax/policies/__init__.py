@@ -16,6 +16,7 @@ from cuelearner_jax.policies.layers import (
     Teaching,
     Uniform,
     best_actions,
+    teaching,
     uniform_in,
     wanted_actions,
 )
@@ -51,6 +52,7 @@ __all__ = [
     "layers",
     "named",
     "policy_of",
+    "teaching",
     "uniform_in",
     "wanted_actions",
 ]

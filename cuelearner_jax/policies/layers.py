@@ -20,6 +20,7 @@ from cuelearner_jax.feedback.answers import in_mind, relative_feedback
 from cuelearner_jax.guides.base import Guide
 from cuelearner_jax.guides.refining import refine
 from cuelearner_jax.policies.node import BY_LANE, SHARED, PolicyNode, describe
+from cuelearner_jax.policies.opaque import in_space, policy_of
 from cuelearner_jax.run_config import kind_to_json, part_to_json
 from cuelearner_jax.spaces import DIRECTIONS, Space
 from cuelearner_jax.types import EnvState, GuidanceModel, Params, Teacher
@@ -227,6 +228,17 @@ class Teaching(struct.PyTreeNode):
         """What the policy does; one that acts at random always draws the same."""
         states = jax.tree.map(lambda leaf: leaf[None], state)
         return self.policy.act(jax.random.key(0), states, obs[None])[0]
+
+
+def teaching(given: Any, space: Space) -> Teacher:
+    """Return who answers: a teacher, or whatever acts as a policy in a space of actions, which teaches what it does.
+
+    Raises UserError for what is neither.
+    """
+    if callable(getattr(given, "best_action", None)) and not isinstance(given, type | Teaching):
+        return given
+    policy = given.policy if isinstance(given, Teaching) else policy_of(given)
+    return Teaching(in_space(policy, space))
 
 
 def best_actions(teacher: Teacher, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +25,7 @@ STILLS, CLIPS, FILMS = 0, 1, 2  # the spare instances: each goes on where it sta
 Frame = UInt8[np.ndarray, "height width 3"]
 
 
-def frames_of(env: GymnasiumTask, slot: int, seed: int, actions: Sequence[Any], first: int) -> list[Frame]:
+def frames_of(env: GymnasiumTask, slot: int, seed: int, actions: Any, first: int) -> list[Frame]:
     """Return pictures of an episode from after `first` of its actions on. Raises UserError where there are none."""
     rows = np.asarray(actions, np.float32).reshape(-1, env.actions.size)
     source = env.source

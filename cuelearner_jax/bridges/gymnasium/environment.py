@@ -133,7 +133,7 @@ class GymnasiumTask(WholeObservations, struct.PyTreeNode):
                 went = pool_of(self.source).carry_out([one for one, sound in zip(requests, acts, strict=True) if sound])
             except UserError as error:
                 user_code.leave(self._whose, error)
-        for row, one in zip(np.flatnonzero(acts), went, strict=False):
+        for row, one in zip(np.flatnonzero(np.asarray(acts)), went, strict=False):
             obs[row], final_obs[row], reward[row] = one.obs, one.final_obs, one.reward
             terminated[row], truncated[row] = one.terminated, one.truncated
             success[row], total[row] = one.success, one.total

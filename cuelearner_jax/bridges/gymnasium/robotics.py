@@ -29,11 +29,12 @@ def supply_joint_types() -> None:
 
     Does nothing where the members do so by themselves.
     """
-    import mujoco
+    import mujoco as library
     import numpy as np
     from gymnasium_robotics.utils import mujoco_utils
 
-    own: Any = mujoco.mjtJoint
+    mujoco: Any = library  # whose members a type checker does not know
+    own = mujoco.mjtJoint
     if np.int32(int(own.mjJNT_HINGE)) in (own.mjJNT_HINGE,) or isinstance(mujoco_utils.mujoco, _View):
         return
     mujoco_utils.mujoco = _View(mujoco)  # pyright: ignore[reportAttributeAccessIssue]

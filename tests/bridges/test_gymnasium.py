@@ -1,0 +1,326 @@
+"""Gymnasium's environments as pure functions of seed and actions."""
+
+import dataclasses
+
+import gymnasium
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from gymnasium_worlds import Adder, Faulty, Forgetful, Nested, start_of
+
+import cuelearner_jax as cl
+from cuelearner_jax import user_code
+from cuelearner_jax.bridges.gymnasium import pool
+from cuelearner_jax.bridges.gymnasium.pool import pool_of
+from cuelearner_jax.environment import Quantity
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.spaces import Box, Choices
+from cuelearner_jax.testing import check_environment
+
+PAID = 13 / 64
+KEYS = jax.random.split(jax.random.key(3), 40)
+
+
+@pytest.fixture(autouse=True)
+def closed():
+    """Each test begins without instances, and leaves none."""
+    pool.close_all()
+    yield
+    pool.close_all()
+
+
+def world(env, max_steps=6, **settings):
+    limit = {} if isinstance(env, str) else {"max_steps": max_steps}
+    return cl.from_gymnasium(env, processes=1, **limit, **settings)
+
+
+def same(found, wanted):
+    jax.tree.map(np.testing.assert_array_equal, jax.device_get(found), jax.device_get(wanted))
+
+
+def walk(world, actions, state=None):
+    """States and steps, the first state the reset's."""
+    state, states, steps = world.reset(KEYS[0])[0] if state is None else state, [], []
+    for key, action in zip(KEYS[1:], actions, strict=False):
+        states.append(state)
+        state, step = world.step(key, state, np.float32(action))
+        steps.append(jax.device_get(step))
+    return [*states, state], steps
+
+
+def rows(steps, name):
+    return np.stack([getattr(step, name) for step in steps])
+
+
+# --- what a step is --------------------------------------------------------------------------------------------------
+
+
+def test_a_step_is_that_of_the_environment():
+    here = world(Adder)
+    state, obs = here.reset(KEYS[0])
+    start = start_of(state.seed)
+    np.testing.assert_array_equal(obs, np.float32([start, 0]))
+    states, steps = walk(here, [[PAID]] * 6 + [[1.0]] * 3, state)
+    # The sixth step passes 1.5, with the start that this key draws, as time runs out.
+    totals = start + PAID * np.arange(1, 7)
+    assert totals[-2] <= 1.5 < totals[-1]
+    np.testing.assert_array_equal(rows(steps[:6], "final_obs"), np.float32([totals, np.arange(1, 7)]).T)
+    np.testing.assert_array_equal(rows(steps[:6], "reward"), np.float32(PAID).repeat(6))
+    assert rows(steps[:6], "terminated").tolist() == [False] * 5 + [True]
+    assert not rows(steps[:6], "truncated").any()  # the end is a termination, even where time runs out with it
+    assert (steps[5].outcome["success"], steps[5].outcome["return"]) == (1.0, 6 * PAID)
+    # The next episode begins with a seed of the step's key, and its first observation is the one to act on.
+    again = start_of(states[6].seed)
+    assert states[6].seed != state.seed
+    assert states[6].steps == 0
+    np.testing.assert_array_equal(steps[5].obs, np.float32([again, 0]))
+    np.testing.assert_array_equal(steps[6].final_obs, np.float32([again + 1.0, 1]))
+    np.testing.assert_array_equal(steps[0].obs, steps[0].final_obs)
+    np.testing.assert_array_equal(steps[0].aftermath, steps[0].final_obs)
+
+
+def test_time_that_runs_out_is_a_truncation_by_the_environment_or_by_the_caller():
+    for limit, last in ((100, 5), (3, 2)):
+        _, steps = walk(world(Adder, max_steps=limit), [[-0.5]] * 6)
+        assert np.flatnonzero(rows(steps, "truncated"))[0] == last
+        assert not rows(steps, "terminated").any()
+        assert steps[last].outcome["success"] == 0.0
+        assert steps[last].final_obs[1] == last + 1
+        assert steps[last].obs[1] == 0
+
+
+@pytest.mark.parametrize("name", ["Pendulum-v1", "MountainCarContinuous-v0"])
+def test_a_roll_out_is_that_of_plain_gymnasium(name):
+    here = world(name)
+    plain = gymnasium.make(name)
+    state, obs = here.reset(KEYS[0])
+    expected, _ = plain.reset(seed=int(state.seed))
+    np.testing.assert_array_equal(obs, np.float32(expected))
+    size = plain.action_space.shape[0]
+    low, high = np.float32(here.actions.low), np.float32(here.actions.high)
+    actions = np.random.default_rng(0).uniform(low, high, (12, size)).astype(np.float32)
+    _, steps = walk(here, actions, state)
+    for action, step in zip(actions, steps, strict=True):
+        expected, reward, *_ = plain.step(action)
+        np.testing.assert_array_equal(step.final_obs, np.float32(expected))
+        np.testing.assert_array_equal(step.reward, np.float32(reward))
+
+
+def test_it_holds_the_laws_of_environments():
+    check_environment(world(Adder).env, steps=24)
+
+
+# --- states are kept, shown again, resumed ---------------------------------------------------------------------------
+
+
+def test_a_state_that_was_left_is_taken_up_by_replaying_its_actions():
+    here = world(Adder)
+    found = pool_of(here.env.source)
+    actions = [[0.1], [0.2], [-0.3], [0.05]]
+    states, steps = walk(here, actions)
+    assert found.replays == 0
+    for number in (1, 3, 0, 2):
+        after, step = here.step(KEYS[number + 1], states[number], np.float32(actions[number]))
+        same((after, step), (states[number + 1], steps[number]))
+    assert found.replays == 1 + 3  # the instance that was put to state 1 then stands at state 2
+    branched, _ = walk(here, [[0.4]], states[2])
+    assert branched[1].place.tolist() != states[3].place.tolist()
+
+
+def test_what_is_resumed_in_another_process_is_bitwise_the_same():
+    here = world(Adder)
+    actions = np.random.default_rng(1).uniform(-1, 0.3, (12, 1))
+    states, whole = walk(here, actions)
+    state, _ = here.reset(KEYS[0])
+    for number, action in enumerate(actions):
+        if number in (0, 3, 8):
+            pool.close_all()  # nothing is left of the instances
+            state = jax.tree.map(jnp.asarray, jax.device_get(state))  # as a checkpoint keeps it
+        state, step = here.step(KEYS[number + 1], state, np.float32(action))
+        same(step, whole[number])
+    same(state, states[-1])
+
+
+def test_lanes_that_share_a_state_each_get_an_instance():
+    here = world(Adder)
+    env, found = here.env, pool_of(here.env.source)
+    state, _ = here.reset(KEYS[0])
+    lanes = jax.tree.map(lambda leaf: jnp.stack([leaf] * 4), state)
+
+    @jax.jit
+    def three(lanes):
+        def one(lanes, number):
+            actions = jnp.array([[0.1], [0.1], [0.2], [-0.5]]) * (number + 1)
+            return jax.vmap(env.step)(jnp.stack([KEYS[9]] * 4), lanes, actions)
+
+        return jax.lax.scan(one, lanes, jnp.arange(3))[1]
+
+    totals = three(lanes).final_obs[-1, :, 0]
+    np.testing.assert_allclose(totals, start_of(state.seed) + np.array([0.6, 0.6, 1.2, -3.0]), rtol=1e-6)
+    assert len(found.slots) == 4
+    assert found.replays == 0
+    # Two sets of lanes, one after the other: instances of both are kept, and replayed once.
+    for _ in range(3):
+        three(lanes)
+    assert len(found.slots) <= 8
+
+
+def test_an_environment_that_does_not_repeat_itself_is_told():
+    here = world(Forgetful)
+    states, _ = walk(here, [[0.1]] * 3)
+    with pytest.raises(UserError, match=r"Forgetful does not repeat itself: with seed \d+ and the same 1 actions"):
+        here.step(KEYS[0], states[1], np.float32([0.1]))
+
+
+# --- spaces ----------------------------------------------------------------------------------------------------------
+
+
+def test_nested_observations_are_named_and_flattened_in_the_order_of_their_space():
+    here = world(Nested)
+    names = [(quantity.name, quantity.size) for quantity in here.observation]
+    assert names == [("arm", 4), ("lights", 2), ("modes", 5), ("wheels.0", 2), ("wheels.1", 3)]
+    assert here.actions == Choices(3)
+    state, obs = here.reset(KEYS[0])
+    arm, lights, modes, wheels = [0.1, 0.2, 0.3, 0.4], [1, 0], [0, 1, 0, 0, 1], [0.5, -0.5]
+    np.testing.assert_array_equal(obs, np.float32([*arm, *lights, *modes, *wheels, 1, 0, 0]))
+    np.testing.assert_array_equal(
+        obs, gymnasium.spaces.flatten(Nested.observation_space, Nested().reset()[0]).astype(np.float32)
+    )
+    _, steps = walk(here, np.eye(3), state)
+    assert rows(steps, "reward").tolist() == [5, 6, 7]
+    np.testing.assert_array_equal(rows(steps, "final_obs")[:, -3:], np.eye(3))
+
+
+def test_slices_and_units_are_what_the_caller_says():
+    here = world(Adder, units={"observation": "m"}, max_steps=6)
+    assert here.observation == (Quantity("observation", 2, "m"),)
+    here = world(Adder, observation=[("total", 1, "m"), ("time", 1, "steps")], cues="more,less", max_steps=6)
+    assert [(one.name, one.unit) for one in here.observation] == [("total", "m"), ("time", "steps")]
+    assert isinstance(here.actions, Box)
+    assert here.actions.cues[0].words == ("more", "less")
+
+
+def test_choices_of_cartpole_are_played():
+    here = world("CartPole-v1")
+    assert (here.actions, here.config.max_steps, here.config.succeeds) == (Choices(2), 500, False)
+    _, steps = walk(here, [[1, 0], [0, 1]] * 4)
+    assert rows(steps, "reward").tolist() == [1.0] * 8
+
+
+class Odd(gymnasium.Env):
+    """Takes its spaces as they are given."""
+
+    def __init__(self, seen, does):
+        self.observation_space, self.action_space = seen, does
+
+
+REAL = gymnasium.spaces.Box(-1, 1, (2,))
+IMAGE = gymnasium.spaces.Box(0, 255, (32, 32, 3), np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("seen", "does", "told"),
+    [
+        (IMAGE, REAL, r"'observation' is an image of shape \(32, 32, 3\): give one with observations of numbers"),
+        (gymnasium.spaces.Dict({"eye": IMAGE, "arm": REAL}), REAL, "'eye' is an image"),
+        (gymnasium.spaces.Text(4), REAL, "is a Text: give one of Box, Discrete"),
+        (REAL, gymnasium.spaces.MultiBinary(3), "its actions are a MultiBinary: wrap the environment"),
+        (REAL, gymnasium.spaces.Discrete(1), "there is only one action"),
+        (REAL, gymnasium.spaces.Box(-np.inf, 1, (2,)), "entry 1 of its actions has no bounds: wrap it"),
+    ],
+)
+def test_spaces_that_are_not_served_are_told_in_one_line(seen, does, told):
+    with pytest.raises(UserError, match=told) as refused:
+        world(lambda: Odd(seen, does), max_steps=5)
+    assert "\n" not in str(refused.value)
+
+
+# --- wrong calls and wrong environments ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("settings", "told"),
+    [
+        ({"env": "Nope-v1"}, "Gymnasium has no environment 'Nope-v1'"),
+        ({"env": "os:system"}, "would import code"),
+        ({"env": 7}, "env is 7: give an id of Gymnasium's registry"),
+        ({"env": Adder}, "has no limit of steps: give max_steps"),
+        ({"env": Adder, "max_steps": 0}, "max_steps is 0: give a whole number"),
+        ({"env": Adder, "max_steps": 6, "num_envs": 0}, "num_envs is 0"),
+        (
+            {"env": Adder, "max_steps": 6, "cues": "left,right;up,down"},
+            "cues are 2 pairs of words, and an action has 1",
+        ),
+        ({"env": Nested, "max_steps": 6, "cues": "left,right"}, "actions are choices without an order"),
+        ({"env": Adder, "max_steps": 6, "observation": [("total", 3, "m")]}, "names 3 entries, and .*Adder has 2"),
+        ({"env": Adder, "max_steps": 6, "observation": [3]}, "give .name, entries, unit. for each slice"),
+        ({"env": Adder, "max_steps": 6, "units": {"totl": "m"}}, "units names 'totl'"),
+        ({"env": Adder, "max_steps": 6, "start": np.zeros(2)}, "arguments of .* cannot be kept in a file"),
+        ({"env": Adder, "max_steps": 6, "strat": 2}, "raised TypeError"),
+        ({"env": lambda: 3, "max_steps": 6}, "gave a int without 'reset'"),
+    ],
+)
+def test_wrong_calls_are_told_in_one_line(settings, told):
+    with pytest.raises(UserError, match=told) as refused:
+        cl.from_gymnasium(**settings)
+    assert "\n" not in str(refused.value)
+
+
+def test_an_instance_is_no_world():
+    with pytest.raises(UserError, match=r"is an environment of Gymnasium: give cl\.from_gymnasium"):
+        cl.adapt(lambda obs: obs, Adder(), labels=10)  # pyright: ignore[reportArgumentType]
+
+
+@pytest.mark.parametrize(
+    ("fault", "told"),
+    [
+        ("raises", "raised RuntimeError: a joint is jammed: mend it first"),
+        ("nan", "gave an observation 'observation' that is not finite in step 3 of the episode with seed"),
+        ("shape", r"gave an observation 'observation' of shape \(3,\), where its space has \(2,\) in step 3"),
+        ("reward", "gave a reward of inf in step 3"),
+        ("words", "gave no number as reward in step 3"),
+    ],
+)
+def test_faults_of_an_environment_are_told_with_their_step(fault, told):
+    here = _unseen(Faulty, fault=fault)
+    with pytest.raises(UserError, match=told) as refused:
+        cl.measure(lambda obs: obs[:, :1], here, episodes=3)
+    assert "Faulty" in str(refused.value)
+    assert "step 3" in str(refused.value)
+    user_code.tell()  # nothing is left behind
+    # What went well before goes on, and what begins anew does too.
+    state, _ = here.reset(KEYS[0])
+    after, _ = here.step(KEYS[1], state, np.float32([0.1]))
+    assert after.steps == 1
+
+
+def _unseen(env, **arguments):
+    """A world whose environment was not tried before: the fault comes while it is used."""
+    sound = world(Adder)
+    body = dataclasses.replace(sound.task.bodies[0], environment=lambda config, split: _of(sound, env, arguments))
+    return cl.World(dataclasses.replace(sound.task, bodies=(body,)), sound.config)
+
+
+def _of(sound, env, arguments):
+    source = dataclasses.replace(sound.env.source, factory=Made(env, tuple(arguments.items())), name=env.__name__)
+    return sound.env.replace(source=source)
+
+
+@dataclasses.dataclass(frozen=True)
+class Made:
+    """A factory that equals another with the same arguments."""
+
+    env: type
+    arguments: tuple
+
+    def __call__(self):
+        return self.env(**dict(self.arguments))
+
+
+def test_without_gymnasium_one_line_says_what_to_install(monkeypatch):
+    from cuelearner_jax.bridges.gymnasium import source
+
+    monkeypatch.setattr(source, "find_spec", lambda name: None)
+    with pytest.raises(UserError, match=r"Gymnasium is not installed: pip install 'cuelearner-jax\[gymnasium\]'"):
+        cl.from_gymnasium("CartPole-v1")
