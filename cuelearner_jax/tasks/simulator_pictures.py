@@ -1,5 +1,8 @@
 """Pictures of brax's and Playground's environments: what MuJoCo's renderer sees of their models."""
 
+# pyright: reportAttributeAccessIssue=false
+# (MuJoCo's compiled module has no stubs)
+
 from __future__ import annotations
 
 from collections.abc import Sequence
@@ -38,7 +41,7 @@ def pose_of(state: Running) -> Pose:
     inner = state.state
     if hasattr(inner, "data"):
         return Pose(inner.data.qpos, inner.data.mocap_pos)
-    physics = getattr(inner, "pipeline_state", None)
+    physics: Any = getattr(inner, "pipeline_state", None)
     if not hasattr(physics, "q"):
         raise UserError("this simulator has no bodies to draw: evaluate a policy in it instead")
     return Pose(physics.q, None)
