@@ -19,16 +19,14 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from cuelearner_jax.environment import Quantity, WholeObservations
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.spaces import DIRECTIONS, Box, Cue, Space
-from cuelearner_jax.spaces.box import SHARE
+from cuelearner_jax.spaces import DIRECTIONS, Box, Cue, Space, box
 from cuelearner_jax.types import Step
 
 State = Any  # of the simulator: a pytree with the members that this file's docstring names
 UNIT = "as the simulator has it"
 WORDS = ("more", "less")
-# Key pairs of cues, enough for the 21 entries of a humanoid: letters above one another, then with Shift, then digits.
-_LETTERS = ("qa", "ed", "rf", "tg", "yh", "uj", "ik", "ol")
-KEYS = (*_LETTERS, *(pair.upper() for pair in _LETTERS), "12", "34", "56", "78", "90")
+# Keys of cues, enough for the 21 entries of a humanoid: those of any box, letters and digits that are left, signs.
+KEYS = (*box.KEYS, "zx", "cv", "bn", "mp", "12", "34", "56", "78", "90", ",.", ";'", "[]", "-=")
 
 
 class Running(struct.PyTreeNode):
@@ -140,14 +138,19 @@ def flat(obs: Array | Mapping[str, Any]) -> Float[Array, " obs"]:
     return leaves[0] if len(leaves) == 1 else jnp.concatenate(leaves)
 
 
+def model_of(simulator: Any) -> Any:
+    """Return a simulator's model as MuJoCo has it (`mujoco.MjModel`); None: there is none."""
+    return getattr(simulator, "mj_model", None) or getattr(getattr(simulator, "sys", None), "mj_model", None)
+
+
 def entries_of(simulator: Any, size: int) -> tuple[str, ...]:
     """Return a name for each entry of an action: of the MuJoCo model's actuator or its joint, else its number."""
     plain = tuple(f"entry {number}" for number in range(1, size + 1))
-    model = getattr(simulator, "mj_model", None) or getattr(getattr(simulator, "sys", None), "mj_model", None)
+    model = model_of(simulator)
     if model is None or model.nu != size:
         return plain
     joints = [int(model.actuator_trnid[index, 0]) for index in range(size)]
-    named = [model.actuator(i).name or (joints[i] >= 0 and model.joint(joints[i]).name) for i in range(size)]
+    named = [model.actuator(i).name or (model.joint(joints[i]).name if joints[i] >= 0 else "") for i in range(size)]
     return tuple(named) if all(named) and len(set(named)) == size else plain
 
 
@@ -159,7 +162,7 @@ def cues_of(entries: Sequence[str]) -> tuple[Cue, ...]:
     if len(entries) > len(KEYS):
         raise UserError(f"an action has {len(entries)} entries, and keys are for {len(KEYS)}: give `cues`")
     keys = KEYS[: len(entries)]
-    return tuple(Cue(name, WORDS, (more, less), SHARE) for name, (more, less) in zip(entries, keys, strict=True))
+    return tuple(Cue(name, WORDS, (more, less), box.SHARE) for name, (more, less) in zip(entries, keys, strict=True))
 
 
 def space_of(

@@ -219,6 +219,8 @@ def task_of(arguments: list[str], command: str, kind: type) -> tuple[Task, list[
 
 def preset_of(task: Task, arguments: list[str], default: str = PAPER) -> tuple[str, Preset, list[str]]:
     """The preset (if none is given, `default` or the first) and other arguments. Raises UserError for a wrong one."""
+    if not task.presets and task.name in registry.FAMILIES:
+        raise UserError(f"{task.name} is a family of tasks: name one of its environments, as {task.name}:NAME")
     if not task.presets:
         raise UserError(f"{task.name} has no preset to start from: give its Task one")
     name, rest = taken(arguments, "--preset", ", ".join(task.presets))

@@ -14,7 +14,7 @@ from cuelearner_envs.bounds import check_word
 from cuelearner_jax.bridges.jax_environment import JaxEnvironment, Layout
 from cuelearner_jax.errors import UserError, closest
 from cuelearner_jax.task import Body, Task
-from cuelearner_jax.tasks.simulators import SimulatorConfig, check_layout, described, environment_of, presets
+from cuelearner_jax.tasks.simulators import SimulatorConfig, check_layout, described, environment_of, pictures, presets
 
 FAMILY = "brax"
 Backend = Literal["generalized", "spring", "positional", "mjx"]
@@ -65,7 +65,7 @@ BRAX = Task(
     name=FAMILY,
     about="brax's environments, each as brax:NAME, brax:pusher for instance",
     config=BraxConfig,
-    bodies=(Body(FAMILY, "brax's own", make_environment),),
+    bodies=(Body(FAMILY, "brax's own", make_environment, pictures=pictures),),
     labels_hold=("max_steps", "backend"),  # a label is about what one observation shows
 )
 

@@ -10,7 +10,7 @@ from typing import Any
 from cuelearner_jax.bridges import playground
 from cuelearner_jax.bridges.jax_environment import JaxEnvironment, Layout
 from cuelearner_jax.task import Body, Task
-from cuelearner_jax.tasks.simulators import SimulatorConfig, check_layout, described, environment_of, presets
+from cuelearner_jax.tasks.simulators import SimulatorConfig, check_layout, described, environment_of, pictures, presets
 
 FAMILY = "playground"
 
@@ -48,7 +48,7 @@ PLAYGROUND = Task(
     name=FAMILY,
     about="MuJoCo Playground's dm_control tasks, each as playground:NAME, playground:CartpoleBalance for instance",
     config=PlaygroundConfig,
-    bodies=(Body(FAMILY, "MJX, MuJoCo in JAX", make_environment),),
+    bodies=(Body(FAMILY, "MJX, MuJoCo in JAX", make_environment, pictures=pictures),),
     labels_hold=("max_steps",),  # a label is about what one observation shows
 )
 

@@ -79,8 +79,6 @@ def resolve(text: str) -> Task:
     Raises:
         UserError: no such task, or its code cannot be loaded.
     """
-    if text in FAMILIES:
-        raise UserError(f"{text} is a family of tasks: name one of its environments, as {text}:NAME")
     if ":" not in text:
         return find(text)
     family, _, environment = text.partition(":")

@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import jax.numpy as jnp
 
 from cuelearner_envs.bounds import MOST_STEPS, check_number
+from cuelearner_jax.adaptation.adapting import plain_scalars
 from cuelearner_jax.agents import ddqn
 from cuelearner_jax.arbiters import paced
 from cuelearner_jax.bridges.jax_environment import JaxEnvironment, Layout, layout_of
-from cuelearner_jax.config import Scalars, Schedule, Sizes
+from cuelearner_jax.config import Schedule, Sizes
 from cuelearner_jax.errors import UserError, shown
 from cuelearner_jax.run_config import RunConfig
-from cuelearner_jax.task import Preset
+from cuelearner_jax.task import Pictures, Preset
 
 
 @dataclass(frozen=True)
@@ -74,6 +75,13 @@ def _check_row(name: str, values: Any, kind: type) -> None:
         raise UserError(f"task.{name} is {shown(values)}: give {what}, or name the task FAMILY:ENVIRONMENT")
 
 
+def pictures() -> Pictures:
+    """Return how these environments are drawn."""
+    from cuelearner_jax.tasks import simulator_pictures  # MuJoCo's loading is not for every command
+
+    return simulator_pictures.PICTURES
+
+
 def described(family: str, name: str, simulator: Any) -> dict[str, Any]:
     """Return the fields of a configuration that follow from a simulator."""
     slices, sizes, entries = layout_of(simulator, name)
@@ -99,7 +107,7 @@ def presets(config: SimulatorConfig) -> dict[str, Preset]:
             RunConfig(
                 config,
                 Sizes(num_envs=10, feedback_layers=(128, 128), fit_steps=400, fit_batch_size=64),
-                Scalars(discount=0.95, max_grad_norm=10.0, eps_deg=0.1, scalar_within_deg=0.1, tau_deg=0.001),
+                replace(plain_scalars(config.layout.box()), discount=0.95, max_grad_norm=10.0),
                 Schedule(
                     total_steps=6_000,
                     random_steps=500,
