@@ -190,7 +190,7 @@ GYMNASIUM = Task(
     bodies=(body(),),
     longest=_longest,
     judge_by=_judge_by,
-    labels_hold=("arguments", "max_steps", "processes", "succeeds"),  # a label is about what one observation shows
+    labels_hold=("max_steps", "processes", "succeeds"),  # a label is about what one observation shows
 )
 
 
