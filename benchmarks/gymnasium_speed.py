@@ -31,7 +31,7 @@ WAYS = {"FetchReach-v4": (0,), "Pendulum-v1": (0, 1), "CartPole-v1": (0, 1)}  # 
 
 def ours(name: str, num_envs: int, steps: int, processes: int) -> Callable[[int], float]:
     """A roll-out of ours: seconds a step of all environments, by the number of the turn."""
-    env = cl.from_gymnasium(name, num_envs=num_envs, processes=processes).env
+    env: Any = cl.from_gymnasium(name, num_envs=num_envs, processes=processes).env
 
     @jax.jit
     def begin(key: jax.Array) -> Any:

@@ -10,6 +10,7 @@
     better.save("policies/better")                          # a folder that load_policy and every command take
     cl.export_policy(better, "walker", world, "numpy")      # a file that runs without JAX, and its contract
     run = cl.train(world, teacher, "quickstart", seeds=8)   # what `cuelearner sweep` does, results in memory
+    arm = cl.from_gymnasium("FetchReach-v4")                # a world as well: any Gymnasium environment
 
 What these take and give stands in their docstrings. Everything else is a room behind this face.
 """

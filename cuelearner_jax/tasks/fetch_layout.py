@@ -20,7 +20,7 @@ _OBJECT = (
 )
 _FINGERS = Quantity("finger positions", 2, "m", "how far each finger is open", OWN)
 _MOTION = (
-    Quantity("object rotation", 3, "rad", "Euler angles", OWN),
+    Quantity("object rotation", 3, "rad (Euler angles)"),
     Quantity("object velocity", 3, "m a step", "relative to the gripper"),
     Quantity("object angular velocity", 3, "rad a step"),
 )

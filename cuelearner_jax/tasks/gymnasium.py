@@ -190,7 +190,7 @@ GYMNASIUM = Task(
     bodies=(body(),),
     longest=_longest,
     judge_by=_judge_by,
-    labels_hold=("arguments", "max_steps", "processes", "succeeds"),  # a label is about what one observation shows
+    labels_hold=("max_steps", "processes", "succeeds"),  # a label is about what one observation shows
 )
 
 
@@ -245,7 +245,10 @@ def task_from(
     source = Source(name, text, max_steps or 0, 1, factory=factory)
     actions, slices, limit, succeeds = _seen(source)
     if not max_steps and not limit:
-        raise UserError(f"environment {name} has no limit of steps: give max_steps, after which episodes are truncated")
+        raise UserError(
+            f"environment {name} has no limit of steps: give max_steps to cl.from_gymnasium, or wrap the environment in "
+            "gymnasium.wrappers.TimeLimit"
+        )
     fetch = fetch_layout.layout_of(name) if factory is None else None
     slices = _named(name, slices, observation or fetch, units or {})
     words = (

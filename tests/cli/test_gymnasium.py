@@ -62,6 +62,7 @@ def test_a_file_may_not_have_an_id_import_code(run, refused, tmp_path):
         refused(["evaluate", folder, "--policy", "uniform", "--episodes", "2"], "which no file may import", folder)
 
 
+@pytest.mark.long
 def test_an_interrupted_training_goes_on_bitwise(run, tmp_path):
     half = tmp_path / "half"
     command = ["train", REACH, *TINY, "--out", str(half)]
@@ -78,6 +79,7 @@ def test_an_interrupted_training_goes_on_bitwise(run, tmp_path):
 APART = {"wall_s", "commit", "command", "folder", "run"}
 
 
+@pytest.mark.long
 def test_code_is_adapted_by_code_that_teaches(tmp_path, capsys):
     out = tmp_path / "better"
     command = ["adapt", "gymnasium_worlds:beside", "--env", REACH, "--teacher", "gymnasium_worlds:toward"]
