@@ -28,7 +28,7 @@ from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.guides.relative import KIND
 from cuelearner_jax.labelling import controls
 from cuelearner_jax.labelling.plan import Base, Plan
-from cuelearner_jax.policies import NearAims, uniform_in
+from cuelearner_jax.policies import NearAims, in_space, uniform_in
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs.grid import LARGEST_SEED
 from cuelearner_jax.runs.trained import PolicySource
@@ -274,7 +274,7 @@ def _base(task: Task, asked: Label[Any], named: str | None, source: PolicySource
         if lane != Lane():
             raise UserError("--base.… chooses in a folder, and none is given: leave it out")
         if named is not None:
-            return Base(code_of(named), named)
+            return Base(in_space(code_of(named), actions_of(env)), named)
         if asked.questions == UNIFORM:
             return Base(uniform_in(env), UNIFORM)
         if asked.questions == PROPOSED:

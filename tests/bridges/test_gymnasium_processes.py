@@ -85,7 +85,7 @@ def test_processes_give_the_numbers_of_one_and_end_when_they_are_closed():
 
 
 def test_pictures_are_of_the_state_that_is_shown(tmp_path):
-    world = cl.make("gymnasium:gymnasium_worlds:limited")
+    world = cl.make("gymnasium:gymnasium_worlds:limited", processes=1)
     env, pictures = world.env, world.task.pictures()
     state, _ = world.reset(KEY)
     states = [state]
@@ -109,7 +109,7 @@ def test_pictures_are_of_the_state_that_is_shown(tmp_path):
 
 
 def test_an_environment_without_pictures_is_told():
-    world = cl.from_gymnasium(Blank, max_steps=6)
+    world = cl.from_gymnasium(Blank, max_steps=6, processes=1)
     state, _ = world.reset(KEY)
     with pytest.raises(UserError, match=r"gives no pictures: let it take render_mode='rgb_array'"):
         gymnasium_pictures.sketch(world.env, state)
