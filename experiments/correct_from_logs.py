@@ -2,9 +2,10 @@
 
     python experiments/correct_from_logs.py --out docs/data/correct_from_logs.csv
 
-200 simulated answers of all cues about recorded situations: in rounds, about actions refined by the model so far, as the
-labelling page asks; or about the policy's actions moved at random within the bound, all at once. Judged on situations
-that were not recorded. The control has each label answered by another label's answer. A few minutes on 2 cores.
+200 simulated answers of all cues about recorded situations: in rounds, about actions refined by the model so far, as
+the labelling page asks; or about the policy's actions moved at random within the bound, all at once. Judged on
+situations that were not recorded. The control has each label answered by another label's answer. A few minutes on 2
+cores.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import dataclasses
 import tempfile
 import warnings
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -96,9 +97,9 @@ def in_rounds(seed: int, guidance: str, folder: Path, control: bool):
     scalars = None
     if control and guidance != "calibration":
         scalars = dataclasses.replace(plain_scalars(BOX), answer="shuffled")
-    bound = {} if guidance == "calibration" else {"bound_deg": BOUND}
-    how = {"labels": LABELS, "guidance": guidance, "judge_by": "labels", "seed": seed, "scalars": scalars}
-    return cl.adapt(off, cl.World(task, task.plain()), wanted, **how, **bound)
+    bound = None if guidance == "calibration" else BOUND
+    how: dict[str, Any] = {"labels": LABELS, "guidance": guidance, "judge_by": "labels", "seed": seed}
+    return cl.adapt(off, cl.World(task, task.plain()), wanted, bound_deg=bound, scalars=scalars, **how)
 
 
 def corrected(guidance: str, questions: str, answers: str, seed: int, folder: Path) -> Row:
@@ -111,8 +112,8 @@ def corrected(guidance: str, questions: str, answers: str, seed: int, folder: Pa
             eps = plain_scalars(BOX).eps_deg
             labels = at_random(seed, eps)
             labels = shuffled(labels, seed) if answers == "shuffled" else labels
-            bound = {} if guidance == "calibration" else {"bound": BOUND}
-            found = cl.correct(off, labels, low=LOW, high=HIGH, eps=eps, guidance=guidance, seed=seed, **bound)
+            bound = None if guidance == "calibration" else BOUND
+            found = cl.correct(off, labels, low=LOW, high=HIGH, eps=eps, guidance=guidance, seed=seed, bound=bound)
     return Row(guidance, questions, answers, seed, error(off, seed), error(found, seed), found.used)
 
 

@@ -56,8 +56,8 @@ def correct(
     eps: float | None = None,
     guidance: str = KIND.name,
     cues: str | Sequence[Any] = "",
-    low: Sequence[float] | None = None,
-    high: Sequence[float] | None = None,
+    low: Sequence[float] | np.ndarray | None = None,
+    high: Sequence[float] | np.ndarray | None = None,
     space: Space | None = None,
     changes: Any = None,
     sizes: GuideSizes | None = None,
@@ -92,12 +92,16 @@ def correct(
             "policy is None: give the policy whose actions the labels are about; of the answers alone, without a base, "
             "cl.fit_feedback makes a model"
         )
-    policy = load_policy(policy) if isinstance(policy, str | os.PathLike) and not str(policy).endswith(ONNX) else policy
+    policy = (
+        load_policy(Path(policy))
+        if isinstance(policy, str | os.PathLike) and not str(policy).endswith(ONNX)
+        else policy
+    )
     before = _recording_of(policy)
     if (
         before is not None
         and not isinstance(labels, str | os.PathLike)
-        and (space, cues, low, high) == (None, "", None, None)
+        and not any(map(_is_told, (space, cues, low, high)))
     ):
         space = logs.space_of(before)  # of a policy that was corrected before
     found = _given(labels, space, cues, low, high)
@@ -160,7 +164,7 @@ def agreement(
 
 def _given(labels: Any, space: Any, cues: Any, low: Any, high: Any) -> GivenLabels:
     """Checked labels with their space. Raises UserError for what makes no sense."""
-    told = [name for name, value in (("cues", cues), ("low", low), ("high", high)) if value not in ("", None, ())]
+    told = [name for name, value in (("cues", cues), ("low", low), ("high", high)) if _is_told(value)]
     if space is not None and told:
         raise UserError(f"{told[0]} is given beside space, which says it already: leave out one of them")
     arguments.optional(arguments.instance, "space", space, Space, "a space of actions")
@@ -179,9 +183,13 @@ def _given(labels: Any, space: Any, cues: Any, low: Any, high: Any) -> GivenLabe
             raise UserError(
                 f"low and high bound {len(low)} and {len(high)} entries, actions have {size}: give one an entry"
             )
-        space = Box(tuple(map(float, low)), tuple(map(float, high)), cues_from(cues) if cues else ())
+        space = Box(tuple(map(float, low)), tuple(map(float, high)), cues_from(cues) if _is_told(cues) else ())
     given.check(rows, Spaces(rows.obs.shape[1], space), RELATIVE)
     return GivenLabels(rows, space, None)
+
+
+def _is_told(value: Any) -> bool:
+    return value is not None and not (isinstance(value, str | tuple | list) and not value)
 
 
 def _numbers(name: str, value: Any) -> list[float]:
@@ -219,7 +227,8 @@ def world_of(found: GivenLabels, before: LogsConfig | None = None) -> World:
     """
     config, size = found.config, found.rows.obs.shape[1]
     if config is None or sum(config.entries) != size:
-        config = LogsConfig(entries=(size,), **logs.scales_of(np.asarray(found.rows.obs)))
+        centre, spread = logs.scales_of(np.asarray(found.rows.obs))
+        config = LogsConfig(entries=(size,), centre=centre, spread=spread)
     if before is not None:
         if logs.space_of(before) != found.space:
             raise UserError(

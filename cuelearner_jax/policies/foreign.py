@@ -95,8 +95,8 @@ class _Torch(Foreign):
             finally:
                 for part, mode in modes:
                     part.training = mode
-        found = found[0] if isinstance(found, tuple | list) and found and isinstance(found[0], torch.Tensor) else found
-        return found.detach().to("cpu", torch.float32).numpy() if isinstance(found, torch.Tensor) else found
+        first: Any = found[0] if isinstance(found, tuple | list) and found else found
+        return first.detach().to("cpu", torch.float32).numpy() if isinstance(first, torch.Tensor) else found
 
 
 class _Predicting(Foreign):

@@ -75,7 +75,7 @@ class Box(Space):
 
     def outward(self, vector: Vectors, action: Vectors) -> Float[Array, "... action"]:
         """Return a vector given in shares of the ranges as a vector to be added to the action."""
-        return vector * _row(self._range, vector)
+        return jnp.asarray(vector) * _row(self._range, vector)
 
     def spread(self, count: int) -> Float[Array, "count action"]:
         """Return `count` vectors that fill the box evenly and reach its bounds, the same ones each time.

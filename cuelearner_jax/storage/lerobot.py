@@ -147,7 +147,8 @@ def _vectors(path: Path, table: pa.Table, key: str, told: dict[str, Any]) -> Flo
 
 def _entries(told: dict[str, Any], before: str) -> tuple[str, ...]:
     """Names of a vector's entries; empty: the dataset names none, or not as many."""
-    names, size = told.get("names"), told["shape"][0]
+    names: Any = told.get("names")
+    size = told["shape"][0]
     if isinstance(names, dict):
         values = list(names.values())
         if all(isinstance(value, list) for value in values):
@@ -175,8 +176,16 @@ def _frames(path: Path, info: dict[str, Any], table: pa.Table, key: str) -> Call
         if episode not in starts:
             raise UserError(f"{path / 'meta/episodes'} does not name the episode {episode}: restore it")
         chunk, number, start = starts[episode]
-        file = inside(path, VIDEO.format(key=key, chunk=int(chunk), file=int(number)), "the video")
-        return Picture(_decoded(file, round((float(start) + float(since)) * info["fps"])), "image/png")
+        try:
+            name, frame = (
+                VIDEO.format(key=key, chunk=int(chunk), file=int(number)),
+                round((start + since) * info["fps"]),
+            )
+        except (TypeError, ValueError, OverflowError) as error:
+            raise UserError(
+                f"{path / 'meta/episodes'} does not say where episode {episode} begins: restore it"
+            ) from error
+        return Picture(_decoded(inside(path, name, "the video"), frame), "image/png")
 
     return frame
 
@@ -203,7 +212,7 @@ def _decoded(file: Path, number: int) -> bytes:
 
     try:
         with imageio.get_reader(file, format="FFMPEG") as video:  # pyright: ignore[reportArgumentType]
-            frame = np.asarray(video.get_data(number))
+            frame = np.asarray(video.get_data(number))  # pyright: ignore[reportAttributeAccessIssue]
     except (OSError, RuntimeError, IndexError, ValueError) as error:
         why = re.sub(r"\s+", " ", str(error))[:80]
         raise UserError(f"frame {number} of {file} cannot be had ({why}): restore the video") from error

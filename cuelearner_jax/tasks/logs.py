@@ -14,7 +14,7 @@ import io
 from collections.abc import Callable, Sequence
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal, cast, get_args
 
 import imageio.v2 as imageio
 import jax
@@ -193,16 +193,17 @@ def task_of(
         UserError: the situations cannot be read, or bounds or cues do not fit their actions.
     """
     path, found = Path(folder), _read(Path(folder))
+    centre, spread = scales_of(found.observations)
     for name, value, kind in (("actions", actions, Actions), ("order", order, Order)):
         if value not in get_args(kind):
             raise UserError(f"{name} is {value!r}{closest(value, get_args(kind))}")
     size = found.actions.shape[1]
     if actions == "box":
-        low, high = bounds_of(found.actions, low, high, found.entries, note)
+        bounds = bounds_of(found.actions, low, high, found.entries, note)
     elif low is not None or high is not None:
         raise UserError(f"low and high bound a box, and actions are {actions}: leave them out")
     else:
-        low, high = (0.0,) * size, (1.0,) * size
+        bounds = (0.0,) * size, (1.0,) * size
     names = found.entries if actions == "box" else ()
     words = cues or (["more,less"] * size if names else ())
     pairs = cues_from(words, names) if words else ()
@@ -210,15 +211,16 @@ def task_of(
         path=str(path),
         digest=found.digest,
         rows=len(found.observations),
-        order=order,
+        order=cast(Order, order),
         names=tuple(quantity.name for quantity in found.slices),
         entries=tuple(quantity.size for quantity in found.slices),
-        actions=actions,
-        low=tuple(map(float, low)),
-        high=tuple(map(float, high)),
+        actions=cast(Actions, actions),
+        low=tuple(map(float, bounds[0])),
+        high=tuple(map(float, bounds[1])),
         cues=tuple(",".join(cue.words) for cue in pairs),
         cue_names=names if pairs else (),
-        **scales_of(found.observations),
+        centre=centre,
+        spread=spread,
     )
     _check_actions(path, found, space_of(config))
     return configured(config)
@@ -232,13 +234,13 @@ def configured(config: LogsConfig, body: Body | None = None) -> Task:
     return dataclasses.replace(LOGS, default=config, presets={PAPER: preset}, bodies=(body or BODY,))
 
 
-def scales_of(observations: Float[np.ndarray, "n obs"]) -> dict[str, tuple[float, ...]]:
+def scales_of(observations: Float[np.ndarray, "n obs"]) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """`centre` and `spread` of a configuration: mean and standard deviation of each entry, 1 where it never changes."""
     rounded = lambda values: tuple(float(f"{value:.6g}") for value in values)  # noqa: E731
     with np.errstate(over="ignore"):
         spread = observations.std(0, dtype=np.float64)
     still = ~(spread > 1e-6 * np.maximum(np.abs(observations).max(0), 1e-12))
-    return {"centre": rounded(observations.mean(0, dtype=np.float64)), "spread": rounded(np.where(still, 1.0, spread))}
+    return rounded(observations.mean(0, dtype=np.float64)), rounded(np.where(still, 1.0, spread))
 
 
 def bounds_of(
@@ -256,13 +258,13 @@ def bounds_of(
         raise UserError(f"{'high' if low is None else 'low'} is given alone: give low and high, a number an entry each")
     if low is not None and high is not None:
         return low, high
-    low, high = actions.min(0).tolist(), actions.max(0).tolist()
-    names = entries or [f"entry {number}" for number in range(1, len(low) + 1)]
-    if still := [name for name, a, b in zip(names, low, high, strict=True) if not b > a]:
+    least, most = actions.min(0).tolist(), actions.max(0).tolist()
+    names = entries or [f"entry {number}" for number in range(1, len(least) + 1)]
+    if still := [name for name, a, b in zip(names, least, most, strict=True) if not b > a]:
         raise UserError(f"{still[0]} of the actions never changes, so its bounds are unknown: give low and high")
-    told = ", ".join(f"{name} {a:.3g} to {b:.3g}" for name, a, b in zip(names, low, high, strict=True))
+    told = ", ".join(f"{name} {a:.3g} to {b:.3g}" for name, a, b in zip(names, least, most, strict=True))
     note(f"bounds of the actions are their range ({told}): give low and high for others")
-    return low, high
+    return least, most
 
 
 def _check_actions(path: Path, found: Situations, space: Space) -> None:
@@ -334,6 +336,8 @@ def _environment(config: LogsConfig, split: str) -> Logs:
 
 def _picture(env: Logs, row: Any) -> tuple[situations.Picture, int]:
     """The picture of a row, and its place in the recording. Raises UserError if there is none."""
+    if not env.path:
+        raise UserError("these situations are those of labels, without pictures: name their folder, as logs:FOLDER")
     place = int(env.places[row])
     found = _read(Path(env.path)).picture(place)
     if found is None:

@@ -60,8 +60,8 @@ def error(policy, obs=OTHERS):
 @pytest.fixture(scope="module")
 def better():
     """Corrected by 150 labels."""
-    how = {"cues": CUES, "low": LOW, "high": HIGH, "eps": EPS, "bound": 0.2, "sizes": SIZES, "scalars": FAST}
-    return cl.correct(off, asked(150), **how)
+    how = {"cues": CUES, "low": np.array(LOW), "high": list(HIGH), "eps": EPS, "bound": 0.2}
+    return cl.correct(off, asked(150), sizes=SIZES, scalars=FAST, **how)
 
 
 def test_a_corrected_policy_is_nearer_to_what_people_have_in_mind(better):
