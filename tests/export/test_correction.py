@@ -4,6 +4,8 @@ import dataclasses
 import subprocess
 import sys
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -76,6 +78,16 @@ def test_of_a_saved_policy_it_needs_no_base(better, tmp_path):
     cl.export_correction(again, tmp_path / "out", format="numpy")
     found = cl.load_exported(tmp_path / "out")(OTHERS, base(OTHERS))
     np.testing.assert_allclose(found, better(OTHERS), atol=1e-5)
+
+
+def test_a_policy_of_jax_functions_is_exported_whole_from_its_folder(tmp_path):
+    own = jax.jit(lambda obs: jnp.stack([0.05 * obs[:, 0], jnp.tanh(obs[:, 1])], -1))
+    how = {"low": LOW, "high": HIGH, "eps": EPS, "bound": 0.2, "sizes": SIZES, "scalars": SCALARS}
+    better = cl.correct(own, labels(), **how)
+    cl.export_policy(better, tmp_path / "whole", format="numpy")
+    np.testing.assert_allclose(cl.load_exported(tmp_path / "whole")(OTHERS), better(OTHERS), atol=1e-5)
+    with pytest.raises(Exception, match="holds a whole policy: leave out the base action"):
+        cl.load_exported(tmp_path / "whole")(OTHERS, base(OTHERS))
 
 
 def test_what_is_given_wrongly_is_told(better, tmp_path):
