@@ -210,9 +210,9 @@ def test_the_page_shows_what_gymnasium_renders_and_films_where_an_action_leads(t
         seen.append(page._scene.content)
         return np.array([1.0 if action < 0.5 else 0.0])
 
-    command = ["gymnasium:gymnasium_worlds:Adder", "--cues", "right,left", *SMALL, "--labels", "3"]
+    command = ["gymnasium:gymnasium_worlds:limited", "--cues", "right,left", *SMALL, "--labels", "3"]
     found = labelled([*command, "--task.processes", "1", "--out", tmp_path / "mine"], ask)
-    assert "cuelearner train gymnasium:gymnasium_worlds:Adder" in capsys.readouterr().out
+    assert "cuelearner train gymnasium:gymnasium_worlds:limited" in capsys.readouterr().out
     assert label_files.read(found).space.cues[0].words == ("right", "left")
     photos = [re.search(r'class="photo" href="([^"]+)"', svg)[1] for svg in seen]
     assert len(set(photos)) == len(photos)  # a picture of each step
