@@ -1,6 +1,7 @@
 """A script in the place of a person and a browser: it runs `cuelearner label` and presses the page's buttons."""
 
 import asyncio
+import inspect
 from unittest import mock
 
 import numpy as np
@@ -19,11 +20,12 @@ def labelled(arguments, ask):
 
     Args:
         arguments: of the command line, as a shell would give them.
-        ask: (observation (obs,), action (action,)) -> the answer (cues,): 1 more, 0 already right, -1 less, `UNSAID`.
+        ask: (observation (obs,), action (action,)) -> the answer (cues,): 1 more, 0 already right, -1 less, `UNSAID`;
+            it may take the `page` too.
 
     Returns the folder of the labels.
     """
-    places = []
+    places, looks = [], "page" in inspect.signature(ask).parameters
 
     def served(_, plan, asked, port, stopping, commands):
         with Session(plan, asked.out) as session:
@@ -31,7 +33,8 @@ def labelled(arguments, ask):
             async def acts(user, pages):
                 (page,) = pages
                 while (item := session.item) is not None:
-                    await answer(user, page, session, ask(np.asarray(item.guide.obs), item.action))
+                    given = np.asarray(item.guide.obs), item.action, *([page] if looks else [])
+                    await answer(user, page, session, ask(*given))
                 user.find(marker="finish").click()
 
             async def finish():

@@ -95,7 +95,7 @@ def test_a_picture_its_arrows_and_its_film_fit_a_phone(browser, tmp_path):
         sizes = f"() => [...document.querySelectorAll('.answers button')].flatMap({sizes})"
         assert min(page.evaluate(sizes)) >= 44
         assert page.evaluate("() => document.querySelector('.photo').decode().then(() => true)")
-        page.locator(".said[data-name='pick-0-more'] .touched").tap()  # the arrow to the left
+        page.locator(".said[data-name='pick-0-more'] .touched").tap(force=True)  # the arrow to the left
         page.wait_for_function("() => document.querySelector('.said.picked')?.dataset.name === 'pick-0-more'")
         page.keyboard.press("c")
         page.wait_for_function("() => document.querySelectorAll('.answers .picked').length === 3")
