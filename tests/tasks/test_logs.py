@@ -117,7 +117,9 @@ def test_networks_see_entries_of_the_order_of_one(folder):
     task = logs.task_of(folder, CUES, **BOUNDS)
     view = task.view(task.plain())
     first = jnp.asarray(observations[0])
-    seen = np.asarray(jax.vmap(lambda obs: view.features(obs, jnp.asarray(recorded.HIGH)).own)(jnp.asarray(observations)))
+    seen = np.asarray(
+        jax.vmap(lambda obs: view.features(obs, jnp.asarray(recorded.HIGH)).own)(jnp.asarray(observations))
+    )
     np.testing.assert_allclose(seen.mean(0), 0.0, atol=1e-5)
     np.testing.assert_allclose(seen.std(0), 1.0, atol=1e-5)
     np.testing.assert_allclose(view.features(first, jnp.asarray(recorded.HIGH)).turned, 1.0, atol=1e-6)
