@@ -40,7 +40,7 @@ $(VENV)/.tested: $(VENV)/.installed
 	@touch $@
 
 $(VENV)/.foreign: $(VENV)/.tested
-	$(UV) pip install --python $(BIN)/python --constraints constraints.txt --group foreign
+	$(BIN)/python -m pip install --disable-pip-version-check --constraint constraints.txt --group foreign
 	@touch $@
 
 setup: $(VENV)/.tested
