@@ -4,6 +4,7 @@ Written for playground 0.2.0. Its locomotion and manipulation tasks download the
 not offered by name, and `from_playground` takes one that the caller made.
 """
 
+# pyright: reportMissingImports=false
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
