@@ -6,12 +6,13 @@ UV := $(BIN)/python -m uv
 PYTEST := $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 UV_VERSION := $(shell sed -n 's/^uv==\([0-9.]*\).*/\1/p' constraints.txt)
 
-.PHONY: help setup quickstart smoke test test-all test-quick durations fuzz lint format docs bench constraints clean
+.PHONY: help setup quickstart smoke test test-all test-quick test-foreign durations fuzz lint format docs bench constraints clean
 help:
 	@echo "make quickstart   train, report and film the small billiards example (two to three minutes)"
 	@echo "make test         run the tests (about 8 minutes on 2 cores)"
 	@echo "make test-all     these, and what checks the same at length"
 	@echo "make test-quick   those in files that take little of that (under 3 minutes)"
+	@echo "make test-foreign those of policies of PyTorch, Stable-Baselines3 and onnxruntime, which it installs"
 	@echo "make durations    make test, and tests/durations.txt: the seconds of each file"
 	@echo "make smoke        one tiny sweep of every form of feedback and of every adaptation on both tasks (minutes on 2 cores)"
 	@echo "make fuzz         damaged folders and files by chance, CASES=2000 SEED=0 (hours on 2 cores)"
@@ -38,6 +39,10 @@ $(VENV)/.tested: $(VENV)/.installed
 	$(UV) pip install --python $(BIN)/python --constraints constraints.txt --group dev
 	@touch $@
 
+$(VENV)/.foreign: $(VENV)/.tested
+	$(UV) pip install --python $(BIN)/python --constraints constraints.txt --group foreign
+	@touch $@
+
 setup: $(VENV)/.tested
 
 quickstart: $(VENV)/.installed
@@ -57,6 +62,9 @@ test-all: $(VENV)/.tested
 
 test-quick: $(VENV)/.tested
 	$(PYTEST) -m "not slow and not long"
+
+test-foreign: $(VENV)/.foreign
+	$(PYTEST) tests/foreign
 
 durations: $(VENV)/.tested
 	$(PYTEST) -m "not long" --durations-to tests/durations.txt

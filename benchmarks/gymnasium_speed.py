@@ -31,7 +31,7 @@ WAYS = {"FetchReach-v4": (0,), "Pendulum-v1": (0, 1), "CartPole-v1": (0, 1)}  # 
 
 def ours(name: str, num_envs: int, steps: int, processes: int) -> Callable[[int], float]:
     """A roll-out of ours: seconds a step of all environments, by the number of the turn."""
-    env = cl.from_gymnasium(name, num_envs=num_envs, processes=processes).env
+    env: Any = cl.from_gymnasium(name, num_envs=num_envs, processes=processes).env
 
     @jax.jit
     def begin(key: jax.Array) -> Any:
@@ -88,6 +88,7 @@ def measured(name: str, num_envs: int, steps: int, turns: int) -> dict[str, Any]
         for way, turn in ways.items():
             times[way].append(turn(number))
     medians = {way: float(np.median(values)) for way, values in times.items()}
+    quartiles = {way: np.quantile(values, [0.25, 0.75]) for way, values in times.items()}
     fastest = min(value for way, value in medians.items() if way.startswith("plain"))
     own = min(value for way, value in medians.items() if way.startswith("ours"))
     return {
@@ -96,9 +97,7 @@ def measured(name: str, num_envs: int, steps: int, turns: int) -> dict[str, Any]
         "steps_a_turn": steps,
         "turns": turns,
         "microseconds_a_step": {way: round(1e6 * value, 1) for way, value in medians.items()},
-        "quartiles": {
-            way: np.round(1e6 * np.quantile(values, [0.25, 0.75]), 1).tolist() for way, values in times.items()
-        },
+        "quartiles": {way: np.round(1e6 * ends, 1).tolist() for way, ends in quartiles.items()},
         "ratio": round(own / fastest, 3),
         "more_microseconds_a_step": round(1e6 * (own - fastest), 1),
     }

@@ -11,6 +11,15 @@
     python benchmarks/labelling_page.py pictures --task examples.reach:TASK --preset quickstart
     python benchmarks/labelling_page.py pictures --task navigation --preset quickstart --called anymal \\
         --more="--robot anymal --task.worlds 16"
+    python benchmarks/labelling_page.py paced --task pictures --labels 300 --out paced_pictures.json
+    MUJOCO_GL=osmesa python benchmarks/labelling_page.py paced --task gymnasium:FetchReach-v4 --labels 300
+    python benchmarks/labelling_page.py kills --task pictures
+    python benchmarks/labelling_page.py pictures --task pictures
+    python benchmarks/labelling_page.py pictures --task pictures --called one_cue --more=--one-cue
+    MUJOCO_GL=osmesa python benchmarks/labelling_page.py pictures --task gymnasium:FetchReach-v4
+
+The task `pictures` is a folder of plain pictures, written anew; a script that knows what they show answers about three
+cues.
 
 `paced`: a script that sees only the page turns navigation's arrow onto the shortest way past what is drawn, but 10% of
 its keys are "don't know" and 10% of the others one of the two wrong ones; in billiards it presses at random. Measured
@@ -37,42 +46,47 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import _photos
 import numpy as np
-from _way import Scene
+from _photos import CUES
+from _presses import Presses, chosen
 from playwright.sync_api import Browser, Page, sync_playwright  # pyright: ignore[reportMissingImports]
 
 from cuelearner_jax.storage import label_files
 from cuelearner_jax.storage.provenance import provenance
 
-KEYS = {"ArrowLeft": 1.0, "ArrowUp": 0.0, "ArrowRight": -1.0, "ArrowDown": None}
-UNSURE, MISTAKES = 0.1, 0.1  # shares of a script's keys, and of its answers
-RIGHT_DEG = 10.0  # half of navigation's eps: an arrow this near the way is left as it is
-# Times of each press: of the key, and of the first frame in which another question stands.
+# Times of each press: of the key, and of the first frame in which another question stands, its picture decoded.
 WATCH = """
 window.taken = [];
 addEventListener("keydown", event => {
-  const scene = document.querySelector("svg.scene");
-  if (!scene || !event.key.startsWith("Arrow")) return;
+  const scene = document.querySelector("svg.scene"), name = window.cue && cue.keys[event.key];
+  if (!scene || !name || /^(pick|film|help)/.test(name)) return;
   const began = performance.now(), item = scene.dataset.item;
   const fitting = document.body.innerText.includes("fitting");
-  const look = () => {
-    const now = document.querySelector("svg.scene");
-    if (now && now.dataset.item === item) { requestAnimationFrame(look); return; }
+  const paint = () => requestAnimationFrame(() => {
     const painted = new MessageChannel();
     painted.port1.onmessage = () => window.taken.push([performance.now() - began, fitting]);
     painted.port2.postMessage(0);
-  };
-  requestAnimationFrame(look);
+  });
+  const changes = new MutationObserver(() => {
+    const now = document.querySelector("svg.scene"), photo = now && now.querySelector("image.photo");
+    if (now && now.dataset.item === item) return;
+    changes.disconnect();
+    if (photo) photo.decode().then(paint); else paint();
+  });
+  changes.observe(document, {childList: true, subtree: true});
 }, true);
 """
-DRAWN = "document.querySelector('svg.scene').outerHTML"
+PHOTOS = "pictures"  # the task that is a folder of plain pictures, written anew
 ITEM = "() => { const one = document.querySelector('svg.scene'); return one ? +one.dataset.item : null; }"
 
 
 @contextlib.contextmanager
 def served(asked: argparse.Namespace, task: str, folder: Path, *more: str) -> Iterator[tuple[subprocess.Popen, str]]:
     """The command, until it has told its address: the process and that."""
-    command = [sys.executable, "-m", "cuelearner_jax.cli", "label", task, "--preset", asked.preset]
+    named = [str(asked.photos), "--cues", CUES] if task == PHOTOS else [task]
+    preset = asked.preset or ("" if task == PHOTOS or ":" in task else "paper")
+    command = [sys.executable, "-m", "cuelearner_jax.cli", "label", *named, *(["--preset", preset] if preset else [])]
     command += ["--no-practice", "--out", str(folder), *shlex.split(asked.more), *more]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env={**os.environ, "PYTHONUNBUFFERED": "1"})
     try:
@@ -106,28 +120,22 @@ def moved(page: Page, item: int, seconds: float = 30.0) -> None:
     page.wait_for_function(f"({ITEM})() !== {item} && cue.ready()", timeout=seconds * 1000)
 
 
-def chosen(page: Page, task: str, rng: random.Random) -> str:
-    """The key that the script presses: it sees the page alone."""
-    if rng.random() < UNSURE:
-        return "ArrowDown"
-    if task != "navigation":
-        return rng.choice(["ArrowLeft", "ArrowUp", "ArrowRight"])
-    scene = Scene(page.evaluate(DRAWN))
-    apart = (scene.to_goal() - scene.asked + 180) % 360 - 180
-    right = "ArrowUp" if abs(apart) <= RIGHT_DEG else "ArrowLeft" if apart > 0 else "ArrowRight"
-    wrong = [key for key, said in KEYS.items() if said is not None and key != right]
-    return rng.choice(wrong) if rng.random() < MISTAKES else right
+def press(page: Page, presses: Presses) -> None:
+    """Presses keys, one after the other."""
+    for number, key in enumerate(presses.keys):
+        time.sleep(0.05 if number else 0.0)  # nobody presses two at once
+        page.keyboard.press(key)
 
 
-def check(folder: Path, pressed: dict[int, str], saved: int) -> dict[str, int]:
+def check(folder: Path, pressed: dict[int, Presses], saved: int) -> dict[str, int]:
     """Presses that the file lacks or has otherwise, and rows that nobody pressed."""
     found = label_files.found_in(folder)
     assert found is not None
     rows = label_files.history(found)
     items = [row["item"] for row in rows]
-    answers = {row["item"]: None if row["answer"] is None else row["answer"][0] for row in rows}
+    answers = {row["item"]: None if row["answer"] is None else tuple(row["answer"]) for row in rows}
     lost = max(saved - len(set(items)), 0)
-    other = sum(answers[item] != KEYS[pressed[item]] for item in answers if item in pressed)
+    other = sum(answers[item] != pressed[item].answer for item in answers if item in pressed)
     return {"rows": len(rows), "lost": lost, "doubled": len(items) - len(set(items)), "otherwise": other}
 
 
@@ -145,9 +153,9 @@ def paced(asked: argparse.Namespace, browser: Browser, work: Path) -> dict[str, 
             if item is None:
                 break
             time.sleep(max(0.0, start + number / asked.rate - time.perf_counter()))
-            key = pressed[item] = chosen(page, task, rng)
-            page.keyboard.press(key)
-            answered += KEYS[key] is not None
+            presses = pressed[item] = chosen(page, task, rng, asked.seen)
+            press(page, presses)
+            answered += presses.answer is not None
             moved(page, item)
         seconds = time.perf_counter() - start
         page.wait_for_function("() => document.body.innerText.includes('All labels are given')")
@@ -212,19 +220,20 @@ def kills(asked: argparse.Namespace, browser: Browser, work: Path) -> dict[str, 
                     item = page.evaluate(ITEM)
                     told = re.search(r"(\d+) answers saved", page.locator(".side").inner_text())
                     saved = max(saved, int(told[1]) if told else 0)
-                    pressed[item] = rng.choice(list(KEYS))
+                    pressed[item] = chosen(page, task, rng, asked.seen)
+                    press(page, pressed[item])
                     if time.perf_counter() > end:
-                        page.keyboard.press(pressed[item], delay=0)
                         time.sleep(rng.uniform(0, 0.03))
                         process.kill()
                         break
-                    page.keyboard.press(pressed[item])
                     moved(page, item, 5.0)
             process.wait()
             page.close()
         found.append(check(folder, pressed, saved))
         rows = label_files.history(folder / label_files.JSONL)
-        pressed = {item: key for item, key in pressed.items() if item < len(rows)}  # the last may not have arrived
+        pressed = {
+            item: presses for item, presses in pressed.items() if item < len(rows)
+        }  # the last may not have arrived
         print(number, found[-1], flush=True)
     return {"kills": len(found), **{name: sum(one[name] for one in found) for name in ("lost", "doubled", "otherwise")},
             "rows": found[-1]["rows"]}  # fmt: skip
@@ -252,7 +261,7 @@ def pictures(asked: argparse.Namespace, browser: Browser, work: Path) -> dict[st
                 rng, wanted = random.Random(2), 0 if kind else 12
                 while int(re.match(r"\d+", page.locator(".side").inner_text())[0]) < wanted:  # pyright: ignore[reportOptionalSubscript]
                     item = page.evaluate(ITEM)
-                    page.keyboard.press(chosen(page, task, rng))
+                    press(page, chosen(page, task, rng, asked.seen))
                     moved(page, item)
                 if wanted:
                     page.wait_for_function("() => document.body.innerText.includes('model 1')", timeout=300_000)
@@ -270,7 +279,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=("paced", "blind", "kills", "pictures"))
     parser.add_argument("--task", nargs="+", default=["navigation"])
-    parser.add_argument("--preset", default="paper")
+    parser.add_argument("--preset", default="", help="(default: paper, of a folder or an environment its own)")
+    parser.add_argument("--situations", type=int, default=200, help="of the task pictures: how many are written")
     parser.add_argument("--guidance", nargs="*", help="pictures: of these kinds instead of the task's own")
     parser.add_argument("--more", default="", help="further options of cuelearner label, in one word")
     parser.add_argument("--labels", type=int, default=500)
@@ -282,7 +292,11 @@ def main() -> None:
     parser.add_argument("--browser", default=shutil.which("chromium"), help="a Chromium")
     parser.add_argument("--out", type=Path, help="write the figures to this JSON file")
     asked = parser.parse_args()
+    asked.seen = asked.photos = None
     with tempfile.TemporaryDirectory() as work, sync_playwright() as driver:
+        if PHOTOS in asked.task:
+            asked.photos = Path(work) / "situations"
+            asked.seen, _ = _photos.write(asked.photos, asked.situations)
         browser = driver.chromium.launch(executable_path=asked.browser, args=["--no-sandbox"])
         found = {"paced": paced, "blind": blind, "kills": kills, "pictures": pictures}[asked.what](
             asked, browser, Path(work)

@@ -10,6 +10,7 @@
     better.save("policies/better")                          # a folder that load_policy and every command take
     cl.export_policy(better, "walker", world, "numpy")      # a file that runs without JAX, and its contract
     run = cl.train(world, teacher, "quickstart", seeds=8)   # what `cuelearner sweep` does, results in memory
+    arm = cl.from_gymnasium("FetchReach-v4")                # a world as well: any Gymnasium environment
 
 What these take and give stands in their docstrings. Everything else is a room behind this face.
 """
@@ -20,13 +21,15 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from cuelearner_jax.api.acting import CallablePolicy, load_policy
     from cuelearner_jax.api.adaptation import AdaptedPolicy, adapt
+    from cuelearner_jax.api.correcting import agreement, correct
     from cuelearner_jax.api.evaluation import measure
-    from cuelearner_jax.api.exporting import export_policy, load_exported
+    from cuelearner_jax.api.exporting import export_correction, export_policy, load_exported
     from cuelearner_jax.api.feedback import FeedbackModel, Labels, ask, fit_feedback, refine
     from cuelearner_jax.api.training import Run, train
     from cuelearner_jax.api.worlds import World, from_gymnasium, make, teacher_of
     from cuelearner_jax.calibration import Distortion, Unknown
     from cuelearner_jax.errors import UserError
+    from cuelearner_jax.spaces import UNSAID
 
 __version__ = "0.1.0"
 
@@ -39,11 +42,15 @@ _PLACES = {
     "FeedbackModel": "api.feedback",
     "Labels": "api.feedback",
     "Run": "api.training",
+    "UNSAID": "spaces",
     "Unknown": "calibration",
     "UserError": "errors",
     "World": "api.worlds",
     "adapt": "api.adaptation",
+    "agreement": "api.correcting",
     "ask": "api.feedback",
+    "correct": "api.correcting",
+    "export_correction": "api.exporting",
     "export_policy": "api.exporting",
     "fit_feedback": "api.feedback",
     "from_gymnasium": "api.worlds",
@@ -57,6 +64,7 @@ _PLACES = {
 }
 
 __all__ = [
+    "UNSAID",
     "AdaptedPolicy",
     "CallablePolicy",
     "Distortion",
@@ -67,7 +75,10 @@ __all__ = [
     "UserError",
     "World",
     "adapt",
+    "agreement",
     "ask",
+    "correct",
+    "export_correction",
     "export_policy",
     "fit_feedback",
     "from_gymnasium",

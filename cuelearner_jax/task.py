@@ -17,7 +17,7 @@ from cuelearner_jax.environment import Environment, View, offers, view_of
 from cuelearner_jax.errors import UserError, closest, shown
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.storage.room import check_room
-from cuelearner_jax.types import EnvState, Reel, Sketch, Teacher
+from cuelearner_jax.types import EnvState, Policy, Reel, Sketch, Teacher
 
 COPIES = 3  # of a world while it is made
 PAPER = "paper"  # the preset that holds where none is given
@@ -56,11 +56,13 @@ class Pictures(NamedTuple):
     # (environment, state): the situation as a person labels it in a browser; None: nobody can
     sketch: Callable[[Any, EnvState], Sketch] | None = None
     # (environment, state, action (action,)): what the action leads to, to be seen in the sketch of the state
-    reel: Callable[[Any, EnvState, Float[Array, " action"]], Reel] | None = None
+    # None, or no reel: there is none
+    reel: Callable[[Any, EnvState, Float[Array, " action"]], Reel | None] | None = None
     # (environment, state, actions (n, action)): SVG elements of where each of the actions leads, to be seen in the
     # sketch of the state; they take their colour from the group around them
     trails: Callable[[Any, EnvState, Float[Array, "n action"]], list[str]] | None = None
     legend: str = ""  # what the trails mean, for a person
+    simulates: bool = True  # is a reel what the action would lead to? False: what was recorded, whatever the action is
 
 
 @dataclass(frozen=True)
@@ -75,6 +77,13 @@ class Body:
     # a folder of the user's -> the body with what lies there; raises UserError if that is not for it; None: takes none
     made_of: Callable[[Path], Body] | None = None
     digest: str = ""  # of what lies in that folder
+    # (configuration, observations (n, obs), actions (n, action)) -> the environment with these in place of what files
+    # hold; without them (None) of zeros, as far as shapes and views depend on it; None: as `environment` has it
+    filled: Callable[[Any, Any, Any], Environment] | None = None
+
+    def shaped(self, config: Any) -> Environment:
+        """The environment of a configuration, as far as shapes and views depend on it."""
+        return self.environment(config, "training") if self.filled is None else self.filled(config, None, None)
 
 
 @dataclass(frozen=True)
@@ -112,6 +121,8 @@ class Task:
     # configuration -> steps of its longest episode, where episodes count (`Step.outcome`); None: steps count
     longest: Callable[[Any], int] | None = None
     wants: Callable[[Any], str] = lambda config: ""  # configuration -> what is wanted there: a sentence for a person
+    # environment -> the policy whose actions people are asked about where none is named; None: uniform actions
+    proposed: Callable[[Any], Policy] | None = None
     near_aims: bool = False  # are people asked near the aims of a situation? Elsewhere no answer would mean much
     presets: dict[str, Preset] = field(default_factory=dict)
     scenarios: dict[str, Scenario] = field(default_factory=dict)
@@ -194,7 +205,7 @@ class Task:
 
     def view(self, config: Any) -> View:
         """What policies look at in a configuration; worlds that no policy looks at are not generated."""
-        make = lambda: self.bodies[0].environment(config, "training")  # noqa: E731
+        make = lambda: self.bodies[0].shaped(config)  # noqa: E731
         if not offers(jax.eval_shape(make), "view"):
             return self.environment(config)
         return jax.jit(lambda: view_of(make()))()
@@ -271,4 +282,4 @@ class Task:
 
 def shape_of(task: Task, config: Any) -> Any:
     """The environment of a configuration with shapes in place of arrays: costs next to nothing."""
-    return jax.eval_shape(lambda: task.bodies[0].environment(config, "training"))
+    return jax.eval_shape(lambda: task.bodies[0].shaped(config))

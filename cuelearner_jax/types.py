@@ -99,6 +99,9 @@ class Sketch(NamedTuple):
     turn: float  # counterclockwise angle on the screen of an action of angle 0 [deg]
     aim: float = 0.0  # length of a thin line that goes on from the arrow [m]
     words: str = ""  # about the situation, in a few words
+    # Of each cue, which way more of it points on the screen: x to the right, y down; None: nowhere. None given: by the
+    # words of the cues (`labelling.pointing`)
+    points: tuple[tuple[float, float] | None, ...] = ()
 
 
 class Reel(NamedTuple):

@@ -1,5 +1,6 @@
-"""A brax environment as a task: an inverted pendulum on a cart, pushed left or right by the x of a direction.
+"""A brax environment as a task of one's own: an inverted pendulum on a cart, pushed right or left.
 
+`brax:inverted_pendulum` is that environment by name. This task adds words for the push and the obvious action.
 Nobody answers here, so kinds of guidance that ask a teacher are refused; the obvious action, pushing to where the pole
 leans, can guide. Run in the folder above this one:
 
@@ -21,10 +22,14 @@ from jaxtyping import Array, Float
 from cuelearner_envs.bounds import MOST_STEPS, check_number
 from cuelearner_jax.agents import ddqn
 from cuelearner_jax.arbiters import paced
-from cuelearner_jax.bridges.brax import BraxTask, from_brax
+from cuelearner_jax.bridges.brax import from_brax
+from cuelearner_jax.bridges.jax_environment import JaxEnvironment
 from cuelearner_jax.config import Scalars, Schedule, Sizes
 from cuelearner_jax.run_config import RunConfig
+from cuelearner_jax.spaces import Cue
 from cuelearner_jax.task import Body, Preset, Task
+
+PUSH = Cue("push", ("right", "left"), ("ArrowRight", "ArrowLeft"), "shares")
 
 
 @dataclass(frozen=True)
@@ -44,15 +49,15 @@ def _made(backend: str) -> envs.Env:
         return envs.get_environment("inverted_pendulum", backend=backend)
 
 
-def toward_the_lean(obs: Float[Array, " obs"]) -> Float[Array, "2"]:
+def toward_the_lean(obs: Float[Array, " obs"]) -> Float[Array, "1"]:
     """The obvious action: push the cart to where the pole leans (the second entry is its angle)."""
-    return jnp.stack([jnp.where(obs[1] > 0, 1.0, -1.0), jnp.zeros(())])
+    return jnp.where(obs[1:2] > 0, 1.0, -1.0)
 
 
-def make_environment(config: PendulumConfig, split: str = "training") -> BraxTask:
+def make_environment(config: PendulumConfig, split: str = "training") -> JaxEnvironment:
     """The environment of a configuration."""
     check_number("max_steps", config.max_steps, 1, MOST_STEPS, whole=True)
-    return from_brax(_made(config.backend), max_steps=config.max_steps, heuristic=toward_the_lean)
+    return from_brax(_made(config.backend), max_steps=config.max_steps, heuristic=toward_the_lean, cues=(PUSH,))
 
 
 TASK = Task(

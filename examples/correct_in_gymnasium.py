@@ -61,7 +61,7 @@ def main(labels=200, guidance="offset", seed=0):
     world = cl.from_gymnasium(
         Table, max_steps=20, cues="right,left;up,down;ahead,back", observation=slices, processes=1
     )
-    plain = plain_scalars(world.env.actions)
+    plain = plain_scalars(world.actions)
     found = {"as it was": error(wrong)}
     for name, answer in (("corrected", "best"), ("answers shuffled", "shuffled")):
         scalars = dataclasses.replace(plain, answer=answer)

@@ -28,12 +28,13 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from cuelearner_envs import film, svg
+from cuelearner_envs import svg
 from cuelearner_envs.bounds import MOST_STEPS, check_number
 from cuelearner_jax.agents import ddqn
 from cuelearner_jax.arbiters import paced
 from cuelearner_jax.config import Scalars, Schedule, Sizes
 from cuelearner_jax.environment import Quantity, WholeObservations
+from cuelearner_jax.pictures import palette_of, write_film
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.spaces.directions import from_angle, retract, rotate
 from cuelearner_jax.task import Body, Pictures, Preset, Scenario, Task
@@ -227,8 +228,8 @@ def animate(env: Reach, frames: list[Frame], file: Path) -> None:
             for _ in range(round(0.6 * rate) if frame.ended else 0):  # the end stands for a moment
                 yield _pixels(way)
 
-    palette = film.palette_of(_pixels(frames[:1]), 100, (BOAT, BUOY, WIND, ARROW, WATER, "#ffffff"))
-    film.write(file, 10.0, pictures, palette)
+    palette = palette_of(_pixels(frames[:1]), 100, (BOAT, BUOY, WIND, ARROW, WATER, "#ffffff"))
+    write_film(file, 10.0, pictures, palette)
 
 
 def question(env: Reach, state: Boat, obs: Float[Array, "4"], action: Float[Array, "2"], file: Path) -> None:

@@ -128,7 +128,7 @@ def adapted(environment: str, kind: str, condition: Condition, labels: int, seed
 
     world, script = world_of(environment), policy_of(jax.jit(SCRIPTS[environment]))
     how: dict[str, Any] = {"guidance": kind, "judge_by": "labels", "seed": seed}
-    scalars = settings(kind, condition.says, condition.shuffled, world.env.actions)
+    scalars = settings(kind, condition.says, condition.shuffled, world.actions)
     if kind != "calibration":
         how |= {"sizes": SIZES, "bound_deg": BOUND}
     found = cl.adapt(script, world, onlooker(environment, OFFSET), labels=labels, scalars=scalars, **how)
@@ -146,7 +146,7 @@ def measured(piece: str, scale: Scale, split: str, known: Sequence[Row]) -> Iter
     first = FIRST_EPISODE[split] + int(number) * scale.episodes
     episodes, seed = range(first, first + scale.episodes), FIRST_SEED[split] + int(number)
     if kind == "base":
-        script = in_space(policy_of(jax.jit(SCRIPTS[environment])), world_of(environment).env.actions)
+        script = in_space(policy_of(jax.jit(SCRIPTS[environment])), world_of(environment).actions)
         for what, offset in (("unchanged", (0.0, 0.0, 0.0)), ("displaced", OFFSET)):
             if (what, "", False) not in done:
                 success = played(environment, script, offset, episodes)

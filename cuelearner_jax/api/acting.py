@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from cuelearner_jax.config import LARGEST_FLOAT
 from cuelearner_jax.environment import Quantity, actions_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.policies import Policy, acted, in_space, named
+from cuelearner_jax.policies.foreign import ONNX
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs import trained
 from cuelearner_jax.spaces import DIRECTIONS, Space
@@ -45,6 +47,7 @@ class CallablePolicy:
     asks: bool = False  # does it ask a teacher, who looks at the true state?
     trained: RunConfig | None = None  # with which configuration; None: no folder says so
     actions: Space = DIRECTIONS  # in which it acts
+    world: World | None = None  # where it was corrected, or loaded for; None: nothing says so
 
     def __post_init__(self) -> None:
         """Raises UserError for a policy that is none, or a description of observations that is none."""
@@ -85,10 +88,12 @@ class CallablePolicy:
 
 
 def as_policy(given: Any, name: str = "policy") -> Policy:
-    """Anything that acts as a policy: a `CallablePolicy`, or what `policies.policy_of` takes.
+    """Anything that acts as a policy: a `CallablePolicy`, a folder of ours, or what `policies.policy_of` takes.
 
     Raises UserError, which says the argument's name, for what is none of them.
     """
+    if isinstance(given, str | os.PathLike) and not str(given).endswith(ONNX):
+        given = load_policy(Path(given))
     return given.policy if isinstance(given, CallablePolicy) else arguments.policy(name, given)
 
 
@@ -169,4 +174,6 @@ def load_policy(
     shape = shape_of(known, changed)
     bound_deg = arguments.optional(arguments.amount, "bound_deg", bound_deg, actions_of(shape))
     found = trained.one_policy(source, changed, name, guidance, labels, seed, bound_deg)
-    return CallablePolicy(found, shape.observation, trained.POLICIES[name].taught, source.config, actions_of(shape))
+    where = world or World(known, changed)
+    taught = trained.POLICIES[name].taught
+    return CallablePolicy(found, shape.observation, taught, source.config, actions_of(shape), where)

@@ -191,7 +191,9 @@ def adapt(
     named = _called(policy) if isinstance(world, World) else None
     trained = RunConfig(source.config.task)
     observation = getattr(env, "observation", ())
-    return AdaptedPolicy(adapted, observation, trained=trained, actions=space, outcome=outcome, named=named)
+    where = world if isinstance(world, World) else None
+    told = {"trained": trained, "actions": space, "world": where}
+    return AdaptedPolicy(adapted, observation, **told, outcome=outcome, named=named)
 
 
 def _source(policy: Any, world: Any) -> PolicySource:

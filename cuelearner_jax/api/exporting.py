@@ -11,17 +11,20 @@ from cuelearner_jax.api.acting import as_policy, as_policy_in
 from cuelearner_jax.api.worlds import World, a_world
 from cuelearner_jax.config import to_json
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.export import contract, decisions, runner
+from cuelearner_jax.export import contract, correction, decisions, runner
 
 
 @user_code.told
-def export_policy(policy: Any, out: str | Path, world: World, format: str = "stablehlo") -> dict[str, Any]:
+def export_policy(
+    policy: Any, out: str | Path, world: World | None = None, format: str = "stablehlo"
+) -> dict[str, Any]:
     """Writes a policy's whole decision as a file, with a contract of what goes in and what comes out.
 
     Args:
         policy: one that was loaded, adapted or refined, or anything else made of JAX functions that acts.
         out: a new folder.
-        world: in which it acts: it names the slices of the observation, and golden cases are taken from it.
+        world: in which it acts: it names the slices of the observation, and golden cases are taken from it (default:
+            where it was corrected).
         format: "stablehlo", "onnx" or "numpy".
 
     Returns:
@@ -31,13 +34,50 @@ def export_policy(policy: Any, out: str | Path, world: World, format: str = "sta
         UserError: the folder is in use; the policy acts at random, asks a teacher, holds Python code, or does not fit.
     """
     out, _ = arguments.path("out", out), as_policy(policy)
-    a_world("world", world)
+    world = _world_of(policy, world)
     contract.check_request(arguments.text("format", format), out)
     env = world.env
     acting = as_policy_in(policy, env)
-    about = {"subject": type(policy).__name__, "world": {"name": world.task.name, **to_json(world.config)}}
     drawn = lambda: decisions.observations(env, acting)  # noqa: E731
-    return contract.write(acting, env, drawn, format, out, about)
+    return contract.write(acting, env, drawn, format, out, _about(policy, world))
+
+
+@user_code.told
+def export_correction(policy: Any, out: str | Path, world: World | None = None, format: str = "onnx") -> dict[str, Any]:
+    """Writes the correction of a corrected policy alone: observation and base action in, action out.
+
+    It runs beside a base that stays where it is: `decide(observation, base_action)`. In ONNX its inputs are `obs` and
+    `base_action`, its output `action`.
+
+    Args:
+        policy: from `correct`, `adapt` or `refine`, or loaded from a policy folder.
+        out: a new folder.
+        world: in which it acts (default: where it was corrected).
+        format: "onnx", "numpy" or "stablehlo".
+
+    Returns:
+        The contract, as `export_policy` does.
+
+    Raises:
+        UserError: the folder is in use; the policy corrects nothing, or cannot do it without its base.
+    """
+    out, own = arguments.path("out", out), as_policy(policy)
+    world = _world_of(policy, world)
+    contract.check_request(arguments.text("format", format), out)
+    alone, seen = correction.correction_of(own, world.env)
+    return contract.write(alone, seen, lambda: correction.cases(world.env), format, out, _about(policy, world))
+
+
+def _world_of(policy: Any, world: Any) -> World:
+    """Where a policy acts. Raises UserError if nothing says so."""
+    world = getattr(policy, "world", None) if world is None else world
+    if world is None:
+        raise UserError("world is not given, and this policy was corrected in none: give one, as cl.make gives it")
+    return a_world("world", world)
+
+
+def _about(policy: Any, world: World) -> dict[str, Any]:
+    return {"subject": type(policy).__name__, "world": {"name": world.task.name, **to_json(world.config)}}
 
 
 def load_exported(folder: str | Path) -> runner.Decision:

@@ -66,7 +66,7 @@ class Run:
         if not len(found):
             raise UserError(f"no lane with seed {wanted} and {budget} labels was trained")
         agents = training.policies(view_of(group.env))
-        return CallablePolicy(agents.lane(int(found[0])), self.world.observation)
+        return CallablePolicy(agents.lane(int(found[0])), self.world.observation, actions=self.world.actions)
 
 
 @user_code.told

@@ -1,12 +1,12 @@
 """Our environments for brax's agents, and brax's environments for our loop. The only file that knows `brax.envs`.
 
-`to_brax` and `wrap_for_training`: brax's PPO and SAC on any of our tasks. `from_brax`: a brax task in our loop.
+`to_brax` and `wrap_for_training`: brax's PPO and SAC on our tasks. `from_brax`: a brax environment in our loop.
 Written for brax 0.14.2 (`brax/envs/base.py`, `brax/envs/wrappers/training.py`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
@@ -16,16 +16,16 @@ import numpy as np
 from brax import envs
 from brax.envs.wrappers import training
 from flax import struct
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from cuelearner_jax.environment import Environment, Quantity, WholeObservations, actions_of
+from cuelearner_jax.bridges.jax_environment import Given, JaxEnvironment, layout_of, space_of
+from cuelearner_jax.environment import Environment, actions_of
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.spaces.directions import check_directions, retract
+from cuelearner_jax.spaces import DIRECTIONS, Box, Cue, Space
 from cuelearner_jax.types import EnvState, Step
 
 RawKey = Any  # uint32 words, which is what brax passes: the wrappers read a batch's shape from them
 State = Any  # brax.envs.State, whose methods of flax a type checker does not know
-X_AXIS = (1.0, 0.0)
 
 
 def supply_device_put_replicated() -> None:
@@ -72,8 +72,8 @@ class BraxView(envs.Env):
 
     @property
     def action_size(self) -> int:
-        """A vector of the plane, of which the direction counts."""
-        return 2
+        """Number of entries of an action."""
+        return actions_of(self.sys).size
 
     @property
     def backend(self) -> str:
@@ -86,7 +86,7 @@ class BraxView(envs.Env):
         state, obs = self.sys.reset(k_start)
         zero = jnp.zeros(())
         episode: Any = Episode(state, obs, jnp.array(False))  # brax declares the state of its own physics here
-        shapes = jax.eval_shape(lambda: _measures(self.sys.step(k_start, state, jnp.array(X_AXIS))[1]))
+        shapes = jax.eval_shape(lambda: _measures(self.sys.step(k_start, state, jnp.zeros(self.action_size))[1]))
         return envs.State(
             pipeline_state=episode,
             obs=obs,
@@ -97,15 +97,17 @@ class BraxView(envs.Env):
             info={"rng": jax.random.key_data(k_next), "truncation": zero},
         )
 
-    def step(self, state: State, action: Float[Array, "2"]) -> State:
-        """Executes the direction `retract(action)`. A finished episode stays as it is until a wrapper begins another.
+    def step(self, state: State, action: Float[Array, " n"]) -> State:
+        """Executes the action that `action` stands for, see `to_brax`.
+
+        A finished episode stays as it is until a wrapper begins another.
 
         Returns:
             `obs` is our `Step.final_obs`, `done` is `terminated` and `info["truncation"]` is `truncated`, as 0 or 1.
         """
         before = state.pipeline_state
         key, k_next = jax.random.split(_typed(state.info["rng"]))
-        following, step = self.sys.step(key, before.env, retract(action))
+        following, step = self.sys.step(key, before.env, _from_cube(actions_of(self.sys), action))
         # With an action repeat brax goes on past the end: what came out of the episode must still be there afterwards.
         hold = partial(jax.tree.map, partial(jnp.where, before.ended))
         measures = _measures(step)
@@ -127,7 +129,10 @@ class BraxView(envs.Env):
 
 
 def to_brax(env: Environment) -> BraxView:
-    """One of our environments as a `brax.envs.Env`: action in [-1, 1]^2, of which only the direction counts.
+    """One of our environments as a `brax.envs.Env`, whose actions are in [-1, 1]^n.
+
+    Of directions in the plane n is 2, and only the direction counts. Of a box n is its size: -1 is each entry's lower
+    bound, 1 its upper bound, and what lies beyond is brought back.
 
     Episodes that our environment truncates arrive at brax's agents as truncated, under brax's own wrappers too; but
     `AutoResetWrapper` begins every episode of a lane at the same cached first state, and brax's evaluator then calls
@@ -137,9 +142,14 @@ def to_brax(env: Environment) -> BraxView:
     `metrics` are `Step.metrics` and, where an episode ends, `Step.outcome` (elsewhere 0), so that brax's sum over an
     episode is the outcome. A brax `randomization_fn` gets our environment and returns a batch of it with its axes.
 
-    Raises UserError for an environment whose actions are no directions.
+    Raises UserError for an environment with another space of actions.
     """
-    check_directions(actions_of(env), "to_brax", "train on this environment with `cuelearner train`")
+    space = actions_of(env)
+    if space != DIRECTIONS and not isinstance(space, Box):
+        raise UserError(
+            f"to_brax works for directions and boxes, not for actions that are {space.name}: train on this environment "
+            "with `cuelearner train`"
+        )
     supply_device_put_replicated()
     return BraxView(env)
 
@@ -166,7 +176,7 @@ def wrap_for_training(
 class FreshEpisodes(envs.Wrapper):
     """What `AutoResetWrapper` does, but with our automatic reset in place of a cached first state."""
 
-    def step(self, state: State, action: Float[Array, "envs 2"]) -> State:
+    def step(self, state: State, action: Float[Array, "envs n"]) -> State:
         """Steps; where that ended an episode, the state is the next one's first and `done` says so."""
         info = {**state.info, "steps": jnp.where(state.done > 0, 0.0, state.info["steps"])}
         state = self.env.step(state.replace(done=jnp.zeros_like(state.done), info=info), action)
@@ -193,6 +203,14 @@ class FreshEpisodes(envs.Wrapper):
         return jax.tree.map(choose, started, begun)
 
 
+def _from_cube(space: Space, action: Float[Array, " n"]) -> Float[Array, " action"]:
+    """The action that a vector of brax's agents stands for, in [-1, 1]^n as a rule."""
+    if not isinstance(space, Box):
+        return space.retract(action)
+    low, high = jnp.array(space.low), jnp.array(space.high)
+    return space.retract(low + (high - low) * (action + 1) / 2)
+
+
 def _typed(rng: RawKey) -> PRNGKeyArray:
     """Our kind of key."""
     return rng if jnp.issubdtype(rng.dtype, jax.dtypes.prng_key) else jax.random.wrap_key_data(rng)
@@ -205,117 +223,37 @@ def _measures(step: Step) -> dict[str, Array]:
     return {name: jnp.asarray(value, jnp.float32) for name, value in {**step.metrics, **outcome}.items()}
 
 
-class Running(struct.PyTreeNode):
-    """State of a `BraxTask` between steps."""
-
-    brax: State
-    steps: Int[Array, ""]  # taken in this episode
-
-
-class BraxTask(WholeObservations, struct.PyTreeNode):
-    """A brax environment as one of ours (`cuelearner_jax.environment.Environment`), made by `from_brax`."""
-
-    max_steps: Int[Array, ""]  # an episode is truncated after this many
-    env: Any = struct.field(pytree_node=False)  # brax.envs.Env
-    entries: int = struct.field(pytree_node=False)  # of an observation
-    to_action: Callable[[Float[Array, "2"]], Float[Array, " n"]] = struct.field(pytree_node=False)
-    heuristic: Callable[[Float[Array, " obs"]], Float[Array, "2"]] | None = struct.field(pytree_node=False)
-
-    @property
-    def observation(self) -> tuple[Quantity, ...]:
-        """One slice: brax names none."""
-        return (Quantity(type(self.env.unwrapped).__name__.lower(), self.entries, "as brax has them"),)
-
-    def reset(self, key: PRNGKeyArray) -> tuple[Running, Float[Array, " obs"]]:
-        """Starts an episode."""
-        state = _as_arrays(self.env.reset(jax.random.key_data(key)))
-        return Running(state, jnp.zeros((), jnp.int32)), state.obs
-
-    def step(self, key: PRNGKeyArray, state: Running, action: Float[Array, "2"]) -> tuple[Running, Step]:
-        """One step of brax's, then its reset if that was the end. `key` is the reset's: its steps know no key."""
-        before = jax.tree.map(lambda leaf: leaf, state.brax)  # brax writes into the dictionaries that it is given
-        after = Running(_as_arrays(self.env.step(before, self.to_action(action))), state.steps + 1)
-        stopped = jnp.asarray(after.brax.info.get("truncation", 0)) > 0
-        terminated = (after.brax.done > 0) & ~stopped
-        truncated = (stopped | (after.steps >= self.max_steps)) & ~terminated
-        fresh, fresh_obs = self.reset(key)
-        final_obs, ended = after.brax.obs, terminated | truncated
-        step = Step(
-            obs=jnp.where(ended, fresh_obs, final_obs),
-            final_obs=final_obs,
-            aftermath=final_obs,
-            reward=after.brax.reward.astype(jnp.float32),
-            terminated=terminated,
-            truncated=truncated,
-            metrics={name: jnp.asarray(value, jnp.float32) for name, value in after.brax.metrics.items()},
-            outcome={},
-        )
-        return jax.tree.map(partial(jnp.where, ended), fresh, after), step
-
-
 def from_brax(
     env: envs.Env,
     to_action: Callable[[Float[Array, "2"]], Float[Array, " n"]] | None = None,
     max_steps: int = 1000,
-    heuristic: Callable[[Float[Array, " obs"]], Float[Array, "2"]] | None = None,
-) -> BraxTask:
-    """A brax environment as one of ours. `env` becomes a constant of what is compiled, `max_steps` is traced.
+    heuristic: Callable[[Float[Array, " obs"]], Float[Array, " action"]] | None = None,
+    *,
+    cues: Sequence[Cue] = (),
+) -> JaxEnvironment:
+    """Return a brax environment as one of ours, with its whole box [-1, 1]^n of actions.
+
+    `env` becomes a constant of what is compiled, `max_steps` is traced. Observations in a dictionary become one vector,
+    with a slice for each entry of the dictionary, in the order of their names.
 
     Args:
         env: bare, or in brax's `EpisodeWrapper`, whose truncations are then truncations here.
-        to_action: direction (2,) -> brax action (n,) in [-1, 1]^n. Not needed for two actions (the direction itself, in
-            the box [-1, 1]^2) and for one (the direction's x).
+        to_action: direction (2,) -> brax action (n,) in [-1, 1]^n. With it actions are directions in the plane.
         max_steps: an episode is truncated after this many steps.
-        heuristic: observation -> the obvious direction. A brax environment names none: without this the guidance
+        heuristic: observation -> the obvious action. A brax environment names none: without this the guidance
             "heuristic" is refused there.
+        cues: one an entry of the box (default: the entry's name in the model, else its number, "more" and "less").
 
     Raises:
-        UserError: observations or actions do not fit.
+        UserError: observations or actions do not fit, or `cues` are given beside `to_action`.
     """
     name = type(env.unwrapped).__name__
-    shapes = jax.eval_shape(env.reset, jax.random.key_data(jax.random.key(0)))
-    if isinstance(shapes.obs, Mapping):
-        raise UserError(f"{name}: observations are a dictionary ({', '.join(shapes.obs)}); an array (n,) is needed")
-    if shapes.obs.ndim != 1:
-        raise UserError(
-            f"{name}: observations have shape {shapes.obs.shape}; one (n,) of a single environment is needed"
-        )
-    if "first_obs" in shapes.info:
-        raise UserError(f"{name}: AutoResetWrapper hides the last observation of an episode: pass what it wraps")
-    if to_action is None:
-        to_action = _to_box(name, env.action_size)
-    given = jax.eval_shape(to_action, jnp.array(X_AXIS)).shape
-    if given != (env.action_size,):
-        raise UserError(f"{name}: to_action returns shape {given}, but an action has shape {(env.action_size,)}")
-    return BraxTask(
+    layout = layout_of(env, name)
+    return JaxEnvironment(
         max_steps=jnp.array(max_steps, jnp.int32),
-        env=env,
-        entries=shapes.obs.shape[0],
+        simulator=Given(env),
+        observation=layout.observation,
+        actions=space_of(name, layout, to_action, cues),
         to_action=to_action,
         heuristic=heuristic,
     )
-
-
-def _to_box(name: str, size: int) -> Callable[[Float[Array, "2"]], Float[Array, " n"]]:
-    """A direction in brax's box, where there is only one way."""
-    if size == 1:
-        return _x_alone
-    if size == 2:
-        return _itself
-    raise UserError(
-        f"{name}: an action has {size} entries: pass to_action, a function from a direction (2,) to ({size},)"
-    )
-
-
-def _as_arrays(state: State) -> State:
-    """Some of brax's environments pay Python's numbers."""
-    return jax.tree.map(jnp.asarray, state)
-
-
-# Functions of the module, and not lambdas: two adapters of one environment then share what is compiled.
-def _itself(action: Float[Array, "2"]) -> Float[Array, "2"]:
-    return action
-
-
-def _x_alone(action: Float[Array, "2"]) -> Float[Array, "1"]:
-    return action[:1]

@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Annotated, Any, Generic
 
 from cuelearner_jax.adaptation import changes
-from cuelearner_jax.cli.parsing import TASK_OPTIONS, about, code_of, out, parse, source_of, taken
+from cuelearner_jax.api import correcting
+from cuelearner_jax.cli.parsing import TASK_OPTIONS, about, code_of, is_code, out, parse, source_of, taken
 from cuelearner_jax.cli.shared_options import Flag, KindsT, TaskT, kinds_type, unprefixed
 from cuelearner_jax.errors import NotFinite, UserError
-from cuelearner_jax.plugins import REFERENCE
 from cuelearner_jax.runs.trained import PolicySource
 from cuelearner_jax.storage import policy_folders
 from cuelearner_jax.studies import adapt
@@ -21,7 +21,8 @@ from cuelearner_jax.terminal import console, progress_bars, watched_by
 @dataclass(frozen=True, kw_only=True)
 class Adapt(AdaptRequest[TaskT, KindsT], Generic[TaskT, KindsT]):
     """Correct a finished policy (of a run folder or policy folder; or, with --task, package.module:NAME, any function
-    of observations) by labels about what it does in a changed world."""
+    of observations, or a file in ONNX) by labels about what it does in a changed world. With --labels-from of a page
+    about recorded situations, no task is needed."""
 
     out: Path
     """The policy folder that is written."""
@@ -73,12 +74,23 @@ def _source(arguments: list[str]) -> tuple[PolicySource, Any, str | None, list[s
 
     Raises UserError if they cannot be had.
     """
-    if arguments and REFERENCE.fullmatch(arguments[0]) and not Path(arguments[0]).exists():
+    if arguments and is_code(arguments[0]):
         named, rest = arguments[0], arguments[1:]
-        if not any(word.split("=")[0] in TASK_OPTIONS for word in rest):
-            raise UserError(f"{named} is to act in some task: name it, as --task navigation or --env gymnasium:NAME")
-        source, rest = source_of(rest, "adapt", Adapt)
+        if any(word.split("=")[0] in TASK_OPTIONS for word in rest):
+            source, rest = source_of(rest, "adapt", Adapt)
+        else:
+            source = _of_labels(named, taken(rest, "--labels-from", FIRST["labels_from"])[0])
         return source, code_of(named), named, rest
     named, _ = taken(arguments, "--base", "package.module:NAME")
     source, rest = source_of(arguments, "adapt", Adapt)
     return source, None, named, rest
+
+
+def _of_labels(named: str, path: str | None) -> PolicySource:
+    """The situations of a label file in place of a task. Raises UserError unless its labels are about a recording."""
+    found = None if path is None else correcting.of_file(Path(path))
+    if found is None or found.config is None:
+        why = "" if path is None else f", of which {path} does not hold labels of a recording"
+        raise UserError(f"{named} is to act in some task{why}: name it, as --task navigation")
+    world = correcting.world_of(found)
+    return PolicySource(world.task, world.task.start(), None, Path(world.task.name))

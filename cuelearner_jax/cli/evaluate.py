@@ -9,11 +9,13 @@ from typing import Any, Generic
 import numpy as np
 from rich.table import Table
 
-from cuelearner_jax.cli.parsing import out
+from cuelearner_jax.api import correcting
+from cuelearner_jax.cli.parsing import code_of, is_code, out, taken
 from cuelearner_jax.cli.shared_options import TaskT, asked_of_source
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.report import measurements
 from cuelearner_jax.report.measurements import Difference
+from cuelearner_jax.runs import trained
 from cuelearner_jax.runs.trained import POLICIES, PolicySource
 from cuelearner_jax.storage import policy_folders
 from cuelearner_jax.studies import evaluate
@@ -34,6 +36,9 @@ class Evaluate(EvaluateRequest[TaskT], Generic[TaskT]):
     compare: str | None = None
     """Another run folder, policy folder or policy, measured on the same episodes; its default policy where that is a
     folder. The table then shows both and the difference."""
+    labels_from: Path | None = None
+    """Instead: how many answers of this label file the policy agrees with (package.module:NAME and a file in ONNX too),
+    beside the policy as it was and "already right" always."""
     out: Path | None = None
     """Also write the measurements to this JSON file. (Beside all these: --base and --changes package.module:NAME give
     the code of a policy folder that has some, --agent and --arbiter that of a run's own parts.)"""
@@ -44,7 +49,21 @@ OPTIONS = {"evaluate": Evaluate}
 
 def run(arguments: list[str]) -> None:
     """Runs the command. Raises UserError for what cannot be evaluated."""
+    if arguments and is_code(arguments[0]) and (file := taken(arguments, "--labels-from", "a labels.parquet"))[0]:
+        if len(file[1]) > 1:
+            raise UserError(f"the answers of a label file need the policy alone: leave out {file[1][1]}")
+        _print_agreement(arguments[0], code_of(arguments[0]), file[0])
+        return
     source, asked = asked_of_source(arguments, "evaluate", Evaluate)
+    if asked.labels_from is not None:
+        source.check(asked.policy, asked.task, guidance=asked.guidance)
+        if trained.POLICIES[asked.policy].taught:
+            raise UserError(
+                f"policy {asked.policy!r} asks the teacher, who looks at the true state: choose another policy"
+            )
+        policy = trained.one_policy(source, asked.task, asked.policy, next(iter(asked.guidance), None), None, None)
+        _print_agreement(f"{source.folder}, {asked.policy}", policy, asked.labels_from)
+        return
     source.task.engine(asked.engine)
     source.check(asked.policy, asked.task, guidance=asked.guidance)
     envs, steps = evaluate.amount(source.task, asked)
@@ -75,6 +94,24 @@ def run(arguments: list[str]) -> None:
         console.print("not every first episode has ended, so outcomes have no mean: give more --steps")
     if asked.out:
         out.print(f"wrote {asked.out}")
+
+
+def _print_agreement(named: str, policy: Any, path: Any) -> None:
+    """Prints how many answers of a label file a policy agrees with."""
+    found = correcting.agreement(policy, path)
+    table = Table(
+        "", "share of answers", "95% interval", title=f"{named}: agreement with {found.labels} labels of {path}"
+    )
+    rows = (
+        ("the policy", found.policy),
+        ("the policy as it was", found.base),
+        ("always already right", found.right),
+        ("difference from the policy as it was", found.difference),
+    )
+    for name, share in rows:
+        if share is not None:
+            table.add_row(name, f"{share[0]:.3f}", f"{share[1]:.3f} to {share[2]:.3f}")
+    out.print(table)
 
 
 def _other(source: PolicySource, asked: Evaluate[Any]) -> tuple[PolicySource, str]:

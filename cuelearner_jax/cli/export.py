@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Generic
 
 from cuelearner_jax.cli.parsing import out, taken
-from cuelearner_jax.cli.shared_options import Lane, TaskT, asked_of_source
+from cuelearner_jax.cli.shared_options import Flag, Lane, TaskT, asked_of_source
 from cuelearner_jax.config import digest, to_json
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.export import contract, decisions
+from cuelearner_jax.export import contract, correction, decisions
 from cuelearner_jax.export.formats import FORMATS
+from cuelearner_jax.policies import uniform_in
 from cuelearner_jax.runs import trained
 
 
@@ -24,6 +25,9 @@ class Export(Lane, Generic[TaskT]):
     """stablehlo, onnx or numpy, see above."""
     out: Path = Path("exported")
     """Folder for the decision; it must not be there yet, or be empty."""
+    only_correction: Flag[bool] = False
+    """The correction alone, of a policy folder: observation and base action in, action out. The base stays where it
+    is, and is not needed here."""
     scenario: str | None = None
     """The changed world of this name, see above, whose observations the golden cases are; options of the task
     (--task.…) come on top of it."""
@@ -47,7 +51,13 @@ def run(arguments: list[str]) -> None:
         raise UserError(f"policy {name!r} asks the teacher, who looks at the true state: choose another policy")
     contract.check_request(asked.format, asked.out)
     env = source.task.environment(asked.task)
+    if asked.only_correction and source.adapted is not None:
+        source = replace(source, adapted=replace(source.adapted, code=source.adapted.code or uniform_in(env)))
     policy = asked.policy_in(source, asked.task, env)
+    drawn, seen = (lambda: decisions.observations(env, policy)), env
+    if asked.only_correction:
+        policy, seen = correction.correction_of(policy, env)
+        drawn = lambda: correction.cases(env)  # noqa: E731
     origin = {
         "subject": source.folder.name,
         "policy": name,
@@ -55,7 +65,7 @@ def run(arguments: list[str]) -> None:
         "world": {"name": source.task.name, **to_json(asked.task)},
         "config": digest(to_json(source.config)),
     }
-    written = contract.write(policy, env, lambda: decisions.observations(env, policy), asked.format, asked.out, origin)
+    written = contract.write(policy, seen, drawn, asked.format, asked.out, origin)
     golden = written["golden"]
     out.print(
         f"{golden['cases']} golden cases replayed, largest difference {written['difference']:.1e} "

@@ -8,17 +8,19 @@ import webbrowser
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any, Generic, Literal
+from typing import Annotated, Any, Generic, Literal
 
 import jax
 import numpy as np
+import tyro
 
 from cuelearner_jax import config as configuration
 from cuelearner_jax.adaptation import adapting, calibrated, changes
 from cuelearner_jax.calibration import declared
 from cuelearner_jax.calibration.families import Family
-from cuelearner_jax.cli.parsing import PAPER, about, check_numbers, code_of, out, parse, preset_of, taken, task_of
+from cuelearner_jax.cli.parsing import PAPER, about, check_numbers, code_of, is_code, out, parse, preset_of, taken
 from cuelearner_jax.cli.shared_options import Flag, Lane, TaskT, asking_kind
+from cuelearner_jax.cli.situations import WORDS, task_named, with_cues
 from cuelearner_jax.config import GuideScalars, GuideSizes, Scalars
 from cuelearner_jax.environment import actions_of, offers
 from cuelearner_jax.errors import UserError
@@ -26,8 +28,7 @@ from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.guides.relative import KIND
 from cuelearner_jax.labelling import controls
 from cuelearner_jax.labelling.plan import Base, Plan
-from cuelearner_jax.plugins import REFERENCE
-from cuelearner_jax.policies import NearAims, uniform_in
+from cuelearner_jax.policies import NearAims, in_space, uniform_in
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs.grid import LARGEST_SEED
 from cuelearner_jax.runs.trained import PolicySource
@@ -38,7 +39,7 @@ from cuelearner_jax.task import Task, shape_of
 from cuelearner_jax.tasks import registry
 from cuelearner_jax.terminal import Interrupted, console, interruptible
 
-UNIFORM, NEAR_AIMS = "uniform", "near_aims"
+UNIFORM, NEAR_AIMS, PROPOSED = "uniform", "near_aims", "proposed"
 REACH = 1.5  # of questions near an aim: from the aim, in turns by eps
 PRESET = "quickstart"  # where none is given and chance is asked about: what is labelled trains in minutes
 PRACTICE = len(controls.PRACTICE)  # questions
@@ -48,10 +49,10 @@ UNDRAWN = "a person cannot label what nobody draws; give its Body `pictures` wit
 
 @dataclass(frozen=True)
 class Label(Generic[TaskT]):
-    """Label actions of chance, or of a policy, in a browser.
+    """Label actions of chance, of a policy, or recorded ones, in a browser.
 
     A policy is named after the task: a run folder, a policy folder, or package.module:NAME of a function of
-    observations."""
+    observations. In place of a task a folder of situations may be named: its recorded actions are asked about."""
 
     task: TaskT
     sizes: GuideSizes
@@ -66,7 +67,11 @@ class Label(Generic[TaskT]):
     """A name for you, written beside each label."""
     seed: int = 0
     """Seed of the situations; the labels are this seed's."""
-    bound_deg: float | None = None
+    cues: str = ""
+    """Words for more and less of each entry of an action, as "left,right;up,down" (default: the task's)."""
+    one_cue: Flag[bool] = False
+    """Of several cues: one press, about whichever comes to mind, is the answer; of the others nothing is said."""
+    bound_deg: Annotated[float | None, tyro.conf.arg(aliases=("--bound",))] = None
     """Ask about actions within this of the policy's own alone [deg] (default: the scenario's, or wherever the guidance
     leads)."""
     again: Path | None = None
@@ -76,8 +81,9 @@ class Label(Generic[TaskT]):
     robot: str | None = None
     """Another robot, see above (default: the task's own); with a folder, as anymal:FOLDER, one with your own walking
     policy."""
-    questions: Literal["uniform", "near_aims"] = UNIFORM
-    """Without a policy: actions of any direction, or near what a player may aim at (where the task has aims)."""
+    questions: Literal["uniform", "near_aims", "proposed"] = UNIFORM
+    """Without a policy: any actions, those near what a player may aim at (where the task has aims), or those that a
+    recording proposes."""
     changes: str | None = None
     """Of guidance calibration: package.module:NAME of distortions of your own (default: what the world declares)."""
     practice: Flag[bool] = True
@@ -100,9 +106,10 @@ def run(arguments: list[str]) -> None:
         Interrupted: Ctrl-C or SIGTERM; every answer is saved.
     """
     server, typed = _server(), list(arguments)
-    task, rest = task_of(arguments, "label", Label)
+    task, rest = task_named(arguments, "label", Label)
     named, rest = (rest[0], rest[1:]) if rest and not rest[0].startswith("-") else (None, rest)
-    usual = PAPER if named is not None else PRESET
+    finished_policy = named is not None or task.proposed is not None  # is it one that labels are to correct?
+    usual = PAPER if finished_policy else PRESET
     chosen, preset, rest = preset_of(task, rest, usual)
     kind = Label[task.config]  # pyright: ignore[reportInvalidTypeArguments]
     scenario, _ = taken(rest, "--scenario", ", ".join(task.scenarios) or "none")
@@ -110,9 +117,11 @@ def run(arguments: list[str]) -> None:
     source = _source(task, named, taken(rest, "--changes", "package.module:NAME")[0])
     world = source.config.task if source else preset.config.task
     world = changed.applied(world) if changed else world
+    if (cues := taken(rest, "--cues", WORDS)[0]) is not None:
+        world = with_cues(task, world, cues)
     by_evidence = _reads_evidence(rest)
     sizes, scalars, bound = preset.config.sizes, preset.config.scalars, None
-    if named is not None:  # as `adapt` corrects it
+    if finished_policy:  # as `adapt` corrects it
         frame = source.config.sizes.frame if source else sizes.frame
         sizes = adapting.SIZES if by_evidence else dataclasses.replace(adapting.SIZES, frame=frame)
         settling = calibrated.settling if by_evidence else adapting.settling
@@ -126,7 +135,7 @@ def run(arguments: list[str]) -> None:
         guidance=asking_kind(preset_kinds(task, preset)) if named is None else KIND.name,
         bound_deg=bound,
         labels=max(preset.labels) if named is None else calibrated.USUAL if by_evidence else Label.labels,
-        questions=NEAR_AIMS if named is None and task.near_aims else UNIFORM,
+        questions=UNIFORM if named is not None else _usual_questions(task),
     )
     asked = parse(kind, rest, f"label {task.name}", default, about(Label, task, preset=usual))
     plan = planned(task, preset.config, asked, named, source)
@@ -139,6 +148,11 @@ def run(arguments: list[str]) -> None:
     if finished is None:
         raise Interrupted(f"stopped; every answer is in {asked.out}: the same command goes on")
     out.print(f"done: {finished.line}\nnext: {finished.following}")
+
+
+def _usual_questions(task: Task) -> Literal["uniform", "near_aims", "proposed"]:
+    """What people are asked about where neither a policy is named nor anything else is said."""
+    return PROPOSED if task.proposed is not None else NEAR_AIMS if task.near_aims else UNIFORM
 
 
 def _reads_evidence(arguments: list[str]) -> bool:
@@ -181,11 +195,15 @@ def planned(
         asking = [kind.name for kind in guidances.known() if kind.asks]
         raise UserError(f"guidance {guidance.name!r} asks for no labels: give --guidance {' or '.join(asking)}")
     controls.check(guidance.form, space)
+    if asked.one_cue and not (guidance.form.by_eps and len(space.cues) > 1):
+        raise UserError("--one-cue is for relative answers about several cues: leave it out")
     wanted = asked.labels, asked.seed, asked.who.strip(), asked.bound_deg, robot
     if asked.again is not None:
-        return _second(Plan(task, merged, guidance, Base(uniform_in(env), ""), *wanted), asked, named)
+        plan = Plan(task, merged, guidance, Base(uniform_in(env), ""), *wanted, one_cue=asked.one_cue)
+        return _second(plan, asked, named)
     family = _family(asked, env) if guidance.kind.by_evidence else ()
-    return Plan(task, merged, guidance, _base(task, asked, named, source, env), *wanted, family=family)
+    base = _base(task, asked, named, source, env)
+    return Plan(task, merged, guidance, base, *wanted, family=family, one_cue=asked.one_cue)
 
 
 def _check_evidence(asked: Label[Any], named: str | None) -> None:
@@ -235,7 +253,7 @@ def _source(task: Task, named: str | None, changed: str | None) -> PolicySource 
 
     `changed`: code of the distortions that it corrects, if any.
     """
-    if named is None or (REFERENCE.fullmatch(named) and not Path(named).exists()):
+    if named is None or is_code(named):
         return None
     folder = Path(named)
     if not folder.is_dir():
@@ -256,9 +274,13 @@ def _base(task: Task, asked: Label[Any], named: str | None, source: PolicySource
         if lane != Lane():
             raise UserError("--base.… chooses in a folder, and none is given: leave it out")
         if named is not None:
-            return Base(code_of(named), named)
+            return Base(in_space(code_of(named), actions_of(env)), named)
         if asked.questions == UNIFORM:
             return Base(uniform_in(env), UNIFORM)
+        if asked.questions == PROPOSED:
+            if task.proposed is None:
+                raise UserError(f"--questions is {PROPOSED}, but {task.name} is no recording: give {UNIFORM}")
+            return Base(task.proposed(task.environment(asked.task)), PROPOSED)
         if not offers(env, "aims"):
             raise UserError(f"--questions is {NEAR_AIMS}, but {task.name} has no aims in this world: give {UNIFORM}")
         reach = float(actions_of(env).from_unit(REACH * asked.scalars.eps_deg))
@@ -313,6 +335,8 @@ def _following(task: Task, preset: str, config: RunConfig, asked: Any, policy: s
     if asked.again is not None:
         return shlex.join(["cuelearner", "labels", "inspect", str(asked.again), out])
     given = ["--labels-from", out, "--labels", str(labels)]
+    if policy is None and asked.questions == PROPOSED:
+        return f'cl.correct(policy, "{out}")  # in Python, after: import cuelearner_jax as cl'
     if policy is None:
         words = ["train", name, "--preset", preset, "--guidance", asked.guidance, *given]
         parts = ("task", task.config), ("sizes", GuideSizes), ("scalars", GuideScalars)

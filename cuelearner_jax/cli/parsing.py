@@ -25,6 +25,7 @@ from cuelearner_jax.environment import actions_of
 from cuelearner_jax.errors import UserError, closest, no_space
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.policies import policy_of, teaching
+from cuelearner_jax.policies.foreign import ONNX
 from cuelearner_jax.run_config import PARTS
 from cuelearner_jax.runs.trained import POLICIES, PolicySource
 from cuelearner_jax.storage import policy_folders, whole
@@ -218,6 +219,8 @@ def task_of(arguments: list[str], command: str, kind: type) -> tuple[Task, list[
 
 def preset_of(task: Task, arguments: list[str], default: str = PAPER) -> tuple[str, Preset, list[str]]:
     """The preset (if none is given, `default` or the first) and other arguments. Raises UserError for a wrong one."""
+    if not task.presets and task.name in registry.FAMILIES:
+        raise UserError(f"{task.name} is a family of tasks: name one of its environments, as {task.name}:NAME")
     if not task.presets:
         raise UserError(f"{task.name} has no preset to start from: give its Task one")
     name, rest = taken(arguments, "--preset", ", ".join(task.presets))
@@ -319,9 +322,14 @@ def _taught(task: Task, reference: str | None) -> Task:
     return dataclasses.replace(task, teacher=lambda config, env: teaching(code, actions_of(env)))
 
 
+def is_code(named: str) -> bool:
+    """Does a word name a policy that is code: package.module:NAME, or a file in ONNX?"""
+    return named.endswith(ONNX) or (bool(plugins.REFERENCE.fullmatch(named)) and not Path(named).exists())
+
+
 def code_of(reference: str) -> Any:
-    """The policy that `package.module:NAME` leads to. Raises UserError if there is none (`policies.policy_of`)."""
-    return policy_of(plugins.load(reference, object, "a policy"))
+    """The policy that `package.module:NAME` or a file in ONNX is. Raises UserError if there is none (`policy_of`)."""
+    return policy_of(reference if reference.endswith(ONNX) else plugins.load(reference, object, "a policy"))
 
 
 def _of_folder(folder: Path, known: Task | None, code: Any, changed: Any) -> PolicySource:

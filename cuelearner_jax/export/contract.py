@@ -32,6 +32,10 @@ from cuelearner_jax.spaces import DIRECTIONS
 from cuelearner_jax.storage.provenance import provenance
 from cuelearner_jax.storage.whole import is_used, place_of, replacing
 
+BASE = (
+    "a correction alone: the last slice of the observation is the action of a base that is elsewhere, given beside the "
+    "other slices, as decide(observation, base_action)"
+)
 ANGLE = "atan2(action[1], action[0]) [rad]: 0 along x, positive counterclockwise (from x to y)"
 
 
@@ -65,7 +69,9 @@ def write(
     check_request(format, out)
     with place_of(out, _check_free) as place:
         policy = jax.tree.map(jnp.asarray, jax.device_get(policy))  # what was trained may lie on several devices
-        artefact = FORMATS[format].make(policy, traced(policy, env.obs_size), env.obs_size, actions_of(env).size)
+        base = getattr(env, "base_size", 0)  # of a correction alone
+        sizes = env.obs_size, actions_of(env).size, base
+        artefact = FORMATS[format].make(policy, traced(policy, env.obs_size), *sizes)
         golden, cases = golden_cases(policy, drawn()), io.BytesIO()
         np.savez(cases, obs=golden.obs, actions=golden.actions)
         files = {artefact.file: artefact.contents, runner.GOLDEN: cases.getvalue(), "decide.py": decide_source()}
@@ -74,6 +80,7 @@ def write(
             "artefact": {"format": format, "file": artefact.file, **artefact.about},
             "observation": {"size": env.obs_size, "dtype": "float32", "slices": _slices(env.observation)},
             "action": _action(env, describe(policy)),
+            **({"base": {"size": base, "about": BASE}} if base else {}),
             "batch": "observations (n, size), any n; every row is decided by itself",
             "policy": describe(policy),
             "source": source,

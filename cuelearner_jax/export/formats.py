@@ -32,7 +32,8 @@ class Format(NamedTuple):
     """A format."""
 
     about: str
-    make: Callable[[Policy, Traced, int, int], Artefact]  # (policy, its graph, entries of observation and action)
+    # (policy, its graph, entries of what is seen, of the action, and of a base's action at the end of what is seen)
+    make: Callable[[Policy, Traced, int, int, int], Artefact]
 
 
 def _of_graph(traced: Traced, name: str) -> None:
@@ -44,7 +45,7 @@ def _of_graph(traced: Traced, name: str) -> None:
         )
 
 
-def _numpy(policy: Policy, traced: Traced, obs_size: int, action_size: int) -> Artefact:
+def _numpy(policy: Policy, traced: Traced, obs_size: int, action_size: int, base_size: int) -> Artefact:
     _of_graph(traced, "numpy")
     graph = np.frombuffer(json.dumps(traced.graph.as_json()).encode(), np.uint8)
     stored = io.BytesIO()
@@ -53,19 +54,22 @@ def _numpy(policy: Policy, traced: Traced, obs_size: int, action_size: int) -> A
     return Artefact("decision.npz", stored.getvalue(), {"needs": "numpy"})
 
 
-def _onnx(policy: Policy, traced: Traced, obs_size: int, action_size: int) -> Artefact:
+def _onnx(policy: Policy, traced: Traced, obs_size: int, action_size: int, base_size: int) -> Artefact:
     _of_graph(traced, "onnx")
-    contents = onnx_graph.serialized(traced, obs_size, action_size)
+    contents = onnx_graph.serialized(traced, obs_size, action_size, base_size)
     about = {"needs": "onnxruntime", "opset": onnx_graph.OPSET, "input": "obs", "output": "action"}
+    about |= {"base_input": onnx_graph.BASE} if base_size else {}
     return Artefact("decision.onnx", contents, about)
 
 
-def _stablehlo(policy: Policy, traced: Traced, obs_size: int, action_size: int) -> Artefact:
+def _stablehlo(policy: Policy, traced: Traced, obs_size: int, action_size: int, base_size: int) -> Artefact:
     from jax import export
 
-    shape = export.symbolic_shape(f"n, {obs_size}")
-    decide = jax.jit(row_by_row(policy))
-    exported = export.export(decide, platforms=PLATFORMS)(jax.ShapeDtypeStruct(shape, jnp.float32))
+    decide, (count,) = row_by_row(policy), export.symbolic_shape("n")
+    parts = [obs_size - base_size, *([base_size] if base_size else [])]
+    shapes = [jax.ShapeDtypeStruct((count, size), jnp.float32) for size in parts]
+    together = jax.jit(lambda *seen: decide(jnp.concatenate(seen, -1)))
+    exported = export.export(together if base_size else jax.jit(decide), platforms=PLATFORMS)(*shapes)
     about = {"needs": "jax", "jax": jax.__version__, "platforms": list(PLATFORMS)}
     return Artefact("decision.stablehlo", bytes(exported.serialize()), about)
 
@@ -85,7 +89,10 @@ def traced(policy: Policy, obs_size: int) -> Traced:
     assert rules.RULES  # they are registered by importing them
     found = trace(decision_of(policy), obs_size)
     if CALLBACKS & set(found.missing):
-        raise UserError("this policy calls a Python function, which no file can hold: export one of JAX functions")
+        raise UserError(
+            "this policy calls a Python function, which no file can hold: export one of JAX "
+            "functions, or the correction alone (--only-correction, cl.export_correction)"
+        )
     if found.random:
         raise UserError("this policy acts at random, and an exported one cannot: export one that does not")
     return found

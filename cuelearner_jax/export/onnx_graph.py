@@ -18,12 +18,14 @@ from cuelearner_jax.errors import UserError
 from cuelearner_jax.export.graph import Traced
 
 OPSET, IR_VERSION = 18, 8  # of 2022: runtimes of several years take them
+BASE = "base_action"  # the second input of a correction alone
 
 
-def serialized(traced: Traced, obs_size: int, action_size: int) -> bytes:
+def serialized(traced: Traced, obs_size: int, action_size: int, base_size: int = 0) -> bytes:
     """A model with the input `obs` (n, obs_size) and the output `action` (n, action_size).
 
-    Raises UserError if the package onnx is missing.
+    Of a correction alone the last `base_size` entries of what is seen are a second input, `base_action`. Raises
+    UserError if the package onnx is missing.
     """
     try:
         from onnx import TensorProto, checker, helper, numpy_helper
@@ -36,13 +38,17 @@ def serialized(traced: Traced, obs_size: int, action_size: int) -> bytes:
     row = helper.make_tensor_value_info("row", TensorProto.FLOAT, [obs_size])
     decided = helper.make_tensor_value_info("decided", TensorProto.FLOAT, [action_size])
     body = helper.make_graph(nodes, "one_observation", [row], [decided])
-    batch = helper.make_tensor_value_info("obs", TensorProto.FLOAT, ["n", obs_size])
+    batch = [helper.make_tensor_value_info("obs", TensorProto.FLOAT, ["n", obs_size - base_size])]
+    before, rows = [], "obs"
+    if base_size:
+        batch.append(helper.make_tensor_value_info(BASE, TensorProto.FLOAT, ["n", base_size]))
+        before, rows = [helper.make_node("Concat", ["obs", BASE], ["seen"], axis=1)], "seen"
     actions = helper.make_tensor_value_info("action", TensorProto.FLOAT, ["n", action_size])
     constants = {**traced.constants, **writer.constants}
     graph = helper.make_graph(
-        [helper.make_node("Scan", ["obs"], ["action"], body=body, num_scan_inputs=1)],
+        [*before, helper.make_node("Scan", [rows], ["action"], body=body, num_scan_inputs=1)],
         "decision",
-        [batch],
+        batch,
         [actions],
         [numpy_helper.from_array(np.asarray(array, order="C"), name) for name, array in constants.items()],
     )

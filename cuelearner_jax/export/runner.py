@@ -3,6 +3,7 @@
     from decide import Decision
     decide = Decision("folder")        # verifies every file against the contract
     action = decide(observation)       # (obs,) -> (action,); or (n, obs) -> (n, action)
+    action = decide(observation, base_action)       # of a correction alone, which runs beside its base
 
 It needs Python and NumPy, nothing of cuelearner or JAX; decisions in ONNX also need onnxruntime, those in StableHLO
 need JAX. Every row of a batch is decided by itself.
@@ -49,13 +50,17 @@ class Decision:
         known = (CONTRACT, "__pycache__", *self.contract["files"])
         return sorted(path.name for path in self.folder.iterdir() if path.name not in known)
 
-    def __call__(self, obs: Any) -> np.ndarray:
+    def __call__(self, obs: Any, base_action: Any = None) -> np.ndarray:
         """The action for an observation (obs,), or for each of a batch (n, obs): (action,) or (n, action).
 
-        Raises ContractError for an observation of another size, or one that is not finite in single precision; for a
-        decision that is no action.
+        `base_action`, as many rows: of a correction alone, what the base would do there. Raises ContractError for an
+        observation of another size, or one that is not finite in single precision; for a decision that is no action.
         """
         rows, size = _numbers(obs), self.contract["observation"]["size"]
+        if self._base:
+            rows = self._beside(rows, base_action)
+        elif base_action is not None:
+            raise ContractError(f"{self.folder} holds a whole policy: leave out the base action")
         batch = rows[None] if rows.ndim == 1 else rows
         if batch.ndim != 2 or batch.shape[1] != size:
             raise ContractError(f"observations have shape {rows.shape}: the contract says ({size},) or (n, {size})")
@@ -70,6 +75,26 @@ class Decision:
         if "angle" in self.contract["action"] and not actions.any(axis=-1).all():
             raise ContractError(f"{self.folder} decides on zero, which is no direction: export the policy anew")
         return actions[0] if rows.ndim == 1 else actions
+
+    @property
+    def _base(self) -> int:
+        """Entries of a base's action, of a correction alone; else 0."""
+        return self.contract.get("base", {}).get("size", 0)
+
+    def _beside(self, rows: np.ndarray, base_action: Any) -> np.ndarray:
+        """Observations and base actions side by side. Raises ContractError unless there are as many of both."""
+        own = self.contract["observation"]["size"] - self._base
+        if base_action is None:
+            raise ContractError(
+                f"{self.folder} holds a correction alone: give the base's action, decide(obs, base_action)"
+            )
+        base = _numbers(base_action)
+        if rows.ndim not in (1, 2) or rows.shape[-1:] != (own,) or base.shape != (*rows.shape[:-1], self._base):
+            raise ContractError(
+                f"observations have shape {rows.shape} and base actions {base.shape}: the contract says ({own},) and "
+                f"({self._base},), or as many rows of both"
+            )
+        return np.concatenate([rows, base], -1)
 
     def _sound(self, work: Callable[[], Any]) -> Any:
         """What some work on the artefact gives; of one that makes no sense whatever is raised is told in one line."""
@@ -99,7 +124,8 @@ class Decision:
         Raises ContractError if that is more than the contract allows.
         """
         obs, actions = self._sound(self._golden)
-        difference = float(np.abs(self(obs) - actions).max())
+        seen = (obs[:, : -self._base], obs[:, -self._base :]) if self._base else (obs,)
+        difference = float(np.abs(self(*seen) - actions).max())
         allowed = self.contract["golden"]["tolerance"]
         if not difference <= allowed:
             raise ContractError(
@@ -198,6 +224,10 @@ def _check(contract: dict[str, Any]) -> None:
         _hold("slices", part["size"] > 0 and (part["from"], part["to"]) == (end, end + part["size"]))
         end = part["to"]
     _hold("slices", end == contract["observation"]["size"])
+    if "base" in contract:
+        size = contract["base"]["size"]
+        _hold("base", type(size) is int and size == contract["action"]["size"] and size < end)
+        _hold("base", contract["observation"]["slices"][-1]["size"] == size)
 
 
 def _hold(what: str, sound: bool) -> None:
@@ -206,6 +236,12 @@ def _hold(what: str, sound: bool) -> None:
 
 
 Batch = Callable[[np.ndarray], np.ndarray]  # observations (n, obs) -> actions (n, action)
+
+
+def _cut(batch: np.ndarray, base: int) -> list[np.ndarray]:
+    """What is seen as the inputs of a decision: of a correction alone the base's action is one of its own."""
+    parts = [batch[:, :-base], batch[:, -base:]] if base else [batch]
+    return [np.ascontiguousarray(part) for part in parts]
 
 
 def _of_numpy(folder: Path, contract: dict[str, Any]) -> Batch:
@@ -243,7 +279,12 @@ def _of_onnx(folder: Path, contract: dict[str, Any]) -> Batch:
         told = " ".join(str(error).split())[:200]
         version = onnxruntime.__version__
         raise ContractError(f"onnxruntime {version} cannot run this decision ({told}): use another") from None
-    return lambda batch: np.asarray(session.run(None, {"obs": batch})[0])
+    names, base = [one.name for one in session.get_inputs()], contract.get("base", {}).get("size", 0)
+    if names != ["obs", *(["base_action"] if base else [])]:
+        raise ContractError(
+            f"{path} has the inputs {', '.join(names)}, which its contract does not say: export it anew"
+        )
+    return lambda batch: np.asarray(session.run(None, dict(zip(names, _cut(batch, base), strict=True)))[0])
 
 
 def _of_stablehlo(folder: Path, contract: dict[str, Any]) -> Batch:
@@ -258,7 +299,8 @@ def _of_stablehlo(folder: Path, contract: dict[str, Any]) -> Batch:
         if b"callback" in exported.mlir_module_serialized:  # no export has one: it leads out of the program
             raise ContractError(f"{folder} holds a decision that calls Python functions: export the policy anew")
         call = jax.jit(exported.call)
-        call(np.zeros((1, contract["observation"]["size"]), np.float32)).block_until_ready()
+        base = contract.get("base", {}).get("size", 0)
+        call(*_cut(np.zeros((1, contract["observation"]["size"]), np.float32), base)).block_until_ready()
     except ContractError:
         raise
     except Exception:
@@ -267,7 +309,7 @@ def _of_stablehlo(folder: Path, contract: dict[str, Any]) -> Batch:
             f"this decision was exported with JAX {made}, and JAX {jax.__version__} on {jax.default_backend()} cannot "
             f"call it: use JAX {made}, or export the policy anew with this one"
         ) from None
-    return lambda batch: np.asarray(call(batch))
+    return lambda batch: np.asarray(call(*_cut(batch, base)))
 
 
 RUNNERS: dict[str, Callable[[Path, dict[str, Any]], Batch]] = {

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -19,8 +19,8 @@ SHOWN = {" ": "space", "Backspace": "⌫", "Enter": "⏎"}  # keys, for people
 SHOWN |= {"ArrowLeft": "←", "ArrowRight": "→", "ArrowUp": "↑", "ArrowDown": "↓"}
 PRACTICE = (  # what a person is to try, one a question of practice
     "Compare the action with what is wanted, then answer by key, button or click.",
-    "Where you cannot tell, press ↓: it costs nothing. F shows a film of where the action leads.",
-    "An answer can be taken back with ⌫. After this one it counts.",
+    "Where you cannot tell, press {unsure}: it costs nothing.{film}",
+    "An answer can be taken back with {undo}. After this one it counts.",
 )
 
 
@@ -32,7 +32,12 @@ class Control(NamedTuple):
     keys: tuple[str, ...] = ()  # as browsers call them (`KeyboardEvent.key`)
     answer: tuple[float, ...] | None = None  # in the words of the form; None: no answer
     colour: str = ""  # of the button, and of the arrow that shows what it would do: a name of `outcomes`
-    cue: int | None = None  # of several: the one that it answers about; None: it gives the whole answer
+    cue: int | None = None  # of several: the one that it answers about
+
+    @property
+    def picks(self) -> bool:
+        """Is it kept until the answer is sent?"""
+        return self.cue is not None and self.answer is not None and len(self.answer) == 1
 
     @property
     def shown(self) -> str:
@@ -43,24 +48,45 @@ class Control(NamedTuple):
 UNSURE = Control("unsure", "don't know", ("ArrowDown", "s", "S"))
 UNDO = Control("undo", "undo", ("Backspace", "u", "U"))
 FILM = Control("film", "film", ("f", "F", "v", "V"))
+CORRECTED = Control("film-refined", "film of the correction", ("x", "X"))
 HELP = Control("help", "help", ("h", "H", "?"))
 AS_IT_IS = Control("0", "already right", ("ArrowUp", "w", "W", " "), (0.0,), "asked")
 REST_UNSAID = Control("send", "send, of the others nothing is said", ("Enter",), (UNSAID,))
 REST_RIGHT = Control("rest", "send, the others are already right", (" ", "ArrowUp"), (0.0,))
+ALL_RIGHT = REST_RIGHT._replace(words="all already right", colour="asked")
 
 
 def _shown(key: str) -> str:
     return SHOWN.get(key, key.upper() if len(key) == 1 else key)
 
 
-def _either(key: str) -> tuple[str, ...]:
+def _cases(key: str) -> tuple[str, ...]:
     """A key, of a letter both of its cases."""
-    return tuple(dict.fromkeys((key.lower(), key.upper()))) if len(key) == 1 else (key, *BESIDE.get(key, ""))
+    return tuple(dict.fromkeys((key.lower(), key.upper()))) if len(key) == 1 else (key,)
 
 
-def _of_cue(number: int, cue: Cue) -> tuple[Control, ...]:
-    """What can be said about one cue of several."""
-    more, less = (_either(key) for key in cue.keys)
+def _spare(space: Space, keys: tuple[str, ...] | str) -> tuple[str, ...]:
+    """Those of some keys that no cue names."""
+    named = {one for cue in space.cues for key in cue.keys for one in _cases(key)}
+    return tuple(key for key in keys if key not in named)
+
+
+def _keys_of(space: Space, cue: Cue) -> tuple[tuple[str, ...], ...]:
+    """All keys for more and for less of a cue."""
+    return tuple((*_cases(key), *_spare(space, BESIDE.get(key, ""))) for key in cue.keys)
+
+
+def _of_cue(number: int, space: Space, one_cue: bool) -> tuple[Control, ...]:
+    """What can be said about one cue of several: each as a part of the answer, or more and less as the whole of it."""
+    cue, count = space.cues[number], len(space.cues)
+    more, less = _keys_of(space, cue)
+    if one_cue:
+        alone = np.where(np.arange(count) == number, 1.0, UNSAID)
+        said = tuple(map(float, alone)), tuple(map(float, np.where(alone == 1.0, -1.0, UNSAID)))
+        return (
+            Control(f"only-{number}-more", cue.words[0], more, said[0], "left", number),
+            Control(f"only-{number}-less", cue.words[1], less, said[1], "right", number),
+        )
     return (
         Control(f"pick-{number}-more", cue.words[0], more, (1.0,), "left", number),
         Control(f"pick-{number}-right", "already right", (), (0.0,), "asked", number),
@@ -69,16 +95,20 @@ def _of_cue(number: int, cue: Cue) -> tuple[Control, ...]:
     )
 
 
-def answers(form: AnswerForm, space: Space) -> tuple[Control, ...]:
-    """The answers that a form has, in the order of their buttons; none where an answer is pointed at."""
+def answers(form: AnswerForm, space: Space, one_cue: bool = False) -> tuple[Control, ...]:
+    """The answers that a form has, in the order of their buttons; none where an answer is pointed at.
+
+    `one_cue`: of several cues, one press about one of them is the whole answer.
+    """
     if form.by_eps and len(space.cues) == 1:
-        cue = space.cues[0]
-        words = WALKED if space == DIRECTIONS else cue.words
-        more, less = (_either(key) for key in cue.keys)
-        return Control("+1", words[0], more, (1.0,), "left"), AS_IT_IS, Control("-1", words[1], less, (-1.0,), "right")
+        words = WALKED if space == DIRECTIONS else space.cues[0].words
+        more, less = _keys_of(space, space.cues[0])
+        right = AS_IT_IS._replace(keys=_spare(space, AS_IT_IS.keys))
+        return Control("+1", words[0], more, (1.0,), "left"), right, Control("-1", words[1], less, (-1.0,), "right")
     if form.by_eps:
-        about_cues = (control for number, cue in enumerate(space.cues) for control in _of_cue(number, cue))
-        return (*about_cues, REST_RIGHT, REST_UNSAID)
+        about_cues = (control for number in range(len(space.cues)) for control in _of_cue(number, space, one_cue))
+        whole = (ALL_RIGHT,) if one_cue else (REST_RIGHT, REST_UNSAID)
+        return (*about_cues, *(control._replace(keys=_spare(space, control.keys)) for control in whole))
     if form.values is None:
         return ()
     values = form.values(space)
@@ -90,18 +120,25 @@ def answers(form: AnswerForm, space: Space) -> tuple[Control, ...]:
     )
 
 
-def controls(form: AnswerForm, space: Space) -> dict[str, Control]:
-    """Everything that can be pressed, by name; a key that an answer has is no other control's."""
-    own, films = answers(form, space), ()
-    if form.by_eps and len(space.cues) == 1:
-        films = tuple(
-            Control(f"film-{control.colour}", f"film of {control.words}", _either(key))
+def controls(
+    form: AnswerForm, space: Space, one_cue: bool = False, films: bool = True, simulated: bool = True
+) -> dict[str, Control]:
+    """Everything that can be pressed, by name; a key that an answer has is no other control's.
+
+    `films`: is there a film of a situation? `simulated`: of where any action leads from there?
+    """
+    own, filmed = answers(form, space, one_cue), ()
+    if films:
+        filmed = (FILM, CORRECTED) if simulated else (FILM,)
+    if films and simulated and form.by_eps and len(space.cues) == 1:
+        filmed += tuple(
+            Control(f"film-{control.colour}", f"film of {control.words}", _cases(key))
             for control, key in ((own[0], "q"), (own[2], "e"))
         )
     taken = {key for control in own for key in control.keys}
     others = (
         control._replace(keys=tuple(key for key in control.keys if key not in taken))
-        for control in (UNSURE, UNDO, FILM, *films, HELP)
+        for control in (UNSURE, UNDO, *filmed, HELP)
     )
     return {control.name: control for control in (*own, *others)}
 
@@ -131,9 +168,9 @@ def question(form: AnswerForm, space: Space) -> str:
     return f"Your answer? ({form.meaning(space)})"
 
 
-def help_lines(form: AnswerForm, space: Space) -> list[str]:
-    """What the page's help says, line by line."""
-    told = controls(form, space).values()
+def help_lines(form: AnswerForm, space: Space, known: Iterable[Control]) -> list[str]:
+    """What the page's help says of the controls that it knows, line by line."""
+    told = list(known)
     names = [f"{space.cues[one.cue].name}: " if one.cue is not None else "" for one in told]
     lines = [f"{name}{one.words}: {keys_of(one)}" for name, one in zip(names, told, strict=True) if one.keys]
     if form.by_eps and space == DIRECTIONS:
@@ -141,15 +178,24 @@ def help_lines(form: AnswerForm, space: Space) -> list[str]:
             "Left and right are those of somebody who walks along the arrow: left turns it counterclockwise. "
             "Two arrows in the picture show both turns, in the colour of their button and with its key."
         )
-    if form.by_eps and len(space.cues) > 1:
+    if form.by_eps and len(space.cues) > 1 and any(one.picks for one in told):
         lines.append(
             "Say which way each cue should change, then send. Where nothing is said of any, it is: don't know."
         )
+    elif form.by_eps and len(space.cues) > 1:
+        lines.append("Say what comes to mind first: one press is the answer. Of the other cues nothing is said.")
     return [
         *lines,
         "Each answer is saved before the next question shows. Where you cannot tell, say so: it costs nothing.",
         "A key that comes while no question can take it is not taken, and the page says so.",
     ]
+
+
+def hint(number: int, known: Mapping[str, Control]) -> str:
+    """What a person is to try at a question of practice, counted from 0."""
+    film = f" {known['film'].shown} shows a film." if "film" in known else ""
+    told = {name: known[name].shown or known[name].words for name in ("unsure", "undo")}
+    return PRACTICE[min(number, len(PRACTICE) - 1)].format(film=film, **told)
 
 
 def keys_of(control: Control) -> str:
@@ -169,7 +215,7 @@ def given(
         return np.array([np.cos(np.deg2rad(angle_deg)), np.sin(np.deg2rad(angle_deg))], np.float32)
     if pressed.answer is None:
         return None
-    if pressed.name not in (REST_RIGHT.name, REST_UNSAID.name):
+    if pressed.name not in (REST_RIGHT.name, REST_UNSAID.name):  # which fill up what was picked
         return np.asarray(pressed.answer, np.float32)
     found = np.array([said.get(number, *pressed.answer) for number in range(len(space.cues))], np.float32)
     return None if (found == UNSAID).all() else found

@@ -39,6 +39,10 @@ const cue = {
     line.classList.toggle("now", !!why);
   },
   drop(why) { cue.dropped += 1; cue.tell(why); },
+  mark(names) {  // what is picked of several cues, in the picture
+    document.querySelectorAll("svg.scene .said").forEach(
+      said => said.classList.toggle("picked", names.includes(said.dataset.name)));
+  },
   refused(why) { cue.sent = false; cue.drop(why); },  // by the server
   angle(event) {
     const scene = cue.scene();
@@ -56,28 +60,39 @@ const cue = {
     mover.style.visibility = at ? "visible" : "hidden";
     if (at) mover.setAttribute("transform", `translate(${at[0]} ${at[1]}) rotate(${at[2]})`);
   },
-  play(film) {
+  photos(scene, film) {  // the pictures of a film, over that of the scene: decoded first, so that none flickers
+    const photo = scene.querySelector("image.photo");
+    scene.querySelectorAll("image.frame").forEach(one => one.remove());
+    if (!photo) return [];
+    return film.pictures.map(picture => {
+      const frame = photo.cloneNode();
+      frame.setAttribute("class", "frame");
+      frame.setAttribute("href", picture);
+      frame.style.visibility = "hidden";
+      photo.parentNode.append(frame);
+      return frame;
+    });
+  },
+  async play(film) {
     const scene = cue.scene();
     if (!scene || +scene.dataset.item !== film.item) return;
     const movers = Object.fromEntries([...scene.querySelectorAll(".mover")].map(one => [one.dataset.mover, one]));
-    const photo = scene.querySelector("image.photo");
-    if (photo && !photo.dataset.stands) photo.dataset.stands = photo.getAttribute("href");
-    const show = (places, picture) => {
+    const run = ++cue.playing, photos = cue.photos(scene, film);
+    const show = (places, at) => {
       Object.entries(movers).forEach(([name, mover]) => cue.place(mover, places[name]));
-      if (photo && picture && photo.getAttribute("href") !== picture) photo.setAttribute("href", picture);
+      photos.forEach((photo, number) => { photo.style.visibility = number === at ? "visible" : "hidden"; });
     };
-    const run = ++cue.playing, start = performance.now();
-    const last = Math.max(film.frames.length, film.pictures.length) - 1;
+    await Promise.all(photos.map(photo => photo.decode && photo.decode().catch(() => {})));
+    const start = performance.now(), last = Math.max(film.frames.length, photos.length) - 1;
     const words = document.querySelector(".film-words");
     if (words) words.textContent = "";
     const tick = now => {
       if (run !== cue.playing || !scene.isConnected) return;
-      const at = Math.floor((now - start) / 1000 / film.period);
-      const frame = Math.max(0, Math.min(at, last));
-      show(film.frames[frame] || {}, film.pictures[frame]);
+      const at = Math.floor((now - start) / 1000 / film.period), frame = Math.max(0, Math.min(at, last));
+      show(film.frames[frame] || {}, frame);
       if (at >= last && words) words.textContent = film.words;
-      if (at * film.period < last * film.period + 1.0) requestAnimationFrame(tick);
-      else show(JSON.parse(scene.dataset.places), photo && photo.dataset.stands);
+      if (at * film.period < last * film.period + 1.0) { requestAnimationFrame(tick); return; }
+      show(JSON.parse(scene.dataset.places), -1);
     };
     requestAnimationFrame(tick);
   },
@@ -113,7 +128,8 @@ document.addEventListener("keydown", event => {
 });
 document.addEventListener("click", event => {
   if (document.activeElement && document.activeElement.blur) document.activeElement.blur();
-  const scene = event.target.closest && event.target.closest("svg.scene");
+  const scene = event.target.closest && event.target.closest("svg.scene"), said = event.target.closest(".said");
+  if (scene && said) { cue.send(said.dataset.name, {clicks: event.detail}); return; }
   if (scene && +scene.dataset.points) cue.send("point", {angle: cue.angle(event), clicks: event.detail});
 });
 document.addEventListener("pointermove", event => {

@@ -14,7 +14,7 @@ from nicegui.events import GenericEventArguments
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.labelling import controls, view
 from cuelearner_jax.labelling.controls import Control
-from cuelearner_jax.labelling.session import Session, Status
+from cuelearner_jax.labelling.session import Item, Session, Status
 from cuelearner_jax.spaces import UNSAID
 
 HERE = Path(__file__).parent
@@ -35,9 +35,12 @@ class Page:
         self.session, self._pages, self._finish = session, pages, finish
         self.form, self.space = session.plan.form, session.space
         self._by_evidence = session.plan.guidance.kind.by_evidence
-        self.controls = controls.controls(self.form, self.space)
+        self._one_cue = session.plan.one_cue
+        films = session.films, session.simulates
+        self.controls = controls.controls(self.form, self.space, self._one_cue, *films)
         self._said: dict[int, float] = {}  # of the question on the screen, by the number of the cue
         self._said_of = session.number
+        self._drawn: Item | None = None  # what the page shows
         self._loop = asyncio.get_running_loop()
         self._client = ui.context.client
         ui.add_css((HERE / "page.css").read_text())
@@ -83,18 +86,19 @@ class Page:
             ui.button("skip practice", on_click=self._skip, color=None).props("flat dense").mark("skip")
 
     def _answers(self) -> None:
-        own = controls.answers(self.form, self.space)
+        own = controls.answers(self.form, self.space, self._one_cue)
         self._pressable, self._picks = [], {}
         for number, cue in enumerate(self.space.cues):
-            if picks := [control for control in own if control.cue == number]:
+            if about := [control for control in own if control.cue == number]:
                 with ui.element("div").classes("cue"):  # a row each, so that all lie above the fold
                     ui.label(cue.name)
                     with ui.element("div").classes("answers"):
-                        self._picks |= {control: self._button(control) for control in picks}
+                        buttons = {control: self._button(control) for control in about}
+                self._pressable += buttons.values()
+                self._picks |= {control: button for control, button in buttons.items() if control.picks}
         with ui.element("div").classes("answers"):
             self._pressable += [self._button(control) for control in own if control.cue is None]
             self._pressable.append(self._button(self.controls["unsure"]).classes("wide"))
-        self._pressable += self._picks.values()
         ui.label("").classes("dropped").props("aria-live=polite")
         ui.label("").classes("film-words")
 
@@ -115,9 +119,11 @@ class Page:
             for name, about in {**swatches, "refined": refined}.items():
                 ui.html(f'<span class=swatch style="background:var(--{name})"></span>{about}', sanitize=False)
             ui.label(self.session.legend).classes("text-caption")
+        self._tools: dict[str, ui.button] = {}
         with ui.element("div").classes("tools"):
-            for name in ("undo", "film", "help"):
-                self._button(self.controls[name], props="flat dense")
+            for name in ("undo", "film", "film-refined", "help"):
+                if name in self.controls:
+                    self._tools[name] = self._button(self.controls[name], props="flat dense")
             dark = ui.dark_mode(None)
             ui.button("light or dark", on_click=lambda: dark.set_value(not dark.value), color=None).props("flat dense")
         self._saved = ui.label().classes("text-caption")
@@ -128,7 +134,7 @@ class Page:
     def _overlay(self) -> ui.dialog:
         with ui.dialog() as dialog, ui.card().classes("gap-1"):
             ui.label("Help").classes("big")
-            for line in controls.help_lines(self.form, self.space):
+            for line in controls.help_lines(self.form, self.space, self.controls.values()):
                 ui.label(line)
             ui.button("close", on_click=dialog.close)
         return dialog
@@ -163,9 +169,11 @@ class Page:
         taken, why = False, LATE
         if self._help.value or self._early.value:  # a browser may not know yet that it opened
             why = "a window lies over the question: close it first"
-        elif pressed is not None and pressed.cue is not None and pressed.answer is not None:
+        elif pressed is not None and pressed.cue is not None and pressed.answer is not None and pressed.picks:
             if taken := number == self.session.number:
-                self._said[pressed.cue] = pressed.answer[0]  # until the answer is sent
+                self._said_about(number)[pressed.cue] = pressed.answer[0]  # until the answer is sent
+                self._mark()
+                return
         else:
             try:
                 if name == "undo":
@@ -213,7 +221,10 @@ class Page:
         item = self.session.item
         if item is None or item.number != number:
             return
-        shown = self.session.outcomes(item).get(name.removeprefix("film-"), item.action)
+        of = name.removeprefix("film-")
+        shown = item.refined if of == "refined" else self.session.outcomes(item).get(of, item.action)
+        if shown is None:  # nothing corrects it yet
+            return
         reel = await run.io_bound(self.session.film, number, shown)
         if reel is not None:
             with self._client:
@@ -233,13 +244,14 @@ class Page:
         status, item = self.session.status(), self.session.item
         plan = self.session.plan
         how = self.form, plan.config.scalars.eps_deg, self.space
-        self._scene.content = "" if item is None else view.picture(item, *how)
-        self._note.text = "" if item is None else view.note(item, *how)
-        if self._said_of != self.session.number:
-            self._said, self._said_of = {}, self.session.number
-        for control, button in self._picks.items():
-            picked = control.answer == (self._said.get(control.cue, UNSAID),)
-            button.classes(add="picked" if picked else "", remove="" if picked else "picked")
+        if item is not self._drawn:  # what was picked of cues changes nothing in it
+            self._drawn = item
+            self._scene.content = "" if item is None else view.picture(item, *how, self._one_cue)
+            self._note.text = "" if item is None else view.note(item, *how)
+        self._said_about(self.session.number)
+        self._mark()
+        if "film-refined" in self._tools:
+            self._tools["film-refined"].set_visibility(item is not None and item.refined is not None)
         self._practising.set_visibility(item is not None and item.number < 0)
         if item is None:
             self._asked.text = "All labels are given. Thank you. Press finish, or undo to change the last one."
@@ -248,11 +260,26 @@ class Page:
             self._words.text = item.sketch.words if item.sketch else ""
         if item is not None and item.number < 0:
             number, count = self.session.practice + item.number, self.session.practice
-            hint = controls.PRACTICE[min(number, len(controls.PRACTICE) - 1)]
+            hint = controls.hint(number, self.controls)
             self._practice_words.text = f"Practice {number + 1} of {count}, nothing is saved. {hint}"
         for button in self._pressable:
             button.set_enabled(item is not None)
         self._tell(status)
+
+    def _said_about(self, number: int) -> dict[int, float]:
+        """What was picked of a question's cues; of another than the one before nothing."""
+        if self._said_of != number:
+            self._said, self._said_of = {}, number
+        return self._said
+
+    def _mark(self) -> None:
+        """Shows what was picked of several cues."""
+        picked = {one.name for one in self._picks if one.answer == (self._said.get(one.cue, UNSAID),)}
+        for control, button in self._picks.items():
+            button.classes(**{"add" if control.name in picked else "remove": "picked"})
+        if self._picks:
+            with self._client:
+                ui.run_javascript(f"cue.mark({json.dumps(sorted(picked))})")
 
     def _tell(self, status: Status) -> None:
         unsure = f", {status.unsure} not known" if status.unsure else ""

@@ -57,6 +57,7 @@ class Plan:
     again: tuple[np.ndarray, ...] = ()  # actions that another session of this seed asked about: they are asked again
     again_of: str = ""  # digest of its file
     family: Family = ()  # of calibration: what may have changed
+    one_cue: bool = False  # of several cues, is one press, about one of them, the whole answer?
 
     @property
     def form(self) -> AnswerForm:

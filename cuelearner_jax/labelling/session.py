@@ -36,6 +36,7 @@ from cuelearner_jax.task import shape_of
 from cuelearner_jax.types import Label, Reel, Sketch
 
 RECENT = 50  # answers by which the pace is told
+KEPT = 20  # questions back whose pictures are still there; those of earlier ones are made anew where undo leads there
 NUMBERS = 2**31  # of questions: those of practice count down to 0, and their random numbers are the last ones
 
 
@@ -123,7 +124,7 @@ class Session:
         tell("preparing questions")
         self._ensure(self.number)
         self._ensure(self.number + 1)
-        self.film(self.number, self._items[self.number].action)
+        self.films = self.film(self.number, self._items[self.number].action) is not None  # are there any?
         self._next: Future[None] = self._ahead.submit(self._ensure, self.number + 1)
         self._since = time.monotonic()
 
@@ -228,6 +229,11 @@ class Session:
         return self._pictures.legend
 
     @property
+    def simulates(self) -> bool:
+        """Is a film what any action would lead to?"""
+        return self._pictures.simulates
+
+    @property
     def item(self) -> Item | None:
         """The question of the moment; None: all are answered, or the work is finished."""
         with self._lock:
@@ -271,6 +277,8 @@ class Session:
         with self._lock:
             self.number, self._since = number, time.monotonic()
             self._furthest = max(self._furthest, number)
+            if passed := self._items.get(number - KEPT):
+                self._items[passed.number] = passed._replace(sketch=None, trails=None)
             self._next = self._ahead.submit(self._ensure, number + 1)
 
     def undo(self, number: int) -> bool:

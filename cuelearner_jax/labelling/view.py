@@ -5,25 +5,24 @@ from __future__ import annotations
 import html
 import json
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
 from cuelearner_jax.feedback.forms import AnswerForm
-from cuelearner_jax.labelling import controls
+from cuelearner_jax.labelling import controls, pointing
+from cuelearner_jax.labelling.arrows import HAIR, arrow, ends, line
+from cuelearner_jax.labelling.controls import Control
 from cuelearner_jax.labelling.session import Item
 from cuelearner_jax.spaces import DIRECTIONS, Space
 from cuelearner_jax.types import Reel, Sketch
 
-HAIR = 1 / 400  # of the sketch's width: a thin line
 TURNED_REACH = 1.25, 3.5  # how much farther arrows reach that are turned: the more the less they are,
 APART = 10.0  # by this over eps [deg], so that they can be told apart
 BESIDE_TRAILS = 1.8  # no turned arrow reaches farther where trails tell them apart: what it points at stays in view
-HEAD = 7.0  # length of an arrow's head [hairs]
-HALO = ' class="halo"', 3.8  # so that arrows stand out on any ground
 TIPS = 8.0  # turns are drawn larger than they are where tips would be nearer than this [hairs],
 STEEPEST = 30.0  # but eps no larger than this [deg],
 WIDEST = 60.0  # and a refined action no farther away, unless it is [deg]
-BADGE = 7.0  # radius of the key at a turned arrow's tip [hairs]
 LEAST_TURN = 1.0  # of the refined action from the one in question as they are drawn, to be shown [deg]
 
 
@@ -31,7 +30,7 @@ def magnified(item: Item, eps_deg: float) -> int:
     """How many times larger than they are turns of an item's action are drawn: so that one by eps can be seen."""
     assert item.sketch is not None
     sketch, hair = item.sketch, item.sketch.box[2] * HAIR
-    far = _ends(sketch, angle_of(item.action), _farthest(item))[1]
+    far = ends(sketch, angle_of(item.action), _farthest(item))[1]
     seen = min(math.degrees(math.asin(min(TIPS * hair / far, 1.0))), STEEPEST)
     return math.ceil(seen / eps_deg) if eps_deg < 0.75 * seen else 1
 
@@ -44,8 +43,11 @@ def _farthest(item: Item) -> float:
 def note(item: Item, form: AnswerForm, eps_deg: float, space: Space = DIRECTIONS) -> str:
     """What a person has to know about the picture, of an action that is no arrow in it what it is; empty: nothing."""
     if space != DIRECTIONS:
-        refined = "" if item.refined is None else f"; the model makes of it: {space.words_of(item.refined)}"
-        return f"the action: {space.words_of(item.action)}{refined}"
+        told = f"the action: {space.words_of(item.action)}"
+        if item.refined is None:
+            return told
+        change = np.asarray(space.to_unit(space.log(item.action, item.refined)))
+        return f"{told}. The correction: {pointing.change_words(space, change)}"
     times = magnified(item, eps_deg) if form.by_eps else 1
     if times == 1:
         return ""
@@ -53,10 +55,11 @@ def note(item: Item, form: AnswerForm, eps_deg: float, space: Space = DIRECTIONS
     return f"turns are drawn {times} times as large: {eps_deg:g}° as {times * eps_deg:g}°{true}"
 
 
-def picture(item: Item, form: AnswerForm, eps_deg: float, space: Space = DIRECTIONS) -> str:
+def picture(item: Item, form: AnswerForm, eps_deg: float, space: Space = DIRECTIONS, one_cue: bool = False) -> str:
     """An item with a sketch, as an SVG element; attributes `data-…` tell the page's script what it shows.
 
-    Directions are drawn as arrows; of other actions the picture shows what they lead to, where the task draws that.
+    Directions are drawn as arrows. Of other actions the picture shows what they lead to, where the task draws that, and
+    the cues that point somewhere in it. `one_cue`: see `controls.answers`.
     """
     assert item.sketch is not None
     sketch, planar = item.sketch, space == DIRECTIONS
@@ -66,7 +69,7 @@ def picture(item: Item, form: AnswerForm, eps_deg: float, space: Space = DIRECTI
     for name, body in sketch.movers.items():
         place = f'class="mover" data-mover="{html.escape(name)}" transform="{_moved(sketch, name)}"'
         parts.append(f"<g {place}>{body}</g>")
-    parts += _arrows(item, form, eps_deg) if planar else []
+    parts += _arrows(item, form, eps_deg) if planar else _cues(item, space, controls.answers(form, space, one_cue))
     data = {
         "item": item.number,
         "foot": json.dumps(sketch.foot),
@@ -97,16 +100,28 @@ def _arrows(item: Item, form: AnswerForm, eps_deg: float) -> list[str]:
         longer = min(max(APART / drawn, TURNED_REACH[0]), _farthest(item))
         for one in controls.answers(form, DIRECTIONS):
             if one.answer and one.answer[0]:
-                parts.append(_arrow(sketch, angle + one.answer[0] * drawn, one.colour, longer, one.shown))
-    parts.append("" if item.trails else _line(sketch, angle))
-    parts.append(_arrow(sketch, angle, "asked"))
+                parts.append(arrow(sketch, angle + one.answer[0] * drawn, one.colour, longer, one.shown))
+    parts.append("" if item.trails else line(sketch, angle))
+    parts.append(arrow(sketch, angle, "asked"))
     if item.refined is not None:
         turn = (angle_of(item.refined) - angle + 180) % 360 - 180
         turn = math.copysign(min(times * abs(turn), max(WIDEST, abs(turn))), turn)
         if abs(turn) >= LEAST_TURN:
-            parts.append(_arrow(sketch, angle + turn, "refined", 0.8))
+            parts.append(arrow(sketch, angle + turn, "refined", 0.8))
     if form.is_action:
-        parts.append(_arrow(sketch, angle, "pointer"))
+        parts.append(arrow(sketch, angle, "pointer"))
+    return parts
+
+
+def _cues(item: Item, space: Space, answers: Sequence[Control]) -> list[str]:
+    """The answers about cues, the action in question, and what the model makes of it, where cues point somewhere."""
+    assert item.sketch is not None
+    ways, middle = pointing.ways_of(space, item.sketch), space.middle()
+    parts = pointing.answers_drawn(item.sketch, ways, answers)
+    for name, action in (("asked", item.action), ("refined", item.refined)):
+        if action is not None and middle is not None:
+            shares = np.asarray(space.to_unit(space.log(middle, action))) / (space.reach / 2)
+            parts.append(pointing.from_foot(item.sketch, ways, shares, name))
     return parts
 
 
@@ -118,59 +133,3 @@ def film(item: Item, reel: Reel) -> str:
 def _moved(sketch: Sketch, name: str) -> str:
     x, y, turn = sketch.places[name]
     return f"translate({x:.4f} {y:.4f}) rotate({turn:.2f})"
-
-
-def _point(sketch: Sketch, angle: float, along: float, across: float = 0.0) -> tuple[float, float]:
-    """A place on the screen, by its distances along and to the left of an action's direction."""
-    screen = math.radians(angle + sketch.turn)
-    cos, sin = math.cos(screen), math.sin(screen)
-    x, y = along * cos - across * sin, along * sin + across * cos
-    return sketch.foot[0] + x, sketch.foot[1] - y
-
-
-def _room(sketch: Sketch, angle: float) -> float:
-    """From the foot along a direction to the edge of what is shown."""
-    (x, y), (left, top, width, height) = sketch.foot, sketch.box
-    away_x, away_y = (one - other for one, other in zip(_point(sketch, angle, 1.0), sketch.foot, strict=True))
-    across = (left + width - x if away_x > 0 else x - left) / max(abs(away_x), 1e-9)
-    down = (top + height - y if away_y > 0 else y - top) / max(abs(away_y), 1e-9)
-    return min(across, down)
-
-
-def _ends(sketch: Sketch, angle: float, longer: float = 1.0, beyond: float = 0.0) -> tuple[float, float]:
-    """Where an arrow begins and ends, from the foot: within what is shown, but never too short for its head [m].
-
-    `beyond`: what else is to be shown beyond its tip [m].
-    """
-    hair, (first, last) = sketch.box[2] * HAIR, sketch.reach
-    last = first + (last - first) * longer
-    return first, max(min(last, _room(sketch, angle) - 2 * hair - beyond), first + HEAD * hair)
-
-
-def _arrow(sketch: Sketch, angle: float, name: str, longer: float = 1.0, key: str = "") -> str:
-    hair = sketch.box[2] * HAIR
-    head, half, badge = HEAD * hair, 2.8 * hair, BADGE * hair
-    first, last = _ends(sketch, angle, longer, 2 * badge if key else 0.0)
-    shaft = [_point(sketch, angle, first), _point(sketch, angle, last - 0.6 * head)]
-    tip = [_point(sketch, angle, last), *(_point(sketch, angle, last - head, side) for side in (half, -half))]
-    (x1, y1), (x2, y2) = shaft
-    corners = " ".join(f"{x:.4f},{y:.4f}" for x, y in tip)
-    place = f'x1="{x1:.4f}" y1="{y1:.4f}" x2="{x2:.4f}" y2="{y2:.4f}"'
-    halo, line = (f'<line{kind} {place} stroke-width="{width * hair:.5f}"/>' for kind, width in (HALO, ("", 2.2)))
-    head_drawn = f'<polygon points="{corners}" stroke-width="{1.6 * hair:.5f}"/>'
-    shown = ""
-    if key:  # which says this, at its tip: left and right on the screen are others where the arrow points down
-        x, y = _point(sketch, angle, last + badge)
-        disc = f'<circle cx="{x:.4f}" cy="{y:.4f}" r="{badge:.5f}" stroke-width="{0.8 * hair:.5f}"/>'
-        shown = f'<g class="at-key">{disc}<text x="{x:.4f}" y="{y:.4f}" font-size="{1.6 * badge:.5f}">{key}</text></g>'
-    return f'<g class="arrow {name}">{halo}{line}{head_drawn}{shown}</g>'
-
-
-def _line(sketch: Sketch, angle: float) -> str:
-    if not sketch.aim:
-        return ""
-    (x1, y1), (x2, y2) = (_point(sketch, angle, along) for along in (sketch.reach[1], sketch.reach[1] + sketch.aim))
-    hair = sketch.box[2] * HAIR
-    dashes = f"{4 * hair:.5f} {3 * hair:.5f}"
-    place = f'x1="{x1:.4f}" y1="{y1:.4f}" x2="{x2:.4f}" y2="{y2:.4f}"'
-    return f'<line class="aim" {place} stroke-width="{0.8 * hair:.5f}" stroke-dasharray="{dashes}"/>'

@@ -14,8 +14,9 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from cuelearner_jax import types, user_code
 from cuelearner_jax.errors import UserError, raised_by, shown
+from cuelearner_jax.policies import foreign
 from cuelearner_jax.policies.node import PolicyNode
-from cuelearner_jax.spaces import DIRECTIONS, Space
+from cuelearner_jax.spaces import DIRECTIONS, Choices, Space
 from cuelearner_jax.types import EnvState
 
 
@@ -70,14 +71,22 @@ class Opaque(PolicyNode):
         return self._checked(chosen, len(flat), np.asarray).reshape(*rows.shape[:-1], self.actions.size)
 
     def _checked(self, chosen: Any, rows: int, as_array: Callable[..., Any]) -> Any:
-        """What the function returned, as an array of real numbers."""
+        """What the function returned, as an array of real numbers.
+
+        Of a pair of actions and the policy's own state, as models of Stable-Baselines3 return it, the actions. Whole
+        numbers in place of choices are their places.
+        """
         wanted = (rows, self.actions.size)
+        if isinstance(chosen, tuple) and len(chosen) == 2 and (chosen[1] is None or np.ndim(chosen[0]) == 2):
+            chosen = chosen[0]
         try:
             found = as_array(chosen)
         except (TypeError, ValueError) as error:
             raise UserError(f"{named(self)} returned {shown(chosen)}: return an array of shape {wanted}") from error
         if getattr(found.dtype, "kind", "key") not in "fiu" and not jnp.issubdtype(found.dtype, jnp.floating):
             raise UserError(f"{named(self)} returned {found.dtype} numbers: return real ones, of shape {wanted}")
+        if isinstance(self.actions, Choices) and found.shape == (rows,) and getattr(found.dtype, "kind", "") in "iu":
+            return as_array(found[:, None] == np.arange(self.actions.size)).astype(np.float32)
         if found.shape != wanted:
             raise UserError(
                 f"{named(self)} returned actions of shape {found.shape} for {rows} observations: return {wanted}"
@@ -121,17 +130,22 @@ def policy_of(given: Any) -> Any:
     """Anything that acts as a policy.
 
     Args:
-        given: a policy; a class or function that gives one when it is called with nothing; or a function of a batch of
-            observations: one that `jax.jit` made is compiled with what calls it, any other gets NumPy arrays.
+        given: a policy; a class or function that gives one when it is called with nothing; a function of a batch of
+            observations: one that `jax.jit` made is compiled with what calls it, any other gets NumPy arrays; or a
+            policy of another library, see `foreign.function_of`.
 
     Raises:
         UserError: it is none of these, or a policy that is no pytree.
     """
+    if (function := foreign.function_of(given)) is not None:
+        return Opaque(function, on_host=True)
     if callable(given) and not (hasattr(given, "act") and not isinstance(given, type)) and _takes_nothing(given):
         try:
             given = given()
         except Exception as error:
             raise raised_by(f"policy {getattr(given, '__qualname__', given)}", error) from error
+        if (function := foreign.function_of(given)) is not None:
+            return Opaque(function, on_host=True)
     if hasattr(given, "act"):
         if any(leaf is given for leaf in jax.tree.leaves(given)):
             kind = type(given).__name__
@@ -143,7 +157,10 @@ def policy_of(given: Any) -> Any:
         return Opaque(given)
     if callable(given) and not isinstance(given, type):
         return Opaque(given, on_host=True)
-    raise UserError(f"{shown(given)} is no policy: give a function of observations (n, obs), or load one")
+    raise UserError(
+        f"{shown(given)} is no policy: give a function of observations (n, obs), a module of PyTorch, a "
+        "model of Stable-Baselines3 or a file in ONNX, or load one"
+    )
 
 
 def _takes_nothing(given: Callable[..., Any]) -> bool:

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from cuelearner_jax.adaptation.adapting import plain_scalars
 from cuelearner_jax.arbiters.protocol import Finishes
 from cuelearner_jax.environment import actions_of, offers, spaces_of, view_of
 from cuelearner_jax.errors import UserError, closest, listed
@@ -19,7 +20,7 @@ from cuelearner_jax.runs.adapted import AdaptedLanes, open_folder
 from cuelearner_jax.runs.failures import without_failed
 from cuelearner_jax.runs.grid import Grid
 from cuelearner_jax.runs.run_folders import Piece, RunLanes, lanes_of, open_run
-from cuelearner_jax.storage import policy_folders
+from cuelearner_jax.storage import label_files, policy_folders
 from cuelearner_jax.task import Task, shape_of
 from cuelearner_jax.terminal import console
 from cuelearner_jax.types import Teacher
@@ -121,7 +122,8 @@ class PolicySource:
                 raise UserError(f"{folder} is a run, without code in its policies: leave out --base")
             return run
         task, world, lanes = open_folder(folder, find, code, changes)
-        return cls(task, RunConfig(world), None, folder, adapted=lanes)
+        scalars = plain_scalars(actions_of(shape_of(task, world)))
+        return cls(_with_labels(task, folder), RunConfig(world, scalars=scalars), None, folder, adapted=lanes)
 
     @property
     def default_policy(self) -> str:
@@ -200,6 +202,21 @@ class PolicySource:
             pieces = self.pieces or (Piece(self.folder, self.grid),)
             loaded += lanes_of(self.task, self.config, pieces, name, sweep=pieces[0].folder != self.folder)
         return loaded
+
+
+def _with_labels(task: Task, folder: Path) -> Task:
+    """A policy folder's task, whose situations are those of the folder's labels where its configuration names none."""
+    body = task.bodies[0]
+    if body.filled is None:
+        return task
+
+    def environment(config: Any, split: str) -> Any:
+        if task.files(config) or label_files.found_in(folder) is None:
+            return body.environment(config, split)
+        rows = label_files.read(folder).labels
+        return body.filled(config, rows.obs, rows.action)  # pyright: ignore[reportOptionalCall]
+
+    return replace(task, bodies=(replace(body, environment=environment), *task.bodies[1:]))
 
 
 class Block(NamedTuple):

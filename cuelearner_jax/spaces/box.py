@@ -73,6 +73,10 @@ class Box(Space):
         bounded = jnp.clip(vector, _row(self.low, vector), _row(self.high, vector))
         return jnp.where(jnp.isfinite(vector), bounded, jnp.nan)
 
+    def outward(self, vector: Vectors, action: Vectors) -> Float[Array, "... action"]:
+        """Return a vector given in shares of the ranges as a vector to be added to the action."""
+        return jnp.asarray(vector) * _row(self._range, vector)
+
     def spread(self, count: int) -> Float[Array, "count action"]:
         """Return `count` vectors that fill the box evenly and reach its bounds, the same ones each time.
 
@@ -80,7 +84,7 @@ class Box(Space):
         quasirandom sequences", 2018); of one entry they are evenly spaced.
         """
         if count == 1:
-            return self._at(jnp.full((1, self.size), 0.5))
+            return self.middle()[None]
         ratio = 2.0
         for _ in range(64):  # the root of x^(size + 1) = x + 1
             ratio = (1 + ratio) ** (1 / (self.size + 1))
@@ -88,6 +92,10 @@ class Box(Space):
         places = np.arange(count)[:, None] * steps % 1.0 if self.size > 1 else np.arange(float(count))[:, None]
         places = (places - places.min(0)) / np.ptp(places, 0)
         return self._at(jnp.asarray(places, jnp.float32))
+
+    def middle(self) -> Float[Array, " action"]:
+        """Return the vector halfway between the bounds."""
+        return self._at(jnp.full((self.size,), 0.5))
 
     def _at(self, shares: Float[Array, "... action"]) -> Float[Array, "... action"]:
         return _row(self.low, shares) + _row(self._range, shares) * shares

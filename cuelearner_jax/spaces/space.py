@@ -73,6 +73,10 @@ class Space:
         """Return `count` actions, spread evenly."""
         raise NotImplementedError
 
+    def middle(self) -> Float[Array, " action"] | None:
+        """Return the action in the middle of every cue's range; None: there is none."""
+        return None
+
     def to_json(self) -> dict[str, Any]:
         """Describe the space for a file; see `spaces.from_json`."""
         return {

@@ -10,14 +10,14 @@ from cuelearner_jax.spaces.box import KEYS, SHARE
 from cuelearner_jax.spaces.space import Cue
 
 LONGEST = 40  # characters of a word
-ARROWS = {"left": "ArrowLeft", "right": "ArrowRight"}
-HELD = {"left": "a", "right": "d"}  # what stands for these arrows too
+ARROWS = {"left": "ArrowLeft", "right": "ArrowRight", "up": "ArrowUp", "down": "ArrowDown"}
+HELD = {"left": "a", "right": "d"}  # what stands for two of these arrows too
 
 
 def cues_from(words: Any, names: Sequence[str] = (), unit: str = SHARE) -> tuple[Cue, ...]:
     """Return cues by their words, each with keys of its own.
 
-    Keys are arrows for left and right, or else a letter of the word that is free.
+    Keys are arrows for left, right, up and down, or else a letter of the word that is free.
 
     Args:
         words: "left,right;up,down", or pairs of words; the first of a pair asks for more of an entry, the second for

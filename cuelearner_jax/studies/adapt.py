@@ -371,7 +371,9 @@ def sentences(found: Adapted) -> list[str]:
             worth, worse = f"{judged.by} on tuning episodes {before} before, {after} after", "worse than before"
             worth += f" ({_worth(judged.difference[own], judged.rewarded_steps[own])})"
         lines.append(f"{budget} labels within {bound:g} {unit}: {worth}")
-        if narrowed := sorted({*judged.within_deg[own & judged.used].round(3).tolist()} - {round(bound, 3)}):
+        if narrowed := sorted(
+            {*judged.within_deg[own & judged.used].astype(float).round(3).tolist()} - {round(bound, 3)}
+        ):
             lines[-1] += f", used within {' or '.join(f'{angle:g}' for angle in narrowed)} {unit}"
         left = lanes.seed[own & ~judged.used]
         if len(left):

@@ -5,6 +5,10 @@ Source: `generate_mujoco_observations` and `_get_obs` of `gymnasium_robotics/env
 
 from __future__ import annotations
 
+import json
+import math
+from typing import Any
+
 from cuelearner_jax.environment import OWN, Quantity
 
 # What a camera tells of the object and the goal is in metres, and shifts with the camera. What the robot measures of
@@ -16,7 +20,7 @@ _OBJECT = (
 )
 _FINGERS = Quantity("finger positions", 2, "m", "how far each finger is open", OWN)
 _MOTION = (
-    Quantity("object rotation", 3, "rad", "Euler angles", OWN),
+    Quantity("object rotation", 3, "rad (Euler angles)"),
     Quantity("object velocity", 3, "m a step", "relative to the gripper"),
     Quantity("object angular velocity", 3, "rad a step"),
 )
@@ -27,6 +31,9 @@ _GRIPPER_MOTION = (
 _DESIRED = Quantity("desired goal", 3, "m", "where the gripper, or the object, is to be")
 CUES = ("forward,backward", "left,right", "up,down", "open,close")
 CUE_NAMES = ("x", "y", "z", "fingers")
+# Of pictures: over the robot's shoulder, so that its left is to the left. Fetch's own camera faces the robot.
+CAMERA = {"distance": 1.6, "azimuth": 45.0, "elevation": -30.0, "lookat": [1.3, 0.75, 0.5]}
+FETCH = "FetchReach", "FetchPush", "FetchSlide", "FetchPickAndPlace"
 
 
 def layout_of(environment: str) -> tuple[Quantity, ...] | None:
@@ -34,7 +41,29 @@ def layout_of(environment: str) -> tuple[Quantity, ...] | None:
     if environment.startswith("FetchReach"):
         achieved = Quantity("achieved goal", 3, "m", "the gripper position again", OWN)
         return achieved, _DESIRED, _GRIPPER, _FINGERS, *_GRIPPER_MOTION
-    if environment.startswith(("FetchPush", "FetchSlide", "FetchPickAndPlace")):
+    if environment.startswith(FETCH):
         achieved = Quantity("achieved goal", 3, "m", "the object position again")
         return achieved, _DESIRED, _GRIPPER, *_OBJECT, _FINGERS, *_MOTION, *_GRIPPER_MOTION
     return None
+
+
+def drawn_with(environment: str, arguments: str) -> str:
+    """Return the arguments of an environment (JSON) for pictures: with the camera, where Fetch is given none."""
+    named: dict[str, Any] = json.loads(arguments)
+    if not environment.startswith(FETCH) or "default_camera_config" in named:
+        return arguments
+    return json.dumps({**named, "default_camera_config": CAMERA})
+
+
+def points_of(environment: str, arguments: str) -> tuple[tuple[float, float] | None, ...]:
+    """Return which way more of each cue points in Fetch's pictures (`Sketch.points`); none for other environments."""
+    if not environment.startswith(FETCH):
+        return ()
+    up = (0.0, -1.0)
+    if "default_camera_config" in json.loads(arguments):
+        return None, None, up, None
+    turn, tilt = (math.radians(float(CAMERA[name])) for name in ("azimuth", "elevation"))  # pyright: ignore
+    sight, rise = (math.cos(turn), math.sin(turn)), math.sin(-tilt)
+    # A step away from the camera leads up the picture, by as much as the camera looks down.
+    forward, left = (sight[1], -sight[0] * rise), (-sight[0], -sight[1] * rise)
+    return forward, left, up, None

@@ -190,7 +190,7 @@ GYMNASIUM = Task(
     bodies=(body(),),
     longest=_longest,
     judge_by=_judge_by,
-    labels_hold=("arguments", "max_steps", "processes", "succeeds"),  # a label is about what one observation shows
+    labels_hold=("max_steps", "processes", "succeeds"),  # a label is about what one observation shows
 )
 
 
@@ -235,24 +235,18 @@ def task_from(
     name = given if isinstance(given, str) else called or _called(given)
     if factory is None and not max_steps:
         max_steps = known(name).max_episode_steps
-    try:
-        text = json.dumps(dict(arguments or {}))
-    except (TypeError, ValueError) as error:
-        raise UserError(
-            f"the arguments of {name} cannot be kept in a file ({error}): give a function that makes the environment "
-            "with them"
-        ) from error
+    text = _kept(name, arguments or {})
     source = Source(name, text, max_steps or 0, 1, factory=factory)
     actions, slices, limit, succeeds = _seen(source)
     if not max_steps and not limit:
-        raise UserError(f"environment {name} has no limit of steps: give max_steps, after which episodes are truncated")
+        raise UserError(
+            f"environment {name} has no limit of steps: give max_steps to cl.from_gymnasium, or wrap it in "
+            "gymnasium.wrappers.TimeLimit"
+        )
     fetch = fetch_layout.layout_of(name) if factory is None else None
     slices = _named(name, slices, observation or fetch, units or {})
-    words = (
-        cues.split(";")
-        if isinstance(cues, str)
-        else [pair if isinstance(pair, str) else ",".join(pair) for pair in cues]
-    )
+    pairs = cues.split(";") if isinstance(cues, str) else cues
+    words = [pair if isinstance(pair, str) else ",".join(pair) for pair in pairs if pair]
     names: tuple[str, ...] = ()
     if not words and fetch and len(actions.low) == len(fetch_layout.CUES):
         words, names = list(fetch_layout.CUES), fetch_layout.CUE_NAMES
@@ -280,6 +274,17 @@ def task_from(
         bodies=(body(factory),),
         presets=presets(config, num_envs),
     )
+
+
+def _kept(name: str, arguments: Mapping[str, Any]) -> str:
+    """Arguments as a file keeps them."""
+    try:
+        return json.dumps(dict(arguments))
+    except (TypeError, ValueError) as error:
+        raise UserError(
+            f"the arguments of {name} cannot be kept in a file ({error}): give a function that makes the environment "
+            "with them"
+        ) from error
 
 
 def _called(code: Any) -> str:

@@ -14,6 +14,7 @@ from cuelearner_jax import pictures, user_code
 from cuelearner_jax.bridges.gymnasium.environment import Episode, GymnasiumTask
 from cuelearner_jax.bridges.gymnasium.pool import pool_of
 from cuelearner_jax.task import Pictures
+from cuelearner_jax.tasks import fetch_layout
 from cuelearner_jax.types import Reel, Sketch
 
 HELD = 5  # steps for which a clip holds an action: one alone is hardly seen
@@ -27,7 +28,10 @@ Frame = UInt8[np.ndarray, "height width 3"]
 def frames_of(env: GymnasiumTask, slot: int, seed: int, actions: Any, first: int) -> list[Frame]:
     """Return pictures of an episode from after `first` of its actions on. Raises UserError where there are none."""
     rows = np.asarray(actions, np.float32).reshape(-1, env.actions.size)
-    return pool_of(dataclasses.replace(env.source, drawn=True)).filmed(slot, seed, rows, first)
+    source = env.source
+    if source.factory is None:
+        source = dataclasses.replace(source, arguments=fetch_layout.drawn_with(source.name, source.arguments))
+    return pool_of(dataclasses.replace(source, drawn=True)).filmed(slot, seed, rows, first)
 
 
 def _went(state: Episode) -> tuple[int, np.ndarray]:
@@ -44,7 +48,9 @@ def picture(env: GymnasiumTask, state: Episode) -> Frame:
 
 def sketch(env: GymnasiumTask, state: Episode) -> Sketch:
     """Return what a state looks like, for the page."""
-    return pictures.sketch(picture(env, state), f"step {int(state.steps) + 1}")
+    found = pictures.sketch(picture(env, state), f"step {int(state.steps) + 1}")
+    source = env.source
+    return found if source.factory else found._replace(points=fetch_layout.points_of(source.name, source.arguments))
 
 
 def reel(env: GymnasiumTask, state: Episode, action: Float[Array, " action"]) -> Reel:

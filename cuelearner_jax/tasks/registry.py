@@ -21,11 +21,19 @@ GROUP = "cuelearner.tasks"  # of entry points: the task's name = "package.module
 BUILT_IN = {
     "billiards": "cuelearner_jax.tasks.billiards:BILLIARDS",
     "gymnasium": "cuelearner_jax.tasks.gymnasium:GYMNASIUM",
+    "logs": "cuelearner_jax.tasks.logs:LOGS",
     "navigation": "cuelearner_jax.tasks.navigation:NAVIGATION",
+    "brax": "cuelearner_jax.tasks.brax:BRAX",
+    "playground": "cuelearner_jax.tasks.playground:PLAYGROUND",
 }
 # Environments of other libraries, named FAMILY:ENVIRONMENT: a function from the environment's name to a task, which
 # bears the family's name. The family's own task, by which its folders are read, is built in.
-FAMILIES: dict[str, str] = {"gymnasium": "cuelearner_jax.tasks.gymnasium:task_of"}
+FAMILIES: dict[str, str] = {
+    "gymnasium": "cuelearner_jax.tasks.gymnasium:task_of",
+    "logs": "cuelearner_jax.tasks.logs:task_of",
+    "brax": "cuelearner_jax.tasks.brax:task_of",
+    "playground": "cuelearner_jax.tasks.playground:task_of",
+}
 
 _registered: dict[str, Task] = {}
 
@@ -71,8 +79,6 @@ def resolve(text: str) -> Task:
     Raises:
         UserError: no such task, or its code cannot be loaded.
     """
-    if text in FAMILIES:
-        raise UserError(f"{text} is a family of tasks: name one of its environments, as {text}:NAME")
     if ":" not in text:
         return find(text)
     family, _, environment = text.partition(":")

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import probes
 import pytest
+from box_task import SMALL, Reach
 from brax import envs
 from brax.envs.wrappers import training
 from brax.training.agents.ppo import losses as ppo_losses
@@ -21,6 +22,8 @@ from cuelearner_envs.navigation import config as navigation
 from cuelearner_jax.bridges import brax as brax_adapter
 from cuelearner_jax.bridges.brax import to_brax, wrap_for_training
 from cuelearner_jax.environment import Quantity, WholeObservations
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.spaces import Choices
 from cuelearner_jax.types import Step
 
 RAW = jax.random.key_data(jax.random.key(0))
@@ -68,6 +71,23 @@ def test_a_step_is_ours_with_the_direction_of_the_action():
     assert jax.tree.structure(state) == jax.tree.structure(after)
     kinds = lambda tree: jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype), tree)  # noqa: E731
     assert kinds(state) == kinds(after)
+
+
+def test_a_box_is_stretched_to_the_cube_of_brax():
+    reach = Reach()  # lower bounds -1, 0 and -2, upper bounds 1, 4 and 0
+    env = to_brax(reach)
+    assert env.action_size == 3
+    state = env.reset(RAW)
+    in_cube = lambda action: 2 * (action - jnp.array(SMALL.low)) / jnp.array([2.0, 4.0, 2.0]) - 1  # noqa: E731
+    best = reach.best(state.obs)
+    assert env.step(state, in_cube(best)).reward == 1
+    assert env.step(state, in_cube(best).at[1].add(0.3)).reward == 0  # 0.15 of the range away
+    corner = Reach(offset=jnp.float32(5.0))  # whose best action is the upper corner
+    env = to_brax(corner)
+    assert env.step(env.reset(RAW), jnp.full(3, 3.0)).reward == 1  # beyond the bounds is brought back
+    assert env.step(env.reset(RAW), jnp.ones(3)).reward == 1
+    with pytest.raises(UserError, match="to_brax works for directions and boxes, not for actions that are choices"):
+        to_brax(Reach(Choices(3)))
 
 
 def test_a_typed_key_will_do():

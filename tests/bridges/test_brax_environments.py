@@ -12,9 +12,11 @@ from brax.envs.wrappers import training
 
 from cuelearner_jax import loop
 from cuelearner_jax.bridges.brax import from_brax, to_brax
-from cuelearner_jax.environment import Environment, offers, symmetries_of
+from cuelearner_jax.bridges.jax_environment import cues_of
+from cuelearner_jax.environment import Environment, actions_of, offers, symmetries_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides import registry as guidances
+from cuelearner_jax.spaces import DIRECTIONS, Box, Cue
 from cuelearner_jax.spaces.directions import evenly_spaced
 
 
@@ -98,15 +100,51 @@ def test_a_step_leaves_the_state_that_it_was_given():
     env = from_brax(Field())
     state, _ = env.reset(jax.random.key(0))
     env.step(jax.random.key(1), state, jnp.array([1.0, 0.0]))
-    assert state.brax.metrics["length"] == 0
+    assert state.state.metrics["length"] == 0
 
 
 def test_actions_of_another_size():
-    start, steps = walk(from_brax(Field(1)), [(-0.6, 0.8)])
+    start, steps = walk(from_brax(Field(1)), [(-0.6,)])
     np.testing.assert_allclose(steps[0].final_obs, start + np.array([-0.3, 0.0]), atol=1e-7)
+    start, steps = walk(from_brax(Field(3)), [(-0.6, 0.8, 0.5)])
+    np.testing.assert_allclose(steps[0].final_obs, start + np.array([-0.3, 0.4]), atol=1e-7)
     three = from_brax(Field(3), to_action=lambda direction: jnp.append(-direction, 0.0))
     start, steps = walk(three, [(-0.6, 0.8)])
     np.testing.assert_allclose(steps[0].final_obs, start + np.array([0.3, -0.4]), atol=1e-7)
+
+
+def test_actions_are_the_whole_box_or_directions_where_the_caller_says_what_they_mean():
+    box = from_brax(Field(3)).actions
+    assert (box.low, box.high) == ((-1.0,) * 3, (1.0,) * 3)
+    assert [cue.name for cue in box.cues] == ["entry 1", "entry 2", "entry 3"]
+    assert {cue.words for cue in box.cues} == {("more", "less")}
+    own = (Cue("east", ("right", "left"), ("d", "a"), "shares"), Cue("north", ("up", "down"), ("w", "s"), "shares"))
+    assert from_brax(Field(), cues=own).actions == Box((-1.0, -1.0), (1.0, 1.0), own)
+    assert actions_of(from_brax(Field(), lambda direction: direction)) == DIRECTIONS
+    named = from_brax(envs.get_environment("halfcheetah")).actions  # by its model
+    assert [cue.name for cue in named.cues] == ["bthigh", "bshin", "bfoot", "fthigh", "fshin", "ffoot"]
+    assert len({key for cue in cues_of(["joint"] * 21) for key in cue.keys}) == 42  # a humanoid's
+    with pytest.raises(UserError, match="22 entries, and keys are for 21: give `cues`"):
+        cues_of(["joint"] * 22)
+
+
+def test_observations_in_a_dictionary_are_one_vector_with_named_slices():
+    class Parts(Field):
+        def reset(self, rng):
+            state = super().reset(rng)
+            return state.replace(obs={"place": state.obs, "angle": state.obs[0]})
+
+        def step(self, state, action):
+            after = super().step(state.replace(obs=state.obs["place"]), action)
+            return after.replace(obs={"place": after.obs, "angle": after.obs[0]})
+
+    env = from_brax(Parts())
+    assert [(part.name, part.size) for part in env.observation] == [("angle", 1), ("place", 2)]
+    (whole, steps), (start, expected) = walk(env, [(0.6, 0.8)] * 3), walk(from_brax(Field()), [(0.6, 0.8)] * 3)
+    np.testing.assert_array_equal(whole, start[[0, 0, 1]])
+    for one, other in zip(steps, expected, strict=True):
+        np.testing.assert_array_equal(one.obs, other.obs[[0, 0, 1]])
+        np.testing.assert_array_equal(one.aftermath, other.aftermath[[0, 0, 1]])
 
 
 def test_there_is_an_obvious_direction_where_one_is_given():
@@ -118,10 +156,13 @@ def test_there_is_an_obvious_direction_where_one_is_given():
 @pytest.mark.parametrize(
     ("env", "to_action", "words"),
     [
-        (Field(3), None, "Field: an action has 3 entries: pass to_action"),
         (Field(3), lambda direction: direction, r"Field: to_action returns shape \(2,\), but .* \(3,\)"),
-        (envs.get_environment("fast", obs_mode="dict_state"), None, r"Fast: .* dictionary \(state\)"),
-        (training.VmapWrapper(Field(), 2), None, r"Field: observations have shape \(2, 2\)"),
+        (
+            envs.get_environment("fast", obs_mode="dict_pixels"),
+            None,
+            r"Fast: .* 'pixels/view_0' is an image \(4, 4, 3\)",
+        ),
+        (training.VmapWrapper(Field(), 2), None, r"Field: it is a batch of shape \(2,\): give a single"),
         (training.AutoResetWrapper(Field()), None, "Field: AutoResetWrapper hides"),
     ],
 )
@@ -129,6 +170,8 @@ def test_what_does_not_fit_is_refused_in_one_line(env, to_action, words):
     with pytest.raises(UserError, match=words) as refused:
         from_brax(env, to_action)
     assert "\n" not in str(refused.value)
+    with pytest.raises(UserError, match="cues are of the box, to_action of directions: give one of the two"):
+        from_brax(Field(), lambda direction: direction, cues=from_brax(Field()).actions.cues)
 
 
 # Our loop on brax's.

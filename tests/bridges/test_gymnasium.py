@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from gymnasium_worlds import Adder, Faulty, Forgetful, Nested, start_of
+from gymnasium_worlds import Adder, Faulty, Forgetful, Nested, Reach, start_of, toward
 
 import cuelearner_jax as cl
 from cuelearner_jax import user_code
@@ -324,3 +324,19 @@ def test_without_gymnasium_one_line_says_what_to_install(monkeypatch):
     monkeypatch.setattr(source, "find_spec", lambda name: None)
     with pytest.raises(UserError, match=r"Gymnasium is not installed: pip install 'cuelearner-jax\[gymnasium\]'"):
         cl.from_gymnasium("CartPole-v1")
+
+
+@pytest.mark.long
+def test_an_agent_is_trained_and_called_in_the_space_of_its_world():
+    here = cl.from_gymnasium(Reach, max_steps=12, num_envs=2, processes=1)
+    start = here.task.presets["quickstart"].config
+    schedule = dataclasses.replace(
+        start.schedule, total_steps=40, eval_every=40, checkpoint_every=40, eval_envs=2, eval_steps=24
+    )
+    agent = dataclasses.replace(start.agent, q_layers=(8,), directions=8, target_directions=8, replay_capacity=40)
+    sizes = dataclasses.replace(start.sizes, feedback_layers=(8,), fit_steps=20, fit_batch_size=16)
+    config = dataclasses.replace(start, schedule=schedule, agent=agent, sizes=sizes)
+    run = cl.train(here, toward, config, guidance=["relative"], labels=[10], seeds=2, progress=False)
+    policy = run.policy()
+    assert policy(np.zeros((2, 6))).shape == (2, 3)
+    assert np.isfinite(cl.measure(policy, here, episodes=2).metrics["return"]).all()

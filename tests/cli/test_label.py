@@ -76,6 +76,8 @@ def test_the_page_is_served_to_who_knows_its_address_until_ctrl_c(tmp_path, refu
         (["--port", "70000"], "--port is 70000: give a number"),
         (["--base.seed", "1"], "--base.… chooses in a folder, and none is given"),
         (["--who", " "], "--who is empty"),
+        (["--one-cue"], "--one-cue is for relative answers about several cues: leave it out"),
+        (["--cues", "left,right"], "has its own: leave it out"),
         (["--robot", "anymal"], "has no robots to choose from"),
         (["--again", "nothing"], "no label file at nothing"),
         (["--questions", "near_aims"], "--questions is near_aims, but wandering has no aims in this world"),

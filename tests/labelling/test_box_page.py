@@ -35,7 +35,7 @@ def test_each_cue_has_its_words_and_keys_and_no_key_says_two_things():
     assert known["pick-2-more"].keys == ("o", "O")
     assert known["pick-1-less"].keys == ("f", "F")
     assert known["film"].keys == ("v", "V")  # F is the second cue's
-    assert "height: down: F" in controls.help_lines(RELATIVE, GRIPPER)
+    assert "height: down: F" in controls.help_lines(RELATIVE, GRIPPER, known.values())
     assert "ArrowDown" in known["unsure"].keys
 
 
@@ -60,7 +60,7 @@ def test_the_page_asks_about_each_cue_and_the_file_keeps_what_was_said(tmp_path)
             for words in ("sideways", "height", "fingers", "open", "not said", "Which way should the action change?"):
                 await user.should_see(words)
             await user.should_see("the action: sideways")
-            assert 'class="arrow' not in page._scene.content
+            assert page._scene.content.count('class="said') == 4  # left, right, up, down; to open points nowhere
             assert "<path d='0'/>" in page._scene.content
             user.find(marker="pick-0-less").click()
             user.find(marker="pick-2-more").click()
@@ -118,6 +118,8 @@ def test_the_picture_of_an_action_that_is_no_arrow_says_what_it_is():
     svg = view.picture(item, RELATIVE, EPS, GRIPPER)
     assert "the action: sideways 0.5, height 1, fingers -1" in svg
     assert view.note(item._replace(refined=item.action), RELATIVE, EPS, GRIPPER).endswith(
-        "the model makes of it: sideways 0.5, height 1, fingers -1"
+        "fingers -1. The correction: as it is"
     )
+    told = view.note(item._replace(refined=np.float32([0.1, 1.0, -0.5])), RELATIVE, EPS, GRIPPER)
+    assert told.endswith("The correction: right by 20%, open by 25% of the range")
     assert probes.SCALARS.eps_deg != EPS

@@ -84,6 +84,36 @@ def test_the_buttons_of_three_cues_lie_above_the_fold(browser, tmp_path):
         assert page.evaluate("() => document.querySelector('svg.scene').getBoundingClientRect().height") > 300
 
 
+def test_a_picture_its_arrows_and_its_film_fit_a_phone(browser, tmp_path):
+    folder = tmp_path / "labels"
+    with served(folder, "--no-practice", task="photo_task:TASK") as (_, address):
+        page = browser.new_page(viewport={"width": 390, "height": 844}, has_touch=True)
+        page.goto(address)
+        page.wait_for_function("() => cue.ready()")
+        assert page.evaluate("() => document.documentElement.scrollWidth") == 390
+        sizes = "one => [one.offsetWidth, one.offsetHeight]"
+        sizes = f"() => [...document.querySelectorAll('.answers button')].flatMap({sizes})"
+        assert min(page.evaluate(sizes)) >= 44
+        assert page.evaluate("() => document.querySelector('.photo').decode().then(() => true)")
+        page.locator(".said[data-name='pick-0-more'] .touched").tap(force=True)  # the arrow to the left
+        page.wait_for_function("() => document.querySelector('.said.picked')?.dataset.name === 'pick-0-more'")
+        page.keyboard.press("c")
+        page.wait_for_function("() => document.querySelectorAll('.answers .picked').length === 3")
+        page.keyboard.press("v")
+        page.wait_for_function("() => document.querySelectorAll('image.frame').length === 6")
+        page.wait_for_function("() => document.querySelector('.film-words').textContent.includes('from the best')")
+        page.wait_for_function(
+            "() => [...document.querySelectorAll('image.frame')].every(one => one.style.visibility === 'hidden')"
+        )
+        page.keyboard.press("Enter")
+        moved(page, 0)
+        page.keyboard.press("ArrowLeft")
+        page.keyboard.press(" ")
+        moved(page, 1)
+    rows = label_files.history(folder / label_files.JSONL)
+    assert [row["answer"] for row in rows] == [[1.0, 2.0, -1.0], [1.0, 0.0, 0.0]]
+
+
 def test_pointing_shows_what_to_do_instead(browser, tmp_path):
     folder = tmp_path / "labels"
     with served(folder, "--no-practice", "--guidance", "demonstration") as (process, address):

@@ -13,7 +13,6 @@ from flax import struct
 
 from cuelearner_jax import asking
 from cuelearner_jax.agents import ddqn
-from cuelearner_jax.bridges import brax
 from cuelearner_jax.environment import spaces_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.feedback import given
@@ -231,7 +230,6 @@ def test_a_label_file_holds_answers_about_a_box(form, tmp_path):
     ("what", "planar"),
     [
         ("agent.coarse_directions", lambda: ddqn.Config(coarse_directions=36).make("raw", spaces_of(Reach()))),
-        ("to_brax", lambda: brax.to_brax(Reach())),
     ],
 )
 def test_what_knows_directions_alone_refuses_a_box(what, planar):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -100,8 +101,7 @@ class GymnasiumTask(WholeObservations, struct.PyTreeNode):
     def _reset_here(self, seed: Any) -> tuple[np.ndarray, np.ndarray]:
         """Reset on the host: any leading axes."""
         seeds = np.asarray(seed)
-        requests = [Request(int(one)) for one in seeds.ravel()]
-        obs, place = self._carried(requests)[::7]
+        obs, *_, place = self._carried([Request(one) for one in seeds.ravel().tolist()])
         return obs.reshape((*seeds.shape, -1)), place.reshape((*seeds.shape, 2))
 
     def _step_here(self, *given: Any) -> tuple[np.ndarray, ...]:
@@ -110,34 +110,37 @@ class GymnasiumTask(WholeObservations, struct.PyTreeNode):
         shape = seeds.shape
         seeds, steps, next_seeds = (column.ravel().tolist() for column in (seeds, steps, next_seeds))
         history, actions = history.reshape(-1, *history.shape[-2:]), actions.reshape(-1, actions.shape[-1])
-        places = np.ascontiguousarray(places).reshape(-1, 2)
+        places = [row.tobytes() for row in np.ascontiguousarray(places).reshape(-1, 2)]
+        # What is no action is not executed, and what comes of nothing stays nothing.
+        acts: Any = np.isfinite(actions).all(-1).tolist()
         requests = [
-            Request(seeds[row], places[row].tobytes(), steps[row], history[row], actions[row], next_seeds[row])
-            for row in range(len(seeds))
+            Request(*row) if sound and row[1] != NOWHERE else None
+            for sound, *row in zip(acts, seeds, places, steps, history, actions, next_seeds, strict=True)
         ]
         found = self._carried(requests)
         return tuple(column.reshape((*shape, *column.shape[1:])) for column in found)
 
-    def _carried(self, requests: list[Request]) -> tuple[np.ndarray, ...]:
-        """What requests led to, column by column; NaN once an environment has failed, which `user_code` tells."""
-        rows = len(requests)
+    def _carried(self, requests: Sequence[Request | None]) -> tuple[np.ndarray, ...]:
+        """What requests led to, column by column; NaN where there is none, and once an environment has failed.
+
+        `user_code` then tells of the failure.
+        """
+        rows, asked = len(requests), [row for row, one in enumerate(requests) if one is not None]
         obs, final_obs = np.full((2, rows, self.obs_size), np.nan, np.float32)
         reward, success, total = np.full((3, rows), np.nan, np.float32)
         terminated, truncated = np.zeros((2, rows), bool)
         place = np.zeros((rows, 2), np.uint32)
-        # What is no action is not executed, and what comes of nothing stays nothing.
-        acts = [one.action is None or (one.place != NOWHERE and np.isfinite(one.action).all()) for one in requests]
-        went = []
-        if not user_code.is_waiting():
+        if asked and not user_code.is_waiting():
             try:
-                went = pool_of(self.source).carry_out([one for one, sound in zip(requests, acts, strict=True) if sound])
+                went = pool_of(self.source).carry_out([one for one in requests if one is not None])
             except UserError as error:
                 user_code.leave(self._whose, error)
-        for row, one in zip(np.flatnonzero(np.asarray(acts)), went, strict=False):
-            obs[row], final_obs[row], reward[row] = one.obs, one.final_obs, one.reward
-            terminated[row], truncated[row] = one.terminated, one.truncated
-            success[row], total[row] = one.success, one.total
-            place[row] = np.frombuffer(one.place, np.uint32)
+            else:
+                columns = zip(*went, strict=True)
+                parts = obs, final_obs, reward, terminated, truncated, success, total
+                for part, column in zip(parts, columns, strict=False):  # all but the places
+                    part[asked] = column
+                place[asked] = np.frombuffer(b"".join(one.place for one in went), np.uint32).reshape(-1, 2)
         return obs, final_obs, reward, terminated, truncated, success, total, place
 
 

@@ -9,12 +9,14 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import math
+import struct
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from cuelearner_jax.bridges.gymnasium.layout import NoVector, actions_of, flatten, leaves_of, to_action
+from cuelearner_jax.bridges.gymnasium.layout import NoVector, action_maker, actions_of, flatten, leaves_of
 from cuelearner_jax.errors import UserError, raised_by
 
 SUCCESS = ("success", "is_success")  # names in `info`
@@ -63,6 +65,7 @@ class Running:
         self.env, self.whose = env, whose
         self.leaves = leaves_of(whose, env.observation_space)
         actions_of(whose, env.action_space)
+        self.to_action = action_maker(env.action_space)
         self.seed, self.steps, self.total, self.place = -1, 0, 0.0, b""
 
     def reset(self, seed: int) -> np.ndarray:
@@ -81,7 +84,7 @@ class Running:
         self.steps += 1
         when = f"step {self.steps} of the episode with seed {self.seed}"
         try:
-            given, reward, terminated, truncated, info = self.env.step(to_action(self.env.action_space, action))
+            given, reward, terminated, truncated, info = self.env.step(self.to_action(action))
         except Exception as error:
             raise raised_by(f"environment {self.whose}, in {when},", error) from error
         obs = self._vector(given, when)
@@ -89,14 +92,14 @@ class Running:
             reward = float(reward)
         except (TypeError, ValueError):
             raise UserError(f"environment {self.whose} gave no number as reward in {when}: mend it first") from None
-        if not np.isfinite(reward):
+        if not math.isfinite(reward):
             raise UserError(f"environment {self.whose} gave a reward of {reward} in {when}: mend it first")
         terminated = bool(terminated)
         truncated = (bool(truncated) or self.steps >= max_steps) and not terminated
         success = next((float(info[name]) for name in SUCCESS if name in info), 0.0)
         self.total += reward
-        told = np.asarray([reward, terminated, truncated, success], np.float32).tobytes()
-        parts = self.place + np.asarray(action, np.float32).tobytes() + obs.tobytes() + told
+        told = struct.pack("<d??d", reward, terminated, truncated, success)
+        parts = self.place + action.tobytes() + obs.tobytes() + told
         self.place = hashlib.blake2b(parts, digest_size=PLACE_BYTES).digest()
         return obs, reward, terminated, truncated, success
 
@@ -105,7 +108,7 @@ class Running:
             obs = flatten(self.leaves, given)
         except NoVector as error:
             raise UserError(f"environment {self.whose} gave {error} in {when}: keep its shapes") from None
-        if not np.isfinite(obs).all():
+        if not (math.isfinite(obs.sum()) or np.isfinite(obs).all()):
             start = 0
             for leaf in self.leaves:
                 if not np.isfinite(obs[start : start + leaf.size]).all():

@@ -5,7 +5,7 @@ Loads neither JAX nor Gymnasium: a worker process begins quickly.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -139,8 +139,10 @@ def actions_of(whose: str, space: Any) -> Actions:
     return Actions(tuple(low.tolist()), tuple(high.tolist()))
 
 
-def to_action(space: Any, vector: np.ndarray) -> Any:
-    """Return what the environment takes for a vector (action,)."""
+def action_maker(space: Any) -> Callable[[np.ndarray], Any]:
+    """Return what makes an action of the environment of a vector (action,)."""
     if type(space).__name__ == "Discrete":
-        return int(np.argmax(vector)) + int(space.start)
-    return vector.reshape(space.shape).astype(space.dtype)
+        start = int(space.start)
+        return lambda vector: int(vector.argmax()) + start
+    shape, dtype = space.shape, space.dtype
+    return lambda vector: vector.reshape(shape).astype(dtype)

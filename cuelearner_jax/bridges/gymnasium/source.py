@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import json
 import os
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -131,7 +132,16 @@ def made(name: str, arguments: dict[str, Any], max_steps: int) -> Any:
 
 def made_by(factory: Callable[..., Any], arguments: dict[str, Any]) -> Any:
     """Return an environment of the user's code. Raises UserError for what is none."""
-    env = factory(**arguments)
+    try:
+        env = factory(**arguments)
+    except AssertionError:
+        # What gymnasium_robotics raises beside this MuJoCo, where the user's code makes one of its environments.
+        if "gymnasium_robotics" not in sys.modules:
+            raise
+        from cuelearner_jax.bridges.gymnasium.robotics import supply_joint_types
+
+        supply_joint_types()
+        env = factory(**arguments)
     wanted = ("reset", "step", "observation_space", "action_space")
     if lacking := [name for name in wanted if not hasattr(env, name)]:
         raise UserError(

@@ -75,8 +75,8 @@ class Studio:
         self._context.free()
         self._gl.free()
 
-    def pose(self, qpos: Float[np.ndarray, "19"]) -> None:
-        """Puts the robot into a configuration."""
+    def pose(self, qpos: Float[np.ndarray, " qpos"]) -> None:
+        """Puts the model into a configuration."""
         self.data.qpos[:] = qpos
         mujoco.mj_forward(self.model, self.data)
 

@@ -1,0 +1,190 @@
+"""Simulators of brax's interface, MuJoCo Playground's too, as environments for our loop.
+
+Such a simulator has `reset(rng) -> State` and `step(state, action) -> State`; a State has `obs`, `reward`, `done`,
+`metrics` and `info`. This file imports neither library. `bridges.brax` and `bridges.playground` say what each brings.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+
+from cuelearner_jax.environment import Quantity, WholeObservations
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.spaces import DIRECTIONS, Box, Cue, Space, box
+from cuelearner_jax.types import Step
+
+State = Any  # of the simulator: a pytree with the members that this file's docstring names
+UNIT = "as the simulator has it"
+WORDS = ("more", "less")
+# Keys of cues, enough for the 21 entries of a humanoid: those of any box, letters and digits that are left, signs.
+KEYS = (*box.KEYS, "zx", "cv", "bn", "mp", "12", "34", "56", "78", "90", ",.", ";'", "[]", "-=")
+
+
+class Running(struct.PyTreeNode):
+    """State of a `JaxEnvironment` between steps."""
+
+    state: State  # of the simulator
+    steps: Int[Array, ""]  # taken in this episode
+
+
+class JaxEnvironment(WholeObservations, struct.PyTreeNode):
+    """A simulator as one of our environments (`cuelearner_jax.environment.Environment`).
+
+    The simulator is a constant of what is compiled, `max_steps` is traced. What stands here beside `simulator` is all
+    that policies look at: none of it needs the simulator.
+    """
+
+    max_steps: Int[Array, ""]  # an episode is truncated after this many
+    simulator: Callable[[], Any] = struct.field(pytree_node=False)  # gives it; equal ones share what is compiled
+    observation: tuple[Quantity, ...] = struct.field(pytree_node=False)
+    actions: Space = struct.field(pytree_node=False)
+    # action of ours -> the simulator's (n,); None: as it is
+    to_action: Callable[[Float[Array, " action"]], Float[Array, " n"]] | None = struct.field(pytree_node=False)
+    heuristic: Callable[[Float[Array, " obs"]], Float[Array, " action"]] | None = struct.field(pytree_node=False)
+
+    def reset(self, key: PRNGKeyArray) -> tuple[Running, Float[Array, " obs"]]:
+        """Start an episode."""
+        state = _as_arrays(self.simulator().reset(jax.random.key_data(key)))
+        return Running(state, jnp.zeros((), jnp.int32)), flat(state.obs)
+
+    def step(self, key: PRNGKeyArray, state: Running, action: Float[Array, " action"]) -> tuple[Running, Step]:
+        """Step the simulator, then reset it if that was the end. `key` is the reset's: simulators' steps take none."""
+        before = jax.tree.map(lambda leaf: leaf, state.state)  # simulators write into dictionaries that they are given
+        given = action if self.to_action is None else self.to_action(action)
+        after = Running(_as_arrays(self.simulator().step(before, given)), state.steps + 1)
+        stopped = jnp.asarray(after.state.info.get("truncation", 0)) > 0
+        terminated = (after.state.done > 0) & ~stopped
+        truncated = (stopped | (after.steps >= self.max_steps)) & ~terminated
+        fresh, fresh_obs = self.reset(key)
+        final_obs, ended = flat(after.state.obs), terminated | truncated
+        step = Step(
+            obs=jnp.where(ended, fresh_obs, final_obs),
+            final_obs=final_obs,
+            aftermath=final_obs,
+            reward=after.state.reward.astype(jnp.float32),
+            terminated=terminated,
+            truncated=truncated,
+            metrics={name: jnp.asarray(value, jnp.float32) for name, value in after.state.metrics.items()},
+            outcome={},
+        )
+        return jax.tree.map(partial(jnp.where, ended), fresh, after), step
+
+
+@dataclass(frozen=True)
+class Given:
+    """A simulator that the caller made; two of one simulator are equal."""
+
+    simulator: Any
+
+    def __call__(self) -> Any:
+        """Return the simulator."""
+        return self.simulator
+
+
+class Layout(NamedTuple):
+    """What policies have to know of a simulator."""
+
+    slices: tuple[str, ...]  # names of an observation's slices, in their order
+    sizes: tuple[int, ...]  # entries of each slice
+    entries: tuple[str, ...]  # names of an action's entries
+
+    @property
+    def observation(self) -> tuple[Quantity, ...]:
+        """The slices as an environment has them."""
+        return tuple(Quantity(name, size, UNIT) for name, size in zip(self.slices, self.sizes, strict=True))
+
+    def box(self, cues: Sequence[Cue] = ()) -> Box:
+        """Return the space [-1, 1]^n of the actions, with a cue an entry: `cues`, or the entry's name."""
+        size = len(self.entries)
+        named = tuple(cues) or cues_of(self.entries)
+        return Box((-1.0,) * size, (1.0,) * size, named)
+
+
+def layout_of(simulator: Any, name: str) -> Layout:
+    """Return the layout of a simulator; nothing is compiled. `name`: of the simulator, for messages.
+
+    Raises:
+        UserError: it is a batch of several, hides the end of an episode, or observes images.
+    """
+    shapes = jax.eval_shape(simulator.reset, jax.random.key_data(jax.random.key(0)))
+    if shapes.reward.shape:
+        raise UserError(f"{name}: it is a batch of shape {shapes.reward.shape}: give a single environment")
+    if "first_obs" in shapes.info:
+        raise UserError(f"{name}: AutoResetWrapper hides the last observation of an episode: pass what it wraps")
+    found = jax.tree_util.tree_leaves_with_path(shapes.obs)
+    slices = [("/".join(str(part.key) for part in path) or name.lower(), leaf.shape) for path, leaf in found]
+    for part, shape in slices:
+        if len(shape) > 1 or part.startswith("pixels"):
+            raise UserError(f"{name}: the observation {part!r} is an image {shape}: give numbers (n,), as its state")
+    return Layout(
+        tuple(part for part, _ in slices),
+        tuple(math.prod(shape) for _, shape in slices),
+        entries_of(simulator, int(simulator.action_size)),
+    )
+
+
+def flat(obs: Array | Mapping[str, Any]) -> Float[Array, " obs"]:
+    """Return an observation as one vector; the slices of a dictionary stand in the order of their names."""
+    leaves = [jnp.ravel(leaf).astype(jnp.float32) for leaf in jax.tree.leaves(obs)]
+    return leaves[0] if len(leaves) == 1 else jnp.concatenate(leaves)
+
+
+def model_of(simulator: Any) -> Any:
+    """Return a simulator's model as MuJoCo has it (`mujoco.MjModel`); None: there is none."""
+    return getattr(simulator, "mj_model", None) or getattr(getattr(simulator, "sys", None), "mj_model", None)
+
+
+def entries_of(simulator: Any, size: int) -> tuple[str, ...]:
+    """Return a name for each entry of an action: of the MuJoCo model's actuator or its joint, else its number."""
+    plain = tuple(f"entry {number}" for number in range(1, size + 1))
+    model = model_of(simulator)
+    if model is None or model.nu != size:
+        return plain
+    joints = [int(model.actuator_trnid[index, 0]) for index in range(size)]
+    named = [model.actuator(i).name or (model.joint(joints[i]).name if joints[i] >= 0 else "") for i in range(size)]
+    return tuple(named) if all(named) and len(set(named)) == size else plain
+
+
+def cues_of(entries: Sequence[str]) -> tuple[Cue, ...]:
+    """Return a cue for each entry of an action: its name, "more" and "less", and two keys.
+
+    Raises UserError for more entries than there are keys.
+    """
+    if len(entries) > len(KEYS):
+        raise UserError(f"an action has {len(entries)} entries, and keys are for {len(KEYS)}: give `cues`")
+    keys = KEYS[: len(entries)]
+    return tuple(Cue(name, WORDS, (more, less), box.SHARE) for name, (more, less) in zip(entries, keys, strict=True))
+
+
+def space_of(
+    name: str,
+    layout: Layout,
+    to_action: Callable[[Float[Array, "2"]], Float[Array, " n"]] | None,
+    cues: Sequence[Cue] = (),
+) -> Space:
+    """Return directions where `to_action` says what they mean, else the whole box.
+
+    Raises UserError where `to_action` gives other shapes, or cues are given beside it or do not fit the box.
+    """
+    if to_action is None:
+        return layout.box(cues)
+    if cues:
+        raise UserError(f"{name}: cues are of the box, to_action of directions: give one of the two")
+    given, wanted = jax.eval_shape(to_action, jnp.zeros(2)).shape, (len(layout.entries),)
+    if given != wanted:
+        raise UserError(f"{name}: to_action returns shape {given}, but an action has shape {wanted}")
+    return DIRECTIONS
+
+
+def _as_arrays(state: State) -> State:
+    """Some simulators pay Python's numbers."""
+    return jax.tree.map(jnp.asarray, state)

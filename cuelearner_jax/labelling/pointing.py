@@ -1,0 +1,132 @@
+"""Where cues point in a picture: as the task says, or by their words; and how they are drawn there."""
+
+from __future__ import annotations
+
+import html
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from cuelearner_jax.labelling.arrows import BADGE, HAIR, arrow, room
+from cuelearner_jax.labelling.controls import Control
+from cuelearner_jax.spaces import DIRECTIONS, Cue, Space
+from cuelearner_jax.spaces.box import SHARE
+from cuelearner_jax.types import Sketch
+
+Direction = tuple[float, float]  # on the screen: x to the right, y down
+AWAY = (0.7, -0.7)  # what lies farther off is drawn to the upper right: up and right are other cues'
+WORDS: dict[str, Direction] = {
+    **dict.fromkeys(("left", "leftward", "leftwards"), (-1.0, 0.0)),
+    **dict.fromkeys(("right", "rightward", "rightwards"), (1.0, 0.0)),
+    **dict.fromkeys(("up", "upward", "upwards", "higher", "raise"), (0.0, -1.0)),
+    **dict.fromkeys(("down", "downward", "downwards", "lower"), (0.0, 1.0)),
+    **dict.fromkeys(("forward", "forwards", "farther", "further", "away", "ahead"), AWAY),
+    **dict.fromkeys(("back", "backward", "backwards", "nearer", "closer"), (-AWAY[0], -AWAY[1])),
+}
+LENGTH = 0.1  # of the arrow of a cue, of the shorter side of the picture
+LEAST = 0.05  # of a sketch's reach: an arrow of an action that is shorter is not drawn
+LARGER = 1.5  # strokes and keys of cues' arrows: than those of directions
+
+
+def by_words(cue: Cue) -> Direction | None:
+    """Return which way more of a cue points by its words; None: they do not say, or contradict each other."""
+    found = [_direction(words) for words in cue.words]
+    more, less = found[0], None if found[1] is None else (-found[1][0], -found[1][1])
+    if more is not None and less is not None and more != less:
+        return None
+    return more or less
+
+
+def _direction(words: str) -> Direction | None:
+    said = {WORDS[word] for word in words.lower().replace("-", " ").split() if word in WORDS}
+    return said.pop() if len(said) == 1 else None
+
+
+def ways_of(space: Space, sketch: Sketch) -> tuple[Direction | None, ...]:
+    """Return which way more of each cue points in a sketch; nothing for directions, which are drawn as they are.
+
+    A direction that is given has its own length; one by words has length 1 or less.
+    """
+    if space == DIRECTIONS:
+        return ()
+    if sketch.points:
+        return tuple(sketch.points)
+    return tuple(by_words(cue) for cue in space.cues)
+
+
+def answers_drawn(sketch: Sketch, ways: Sequence[Direction | None], controls: Sequence[Control]) -> list[str]:
+    """Draw each control that asks for more or less of a cue that points somewhere: an arrow with its key and words.
+
+    The arrows stand near the edge, so that the middle of the picture stays free.
+    """
+    drawn, lanes = [], {}
+    for control in controls:
+        number = 0 if len(ways) == 1 else control.cue
+        if number is None or control.answer is None or (way := ways[number]) is None:
+            continue
+        sign = control.answer[number if len(control.answer) > 1 else 0]
+        if abs(sign) != 1.0:
+            continue
+        angle = math.degrees(math.atan2(-sign * way[1], sign * way[0]))
+        lane = lanes[round(angle)] = lanes.get(round(angle), -1) + 1  # several cues may point the same way
+        drawn.append(_at_edge(sketch, angle, lane, control))
+    return drawn
+
+
+def _at_edge(sketch: Sketch, angle: float, lane: int, control: Control) -> str:
+    _, _, width, height = sketch.box
+    length, size = LENGTH * min(width, height), BADGE * HAIR * width * LARGER
+    across = (lane + 1) // 2 * (-1) ** lane * 4.0 * size
+    middle = sketch.box[0] + width / 2, sketch.box[1] + height / 2
+    x, y = math.cos(math.radians(angle)), -math.sin(math.radians(angle))
+    middle = middle[0] - y * across, middle[1] + x * across
+    at = sketch._replace(foot=middle, turn=0.0)
+    out = room(at, angle) - length - 3.0 * size
+    foot = middle[0] + x * out, middle[1] + y * out
+    at = at._replace(foot=foot, reach=(0.0, length))
+    anchor = "end" if x > 0.5 else "start" if x < -0.5 else "middle"
+    words = (
+        f'<text class="cue-words" x="{foot[0] - x * 0.8 * size:.3f}" y="{foot[1] - y * 1.6 * size:.3f}" '
+        f'text-anchor="{anchor}" font-size="{1.8 * size:.3f}" stroke-width="{0.3 * size:.3f}">'
+        f"{html.escape(control.words)}</text>"
+    )
+    drawn = arrow(at, angle, control.colour, key=control.shown, larger=LARGER)
+    touched = (
+        f'<circle class="touched" cx="{foot[0] + x * length:.3f}" cy="{foot[1] + y * length:.3f}" r="{length:.3f}"/>'
+    )
+    name = html.escape(control.name)
+    return f'<g class="said {control.colour}" data-name="{name}">{touched}{drawn}{words}</g>'
+
+
+def from_foot(sketch: Sketch, ways: Sequence[Direction | None], shares: np.ndarray, name: str) -> str:
+    """Draw an action as an arrow from the foot of a sketch, if it is long enough to be seen.
+
+    `shares` (cues,) tell how far the action is from the middle of each cue's range, 1 at its end.
+    """
+    moves = [(float(share) * way[0], float(share) * way[1]) for share, way in zip(shares, ways, strict=True) if way]
+    x, y = sum(move[0] for move in moves), sum(move[1] for move in moves)
+    far = math.hypot(x, y)
+    if far < LEAST:
+        return ""
+    first, last = sketch.reach
+    at = sketch._replace(turn=0.0, reach=(first, first + far * (last - first)))
+    return arrow(at, math.degrees(math.atan2(-y, x)), name)
+
+
+def change_words(space: Space, change: np.ndarray) -> str:
+    """Return a change (cues,) in the words of the cues, as "left by 12%, open by 30% of the range".
+
+    `change` is in the space's unit.
+    """
+    of_range = space.unit == SHARE
+    told = [
+        f"{cue.words[0 if part > 0 else 1]} by {_amount(abs(part), space.unit)}"
+        for cue, part in zip(space.cues, np.asarray(change, float), strict=True)
+        if abs(part) >= 0.005 * space.reach
+    ]
+    return f"{', '.join(told)}{' of the range' if of_range else ''}" if told else "as it is"
+
+
+def _amount(value: float, unit: str) -> str:
+    return f"{100 * value:.0f}%" if unit == SHARE else f"{value:.2g} {unit}"

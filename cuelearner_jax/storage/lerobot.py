@@ -1,0 +1,221 @@
+"""LeRobot datasets, format v3.0: observations, actions and pictures of single frames; read without LeRobot.
+
+    meta/info.json                                  codebase_version, fps, features
+    meta/episodes/chunk-000/file-000.parquet        where each episode lies in the videos
+    data/chunk-000/file-000.parquet                 a row a frame
+    videos/KEY/chunk-000/file-000.mp4               the frames of many episodes, one after another
+
+Source: huggingface/lerobot 0.6.2, src/lerobot/datasets/utils.py and docs/source/lerobot-dataset-v3.mdx. Paths are those
+of the format and never templates of a file; of a video only the frames that are asked for are decoded.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import re
+from collections.abc import Callable
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from jaxtyping import Float
+
+from cuelearner_jax.errors import UserError, shown
+from cuelearner_jax.storage.picture_files import Picture, inside
+from cuelearner_jax.storage.room import check_room, check_size
+
+INFO = Path("meta/info.json")
+VERSION = "v3.0"  # of the format
+VIDEO = "videos/{key}/chunk-{chunk:03d}/file-{file:03d}.mp4"
+OBSERVATION, ACTION = "observation", "action"
+
+
+class Recording(NamedTuple):
+    """The frames of a dataset, in the order of its files."""
+
+    observations: Float[np.ndarray, "n obs"]
+    actions: Float[np.ndarray, "n action"]
+    observation_entries: tuple[str, ...]  # empty: the dataset names none
+    action_entries: tuple[str, ...]
+    frames: Callable[[int], Picture] | None  # row -> the picture of its first camera; None: there is no camera
+
+
+def is_one(path: Path) -> bool:
+    """Is a folder a LeRobot dataset?"""
+    return (path / INFO).is_file()
+
+
+def read(path: Path) -> Recording:
+    """Read a dataset's rows; its pictures are read when they are asked for.
+
+    Raises:
+        UserError: it is of another version of the format, damaged, or has no observations or actions that are vectors.
+    """
+    info = _info(path)
+    features = info["features"]
+    seen = [key for key, told in features.items() if key.startswith(f"{OBSERVATION}.") and _is_vector(told)]
+    for name, found in ((f"{OBSERVATION}.state", seen), (ACTION, _is_vector(features.get(ACTION)))):
+        if not found:
+            raise UserError(
+                f"{path} has no feature {name} of numbers (it has {', '.join(features)}): give a dataset with one"
+            )
+    cameras = [
+        key for key, told in features.items() if isinstance(told, dict) and told.get("dtype") in ("video", "image")
+    ]
+    table = _rows(path, [*seen, ACTION, "episode_index", "timestamp", *_stored(features, cameras[:1])])
+    vectors = {key: _vectors(path, table, key, features[key]) for key in [*seen, ACTION]}
+    observed = [
+        name for key in seen for name in _entries(features[key], key.partition(".")[2] if len(seen) > 1 else "")
+    ]
+    return Recording(
+        np.concatenate([vectors[key] for key in seen], -1),
+        vectors[ACTION],
+        tuple(observed) if len(set(observed)) == sum(vectors[key].shape[1] for key in seen) else (),
+        _entries(features[ACTION], ""),
+        _frames(path, info, table, cameras[0]) if cameras else None,
+    )
+
+
+def _info(path: Path) -> dict[str, Any]:
+    """What info.json says. Raises UserError for another version of the format, or nonsense."""
+    file = path / INFO
+    try:
+        check_size(file)
+        info = json.loads(file.read_text(encoding="utf-8"))
+        version, sound = info["codebase_version"], isinstance(info["features"], dict) and info["fps"] > 0
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+        raise UserError(f"{file} is damaged: restore it from where the dataset came from") from error
+    if version != VERSION:
+        raise UserError(
+            f"{path} is a LeRobot dataset of the format {shown(version)}, {VERSION} is wanted: convert it by LeRobot's "
+            "own script first"
+        )
+    if not sound:
+        raise UserError(f"{file} is damaged: restore it from where the dataset came from")
+    return info
+
+
+def _is_vector(told: Any) -> bool:
+    """Is a feature a row of numbers?"""
+    if not isinstance(told, dict) or not str(told.get("dtype")).startswith(("float", "int")):
+        return False
+    shape = told.get("shape")
+    return isinstance(shape, list) and len(shape) == 1 and type(shape[0]) is int and shape[0] > 0
+
+
+def _stored(features: dict[str, Any], cameras: list[str]) -> list[str]:
+    """Cameras whose pictures lie in the rows themselves."""
+    return [key for key in cameras if features[key].get("dtype") == "image"]
+
+
+def _rows(path: Path, columns: list[str]) -> pa.Table:
+    """These columns of all data files. Raises UserError for files that cannot be read, or lack a column."""
+    files = sorted((path / "data").glob("chunk-*/file-*.parquet"))
+    if not files:
+        raise UserError(f"{path / 'data'} holds no frames: restore it from where the dataset came from")
+    return pa.concat_tables([_parquet(path, file, columns) for file in files], promote_options="permissive")
+
+
+def _parquet(path: Path, file: Path, columns: list[str]) -> pa.Table:
+    inside(path, str(file.relative_to(path)), "the file")
+    try:
+        opened = pq.ParquetFile(file)
+        groups = (opened.metadata.row_group(group) for group in range(opened.num_row_groups))
+        check_room(f"{file} is large", 4 * sum(group.total_byte_size for group in groups), "give fewer episodes")
+        if missing := [name for name in columns if name not in opened.schema_arrow.names]:
+            raise UserError(f"{file} has no column {missing[0]}: restore it from where the dataset came from")
+        return opened.read(columns=columns)
+    except (pa.ArrowException, OSError, ValueError) as error:
+        raise UserError(f"{file} cannot be read: restore it from where the dataset came from") from error
+
+
+def _vectors(path: Path, table: pa.Table, key: str, told: dict[str, Any]) -> Float[np.ndarray, "n size"]:
+    size = told["shape"][0]
+    try:
+        found = np.asarray(table[key].to_pylist(), np.float32)
+        found = found.reshape(len(table), 1) if size == 1 else found
+        if found.shape != (len(table), size):
+            raise ValueError
+    except (TypeError, ValueError) as error:
+        raise UserError(f"{path}: {key} does not hold {size} numbers in every frame: leave the others out") from error
+    return found
+
+
+def _entries(told: dict[str, Any], before: str) -> tuple[str, ...]:
+    """Names of a vector's entries; empty: the dataset names none, or not as many."""
+    names: Any = told.get("names")
+    size = told["shape"][0]
+    if isinstance(names, dict):
+        values = list(names.values())
+        if all(isinstance(value, list) for value in values):
+            names = [name for value in values for name in value]
+        elif all(type(value) is int for value in values):
+            names = sorted(names, key=lambda name: names[name])
+    if not isinstance(names, list) or len(names) != size or len(set(map(str, names))) != size:
+        return ()
+    return tuple(f"{before}: {name}" if before else str(name) for name in names)
+
+
+def _frames(path: Path, info: dict[str, Any], table: pa.Table, key: str) -> Callable[[int], Picture]:
+    """Row -> its picture by a camera."""
+    if info["features"][key]["dtype"] == "image":
+        return lambda row: _embedded(path, key, table[key][row].as_py())
+    names = {name: f"videos/{key}/{name}" for name in ("chunk_index", "file_index", "from_timestamp")}
+    starts: dict[int, tuple[int, int, float]] = {}
+    for file in sorted((path / "meta/episodes").glob("chunk-*/file-*.parquet")):
+        told = _parquet(path, file, ["episode_index", *names.values()])
+        columns = (told[name].to_pylist() for name in ("episode_index", *names.values()))
+        starts |= {episode: tuple(rest) for episode, *rest in zip(*columns, strict=True)}
+
+    def frame(row: int) -> Picture:
+        episode, since = table["episode_index"][row].as_py(), table["timestamp"][row].as_py()
+        if episode not in starts:
+            raise UserError(f"{path / 'meta/episodes'} does not name the episode {episode}: restore it")
+        chunk, number, start = starts[episode]
+        try:
+            name, frame = (
+                VIDEO.format(key=key, chunk=int(chunk), file=int(number)),
+                round((start + since) * info["fps"]),
+            )
+        except (TypeError, ValueError, OverflowError) as error:
+            raise UserError(
+                f"{path / 'meta/episodes'} does not say where episode {episode} begins: restore it"
+            ) from error
+        return Picture(_decoded(inside(path, name, "the video"), frame), "image/png")
+
+    return frame
+
+
+def _embedded(path: Path, key: str, stored: Any) -> Picture:
+    """A picture that lies in its row, as {"bytes": ..., "path": ...}, or in a file that the row names."""
+    data, name = (stored.get(part) for part in ("bytes", "path")) if isinstance(stored, dict) else (None, None)
+    if data is None and isinstance(name, str):
+        try:
+            data = inside(path, name, "picture").read_bytes()
+        except OSError as error:
+            raise UserError(f"picture {name} of {path} cannot be read ({error.strerror}): put it there") from error
+    if not isinstance(data, bytes):
+        raise UserError(f"{path}: a frame of {key} holds no picture: restore it from where the dataset came from")
+    kind = "image/jpeg" if data.startswith(b"\xff\xd8") else "image/png"
+    return Picture(data, kind)
+
+
+@lru_cache(maxsize=64)
+def _decoded(file: Path, number: int) -> bytes:
+    """One frame of a video as PNG. Raises UserError if it cannot be had."""
+    import imageio.v2 as imageio  # takes a while to load
+    from PIL import Image
+
+    try:
+        with imageio.get_reader(file, format="FFMPEG") as video:  # pyright: ignore[reportArgumentType]
+            frame = np.asarray(video.get_data(number))  # pyright: ignore[reportAttributeAccessIssue]
+    except (OSError, RuntimeError, IndexError, ValueError) as error:
+        why = re.sub(r"\s+", " ", str(error))[:80]
+        raise UserError(f"frame {number} of {file} cannot be had ({why}): restore the video") from error
+    stored = io.BytesIO()
+    Image.fromarray(frame).save(stored, "PNG")
+    return stored.getvalue()

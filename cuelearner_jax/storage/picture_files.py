@@ -1,0 +1,71 @@
+"""Pictures beside recorded situations: files of a folder, by names that do not lead out of the folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from cuelearner_jax.errors import UserError, shown
+
+KINDS = {
+    ".png": "image/png",
+    ".jpg": "image/jpeg",
+    ".jpeg": "image/jpeg",
+    ".gif": "image/gif",
+    ".mp4": "video/mp4",
+}
+LARGEST_PICTURE = 50_000_000  # bytes
+
+
+class Picture(NamedTuple):
+    """A picture or a short clip as it lies in a file."""
+
+    data: bytes
+    kind: str  # its media type, one of `KINDS`
+
+
+def inside(folder: Path, name: str, what: str) -> Path:
+    """A file below a folder by its name there. Raises UserError for a path that leads out of the folder."""
+    root = folder.resolve()
+    try:
+        there = (root / name).resolve()
+    except (OSError, ValueError, RuntimeError):
+        there = root
+    if Path(name).is_absolute() or not there.is_relative_to(root) or there == root:
+        raise UserError(f"{what} {shown(name)} leads out of {folder}: give the name of a file in that folder")
+    return there
+
+
+class PictureFiles:
+    """Pictures in files beside a table."""
+
+    def __init__(self, table: Path, names: Any, rows: int) -> None:
+        """Raises UserError for names that are none, are too few, or lead out of the folder."""
+        self._folder = table.parent
+        names = [
+            None if name in (None, "") else name for name in (names.tolist() if hasattr(names, "tolist") else names)
+        ]
+        if len(names) != rows:
+            raise UserError(
+                f"{table} has {len(names)} pictures for {rows} situations: give a name a row, or an empty one"
+            )
+        if wrong := next((name for name in names if name is not None and not isinstance(name, str)), None):
+            raise UserError(f"{table}: a picture is {shown(wrong)}: give the name of a file in the folder")
+        for name in {name for name in names if name is not None}:
+            inside(self._folder, name, "picture")
+            if Path(name).suffix.lower() not in KINDS:
+                raise UserError(f"picture {shown(name)} is of no kind that a page shows: give {', '.join(KINDS)}")
+        self._names: list[str | None] = names
+
+    def __call__(self, row: int) -> Picture | None:
+        """The picture of a row. Raises UserError if it cannot be read."""
+        if (name := self._names[row]) is None:
+            return None
+        place = inside(self._folder, name, "picture")
+        try:
+            if place.stat().st_size > LARGEST_PICTURE:
+                raise UserError(f"picture {place} has more than {LARGEST_PICTURE:,} bytes: make it smaller")
+            data = place.read_bytes()
+        except OSError as error:
+            raise UserError(f"picture {place} of row {row} cannot be read ({error.strerror}): put it there") from error
+        return Picture(data, KINDS[place.suffix.lower()])

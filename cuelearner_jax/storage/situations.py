@@ -1,0 +1,226 @@
+"""Recorded situations: what was seen, the action that was proposed, and a picture of each where there is one.
+
+A folder holds `situations.parquet`, `.csv` or `.npz`, and pictures beside it; a LeRobot dataset folder is read too, see
+`storage.lerobot`. Columns of the table:
+
+| column      | type                        | meaning                                                             |
+|-------------|-----------------------------|---------------------------------------------------------------------|
+| observation | list of floats (obs,)       | what a policy would see; in CSV numbers with spaces between         |
+| action      | list of floats (action,)    | what was proposed, or done                                          |
+| picture     | string                      | optional: a file in the folder, PNG or JPEG, or a clip, GIF or MP4  |
+
+In place of a list there may be one column an entry, `observation.NAME` or `action.NAME`: the names then are those of
+the entries. Nothing in such a folder is executed: no pickles, and no path that leads out of the folder.
+"""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import re
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from jaxtyping import Float
+
+from cuelearner_jax.environment import Quantity
+from cuelearner_jax.errors import UserError, listed, shown
+from cuelearner_jax.storage import lerobot
+from cuelearner_jax.storage.picture_files import Picture, PictureFiles
+from cuelearner_jax.storage.room import check_room
+
+STEM = "situations"
+OBSERVATION, ACTION, PICTURE = "observation", "action", "picture"
+MOST_NAMED = 64  # entries of an observation that are slices of their own
+
+
+class Situations(NamedTuple):
+    """Recorded situations, a row each."""
+
+    observations: Float[np.ndarray, "n obs"]
+    actions: Float[np.ndarray, "n action"]
+    slices: tuple[Quantity, ...]  # of an observation
+    entries: tuple[str, ...]  # names of an action's entries; empty: the recording names none
+    digest: str  # tells these situations from others
+    has_pictures: bool
+    # row -> its picture; None: that row has none. Raises UserError for a picture that cannot be read.
+    picture: Callable[[int], Picture | None]
+
+
+def read(path: Path) -> Situations:
+    """Read a folder of situations, its table alone, or a LeRobot dataset folder.
+
+    Raises:
+        UserError: there is nothing to read, columns are missing or do not fit, or a number is not finite.
+    """
+    if lerobot.is_one(path):
+        found = lerobot.read(path)
+        slices = named_slices(found.observation_entries, found.observations.shape[1])
+        return _whole(path, found.observations, found.actions, slices, found.action_entries, found.frames)
+    table = _table_in(path)
+    columns = _READERS[table.suffix](table)
+    observations, seen = _matrix(table, columns, OBSERVATION)
+    actions, entries = _matrix(table, columns, ACTION)
+    if len(actions) != len(observations):
+        raise UserError(
+            f"{table} has {len(observations)} observations and {len(actions)} actions: give as many of both"
+        )
+    files = columns.get(PICTURE)
+    return _whole(
+        table,
+        observations,
+        actions,
+        named_slices(seen, observations.shape[1]),
+        entries,
+        None if files is None else PictureFiles(table, files, len(observations)),
+    )
+
+
+def _whole(
+    path: Path,
+    observations: np.ndarray,
+    actions: np.ndarray,
+    slices: tuple[Quantity, ...],
+    entries: tuple[str, ...],
+    pictures: Any,
+) -> Situations:
+    """Checked situations. Raises UserError for none, or for numbers that are not finite."""
+    for name, rows in ((OBSERVATION, observations), (ACTION, actions)):
+        if not rows.size:
+            raise UserError(f"{path} holds no {name}s: record some situations first")
+        if len(wrong := np.flatnonzero(~np.isfinite(rows).all(-1))):
+            raise UserError(
+                f"{path}: {name}s of the rows {listed(wrong.tolist())} are not finite: leave these rows out"
+            )
+    told = hashlib.sha256()
+    for rows in (observations, actions):
+        told.update(str(rows.shape).encode() + np.ascontiguousarray(rows).tobytes())
+    told.update("\n".join([quantity.name for quantity in slices] + ["", *entries]).encode())
+    there = (lambda row: None) if pictures is None else pictures
+    return Situations(observations, actions, slices, entries, told.hexdigest()[:12], pictures is not None, there)
+
+
+def named_slices(entries: tuple[str, ...], size: int) -> tuple[Quantity, ...]:
+    """Return the slices of an observation: one an entry where entries have names and are few, or else a single one."""
+    if len(entries) == size and size <= MOST_NAMED:
+        return tuple(Quantity(name, 1, "1", "as recorded") for name in entries)
+    return (Quantity(OBSERVATION, size, "1", "as recorded"),)
+
+
+def _table_in(path: Path) -> Path:
+    """The table of a folder, or the one that is given. Raises UserError if there is none."""
+    if path.is_file():
+        if path.suffix not in _READERS:
+            raise UserError(f"{path} is no table of situations: give a folder, or a file {', '.join(_READERS)}")
+        return path
+    if not path.is_dir():
+        raise UserError(f"there is no folder of situations at {path}: give one that holds {STEM}.parquet")
+    found = [path / f"{STEM}{suffix}" for suffix in _READERS if (path / f"{STEM}{suffix}").is_file()]
+    if not found:
+        empty = "is empty" if not any(path.iterdir()) else f"holds no {STEM}.parquet, .csv or .npz"
+        raise UserError(
+            f"{path} {empty}, and is no LeRobot dataset either: give a folder with such a table, with the columns "
+            f"{OBSERVATION} and {ACTION}"
+        )
+    if len(found) > 1:
+        raise UserError(f"{path} holds {' and '.join(table.name for table in found)}: give the one that is meant")
+    return found[0]
+
+
+def _of_parquet(table: Path) -> dict[str, Any]:
+    try:
+        file = pq.ParquetFile(table)
+        size = sum(file.metadata.row_group(group).total_byte_size for group in range(file.num_row_groups))
+        check_room(f"{table} is large", 4 * size, "give fewer rows")
+        found = file.read()
+        return {name: found[name].to_pylist() for name in found.column_names}
+    except (pa.ArrowException, OSError, ValueError) as error:
+        raise _damaged(table, error) from error
+
+
+def _of_csv(table: Path) -> dict[str, Any]:
+    try:
+        with table.open(newline="", encoding="utf-8") as file:
+            rows = list(csv.reader(file, strict=True))
+    except (OSError, UnicodeError, csv.Error) as error:
+        raise _damaged(table, error) from error
+    head, *rows = rows or [[]]
+    for number, row in enumerate(rows, start=2):
+        if len(row) != len(head):
+            raise UserError(f"{table}: line {number} has {len(row)} fields, the head {len(head)}: give as many")
+    columns: dict[str, Any] = {name: list(values) for name, values in zip(head, zip(*rows, strict=True), strict=False)}
+    for name in columns.keys() - {PICTURE}:
+        if name in (OBSERVATION, ACTION):
+            columns[name] = [re.split(r"[\s;,]+", text.strip("[] ")) for text in columns[name]]
+    return columns or {name: [] for name in head}
+
+
+def _of_npz(table: Path) -> dict[str, Any]:
+    try:
+        with np.load(table, allow_pickle=False) as stored:
+            return {name: stored[name] for name in stored.files}
+    except (OSError, ValueError, zipfile.BadZipFile, EOFError) as error:
+        raise _damaged(table, error) from error
+
+
+_READERS: dict[str, Callable[[Path], dict[str, Any]]] = {
+    ".parquet": _of_parquet,
+    ".csv": _of_csv,
+    ".npz": _of_npz,
+}
+
+
+def _damaged(table: Path, error: Exception) -> UserError:
+    why = " ".join(str(error).split())[:120] or type(error).__name__
+    return UserError(f"{table} cannot be read ({why}): write the table anew, without Python objects in it")
+
+
+def _matrix(table: Path, columns: dict[str, Any], name: str) -> tuple[Float[np.ndarray, "n size"], tuple[str, ...]]:
+    """Numbers (n, size) of a column of lists, or of one column an entry, and the names of the entries.
+
+    Raises UserError for what is missing or does not fit.
+    """
+    entries = tuple(column.partition(".")[2] for column in columns if column.startswith(f"{name}."))
+    if name not in columns and not entries:
+        there = ", ".join(columns) or "none"
+        raise UserError(
+            f"{table} has no column {name} (its columns: {there}): give a list a row, or {name}.NAME columns"
+        )
+    if name in columns and entries:
+        raise UserError(f"{table} has the columns {name} and {name}.{entries[0]}: give one form of both")
+    if entries:
+        parts = [_numbers(table, f"{name}.{entry}", columns[f"{name}.{entry}"], 1) for entry in entries]
+        if len({len(part) for part in parts}) > 1:
+            raise UserError(f"{table}: columns {name}.NAME have several lengths: give as many rows of each")
+        return np.stack(parts, -1), entries
+    return _numbers(table, name, columns[name], 2), ()
+
+
+def _numbers(table: Path, name: str, values: Any, axes: int) -> np.ndarray:
+    """A column as 32-bit floats. Raises UserError for rows of several sizes, or for what is no number."""
+    try:
+        found = np.asarray(values)
+        if found.dtype.kind in "US" or found.dtype == object:
+            found = np.asarray([[float(entry) for entry in row] if axes == 2 else float(row) for row in values])
+        if found.dtype.kind not in "fiu":
+            raise TypeError
+    except (TypeError, ValueError):
+        sizes = {len(row) for row in values if isinstance(row, list | tuple)}
+        why = (
+            f"rows of {listed(sizes)} entries" if len(sizes) > 1 else f"what is no number ({shown(values[0])[:60]} ...)"
+        )
+        raise UserError(
+            f"{table}: the column {name} holds {why}: give the same number of numbers in every row"
+        ) from None
+    if found.ndim != axes and found.size:
+        raise UserError(
+            f"{table}: the column {name} has the shape {found.shape}: give {'(n, size)' if axes == 2 else '(n,)'}"
+        )
+    with np.errstate(over="ignore"):
+        found = found.astype(np.float32)
+    return found if axes == 1 or found.ndim == 2 else np.zeros((len(found), 0), np.float32)

@@ -1,0 +1,77 @@
+"""brax's environments as tasks, by name: `brax:pusher`."""
+
+from __future__ import annotations
+
+import dataclasses
+import warnings
+from dataclasses import dataclass
+from functools import cache
+from typing import Any, Literal, get_args
+
+import jax
+
+from cuelearner_envs.bounds import check_word
+from cuelearner_jax.bridges.jax_environment import JaxEnvironment, Layout
+from cuelearner_jax.errors import UserError, closest
+from cuelearner_jax.task import Body, Task
+from cuelearner_jax.tasks.simulators import SimulatorConfig, check_layout, described, environment_of, pictures, presets
+
+FAMILY = "brax"
+Backend = Literal["generalized", "spring", "positional", "mjx"]
+
+
+@dataclass(frozen=True)
+class BraxConfig(SimulatorConfig):
+    """One of brax's environments. Every field is an option `--task.…`, the line below it its help."""
+
+    backend: Backend = "generalized"
+    """Which of brax's physics."""
+
+
+@dataclass(frozen=True)
+class Simulator:
+    """Gives the brax environment of a name; equal ones give one object, and so share what is compiled."""
+
+    environment: str
+    backend: str
+    layout: Layout
+
+    def __call__(self) -> Any:
+        """Return the environment. Raises UserError if brax has none, or one of another layout."""
+        env = _made(self.environment, self.backend)
+        check_layout(FAMILY, self.environment, self.layout, env)
+        return env
+
+
+@cache
+def _made(name: str, backend: str) -> Any:
+    from brax import envs  # takes seconds to load
+
+    known: dict[str, Any] = envs._envs  # brax lists its environments nowhere else
+    if name not in known:
+        raise UserError(f"brax has no environment {name!r}{closest(name, known)}")
+    with warnings.catch_warnings(), jax.ensure_compile_time_eval():  # it holds arrays, and something may be traced
+        warnings.filterwarnings("ignore", message="Brax System")  # that brax is not being developed any more
+        return envs.get_environment(name, backend=backend)
+
+
+def make_environment(config: BraxConfig, split: str = "training") -> JaxEnvironment:
+    """Return the environment of a configuration. Raises UserError for a value that makes none."""
+    check_word("backend", config.backend, get_args(Backend))
+    return environment_of(FAMILY, config, Simulator(config.environment, config.backend, config.layout))
+
+
+BRAX = Task(
+    name=FAMILY,
+    about="brax's environments, each as brax:NAME, brax:pusher for instance",
+    config=BraxConfig,
+    bodies=(Body(FAMILY, "brax's own", make_environment, pictures=pictures),),
+    labels_hold=("max_steps", "backend"),  # a label is about what one observation shows
+)
+
+
+@cache
+def task_of(name: str) -> Task:
+    """Return the task of one of brax's environments, whole box of actions. Raises UserError if brax has none."""
+    config = BraxConfig(**described(FAMILY, name, _made(name, BraxConfig.backend)))
+    return dataclasses.replace(BRAX, about=f"brax's {name}", default=config, presets=presets(config))

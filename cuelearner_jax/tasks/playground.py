@@ -1,0 +1,60 @@
+"""MuJoCo Playground's dm_control tasks, by name: `playground:CartpoleBalance`."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+from cuelearner_jax.bridges import playground
+from cuelearner_jax.bridges.jax_environment import JaxEnvironment, Layout
+from cuelearner_jax.task import Body, Task
+from cuelearner_jax.tasks.simulators import SimulatorConfig, check_layout, described, environment_of, pictures, presets
+
+FAMILY = "playground"
+
+
+@dataclass(frozen=True)
+class PlaygroundConfig(SimulatorConfig):
+    """One of Playground's dm_control tasks. Every field is an option `--task.…`, the line below it its help."""
+
+
+@dataclass(frozen=True)
+class Simulator:
+    """Gives the Playground task of a name; equal ones give one object, and so share what is compiled."""
+
+    environment: str
+    layout: Layout
+
+    def __call__(self) -> Any:
+        """Return the task. Raises UserError if it cannot be had, or has another layout."""
+        env = _made(self.environment)
+        check_layout(FAMILY, self.environment, self.layout, env)
+        return env
+
+
+@cache
+def _made(name: str) -> Any:
+    return playground.make(name)
+
+
+def make_environment(config: PlaygroundConfig, split: str = "training") -> JaxEnvironment:
+    """Return the environment of a configuration. Raises UserError for a value that makes none."""
+    return environment_of(FAMILY, config, Simulator(config.environment, config.layout))
+
+
+PLAYGROUND = Task(
+    name=FAMILY,
+    about="MuJoCo Playground's dm_control tasks, each as playground:NAME, playground:CartpoleBalance for instance",
+    config=PlaygroundConfig,
+    bodies=(Body(FAMILY, "MJX, MuJoCo in JAX", make_environment, pictures=pictures),),
+    labels_hold=("max_steps",),  # a label is about what one observation shows
+)
+
+
+@cache
+def task_of(name: str) -> Task:
+    """Return one of Playground's dm_control tasks, whole box of actions. Raises UserError if it cannot be had."""
+    config = PlaygroundConfig(**described(FAMILY, name, _made(name)))
+    return dataclasses.replace(PLAYGROUND, about=f"Playground's {name}", default=config, presets=presets(config))

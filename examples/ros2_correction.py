@@ -1,0 +1,88 @@
+"""A ROS 2 node that runs a correction beside a base, which stays where it is. `Beside` is its core, and needs no ROS.
+
+    cuelearner export policies/arm --only-correction --format onnx --out exported/arm
+    python examples/ros2_correction.py exported/arm
+
+It hears `observation` (std_msgs/Float32MultiArray, as the policy sees it) and `base_action` (the same type, what the
+base decided about it), and says `action` for each base action. Where the observation is older than a fifth of a second,
+or a number is not finite, it passes the base's action on as it is and says so once: a robot goes on without the
+correction, never without its base.
+"""
+
+# pyright: reportMissingImports=false
+# (ROS 2 brings its own Python packages)
+
+import sys
+from typing import Any
+
+import numpy as np
+
+from cuelearner_jax.export.runner import ContractError, Decision  # on a robot: the decide.py beside the decision
+
+STALE = 0.2  # [s]
+
+
+class Beside:
+    """A correction and what was seen last. Times in seconds."""
+
+    def __init__(self, folder):
+        """Reads a correction. Raises ContractError for a damaged one, ValueError for a whole policy."""
+        self.decide = Decision(folder)
+        contract = self.decide.contract
+        if "base" not in contract:
+            raise ValueError(f"{folder} holds a whole policy: export its correction alone, with --only-correction")
+        self.size = contract["observation"]["size"] - contract["base"]["size"]
+        self.entries = contract["base"]["size"]
+        self.seen: Any = None  # (observation (size,), time)
+        self.trouble = ""  # why the last action was the base's own; empty: it was corrected
+
+    def hear(self, observation, now):
+        """An observation. Raises ValueError for one of another size."""
+        found = np.asarray(observation, np.float32)
+        if found.shape != (self.size,):
+            raise ValueError(f"an observation has {found.size} entries: the contract says {self.size}")
+        self.seen = found, now
+
+    def action(self, base_action, now):
+        """The corrected action; the base's own where there is nothing to correct it by, and `trouble` says why."""
+        base = np.asarray(base_action, np.float32)
+        if base.shape != (self.entries,):
+            raise ValueError(f"a base action has {base.size} entries: the contract says {self.entries}")
+        if self.seen is None or now - self.seen[1] > STALE:
+            self.trouble = "no fresh observation"
+            return base
+        try:
+            found = self.decide(self.seen[0], base)
+        except ContractError as error:
+            self.trouble = str(error)
+            return base
+        self.trouble = ""
+        return found
+
+
+def main(folder):
+    """Runs the node."""
+    import rclpy  # of a ROS 2 installation
+    from rclpy.node import Node
+    from std_msgs.msg import Float32MultiArray
+
+    rclpy.init()
+    node, beside = Node("cuelearner_correction"), Beside(folder)
+    said = node.create_publisher(Float32MultiArray, "action", 1)
+
+    def now():
+        return node.get_clock().now().nanoseconds * 1e-9
+
+    def correct(message):
+        before = beside.trouble
+        said.publish(Float32MultiArray(data=beside.action(message.data, now()).tolist()))
+        if beside.trouble and beside.trouble != before:
+            node.get_logger().warning(f"the base acts alone: {beside.trouble}")
+
+    node.create_subscription(Float32MultiArray, "observation", lambda heard: beside.hear(heard.data, now()), 1)
+    node.create_subscription(Float32MultiArray, "base_action", correct, 1)
+    rclpy.spin(node)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])

@@ -1,0 +1,192 @@
+"""A policy corrected by labels alone: better on other situations, saved and loaded, judged by answers it never saw."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import cuelearner_jax as cl
+from cuelearner_jax.api.feedback import rows_of
+from cuelearner_jax.config import GuideSizes, Scalars
+from cuelearner_jax.feedback.answers import relative_feedback
+from cuelearner_jax.spaces import DIRECTIONS, Box, cues_from
+from cuelearner_jax.storage import label_files
+
+LOW, HIGH = (-0.1, -0.1, -1.0), (0.1, 0.1, 1.0)
+SPACE = Box(LOW, HIGH)
+CUES = "left,right;up,down;open,close"
+OFFSET = np.array([0.02, -0.015, 0.2], np.float32)  # a tenth of the ranges or so
+EPS = 0.04
+SIZES = GuideSizes(frame="action", feedback_layers=(32, 32), fit_steps=200, fit_batch_size=32)
+FAST = dataclasses.replace(Scalars(), eps_deg=EPS, tau_deg=0.002, tau_max_deg=1.0, feedback_learning_rate=0.01)
+
+
+def wanted(obs):
+    """What people have in mind."""
+    return np.stack([0.06 * obs[:, 0], 0.06 * obs[:, 1], 0.6 * np.tanh(obs[:, 2] * obs[:, 0])], -1).astype(np.float32)
+
+
+def off(obs):
+    """A policy in NumPy that is wrong by a constant."""
+    return wanted(obs) + OFFSET
+
+
+def answers(obs, actions, space=SPACE, best=wanted):
+    """What people say of actions."""
+    told = jax.vmap(lambda action, best: relative_feedback(space, action, best, EPS))
+    return np.array(told(jnp.asarray(actions), jnp.asarray(best(obs))))
+
+
+def asked(count, seed=0, reach=0.2):
+    """Labels about the policy's actions, moved at random by up to `reach` of the ranges."""
+    random = np.random.default_rng(seed)
+    obs = random.uniform(-1, 1, (count, 3)).astype(np.float32)
+    moved = off(obs) + reach * random.uniform(-1, 1, (count, 3)) * (np.array(HIGH) - np.array(LOW))
+    actions = np.clip(moved, LOW, HIGH).astype(np.float32)
+    return cl.Labels(obs, actions, answers(obs, actions))
+
+
+OTHERS = np.random.default_rng(9).uniform(-1, 1, (200, 3)).astype(np.float32)
+ERROR = np.abs(OFFSET / (np.array(HIGH) - np.array(LOW))).mean()
+
+
+def error(policy, obs=OTHERS):
+    """Mean distance from what people have in mind, in shares of the ranges."""
+    return (np.abs(policy(obs) - np.clip(wanted(obs), LOW, HIGH)) / (np.array(HIGH) - np.array(LOW))).mean()
+
+
+@pytest.fixture(scope="module")
+def better():
+    """Corrected by 150 labels."""
+    how = {"cues": CUES, "low": np.array(LOW), "high": list(HIGH), "eps": EPS, "bound": 0.2}
+    return cl.correct(off, asked(150), sizes=SIZES, scalars=FAST, **how)
+
+
+def test_a_corrected_policy_is_nearer_to_what_people_have_in_mind(better):
+    assert better.used
+    assert error(off) == pytest.approx(ERROR, rel=0.02)
+    assert error(better) < 0.5 * ERROR
+    assert better.actions.cues[1].words == ("up", "down")
+    assert better(OTHERS[0]).shape == (3,)
+
+
+def test_corrections_stay_within_the_bound(better):
+    far = np.abs(better(OTHERS) - np.clip(off(OTHERS), LOW, HIGH)) / (np.array(HIGH) - np.array(LOW))
+    assert far.max() <= 0.2 + 1e-5
+
+
+def test_it_agrees_with_more_answers_that_it_never_saw(better):
+    found = cl.agreement(better, asked(100, seed=5))
+    assert found.labels == 100
+    assert found.policy[0] > found.base[0]
+    assert found.policy[1] <= found.policy[0] <= found.policy[2]
+    assert found.difference[0] == pytest.approx(found.policy[0] - found.base[0])
+    assert found.right[0] == pytest.approx((asked(100, seed=5).answer == 0).mean(), abs=1e-6)
+    assert any("always already right" in line for line in found.words())
+
+
+def test_agreement_counts_what_was_said_alone():
+    obs = OTHERS[:4]
+    actions = np.clip(off(obs), LOW, HIGH)
+    said = answers(obs, actions)
+    said[:, 1:] = cl.UNSAID
+    of = cl.Labels(obs, actions, said)
+    assert cl.agreement(wanted, of, eps=EPS, space=SPACE).policy[0] == 1.0
+    assert cl.agreement(off, of, eps=EPS, space=SPACE).policy[0] == 0.0  # it calls each of its own actions right
+    swapped = of._replace(answer=np.where(said == cl.UNSAID, said, -said))
+    assert cl.agreement(wanted, swapped, eps=EPS, space=SPACE).policy[0] == 0.0
+
+
+def test_it_is_saved_and_loaded_with_the_code_of_its_base(better, tmp_path):
+    better.save(tmp_path / "better")
+    again = cl.load_policy(tmp_path / "better", base=off)
+    np.testing.assert_allclose(again(OTHERS), better(OTHERS), atol=1e-6)
+    assert again.actions == better.actions
+    with pytest.raises(cl.UserError, match="made of code"):
+        cl.load_policy(tmp_path / "better")
+    assert cl.agreement(again, asked(100, seed=5)).policy == cl.agreement(better, asked(100, seed=5)).policy
+
+
+def test_it_can_be_corrected_again(better, tmp_path):
+    how = {"eps": EPS, "bound": 0.1, "sizes": SIZES, "scalars": FAST}
+    again = cl.correct(better, asked(60, seed=3), **how)
+    again.save(tmp_path / "again")
+    np.testing.assert_allclose(cl.load_policy(tmp_path / "again", base=off)(OTHERS), again(OTHERS), atol=1e-6)
+    with pytest.raises(cl.UserError, match="corrected with other bounds or cues before"):
+        cl.correct(better, asked(60), low=LOW, high=(1.0, 1.0, 1.0), **how)
+
+
+@pytest.mark.long
+def test_a_constant_change_is_found_by_calibration():
+    labels = asked(150, reach=0.1)
+    found = cl.correct(off, labels, low=LOW, high=HIGH, eps=EPS, guidance="calibration")
+    assert found.used
+    assert error(found) < 0.25 * ERROR
+    assert "shares" in found.words[0]
+
+
+def test_labels_of_a_file_say_their_own_space_and_strength(tmp_path):
+    labels = asked(40)
+    space = Box(LOW, HIGH, cues_from(CUES))
+    rows = rows_of(labels)
+    seeds = np.zeros(40)
+    label_files.write_file(
+        tmp_path / "labels.parquet", label_files.LabelFile({"name": "arm"}, "relative", space, EPS, seeds, rows), "more"
+    )
+    found = cl.correct(off, tmp_path, bound=0.2, sizes=SIZES)
+    assert found.actions == space
+    with pytest.raises(cl.UserError, match="says its own space of actions: leave out low"):
+        cl.correct(off, tmp_path, low=LOW, high=HIGH)
+    with pytest.raises(cl.UserError, match="leave out eps"):
+        cl.correct(off, tmp_path, eps=0.2)
+    assert cl.agreement(off, tmp_path).labels == 40
+
+
+@pytest.mark.long
+def test_directions_are_corrected_too():
+    random = np.random.default_rng(0)
+    obs = random.normal(size=(60, 2)).astype(np.float32)
+    ahead = lambda obs: obs / np.linalg.norm(obs, axis=-1, keepdims=True)  # noqa: E731
+    actions = ahead(obs)
+    labels = cl.Labels(obs, actions, np.ones(60, np.float32))
+    found = cl.correct(ahead, labels, space=DIRECTIONS, bound=30.0, eps=5.0, sizes=SIZES)
+    turned = np.asarray(DIRECTIONS.log(jnp.asarray(actions), jnp.asarray(found(obs))))
+    assert turned.mean() > 0.05
+
+
+def test_bounds_that_are_not_given_are_told():
+    labels = asked(30)
+    with pytest.warns(UserWarning, match="bounds of the actions are their range"):
+        found = cl.correct(off, labels, eps=EPS, bound=0.2, sizes=SIZES)
+    np.testing.assert_allclose(found.actions.low, labels.action.min(0))
+
+
+@pytest.mark.parametrize(
+    ("changed", "told"),
+    [
+        ({"policy": None}, "policy is None: give the policy"),
+        ({"labels": cl.Labels(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3)))}, "labels have shapes"),
+        ({"labels": "absent", "low": None, "high": None, "cues": ""}, "there is no label file"),
+        ({"labels": cl.Labels(OTHERS[:20], wanted(OTHERS[:20]), np.zeros((20, 2)))}, r"\(labels, 3\) is needed"),
+        ({"labels": cl.Labels(OTHERS[:20], wanted(OTHERS[:20]), np.full((20, 3), 0.5))}, "an answer is none of"),
+        ({"labels": cl.Labels(np.full((20, 3), np.nan), wanted(OTHERS[:20]), np.zeros((20, 3)))}, "not finite"),
+        ({"low": (0.0,) * 3}, "actions are no vectors between the bounds"),
+        ({"low": (0.0,) * 2, "high": (1.0,) * 2}, "low and high bound 2 and 2 entries, actions have 3"),
+        ({"low": None}, "high is given alone"),
+        ({"cues": "left,right"}, "give one cue an entry"),
+        ({"bound": 2.0}, "give a number above 0 and up to 1"),
+        ({"bound": 0.01}, "say nothing within a bound of 0.01"),
+        ({"guidance": "shy"}, "shy"),
+        ({"policy": lambda obs: obs[:, :2]}, "returned actions of shape"),
+        ({"policy": lambda obs: obs * np.nan}, "not finite"),
+        ({"space": SPACE}, "cues is given beside space"),
+        ({"policy": 3}, "3 is no policy"),
+    ],
+)
+def test_what_makes_no_sense_is_told_in_one_line(changed, told):
+    usual = {"policy": off, "labels": asked(20), "cues": CUES, "low": LOW, "high": HIGH, "eps": EPS, "bound": 0.2}
+    with pytest.raises(cl.UserError, match=told) as error:
+        cl.correct(**{**usual, "sizes": SIZES, **changed})
+    assert "\n" not in str(error.value)

@@ -1,0 +1,259 @@
+"""brax's environments and MuJoCo Playground's tasks, by name."""
+
+import dataclasses
+import json
+import re
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from brax import envs
+from flax import struct
+
+import cuelearner_jax as cl
+from cuelearner_jax.cli import main
+from cuelearner_jax.config import GuideSizes
+from cuelearner_jax.environment import spaces_of
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.policies import uniform_in
+from cuelearner_jax.spaces import Box
+from cuelearner_jax.storage import results
+from cuelearner_jax.task import shape_of
+from cuelearner_jax.tasks import brax, playground, registry
+from cuelearner_jax.testing import check_environment, check_task
+
+FAST = registry.resolve("brax:fast")
+TINY = [
+    *("--preset", "quickstart", "--agent.q-layers", "16", "--agent.directions", "16", "--agent.target-directions", "8"),
+    *("--sizes.lanes-per-block", "1", "--agent.batch-size", "8", "--schedule.random-steps", "20"),
+    *("--schedule.learn-after", "20", "--schedule.total-steps", "80", "--schedule.eval-every", "40"),
+    *("--schedule.checkpoint-every", "40", "--schedule.eval-steps", "40"),
+]
+
+
+def same_steps(world, simulator, steps, tolerance=0.0):
+    """Hold our roll-out of random actions against the simulator's own: the same key, the same actions, no end."""
+    key = jax.random.key(3)
+    actions = world.actions.sample(jax.random.key(4), (steps,))
+    reset, advance = jax.jit(simulator.reset), jax.jit(simulator.step)
+    state, obs = world.reset(key)
+    other = reset(jax.random.key_data(key))
+    np.testing.assert_allclose(obs, other.obs, atol=tolerance)
+    for number, action in enumerate(actions):
+        state, step = world.step(jax.random.key(number), state, action)
+        other = advance(other, action)
+        assert not step.terminated
+        np.testing.assert_allclose(step.final_obs, other.obs, rtol=tolerance, atol=tolerance)
+        np.testing.assert_allclose(step.reward, other.reward, rtol=tolerance, atol=tolerance)
+        for name, value in other.metrics.items():
+            np.testing.assert_allclose(step.metrics[name], value, rtol=tolerance, atol=tolerance)
+
+
+def test_a_name_gives_the_whole_box_and_the_layout():
+    pusher = registry.resolve("brax:pusher")
+    assert (pusher.name, pusher.about) == ("brax", "brax's pusher")
+    env = shape_of(pusher, pusher.plain())
+    assert spaces_of(env).obs_size == 23
+    assert isinstance(env.actions, Box)
+    assert (env.actions.low, env.actions.high) == ((-1.0,) * 7, (1.0,) * 7)
+    assert env.actions.cues[0].name == "r_shoulder_pan_joint"
+    assert registry.resolve("brax:pusher") is pusher
+    assert pusher.plain().max_steps == 1000
+    assert registry.find("brax").presets == {}  # the family's own task reads folders, and is no environment
+
+
+def test_a_step_is_that_of_brax():
+    same_steps(cl.make("brax:fast"), envs.get_environment("fast"), 5)
+
+
+def test_time_runs_out_and_the_next_episode_begins():
+    world = cl.make("brax:fast", max_steps=2)
+    state, _ = world.reset(jax.random.key(0))
+    ends = []
+    for number in range(4):
+        state, step = world.step(jax.random.key(number), state, jnp.ones(1))
+        ends.append((bool(step.terminated), bool(step.truncated)))
+        if step.truncated:
+            np.testing.assert_array_equal(step.obs, [0, 0])
+            assert (step.final_obs > 0).all()
+    assert ends == [(False, False), (False, True)] * 2
+
+
+def test_a_task_of_a_family_keeps_the_laws():
+    check_task(FAST, dataclasses.replace(FAST.plain(), max_steps=3), steps=8)
+
+
+def test_what_policies_look_at_needs_no_simulator(monkeypatch):
+    def nothing(*_):
+        raise AssertionError("the simulator was made")
+
+    monkeypatch.setattr(brax, "_made", nothing)
+    monkeypatch.setattr(playground, "_made", nothing)
+    env = registry.find("brax").view(FAST.plain())
+    assert (env.obs_size, env.actions.size) == (2, 1)
+    config = playground.PlaygroundConfig("Any", slices=("a", "b"), slice_sizes=(2, 3), entries=("x",))
+    assert shape_of(registry.find("playground"), config).obs_size == 5
+
+
+@pytest.mark.parametrize(
+    ("name", "says"),
+    [
+        ("brax:pushr", "brax has no environment 'pushr', did you mean 'pusher'?"),
+    ],
+)
+def test_a_name_that_is_none_is_refused_in_one_line(name, says, capsys):
+    with pytest.raises(UserError, match=re.escape(says)):
+        cl.make(name)
+    assert main(["train", "brax", "--out", "nowhere"]) == 2
+    assert "brax is a family of tasks: name one of its environments, as brax:NAME" in capsys.readouterr().err
+    assert main(["train", name, "--out", "nowhere"]) == 2
+    assert says in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"max_steps": 0}, "task.max_steps is 0: give a whole number from 1"),
+        ({"backend": "bullet"}, "task.backend is 'bullet': choose one of generalized"),
+        ({"environment": ""}, "task.environment is '': name the task brax:ENVIRONMENT"),
+        ({"slices": ()}, "task.slices is (): give names, or name the task"),
+        ({"slice_sizes": (0,)}, "task.slice_sizes is (0,): give whole numbers above 0"),
+        ({"slice_sizes": (1, 1)}, "task.slice_sizes is (1, 1): give a number for each of task.slices"),
+        ({"entries": (1,)}, "task.entries is (1,): give names"),
+    ],
+)
+def test_a_configuration_that_makes_no_environment_is_refused_in_one_line(changes, says):
+    with pytest.raises(UserError, match=re.escape(says)):
+        FAST.environment(dataclasses.replace(FAST.plain(), **changes))
+
+
+def test_a_simulator_of_another_layout_is_refused():
+    world = cl.make("brax:fast", environment="inverted_pendulum")
+    says = "brax:inverted_pendulum has observations of 4 entries and actions of 1, the configuration 2 and 1"
+    with pytest.raises(UserError, match=says):
+        world.reset(jax.random.key(0))
+
+
+def test_a_missing_package_is_told_with_its_extra(monkeypatch):
+    monkeypatch.setitem(sys.modules, "mujoco_playground", None)
+    with pytest.raises(UserError, match=r"need the extra `playground`: pip install 'cuelearner-jax\[playground\]'"):
+        registry.resolve("playground:NoSuchTask")
+
+
+def test_the_command_line_trains_seeds_and_reads_the_folder_by_the_familys_name(tmp_path, capsys):
+    run = tmp_path / "run"
+    assert main(["sweep", "brax:fast", *TINY, "--seeds", "2", "--out", str(run)]) == 0
+    found = results.read(run).to_pylist()
+    assert {(row["task"], row["seed"]) for row in found} == {("brax", 0), ("brax", 1)}
+    losses = {row["seed"]: row["train_loss"] for row in found}
+    assert losses[0] != losses[1]
+    told = json.loads((run / "config.json").read_text())["task"]
+    assert (told["name"], told["environment"], told["slice_sizes"], told["entries"]) == (
+        "brax",
+        "fast",
+        [2],
+        ["entry 1"],
+    )
+    assert main(["evaluate", str(run), "--envs", "2", "--steps", "8"]) == 0
+    assert "reward" in capsys.readouterr().out
+    policy = cl.load_policy(run)
+    assert np.abs(policy(np.zeros((3, 2), np.float32))).max() <= 1
+    assert policy(np.zeros((3, 2), np.float32)).shape == (3, 1)
+
+
+class Half(struct.PyTreeNode):
+    """A teacher whose best action is 0.5 everywhere."""
+
+    def best_action(self, state, obs):
+        return jnp.full(1, 0.5)
+
+
+@pytest.mark.long
+def test_a_policy_is_corrected_in_a_simulator():
+    world = cl.make("brax:fast", max_steps=20)
+    sizes = GuideSizes(feedback_layers=(16, 16), fit_steps=400)
+
+    def still(obs):
+        return np.zeros((len(obs), 1), np.float32)
+
+    adapted = cl.adapt(still, world, Half(), labels=100, bound_deg=0.8, eps_deg=0.1, sizes=sizes, judge_by="labels")
+    _, obs = world.reset(jax.random.key(0))
+    assert float(adapted(np.asarray(obs)[None])[0, 0]) == pytest.approx(0.5, abs=0.15)
+
+
+# Real physics, which takes tens of seconds to compile.
+
+
+@pytest.mark.long
+def test_pusher_is_that_of_brax_step_for_step():
+    world = cl.make("brax:pusher")
+    same_steps(world, envs.get_environment("pusher"), 5, tolerance=1e-4)
+    seeds = jax.vmap(world.env.reset)(jax.random.split(jax.random.key(0), 3))[1]
+    assert seeds.shape == (3, 23)
+    assert len(np.unique(seeds[:, 17])) == 3  # where the object lies
+
+
+@pytest.mark.long
+def test_cartpole_is_that_of_playground_step_for_step():
+    suite = pytest.importorskip("mujoco_playground").dm_control_suite
+    world = cl.make("playground:CartpoleBalance", max_steps=4)
+    assert [cue.name for cue in world.actions.cues] == ["slide"]
+    simulator = suite.load("CartpoleBalance", config_overrides={"impl": "jax"})
+    same_steps(dataclasses.replace(world, config=world.task.plain()), simulator, 5, tolerance=1e-4)
+    check_environment(world.env, 8, tolerance=1e-4)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("name", "says"),
+    [
+        ("NoSuchTask", "playground has no task 'NoSuchTask': choose one of AcrobotSwingup"),
+        ("PandaPickCube", "playground:PandaPickCube downloads its robot: make that environment yourself"),
+    ],
+)
+def test_a_task_that_playground_cannot_give_is_refused_in_one_line(name, says):
+    pytest.importorskip("mujoco_playground")
+    with pytest.raises(UserError, match=re.escape(says)):
+        cl.make(f"playground:{name}")
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", ["brax:pusher", "playground:CartpoleBalance"])
+def test_the_command_line_trains_on_real_physics(name, tmp_path):
+    if name.startswith("playground"):
+        pytest.importorskip("mujoco_playground")
+    assert main(["sweep", name, *TINY, "--seeds", "2", "--out", str(tmp_path / "run")]) == 0
+    rows = results.read(tmp_path / "run").to_pylist()
+    assert {row["seed"] for row in rows} == {0, 1}
+    assert all(np.isfinite(row["reward"]) for row in rows)
+    losses = {row["seed"]: row["train_loss"] for row in rows}  # rewards may be equal: validation's episodes are
+    assert losses[0] != losses[1]
+
+
+@pytest.mark.long
+def test_pictures_are_of_the_models_bodies(tmp_path):
+    """The pendulum moves, and the film begins where the episode does."""
+    world = cl.make("brax:inverted_pendulum", backend="positional", max_steps=50)
+    drawn = world.task.pictures()
+    state, obs = world.reset(jax.random.key(0))
+    first = drawn.sketch(world.env, state)
+    assert first.box[2:] == (480, 360)
+    found = drawn.reel(world.env, state, jnp.ones(1))
+    assert len(found.pictures) == 6
+    assert len(set(found.pictures)) == 6
+    frames, rewards = drawn.record(world.env, uniform_in(world.env), jax.random.key(0), 4)
+    assert len(frames) == len(rewards) == 4
+    assert np.abs(frames[0].astype(int) - frames[3].astype(int)).max() > 50
+    drawn.still(world.env, frames, tmp_path / "still.png")
+    drawn.question(world.env, state, obs, jnp.ones(1), tmp_path / "question.png")
+    assert (tmp_path / "still.png").stat().st_size > 1000
+    assert (tmp_path / "question.png").stat().st_size > 1000
+
+
+def test_a_simulator_without_bodies_is_not_drawn():
+    world = cl.make("brax:fast")
+    state, _ = world.reset(jax.random.key(0))
+    with pytest.raises(UserError, match="has no MuJoCo model to draw: evaluate a policy in it instead"):
+        world.task.pictures().sketch(world.env, state)

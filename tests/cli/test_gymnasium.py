@@ -1,0 +1,137 @@
+"""Gymnasium's environments on the command line: trained, resumed, adapted, drawn, and never imported by a file."""
+
+import json
+import shutil
+
+import numpy as np
+import probes
+import pytest
+from gymnasium_worlds import reach, toward
+from small_runs import stopping_at
+
+import cuelearner_jax as cl
+from cuelearner_jax.bridges.gymnasium import pool
+from cuelearner_jax.cli import main
+from cuelearner_jax.storage import results
+
+REACH = "gymnasium:gymnasium_worlds:reach"
+TINY = [
+    *("--agent.q-layers", "8", "--agent.directions", "8", "--agent.target-directions", "8", "--agent.batch-size", "8"),
+    *("--agent.replay-capacity", "80", "--sizes.num-envs", "4", "--schedule.eval-every", "40"),
+    *("--schedule.total-steps", "80", "--schedule.random-steps", "8", "--schedule.learn-after", "8"),
+    *("--schedule.guidance-until", "80", "--schedule.checkpoint-every", "40", "--schedule.eval-envs", "4"),
+    *("--schedule.eval-steps", "48", "--task.processes", "1", "--guidance", "none"),
+]
+SMALL = [
+    *("--sizes.feedback-layers", "8", "8", "--sizes.fit-steps", "40", "--sizes.labels-per-round", "10"),
+    *("--sizes.fit-batch-size", "16", "--judge-episodes", "4", "--task.processes", "1"),
+]
+
+
+@pytest.fixture(autouse=True)
+def closed():
+    yield
+    pool.close_all()
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A finished run."""
+    out = tmp_path_factory.mktemp("gymnasium") / "run"
+    assert main(["train", REACH, *TINY, "--out", str(out)]) == 0
+    return out
+
+
+def test_a_run_is_opened_without_its_environment_and_played_where_its_code_is_named(run, refused, capsys):
+    described = json.loads((run / "config.json").read_text())["task"]
+    assert (described["name"], described["environment"]) == ("gymnasium", "gymnasium_worlds:reach")
+    policy = cl.load_policy(run)  # nothing is imported for it
+    assert policy(np.zeros(6)).shape == (3,)
+    says = "environment gymnasium_worlds:reach is code, which no file may import: name it anew, as gymnasium:"
+    refused(["evaluate", run, "--episodes", "4"], says, run)
+    assert main(["evaluate", str(run), "--env", REACH, "--episodes", "4", "--task.processes", "1"]) == 0
+    assert "success" in capsys.readouterr().out
+
+
+def test_a_file_may_not_have_an_id_import_code(run, refused, tmp_path):
+    for name in ("os:system", "gymnasium_worlds:Reach-v0"):
+        folder = tmp_path / name.replace(":", "-")
+        folder.mkdir()
+        shutil.copy(run / "config.json", folder)
+        probes.edit_json(folder / "config.json", lambda told, name=name: told["task"].update(environment=name))
+        refused(["evaluate", folder, "--policy", "uniform", "--episodes", "2"], "which no file may import", folder)
+
+
+@pytest.mark.long
+def test_an_interrupted_training_goes_on_bitwise(run, tmp_path):
+    half = tmp_path / "half"
+    command = ["train", REACH, *TINY, "--out", str(half)]
+    with stopping_at(1):
+        assert main(command) == 130
+    pool.close_all()  # nothing is left of the instances
+    assert main([*command, "--resume"]) == 0
+    whole, resumed = (results.read(folder).to_pylist() for folder in (run, half))
+    assert len(whole) == len(resumed)
+    for before, after in zip(whole, resumed, strict=True):
+        assert {name for name in before if before[name] != after[name]} <= APART
+
+
+APART = {"wall_s", "commit", "command", "folder", "run"}
+
+
+@pytest.mark.long
+def test_code_is_adapted_by_code_that_teaches(tmp_path, capsys):
+    out = tmp_path / "better"
+    command = ["adapt", "gymnasium_worlds:beside", "--env", REACH, "--teacher", "gymnasium_worlds:toward"]
+    assert main([*command, "--labels", "20", *SMALL, "--out", str(out)]) == 0
+    told = capsys.readouterr().out
+    assert "success on tuning episodes" in told  # where there is one, success judges
+    command = ["evaluate", str(out), "--env", REACH, "--base", "gymnasium_worlds:beside", "--episodes", "4"]
+    assert main([*command, "--task.processes", "1"]) == 0
+
+
+def test_python_and_the_command_line_agree(tmp_path):
+    file = tmp_path / "found.json"
+    command = ["evaluate", REACH, "--policy", "teacher", "--teacher", "gymnasium_worlds:toward", "--episodes", "4"]
+    assert main([*command, "--task.processes", "1", "--out", str(file)]) == 0
+    world = cl.from_gymnasium(reach, processes=1)
+    mine = cl.measure(toward, world, episodes=4).metrics
+    assert mine["success"] == [1.0]
+    (row,) = json.loads(file.read_text())["rows"]
+    for name, values in mine.items():
+        assert row[name] == pytest.approx(values.tolist(), rel=1e-5)
+
+
+def test_pictures_are_written(tmp_path):
+    command = ["render", "gymnasium:gymnasium_worlds:limited", "--policy", "uniform", "--steps", "3"]
+    assert main([*command, "--out", str(tmp_path / "film")]) == 0
+    assert sorted(file.suffix for file in (tmp_path / "film").iterdir()) == [".gif", ".png"]
+    assert main([*command, "--question", "--out", str(tmp_path / "asked")]) == 0
+    assert len(list((tmp_path / "asked").iterdir())) == 1
+
+
+@pytest.mark.parametrize(
+    ("command", "says"),
+    [
+        (["evaluate", "gymnasium"], "gymnasium is a family of tasks: name one of its environments, as gymnasium:NAME"),
+        (["evaluate", "gymnasium:Nope-v1"], "Gymnasium has no environment 'Nope-v1'"),
+        (["evaluate", "gymnasium:gymnasium_worlds:Nope"], "gymnasium_worlds has no 'Nope'"),
+        (["evaluate", "gymnasium:gymnasium_worlds:Adder"], "has no limit of steps: give max_steps"),
+        (["train", REACH, "--env", "navigation"], "the task is named twice"),
+        (["train", "--task", "billiards", "--env", "navigation"], "the task is named twice"),
+        (["evaluate", REACH, "--teacher", "gymnasium_worlds:nobody", "--policy", "teacher"], "has no 'nobody'"),
+        (["adapt", "gymnasium_worlds:beside", "--teacher", "gymnasium_worlds:toward"], "--env gymnasium:NAME"),
+        (
+            ["evaluate", REACH, "--policy", "uniform", "--task.arguments", "[]"],
+            "task.arguments is '[]': give arguments",
+        ),
+        (["evaluate", REACH, "--policy", "uniform", "--task.max-steps", "0"], "task.max_steps is 0: give a whole"),
+    ],
+)
+def test_wrong_commands_are_refused_in_one_line(command, says, refused, tmp_path):
+    refused(command, says, tmp_path)
+
+
+def test_a_policy_of_another_size_is_refused(run, refused):
+    says = "acts on observations of 6 entries with actions of 3, gymnasium:CartPole-v1 has 4 and 2: name another"
+    refused(["evaluate", run, "--env", "gymnasium:CartPole-v1"], says, run)

@@ -1,0 +1,106 @@
+"""Labels of a recording on the command line: a policy corrected, judged and exported without a task or a simulator."""
+
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import recorded_situations as recorded
+
+import cuelearner_jax as cl
+from cuelearner_jax import config as configuration
+from cuelearner_jax.cli import main
+from cuelearner_jax.feedback.answers import relative_feedback
+from cuelearner_jax.storage import label_files
+from cuelearner_jax.tasks import logs
+from cuelearner_jax.types import Label
+
+CODE = """
+import numpy as np
+
+def policy(obs):
+    return obs[:, :3] * np.array([0.3, 0.1, 0.6]) + np.array([0.0, 0.2, 0.0])  # within the bounds
+
+def narrow(obs):
+    return obs[:, :2]
+"""
+EPS = 0.05
+SMALL = ("--sizes.feedback-layers", "8", "--sizes.fit-steps", "20", "--sizes.fit-batch-size", "20")
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory):
+    """A folder with a policy's code, recorded situations, and labels that ask for more of each entry."""
+    folder = tmp_path_factory.mktemp("logs")
+    (folder / "own_arm.py").write_text(CODE)
+    recorded.write(folder / "situations", pictures=False)
+    task = logs.task_of(folder / "situations", "left,right;up,down;open,close", recorded.LOW, recorded.HIGH)
+    space, random = logs.space_of(task.plain()), np.random.default_rng(0)
+    obs = random.uniform(-1, 1, (40, 4)).astype(np.float32)
+    namespace = {}
+    exec(CODE, namespace)
+    actions = namespace["policy"](obs).astype(np.float32)
+    best = np.clip(actions + 0.1, recorded.LOW, recorded.HIGH).astype(np.float32)
+    told = jax.vmap(lambda action, best: relative_feedback(space, action, best, EPS))
+    rows = Label(obs, actions, np.asarray(told(jnp.asarray(actions), jnp.asarray(best))), np.ones(40, bool))
+    of = {"name": "logs", **configuration.to_json(task.plain())}
+    (folder / "labels").mkdir()
+    file = label_files.LabelFile(of, "relative", space, EPS, np.zeros(40), rows)
+    label_files.write_file(folder / "labels/labels.parquet", file, "more")
+    return folder
+
+
+@pytest.fixture
+def there(place, monkeypatch):
+    """That folder as the current one."""
+    monkeypatch.chdir(place)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    return place
+
+
+def test_a_policy_of_code_is_corrected_judged_and_exported(there, capsys):
+    adapt = ["adapt", "own_arm:policy", "--labels-from", "labels", "--bound-deg", "0.2", *SMALL]
+    assert main([*adapt, "--out", "policies/arm"]) == 0
+    assert "40 labels within 0.2 shares: predicts" in capsys.readouterr().out
+    evaluate = ["evaluate", "policies/arm", "--labels-from", "labels"]
+    assert main([*evaluate, "--base", "own_arm:policy"]) == 0
+    told = capsys.readouterr().out
+    for words in ("agreement with 40 labels", "the policy as it was", "always already right", "difference from"):
+        assert words in told
+    assert main(["evaluate", "own_arm:policy", "--labels-from", "labels"]) == 0
+    assert "own_arm:policy: agreement with 40 labels of labels" in capsys.readouterr().out
+    assert main(["export", "policies/arm", "--only-correction", "--format", "numpy", "--out", "exported"]) == 0
+    import own_arm
+
+    obs = recorded.arrays()[0]
+    better = cl.load_policy("policies/arm", base=own_arm.policy)
+    found = cl.load_exported("exported")(obs, own_arm.policy(obs))
+    np.testing.assert_allclose(found, better(obs), atol=1e-5)
+    assert main(["export", "policies/arm", "--format", "numpy", "--base", "own_arm:policy", "--out", "no"]) == 2
+    assert "or the correction alone (--only-correction" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("command", "told"),
+    [
+        (["adapt", "own_arm:policy", "--out", "p"], "is to act in some task: name it"),
+        (["adapt", "own_arm:policy", "--labels-from", "absent", "--out", "p"], "no label file at absent"),
+        (["adapt", "own_arm:narrow", "--labels-from", "labels", "--out", "p", *SMALL], "returned actions of shape"),
+        (["adapt", "absent.onnx", "--labels-from", "labels", "--out", "p"], "there is no file absent.onnx"),
+        (["evaluate", "own_arm:narrow", "--labels-from", "labels"], "returned actions of shape"),
+        (["evaluate", "own_arm:policy", "--labels-from", "labels", "--steps", "5"], "leave out --steps"),
+        (["evaluate", "logs"], "is a family of tasks: name one of its environments, as logs:NAME"),
+        (["evaluate", "logs:absent"], "there is no folder of situations at absent"),
+        (
+            ["export", "logs:situations", "--policy", "uniform", "--only-correction", "--out", "p"],
+            "corrects no other one",
+        ),
+    ],
+)
+def test_what_cannot_be_is_told_in_one_line(command, told, there, capsys):
+    assert main(command) == 2
+    lines = [line for line in capsys.readouterr().err.splitlines() if not line.startswith("bounds of the actions")]
+    assert len(lines) == 1, lines
+    assert told in lines[0]
+    assert not (there / "p").exists()

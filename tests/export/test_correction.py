@@ -1,0 +1,122 @@
+"""The correction alone: it does beside a base what the corrected policy does, in every format, without that base."""
+
+import dataclasses
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import cuelearner_jax as cl
+from cuelearner_jax.calibration import Distortion, Unknown
+from cuelearner_jax.config import GuideSizes, Scalars
+
+LOW, HIGH = (-0.1, -1.0), (0.1, 1.0)
+EPS = 0.05
+SIZES = GuideSizes(frame="action", feedback_layers=(8,), fit_steps=40, fit_batch_size=20)
+SCALARS = dataclasses.replace(Scalars(), eps_deg=EPS, tau_deg=0.002, tau_max_deg=1.0, feedback_learning_rate=0.02)
+RANDOM = np.random.default_rng(0)
+OBS = RANDOM.uniform(-1, 1, (60, 3)).astype(np.float32)
+OTHERS = RANDOM.uniform(-1, 1, (7, 3)).astype(np.float32)
+
+
+def base(obs):
+    """A policy in NumPy, which no file can hold."""
+    return np.stack([0.05 * obs[:, 0], np.tanh(obs[:, 1])], -1)
+
+
+def labels():
+    """More of the first entry, less of the second."""
+    return cl.Labels(OBS, base(OBS).astype(np.float32), np.tile(np.array([1.0, -1.0], np.float32), (60, 1)))
+
+
+@pytest.fixture(scope="module")
+def better():
+    """Corrected by these."""
+    how = {"low": LOW, "high": HIGH, "eps": EPS, "bound": 0.2, "sizes": SIZES, "scalars": SCALARS}
+    return cl.correct(base, labels(), cues="left,right;open,close", **how)
+
+
+@pytest.mark.parametrize("format", ["onnx", "numpy", "stablehlo"])
+def test_beside_its_base_it_does_what_the_policy_does(format, better, tmp_path):
+    written = cl.export_correction(better, tmp_path / "out", format=format)
+    assert written["difference"] <= written["golden"]["tolerance"]
+    assert written["base"]["size"] == 2
+    assert [part["name"] for part in written["observation"]["slices"]] == ["observation", "base action"]
+    decide = cl.load_exported(tmp_path / "out")
+    found = decide(OTHERS, base(OTHERS))
+    np.testing.assert_allclose(found, better(OTHERS), atol=1e-5)
+    assert np.abs(found - base(OTHERS)).max() > 0.01
+    np.testing.assert_allclose(decide(OTHERS[0], base(OTHERS)[0]), found[0], atol=1e-6)
+
+
+def test_onnxruntime_runs_it_without_jax(better, tmp_path):
+    pytest.importorskip("onnxruntime")
+    cl.export_correction(better, tmp_path / "out")
+    np.savez(tmp_path / "cases.npz", obs=OTHERS, base=base(OTHERS).astype(np.float32), action=better(OTHERS))
+    code = """
+import sys
+import numpy as np, onnxruntime
+session = onnxruntime.InferenceSession("out/decision.onnx", providers=["CPUExecutionProvider"])
+assert [one.name for one in session.get_inputs()] == ["obs", "base_action"]
+cases = np.load("cases.npz")
+(action,) = session.run(["action"], {"obs": cases["obs"], "base_action": cases["base"]})
+assert np.abs(action - cases["action"]).max() < 1e-5
+sys.path.insert(0, "out")
+from decide import Decision
+assert np.abs(Decision("out")(cases["obs"], cases["base"]) - cases["action"]).max() < 1e-5
+assert not {"jax", "cuelearner_jax"} & set(sys.modules)
+"""
+    subprocess.run([sys.executable, "-I", "-c", code], cwd=tmp_path, check=True)
+
+
+def test_of_a_saved_policy_it_needs_no_base(better, tmp_path):
+    better.save(tmp_path / "better")
+    again = cl.load_policy(tmp_path / "better", base=base)
+    cl.export_correction(again, tmp_path / "out", format="numpy")
+    found = cl.load_exported(tmp_path / "out")(OTHERS, base(OTHERS))
+    np.testing.assert_allclose(found, better(OTHERS), atol=1e-5)
+
+
+def test_a_policy_of_jax_functions_is_exported_whole_from_its_folder(tmp_path):
+    own = jax.jit(lambda obs: jnp.stack([0.05 * obs[:, 0], jnp.tanh(obs[:, 1])], -1))
+    how = {"low": LOW, "high": HIGH, "eps": EPS, "bound": 0.2, "sizes": SIZES, "scalars": SCALARS}
+    better = cl.correct(own, labels(), **how)
+    cl.export_policy(better, tmp_path / "whole", format="numpy")
+    np.testing.assert_allclose(cl.load_exported(tmp_path / "whole")(OTHERS), better(OTHERS), atol=1e-5)
+    with pytest.raises(Exception, match="holds a whole policy: leave out the base action"):
+        cl.load_exported(tmp_path / "whole")(OTHERS, base(OTHERS))
+
+
+def test_what_is_given_wrongly_is_told(better, tmp_path):
+    cl.export_correction(better, tmp_path / "out", format="numpy")
+    decide = cl.load_exported(tmp_path / "out")
+    for given, told in (
+        ((OTHERS,), r"give the base's action, decide\(obs, base_action\)"),
+        ((OTHERS, base(OTHERS)[:3]), "as many rows of both"),
+        ((OTHERS[:, :2], base(OTHERS)), "as many rows of both"),
+        ((OTHERS, np.full((7, 2), np.nan)), "not finite"),
+    ):
+        with pytest.raises(Exception, match=told) as error:
+            decide(*given)
+        assert type(error.value).__name__ == "ContractError"
+    with pytest.raises(cl.UserError, match="is not empty"):
+        cl.export_correction(better, tmp_path / "out")
+
+
+def test_a_whole_policy_takes_no_base_action_and_code_can_be_in_no_file(better, tmp_path):
+    with pytest.raises(cl.UserError, match="or the correction alone"):
+        cl.export_policy(better, tmp_path / "whole")
+    with pytest.raises(cl.UserError, match="corrects no other one"):
+        cl.export_correction(cl.CallablePolicy(better.policy.base), tmp_path / "no", world=better.world)
+
+
+def test_a_correction_that_asks_its_base_anew_cannot_stand_alone(better, tmp_path):
+    from cuelearner_jax.calibration import Calibrated
+
+    seen = Distortion("shift", (Unknown("shift", "m"),), sees=lambda theta, obs: obs - theta)
+    policy = Calibrated(better.policy.base, np.zeros(1, np.float32), (seen,))
+    with pytest.raises(cl.UserError, match=r"asks its base about other observations \(shift\)"):
+        cl.export_correction(dataclasses.replace(better, policy=policy), tmp_path / "out")

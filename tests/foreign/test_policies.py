@@ -1,0 +1,221 @@
+"""Policies of PyTorch, Stable-Baselines3 and onnxruntime act as themselves; faults are told in one line."""
+
+import jax
+import numpy as np
+import pytest
+
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.policies import in_space, policy_of
+from cuelearner_jax.spaces import Box, Choices
+
+FIRST = np.eye(3, 2)  # a policy whose action is the first two entries of its observation
+SPACE = Box((-1.0, -1.0), (1.0, 1.0))
+OBS = np.random.default_rng(0).uniform(-1, 1, (5, 3)).astype(np.float32)
+
+
+def acted(given, obs=OBS, space=SPACE):
+    """What a policy does in a compiled program."""
+    policy = in_space(policy_of(given), space)
+    return np.asarray(jax.jit(lambda obs: policy.act(jax.random.key(0), None, obs))(obs))
+
+
+def fault(given, obs=OBS, space=SPACE):
+    """What is told of a policy, in one line."""
+    from cuelearner_jax.api.acting import CallablePolicy
+
+    with pytest.raises(UserError) as error:
+        CallablePolicy(in_space(policy_of(given), space), actions=space)(obs)
+    assert "\n" not in str(error.value)
+    return str(error.value)
+
+
+@pytest.fixture
+def torch():
+    return pytest.importorskip("torch")
+
+
+def network(torch, outputs=2, dtype=None):
+    """A small network with dropout, which acts at random unless it is in evaluation mode."""
+    torch.manual_seed(0)
+    parts = torch.nn.Linear(3, 8), torch.nn.Tanh(), torch.nn.Dropout(0.5), torch.nn.Linear(8, outputs), torch.nn.Tanh()
+    return torch.nn.Sequential(*parts).to(dtype or torch.float32)
+
+
+def test_a_module_acts_in_evaluation_mode_and_keeps_its_own(torch):
+    module = network(torch).train()
+    module[0].eval()
+    found = acted(module)
+    assert [part.training for part in module] == [False, True, True, True, True]
+    with torch.no_grad():
+        np.testing.assert_allclose(found, module.eval()(torch.as_tensor(OBS)).numpy(), atol=1e-6)
+    assert all(own.grad is None for own in module.parameters())
+
+
+def test_a_module_in_double_precision_acts_too(torch):
+    module = network(torch, dtype=torch.float64)
+    with torch.no_grad():
+        wanted = module.eval()(torch.as_tensor(OBS, dtype=torch.float64)).numpy()
+    np.testing.assert_allclose(acted(module), wanted, atol=1e-6)
+
+
+def test_a_module_that_gives_more_than_actions_is_asked_for_the_first(torch):
+    class Actor(torch.nn.Module):
+        def forward(self, obs):
+            return obs[:, :2] / 2, obs.sum()
+
+    np.testing.assert_allclose(acted(Actor()), OBS[:, :2] / 2)
+
+
+def test_a_class_of_modules_is_made(torch):
+    class Actor(torch.nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.act = torch.nn.ReLU()  # a name that policies of ours have
+
+        def forward(self, obs):
+            return self.act(obs[:, :2])
+
+    np.testing.assert_allclose(acted(Actor), np.maximum(OBS[:, :2], 0))
+
+
+def test_faults_of_modules_are_told(torch):
+    class Broken(torch.nn.Module):
+        def forward(self, obs):
+            return obs[:, :2] / 0 * 0
+
+    assert "not finite" in fault(Broken())
+    assert "returned actions of shape (5, 3) for 5 observations: return (5, 2)" in fault(network(torch, 3))
+    assert "RuntimeError" in fault(network(torch), OBS[:, :2])
+
+
+def test_a_module_is_the_same_policy_each_time(torch):
+    module = network(torch)
+    assert policy_of(module).function == policy_of(module).function
+    assert hash(policy_of(module).function) == hash(policy_of(module).function)
+    assert policy_of(module).function != policy_of(network(torch)).function
+
+
+@pytest.fixture
+def gymnasium():
+    pytest.importorskip("stable_baselines3")
+    return pytest.importorskip("gymnasium")
+
+
+def env_of(gymnasium, space, actions):
+    """An environment of one step with these spaces."""
+
+    class One(gymnasium.Env):
+        observation_space, action_space = space, actions
+
+        def reset(self, *, seed=None, options=None):
+            super().reset(seed=seed)
+            return self.observation_space.sample(), {}
+
+        def step(self, action):
+            return self.observation_space.sample(), 0.0, True, False, {}
+
+    return One()
+
+
+def test_a_model_of_stable_baselines3_acts_deterministically(gymnasium):
+    from stable_baselines3 import SAC
+
+    box = gymnasium.spaces.Box
+    model = SAC(
+        "MlpPolicy",
+        env_of(gymnasium, box(-1, 1, (3,)), box(-1, 1, (2,))),
+        policy_kwargs={"net_arch": [8]},
+        seed=0,
+        device="cpu",
+        buffer_size=10,
+    )
+    wanted = model.predict(OBS, deterministic=True)[0]
+    for given in (model, model.predict, model.policy, lambda obs: model.predict(obs, deterministic=True)):
+        np.testing.assert_allclose(acted(given), wanted, atol=1e-6)
+    assert "takes observations of 3 entries, these have 2" in fault(model, OBS[:, :2])
+
+
+def test_a_model_of_dictionaries_takes_rows_in_the_order_of_its_keys(gymnasium):
+    from stable_baselines3 import PPO
+
+    box = gymnasium.spaces.Box
+    seen = gymnasium.spaces.Dict({"pose": box(-1, 1, (2,)), "goal": box(-1, 1, (1,))})
+    model = PPO(
+        "MultiInputPolicy",
+        env_of(gymnasium, seen, box(-1, 1, (2,))),
+        policy_kwargs={"net_arch": [8]},
+        seed=0,
+        n_steps=2,
+        batch_size=2,
+        device="cpu",
+    )
+    sizes = {name: part.shape[0] for name, part in model.observation_space.spaces.items()}
+    ends = np.cumsum(list(sizes.values()))
+    rows = {name: OBS[:, end - size : end] for (name, size), end in zip(sizes.items(), ends, strict=True)}
+    np.testing.assert_allclose(acted(model), model.predict(rows, deterministic=True)[0], atol=1e-6)
+
+
+def test_choices_may_be_given_by_their_places(gymnasium):
+    from stable_baselines3 import PPO
+
+    spaces = gymnasium.spaces
+    model = PPO(
+        "MlpPolicy",
+        env_of(gymnasium, spaces.Box(-1, 1, (3,)), spaces.Discrete(4)),
+        policy_kwargs={"net_arch": [8]},
+        seed=0,
+        n_steps=2,
+        batch_size=2,
+        device="cpu",
+    )
+    found = acted(model, space=Choices(4))
+    np.testing.assert_array_equal(found, np.eye(4)[model.predict(OBS, deterministic=True)[0]])
+
+
+@pytest.fixture
+def stored(tmp_path):
+    """Writes a file in ONNX: obs (rows, size) times a matrix, under these names."""
+    onnx = pytest.importorskip("onnx")
+    pytest.importorskip("onnxruntime")
+    helper, real = onnx.helper, onnx.TensorProto.FLOAT
+
+    def write(rows="n", outputs=("action",), inputs=("obs",), matrix=FIRST):
+        weights = onnx.numpy_helper.from_array(matrix.astype(np.float32), "w")
+        nodes = [helper.make_node("MatMul", [inputs[0], "w"], [name]) for name in outputs]
+        given = [helper.make_tensor_value_info(name, real, [rows, 3]) for name in inputs]
+        made = [helper.make_tensor_value_info(name, real, [rows, 2]) for name in outputs]
+        model = helper.make_model(
+            helper.make_graph(nodes, "policy", given, made, [weights]), opset_imports=[helper.make_opsetid("", 18)]
+        )
+        model.ir_version = 8
+        path = tmp_path / "policy.onnx"
+        path.write_bytes(model.SerializeToString())
+        return path
+
+    return write
+
+
+@pytest.mark.parametrize("rows", ["n", 1, 5])
+def test_a_file_in_onnx_acts(rows, stored):
+    path = stored(rows)
+    np.testing.assert_allclose(acted(path), OBS[:, :2])
+    np.testing.assert_allclose(acted(str(path)), OBS[:, :2])
+
+
+def test_of_several_outputs_the_one_called_action_is_taken(stored):
+    np.testing.assert_allclose(acted(stored(outputs=("value", "action"))), OBS[:, :2])
+
+
+def test_files_in_onnx_that_do_not_fit_are_told(stored, tmp_path):
+    with pytest.raises(UserError, match="has the outputs mean, value"):
+        policy_of(stored(outputs=("mean", "value")))
+    with pytest.raises(UserError, match=r"has the inputs obs tensor\(float\)"):
+        policy_of(stored(inputs=("obs", "mask")))
+    with pytest.raises(UserError, match="there is no file"):
+        policy_of(tmp_path / "absent.onnx")
+    (tmp_path / "damaged.onnx").write_bytes(b"no model")
+    with pytest.raises(UserError, match="cannot be run by onnxruntime"):
+        policy_of(tmp_path / "damaged.onnx")
+    path = stored()
+    assert "takes observations of 3 entries, these have 2" in fault(path, OBS[:, :2])
+    assert "not finite" in fault(stored(matrix=np.full((3, 2), np.nan)))

@@ -1,0 +1,242 @@
+"""The page on a folder of pictures: arrows of cues, one cue a press, what is refused, and a script that answers."""
+
+import asyncio
+import re
+
+import numpy as np
+import pytest
+import recorded_situations as recorded
+from page_answers import labelled, pressed
+
+pytest.importorskip("nicegui")
+from page_user import press, shown
+
+from cuelearner_jax.cli import label
+from cuelearner_jax.cli.situations import task_named, with_cues
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.feedback.answers import RELATIVE
+from cuelearner_jax.labelling import controls, pointing, view
+from cuelearner_jax.labelling.session import Item, Session
+from cuelearner_jax.spaces import UNSAID, Box, cues_from
+from cuelearner_jax.storage import label_files
+from cuelearner_jax.tasks import fetch_layout
+from cuelearner_jax.types import Sketch
+
+CUES = "left,right;up,down;open,close"
+SMALL = ("--sizes.feedback-layers", "8", "--sizes.fit-steps", "20", "--no-practice")
+BOUNDS = ("--task.low", "-0.5", "0", "-1", "--task.high", "0.5", "0.4", "1")
+GOAL = np.array([0.25, 0.3, 0.0])
+PHOTO = Sketch((0, 0, 640, 480), "<image class='photo'/>", {}, {}, (320, 240), (0, 120), 0.0)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A folder of twelve pictures."""
+    recorded.write(tmp_path / "situations")
+    return tmp_path / "situations"
+
+
+def arrows(svg):
+    """Name -> angle on the screen [deg, counterclockwise] and words of each cue's arrow in a picture."""
+    found = {}
+    for part in svg.split('<g class="said ')[1:]:
+        name, drawn = re.match(r'\w+" data-name="([^"]+)">', part)[1], part
+        x1, y1, x2, y2 = map(float, re.search(r'x1="(\S+)" y1="(\S+)" x2="(\S+)" y2="(\S+)"', drawn).groups())
+        words = re.findall(r">([^<>]+)</text>", drawn)
+        found[name] = round(np.degrees(np.arctan2(y1 - y2, x2 - x1))), *words
+    return found
+
+
+def drawn(space, action=None, sketch=PHOTO, one_cue=False, refined=None):
+    """The picture of an item."""
+    action = np.asarray(space.middle()) if action is None else action
+    return view.picture(Item(0, None, action, sketch, refined), RELATIVE, 0.1, space, one_cue)
+
+
+def box(words):
+    """A box around zero with these cues."""
+    cues = cues_from(words)
+    return Box((-1.0,) * len(cues), (1.0,) * len(cues), cues)
+
+
+def test_cues_are_arrows_where_their_words_point_with_keys_and_words():
+    found = arrows(drawn(box(f"forward,back;{CUES}")))
+    assert found == {
+        "pick-0-more": (45, "F", "forward"),
+        "pick-0-less": (-135, "B", "back"),
+        "pick-1-more": (180, "←", "left"),
+        "pick-1-less": (0, "→", "right"),
+        "pick-2-more": (90, "↑", "up"),
+        "pick-2-less": (-90, "↓", "down"),
+    }  # to open points nowhere: its words stand beside the picture
+    assert {name[:5] for name in arrows(drawn(box(CUES), one_cue=True))} == {"only-"}
+    assert arrows(drawn(box("higher,lower"))) == {"+1": (90, "H", "higher"), "-1": (-90, "L", "lower")}
+    assert arrows(drawn(box("right,left")))["+1"][0] == 0  # more may be to the right
+    assert pointing.by_words(cues_from("left,up")[0]) is None
+    assert pointing.by_words(cues_from("more to the left,less")[0]) == (-1.0, 0.0)
+
+
+def test_arrows_stay_in_the_picture_and_two_that_point_alike_lie_apart():
+    svg = drawn(box("up,down;higher,lower"))
+    discs = np.array(re.findall(r'<circle cx="(\S+)" cy="(\S+)" r="(\S+)"', svg), float)
+    assert len(discs) == 4
+    x, y, radius = discs.T
+    assert (x - radius).min() >= 0
+    assert (y - radius).min() >= 0
+    assert (x + radius).max() <= 640
+    assert (y + radius).max() <= 480
+    assert np.hypot(x[0] - x[2], y[0] - y[2]) > 2 * radius[0]
+
+
+def test_a_task_says_where_cues_point_in_its_pictures():
+    forward, left, up, fingers = fetch_layout.points_of("FetchReach-v4", "{}")
+    half, eighth = np.sqrt(0.5), np.sqrt(0.125)  # azimuth 45 degrees, and half of what leads away is up: sin 30 degrees
+    np.testing.assert_allclose([forward, left], [(half, -eighth), (-half, -eighth)], atol=1e-6)
+    assert (up, fingers) == ((0.0, -1.0), None)
+    assert fetch_layout.points_of("FetchReach-v4", '{"default_camera_config": {}}')[:2] == (None, None)
+    assert fetch_layout.points_of("Pendulum-v1", "{}") == ()
+    found = arrows(drawn(box(f"forward,back;{CUES}"), sketch=PHOTO._replace(points=(forward, left, up, None))))
+    assert (found["pick-0-more"][0], found["pick-1-more"][0], found["pick-2-less"][0]) == (27, 153, -90)
+
+
+def test_the_action_and_its_correction_are_arrows_from_the_middle_and_the_correction_is_told_in_words():
+    space = box(CUES)
+    action, refined = np.float32([-0.5, 0.0, 0.0]), np.float32([0.0, 0.4, -1.0])
+    svg = drawn(space, action, refined=refined)
+    ends = {
+        name: tuple(map(float, ends))
+        for name, *ends in re.findall(r'class="arrow (asked|refined)"><line[^>]*x1="(\S+)" y1="(\S+)"[^>]*', svg)
+    }
+    assert ends == {"asked": (320.0, 240.0), "refined": (320.0, 240.0)}
+    tips = re.findall(r'class="arrow (?:asked|refined)">.*?points="([\d.]+),([\d.]+)', svg)
+    # Half of the way to the end of the range is half of the reach; more of the cue is to the left.
+    np.testing.assert_allclose(np.array(tips, float), [(380, 240), (320, 192)], atol=0.01)
+    told = view.note(Item(0, None, action, PHOTO, refined), RELATIVE, 0.1, space)
+    assert told.endswith("The correction: left by 25%, up by 20%, close by 50% of the range")
+    assert drawn(space).count('class="arrow asked"') == 0  # the middle is nowhere to point to
+
+
+def test_a_key_of_a_cue_is_no_other_controls():
+    known = controls.controls(RELATIVE, box(CUES))
+    keys = [key for control in known.values() for key in control.keys]
+    assert len(keys) == len(set(keys))
+    assert (known["unsure"].shown, known["rest"].shown) == ("S", "space")
+    assert "press S: it costs nothing. F shows a film" in controls.hint(1, known)
+    assert known["pick-0-less"].keys == ("ArrowRight", "d", "D")
+    assert "film" not in controls.controls(RELATIVE, box(CUES), films=False)
+    assert "film-refined" not in controls.controls(RELATIVE, box(CUES), simulated=False)
+
+
+def test_one_press_about_one_cue_says_nothing_of_the_others():
+    known = controls.controls(RELATIVE, box(CUES), one_cue=True)
+    said = {name: controls.given(box(CUES), one, None, {}) for name, one in known.items() if one.answer}
+    assert said.keys() == {f"only-{cue}-{way}" for cue in range(3) for way in ("more", "less")} | {"rest"}
+    np.testing.assert_array_equal(said["only-1-less"], [UNSAID, -1.0, UNSAID])
+    np.testing.assert_array_equal(said["rest"], [0.0, 0.0, 0.0])
+    assert pressed(known, np.array([UNSAID, -1.0, UNSAID])) == ["only-1-less"]
+
+
+def test_one_cue_a_press_on_a_folder_of_pictures(folder, tmp_path):
+    arguments = [str(folder), "--cues", CUES, *BOUNDS]
+    task, _ = task_named(arguments, "label", label.Label)
+    config = task.presets["paper"].config
+    asked = label.Label(
+        task.plain(),
+        label._part(label.GuideSizes, label.adapting.SIZES),
+        label._part(label.GuideScalars, config.scalars),
+        tmp_path / "labels",
+        guidance="relative",
+        labels=10,
+        questions="proposed",
+        one_cue=True,
+    )
+    plan = label.planned(task, config, asked, None)
+    with Session(plan, tmp_path / "labels") as session:
+
+        async def acts(user, pages):
+            (page,) = pages
+            await user.should_see("sideways")
+            assert "film" not in page.controls  # plain pictures have none
+            assert 'class="photo" href="data:image/png;base64,' in page._scene.content
+            first = np.asarray(session.item.guide.obs)
+            row = np.flatnonzero((recorded.arrays()[0] == first).all(-1))
+            np.testing.assert_allclose(session.item.action, recorded.arrays()[1][row[0]], atol=1e-6)
+            await press(user, "only-2-more", lambda: session.number == 1)
+            await press(user, "rest", lambda: session.number == 2)
+            await press(user, "unsure", lambda: session.number == 3)
+            await press(user, "undo", lambda: session.number == 2)
+            await press(user, "only-0-less", lambda: session.number == 3)
+            await asyncio.sleep(0.05)
+            await user.should_see("3 of 10")
+
+        shown(session, acts)
+    file = label_files.read(tmp_path / "labels")
+    np.testing.assert_array_equal(file.labels.answer, [[UNSAID, UNSAID, 1.0], [0.0, 0.0, 0.0], [-1.0, UNSAID, UNSAID]])
+    assert [cue.words for cue in file.space.cues] == [("left", "right"), ("up", "down"), ("open", "close")]
+    assert file.session["base"] == "proposed"
+
+
+def test_a_script_labels_a_folder_by_the_command_and_labels_of_others_are_refused(folder, tmp_path, capsys):
+    told = []
+
+    def ask(obs, action):
+        """What a person says who wants the gripper at one place, and sees a tenth of a range."""
+        apart = (GOAL - action) / (np.array(recorded.HIGH) - recorded.LOW)
+        told.append(np.where(np.abs(apart) > 0.1, np.sign(apart), 0.0))
+        return told[-1]
+
+    command = [folder, "--cues", CUES, *BOUNDS, *SMALL, "--out", tmp_path / "mine", "--who", "Ada"]
+    found = labelled([*command, "--labels", "12"], ask)
+    assert 'next: cl.correct(policy, "' in capsys.readouterr().out
+    file = label_files.read(found)
+    np.testing.assert_array_equal(file.labels.answer, told)
+    assert file.people.who.tolist() == ["Ada"] * 12
+    assert sorted(map(tuple, np.asarray(file.labels.obs))) == sorted(map(tuple, recorded.arrays()[0]))  # each once
+    other = tmp_path / "others"
+    recorded.write(other, rows=8)
+    cues = [folder, "--cues", "right,left;up,down;open,close", *command[3:]]
+    for arguments, words in (([other, *command[1:]], "another task.path"), (cues, "another task.cues")):
+        with pytest.raises(UserError, match=words) as raised:
+            label.run([*map(str, arguments)])
+        assert "\n" not in str(raised.value)
+    assert len(label_files.read(found).labels.answer) == 12
+
+
+def test_the_page_shows_what_gymnasium_renders_and_films_where_an_action_leads(tmp_path, capsys):
+    pytest.importorskip("gymnasium")
+    seen = []
+
+    def ask(obs, action, page):
+        seen.append(page._scene.content)
+        return np.array([1.0 if action < 0.5 else 0.0])
+
+    command = ["gymnasium:gymnasium_worlds:limited", "--cues", "right,left", *SMALL, "--labels", "3"]
+    found = labelled([*command, "--task.processes", "1", "--out", tmp_path / "mine"], ask)
+    assert "cuelearner train gymnasium:gymnasium_worlds:limited" in capsys.readouterr().out
+    assert label_files.read(found).space.cues[0].words == ("right", "left")
+    photos = [re.search(r'class="photo" href="([^"]+)"', svg)[1] for svg in seen]
+    assert len(set(photos)) == len(photos)  # a picture of each step
+    assert arrows(seen[0]) == {"+1": (0, "→", "right"), "-1": (180, "←", "left")}
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        (["--cues", "left,right;up,down"], "2 pairs of words for 3 entries"),
+        (["--cues", "left;right"], "two words for each entry"),
+        ([*BOUNDS[:4]], "low is given alone"),
+        (["--task.low", "a", "b"], "--task.low is 'a b': give a number for each entry"),
+    ],
+)
+def test_what_does_not_fit_a_folder_is_told_in_one_line(folder, given, told):
+    with pytest.raises(UserError, match=re.escape(told)):
+        task_named([str(folder), *given], "label", label.Label)
+
+
+def test_cues_and_one_cue_need_a_space_that_has_several(tmp_path):
+    task, _ = task_named(["navigation"], "label", label.Label)
+    with pytest.raises(UserError, match="navigation has its own: leave it out"):
+        with_cues(task, task.plain(), "left,right")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(UserError, match="is empty"):
+        task_named([str(tmp_path / "empty")], "label", label.Label)

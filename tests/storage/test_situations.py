@@ -1,0 +1,196 @@
+"""Recorded situations: three forms of a folder and a LeRobot dataset say the same; what is wrong is told in a line."""
+
+import io
+import json
+import pickle
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+import recorded_situations as recorded
+from PIL import Image
+
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.storage import situations
+
+
+@pytest.mark.parametrize("form", ["parquet", "csv", "npz"])
+def test_a_folder_is_read(form, tmp_path):
+    observations, actions = recorded.write(tmp_path / "there", form=form)
+    found = situations.read(tmp_path / "there")
+    np.testing.assert_array_equal(found.observations, observations)
+    np.testing.assert_array_equal(found.actions, actions)
+    assert found.entries == (() if form == "npz" else recorded.ENTRIES)
+    assert [(one.name, one.size) for one in found.slices] == [("observation", 4)]
+    picture = found.picture(7)
+    assert picture.kind == "image/png"
+    assert Image.open(io.BytesIO(picture.data)).getpixel((0, 0)) == (7, 0, 0)
+
+
+def test_the_digest_tells_situations_apart(tmp_path):
+    recorded.write(tmp_path / "a", rows=5)
+    recorded.write(tmp_path / "b", rows=5, form="csv")
+    recorded.write(tmp_path / "c", rows=6)
+    first, same, other = (situations.read(tmp_path / name).digest for name in "abc")
+    assert first == same
+    assert first != other
+
+
+def test_a_lerobot_dataset_is_read(tmp_path):
+    observations, actions = recorded.write_lerobot(tmp_path / "set")
+    found = situations.read(tmp_path / "set")
+    np.testing.assert_array_equal(found.observations, observations)
+    np.testing.assert_array_equal(found.actions, actions)
+    assert [one.name for one in found.slices] == ["shoulder", "elbow", "wrist", "jaw"]
+    assert found.entries == recorded.ENTRIES
+    for row in (0, 4, 5, 11):  # of both episodes, which share a video
+        shade = np.asarray(Image.open(io.BytesIO(found.picture(row).data)).convert("L")).mean()
+        assert shade == pytest.approx(20 * row, abs=4)
+
+
+def test_a_lerobot_dataset_without_names_or_camera(tmp_path):
+    recorded.write_lerobot(tmp_path / "set", names=False)
+    path = tmp_path / "set/meta/info.json"
+    info = json.loads(path.read_text())
+    del info["features"]["observation.images.front"]
+    path.write_text(json.dumps(info))
+    found = situations.read(tmp_path / "set")
+    assert found.entries == ()
+    assert [(one.name, one.size) for one in found.slices] == [("observation", 4)]
+    assert not found.has_pictures
+    assert found.picture(0) is None
+
+
+def table(folder, **columns):
+    folder.mkdir(exist_ok=True)
+    pq.write_table(pa.table(columns), folder / "situations.parquet")
+
+
+GOOD = {"observation": [[0.0, 1.0], [2.0, 3.0]], "action": [[0.5], [0.25]]}
+
+
+@pytest.mark.parametrize(
+    ("changed", "told"),
+    [
+        ({"action": None}, "has no column action (its columns: observation)"),
+        ({"observation": [[0.0, 1.0], [2.0]]}, "rows of 1 to 2 entries|rows of 1, 2 entries"),
+        ({"observation": [[0.0, 1.0], [2.0, float("nan")]]}, "the rows 1 are not finite"),
+        ({"action": [["a"], ["b"]]}, "what is no number"),
+        ({"picture": ["../secret.png", None]}, "leads out of"),
+        ({"picture": ["/etc/passwd", None]}, "leads out of"),
+        ({"picture": ["notes.txt", None]}, "is of no kind that a page shows"),
+        ({"picture": [1.0, 2.0]}, "give the name of a file"),
+        ({"observation": [], "action": []}, "holds no observations"),
+    ],
+)
+def test_what_does_not_fit_is_told(changed, told, tmp_path):
+    columns = {name: values for name, values in {**GOOD, **changed}.items() if values is not None}
+    table(tmp_path / "there", **columns)
+    with pytest.raises(UserError) as error:
+        situations.read(tmp_path / "there")
+    assert any(words in str(error.value) for words in told.split("|"))
+
+
+def test_sizes_that_differ_are_told(tmp_path):
+    (tmp_path / "there").mkdir()
+    np.savez(tmp_path / "there/situations.npz", observation=np.zeros((3, 2)), action=np.zeros((2, 1)))
+    with pytest.raises(UserError, match="3 observations and 2 actions"):
+        situations.read(tmp_path / "there")
+
+
+def test_an_empty_folder_and_none_are_told(tmp_path):
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(UserError, match="is empty, and is no LeRobot dataset either"):
+        situations.read(tmp_path / "empty")
+    with pytest.raises(UserError, match="there is no folder of situations"):
+        situations.read(tmp_path / "absent")
+
+
+def test_a_link_does_not_lead_out_of_the_folder(tmp_path):
+    (tmp_path / "secret.png").write_bytes(b"secret")
+    table(tmp_path / "there", **GOOD, picture=["a.png", None])
+    (tmp_path / "there/a.png").symlink_to(tmp_path / "secret.png")
+    with pytest.raises(UserError, match="leads out of"):
+        situations.read(tmp_path / "there")
+
+
+def test_a_picture_that_is_gone_is_told_when_it_is_wanted(tmp_path):
+    table(tmp_path / "there", **GOOD, picture=["a.png", None])
+    found = situations.read(tmp_path / "there")
+    assert found.picture(1) is None
+    with pytest.raises(UserError, match="of row 0 cannot be read"):
+        found.picture(0)
+
+
+class Trap:
+    """Its unpickling would be seen."""
+
+    def __reduce__(self):
+        return print, ("executed",)
+
+
+def test_nothing_is_unpickled(tmp_path, capsys):
+    (tmp_path / "there").mkdir()
+    pickled = np.array([Trap()], object)
+    np.savez(tmp_path / "there/situations.npz", observation=np.zeros((1, 2)), action=pickled)
+    with pytest.raises(UserError, match="without Python objects"):
+        situations.read(tmp_path / "there")
+    (tmp_path / "there/situations.npz").write_bytes(pickle.dumps(Trap()))
+    with pytest.raises(UserError, match="cannot be read"):
+        situations.read(tmp_path / "there")
+    assert "executed" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (lambda info: info.update(codebase_version="v2.1"), "of the format 'v2.1', v3.0 is wanted"),
+        (lambda info: info.update(features=[]), "is damaged"),
+        (lambda info: info.pop("fps"), "is damaged"),
+        (lambda info: info["features"].pop("action"), "has no feature action"),
+        (lambda info: info["features"]["observation.state"].update(dtype="string"), "has no feature observation.state"),
+        (lambda info: info["features"]["action"].update(shape=[2]), "action does not hold 2 numbers"),
+    ],
+)
+def test_a_lerobot_dataset_that_cannot_be_read_is_told(change, told, tmp_path):
+    recorded.write_lerobot(tmp_path / "set")
+    path = tmp_path / "set/meta/info.json"
+    info = json.loads(path.read_text())
+    change(info)
+    path.write_text(json.dumps(info))
+    with pytest.raises(UserError, match=told):
+        situations.read(tmp_path / "set")
+
+
+def test_episodes_that_begin_nowhere_are_told(tmp_path):
+    recorded.write_lerobot(tmp_path / "set")
+    episodes = tmp_path / "set/meta/episodes/chunk-000/file-000.parquet"
+    stored = pq.read_table(episodes)
+    name = "videos/observation.images.front/from_timestamp"
+    place = stored.column_names.index(name)
+    pq.write_table(stored.set_column(place, name, pa.array([float("nan"), 0.5])), episodes)
+    found = situations.read(tmp_path / "set")
+    assert found.picture(5).kind == "image/png"
+    with pytest.raises(UserError, match="does not say where episode 0 begins"):
+        found.picture(0)
+    episodes.unlink()
+    with pytest.raises(UserError, match="does not name the episode 0"):
+        situations.read(tmp_path / "set").picture(0)
+
+
+def test_a_camera_does_not_lead_out_of_a_dataset(tmp_path):
+    recorded.write_lerobot(tmp_path / "set")
+    path = tmp_path / "set/meta/info.json"
+    text = path.read_text().replace("observation.images.front", "../../../outside")
+    path.write_text(text)
+    episodes = tmp_path / "set/meta/episodes/chunk-000/file-000.parquet"
+    stored = pq.read_table(episodes)
+    pq.write_table(
+        stored.rename_columns(
+            [name.replace("observation.images.front", "../../../outside") for name in stored.column_names]
+        ),
+        episodes,
+    )
+    with pytest.raises(UserError, match="leads out of"):
+        situations.read(tmp_path / "set").picture(0)
