@@ -103,7 +103,8 @@ def known(name: str) -> Any:
         )
     import gymnasium
 
-    if name not in gymnasium.registry and find_spec("gymnasium_robotics") is not None:
+    imported_before = "gymnasium_robotics" in sys.modules  # by the caller: its environments are registered, and fail
+    if imported_before or (name not in gymnasium.registry and find_spec("gymnasium_robotics") is not None):
         from cuelearner_jax.bridges.gymnasium.robotics import register
 
         register()
