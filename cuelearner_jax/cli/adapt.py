@@ -91,6 +91,6 @@ def _of_labels(named: str, path: str | None) -> PolicySource:
     found = None if path is None else correcting.of_file(Path(path))
     if found is None or found.config is None:
         why = "" if path is None else f", of which {path} does not hold labels of a recording"
-        raise UserError(f"{named} is to act in some task{why}: name it, as --task navigation")
+        raise UserError(f"{named} is to act in some task{why}: name it, as --task navigation or --env gymnasium:NAME")
     world = correcting.world_of(found)
     return PolicySource(world.task, world.task.start(), None, Path(world.task.name))

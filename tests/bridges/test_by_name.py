@@ -59,7 +59,7 @@ def test_a_name_gives_the_whole_box_and_the_layout():
     assert isinstance(env.actions, Box)
     assert (env.actions.low, env.actions.high) == ((-1.0,) * 7, (1.0,) * 7)
     assert env.actions.cues[0].name == "r_shoulder_pan_joint"
-    assert registry.resolve("brax:pusher") is pusher
+    assert registry.resolve("brax:pusher") == pusher
     assert pusher.plain().max_steps == 1000
     assert registry.find("brax").presets == {}  # the family's own task reads folders, and is no environment
 
