@@ -151,4 +151,4 @@ def main(seeds: int = 5, out: Path | None = None) -> list[Row]:
 
 
 if __name__ == "__main__":
-    tyro.cli(main, prog=Path(__file__).name)
+    tyro.cli(main, prog=Path(__file__).name, description=__doc__)
