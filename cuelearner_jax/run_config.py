@@ -48,9 +48,11 @@ class RunConfig(Generic[TaskT, AgentT, ArbiterT, KindsT]):
     scalars: Scalars = dataclasses.field(default_factory=Scalars)
     schedule: Schedule = dataclasses.field(default_factory=Schedule)
     agent: AgentT = dataclasses.field(default_factory=ddqn.Config)  # pyright: ignore[reportAssignmentType]
+    """Options of the agent."""
     arbiter: ArbiterT = dataclasses.field(default_factory=episodes.Config)  # pyright: ignore[reportAssignmentType]
-    # Options of kinds by their names; a kind that is not there has its defaults.
+    """Options of the arbiter."""
     kinds: KindsT = dataclasses.field(default_factory=dict)  # pyright: ignore[reportAssignmentType]
+    """Options of kinds by their names; a kind that is not there has its defaults."""
 
     @property
     def bootstraps(self) -> bool:

@@ -103,7 +103,8 @@ class AdaptRequest(Generic[TaskT, KindsT]):
     tuning episodes."""
     sizes: GuideSizes = adapting.SIZES
     scalars: Scalars = field(default_factory=Scalars)
-    kinds: KindsT = field(default_factory=dict)  # pyright: ignore[reportAssignmentType]  # options by kind, as a run's
+    kinds: KindsT = field(default_factory=dict)  # pyright: ignore[reportAssignmentType]
+    """Options of kinds by their names, as a run's."""
 
 
 class Subject(NamedTuple):
