@@ -40,6 +40,7 @@ $(VENV)/.tested: $(VENV)/.installed
 	@touch $@
 
 $(VENV)/.foreign: $(VENV)/.tested
+	$(UV) pip install --python $(BIN)/python "pip>=25.1" # the first that knows groups
 	$(BIN)/python -m pip install --disable-pip-version-check --constraint constraints.txt --group foreign
 	@touch $@
 
