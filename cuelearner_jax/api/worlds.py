@@ -123,7 +123,7 @@ def from_gymnasium(
         env: an id of Gymnasium's registry (gymnasium_robotics' included), or a class or function that gives an
             environment when it is called with `arguments`.
         num_envs: environments that step together in training.
-        max_steps: an episode is truncated after so many (default: as the environment says).
+        max_steps: an episode is truncated after so many (default: as the environment says, or 1,000).
         cues: words for more and less of each entry of an action, "left,right;up,down" (default: "more,less").
         observation: a name, a number of entries and a unit for each slice of the flattened observation,
             [("gripper", 3, "m"), ("goal", 3, "m")] (default: its entries by the names of its space).

@@ -34,9 +34,11 @@ from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.spaces import Box, Choices, Space, cues_from
 from cuelearner_jax.task import Body, Pictures, Preset, Task
 from cuelearner_jax.tasks import fetch_layout
+from cuelearner_jax.terminal import console
 
 FAMILY = "gymnasium"
 NUM_ENVS = 8
+UNLIMITED = 1_000  # steps after which an episode is truncated, where neither environment nor caller has a limit
 TRIED = 100  # steps of an episode, to see whether the environment tells of success
 MOST_PROCESSES = 256
 UNKNOWN_UNIT = "as given"
@@ -214,6 +216,7 @@ def task_from(
     cues: Any = (),
     observation: Sequence[Any] | None = None,
     units: Mapping[str, str] | None = None,
+    note: Callable[[str], None] = console.print,
 ) -> Task:
     """Return an environment as a task. One instance is made, and plays an episode, to see how it is made up.
 
@@ -222,6 +225,7 @@ def task_from(
         arguments: of the environment, by name.
         called: what code is called in messages and files (default: module:NAME of it).
         num_envs, max_steps, processes, cues, observation, units: as `cl.from_gymnasium` has them.
+        note: is told which limit of steps was chosen for want of one, in one line.
 
     Raises:
         UserError: it cannot be made, or its spaces are none that are served.
@@ -239,10 +243,11 @@ def task_from(
     source = Source(name, text, max_steps or 0, 1, factory=factory)
     actions, slices, limit, succeeds = _seen(source)
     if not max_steps and not limit:
-        raise UserError(
-            f"environment {name} has no limit of steps: give max_steps to cl.from_gymnasium, or wrap it in "
-            "gymnasium.wrappers.TimeLimit"
+        note(
+            f"environment {name} has no limit of steps: an episode is truncated after {UNLIMITED:,} (give "
+            "--task.max-steps, or max_steps in Python, for another limit)"
         )
+        limit = UNLIMITED
     fetch = fetch_layout.layout_of(name) if factory is None else None
     slices = _named(name, slices, observation or fetch, units or {})
     pairs = cues.split(";") if isinstance(cues, str) else cues
@@ -296,7 +301,7 @@ def _called(code: Any) -> str:
 def _seen(source: Source) -> tuple[Actions, list[Quantity], int, bool]:
     """How an environment is made up: actions, slices of an observation, its limit of steps (0: none), and whether it
     tells of success within an episode."""
-    whose = f"environment {source.name}"
+    whose, when, succeeds = f"environment {source.name}", "in its first reset,", False
     try:
         env = source.make()
     except UserError:
@@ -312,8 +317,8 @@ def _seen(source: Source) -> tuple[Actions, list[Quantity], int, bool]:
         limit = _limit(env)
         one.reset(0)
         env.action_space.seed(0)
-        succeeds = False
-        for _ in range(min(limit or TRIED, TRIED)):
+        for number in range(1, 1 + min(limit or TRIED, TRIED)):
+            when = f"in step {number} of its first episode,"
             _, _, ended, cut, info = env.step(env.action_space.sample())
             succeeds = succeeds or any(name in info for name in TELLS)
             if ended or cut or succeeds:
@@ -321,7 +326,7 @@ def _seen(source: Source) -> tuple[Actions, list[Quantity], int, bool]:
     except UserError:
         raise
     except Exception as error:
-        raise raised_by(f"{whose}, in its first episode,", error) from error
+        raise raised_by(f"{whose}, {when}", error) from error
     finally:
         env.close()
     return actions, slices, limit, succeeds

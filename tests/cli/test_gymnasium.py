@@ -110,13 +110,18 @@ def test_pictures_are_written(tmp_path):
     assert len(list((tmp_path / "asked").iterdir())) == 1
 
 
+def test_an_environment_without_a_limit_of_steps_gets_one_that_is_told(capsys):
+    command = ["evaluate", "gymnasium:gymnasium_worlds:Adder", "--policy", "uniform", "--episodes", "3"]
+    assert main([*command, "--task.max-steps", "6", "--task.processes", "1"]) == 0
+    assert "has no limit of steps: an episode is truncated after 1,000" in " ".join(capsys.readouterr().err.split())
+
+
 @pytest.mark.parametrize(
     ("command", "says"),
     [
         (["evaluate", "gymnasium"], "gymnasium is a family of tasks: name one of its environments, as gymnasium:NAME"),
         (["evaluate", "gymnasium:Nope-v1"], "Gymnasium has no environment 'Nope-v1'"),
         (["evaluate", "gymnasium:gymnasium_worlds:Nope"], "gymnasium_worlds has no 'Nope'"),
-        (["evaluate", "gymnasium:gymnasium_worlds:Adder"], "has no limit of steps: give max_steps"),
         (["train", REACH, "--env", "navigation"], "the task is named twice"),
         (["train", "--task", "billiards", "--env", "navigation"], "the task is named twice"),
         (["evaluate", REACH, "--teacher", "gymnasium_worlds:nobody", "--policy", "teacher"], "has no 'nobody'"),
