@@ -61,6 +61,8 @@ class Pictures(NamedTuple):
     # (environment, state, actions (n, action)): SVG elements of where each of the actions leads, to be seen in the
     # sketch of the state; they take their colour from the group around them
     trails: Callable[[Any, EnvState, Float[Array, "n action"]], list[str]] | None = None
+    # (environment): raises UserError if it cannot be drawn, which for some only trying tells; None: all can
+    check: Callable[[Any], None] | None = None
     legend: str = ""  # what the trails mean, for a person
     simulates: bool = True  # is a reel what the action would lead to? False: what was recorded, whatever the action is
 

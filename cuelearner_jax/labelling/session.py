@@ -94,6 +94,8 @@ class Session:
         self._pictures = plan.task.pictures()
         if self._pictures.sketch is None:
             raise UserError(f"{plan.task.name} has no sketches to label by: give its body's Pictures `sketch`")
+        if self._pictures.check is not None:
+            self._pictures.check(plan.task.environment(plan.config.task))
         self.plan = plan
         shape = shape_of(plan.task, plan.config.task)
         self.space = space = actions_of(shape)

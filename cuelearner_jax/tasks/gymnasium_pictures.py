@@ -46,6 +46,11 @@ def picture(env: GymnasiumTask, state: Episode) -> Frame:
     return frames_of(env, STILLS, seed, actions, len(actions))[-1]
 
 
+def check(env: GymnasiumTask) -> None:
+    """Raises UserError where the environment cannot be drawn."""
+    frames_of(env, STILLS, 0, np.zeros((0, env.actions.size)), 0)
+
+
 def sketch(env: GymnasiumTask, state: Episode) -> Sketch:
     """Return what a state looks like, for the page."""
     found = pictures.sketch(picture(env, state), f"step {int(state.steps) + 1}")
@@ -101,4 +106,5 @@ PICTURES = Pictures(
     question=question,
     sketch=sketch,
     reel=reel,
+    check=check,
 )

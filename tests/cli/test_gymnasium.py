@@ -124,6 +124,7 @@ def test_an_environment_without_a_limit_of_steps_gets_one_that_is_told(capsys):
         (["evaluate", "gymnasium:gymnasium_worlds:Nope"], "gymnasium_worlds has no 'Nope'"),
         (["train", REACH, "--env", "navigation"], "the task is named twice"),
         (["train", "--task", "billiards", "--env", "navigation"], "the task is named twice"),
+        (["label", REACH, "--out", "labels"], "cannot be drawn"),
         (["evaluate", REACH, "--teacher", "gymnasium_worlds:nobody", "--policy", "teacher"], "has no 'nobody'"),
         (["adapt", "gymnasium_worlds:beside", "--teacher", "gymnasium_worlds:toward"], "--env gymnasium:NAME"),
         (
@@ -133,7 +134,8 @@ def test_an_environment_without_a_limit_of_steps_gets_one_that_is_told(capsys):
         (["evaluate", REACH, "--policy", "uniform", "--task.max-steps", "0"], "task.max_steps is 0: give a whole"),
     ],
 )
-def test_wrong_commands_are_refused_in_one_line(command, says, refused, tmp_path):
+def test_wrong_commands_are_refused_in_one_line(command, says, refused, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     refused(command, says, tmp_path)
 
 
