@@ -93,7 +93,10 @@ def as_policy(given: Any, name: str = "policy") -> Policy:
     Raises UserError, which says the argument's name, for what is none of them.
     """
     if isinstance(given, str | os.PathLike) and not str(given).endswith(ONNX):
-        given = load_policy(Path(given))
+        try:
+            given = load_policy(Path(given))
+        except UserError as error:
+            raise UserError(f"{name}: {error}") from error
     return given.policy if isinstance(given, CallablePolicy) else arguments.policy(name, given)
 
 

@@ -41,7 +41,7 @@ NO_NAMES = (3, b"agent", ["none"], ESCAPE, "", True)
 NO_PATHS = (None, 3, b"runs", "", "a\0b", [], True, 0.5)
 NO_WORLDS = (None, 3, "navigation", cl.World, TASK, probes.WindowConfig(), [])
 NO_POLICIES = (None, 3, "agent", [], np.zeros((4, 2)), Broken(), b"", WORLD)
-NO_TEACHERS = (3, "navigation", probes.Expert, lambda obs: obs, [])
+NO_TEACHERS = (3, "navigation", probes.Expert, lambda obs: obs[:, :1], [])
 NO_SIZES = (3, "small", GuideSizes, {}, Scalars(), GuideSizes(fit_steps=0.5), GuideSizes(feedback_layers=("a",)))
 NO_SCALARS = (3, "small", Scalars, {}, GuideSizes(), Scalars(eps_deg="5"), Scalars(k_max=None), Scalars(eps_deg=True))
 NO_ROWS = (
