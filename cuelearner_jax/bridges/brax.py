@@ -129,7 +129,7 @@ class BraxView(envs.Env):
 
 
 def to_brax(env: Environment) -> BraxView:
-    """One of our environments as a `brax.envs.Env`, whose actions are in [-1, 1]^n.
+    """Return one of our environments as a `brax.envs.Env`, whose actions are in [-1, 1]^n.
 
     Of directions in the plane n is 2, and only the direction counts. Of a box n is its size: -1 is each entry's lower
     bound, 1 its upper bound, and what lies beyond is brought back.

@@ -323,7 +323,7 @@ def _taught(task: Task, reference: str | None) -> Task:
 
 
 def is_code(named: str) -> bool:
-    """Does a word name a policy that is code: package.module:NAME, or a file in ONNX?"""
+    """Return whether a word names a policy that is code: package.module:NAME, or a file in ONNX."""
     return named.endswith(ONNX) or (bool(plugins.REFERENCE.fullmatch(named)) and not Path(named).exists())
 
 

@@ -57,7 +57,7 @@ class CorrectionAlone(PolicyNode):
 
 @dataclass(frozen=True)
 class Beside:
-    """What a correction alone sees and does, as exporting asks an environment for it."""
+    """Observation and action of a correction alone, as exporting asks an environment for it."""
 
     observation: tuple[Quantity, ...]
     actions: Space

@@ -100,7 +100,7 @@ def _info(path: Path) -> dict[str, Any]:
 
 
 def _is_vector(told: Any) -> bool:
-    """Is a feature a row of numbers?"""
+    """Return whether a feature is a row of numbers."""
     if not isinstance(told, dict) or not str(told.get("dtype")).startswith(("float", "int")):
         return False
     shape = told.get("shape")
