@@ -6,7 +6,10 @@
 
 RUN is the folder of a run of the preset `regulation`; each of its seeds is calibrated. Without it, billiards is played
 by the shipped network, greedily. No rewarded step is spent; the last table compares the policies on episodes that
-nothing was chosen on.
+nothing was chosen on. Many processes may share the work, and another may compare the policies later:
+
+    python experiments/calibration.py --task billiards --bases RUN --seeds 4 --shard 3 32 --steps 0 --out 3.json
+    python experiments/calibration.py --task billiards --bases RUN --found 1.json 2.json 3.json --out all.json
 """
 
 from __future__ import annotations
@@ -15,6 +18,8 @@ import argparse
 import dataclasses
 import json
 import time
+from collections.abc import Iterator, Sequence
+from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -26,6 +31,7 @@ from cuelearner_envs.billiards.environment import Balls
 from cuelearner_jax.adaptation.adapting import settling
 from cuelearner_jax.agents.choice import best_near_peaks
 from cuelearner_jax.calibration.calibrating import Result, calibrate
+from cuelearner_jax.calibration.corrected import Calibrated
 from cuelearner_jax.calibration.families import Distortion, Unknown, declared
 from cuelearner_jax.calibration.simulated import simulated
 from cuelearner_jax.calibration.walking import Walk
@@ -46,12 +52,13 @@ SCENES: dict[str, tuple[str, dict[str, Any]]] = {
     "turned_and_shifted": ("turned_strike", {"observation_bias": (0.0071, 0.0071)}),
     "tilted_table": ("tilted_table", {}),
     "turned_lidar": ("turned_lidar", {}),
+    "turned_sensors": ("turned_lidar", {"goal_rotation_deg": 10.0}),
     "noisy_lidar": ("turned_lidar", {"lidar_rotation_deg": 0.0, "lidar_dropout": 0.3}),
 }
 LIKE = {"billiards": "turned_strike", "navigation": "turned_lidar"}
 WORLDS = {
     "billiards": (UNCHANGED, "turned_strike", "shifted_balls", "turned_and_shifted", "tilted_table"),
-    "navigation": (UNCHANGED, "turned_lidar", "noisy_lidar"),
+    "navigation": (UNCHANGED, "turned_lidar", "turned_sensors", "noisy_lidar"),
 }
 METRIC = {"billiards": "reward", "navigation": "success"}
 LABELS = (10, 25, 50, 100)
@@ -123,15 +130,96 @@ def worth(world: World, policy: Any, split: str, steps: int) -> float:
 
 
 def told(found: Result) -> dict[str, Any]:
-    """A result in plain values."""
+    """A result in plain values; `theta`: the unknowns behind which the policy acts."""
     estimates = {one.name: [round(number, 5) for number in (one.mean, one.low, one.high)] for one in found.estimates}
     evidence = {" + ".join(names) or "none": round(value, 2) for names, value in found.evidence.items()}
     plain = {"verdict": found.verdict, "changes": found.changes, "estimates": estimates, "evidence": evidence}
+    if isinstance(found.policy, Calibrated):
+        plain |= {"theta": np.asarray(found.policy.theta, float).tolist()}
+        plain |= {"family": [one.name for one in found.policy.family]}
     return {**plain, "held_out": found.held_out, "wrong": found.wrong, "apart": found.apart, "more": found.more}
 
 
-def main() -> None:
-    """Calibrates each base in each world with each number of labels; prints a line each, then the table."""
+def found_policy(row: dict[str, Any], base: Any, family: tuple[Distortion, ...]) -> Any:
+    """The policy that a row tells of: the base, or the base behind what was found."""
+    if "theta" not in row:
+        return base
+    own = tuple(one for name in row["family"] for one in family if one.name == name)
+    return Calibrated(base, jnp.asarray(row["theta"], jnp.float32), own)
+
+
+class Study(NamedTuple):
+    """What is asked of which policies."""
+
+    task: Any
+    own: Any  # the configuration of the unchanged world
+    scalars: Scalars
+    bases: dict[int, Any]
+    asked: argparse.Namespace
+    made: dict[str, tuple[World, tuple[Distortion, ...]]]  # worlds so far: what is compiled for one serves again
+
+    def world(self, name: str) -> tuple[World, tuple[Distortion, ...]]:
+        """A world and what may have changed in it."""
+        if name in self.made:
+            return self.made[name]
+        faults: dict[str, Any] = {
+            "mistake_probability": self.asked.mistakes,
+            "teacher_bias_deg": self.asked.bias_deg,
+        }
+        if self.asked.eps_deg:
+            faults["eps_deg"] = self.asked.eps_deg
+        world = world_of(self.task, name, self.own, self.scalars, self.asked.split, faults)
+        self.made[name] = world, family_of(self.task, self.own, world, name == "tilted_table")
+        return self.made[name]
+
+    def calibrated(self, name: str, base: int, seed: int, labels: int) -> dict[str, Any]:
+        """A row: what so many answers tell of a world."""
+        world, family = self.world(name)
+        start, used, walk = time.time(), time.process_time(), Walk(world.env, world.teacher, world.scalars)
+        key = jax.random.fold_in(jax.random.key(seed), labels)
+        found = calibrate(
+            self.bases[base], family, walk.situations, walk.answers, labels, key,
+            space=actions_of(world.env), eps_deg=float(world.scalars.eps_deg),
+        )  # fmt: skip
+        row = {"world": name, "base": base, "labels": labels, "seed": seed, **told(found)}
+        row["eps_deg"] = float(world.scalars.eps_deg)
+        row["seconds"] = round(time.time() - start, 1)
+        return {**row, "cpu_seconds": round(time.process_time() - used, 1)}
+
+    def rows(self) -> Iterator[dict[str, Any]]:
+        """A row for each world, base, seed and number of labels of this process's share."""
+        number, of = self.asked.shard
+        seeds = range(self.asked.first_seed, self.asked.first_seed + self.asked.seeds)
+        each = list(product(self.bases, seeds))[number - 1 :: of]
+        for name in self.worlds:
+            for base, seed in each:
+                yield from (self.calibrated(name, base, seed, labels) for labels in self.asked.labels)
+
+    @property
+    def worlds(self) -> Sequence[str]:
+        """Those that are asked for."""
+        return self.asked.worlds or WORLDS[self.task.name]
+
+    def compared(self, rows: Sequence[dict[str, Any]]) -> Iterator[dict[str, Any]]:
+        """The rows with the worth of their policies, and of the bases as they are."""
+        for name in dict.fromkeys(row["world"] for row in rows):
+            world, family = self.world(name)
+            own = [row for row in rows if row["world"] == name]
+            plain = [{"world": name, "base": base, "labels": 0} for base in dict.fromkeys(row["base"] for row in own)]
+            unadapted = {}
+            for row in [*plain, *own]:
+                base = row["base"]
+                if row["labels"] and "theta" not in row:
+                    yield {**row, "worth": unadapted[base]}  # the policy as it was
+                    continue
+                policy = found_policy(row, self.bases[base], family)
+                earned = worth(world, policy, self.asked.split, self.asked.steps)
+                unadapted.setdefault(base, earned)
+                yield {**row, "worth": earned}
+
+
+def arguments() -> argparse.ArgumentParser:
+    """What can be asked for."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--task", choices=list(WORLDS), default="billiards")
     parser.add_argument("--bases", type=Path, help="run folder of the base agents")
@@ -139,44 +227,31 @@ def main() -> None:
     parser.add_argument("--labels", nargs="+", type=int, default=LABELS)
     parser.add_argument("--seeds", type=int, default=1, help="of labels, for each base")
     parser.add_argument("--most-bases", type=int, default=8)
+    parser.add_argument("--eps-deg", type=float, default=0.0, help="strength of an answer (default: the scenario's)")
     parser.add_argument("--mistakes", type=float, default=0.0, help="that an answer is reversed; 0.5: a control")
     parser.add_argument("--bias-deg", type=float, default=0.0, help="of everything that the teacher means")
     parser.add_argument("--first-seed", type=int, default=0)
+    parser.add_argument("--shard", type=int, nargs=2, default=(1, 1), metavar=("K", "N"), help="the K-th of N shares")
     parser.add_argument("--steps", type=int, default=10_000, help="of an evaluation; 0: none")
     parser.add_argument("--split", choices=("tuning", "validation"), default="tuning", help="of its episodes")
+    parser.add_argument("--found", type=Path, nargs="+", default=[], help="compare the policies of these files")
     parser.add_argument("--out", type=Path, help="write all rows to this JSON file")
-    asked = parser.parse_args()
+    return parser
+
+
+def main() -> None:
+    """Calibrates each base in each world with each number of labels; prints a line each, then the table."""
+    asked = arguments().parse_args()
     task = registry.find(asked.task)
     own, scalars, bases = bases_of(task, asked.bases)
-    faults = {"mistake_probability": asked.mistakes, "teacher_bias_deg": asked.bias_deg}
+    study = Study(task, own, scalars, dict(list(bases.items())[: asked.most_bases]), asked, {})
+    found = [row for file in asked.found for row in json.loads(file.read_text())["rows"]] or study.rows()
     rows: list[dict[str, Any]] = []
-    for name in asked.worlds or WORLDS[asked.task]:
-        world = world_of(task, name, own, scalars, asked.split, faults)
-        family, space = family_of(task, own, world, name == "tilted_table"), actions_of(world.env)
-        for base, policy in list(bases.items())[: asked.most_bases]:
-            if asked.steps:
-                rows.append(
-                    {"world": name, "base": base, "labels": 0, "worth": worth(world, policy, asked.split, asked.steps)}
-                )
-                print(rows[-1], flush=True)
-            for labels in asked.labels:
-                for seed in range(asked.first_seed, asked.first_seed + asked.seeds):
-                    start, used, walk = time.time(), time.process_time(), Walk(world.env, world.teacher, world.scalars)
-                    key = jax.random.fold_in(jax.random.key(seed), labels)
-                    found = calibrate(
-                        policy, family, walk.situations, walk.answers, labels, key,
-                        space=space, eps_deg=world.scalars.eps_deg,
-                    )  # fmt: skip
-                    row = {"world": name, "base": base, "labels": labels, "seed": seed, **told(found)}
-                    row["seconds"], row["cpu_seconds"] = (
-                        round(now - then, 1) for now, then in ((time.time(), start), (time.process_time(), used))
-                    )
-                    if asked.steps:
-                        row["worth"] = worth(world, found.policy, asked.split, asked.steps)
-                    rows.append(row)
-                    print(json.dumps(row), flush=True)
-    if asked.out:
-        asked.out.write_text(json.dumps({**provenance(), "task": asked.task, "rows": rows}, indent=1) + "\n")
+    for row in study.compared(list(found)) if asked.found or asked.steps else found:
+        rows.append(row)
+        print(json.dumps(row), flush=True)
+        if asked.out:
+            asked.out.write_text(json.dumps({**provenance(), "task": asked.task, "rows": rows}, indent=1) + "\n")
     table(rows)
 
 

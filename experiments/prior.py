@@ -226,6 +226,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     scales = "; ".join(f"{name}: {scale.about}" for name, scale in SCALES.items())
     parser.add_argument("--scale", choices=list(SCALES), default="paper", help=scales)
     parser.add_argument("--pieces", nargs="+", default=[], metavar="NAME", help="these alone, or all below a folder")
+    parser.add_argument("--labels", nargs="+", type=int, default=[], help="these of the pieces' budgets alone")
     parser.add_argument("--out", type=Path, default=Path("runs/prior"), help="folder")
     parser.add_argument("--minutes", type=float, help="save and end after so many; the same command goes on")
     parser.add_argument("--list", action="store_true", help="list the pieces and stop")
@@ -236,6 +237,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         pieces = chosen(experiment, asked.pieces)
     except ValueError as error:
         parser.error(str(error))
+    if asked.labels:
+        kept = [piece._replace(labels=tuple(one for one in piece.labels if one in asked.labels)) for piece in pieces]
+        pieces = [new for old, new in zip(pieces, kept, strict=True) if new.labels or not old.labels]
     if asked.list:
         print(listed(pieces))
         return 0

@@ -122,6 +122,7 @@ TABLE = {
         "max_steps": (0, NAN, "many", 10**7),
         "goal_radius": (0.0, -1.0, NAN, INF, "wide", None, HUGE),
         "lidar_rotation_deg": (NAN, INF, "15", None, True),
+        "goal_rotation_deg": (NAN, INF, "15", None, True),
         "lidar_dropout": (-0.1, 1.1, NAN, "none"),
         "mirrors": (1, "yes", None, NAN, []),
         "preferred_side": ("up", "left", 1, None),

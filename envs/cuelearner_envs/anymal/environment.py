@@ -166,6 +166,7 @@ def make_environment(
         max_steps=plain.max_steps,
         period=plain.period,
         goal_radius=plain.goal_radius,
+        goal_rotation=plain.goal_rotation,
         mirrors=plain.mirrors,
         sides=plain.sides,
         look_ahead=plain.look_ahead,

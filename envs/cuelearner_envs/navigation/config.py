@@ -47,6 +47,8 @@ class NavigationConfig:
     """Changed world: standard deviation of a beam's error [m]."""
     lidar_dropout: float = 0.0
     """Changed world: probability that a beam reads the full range."""
+    goal_rotation_deg: float = 0.0
+    """Changed world: the direction to the goal is measured turned by this, counterclockwise [deg]."""
     mirrors: bool = False
     """Multiply transitions by their mirror images, whatever the guidance; labels stay as they were given."""
     look_ahead: bool = False
@@ -71,6 +73,7 @@ def check(config: NavigationConfig) -> None:
     check_number("goal_radius", config.goal_radius, positive=True, unit="metres")
     check_number("max_range", config.max_range, positive=True, unit="metres")
     check_number("lidar_rotation_deg", config.lidar_rotation_deg, unit="degrees")
+    check_number("goal_rotation_deg", config.goal_rotation_deg, unit="degrees")
     check_number("lidar_noise", config.lidar_noise, 0, unit="metres")
     check_number("lidar_dropout", config.lidar_dropout, 0, 1, unit="a probability")
 
@@ -88,6 +91,7 @@ def make_environment(config: NavigationConfig, split: str = "training") -> Navig
         ),
         max_steps=jnp.int32(config.max_steps),
         goal_radius=jnp.float32(config.goal_radius),
+        goal_rotation=jnp.deg2rad(jnp.float32(config.goal_rotation_deg)),
         mirrors=config.mirrors,
         sides=config.style == "corridor",
         look_ahead=config.look_ahead,

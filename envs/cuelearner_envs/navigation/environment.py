@@ -53,6 +53,7 @@ class Navigation(Described, struct.PyTreeNode):
     max_steps: Int[Array, ""] | int = 200  # an episode is truncated after this many
     period: Scalar = 0.2  # duration of a step [s]
     goal_radius: Scalar = 0.5  # nearer than this, the goal is reached [m]
+    goal_rotation: Scalar = 0.0  # the goal's direction is measured turned by this [rad]
     mirrors: bool = struct.field(pytree_node=False, default=False)  # offer the mirror image as data?
     sides: bool = struct.field(pytree_node=False, default=False)  # say on which side obstacles were passed?
     look_ahead: bool = struct.field(pytree_node=False, default=False)  # do aims tell where a second leg leads?
@@ -187,7 +188,7 @@ class Navigation(Described, struct.PyTreeNode):
         - 2: direction to the goal in the body's frame; 1: distance to the goal over 15 m
         - 6: the last three actions, the latest first
         """
-        offset = rotate(state.goal - state.pose[:2], -state.pose[2])
+        offset = rotate(state.goal - state.pose[:2], self.goal_rotation - state.pose[2])
         distance = jnp.linalg.norm(offset)
         return jnp.concatenate(
             [jnp.exp(-self.ranges(state)), retract(offset), distance[None] / FARTHEST, state.previous.ravel()]

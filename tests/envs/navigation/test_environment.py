@@ -20,7 +20,7 @@ AHEAD, LEFT, BACK = jnp.array([1.0, 0.0]), jnp.array([0.0, 1.0]), jnp.array([-1.
 STRIDE = 0.2 - 0.1 * (1 - math.exp(-2))  # the first step from rest: 1 m/s, 0.2 s, a lag of 0.1 s [m]
 GOAL, DISTANCE, PREVIOUS = slice(271, 273), 273, slice(274, 280)
 FAULTLESS = Lidar(*map(jnp.float32, (10.0, 0.0, 0.0, 0.0)))
-CHANGED = NavigationConfig("clutter", 8, 5, 17, 0.7, 6.0, 15.0, 0.02, 0.1, True)
+CHANGED = NavigationConfig("clutter", 8, 5, 17, 0.7, 6.0, 15.0, 0.02, 0.1, 10.0, True)
 
 observe = jax.jit(lambda env, state: env.observe(state))
 
@@ -250,6 +250,15 @@ def test_a_turned_sensor_reads_what_another_beam_read():
     np.testing.assert_array_equal(turned[271:], seen[271:])
 
 
+def test_a_turned_goal_sensor_changes_the_goals_direction_alone():
+    state = walker((1.0, 0.5, 0.3))
+    seen = np.asarray(observe(HALL, state))
+    turned = np.asarray(observe(HALL.replace(goal_rotation=make_environment(CHANGED).goal_rotation), state))
+    angles = [math.atan2(obs[272], obs[271]) for obs in (seen, turned)]
+    assert (angles[1] - angles[0]) % (2 * math.pi) == pytest.approx(math.radians(10), abs=1e-5)
+    np.testing.assert_array_equal(np.delete(turned, [271, 272]), np.delete(seen, [271, 272]))
+
+
 def test_every_split_has_worlds_of_its_own_and_always_the_same():
     config = NavigationConfig(worlds=8)
     splits = {name: make_environment(config, name).worlds for name in ("training", "validation", "tuning")}
@@ -286,6 +295,7 @@ def test_a_configuration_reaches_the_environment():
         ("max_range", math.inf, "task.max_range is inf: give a positive number (metres)"),
         ("lidar_dropout", 2.0, "task.lidar_dropout is 2.0: give a finite number from 0 up to 1 (a probability)"),
         ("lidar_noise", -0.1, "task.lidar_noise is -0.1: give a finite number from 0 (metres)"),
+        ("goal_rotation_deg", math.inf, "task.goal_rotation_deg is inf: give a finite number"),
         ("lidar_rotation_deg", math.nan, "task.lidar_rotation_deg is nan: give a finite number"),
     ],
 )
