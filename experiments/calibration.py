@@ -245,9 +245,12 @@ def main() -> None:
     task = registry.find(asked.task)
     own, scalars, bases = bases_of(task, asked.bases)
     study = Study(task, own, scalars, dict(list(bases.items())[: asked.most_bases]), asked, {})
-    found = [row for file in asked.found for row in json.loads(file.read_text())["rows"]] or study.rows()
+    found = [
+        row for file in asked.found for row in json.loads(file.read_text())["rows"] if row["world"] in study.worlds
+    ]
     rows: list[dict[str, Any]] = []
-    for row in study.compared(list(found)) if asked.found or asked.steps else found:
+    calibrated = found if asked.found else study.rows()
+    for row in study.compared(list(calibrated)) if asked.steps else calibrated:
         rows.append(row)
         print(json.dumps(row), flush=True)
         if asked.out:
