@@ -10,8 +10,8 @@ for each variant the mean over its seeds with its 95% bootstrap interval, which 
 rewarded steps with those in which arms were validated.
 
 Beside labels stand their controls: `any_aim` (all aims alike), `rule` (written by hand), `shuffled` (labels with each
-other's answers), and `none` (the agent alone). `cage` has no arm but the prior's, `paced` and `papers` are the ways
-that were there before, `by_value` has a second critic compare.
+other's answers), and `none` (the agent alone). `ruled` begins with the rule, which labels correct. `cage` has no arm
+but the prior's, `paced` and `papers` are the ways that were there before, `by_value` has a second critic compare.
 """
 
 from __future__ import annotations
@@ -68,6 +68,7 @@ PRIOR_OF_WAYS: Options = {
     "arbiter.judge-steps": 20_000,
 }
 CAGE: Options = {"arbiter.own-share": 0.0, "arbiter.near-share": 0.0}
+RULED: Options = {"intent.from-rule": True}
 SHUFFLED: Options = {"scalars.answer": "shuffled"}
 
 
@@ -84,6 +85,8 @@ def variants(
         ("prior", "rule", (), shaped, "control: aims by hand"),
         ("shuffled", "intent", budgets[:2], {**shaped, **SHUFFLED}, "control: shuffled answers"),
         *(("prior", kind, most, shaped, f"labels of the form {kind}") for kind in FORMS),
+        ("ruled", "intent", budgets, {**shaped, **RULED}, "labels correct the rule"),
+        ("ruled_shuffled", "intent", budgets[:2], {**shaped, **RULED, **SHUFFLED}, "control: shuffled answers"),
         ("cage", "intent", most, {**shaped, **CAGE}, "aims alone"),
         ("cage", "any_aim", (), {**shaped, **CAGE}, "aims alone, without labels"),
         ("by_value", "intent", most, by_value, "a second critic compares"),

@@ -48,22 +48,31 @@ class Config:
     """Hidden layers of the network that weighs the task's aims: the same ones for every aim."""
     aim_doubt: Annotated[float, Bounds(0)] = 2.0
     """Actions stay as they are where it is at least so many times likelier that no aim is meant."""
+    from_rule: bool = False
+    """Begin with the task's own rule among its aims, which labels correct; without, all aims begin alike."""
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        """What an environment must have, beside the kind's own needs."""
+        return ("rule",) if self.from_rule else ()
 
 
 class Weights(nn.Module):
     """log-weights of a situation's aims, and of none of them: every aim goes through the same layers."""
 
     layers: tuple[int, ...]
+    from_last: bool = False  # is the last feature of an aim its log-weight before the first label?
 
     @nn.compact
     def __call__(
         self, features: Float[Array, "aims features"], possible: Bool[Array, " aims"]
     ) -> Float[Array, " aims_and_none"]:
-        """Starts out without a preference."""
+        """Starts out without a preference of its own."""
         x = features
         for width in self.layers:
             x = nn.relu(nn.Dense(width, kernel_init=nn.initializers.xavier_uniform())(x))
         weights = nn.Dense(1, kernel_init=nn.initializers.zeros)(x)[:, 0]
+        weights = weights + features[:, -1] if self.from_last else weights
         none = self.param("none", nn.initializers.zeros, (1,))
         return jnp.concatenate([jnp.where(possible, weights, -jnp.inf), none])
 
@@ -96,9 +105,8 @@ def likelihood(
     return each[..., 0] if len(space.cues) == 1 else jnp.prod(each, -1, where=said(h))
 
 
-def evidence_of(env: Any, space: Space, label: Label, scalars: GuideScalars) -> Evidence:
+def evidence_of(aims: Aims, space: Space, label: Label, scalars: GuideScalars) -> Evidence:
     """What a label says of the aims of its situation."""
-    aims: Aims = env.aims(label.obs)
     eps = space.from_unit(scalars.eps_deg)
     of_aims = likelihood(space, label.action, aims.actions, label.answer, eps)
     of_none = likelihood(space, label.action, space.spread(ELSEWHERE), label.answer, eps).mean(keepdims=True)
@@ -129,7 +137,8 @@ class Intent(Guide):
 
         Aims' features and which of them are possible stand where other kinds have observations and actions.
         """
-        weights, width = Weights(self.options.aim_layers), self.spaces.aims or 0
+        weights = Weights(self.options.aim_layers, self.options.from_rule)
+        width = (self.spaces.aims or 0) + self.options.from_rule
 
         def init(key: PRNGKeyArray) -> Params:
             return weights.init(key, jnp.zeros((1, width)), jnp.ones(1, bool))
@@ -141,11 +150,16 @@ class Intent(Guide):
 
         return ensemble(self.sizes.ensemble, init, shares)
 
+    def aims(self, env: Any, obs: Float[Array, " obs"]) -> Aims:
+        """A situation's aims; with `from_rule` their features end with their log-weights by the task's rule."""
+        aims: Aims = env.aims(obs)
+        if not self.options.from_rule:
+            return aims
+        return aims._replace(features=jnp.concatenate([aims.features, env.rule(obs)[:, None]], -1))
+
     def footprint(self, env: Any) -> Footprint:
         """Every aim goes through the layers."""
-        aims, features = jax.eval_shape(
-            lambda env, obs: env.aims(obs), env, jnp.zeros(self.spaces.obs_size)
-        ).features.shape
+        aims, features = jax.eval_shape(self.aims, env, jnp.zeros(self.spaces.obs_size)).features.shape
         layers = tuple(aims * width for width in self.options.aim_layers)
         return Footprint("--intent.aim-layers", layers, aims * features)
 
@@ -153,7 +167,9 @@ class Intent(Guide):
         self, key: PRNGKeyArray, env: Any, labels: Label, former: GuidanceModel, scalars: GuideScalars
     ) -> GuidanceModel:
         """The model under which the answers are likeliest."""
-        rows = jax.vmap(lambda label: evidence_of(env, self.spaces.actions, label, scalars))(labels)
+        rows = jax.vmap(lambda label: evidence_of(self.aims(env, label.obs), self.spaces.actions, label, scalars))(
+            labels
+        )
 
         def surprise(params: Params, rows: Evidence) -> Float[Array, " rows"]:
             """-log of the probability of each answer."""
@@ -172,7 +188,7 @@ class Intent(Guide):
         scalars: GuideScalars,
     ) -> Refined:
         """By at most eps a pass toward the likeliest aim, in active rows of a fitted model that is sure enough."""
-        space, aims = self.spaces.actions, jax.vmap(env.aims)(obs)
+        space, aims = self.spaces.actions, jax.vmap(partial(self.aims, env))(obs)
         share = self.shares(model, env, aims)
         find = partial(followed, space, doubt=self.options.aim_doubt)
         goals, sure = jax.vmap(find)(share, aims.actions, actions)
@@ -199,8 +215,8 @@ class Intent(Guide):
         actions: Float[Array, "m action"],
         scalars: GuideScalars,
     ) -> Float[Array, " m"]:
-        """log of the density of actions round the aims (`log_density`); before the first fit all aims are alike."""
-        aims: Aims = jax.vmap(env.aims)(obs[None])
+        """log of the density of actions round the aims (`log_density`); before the first fit by the rule, or alike."""
+        aims = jax.vmap(partial(self.aims, env))(obs[None])
         share = self.shares(model, env, aims)[0]
         return log_density(self.spaces.actions, aims.actions[0], share, actions)
 
@@ -208,7 +224,7 @@ class Intent(Guide):
         self, model: GuidanceModel, env: Any, obs: Float[Array, "n obs"], actions: Float[Array, "n action"]
     ) -> Float[Array, " n"]:
         """The variance of the members' probabilities, summed over aims; of situations, whatever the action."""
-        aims: Aims = jax.vmap(env.aims)(obs)
+        aims = jax.vmap(partial(self.aims, env))(obs)
         return self.network.disagreement(env, model.params, aims.features, aims.possible)
 
 

@@ -87,7 +87,7 @@ def make(name: str, sizes: GuideSizes, env: Any, options: Any = None) -> Guide:
         UserError: no such kind, or the environment lacks what it needs.
     """
     kind = find(name)
-    for need in kind.needs:
+    for need in (*kind.needs, *getattr(options, "needs", ())):
         if not offers(env, need):
             raise UserError(f"guidance {kind.name!r} needs an environment with `{need}`, which this task's has not")
     return kind.make(sizes, spaces_of(env), options)

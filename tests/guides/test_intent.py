@@ -31,9 +31,9 @@ BASE = directions.rotate(OBS, jnp.linspace(-3.0, 3.0, 16))
 EVERYWHERE = jnp.ones(16, bool)
 
 
-def told(sizes):
+def told(sizes, env=ENV, options=OPTIONS):
     """A bundle and its model of 40 of the expert's answers about random actions."""
-    bundle = registry.make("intent", sizes, ENV, OPTIONS)
+    bundle = registry.make("intent", sizes, env, options)
     keys = jax.random.split(jax.random.key(3), 40)
     obs = jax.vmap(lambda key: ENV.reset(key)[1])(keys)
     asked = directions.uniform(jax.random.key(4), (40,))
@@ -41,7 +41,7 @@ def told(sizes):
     answers, _ = tell(keys, obs, asked)
     labels = Label(obs, asked, answers, jnp.ones(40, bool))
     former = bundle.init(jax.random.key(0))
-    return bundle, jax.jit(bundle.fit)(jax.random.key(1), ENV, labels, former, probes.SCALARS)
+    return bundle, jax.jit(bundle.fit)(jax.random.key(1), env, labels, former, probes.SCALARS)
 
 
 class Shut(probes.Aimed):
@@ -65,6 +65,36 @@ def test_what_is_not_open_may_be_meant_and_is_not_followed(fitted):
 def test_who_reads_intent_needs_aims():
     with pytest.raises(UserError, match="needs an environment with `aims`"):
         registry.make("intent", SIZES, probes.Window())
+
+
+class Ruleless(probes.Aimed):
+    @property
+    def rule(self):
+        raise AttributeError("rule")
+
+
+class Ruled(probes.Aimed):
+    """Its rule holds the third of four aims for e^2 times as likely as any other."""
+
+    def rule(self, obs):
+        return jnp.array([0.0, 0.0, 2.0, 0.0])
+
+
+def test_labels_begin_with_the_tasks_rule_and_correct_it():
+    options = dataclasses.replace(OPTIONS, from_rule=True)
+    with pytest.raises(UserError, match="needs an environment with `rule`"):
+        registry.make("intent", SIZES, Ruleless(), options)
+    env = Ruled()
+    bundle = registry.make("intent", SIZES, env, options)
+    aims = jax.vmap(lambda obs: bundle.aims(env, obs))(OBS)
+    share = bundle.shares(bundle.init(jax.random.key(0)), env, aims)[0]
+    possible = np.flatnonzero(ENV.aims(OBS[0]).possible)
+    weights = np.exp([2.0 * (aim == 2) for aim in possible])
+    np.testing.assert_allclose(share[possible], weights / (weights.sum() + 1.0), rtol=1e-5)  # the last: none
+    assert share[2] == share.max()
+    bundle, model = told(SIZES, env, options)
+    share = bundle.shares(model, env, aims)[0]
+    assert share[1] > 0.9  # what the expert means
 
 
 @pytest.fixture(scope="module")
@@ -165,7 +195,7 @@ def test_what_an_answer_says_of_aims_depends_on_its_strength():
 
     def of(eps_deg):
         scalars = dataclasses.replace(probes.SCALARS, eps_deg=eps_deg)
-        return intent.evidence_of(ENV, DIRECTIONS, label, scalars).likelihood
+        return intent.evidence_of(ENV.aims(OBS[0]), DIRECTIONS, label, scalars).likelihood
 
     # Logistic, of one degree: half at the edge of 10; e^-10 within that of 20; all but e^-8 beyond that of 2.
     for strength, said in ((20.0, 0.5), (40.0, math.exp(-10)), (4.0, 1 - math.exp(-8))):

@@ -9,7 +9,13 @@ import pytest
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.tasks import registry
 
-NEGATIVE = {"action_turn_deg", "observation_bias", "acceleration", "lidar_rotation_deg", "goal_rotation_deg"}  # where -1 makes sense
+NEGATIVE = {
+    "action_turn_deg",
+    "observation_bias",
+    "acceleration",
+    "lidar_rotation_deg",
+    "goal_rotation_deg",
+}  # where -1 makes sense
 SENSELESS = (math.nan, math.inf, -math.inf, 1e39, 10**400, "many", None, True)  # 1e39: infinite in single precision
 
 
