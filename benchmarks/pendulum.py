@@ -1,7 +1,7 @@
 """Gymnasium's Pendulum-v1 as an environment of JAX: swing up a pole by a torque, and hold it there.
 
-Constants and reward are those of Gymnasium 1.4: gravity 10 m/s^2, 1 kg, 1 m, torques up to 2 N m, steps of 0.05 s, up to
-8 rad/s, episodes of 200 steps that time alone ends.
+Constants and reward are those of Gymnasium 1.4: gravity 10 m/s^2, 1 kg, 1 m, torques up to 2 N m, steps of 0.05 s, at
+most 8 rad/s, episodes of 200 steps that time alone ends.
 """
 
 from __future__ import annotations

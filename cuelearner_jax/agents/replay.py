@@ -15,7 +15,7 @@ import jax.custom_batching
 import jax.numpy as jnp
 from flax import struct
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, Num, PRNGKeyArray
 
 from cuelearner_jax.environment import Environment, actions_of, random_symmetries
 from cuelearner_jax.types import Step
@@ -66,8 +66,8 @@ class RingBuffer(NamedTuple):
 
 @jax.custom_batching.custom_vmap
 def _write(
-    rows: Float[Array, "*lanes capacity width"], packed: Float[Array, "*lanes n width"], start: Int[Array, ""]
-) -> Float[Array, "*lanes capacity width"]:
+    rows: Num[Array, "*lanes capacity width"], packed: Num[Array, "*lanes n width"], start: Int[Array, ""]
+) -> Num[Array, "*lanes capacity width"]:
     """`packed` in place of the rows from `start` on."""
     zero = jnp.zeros_like(start)
     return jax.lax.dynamic_update_slice(rows, packed, (*[zero] * (rows.ndim - 2), start, zero))
@@ -190,9 +190,9 @@ def count_guided(
         step: rows written so far, see `RingBuffer`.
         guided: which of the steps being added the guide chose.
     """
-    before = counts[jnp.mod(step - 1, counts.shape[0])]
-    added = before + jnp.cumsum(guided.astype(counts.dtype))[:, None]
-    return _write(counts, added, jnp.mod(step, counts.shape[0]))
+    before = counts[jnp.mod(step - 1, counts.shape[0]), 0]
+    added = before + jnp.cumsum(guided.astype(counts.dtype))
+    return _write(counts, added[:, None], jnp.mod(step, counts.shape[0]))
 
 
 def draw_sorts(
