@@ -86,7 +86,9 @@ class Config:
                 f"agent 'sac' acts in boxes, not in {spaces.actions.name}: give --agent ddqn, which serves any space"
             )
         if frame != "raw":
-            raise UserError(f"sizes.frame is {frame!r}, but the actor of agent 'sac' is given no action: give raw")
+            raise UserError(
+                f"sizes.frame is {frame!r}, but the actor of 'sac' is given no action: give --sizes.frame raw"
+            )
         return SoftActorCritic(self, frame, spaces, bootstraps)
 
     def check(self, sizes: Sizes, bootstraps: bool) -> None:
@@ -262,7 +264,8 @@ class SoftActorCritic:
         adam = optimizer("adam", options.temperature_rate, scalars.max_grad_norm)
         heat_change, heat_opt = adam.update(heat * surplus, rest.heat_opt, rest.log_heat)
         params = {"actor": optax.apply_updates(actor, change), "critics": critics}
-        rest = SACState(target_critics, rest.log_heat + heat_change, actor_opt, critics_opt, heat_opt)
+        log_heat = jnp.asarray(optax.apply_updates(rest.log_heat, heat_change))
+        rest = SACState(target_critics, log_heat, actor_opt, critics_opt, heat_opt)
         return params, rest, losses.mean(), jnp.maximum(norms.max(), optax.tree.norm(gradient))
 
     def targets(
