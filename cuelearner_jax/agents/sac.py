@@ -281,7 +281,8 @@ class SoftActorCritic:
         """What the critics' values of a batch are fitted to: r + discount * (Q'(s', a') - heat * log p(a')).
 
         Q' is the smallest value of the target critics drawn for this batch, a' the actor's draw. With an `other` it is
-        r + discount * Q'(s', other) where Q'(s', other) is larger than Q'(s', a'): entropy is the actor's alone.
+        r + discount * Q'(s', other) where that is larger. An offered action has no entropy; would Q' alone decide which
+        of the two counts, a target could be smaller for an offer, and good places would look bad.
         """
         if not self.bootstraps:
             return batch.reward
@@ -293,8 +294,8 @@ class SoftActorCritic:
             action = self.in_box(drawn.unit)
             offered = other(batch.next_obs, action)
             its = self.values(judges, batch.next_obs, self.in_unit(offered)).min(0)
-            # An offer that is the actor's own action may differ from it in the last digits of the coordinates.
-            value = jnp.where((its > own) & (offered != action).any(-1), its, value)
+            # An actor's own action as an offer is none: it has entropy.
+            value = jnp.where((offered != action).any(-1), jnp.maximum(its, value), value)
         return jax.lax.stop_gradient(batch.reward + discount * batch.discount * value)
 
     def _judges(self, target_critics: Params, key: PRNGKeyArray) -> Params:

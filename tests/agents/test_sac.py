@@ -105,7 +105,7 @@ def test_targets_are_those_counted_by_hand(entropy):
     np.testing.assert_array_equal(found[1::2], batch.reward[1::2])
 
 
-def test_targets_take_an_offer_where_the_target_critics_prefer_it_without_the_actors_entropy():
+def test_targets_take_an_offer_where_it_is_worth_more_than_the_actors_action_with_its_entropy():
     agent = agent_of()
     params, rest = agent.init(KEY)
     batch, heat, middle = batch_of(200), 0.3, jnp.array([1.0, 0.25])
@@ -117,10 +117,11 @@ def test_targets_take_an_offer_where_the_target_critics_prefer_it_without_the_ac
         np.minimum(*(by_hand(rest.target_critics, n, batch.next_obs, unit) for n in range(2)))
         for unit in (drawn.unit, np.zeros((200, 2)))
     )
-    taken = its > own
-    assert 20 < taken.sum() < 180
-    offered = batch.reward + 0.9 * batch.discount * its
-    np.testing.assert_allclose(found, np.where(taken, offered, plain), rtol=1e-5, atol=1e-6)
+    soft = own - heat * np.asarray(drawn.log_density)
+    assert 20 < (its > soft).sum() < 180
+    assert ((its > own) & (its < soft)).any()  # where Q' alone would have made the target smaller
+    expected = batch.reward + 0.9 * batch.discount * np.maximum(its, soft)
+    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
     # Its own actions offered are no other ones, to the last bit.
     np.testing.assert_array_equal(agent.targets(*arguments, lambda obs, own: own), plain)
 

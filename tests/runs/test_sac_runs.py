@@ -139,3 +139,20 @@ def test_replay_tells_ends_by_time_from_terminations_and_guided_steps(lane):
     by_guide = np.isclose(told, columns[:, 2:4], atol=1e-6).all(-1)
     np.testing.assert_array_equal(np.asarray(state.agent.guided)[:, 0], np.cumsum(by_guide))
     assert 0 < by_guide.sum() < 24
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("wrong", [0.0, 2.0])
+def test_a_finished_policy_is_not_worse_for_a_guide_whatever_the_guide_is_worth(tmp_path, wrong):
+    agent = dataclasses.replace(SMALL, actor_layers=(32,), critic_layers=(32, 32), batch_size=64, replay_capacity=2000)
+    total = {"total_steps": 2000, "guidance_until": 2000, "eval_every": 1000, "checkpoint_every": 1000}
+    evaluated = {"random_steps": 200, "learn_after": 100, "eval_steps": 800, "eval_envs": 100}
+    config = walk_task.config(agent, by_value.Config(judge_steps=400), schedule={**total, **evaluated})
+    config = dataclasses.replace(config, task=WalkConfig(wrong))
+    train.run(Order(TASK, config, Grid(("none", "heuristic"), tuple(range(6)), (0,)), tmp_path / "run"))
+    last = [row for row in results.read(tmp_path / "run").to_pylist() if row["step"] == 2000]
+    earned = {
+        kind: np.array([row["reward"] for row in last if row["guidance"] == kind]) for kind in ("none", "heuristic")
+    }
+    spread = np.hypot(*(values.std(ddof=1) / len(values) ** 0.5 for values in earned.values()))
+    assert earned["heuristic"].mean() > earned["none"].mean() - 2 * spread - 0.005
