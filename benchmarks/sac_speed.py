@@ -148,12 +148,13 @@ def of_brax(env: Any, setting: Setting, length: int, own: bool) -> Way:
     """brax's SAC; `own`: the environment is one of ours, through `to_brax`."""
     from brax.training.agents.sac import networks, train
 
+    factory: Any = functools.partial(networks.make_sac_networks, hidden_layer_sizes=setting.layers)
     steps = -(-(setting.steps - setting.prefill) // setting.evaluations)  # between two evaluations
 
     def run(seed: int) -> Rows:
         rows: Rows = []
 
-        def progress(step: int, metrics: dict[str, Any]) -> None:
+        def progress(step: int, metrics: Any) -> None:
             if step:
                 own = {"step": step, "return": float(metrics["eval/episode_reward"])}
                 rows.append({**own, "seconds": steps / float(metrics["training/sps"]), "steps": steps})
@@ -176,7 +177,7 @@ def of_brax(env: Any, setting: Setting, length: int, own: bool) -> Way:
             grad_updates_per_step=setting.updates_per_step,
             deterministic_eval=True,
             max_devices_per_host=1,
-            network_factory=functools.partial(networks.make_sac_networks, hidden_layer_sizes=setting.layers),
+            network_factory=factory,
             progress_fn=progress,
         )
         return rows

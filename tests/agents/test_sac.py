@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from functools import partial
+from functools import cache, partial
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +14,7 @@ from walk_task import BOX, SMALL, Walk
 from cuelearner_jax.agents import sac
 from cuelearner_jax.agents.protocol import AgentFunctions, has_actor
 from cuelearner_jax.agents.replay import Memory, Transition, buffer_for, count_guided, stored_step
+from cuelearner_jax.config import static
 from cuelearner_jax.environment import Spaces, spaces_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.spaces import DIRECTIONS, Choices
@@ -34,8 +35,9 @@ def agent_of(options=SMALL, bootstraps=True):
 def test_the_density_integrates_to_one_and_draws_follow_it(mean, std):
     unit = np.linspace(-1, 1, 200_002)[1:-1]
     before = np.arctanh(unit)
-    columns = [jnp.asarray(x, jnp.float32)[:, None] for x in ((before - mean) / std, np.full(len(unit), math.log(std)))]
-    density = np.exp(np.asarray(sac.squashed_log_density(*columns, jnp.asarray(before, jnp.float32)[:, None]), float))
+    noise, log_std = (before - mean) / std, np.full(len(unit), math.log(std))
+    columns = (jnp.asarray(values, jnp.float32)[:, None] for values in (noise, log_std, before))
+    density = np.exp(np.asarray(sac.squashed_log_density(*columns)).astype(float))
     assert np.trapezoid(density, unit) == pytest.approx(1, abs=2e-3)
     agent = agent_of()
     actor = jax.tree.map(jnp.zeros_like, agent.init(KEY)[0]["actor"])
@@ -130,9 +132,10 @@ def test_each_target_draws_a_subset_of_the_critics():
     agent = agent_of(dataclasses.replace(THREE, target_critics=1, entropy_in_targets=False))
     params, rest = agent.init(KEY)
     batch, seen = batch_of(), set()
-    for number in range(12):
+    targets = jax.jit(lambda key: agent.targets(1.0, params["actor"], rest.target_critics, 0.0, batch, key))
+    for number in range(10):
         key = jax.random.key(number)
-        found = agent.targets(1.0, params["actor"], rest.target_critics, 0.0, batch, key)
+        found = targets(key)
         unit = agent.draw(params["actor"], batch.next_obs, jax.random.split(key)[0]).unit
         each = [batch.reward + batch.discount * by_hand(rest.target_critics, n, batch.next_obs, unit) for n in range(3)]
         (own,) = [n for n in range(3) if np.allclose(found, each[n], rtol=1e-5, atol=1e-6)]
@@ -192,13 +195,21 @@ def test_a_minibatch_has_its_share_of_guided_steps(share, count):
         assert [n % 5 == 0 for n in drawn] == [True] * count + [False] * (8 - count)
 
 
-def updated(options, params=None, rest=None, **scalars):
-    agent = agent_of(options)
-    fresh, state = agent.init(KEY)
-    scalars = dataclasses.replace(probes.SCALARS, discount=0.9, **scalars)
-    before = (fresh if params is None else params, state if rest is None else rest)
-    after = agent.update(ENV, options, scalars, jnp.array(1), *before, MEMORY, KEY)
-    return before, after
+@cache
+def update_of(still):
+    """The compiled update of options without their floats."""
+    return jax.jit(
+        lambda options, scalars, params, rest: agent_of(still).update(
+            ENV, options, scalars, jnp.array(1), params, rest, MEMORY, KEY
+        )
+    )
+
+
+def updated(options):
+    """Parameters and the rest before an update, and what it returns."""
+    before = agent_of(options).init(KEY)
+    scalars = dataclasses.replace(probes.SCALARS, discount=0.9)
+    return before, update_of(static(options))(options, scalars, *before)
 
 
 def steps_of(opt_state):

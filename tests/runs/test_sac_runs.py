@@ -98,35 +98,35 @@ def test_the_agent_and_the_better_of_both_are_exported_as_they_act(whole, tmp_pa
 
 
 @pytest.fixture(scope="module")
-def lane():
-    return loop.make_lane(CONFIG, registry.make("heuristic", CONFIG.sizes, ENV), ENV, 0)
+def lanes():
+    """Two lanes after eight iterations: vmapped, as an accelerator has them, and each alone."""
+    lane = loop.make_lane(CONFIG, registry.make("heuristic", CONFIG.sizes, ENV), ENV, 0)
+
+    def iterated(state):
+        def one(carry, _):
+            clock, state = carry
+            state, _ = lane.iterate(ENV, CONFIG.settings, clock, state)
+            return (lane.advance(clock, CONFIG.schedule), state), None
+
+        return jax.lax.scan(one, (loop.start_clock(), state), length=8)[0][1]
+
+    init, alone = jax.jit(lambda key: lane.init(ENV, key, 0)), jax.jit(iterated)
+    start = [init(jax.random.fold_in(jax.random.key(0), seed)) for seed in range(2)]
+    both = jax.tree.map(lambda *leaves: jnp.stack(leaves), *start)
+    return jax.jit(jax.vmap(iterated))(both), [alone(state) for state in start]
 
 
-def iterated(lane, state, count=8):
-    def one(carry, _):
-        clock, state = carry
-        state, _ = lane.iterate(ENV, CONFIG.settings, clock, state)
-        return (lane.advance(clock, CONFIG.schedule), state), None
-
-    return jax.lax.scan(one, (loop.start_clock(), state), length=count)[0][1]
-
-
-def test_side_by_side_lanes_are_those_of_single_seeds(lane):
-    """As an accelerator has them: vmapped. On a CPU lanes are taken one by one, and are equal by the bit."""
-    keys = jax.vmap(lambda seed: jax.random.fold_in(jax.random.key(0), seed))(jnp.arange(2))
-    start = jax.vmap(lambda key: lane.init(ENV, key, 0))(keys)
-    beside = jax.jit(jax.vmap(partial(iterated, lane)))(start)
-    alone = jax.jit(partial(iterated, lane))
-    for index in range(2):
-        mine = probes.lane(beside, index)
-        single = alone(jax.tree.map(lambda leaf, index=index: leaf[index], start))
+def test_side_by_side_lanes_are_those_of_single_seeds(lanes):
+    """On a CPU lanes are taken one by one, and are equal by the bit; vmapped, products are summed in another order."""
+    beside, alone = lanes
+    for index, single in enumerate(alone):
         other = jax.tree.map(lambda leaf: np.asarray(probes.words(leaf)), single)
-        jax.tree.map(partial(np.testing.assert_allclose, rtol=2e-4, atol=2e-5), mine, other)
+        jax.tree.map(partial(np.testing.assert_allclose, rtol=2e-4, atol=2e-5), probes.lane(beside, index), other)
     assert int(np.asarray(beside.agent.guided).max()) > 0
 
 
-def test_replay_tells_ends_by_time_from_terminations_and_guided_steps(lane):
-    state = jax.jit(partial(iterated, lane))(lane.init(ENV, jax.random.key(3), 0))
+def test_replay_tells_ends_by_time_from_terminations_and_guided_steps(lanes):
+    _, (state, _) = lanes
     columns = np.asarray(state.agent.replay)  # place, time, two entries, reward, discount, ended, next place and time
     discount, ended, place, time = columns[:, 5], columns[:, 6], columns[:, 7], columns[:, 8]
     off = np.abs(place) > walk_task.EDGE
