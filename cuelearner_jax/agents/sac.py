@@ -127,10 +127,10 @@ class SACState(struct.PyTreeNode):
     """What learning keeps beside the parameters."""
 
     target_critics: Params  # None where nothing bootstraps (discount 0)
-    log_heat: Float[Array, ""]  # logarithm of the temperature over `Config.first_temperature`
+    log_temperature: Float[Array, ""]  # logarithm of the temperature over `Config.first_temperature`
     actor_opt: Any
     critics_opt: Any
-    heat_opt: Any
+    temperature_opt: Any
 
 
 @dataclass(frozen=True)
@@ -163,10 +163,10 @@ class SoftActorCritic:
         obs, action = jnp.zeros(self.spaces.obs_size), jnp.zeros(space.size)
         actor = self._actor.init(k_actor, obs)
         critics = jax.vmap(lambda k: self._critic.init(k, obs, action))(jax.random.split(k_critics, own.critics))
-        log_heat = jnp.zeros(())
-        opt_states = (optimizer("adam", 0.0, 0.0).init(leaf) for leaf in (actor, critics, log_heat))
+        log_temperature = jnp.zeros(())
+        opt_states = (optimizer("adam", 0.0, 0.0).init(leaf) for leaf in (actor, critics, log_temperature))
         copy = jax.tree.map(jnp.copy, critics) if self.bootstraps else None
-        return {"actor": actor, "critics": critics}, SACState(copy, log_heat, *opt_states)
+        return {"actor": actor, "critics": critics}, SACState(copy, log_temperature, *opt_states)
 
     def act(self, env: Any, params: Params, obs: Float[Array, "n obs"], key: PRNGKeyArray) -> Float[Array, "n action"]:
         """The action of the Gaussian's mean."""
@@ -222,63 +222,63 @@ class SoftActorCritic:
 
         See `protocol.AgentFunctions.update`. `other`: see `targets`. The loss is the critics'.
         """
-        own, actor = self.options, params["actor"]
+        own, actor, most = self.options, params["actor"], scalars.max_grad_norm
         k_critics, k_actor = jax.random.split(key)
-        heat = options.first_temperature * jnp.exp(rest.log_heat)
+        temperature = options.first_temperature * jnp.exp(rest.log_temperature)
 
         def minibatch(carry: tuple[Params, Any, Params, Array], key: PRNGKeyArray) -> tuple[Any, tuple[Array, Array]]:
             critics, opt_state, target_critics, _ = carry
             k_batch, k_target = jax.random.split(key)
             (batch,) = memory.batches(k_batch, own.batch_size, guided_share=options.guided_share)
-            targets = self.targets(scalars.discount, actor, target_critics, heat, batch, k_target, other)
+            targets = self.targets(scalars.discount, actor, target_critics, temperature, batch, k_target, other)
             unit = self.in_unit(batch.action)
-            loss, gradient = jax.value_and_grad(lambda own: loss_of(self.values(own, batch.obs, unit), targets))(
-                critics
-            )
-            adam = optimizer("adam", options.critic_rate, scalars.max_grad_norm)
-            change, opt_state = adam.update(gradient, opt_state, critics)
-            critics = optax.apply_updates(critics, change)
+            error = lambda critics: loss_of(self.values(critics, batch.obs, unit), targets)  # noqa: E731
+            loss, gradient = jax.value_and_grad(error)(critics)
+            critics, opt_state = stepped(options.critic_rate, most, gradient, opt_state, critics)
             if self.bootstraps:
                 target_critics = optax.incremental_update(critics, target_critics, options.polyak)
             return (critics, opt_state, target_critics, batch.obs), (loss, optax.tree.norm(gradient))
 
-        start = (
-            params["critics"],
-            rest.critics_opt,
-            rest.target_critics,
-            jnp.zeros((own.batch_size, self.spaces.obs_size)),
-        )
+        none = jnp.zeros((own.batch_size, self.spaces.obs_size))
+        start = params["critics"], rest.critics_opt, rest.target_critics, none
         keys = jax.random.split(k_critics, own.updates_per_step)
         (critics, critics_opt, target_critics, obs), (losses, norms) = jax.lax.scan(minibatch, start, keys)
 
-        def climb(actor: Params) -> tuple[Array, Array]:
-            drawn = self.draw(actor, obs, k_actor)
-            return jnp.mean(
-                heat * drawn.log_density - self._climbed(critics, obs, drawn.unit)
-            ), drawn.log_density.mean()
-
-        (_, log_density), gradient = jax.value_and_grad(climb, has_aux=True)(actor)
-        adam = optimizer("adam", options.actor_rate, scalars.max_grad_norm)
-        change, actor_opt = adam.update(gradient, rest.actor_opt, actor)
+        climbed = jax.value_and_grad(self.actor_loss, has_aux=True)(actor, critics, temperature, obs, k_actor)
+        (_, log_density), gradient = climbed
+        actor, actor_opt = stepped(options.actor_rate, most, gradient, rest.actor_opt, actor)
         surplus = -log_density - options.target_entropy * self.spaces.actions.size
-        adam = optimizer("adam", options.temperature_rate, scalars.max_grad_norm)
-        heat_change, heat_opt = adam.update(heat * surplus, rest.heat_opt, rest.log_heat)
-        params = {"actor": optax.apply_updates(actor, change), "critics": critics}
-        log_heat = jnp.asarray(optax.apply_updates(rest.log_heat, heat_change))
-        rest = SACState(target_critics, log_heat, actor_opt, critics_opt, heat_opt)
-        return params, rest, losses.mean(), jnp.maximum(norms.max(), optax.tree.norm(gradient))
+        log_temperature, temperature_opt = stepped(
+            options.temperature_rate, most, temperature * surplus, rest.temperature_opt, rest.log_temperature
+        )
+        state = SACState(target_critics, log_temperature, actor_opt, critics_opt, temperature_opt)
+        norm = jnp.maximum(norms.max(), optax.tree.norm(gradient))
+        return {"actor": actor, "critics": critics}, state, losses.mean(), norm
+
+    def actor_loss(
+        self,
+        actor: Params,
+        critics: Params,
+        temperature: Float[Array, ""] | float,
+        obs: Float[Array, "n obs"],
+        key: PRNGKeyArray,
+    ) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        """The mean of temperature * log p(a) - Q(s, a) of the actor's draws, and that of log p(a)."""
+        drawn = self.draw(actor, obs, key)
+        loss = temperature * drawn.log_density - self._climbed(critics, obs, drawn.unit)
+        return loss.mean(), drawn.log_density.mean()
 
     def targets(
         self,
         discount: Float[Array, ""] | float,
         actor: Params,
         target_critics: Params,
-        heat: Float[Array, ""] | float,
+        temperature: Float[Array, ""] | float,
         batch: Transition,
         key: PRNGKeyArray,
         other: Offer | None = None,
     ) -> Float[Array, " batch"]:
-        """What the critics' values of a batch are fitted to: r + discount * (Q'(s', a') - heat * log p(a')).
+        """What the critics' values of a batch are fitted to: r + discount * (Q'(s', a') - temperature * log p(a')).
 
         Q' is the smallest value of the target critics drawn for this batch, a' the actor's draw. With an `other` it is
         r + discount * Q'(s', other) where that is larger. An offered action has no entropy; would Q' alone decide which
@@ -289,7 +289,7 @@ class SoftActorCritic:
         k_act, k_critics = jax.random.split(key)
         drawn, judges = self.draw(actor, batch.next_obs, k_act), self._judges(target_critics, k_critics)
         own = self.values(judges, batch.next_obs, drawn.unit).min(0)
-        value = own - heat * drawn.log_density if self.options.entropy_in_targets else own
+        value = own - temperature * drawn.log_density if self.options.entropy_in_targets else own
         if other is not None:
             action = self.in_box(drawn.unit)
             offered = other(batch.next_obs, action)
@@ -346,6 +346,14 @@ def squashed_log_density(
     normal = -0.5 * (noise**2 + math.log(2 * math.pi)) - log_std
     squashed = 2 * (math.log(2) - before - jax.nn.softplus(-2 * before))
     return jnp.sum(normal - squashed, -1)
+
+
+def stepped(
+    rate: Float[Array, ""] | float, max_norm: Float[Array, ""] | float, gradient: Any, opt_state: Any, params: Any
+) -> tuple[Any, Any]:
+    """Parameters and Adam's state after a step with a gradient clipped to a norm."""
+    change, opt_state = optimizer("adam", rate, max_norm).update(gradient, opt_state, params)
+    return optax.apply_updates(params, change), opt_state
 
 
 def loss_of(values: Float[Array, "critics batch"], targets: Float[Array, " batch"]) -> Float[Array, ""]:

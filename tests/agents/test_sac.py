@@ -97,11 +97,11 @@ def batch_of(size=6):
 def test_targets_are_those_counted_by_hand(entropy):
     agent = agent_of(dataclasses.replace(SMALL, entropy_in_targets=entropy))
     params, rest = agent.init(KEY)
-    batch, heat = batch_of(), 0.3
-    found = agent.targets(0.9, params["actor"], rest.target_critics, heat, batch, KEY)
+    batch, temperature = batch_of(), 0.3
+    found = agent.targets(0.9, params["actor"], rest.target_critics, temperature, batch, KEY)
     drawn = agent.draw(params["actor"], batch.next_obs, jax.random.split(KEY)[0])
     smallest = np.minimum(*(by_hand(rest.target_critics, n, batch.next_obs, drawn.unit) for n in range(2)))
-    value = smallest - (heat * np.asarray(drawn.log_density) if entropy else 0)
+    value = smallest - (temperature * np.asarray(drawn.log_density) if entropy else 0)
     np.testing.assert_allclose(found, batch.reward + 0.9 * batch.discount * value, rtol=1e-5, atol=1e-6)
     # Nothing follows a termination.
     np.testing.assert_array_equal(found[1::2], batch.reward[1::2])
@@ -110,8 +110,8 @@ def test_targets_are_those_counted_by_hand(entropy):
 def test_targets_take_an_offer_where_it_is_worth_more_than_the_actors_action_with_its_entropy():
     agent = agent_of()
     params, rest = agent.init(KEY)
-    batch, heat, middle = batch_of(200), 0.3, jnp.array([1.0, 0.25])
-    arguments = (0.9, params["actor"], rest.target_critics, heat, batch, KEY)
+    batch, temperature, middle = batch_of(200), 0.3, jnp.array([1.0, 0.25])
+    arguments = (0.9, params["actor"], rest.target_critics, temperature, batch, KEY)
     plain = agent.targets(*arguments)
     found = agent.targets(*arguments, lambda obs, own: jnp.broadcast_to(middle, own.shape))
     drawn = agent.draw(params["actor"], batch.next_obs, jax.random.split(KEY)[0])
@@ -119,7 +119,7 @@ def test_targets_take_an_offer_where_it_is_worth_more_than_the_actors_action_wit
         np.minimum(*(by_hand(rest.target_critics, n, batch.next_obs, unit) for n in range(2)))
         for unit in (drawn.unit, np.zeros((200, 2)))
     )
-    soft = own - heat * np.asarray(drawn.log_density)
+    soft = own - temperature * np.asarray(drawn.log_density)
     assert 20 < (its > soft).sum() < 180
     assert ((its > own) & (its < soft)).any()  # where Q' alone would have made the target smaller
     expected = batch.reward + 0.9 * batch.discount * np.maximum(its, soft)
@@ -219,7 +219,7 @@ def steps_of(opt_state):
 
 def test_critics_step_for_each_minibatch_actor_and_temperature_once():
     (params, _), (after, state, loss, norm) = updated(dataclasses.replace(THREE, updates_per_step=3))
-    assert [steps_of(opt) for opt in (state.critics_opt, state.actor_opt, state.heat_opt)] == [3, 1, 1]
+    assert [steps_of(opt) for opt in (state.critics_opt, state.actor_opt, state.temperature_opt)] == [3, 1, 1]
     for old, new in zip(jax.tree.leaves(params), jax.tree.leaves(after), strict=True):
         assert (old != new).any()
     assert float(loss) > 0
@@ -239,9 +239,9 @@ def test_target_critics_follow_at_their_rate():
 @pytest.mark.parametrize(("entropy", "way"), [(5.0, 1), (-50.0, -1)])
 def test_the_temperature_moves_the_entropy_to_its_target(entropy, way):
     _, (_, state, *_) = updated(dataclasses.replace(SMALL, target_entropy=entropy))
-    assert np.sign(float(state.log_heat)) == way
+    assert np.sign(float(state.log_temperature)) == way
     _, (_, state, *_) = updated(dataclasses.replace(SMALL, target_entropy=entropy, temperature_rate=0.0))
-    assert float(state.log_heat) == 0
+    assert float(state.log_temperature) == 0
 
 
 def test_at_discount_zero_targets_are_rewards():
