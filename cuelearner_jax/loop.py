@@ -22,9 +22,18 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from cuelearner_jax import asking
 from cuelearner_jax.agents.networks import all_finite
-from cuelearner_jax.agents.protocol import AgentFunctions, AgentOptions
-from cuelearner_jax.agents.replay import Memory, RingBuffer, buffer_for, stored_step
-from cuelearner_jax.arbiters.protocol import Arbiter, ArbiterOptions, Chooses, HasCritic, Known, Outcome
+from cuelearner_jax.agents.protocol import AgentFunctions, AgentOptions, draws_sorts
+from cuelearner_jax.agents.replay import Memory, RingBuffer, buffer_for, count_guided, stored_step
+from cuelearner_jax.arbiters.protocol import (
+    Arbiter,
+    ArbiterOptions,
+    Chooses,
+    HasCritic,
+    Known,
+    Outcome,
+    make_arbiter,
+    offer_of,
+)
 from cuelearner_jax.asking import GuideState, Stream, label_slots
 from cuelearner_jax.config import Scalars, Schedule, Sizes, static
 from cuelearner_jax.devices import (
@@ -57,6 +66,7 @@ class AgentState(struct.PyTreeNode):
     replay: Float[Array, "capacity width"]
     env: EnvState  # leading axis: num_envs
     obs: Float[Array, "num_envs obs"]
+    guided: Int[Array, "capacity 1"] | None = None  # guided steps up to each row of replay, where the agent asks
 
 
 class TrainState(struct.PyTreeNode):
@@ -218,18 +228,24 @@ class Lane(NamedTuple):
     bootstraps: bool  # do targets look at the next observation?
     largest_budget: int
 
+    @property
+    def counts_guided(self) -> bool:
+        """Whether replay counts guided steps: for an agent that draws them apart, under a guide that acts."""
+        return draws_sorts(self.learner.options) and self.guidance.moves
+
     def init(self, env: Environment, key: PRNGKeyArray, budget: Int[Array, ""] | int) -> TrainState:
         """A fresh lane. Budgets do not touch the random numbers: lanes of one seed start alike."""
         k_agent, k_guidance, k_ask, k_env = jax.random.split(jax.random.fold_in(key, Stream.INIT), 4)
         slots = label_slots(self.largest_budget, self.sizes)
         params, training = self.learner.init(k_agent)
         env_state, obs = jax.vmap(env.reset)(jax.random.split(k_env, self.sizes.num_envs))
-        replay = self.buffer.empty(self.learner.options.replay_capacity)
+        capacity = self.learner.options.replay_capacity
+        guided = jnp.zeros((capacity, 1), jnp.int32) if self.counts_guided else None
         arbiter = self.arbiter.init(self.sizes.num_envs)
         if isinstance(self.arbiter, HasCritic):
             arbiter = self.arbiter.with_critic(arbiter, self.learner.init(jax.random.fold_in(k_agent, APART)))
         return TrainState(
-            agent=AgentState(params, training, replay, env_state, obs),
+            agent=AgentState(params, training, self.buffer.empty(capacity), env_state, obs, guided),
             guide=asking.start(self.guidance, env, slots, budget, k_guidance, k_ask, self.sizes),
             arbiter=arbiter,
             key=key,
@@ -338,6 +354,8 @@ class Lane(NamedTuple):
         arbiter = self.arbiter.follow(state.arbiter, settings.arbiter, settings.scalars, outcome, key)
         stored = jax.vmap(partial(stored_step, bootstraps=self.bootstraps))(acted.remembered, acted.actions, step)
         agent = agent.replace(replay=self.buffer.add(agent.replay, clock.step, stored), obs=step.obs)
+        if agent.guided is not None:
+            agent = agent.replace(guided=count_guided(agent.guided, clock.step, acted.passes > 0))
         moved = acted.passes.astype(jnp.float32)
         metrics = {
             "reward": step.reward.mean(),
@@ -350,13 +368,15 @@ class Lane(NamedTuple):
         self, env: Environment, settings: Settings, clock: Clock, state: TrainState, key: PRNGKeyArray
     ) -> tuple[TrainState, dict[str, Float[Array, ""]]]:
         """As many gradient steps as environment steps were just made, once there are enough of these."""
-        filled, agent = clock.step + self.sizes.num_envs, state.agent
-        memory = Memory(env, self.buffer, agent.replay, filled, self.sizes.num_envs, self.bootstraps)
+        filled, agent, schedule = clock.step + self.sizes.num_envs, state.agent, settings.schedule
+        memory = Memory(env, self.buffer, agent.replay, filled, self.sizes.num_envs, self.bootstraps, agent.guided)
+        offer = offer_of(self.arbiter, self.guidance, state.guide.model, env, settings.scalars, guides(clock, schedule))
+        offered = {} if offer is None else {"other": offer}
 
         def update(learned: tuple[Any, Any], key: PRNGKeyArray, index: Array) -> tuple[tuple[Any, Any], Any]:
             count, own = clock.update + index + 1, jax.random.fold_in(key, index)
             params, training, loss, norm = self.learner.update(
-                env, settings.agent, settings.scalars, count, *learned, memory, own
+                env, settings.agent, settings.scalars, count, *learned, memory, own, **offered
             )
             return (params, training), (loss, norm)
 
@@ -367,7 +387,7 @@ class Lane(NamedTuple):
 
         def updated(learned: tuple[Any, Any], key: PRNGKeyArray) -> tuple[tuple[Any, Any], Array, Array]:
             return jax.lax.cond(
-                filled >= settings.schedule.learn_after,
+                filled >= schedule.learn_after,
                 lambda: updates(learned, key),
                 lambda: (learned, jnp.zeros(()), jnp.array(True)),
             )
@@ -395,4 +415,5 @@ def _lane_of(sizes: Sizes, parts: _Parts, guidance: Guide, largest_budget: int, 
     agent, arbiter, bootstraps = parts
     learner = agent.make(sizes.frame, spaces_of(env), bootstraps)
     buffer = buffer_for(env, bootstraps)
-    return Lane(sizes, guidance, learner, arbiter.make(bootstraps), buffer, bootstraps, largest_budget)
+    made = make_arbiter(arbiter, agent, bootstraps)
+    return Lane(sizes, guidance, learner, made, buffer, bootstraps, largest_budget)

@@ -107,8 +107,8 @@ def test_a_run_s_options_come_back_from_json_with_their_parts():
     told = json.loads(json.dumps(run_config.to_json(asked)))
     assert (told["agent"]["name"], told["arbiter"]["name"]) == ("ddqn", "paced")
     assert run_config.from_json(asked.task, told) == asked
-    with pytest.raises(UserError, match="unknown agent 'sac'"):
-        run_config.from_json(asked.task, {**told, "agent": {"name": "sac"}})
+    with pytest.raises(UserError, match="unknown agent 'gone'"):
+        run_config.from_json(asked.task, {**told, "agent": {"name": "gone"}})
 
 
 def test_defaults_and_probes_can_work():

@@ -43,22 +43,26 @@ class MLP(nn.Module):
     layers: Sequence[int]
     outputs: int
     dtype: DTypeLike = jnp.float32  # of the hidden layers' arithmetic; parameters and outputs are float32
+    layer_norm: bool = False  # are hidden layers normalised before their ReLU?
 
     @nn.compact
     def __call__(self, obs: Float[Array, "... obs"], action: Float[Array, "... action"]) -> Float[Array, "... outputs"]:
         """Leading axes of `obs` and `action` must broadcast."""
-        x = nn.relu(Joined(self.layers[0], self.dtype, name="Dense_0")(obs, action))
+        x = nn.relu(self._normed(Joined(self.layers[0], self.dtype, name="Dense_0")(obs, action), 0))
         for place, width in enumerate(self.layers[1:], start=1):
-            x = nn.relu(self._dense(width, place, self.dtype)(x))
+            x = nn.relu(self._normed(self._dense(width, place, self.dtype)(x), place))
         return self._dense(self.outputs, len(self.layers), jnp.float32)(x)
+
+    def _normed(self, x: Float[Array, "... width"], place: int) -> Float[Array, "... width"]:
+        return nn.LayerNorm(dtype=self.dtype, name=f"LayerNorm_{place}")(x) if self.layer_norm else x
 
     def _dense(self, width: int, place: int, dtype: DTypeLike) -> nn.Dense:
         return nn.Dense(width, dtype=dtype, kernel_init=nn.initializers.xavier_uniform(), name=f"Dense_{place}")
 
 
-def q_network(layers: Sequence[int], dtype: DTypeLike = jnp.float32) -> MLP:
+def q_network(layers: Sequence[int], dtype: DTypeLike = jnp.float32, layer_norm: bool = False) -> MLP:
     """Q(s, a): one output."""
-    return MLP(tuple(layers), 1, dtype)
+    return MLP(tuple(layers), 1, dtype, layer_norm)
 
 
 def residual_network(layers: Sequence[int], outputs: int) -> MLP:

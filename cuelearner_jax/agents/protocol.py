@@ -6,6 +6,7 @@ equal options for equal spaces is equal, so that a program compiled for one serv
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, ClassVar, Protocol, runtime_checkable
 
 from jaxtyping import Array, Float, Int, PRNGKeyArray
@@ -13,7 +14,12 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 from cuelearner_jax.agents.replay import Memory
 from cuelearner_jax.config import Frame, Scalars, Sizes
 from cuelearner_jax.environment import Spaces
+from cuelearner_jax.spaces import DIRECTIONS, Space
 from cuelearner_jax.types import Params
+
+Offer = Callable[
+    [Array, Array], Array
+]  # (observations (n, obs), actions (n, action)) -> actions offered in their place
 
 
 @runtime_checkable
@@ -112,3 +118,30 @@ class AgentOptions(Protocol):
     def check(self, sizes: Sizes, bootstraps: bool) -> None:
         """Raises UserError for options that do not work together; each is within its bounds."""
         ...
+
+
+class OptionalFacts(Protocol):
+    """What a class of options may say beside `AgentOptions`; ask by the functions below."""
+
+    ACTOR: ClassVar[bool]  # does an actor choose, not the argmax of `value`? `update` then takes an `Offer`, `other`
+    SORTS: ClassVar[bool]  # does `update` draw guided and own steps apart? Replay then counts the guided ones
+    ACTS_IN: ClassVar[Space]  # one of the spaces in which it acts, where these are not all
+
+
+def has_actor(options: Any) -> bool:
+    """Whether agents of these options act by an actor.
+
+    An argmax of values never finds another action better by the same values. An actor's choice can be compared by them,
+    and `update(..., other=offer)` lets targets bootstrap from the better of the actor's action and the one offered.
+    """
+    return getattr(options, "ACTOR", False)
+
+
+def draws_sorts(options: Any) -> bool:
+    """Whether agents of these options draw guided and own steps apart (`Memory.batches`, `guided_share`)."""
+    return getattr(options, "SORTS", False)
+
+
+def stand_in(options: Any) -> Space:
+    """A small space in which agents of these options act, where the task's is not known."""
+    return getattr(options, "ACTS_IN", DIRECTIONS)

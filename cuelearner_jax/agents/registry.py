@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from cuelearner_jax.agents import ddqn
+from cuelearner_jax.agents import ddqn, sac
 from cuelearner_jax.agents.protocol import AgentOptions
 from cuelearner_jax.plugins import PartRegistry
 
-AGENTS = PartRegistry[AgentOptions]("agent", ddqn.Config)
+AGENTS = PartRegistry[AgentOptions]("agent", ddqn.Config, sac.Config)

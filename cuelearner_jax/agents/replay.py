@@ -15,7 +15,7 @@ import jax.custom_batching
 import jax.numpy as jnp
 from flax import struct
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, Num, PRNGKeyArray
 
 from cuelearner_jax.environment import Environment, actions_of, random_symmetries
 from cuelearner_jax.types import Step
@@ -66,8 +66,8 @@ class RingBuffer(NamedTuple):
 
 @jax.custom_batching.custom_vmap
 def _write(
-    rows: Float[Array, "*lanes capacity width"], packed: Float[Array, "*lanes n width"], start: Int[Array, ""]
-) -> Float[Array, "*lanes capacity width"]:
+    rows: Num[Array, "*lanes capacity width"], packed: Num[Array, "*lanes n width"], start: Int[Array, ""]
+) -> Num[Array, "*lanes capacity width"]:
     """`packed` in place of the rows from `start` on."""
     zero = jnp.zeros_like(start)
     return jax.lax.dynamic_update_slice(rows, packed, (*[zero] * (rows.ndim - 2), start, zero))
@@ -133,16 +133,28 @@ class Memory(NamedTuple):
     filled: Int[Array, ""]  # rows written so far
     num_envs: int
     bootstraps: bool  # do transitions have a next observation?
+    guided: Int[Array, "capacity 1"] | None = None  # see `count_guided`; None: guided steps are not counted
 
     def batches(
-        self, key: PRNGKeyArray, size: int, n_step: int = 1, discount: Float[Array, ""] | float = 0.0
+        self,
+        key: PRNGKeyArray,
+        size: int,
+        n_step: int = 1,
+        discount: Float[Array, ""] | float = 0.0,
+        guided_share: Float[Array, ""] | float | None = None,
     ) -> list[Transition]:
-        """Uniformly drawn transitions (size,), each under a random symmetry of the environment.
+        """Drawn transitions (size,), each under a random symmetry of the environment.
 
         With `n_step` above 1 a second batch follows: from the same steps on, up to so many of one episode as one.
+        All stored steps are as likely; with a `guided_share` the first of a batch, up to that share, are guided steps
+        and the others own steps, each sort as likely. A sort without steps leaves its place to the other.
         """
         k_sample, k_mirror = jax.random.split(key)
-        numbers = self.buffer.draw(k_sample, self.rows, self.filled, size)
+        if guided_share is None or self.guided is None:
+            numbers = self.buffer.draw(k_sample, self.rows, self.filled, size)
+        else:
+            wanted = jnp.arange(size) < jnp.round(guided_share * size)
+            numbers = draw_sorts(k_sample, self.guided[:, 0], self.filled, wanted)
         found = [self.one_step(self.buffer.read(self.rows, numbers))]
         if n_step > 1:
             found.append(self.n_step(numbers, n_step, discount))
@@ -166,6 +178,57 @@ class Memory(NamedTuple):
         end = self.buffer.read(self.rows, jnp.mod(numbers + last * self.num_envs, self.rows.shape[0]))
         next_obs = jax.vmap(self.env.recall_next)(end.obs, end.action, end.aftermath)
         return Transition(jax.vmap(self.env.recall)(first.obs), first.action, reward, factor, next_obs)
+
+
+def count_guided(
+    counts: Int[Array, "capacity 1"], step: Int[Array, ""], guided: Bool[Array, " n"]
+) -> Int[Array, "capacity 1"]:
+    """Count guided steps beside the rows of a ring buffer: of all steps made up to each row, that row included.
+
+    Args:
+        counts: of the rows so far, 0 at first.
+        step: rows written so far, see `RingBuffer`.
+        guided: which of the steps being added the guide chose.
+    """
+    before = counts[jnp.mod(step - 1, counts.shape[0]), 0]
+    added = before + jnp.cumsum(guided.astype(counts.dtype))
+    return _write(counts, added[:, None], jnp.mod(step, counts.shape[0]))
+
+
+def draw_sorts(
+    key: PRNGKeyArray, counts: Int[Array, " capacity"], filled: Int[Array, ""], guided: Bool[Array, " batch"]
+) -> Int[Array, " batch"]:
+    """Draw numbers of rows of one sort each, every row of a sort as likely.
+
+    A row is found by its rank among those of its sort, by bisection. Once rows are written over, the oldest is left
+    out: the count before it, which told its sort, is gone.
+
+    Args:
+        key: of the draw.
+        counts: guided steps up to each row, see `count_guided`.
+        filled: rows written so far, also those written over since.
+        guided: which of the numbers are to be of guided steps, the others of own ones; of a sort without rows the
+            numbers are of the other.
+    """
+    capacity = counts.shape[0]
+    lost = jnp.maximum(filled - capacity, 0)
+    first = jnp.where(lost > 0, lost + 1, 0)
+    before = jnp.where(lost > 0, counts[jnp.mod(lost, capacity)], 0)
+    among = filled - first
+    found = counts[jnp.mod(filled - 1, capacity)] - before
+    guided = jnp.where(found == 0, False, jnp.where(found == among, True, guided))
+    rank = jax.random.randint(key, guided.shape, 0, jnp.maximum(jnp.where(guided, found, among - found), 1)) + 1
+
+    def halve(_: Int[Array, ""], ends: tuple[Array, Array]) -> tuple[Array, Array]:
+        low, high = ends
+        middle = (low + high) // 2
+        of_guide = counts[jnp.mod(first + middle, capacity)] - before
+        reached = jnp.where(guided, of_guide, middle + 1 - of_guide) >= rank
+        return jnp.where(reached, low, middle + 1), jnp.where(reached, middle, high)
+
+    start = jnp.zeros_like(rank), jnp.broadcast_to(jnp.maximum(among - 1, 0), rank.shape)
+    place, _ = jax.lax.fori_loop(0, capacity.bit_length(), halve, start)
+    return jnp.mod(first + place, capacity)
 
 
 def n_step_return(

@@ -1,25 +1,39 @@
-"""The guide's action is executed where a critic that did not choose values it above the agent's.
+"""The guide's action is executed where critics that did not choose it value it above the agent's.
 
 Imitation bootstrapped reinforcement learning takes whichever of two actions has the larger Q (Hu, Mirchandani, Sadigh,
-RSS 2024). An agent that takes the argmax of Q never finds another action larger by the same Q. So a second critic
-compares: it starts from other parameters, learns from other batches of the same replay, and selects nothing, so that
-what the first overestimates is not the second's error too (double Q-learning: van Hasselt, NeurIPS 2010).
+RSS 2024): while acting, in bootstrapped targets, and in the finished policy. The agent decides which critics compare:
+
+- An agent with an actor (`sac`): its own critics, as in the paper. The actor climbs their values by gradients and
+  seldom stands at their maximum, so another action can be larger by the same values. `value` compares, the smallest
+  value of all critics.
+- An agent that takes the argmax of Q (`ddqn`) never finds another action larger by the same Q. So a second critic
+  compares: it starts from other parameters, learns from other batches of the same replay, and selects nothing, so that
+  what the first overestimates is not the second's error too (double Q-learning: van Hasselt, NeurIPS 2010). It compares
+  while acting alone; targets and the finished policy are the agent's.
+
+Acting and targets follow the guide until the cut-off. In the finished policy the better of both acts only where that
+validates better than the agent alone.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from flax import struct
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
+from cuelearner_jax.agents.protocol import AgentOptions, has_actor
 from cuelearner_jax.arbiters.episodes import redrawn
-from cuelearner_jax.arbiters.protocol import Known, Outcome
-from cuelearner_jax.config import SHARE, Scalars, part
+from cuelearner_jax.arbiters.protocol import Arbiter, Known, Outcome
+from cuelearner_jax.config import POSITIVE, SHARE, Scalars, part
 from cuelearner_jax.guides.refining import Refined
 from cuelearner_jax.types import Params
+
+ARMS = ("own", "better")
+OWN, BETTER = range(len(ARMS))
 
 
 @part
@@ -27,22 +41,65 @@ class Config:
     """Options of comparing values."""
 
     NAME: ClassVar[str] = "by_value"
-    ABOUT: ClassVar[str] = "the guide's action is executed where a second critic values it above the agent's"
+    ABOUT: ClassVar[str] = "the guide's action is executed where critics value it above the agent's"
 
     probability: Annotated[float, SHARE] = 1.0
     """Probability that an episode is arbitrated; others are the agent's own."""
+    in_targets: bool = True
+    """Do targets, too, bootstrap from the better of both actions? Of agents with an actor alone."""
+    in_policy: bool = True
+    """May the finished policy take the better of both actions? Of agents with an actor alone."""
+    judge_steps: Annotated[int, POSITIVE] = 2_000
+    """Steps in which the agent alone and the better of both are validated before an evaluation, where `in_policy`."""
 
     def make(self, bootstraps: bool) -> ByValue:
-        """The arbiter."""
+        """The arbiter beside an agent that takes the argmax of its values."""
         return ByValue()
+
+    def make_beside(self, agent: AgentOptions, bootstraps: bool) -> Arbiter:
+        """The arbiter beside an agent."""
+        if not has_actor(agent):
+            return self.make(bootstraps)
+        in_targets = self.in_targets and bootstraps
+        return Finishing(in_targets, self.judge_steps) if self.in_policy else ByOwnValues(in_targets)
 
 
 class Compared(struct.PyTreeNode):
-    """The episodes that are arbitrated, and the second critic."""
+    """The episodes that are arbitrated; the second critic, or the arm of the finished policy, where there is one."""
 
     arbitrated: Bool[Array, " num_envs"]
     params: Params = None
     training: Any = None  # what learning keeps beside the parameters
+    best: Int[Array, ""] | None = None
+
+
+def better(
+    known: Known,
+    critics: Params,
+    obs: Float[Array, "n obs"],
+    own: Float[Array, "n action"],
+    other: Float[Array, "n action"],
+) -> Bool[Array, " n"]:
+    """Where the agent's values under other parameters, `critics`, are larger of the other action."""
+
+    def gain(obs: Array, own: Array, other: Array) -> Array:
+        values = known.agent.value(known.env, critics, obs, jnp.stack([own, other]))
+        return values[1] - values[0]
+
+    return jax.vmap(gain)(obs, own, other) > 0
+
+
+def chosen(
+    known: Known,
+    critics: Params,
+    obs: Float[Array, "n obs"],
+    own: Float[Array, "n action"],
+    asked: Bool[Array, " n"],
+) -> Refined:
+    """The guide's actions where critics value them above the agent's, in rows that are asked about."""
+    guided = known.guide.act(known.model, known.env, obs, own, asked, known.scalars)
+    taken = asked & better(known, critics, obs, own, guided.actions)
+    return Refined(jnp.where(taken[:, None], guided.actions, own), jnp.where(taken, guided.passes, 0))
 
 
 class ByValue(NamedTuple):
@@ -81,12 +138,69 @@ class ByValue(NamedTuple):
         key: PRNGKeyArray,
     ) -> Refined:
         """The guide's action where the second critic values it above the agent's, in arbitrated episodes."""
-        asked = state.arbitrated & learns
-        guided = known.guide.act(known.model, known.env, obs, base, asked, known.scalars)
+        return chosen(known, state.params, obs, base, state.arbitrated & learns)
 
-        def gain(obs: Array, own: Array, other: Array) -> Array:
-            values = known.agent.value(known.env, state.params, obs, jnp.stack([own, other]))
-            return values[1] - values[0]
 
-        better = asked & (jax.vmap(gain)(obs, base, guided.actions) > 0)
-        return Refined(jnp.where(better[:, None], guided.actions, base), jnp.where(better, guided.passes, 0))
+@dataclass(frozen=True)
+class ByOwnValues:
+    """The arbiter beside an agent with an actor (`protocol.Chooses`, `protocol.InTargets`)."""
+
+    in_targets: bool
+
+    def init(self, num_envs: int) -> Compared:
+        """The first episodes, which begin with uniform actions, are the agent's own."""
+        return Compared(jnp.zeros(num_envs, bool))
+
+    def guided(self, state: Compared) -> Bool[Array, " num_envs"]:
+        """The episodes that are arbitrated."""
+        return state.arbitrated
+
+    def follow(
+        self, state: Compared, options: Config, scalars: Scalars, outcome: Outcome, key: PRNGKeyArray
+    ) -> Compared:
+        """Draws for the episodes that begin."""
+        return ByValue().follow(state, options, scalars, outcome, key)
+
+    def choose(
+        self,
+        state: Compared,
+        options: Config,
+        known: Known,
+        obs: Float[Array, "num_envs obs"],
+        base: Float[Array, "num_envs action"],
+        learns: Bool[Array, ""],
+        key: PRNGKeyArray,
+    ) -> Refined:
+        """The guide's action where the agent's critics value it above the actor's, in arbitrated episodes."""
+        return chosen(known, known.params, obs, base, state.arbitrated & learns)
+
+
+@dataclass(frozen=True)
+class Finishing(ByOwnValues):
+    """The arbiter that may act in the finished policy too (`protocol.Finishes`)."""
+
+    judge_steps: int
+
+    @property
+    def arms(self) -> tuple[str, ...]:
+        """The agent alone; the better of both actions."""
+        return ARMS
+
+    def init(self, num_envs: int) -> Compared:
+        """The agent acts until the better of both validates better."""
+        return super().init(num_envs).replace(best=jnp.array(OWN, jnp.int32))
+
+    def arm(self, state: Compared) -> Any:
+        """The arm that validated best."""
+        return state.best
+
+    def with_arm(self, state: Compared, arm: Int[Array, "*lanes"]) -> Compared:
+        """The state in which another arm validated best."""
+        return state.replace(best=arm)
+
+    def act(
+        self, arm: Int[Array, ""], options: Config, known: Known, obs: Float[Array, "n obs"], key: PRNGKeyArray
+    ) -> Float[Array, "n action"]:
+        """The actor's actions, or the better of these and the guide's."""
+        own, every = known.agent.act(known.env, known.params, obs, key), jnp.ones(len(obs), bool)
+        return jax.lax.cond(arm == OWN, lambda: own, lambda: chosen(known, known.params, obs, own, every).actions)

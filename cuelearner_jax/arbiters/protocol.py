@@ -8,9 +8,11 @@ from __future__ import annotations
 
 from typing import Any, ClassVar, NamedTuple, Protocol, runtime_checkable
 
+import jax
+import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from cuelearner_jax.agents.protocol import AgentFunctions
+from cuelearner_jax.agents.protocol import AgentFunctions, AgentOptions, Offer
 from cuelearner_jax.config import GuideScalars, Scalars
 from cuelearner_jax.guides.base import Guide
 from cuelearner_jax.guides.refining import Refined
@@ -107,6 +109,16 @@ class HasCritic(Arbiter, Protocol):
 
 
 @runtime_checkable
+class InTargets(Arbiter, Protocol):
+    """An arbiter whose choice may count in bootstrapped targets too, of agents with an actor."""
+
+    @property
+    def in_targets(self) -> bool:
+        """Do targets bootstrap from the better of the actor's and the guide's action, in the time of guidance?"""
+        ...
+
+
+@runtime_checkable
 class Finishes(Arbiter, Protocol):
     """An arbiter that acts in the finished policy too, by one of several arms, whichever validates best."""
 
@@ -148,3 +160,26 @@ class ArbiterOptions(Protocol):
     def make(self, bootstraps: bool) -> Arbiter:
         """The arbiter; floats of the options may be None. `bootstraps`: is the discount factor above 0?"""
         ...
+
+
+def make_arbiter(options: ArbiterOptions, agent: AgentOptions, bootstraps: bool) -> Arbiter:
+    """The arbiter of options; those that look at the agent have `make_beside(agent, bootstraps)` too."""
+    beside = getattr(options, "make_beside", None)
+    return options.make(bootstraps) if beside is None else beside(agent, bootstraps)
+
+
+def offer_of(
+    arbiter: Arbiter, guide: Guide, model: GuidanceModel, env: Any, scalars: GuideScalars, counts: Bool[Array, ""]
+) -> Offer | None:
+    """The guide's actions, for targets to compare with the actor's; None: the arbiter leaves targets alone.
+
+    `counts`: is this the time of guidance? Outside it the actor's actions come back. It must not differ between lanes.
+    """
+    if not (isinstance(arbiter, InTargets) and arbiter.in_targets and guide.moves):
+        return None
+
+    def offer(obs: Float[Array, "n obs"], own: Float[Array, "n action"]) -> Float[Array, "n action"]:
+        every = jnp.ones(len(obs), bool)
+        return jax.lax.cond(counts, lambda: guide.act(model, env, obs, own, every, scalars).actions, lambda: own)
+
+    return offer

@@ -116,6 +116,11 @@ class Guide:
         return self.kind.asks
 
     @property
+    def moves(self) -> bool:
+        """Whether it ever does anything in place of an action."""
+        return True
+
+    @property
     def has_members(self) -> bool:
         """Whether its model is an ensemble, whose members can disagree."""
         return self.asks and self.sizes.ensemble > 1

@@ -17,6 +17,11 @@ from cuelearner_jax.types import GuidanceModel, Label
 class Untaught(Guide):
     """A guide with an empty model; by itself no guidance, with which every other kind is compared."""
 
+    @property
+    def moves(self) -> bool:
+        """Whether a class that inherits says how it acts."""
+        return type(self).act is not Untaught.act
+
     def init(self, key: PRNGKeyArray) -> GuidanceModel:
         """Nothing."""
         return GuidanceModel({}, jnp.array(False))

@@ -10,7 +10,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from cuelearner_jax.arbiters.protocol import Arbiter, Finishes, Known
+from cuelearner_jax.arbiters.protocol import Arbiter, Finishes, Known, make_arbiter
 from cuelearner_jax.config import Scalars
 from cuelearner_jax.guides.base import Guide
 from cuelearner_jax.policies.layers import Agent, plain_part
@@ -62,7 +62,7 @@ class Arbitrated(PolicyNode):
 
 def arbiter_of(config: RunConfig) -> Arbiter:
     """The arbiter of a run."""
-    return config.arbiter.make(config.bootstraps)
+    return make_arbiter(config.arbiter, config.agent, config.bootstraps)
 
 
 def acting(arbiter: Arbiter, params: Params, model: GuidanceModel, state: Any) -> dict[str, Any]:

@@ -13,6 +13,7 @@ import numpy as np
 from cuelearner_jax import config as configuration
 from cuelearner_jax import run_config
 from cuelearner_jax.agents import ddqn
+from cuelearner_jax.agents.protocol import stand_in
 from cuelearner_jax.arbiters import episodes
 from cuelearner_jax.environment import Spaces
 from cuelearner_jax.errors import UserError
@@ -22,7 +23,6 @@ from cuelearner_jax.guides.base import NAME, Guide, Kind
 from cuelearner_jax.plugins import REFERENCE
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs.shards import Shard
-from cuelearner_jax.spaces import DIRECTIONS
 from cuelearner_jax.storage import formats, label_files
 from cuelearner_jax.storage.folders import CONFIG
 from cuelearner_jax.storage.room import check_room
@@ -143,7 +143,7 @@ def load(folder: Path, find: Callable[[str], Task]) -> tuple[Task, RunConfig, Gr
 
 def _check_room(path: Path, config: RunConfig, grid: Grid) -> None:
     """Raises UserError if a run's lanes are more than memory holds: their networks at work, or an evaluation."""
-    lanes, spaces = len(grid.seeds) * max(1, len(grid.labels)), Spaces(1, DIRECTIONS, (1, 1))
+    lanes, spaces = len(grid.seeds) * max(1, len(grid.labels)), Spaces(1, stand_in(config.agent), (1, 1))
     agent = config.agent.make(config.sizes.frame, spaces, config.bootstraps)
     weights = sum(leaf.size for leaf in jax.tree.leaves(jax.eval_shape(agent.init, jax.random.key(0))))
     check_room(f"{path} has {lanes:,} lanes of {weights:,} weights", 4 * weights * lanes, "restore the file")

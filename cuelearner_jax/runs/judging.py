@@ -83,3 +83,15 @@ def score(means: dict[str, Any], bootstraps: bool) -> np.ndarray:
     if not bootstraps:
         return np.asarray(means["reward"])
     return np.asarray(means["returned"] / np.maximum(means["ended"], np.finfo(np.float32).tiny))
+
+
+def scores(arms: list[dict[str, Any]], bootstraps: bool) -> np.ndarray:
+    """Scores (arms, lanes) of the roll-outs of all arms, see `score`.
+
+    In a lane where no arm has ended an episode, which may be longer than the validation, the reward a step tells.
+    """
+    found = np.stack([score(means, bootstraps) for means in arms])
+    if not bootstraps:
+        return found
+    ended = np.stack([np.asarray(means["ended"]) for means in arms])
+    return np.where((ended > 0).any(0), found, np.stack([np.asarray(means["reward"]) for means in arms]))

@@ -58,7 +58,7 @@ def _at_rest(block: TrainState, layers: Footprint) -> dict[str, int]:
     """What a block keeps [bytes], by the option that decides it."""
     agent, guide = block.agent, block.guide
     parts = {
-        "--agent.replay-capacity": agent.replay,
+        "--agent.replay-capacity": (agent.replay, agent.guided),
         "--labels": guide.labels,
         "--sizes.num-envs": (agent.env, agent.obs, block.arbiter),
         "--sizes.candidates": (guide.env, guide.obs),

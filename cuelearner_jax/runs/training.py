@@ -17,7 +17,7 @@ from cuelearner_jax.environment import Environment, view_of
 from cuelearner_jax.evaluate import Tell, episodes, untold
 from cuelearner_jax.loop import Clock, TrainState, start_clock
 from cuelearner_jax.policies import Guided, PolicyBlock, acting, finished, uniform_in
-from cuelearner_jax.runs.judging import Returns, judges_envs, judges_episodes, score
+from cuelearner_jax.runs.judging import Returns, judges_envs, judges_episodes, scores
 from cuelearner_jax.runs.lanes import LaneGroup
 from cuelearner_jax.storage import label_files
 from cuelearner_jax.types import Label, Teacher
@@ -180,16 +180,16 @@ class Training:
             return {}
         bootstraps, view = group.config.bootstraps, view_of(world.env)
         size = (judges_envs(bootstraps), arbiter.judge_steps)
-        scores = []
+        found = []
         for arm in map(jnp.asarray, range(len(arbiter.arms))):
             policy_of = lambda lane, arm=arm: self._policy(lane, view, arm=arm)  # noqa: E731
-            found = group.evaluate(policy_of, world, judges_episodes(), *size, self.blocks, self.tell)
-            scores.append(score(found, bootstraps))
-        best = np.argmax(np.nan_to_num(np.stack(scores), nan=-np.inf), axis=0).astype(np.int32)
+            found.append(group.evaluate(policy_of, world, judges_episodes(), *size, self.blocks, self.tell))
+        worth = scores(found, bootstraps)
+        best = np.argmax(np.nan_to_num(worth, nan=-np.inf), axis=0).astype(np.int32)
         for block, rows in enumerate(group.cut):
             chosen, lanes = place(group.mesh, jnp.asarray(best[rows]), BY_LANE), self.blocks[block]
             self.blocks[block] = lanes.replace(arbiter=arbiter.with_arm(lanes.arbiter, chosen))
-        judged = {f"judged_{name}": values for name, values in zip(arbiter.arms, scores, strict=True)}
+        judged = {f"judged_{name}": values for name, values in zip(arbiter.arms, worth, strict=True)}
         return self._of_finite({"arm": best.astype(float), **judged})
 
     def guide_alone(self) -> dict[str, np.ndarray]:

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from cuelearner_jax.agents.replay import StoredStep, ring_buffer
+from cuelearner_jax.agents.replay import StoredStep, count_guided, draw_sorts, ring_buffer
 
 EXAMPLE = StoredStep(jnp.zeros(3), jnp.zeros(2), jnp.zeros(()), jnp.zeros(1), jnp.zeros(1), jnp.zeros(3))
 
@@ -117,3 +117,50 @@ def test_a_capacity_that_is_no_multiple_is_refused():
     buffer = ring_buffer(EXAMPLE)
     with pytest.raises(ValueError, match="no multiple"):
         buffer.add(buffer.empty(7), jnp.array(0), numbered(0, 2))
+
+
+def counted(guided, capacity, at_once):
+    """Counts of guided steps, written so many at once."""
+    counts, add = jnp.zeros((capacity, 1), jnp.int32), jax.jit(count_guided)
+    for step in range(0, len(guided), at_once):
+        counts = add(counts, jnp.array(step), jnp.asarray(guided[step : step + at_once]))
+    return counts
+
+
+def test_guided_steps_are_counted_up_to_each_row():
+    guided = np.array([1, 0, 0, 1, 1, 0, 1, 0, 0, 1], bool)
+    total = np.cumsum(guided)
+    np.testing.assert_array_equal(counted(guided[:8], 8, 2)[:, 0], total[:8])
+    np.testing.assert_array_equal(counted(guided, 8, 2)[:, 0], [*total[8:], *total[2:8]])
+
+
+@pytest.mark.parametrize("steps", [5, 8, 12, 19])
+def test_rows_of_each_sort_are_drawn_alike_and_no_others(steps):
+    """Once the ring of 8 has been round, its oldest row is of an unknown sort, and left out."""
+    guided = np.isin(np.arange(steps) % 7, (1, 2, 5))
+    counts, oldest = counted(guided, 8, 1)[:, 0], max(steps - 8, 0) + (steps > 8)
+    wanted = np.arange(6000) < 3000
+    drawn = np.asarray(draw_sorts(jax.random.key(0), counts, jnp.array(steps), jnp.asarray(wanted)))
+    for sort in (True, False):
+        there = [number % 8 for number in range(oldest, steps) if guided[number] == sort]
+        found = np.bincount(drawn[wanted == sort], minlength=8)
+        assert set(np.flatnonzero(found)) == set(there)
+        expected = 3000 / len(there)
+        assert np.abs(found[there] - expected).max() < 5 * expected**0.5
+
+
+@pytest.mark.parametrize("sort", [True, False])
+def test_a_sort_without_rows_leaves_its_place_to_the_other(sort):
+    counts = counted(np.full(6, sort), 8, 1)[:, 0]
+    drawn = draw_sorts(jax.random.key(0), counts, jnp.array(6), jnp.arange(600) < 300)
+    assert set(np.asarray(drawn).tolist()) == set(range(6))
+
+
+def test_in_lanes_each_has_counts_of_its_own():
+    add = jax.vmap(count_guided, (0, None, 0))
+    flags = jnp.array([[True, True], [False, True]])
+    counts = add(jnp.zeros((2, 4, 1), jnp.int32), jnp.array(0), flags)
+    np.testing.assert_array_equal(add(counts, jnp.array(2), flags)[..., 0], [[1, 2, 3, 4], [0, 1, 1, 2]])
+    draw = jax.vmap(draw_sorts, (None, 0, None, None))
+    drawn = draw(jax.random.key(0), counts[..., 0], jnp.array(2), jnp.ones(50, bool))
+    assert [set(lane.tolist()) for lane in np.asarray(drawn)] == [{0, 1}, {1}]

@@ -228,3 +228,10 @@ def test_a_judge_counts_discounted_returns_of_whole_episodes():
     assert float(means["ended"]) == 0.5
     assert float(judging.score(means, bootstraps=True)) == pytest.approx(math.sqrt(0.5), rel=1e-5)
     assert float(judging.score(means, bootstraps=False)) == pytest.approx(0.75 * math.sqrt(0.5), rel=1e-5)
+
+
+def test_where_no_arm_ends_an_episode_the_reward_a_step_tells():
+    ends = {"returned": np.array([0.0, 0.3]), "ended": np.array([0.0, 0.5]), "reward": np.array([-2.0, 1.0])}
+    never = {"returned": np.zeros(2), "ended": np.zeros(2), "reward": np.array([-1.0, 2.0])}
+    np.testing.assert_allclose(judging.scores([ends, never], bootstraps=True), [[-2.0, 0.6], [-1.0, 0.0]])
+    np.testing.assert_allclose(judging.scores([ends, never], bootstraps=False), [[-2.0, 1.0], [-1.0, 2.0]])

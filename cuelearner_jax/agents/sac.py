@@ -1,0 +1,361 @@
+"""Soft actor-critic in a box: a squashed Gaussian that maximises value and entropy, judged by any number of critics.
+
+Source: Haarnoja et al., "Soft actor-critic algorithms and applications", 2018, with the temperature tuned (Eq. 18).
+More critics, of which each target takes a random subset: Chen et al., "Randomized ensembled double Q-learning", ICLR
+2021. Layer normalisation, and as many guided as own steps in a minibatch: Ball et al., "Efficient online reinforcement
+learning with offline data" (RLPD), ICML 2023.
+
+Networks see actions in unit coordinates: -1 is each entry's lower bound, 1 its upper bound.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar, NamedTuple
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import optax
+from flax import struct
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+
+from cuelearner_jax.agents.ddqn import optimizer
+from cuelearner_jax.agents.networks import q_network
+from cuelearner_jax.agents.protocol import Offer
+from cuelearner_jax.agents.replay import Memory, Transition
+from cuelearner_jax.config import POSITIVE, SHARE, Bounds, Frame, Layers, Scalars, Sizes, part
+from cuelearner_jax.environment import Spaces
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.spaces import Box, Space
+from cuelearner_jax.types import Params
+
+LOG_STD = (-20.0, 2.0)  # bounds of the logarithm of the Gaussian's standard deviation
+
+
+@part
+class Config:
+    """Options of soft actor-critic."""
+
+    NAME: ClassVar[str] = "sac"
+    ABOUT: ClassVar[str] = "soft actor-critic in a box, with any number of critics"
+    ACTOR: ClassVar[bool] = True
+    SORTS: ClassVar[bool] = True
+    ACTS_IN: ClassVar[Space] = Box((-1.0,), (1.0,))
+
+    actor_layers: Layers = (256, 256)
+    """Hidden layers of the actor."""
+    critic_layers: Layers = (256, 256)
+    """Hidden layers of each critic."""
+    critics: Annotated[int, POSITIVE] = 2
+    """Critics."""
+    target_critics: Annotated[int, POSITIVE] = 2
+    """Critics drawn for each target, of whose values the smallest counts. With more critics than that the actor climbs
+    their mean, else their smallest value."""
+    layer_norm: bool = False
+    """Are the critics' hidden layers normalised? It keeps values of actions never tried from growing."""
+    batch_size: Annotated[int, POSITIVE] = 256
+    """Transitions in a minibatch."""
+    updates_per_step: Annotated[int, POSITIVE] = 1
+    """Minibatches for the critics after each environment step; actor and temperature learn from the last one."""
+    replay_capacity: Annotated[int, POSITIVE] = 1_000_000
+    """Transitions kept (a multiple of num_envs)."""
+    guided_share: Annotated[float, SHARE] = 0.5
+    """Share of guided steps in a minibatch, once there are any; the rest are the agent's own."""
+    actor_rate: Annotated[float, Bounds(0)] = 3e-4
+    """Adam's step size of the actor."""
+    critic_rate: Annotated[float, Bounds(0)] = 3e-4
+    """Adam's step size of the critics."""
+    temperature_rate: Annotated[float, Bounds(0)] = 3e-4
+    """Adam's step size of the temperature's logarithm (0: the temperature stays)."""
+    first_temperature: Annotated[float, Bounds(0, above=True)] = 1.0
+    """Temperature at first: what a nat of entropy is worth, in units of reward."""
+    target_entropy: float = -1.0
+    """Entropy that the temperature is tuned to, for each entry of an action, in unit coordinates [nats]."""
+    entropy_in_targets: bool = True
+    """Does a target's value include the entropy of the action that follows?"""
+    polyak: Annotated[float, SHARE] = 0.005
+    """Rate at which the target critics follow."""
+
+    def make(self, frame: Frame, spaces: Spaces, bootstraps: bool = False) -> SoftActorCritic:
+        """The agent for an environment's spaces. Raises UserError for actions of no box, or seen in another frame."""
+        if not isinstance(spaces.actions, Box):
+            raise UserError(
+                f"agent 'sac' acts in boxes, not in {spaces.actions.name}: give --agent ddqn, which serves any space"
+            )
+        if frame != "raw":
+            raise UserError(
+                f"sizes.frame is {frame!r}, but the actor of 'sac' is given no action: give --sizes.frame raw"
+            )
+        return SoftActorCritic(self, frame, spaces, bootstraps)
+
+    def check(self, sizes: Sizes, bootstraps: bool) -> None:
+        """Raises UserError for options that do not work together."""
+        if self.target_critics > self.critics:
+            raise UserError(
+                f"agent.target_critics is {self.target_critics}: give at most agent.critics ({self.critics})"
+            )
+
+
+class Actor(nn.Module):
+    """ReLU layers on an observation; Xavier-uniform weights, zero biases."""
+
+    layers: Sequence[int]
+    size: int
+
+    @nn.compact
+    def __call__(self, obs: Float[Array, "... obs"]) -> tuple[Float[Array, "... action"], Float[Array, "... action"]]:
+        """Mean and logarithm of the standard deviation of the Gaussian."""
+        x = obs
+        for width in self.layers:
+            x = nn.relu(nn.Dense(width, kernel_init=nn.initializers.xavier_uniform())(x))
+        both = nn.Dense(2 * self.size, kernel_init=nn.initializers.xavier_uniform())(x)
+        mean, log_std = jnp.split(both, 2, -1)
+        return mean, jnp.clip(log_std, *LOG_STD)
+
+
+class Drawn(NamedTuple):
+    """Actions drawn from the squashed Gaussian."""
+
+    unit: Float[Array, "n action"]  # in unit coordinates
+    log_density: Float[Array, " n"]  # in unit coordinates
+
+
+class SACState(struct.PyTreeNode):
+    """What learning keeps beside the parameters."""
+
+    target_critics: Params  # None where nothing bootstraps (discount 0)
+    log_temperature: Float[Array, ""]  # logarithm of the temperature over `Config.first_temperature`
+    actor_opt: Any
+    critics_opt: Any
+    temperature_opt: Any
+
+
+@dataclass(frozen=True)
+class SoftActorCritic:
+    """The agent's functions (`protocol.AgentFunctions`); parameters are a dictionary of `actor` and `critics`."""
+
+    options: Config
+    frame: Frame
+    spaces: Spaces
+    bootstraps: bool  # do targets look at the next observation?
+
+    @property
+    def described(self) -> dict[str, Any]:
+        """Its rule of choice, and what the networks see."""
+        return {"rule": "tanh of the actor's mean", "frame": self.frame}
+
+    def working(self, num_envs: int, portion: int) -> dict[str, int]:
+        """Activations of a minibatch with its gradients, and of acting."""
+        own = self.options
+        passes = 3 * own.critics * sum(own.critic_layers) + 3 * sum(own.actor_layers)
+        return {
+            "--agent.batch-size": own.batch_size * (passes + 4 * own.critics),
+            "--sizes.num-envs": 2 * num_envs * max(own.actor_layers),
+        }
+
+    def init(self, key: PRNGKeyArray) -> tuple[Params, SACState]:
+        """Random parameters, the target critics a copy of theirs, the temperature the first one."""
+        own, space = self.options, self.spaces.actions
+        k_actor, k_critics = jax.random.split(key)
+        obs, action = jnp.zeros(self.spaces.obs_size), jnp.zeros(space.size)
+        actor = self._actor.init(k_actor, obs)
+        critics = jax.vmap(lambda k: self._critic.init(k, obs, action))(jax.random.split(k_critics, own.critics))
+        log_temperature = jnp.zeros(())
+        opt_states = (optimizer("adam", 0.0, 0.0).init(leaf) for leaf in (actor, critics, log_temperature))
+        copy = jax.tree.map(jnp.copy, critics) if self.bootstraps else None
+        return {"actor": actor, "critics": critics}, SACState(copy, log_temperature, *opt_states)
+
+    def act(self, env: Any, params: Params, obs: Float[Array, "n obs"], key: PRNGKeyArray) -> Float[Array, "n action"]:
+        """The action of the Gaussian's mean."""
+        return self.in_box(jnp.tanh(self._gaussian(params["actor"], obs)[0]))
+
+    def explore(
+        self, env: Any, options: Config, params: Params, obs: Float[Array, "n obs"], key: PRNGKeyArray
+    ) -> Float[Array, "n action"]:
+        """Actions drawn from the squashed Gaussian."""
+        return self.in_box(self.draw(params["actor"], obs, key).unit)
+
+    def value(
+        self, env: Any, params: Params, obs: Float[Array, "*n obs"], actions: Float[Array, "*m action"]
+    ) -> Float[Array, "*m"]:
+        """The smallest of the critics' values of each action, in a situation each or all in one."""
+        return self.values(params["critics"], obs, self.in_unit(actions)).min(0)
+
+    def in_unit(self, actions: Float[Array, "*n action"]) -> Float[Array, "*n action"]:
+        """Actions of the box in unit coordinates."""
+        return 2 * self.spaces.actions.log(self._box.middle(), actions)
+
+    def in_box(self, unit: Float[Array, "*n action"]) -> Float[Array, "*n action"]:
+        """Actions in unit coordinates as actions of the box."""
+        return self.spaces.actions.exp(self._box.middle(), unit / 2)
+
+    def draw(self, actor: Params, obs: Float[Array, "n obs"], key: PRNGKeyArray) -> Drawn:
+        """Actions drawn from the squashed Gaussian, with the logarithm of their density; both have gradients."""
+        mean, log_std = self._gaussian(actor, obs)
+        noise = jax.random.normal(key, mean.shape)
+        before = mean + jnp.exp(log_std) * noise
+        return Drawn(jnp.tanh(before), squashed_log_density(noise, log_std, before))
+
+    def values(
+        self, critics: Params, obs: Float[Array, "*n obs"], unit: Float[Array, "*m action"]
+    ) -> Float[Array, "critics *m"]:
+        """What each critic expects of actions in unit coordinates."""
+        one = lambda params: jnp.asarray(self._critic.apply(params, obs, unit))[..., 0]  # noqa: E731
+        return jax.vmap(one)(critics)
+
+    def update(
+        self,
+        env: Any,
+        options: Config,
+        scalars: Scalars,
+        count: Int[Array, ""],
+        params: Params,
+        rest: SACState,
+        memory: Memory,
+        key: PRNGKeyArray,
+        other: Offer | None = None,
+    ) -> tuple[Params, SACState, Float[Array, ""], Float[Array, ""]]:
+        """As many minibatches for the critics as the options say, then one step of actor and temperature.
+
+        See `protocol.AgentFunctions.update`. `other`: see `targets`. The loss is the critics'.
+        """
+        own, actor, most = self.options, params["actor"], scalars.max_grad_norm
+        k_critics, k_actor = jax.random.split(key)
+        temperature = options.first_temperature * jnp.exp(rest.log_temperature)
+
+        def minibatch(carry: tuple[Params, Any, Params, Array], key: PRNGKeyArray) -> tuple[Any, tuple[Array, Array]]:
+            critics, opt_state, target_critics, _ = carry
+            k_batch, k_target = jax.random.split(key)
+            (batch,) = memory.batches(k_batch, own.batch_size, guided_share=options.guided_share)
+            targets = self.targets(scalars.discount, actor, target_critics, temperature, batch, k_target, other)
+            unit = self.in_unit(batch.action)
+            error = lambda critics: loss_of(self.values(critics, batch.obs, unit), targets)  # noqa: E731
+            loss, gradient = jax.value_and_grad(error)(critics)
+            critics, opt_state = stepped(options.critic_rate, most, gradient, opt_state, critics)
+            if self.bootstraps:
+                target_critics = optax.incremental_update(critics, target_critics, options.polyak)
+            return (critics, opt_state, target_critics, batch.obs), (loss, optax.tree.norm(gradient))
+
+        none = jnp.zeros((own.batch_size, self.spaces.obs_size))
+        start = params["critics"], rest.critics_opt, rest.target_critics, none
+        keys = jax.random.split(k_critics, own.updates_per_step)
+        (critics, critics_opt, target_critics, obs), (losses, norms) = jax.lax.scan(minibatch, start, keys)
+
+        climbed = jax.value_and_grad(self.actor_loss, has_aux=True)(actor, critics, temperature, obs, k_actor)
+        (_, log_density), gradient = climbed
+        actor, actor_opt = stepped(options.actor_rate, most, gradient, rest.actor_opt, actor)
+        surplus = -log_density - options.target_entropy * self.spaces.actions.size
+        log_temperature, temperature_opt = stepped(
+            options.temperature_rate, most, temperature * surplus, rest.temperature_opt, rest.log_temperature
+        )
+        state = SACState(target_critics, log_temperature, actor_opt, critics_opt, temperature_opt)
+        norm = jnp.maximum(norms.max(), optax.tree.norm(gradient))
+        return {"actor": actor, "critics": critics}, state, losses.mean(), norm
+
+    def actor_loss(
+        self,
+        actor: Params,
+        critics: Params,
+        temperature: Float[Array, ""] | float,
+        obs: Float[Array, "n obs"],
+        key: PRNGKeyArray,
+    ) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        """The mean of temperature * log p(a) - Q(s, a) of the actor's draws, and that of log p(a)."""
+        drawn = self.draw(actor, obs, key)
+        loss = temperature * drawn.log_density - self._climbed(critics, obs, drawn.unit)
+        return loss.mean(), drawn.log_density.mean()
+
+    def targets(
+        self,
+        discount: Float[Array, ""] | float,
+        actor: Params,
+        target_critics: Params,
+        temperature: Float[Array, ""] | float,
+        batch: Transition,
+        key: PRNGKeyArray,
+        other: Offer | None = None,
+    ) -> Float[Array, " batch"]:
+        """What the critics' values of a batch are fitted to: r + discount * (Q'(s', a') - temperature * log p(a')).
+
+        Q' is the smallest value of the target critics drawn for this batch, a' the actor's draw. With an `other` it is
+        r + discount * Q'(s', other) where that is larger. An offered action has no entropy; would Q' alone decide which
+        of the two counts, a target could be smaller for an offer, and good places would look bad.
+        """
+        if not self.bootstraps:
+            return batch.reward
+        k_act, k_critics = jax.random.split(key)
+        drawn, judges = self.draw(actor, batch.next_obs, k_act), self._judges(target_critics, k_critics)
+        own = self.values(judges, batch.next_obs, drawn.unit).min(0)
+        value = own - temperature * drawn.log_density if self.options.entropy_in_targets else own
+        if other is not None:
+            action = self.in_box(drawn.unit)
+            offered = other(batch.next_obs, action)
+            its = self.values(judges, batch.next_obs, self.in_unit(offered)).min(0)
+            # An actor's own action as an offer is none: it has entropy.
+            value = jnp.where((offered != action).any(-1), jnp.maximum(its, value), value)
+        return jax.lax.stop_gradient(batch.reward + discount * batch.discount * value)
+
+    def _judges(self, target_critics: Params, key: PRNGKeyArray) -> Params:
+        """The target critics of one batch: a random subset where there are more than the options ask for."""
+        own = self.options
+        if own.target_critics == own.critics:
+            return target_critics
+        chosen = jax.random.permutation(key, own.critics)[: own.target_critics]
+        return jax.tree.map(lambda leaf: leaf[chosen], target_critics)
+
+    def _climbed(
+        self, critics: Params, obs: Float[Array, "n obs"], unit: Float[Array, "n action"]
+    ) -> Float[Array, " n"]:
+        """The value that the actor climbs."""
+        values = self.values(critics, obs, unit)
+        return values.mean(0) if self.options.critics > self.options.target_critics else values.min(0)
+
+    def _gaussian(self, actor: Params, obs: Float[Array, "n obs"]) -> tuple[Array, Array]:
+        mean, log_std = self._actor.apply(actor, obs)
+        return jnp.asarray(mean), jnp.asarray(log_std)
+
+    @property
+    def _actor(self) -> Actor:
+        return Actor(self.options.actor_layers, self.spaces.actions.size)
+
+    @property
+    def _critic(self) -> nn.Module:
+        return q_network(self.options.critic_layers, layer_norm=self.options.layer_norm)
+
+    @property
+    def _box(self) -> Box:
+        assert isinstance(self.spaces.actions, Box)
+        return self.spaces.actions
+
+
+def squashed_log_density(
+    noise: Float[Array, "n action"], log_std: Float[Array, "n action"], before: Float[Array, "n action"]
+) -> Float[Array, " n"]:
+    """log p(tanh(u)) of u = mean + std * noise, independent entries (Haarnoja et al., appendix C).
+
+    log(1 - tanh(u)^2) is written as 2 (log 2 - u - softplus(-2 u)), which is finite for any u.
+
+    Args:
+        noise: standard normal.
+        log_std: logarithm of std.
+        before: u.
+    """
+    normal = -0.5 * (noise**2 + math.log(2 * math.pi)) - log_std
+    squashed = 2 * (math.log(2) - before - jax.nn.softplus(-2 * before))
+    return jnp.sum(normal - squashed, -1)
+
+
+def stepped(
+    rate: Float[Array, ""] | float, max_norm: Float[Array, ""] | float, gradient: Any, opt_state: Any, params: Any
+) -> tuple[Any, Any]:
+    """Parameters and Adam's state after a step with a gradient clipped to a norm."""
+    change, opt_state = optimizer("adam", rate, max_norm).update(gradient, opt_state, params)
+    return optax.apply_updates(params, change), opt_state
+
+
+def loss_of(values: Float[Array, "critics batch"], targets: Float[Array, " batch"]) -> Float[Array, ""]:
+    """Mean squared error of all critics."""
+    return jnp.mean(jnp.square(values - targets[None]))

@@ -1,0 +1,277 @@
+"""Soft actor-critic: its density, its targets, its critics and its temperature, against numbers from elsewhere."""
+
+import dataclasses
+import math
+from functools import cache, partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import probes
+import pytest
+from walk_task import BOX, SMALL, Walk
+
+from cuelearner_jax.agents import sac
+from cuelearner_jax.agents.protocol import AgentFunctions, has_actor
+from cuelearner_jax.agents.replay import Memory, Transition, buffer_for, count_guided, stored_step
+from cuelearner_jax.config import static
+from cuelearner_jax.environment import Spaces, spaces_of
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.spaces import DIRECTIONS, Choices
+
+ENV, KEY = Walk(), jax.random.key(0)
+SPACES = spaces_of(ENV)
+THREE = dataclasses.replace(SMALL, critics=3, target_critics=2)
+
+
+def agent_of(options=SMALL, bootstraps=True):
+    return options.make("raw", SPACES, bootstraps)
+
+
+# The squashed Gaussian.
+
+
+@pytest.mark.parametrize(("mean", "std"), [(0.0, 1.0), (0.7, 0.3), (-1.5, 0.8)])
+def test_the_density_integrates_to_one_and_draws_follow_it(mean, std):
+    unit = np.linspace(-1, 1, 200_002)[1:-1]
+    before = np.arctanh(unit)
+    noise, log_std = (before - mean) / std, np.full(len(unit), math.log(std))
+    columns = (jnp.asarray(values, jnp.float32)[:, None] for values in (noise, log_std, before))
+    density = np.exp(np.asarray(sac.squashed_log_density(*columns)).astype(float))
+    assert np.trapezoid(density, unit) == pytest.approx(1, abs=2e-3)
+    agent = agent_of()
+    actor = jax.tree.map(jnp.zeros_like, agent.init(KEY)[0]["actor"])
+    actor["params"]["Dense_1"]["bias"] = jnp.array([mean, mean, math.log(std), math.log(std)])
+    drawn = agent.draw(actor, jnp.zeros((20_000, 2)), KEY)
+    for moment in (1, 2):
+        expected = np.trapezoid(unit**moment * density, unit)
+        np.testing.assert_allclose(np.mean(np.asarray(drawn.unit) ** moment, 0), expected, atol=0.02)
+    entropy = -np.trapezoid(density * np.log(density), unit)  # two independent entries have twice that
+    assert float(-drawn.log_density.mean()) == pytest.approx(2 * entropy, abs=0.03)
+
+
+def test_the_density_is_finite_where_tanh_is_one():
+    far = jnp.array([[60.0, -60.0]])
+    found = sac.squashed_log_density(jnp.zeros((1, 2)), jnp.zeros((1, 2)), far)
+    # log(1 - tanh(u)^2) is log 4 - 2 |u| far out.
+    assert float(found[0]) == pytest.approx(2 * (120 - math.log(4) - 0.5 * math.log(2 * math.pi)), rel=1e-5)
+
+
+def test_actions_lie_in_the_box_and_their_unit_coordinates_between_its_bounds():
+    agent = agent_of()
+    corners = jnp.array([BOX.low, BOX.high, (1.0, 0.25)])
+    np.testing.assert_allclose(agent.in_unit(corners), [[-1, -1], [1, 1], [0, 0]], atol=1e-6)
+    np.testing.assert_allclose(agent.in_box(agent.in_unit(corners)), corners, atol=1e-6)
+    params, _ = agent.init(KEY)
+    obs = jax.random.normal(KEY, (200, 2)) * 5
+    best, tried = agent.act(None, params, obs, KEY), agent.explore(None, SMALL, params, obs, KEY)
+    for actions in (best, tried):
+        assert (np.asarray(actions) >= np.array(BOX.low)).all()
+        assert (np.asarray(actions) <= np.array(BOX.high)).all()
+    np.testing.assert_array_equal(best, agent.act(None, params, obs, jax.random.key(1)))
+    assert np.abs(np.asarray(best - tried)).max() > 0.1
+
+
+# Critics and targets.
+
+
+def by_hand(critics, number, obs, unit):
+    """A critic's value by NumPy."""
+    dense = critics["params"]
+    hidden = np.concatenate([obs, unit], -1) @ np.asarray(dense["Dense_0"]["kernel"][number])
+    hidden = np.maximum(hidden + np.asarray(dense["Dense_0"]["bias"][number]), 0)
+    return (hidden @ np.asarray(dense["Dense_1"]["kernel"][number]) + np.asarray(dense["Dense_1"]["bias"][number]))[
+        :, 0
+    ]
+
+
+def batch_of(size=6):
+    keys = jax.random.split(KEY, 4)
+    discount = jnp.array([1.0, 0.0] * (size // 2))
+    reward = jax.random.normal(keys[2], (size,))
+    obs, next_obs = (jax.random.normal(key, (size, 2)) for key in keys[:2])
+    return Transition(obs, BOX.sample(keys[3], (size,)), reward, discount, next_obs)
+
+
+@pytest.mark.parametrize("entropy", [True, False])
+def test_targets_are_those_counted_by_hand(entropy):
+    agent = agent_of(dataclasses.replace(SMALL, entropy_in_targets=entropy))
+    params, rest = agent.init(KEY)
+    batch, temperature = batch_of(), 0.3
+    found = agent.targets(0.9, params["actor"], rest.target_critics, temperature, batch, KEY)
+    drawn = agent.draw(params["actor"], batch.next_obs, jax.random.split(KEY)[0])
+    smallest = np.minimum(*(by_hand(rest.target_critics, n, batch.next_obs, drawn.unit) for n in range(2)))
+    value = smallest - (temperature * np.asarray(drawn.log_density) if entropy else 0)
+    np.testing.assert_allclose(found, batch.reward + 0.9 * batch.discount * value, rtol=1e-5, atol=1e-6)
+    # Nothing follows a termination.
+    np.testing.assert_array_equal(found[1::2], batch.reward[1::2])
+
+
+def test_targets_take_an_offer_where_it_is_worth_more_than_the_actors_action_with_its_entropy():
+    agent = agent_of()
+    params, rest = agent.init(KEY)
+    batch, temperature, middle = batch_of(200), 0.3, jnp.array([1.0, 0.25])
+    arguments = (0.9, params["actor"], rest.target_critics, temperature, batch, KEY)
+    plain = agent.targets(*arguments)
+    found = agent.targets(*arguments, lambda obs, own: jnp.broadcast_to(middle, own.shape))
+    drawn = agent.draw(params["actor"], batch.next_obs, jax.random.split(KEY)[0])
+    own, its = (
+        np.minimum(*(by_hand(rest.target_critics, n, batch.next_obs, unit) for n in range(2)))
+        for unit in (drawn.unit, np.zeros((200, 2)))
+    )
+    soft = own - temperature * np.asarray(drawn.log_density)
+    assert 20 < (its > soft).sum() < 180
+    assert ((its > own) & (its < soft)).any()  # where Q' alone would have made the target smaller
+    expected = batch.reward + 0.9 * batch.discount * np.maximum(its, soft)
+    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
+    # Its own actions offered are no other ones, to the last bit.
+    np.testing.assert_array_equal(agent.targets(*arguments, lambda obs, own: own), plain)
+
+
+def test_each_target_draws_a_subset_of_the_critics():
+    agent = agent_of(dataclasses.replace(THREE, target_critics=1, entropy_in_targets=False))
+    params, rest = agent.init(KEY)
+    batch, seen = batch_of(), set()
+    targets = jax.jit(lambda key: agent.targets(1.0, params["actor"], rest.target_critics, 0.0, batch, key))
+    for number in range(10):
+        key = jax.random.key(number)
+        found = targets(key)
+        unit = agent.draw(params["actor"], batch.next_obs, jax.random.split(key)[0]).unit
+        each = [batch.reward + batch.discount * by_hand(rest.target_critics, n, batch.next_obs, unit) for n in range(3)]
+        (own,) = [n for n in range(3) if np.allclose(found, each[n], rtol=1e-5, atol=1e-6)]
+        seen.add(own)
+    assert seen == {0, 1, 2}
+
+
+def test_the_value_is_the_smallest_of_all_critics_which_begin_apart():
+    agent = agent_of(THREE)
+    params, _ = agent.init(KEY)
+    obs, actions = jnp.array([0.3, 0.5]), BOX.sample(KEY, (50,))
+    each = [by_hand(params["critics"], n, np.tile(obs, (50, 1)), agent.in_unit(actions)) for n in range(3)]
+    found = agent.value(None, params, obs, actions)
+    np.testing.assert_allclose(found, np.min(each, 0), rtol=1e-5, atol=1e-6)
+    assert np.std(each, 0).min() > 1e-4
+    one = agent.value(None, params, obs[None].repeat(50, 0), actions)
+    np.testing.assert_allclose(one, found, rtol=1e-5, atol=1e-6)
+
+
+def test_normalised_layers_bound_a_critics_value_of_any_action():
+    agent = agent_of(dataclasses.replace(SMALL, layer_norm=True))
+    critics = agent.init(KEY)[0]["critics"]
+    near, far = (
+        np.abs(np.asarray(agent.values(critics, jnp.ones(2), scale * jnp.ones((1, 2))))) for scale in (10, 1e4)
+    )
+    np.testing.assert_allclose(far, near, rtol=0.2)
+    plain = agent_of().init(KEY)[0]["critics"]
+    assert np.abs(agent_of().values(plain, jnp.ones(2), 1e4 * jnp.ones((1, 2)))).max() > 1e3
+
+
+# Learning.
+
+
+GUIDED = np.arange(16) % 5 == 0  # steps 0, 5, 10, 15
+
+
+def memory():
+    """The first steps of sixteen walks, whose actions are their numbers."""
+    buffer, keys = buffer_for(ENV, True), jax.random.split(KEY, 16)
+    state, obs = jax.vmap(ENV.reset)(keys)
+    _, step = jax.vmap(ENV.step)(keys, state, BOX.sample(KEY, (16,)))
+    numbers = jnp.arange(16.0)[:, None].repeat(2, 1)
+    stored = jax.vmap(partial(stored_step, bootstraps=True))(obs, numbers, step)
+    rows = buffer.add(buffer.empty(96), jnp.array(0), stored)
+    counts = count_guided(jnp.zeros((96, 1), jnp.int32), jnp.array(0), jnp.asarray(GUIDED))
+    return Memory(ENV, buffer, rows, jnp.array(16), 16, True, counts)
+
+
+MEMORY = memory()
+
+
+@pytest.mark.parametrize(("share", "count"), [(0.0, 0), (0.25, 2), (0.5, 4), (1.0, 8)])
+def test_a_minibatch_has_its_share_of_guided_steps(share, count):
+    for number in range(4):
+        (batch,) = MEMORY.batches(jax.random.key(number), 8, guided_share=jnp.float32(share))
+        drawn = np.asarray(batch.action)[:, 0].astype(int)
+        assert [n % 5 == 0 for n in drawn] == [True] * count + [False] * (8 - count)
+
+
+@cache
+def update_of(still):
+    """The compiled update of options without their floats."""
+    return jax.jit(
+        lambda options, scalars, params, rest: agent_of(still).update(
+            ENV, options, scalars, jnp.array(1), params, rest, MEMORY, KEY
+        )
+    )
+
+
+def updated(options):
+    """Parameters and the rest before an update, and what it returns."""
+    before = agent_of(options).init(KEY)
+    scalars = dataclasses.replace(probes.SCALARS, discount=0.9)
+    return before, update_of(static(options))(options, scalars, *before)
+
+
+def steps_of(opt_state):
+    """How often Adam has stepped."""
+    return int(next(leaf for leaf in jax.tree.leaves(opt_state) if leaf.dtype == jnp.int32))
+
+
+def test_critics_step_for_each_minibatch_actor_and_temperature_once():
+    (params, _), (after, state, loss, norm) = updated(dataclasses.replace(THREE, updates_per_step=3))
+    assert [steps_of(opt) for opt in (state.critics_opt, state.actor_opt, state.temperature_opt)] == [3, 1, 1]
+    for old, new in zip(jax.tree.leaves(params), jax.tree.leaves(after), strict=True):
+        assert (old != new).any()
+    assert float(loss) > 0
+    assert np.isfinite(float(norm))
+    # Target critics lag behind.
+    lag = jax.tree.map(lambda new, target: float(jnp.abs(new - target).max()), after["critics"], state.target_critics)
+    assert min(jax.tree.leaves(lag)) > 0
+
+
+def test_target_critics_follow_at_their_rate():
+    _, (after, state, *_) = updated(dataclasses.replace(SMALL, polyak=1.0))
+    jax.tree.map(np.testing.assert_array_equal, state.target_critics, after["critics"])
+    (_, rest), (_, state, *_) = updated(dataclasses.replace(SMALL, polyak=0.0))
+    jax.tree.map(np.testing.assert_array_equal, state.target_critics, rest.target_critics)
+
+
+@pytest.mark.parametrize(("entropy", "way"), [(5.0, 1), (-50.0, -1)])
+def test_the_temperature_moves_the_entropy_to_its_target(entropy, way):
+    _, (_, state, *_) = updated(dataclasses.replace(SMALL, target_entropy=entropy))
+    assert np.sign(float(state.log_temperature)) == way
+    _, (_, state, *_) = updated(dataclasses.replace(SMALL, target_entropy=entropy, temperature_rate=0.0))
+    assert float(state.log_temperature) == 0
+
+
+def test_at_discount_zero_targets_are_rewards():
+    agent = agent_of(bootstraps=False)
+    params, rest = agent.init(KEY)
+    assert rest.target_critics is None
+    batch = batch_of()
+    found = agent.targets(0.0, params["actor"], None, 1.0, batch.replace(next_obs=jnp.zeros((6, 0))), KEY)
+    np.testing.assert_array_equal(found, batch.reward)
+
+
+# What is refused.
+
+
+@pytest.mark.parametrize("space", [DIRECTIONS, Choices(3)], ids=["directions", "choices"])
+def test_other_spaces_are_refused_with_the_agent_that_serves_them(space):
+    with pytest.raises(UserError, match=f"'sac' acts in boxes, not in {space.name}: give --agent ddqn") as told:
+        SMALL.make("raw", Spaces(2, space))
+    assert "\n" not in str(told.value)
+
+
+def test_options_that_do_not_fit_are_refused():
+    with pytest.raises(UserError, match=r"sizes\.frame is 'action', but the actor"):
+        SMALL.make("action", SPACES)
+    with pytest.raises(UserError, match=r"agent\.target_critics is 3: give at most agent\.critics \(2\)"):
+        dataclasses.replace(SMALL, target_critics=3).check(probes.SIZES, True)
+
+
+def test_it_is_what_the_protocol_asks():
+    assert isinstance(agent_of(), AgentFunctions)
+    assert has_actor(SMALL)
+    assert not has_actor(probes.AGENT)
+    assert set(agent_of().described) == {"rule", "frame"}

@@ -1,0 +1,166 @@
+"""Runs of soft actor-critics whose critics compare with a guide: lanes, resuming, the finished policy, its export."""
+
+import dataclasses
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import probes
+import pytest
+import walk_task
+from small_runs import stopping_at
+from walk_task import SMALL, TASK, Walk, WalkConfig
+
+from cuelearner_jax import loop
+from cuelearner_jax.adaptation import stored
+from cuelearner_jax.arbiters import by_value
+from cuelearner_jax.evaluate import episodes, watched
+from cuelearner_jax.export import contract, decisions
+from cuelearner_jax.guides import registry
+from cuelearner_jax.policies import Arbitrated
+from cuelearner_jax.runs.grid import Grid
+from cuelearner_jax.runs.order import Order
+from cuelearner_jax.runs.trained import PolicySource, one_policy
+from cuelearner_jax.storage import results
+from cuelearner_jax.studies import train
+from cuelearner_jax.terminal import Interrupted
+
+ENV = Walk()
+SCHEDULE = {"total_steps": 48, "guidance_until": 48, "eval_every": 16, "checkpoint_every": 16, "learn_after": 8}
+CONFIG = walk_task.config(
+    dataclasses.replace(SMALL, replay_capacity=32),  # written over before the end
+    by_value.Config(judge_steps=80),
+    sizes={"lanes_per_block": 1},
+    schedule=SCHEDULE,
+)
+GRID = Grid(("heuristic",), (0, 1), (0,))
+
+
+def run(out, **options):
+    train.run(Order(TASK, CONFIG, GRID, out, **options))
+
+
+def rows(out):
+    names = ("seed", "step", "reward", "arm", "judged_own", "judged_better", "train_loss", "train_guided_share")
+    found = [{name: row[name] for name in names} for row in results.read(out).to_pylist()]
+    return sorted(found, key=lambda row: (row["seed"], row["step"]))
+
+
+def policy_of(folder, seed=1):
+    source = PolicySource.of_run(folder, lambda name: TASK)
+    return one_policy(source, WalkConfig(), "agent", None, None, seed)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    out = tmp_path_factory.mktemp("whole") / "run"
+    run(out)
+    return out
+
+
+def test_a_stopped_run_goes_on_to_the_same_rows_and_parameters(whole, tmp_path):
+    out = tmp_path / "run"
+    with stopping_at(2), pytest.raises(Interrupted):
+        run(out)
+    assert max(row["step"] for row in rows(out)) < 48
+    run(out, resume=True)
+    assert rows(out) == rows(whole)
+    mine, again = (jax.tree.leaves(policy_of(folder)) for folder in (whole, out))
+    assert all(np.array_equal(a, b) for a, b in zip(mine, again, strict=True))
+    last = rows(whole)[-1]
+    assert last["train_guided_share"] > 0
+    assert np.isfinite([last["train_loss"], last["judged_own"], last["judged_better"]]).all()
+
+
+def test_what_is_loaded_acts_as_what_was_evaluated(whole):
+    policy = policy_of(whole)
+    assert isinstance(policy, Arbitrated)
+    last = next(row for row in rows(whole) if (row["seed"], row["step"]) == (1, 48))
+    assert int(policy.arm) == last["arm"] == int(last["judged_better"] > last["judged_own"])
+    found = watched(ENV, policy, episodes(), CONFIG.schedule.eval_envs, CONFIG.schedule.eval_steps).means
+    assert float(found["reward"]) == last["reward"]
+
+
+@pytest.mark.parametrize("format", ["numpy", "onnx", pytest.param("stablehlo", marks=pytest.mark.long)])
+def test_the_agent_and_the_better_of_both_are_exported_as_they_act(whole, tmp_path, format):
+    policy = policy_of(whole)
+    better = policy.replace(arm=jnp.int32(by_value.BETTER))
+    for name, one in (("agent", policy.base), ("better", better)):
+        drawn = partial(decisions.observations, ENV, one, 32)
+        written = contract.write(one, ENV, drawn, format, tmp_path / name, {})
+        assert written["difference"] <= decisions.TOLERANCE
+        assert written["action"]["space"]["name"] == "box"
+    assert (written["policy"]["policy"], written["policy"]["arm"]) == ("arbitrated", "better")
+    assert written["policy"]["base"]["agent"]["name"] == "sac"
+
+
+def test_a_policy_folder_can_keep_the_agent(whole):
+    agent = policy_of(whole).base
+    again = stored.from_json(stored.to_json(agent), stored.arrays_of(agent), ENV)
+    obs = jnp.linspace(-1.0, 1.0, 8).reshape(4, 2)
+    np.testing.assert_array_equal(*(policy.act(jax.random.key(0), None, obs) for policy in (agent, again)))
+
+
+# Lanes.
+
+
+@pytest.fixture(scope="module")
+def lanes():
+    """Two lanes after eight iterations: vmapped, as an accelerator has them, and each alone."""
+    lane = loop.make_lane(CONFIG, registry.make("heuristic", CONFIG.sizes, ENV), ENV, 0)
+
+    def iterated(state):
+        def one(carry, _):
+            clock, state = carry
+            state, _ = lane.iterate(ENV, CONFIG.settings, clock, state)
+            return (lane.advance(clock, CONFIG.schedule), state), None
+
+        return jax.lax.scan(one, (loop.start_clock(), state), length=8)[0][1]
+
+    init, alone = jax.jit(lambda key: lane.init(ENV, key, 0)), jax.jit(iterated)
+    start = [init(jax.random.fold_in(jax.random.key(0), seed)) for seed in range(2)]
+    both = jax.tree.map(lambda *leaves: jnp.stack(leaves), *start)
+    return jax.jit(jax.vmap(iterated))(both), [alone(state) for state in start]
+
+
+def test_side_by_side_lanes_are_those_of_single_seeds(lanes):
+    """On a CPU lanes are taken one by one, and are equal by the bit; vmapped, products are summed in another order."""
+    beside, alone = lanes
+    for index, single in enumerate(alone):
+        other = jax.tree.map(lambda leaf: np.asarray(probes.words(leaf)), single)
+        jax.tree.map(partial(np.testing.assert_allclose, rtol=2e-4, atol=2e-5), probes.lane(beside, index), other)
+    assert int(np.asarray(beside.agent.guided).max()) > 0
+
+
+def test_replay_tells_ends_by_time_from_terminations_and_guided_steps(lanes):
+    _, (state, _) = lanes
+    columns = np.asarray(state.agent.replay)  # place, time, two entries, reward, discount, ended, next place and time
+    discount, ended, place, time = columns[:, 5], columns[:, 6], columns[:, 7], columns[:, 8]
+    off = np.abs(place) > walk_task.EDGE
+    assert (ended == 1).any()
+    np.testing.assert_array_equal(discount, np.where(off, 0, 1))
+    np.testing.assert_array_equal(ended == 1, off | (time >= 1))  # the observation before the reset
+    np.testing.assert_allclose(place, columns[:, 0] + 0.25 * (columns[:, 2] - 1), atol=1e-6)
+    # Of 32 rows those whose action is the heuristic's are counted, after the random steps.
+    told = np.asarray(jax.vmap(ENV.heuristic)(jnp.asarray(columns[:, :2])))
+    by_guide = np.isclose(told, columns[:, 2:4], atol=1e-6).all(-1)
+    np.testing.assert_array_equal(np.asarray(state.agent.guided)[:, 0], np.cumsum(by_guide))
+    assert 0 < by_guide.sum() < 24
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("wrong", [0.0, 2.0])
+def test_a_finished_policy_is_not_worse_for_a_guide_whatever_the_guide_is_worth(tmp_path, wrong):
+    agent = dataclasses.replace(SMALL, actor_layers=(32,), critic_layers=(32, 32), batch_size=64, replay_capacity=2000)
+    total = {"total_steps": 2000, "guidance_until": 2000, "eval_every": 1000, "checkpoint_every": 1000}
+    evaluated = {"random_steps": 200, "learn_after": 100, "eval_steps": 800, "eval_envs": 100}
+    config = walk_task.config(agent, by_value.Config(judge_steps=400), schedule={**total, **evaluated})
+    config = dataclasses.replace(config, task=WalkConfig(wrong))
+    train.run(Order(TASK, config, Grid(("none", "heuristic"), tuple(range(6)), (0,)), tmp_path / "run"))
+    last = [row for row in results.read(tmp_path / "run").to_pylist() if row["step"] == 2000]
+    earned = {
+        kind: np.array([row["reward"] for row in last if row["guidance"] == kind]) for kind in ("none", "heuristic")
+    }
+    spread = np.hypot(*(values.std(ddof=1) / len(values) ** 0.5 for values in earned.values()))
+    assert earned["heuristic"].mean() > earned["none"].mean() - 2 * spread - 0.005
