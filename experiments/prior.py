@@ -68,7 +68,8 @@ PRIOR_OF_WAYS: Options = {
     "arbiter.judge-steps": 20_000,
 }
 CAGE: Options = {"arbiter.own-share": 0.0, "arbiter.near-share": 0.0}
-RULED: Options = {"intent.from-rule": True}
+# Chosen on seeds 0 to 3: of 100 labels one model in long fits forgets the rule (0.634 a shot; so: 0.651).
+RULED: Options = {"intent.from-rule": True, "sizes.ensemble": 5, "sizes.fit-steps": 200}
 SHUFFLED: Options = {"scalars.answer": "shuffled"}
 
 

@@ -183,10 +183,11 @@ def test_a_guide_that_becomes_worse_half_way_is_followed_within_a_window():
     assert back[:, 650:].mean() > 0.4  # a guide that becomes better is tried, though seldom seen before
 
 
-def test_every_preset_is_paced_but_those_that_are_the_papers():
+def test_every_preset_is_paced_but_the_papers_and_the_one_that_labels_shape():
     offered = map(registry.find, registry.names())
     found = {(task.name, name): preset.config.arbiter.NAME for task in offered for name, preset in task.presets.items()}
-    assert found == {named: "episodes" if named[1] == "paper" else "paced" for named in found}
+    others = {"paper": "episodes", "shaped": "prior"}
+    assert found == {named: others.get(named[1], "paced") for named in found}
 
 
 # In the loop, on the bandit: the heuristic turns by -1 rad, and is right in a world of that offset alone.
