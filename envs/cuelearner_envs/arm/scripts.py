@@ -1,0 +1,74 @@
+"""Policies written by hand: they look at one observation and remember nothing.
+
+Observations are Fetch's, flattened: these scripts act in Fetch too, and Fetch's (`cuelearner_envs.fetch.scripts`) here.
+"""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from cuelearner_envs.arm import model as arm
+from cuelearner_envs.fetch import scripts as fetch
+from cuelearner_envs.fetch.scripts import GOAL, GRIPPER, OBJECT, Script
+
+FINGERS = slice(15, 17)
+CLEARANCE = 0.08  # from the post's axis: as far the cube's middle goes by [m]
+STRETCH = 0.15  # how far along a tangent the script aims [m]
+GAIN, CARRY_GAIN = 20.0, 12.0  # of a way, per metre: of the gripper alone, and with the cube
+OVER = 0.09  # over the cube's middle: where the gripper travels [m]
+LOW = -0.03  # over the cube's middle less the gripper's: above, fingers would sweep the cube aside [m]
+ALIGNED = 0.012  # across: as near to the cube, the gripper goes down [m]
+AROUND = 0.02  # from the cube's middle: as near, fingers close [m]
+HELD = 0.028  # of each finger's opening: at most as wide, they hold the cube [m]
+GRASPED = 0.035  # from the cube's middle: as near it stays while it is held [m]
+
+
+def past(obs: Float[Array, "n obs"], side: float | Float[Array, ""] = 0.0) -> Float[Array, "n 4"]:
+    """Push the cube past the post to the goal, on the shorter side or on a given one.
+
+    Args:
+        obs: observations.
+        side: +1 left, -1 right, as the robot sees the post; 0: the shorter.
+    """
+    cube, goal = obs[:, OBJECT], obs[:, GOAL]
+    aim = _aim(cube[:, :2], goal[:, :2], side)
+    return fetch.push(obs.at[:, GOAL].set(jnp.concatenate([aim, goal[:, 2:]], -1)))
+
+
+def _aim(cube: Float[Array, "n 2"], goal: Float[Array, "n 2"], side: float | Float[Array, ""]) -> Float[Array, "n 2"]:
+    """Where to push the cube next: the goal, or along the tangent to a circle round the post."""
+    way, to_post = goal - cube, jnp.asarray(arm.POST_PLACE)[None] - cube
+    length = jnp.maximum(jnp.linalg.norm(way, axis=-1, keepdims=True), 1e-6)
+    ahead = way / length
+    along = jnp.sum(to_post * ahead, -1, keepdims=True)  # how far ahead the post is, and how far to the left
+    beside = ahead[:, :1] * to_post[:, 1:] - ahead[:, 1:] * to_post[:, :1]
+    which = jnp.where(side == 0, jnp.where(beside < 0, 1.0, -1.0), side)
+    is_free = (along < 0) | (-which * beside >= CLEARANCE)
+    far = jnp.maximum(jnp.linalg.norm(to_post, axis=-1, keepdims=True), 1e-6)
+    sine = jnp.minimum(CLEARANCE / far, 1.0)
+    cosine, sine = jnp.sqrt(1.0 - sine**2), which * sine
+    x, y = to_post[:, :1] / far, to_post[:, 1:] / far
+    tangent = jnp.concatenate([cosine * x - sine * y, sine * x + cosine * y], -1)
+    return jnp.where(is_free, goal, cube + STRETCH * tangent)
+
+
+def pick(obs: Float[Array, "n obs"]) -> Float[Array, "n 4"]:
+    """Travel over the cube with open fingers, go down, close, and carry the cube to the goal."""
+    cube, goal, gripper = obs[:, OBJECT], obs[:, GOAL], obs[:, GRIPPER]
+    off = cube - gripper
+    across, down = off[:, :2], off[:, 2:]
+    away = jnp.linalg.norm(across, axis=-1, keepdims=True)
+    is_over = away < ALIGNED
+    level = jnp.where(is_over, down, down + OVER)
+    level = jnp.where((away > 4 * ALIGNED) & (down < -OVER), 0.0, level)  # travels at the height that it has
+    coming = GAIN * jnp.concatenate([jnp.where((down > LOW) & ~is_over, 0.0, across), level], -1)
+    is_between = is_over & (jnp.abs(down) < AROUND)
+    opening = jnp.max(obs[:, FINGERS], -1, keepdims=True)
+    is_held = (jnp.linalg.norm(off, axis=-1, keepdims=True) < GRASPED) & (opening < HELD)
+    move = jnp.where(is_held, CARRY_GAIN * (goal - cube), jnp.where(is_between, GAIN * off, coming))
+    fingers = jnp.where(is_held | is_between, -1.0, 1.0)
+    return jnp.clip(jnp.concatenate([move, fingers], -1), -1.0, 1.0)
+
+
+SCRIPTS: dict[str, Script] = {"reach": fetch.reach, "push": past, "pick": pick}
