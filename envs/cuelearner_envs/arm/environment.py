@@ -6,7 +6,7 @@ gripper, or the cube, is within 5 cm of the goal.
 
 from __future__ import annotations
 
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +16,9 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 from cuelearner_envs.arm import model as arm
 from cuelearner_envs.arm import physics
 from cuelearner_envs.arm.physics import Body, Ground
+from cuelearner_envs.arm.places import APART, BASE, HIGHEST, HOME, LANE, LOW_HOME, SPREAD
 from cuelearner_envs.arm.scripts import SCRIPTS
+from cuelearner_envs.fetch.cues import CUE_NAMES, CUES
 from cuelearner_jax.environment import Quantity, WholeObservations
 from cuelearner_jax.spaces import Box, cues_from
 from cuelearner_jax.types import Step
@@ -25,18 +27,8 @@ Scalar = float | Float[Array, ""]
 Skill = Literal["reach", "push", "pick"]
 Reward = Literal["shaped", "dense", "sparse"]
 REWARDS = get_args(Reward)
-SPREAD = 0.15  # of cubes and goals round where the gripper begins, along each axis [m]
-APART = 0.1  # of the cube from there, at least [m]
-HIGHEST = 0.45  # of a goal in the air over the table, `pick` alone [m]
-HOME = (1.3419, 0.7491, 0.5347)  # where the gripper begins [m]
-LOW_HOME = (1.3627, 0.7491, 0.4169)  # where it begins to push, where no post stands [m]
-LANE = ((0.09, 0.15), 0.06)  # of cube and goal before and behind the post along x, and across at most [m]
 PLACEMENTS = 16  # places tried for a cube that must not lie near the gripper
-BASE = (0.6918, 0.7441)  # the robot's base, above which its camera is mounted: x, y [m]
 WAY = 0.5  # of the way from gripper to cube in a shaped reward, to that from cube to goal
-# What the observation shows beside where the robot's own parts are; see `cuelearner_jax.tasks.fetch_layout`.
-CUES = ("forward,backward", "left,right", "up,down", "open,close")
-CUE_NAMES = ("x", "y", "z", "fingers")
 ACTIONS = Box((-1.0,) * 4, (1.0,) * 4, cues_from(CUES, CUE_NAMES))
 
 
@@ -225,5 +217,3 @@ def _in_lane(key: PRNGKeyArray) -> tuple[Float[Array, "2"], Float[Array, "2"]]:
     places = jnp.asarray(arm.POST_PLACE) + jnp.stack([jnp.array([-1.0, 1.0]) * along, across], -1)
     return places[0], places[1]
 
-
-AnyState = Any

@@ -22,7 +22,7 @@ with contextlib.redirect_stdout(None):  # it tells of an optional engine that is
 Scalar = float | Float[Array, ""]
 REACH = 0.05  # of an action of 1: how far its target lies from where the gripper is [m]
 WORKSPACE = ((1.05, 0.4, arm.LOWEST), (1.6, 1.1, 0.95))  # where targets may lie, lowest and highest x, y, z [m]
-KEPT_OUT = 0.045  # from the post's axis: nearer no target lies that is lower than the post [m]
+KEPT_OUT = 0.042  # from the post's axis: nearer no target lies that is lower than the post [m]
 OVER = arm.TABLE + arm.POST_HEIGHT + arm.TIP + 0.005  # height from which on the gripper clears the post [m]
 GRIPPER, FINGERS, CUBE = slice(0, 3), slice(3, 5), slice(5, 12)  # of qpos
 CUBE_VELOCITY, CUBE_TURNING = slice(5, 8), slice(8, 11)  # of qvel

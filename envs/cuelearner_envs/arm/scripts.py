@@ -10,11 +10,11 @@ from jaxtyping import Array, Float
 
 from cuelearner_envs.arm import model as arm
 from cuelearner_envs.fetch import scripts as fetch
-from cuelearner_envs.fetch.scripts import GOAL, GRIPPER, OBJECT, Script
+from cuelearner_envs.fetch.scripts import GOAL, GRIPPER, OBJECT, Amount, Gains, Script
 
 FINGERS = slice(15, 17)
-CLEARANCE = 0.08  # from the post's axis: as far the cube's middle goes by [m]
-STRETCH = 0.15  # how far along a tangent the script aims [m]
+CLEARANCE = 0.07  # from the post's axis: as far the cube's middle goes by [m]
+STRETCH = 0.05  # how far along a tangent the script aims [m]
 GAIN, CARRY_GAIN = 20.0, 12.0  # of a way, per metre: of the gripper alone, and with the cube
 OVER = 0.09  # over the cube's middle: where the gripper travels [m]
 LOW = -0.03  # over the cube's middle less the gripper's: above, fingers would sweep the cube aside [m]
@@ -22,21 +22,29 @@ ALIGNED = 0.012  # across: as near to the cube, the gripper goes down [m]
 AROUND = 0.02  # from the cube's middle: as near, fingers close [m]
 HELD = 0.028  # of each finger's opening: at most as wide, they hold the cube [m]
 GRASPED = 0.035  # from the cube's middle: as near it stays while it is held [m]
+PAST = Gains(along=6.0, side=20.0, back=0.055, ahead=0.02, beside=0.02, arrived=0.03, lead=0.008, fastest=0.06)
 
 
-def past(obs: Float[Array, "n obs"], side: float | Float[Array, ""] = 0.0) -> Float[Array, "n 4"]:
+def past(
+    obs: Float[Array, "n obs"], side: Amount = 0.0, friction: Amount = 1.0, post: Amount = 1.0, gains: Gains = PAST
+) -> Float[Array, "n 4"]:
     """Push the cube past the post to the goal, on the shorter side or on a given one.
 
     Args:
         obs: observations.
         side: +1 left, -1 right, as the robot sees the post; 0: the shorter.
+        friction: of the cube; the more slippery, the slower.
+        post: 1 where it stands; 0: the cube is pushed straight.
+        gains: how.
     """
     cube, goal = obs[:, OBJECT], obs[:, GOAL]
-    aim = _aim(cube[:, :2], goal[:, :2], side)
-    return fetch.push(obs.at[:, GOAL].set(jnp.concatenate([aim, goal[:, 2:]], -1)))
+    aim = jnp.where(post > 0, _aim(cube[:, :2], goal[:, :2], side), goal[:, :2])
+    slower = jnp.sqrt(jnp.minimum(friction, 1.0))
+    gains = gains._replace(along=gains.along * slower)
+    return fetch.push(obs.at[:, GOAL].set(jnp.concatenate([aim, goal[:, 2:]], -1)), gains)
 
 
-def _aim(cube: Float[Array, "n 2"], goal: Float[Array, "n 2"], side: float | Float[Array, ""]) -> Float[Array, "n 2"]:
+def _aim(cube: Float[Array, "n 2"], goal: Float[Array, "n 2"], side: Amount) -> Float[Array, "n 2"]:
     """Where to push the cube next: the goal, or along the tangent to a circle round the post."""
     way, to_post = goal - cube, jnp.asarray(arm.POST_PLACE)[None] - cube
     length = jnp.maximum(jnp.linalg.norm(way, axis=-1, keepdims=True), 1e-6)
