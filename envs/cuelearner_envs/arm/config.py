@@ -21,7 +21,7 @@ SIDES = {"none": 0.0, "left": 1.0, "right": -1.0}
 class ArmConfig:
     """A skill of the arm and the world in which it is asked for."""
 
-    skill: Skill = "reach"
+    skill: Skill = "push"
     """reach: the gripper to a goal. push: a cube to a goal on the table. pick: a cube to a goal on or over the table."""
     reward: Reward = "shaped"
     """sparse: -1 a step until success, then 0. dense: minus the distance from the goal. shaped: also half the distance

@@ -160,8 +160,8 @@ def _box(middle: np.ndarray, half: Sequence[float], turn: np.ndarray | None = No
         for way in (1.0, -1.0):
             corners = np.zeros((4, 3))
             corners[:, axis] = way * half[axis]
-            corners[:, first] = np.array([1, -way, -1, way]) * half[first]
-            corners[:, second] = np.array([way, 1, -way, -1]) * half[second]
+            corners[:, first] = np.array([1, -1, -1, 1])[:: int(way)] * half[first]
+            corners[:, second] = np.array([1, 1, -1, -1])[:: int(way)] * half[second]
             faces.append(middle + corners @ turn.T)
     return faces
 

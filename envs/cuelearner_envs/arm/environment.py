@@ -17,7 +17,7 @@ from cuelearner_envs.arm import model as arm
 from cuelearner_envs.arm import physics
 from cuelearner_envs.arm.physics import Body, Ground
 from cuelearner_envs.arm.places import APART, BASE, HIGHEST, HOME, LANE, LOW_HOME, SPREAD
-from cuelearner_envs.arm.scripts import SCRIPTS
+from cuelearner_envs.arm.scripts import act
 from cuelearner_envs.fetch.cues import CUE_NAMES, CUES
 from cuelearner_jax.environment import Quantity, WholeObservations
 from cuelearner_jax.spaces import Box, cues_from
@@ -165,8 +165,8 @@ class Arm(WholeObservations, struct.PyTreeNode):
         )
 
     def heuristic(self, obs: Float[Array, " obs"]) -> Float[Array, "4"]:
-        """Return the script's action: the teacher's, of what is seen."""
-        return SCRIPTS[self.skill](obs[None])[0]
+        """Return the script's action: the teacher's of what is seen, on a table that nobody has changed."""
+        return act(self.skill, obs[None], post=self.ground.post)[0]
 
     def _earned(self, after: Situation) -> Float[Array, ""]:
         distance = self.distance(after)

@@ -10,11 +10,11 @@ from jaxtyping import Array, Float
 
 from cuelearner_envs.arm import model as arm
 from cuelearner_envs.fetch import scripts as fetch
-from cuelearner_envs.fetch.scripts import GOAL, GRIPPER, OBJECT, Amount, Gains, Script
+from cuelearner_envs.fetch.scripts import GOAL, GRIPPER, OBJECT, Amount, Gains
 
 FINGERS = slice(15, 17)
-CLEARANCE = 0.07  # from the post's axis: as far the cube's middle goes by [m]
-STRETCH = 0.05  # how far along a tangent the script aims [m]
+CLEARANCE = 0.08  # from the post's axis: as far the cube's middle goes by [m]
+STRETCH = 0.04  # how far along a tangent the script aims [m]
 GAIN, CARRY_GAIN = 20.0, 12.0  # of a way, per metre: of the gripper alone, and with the cube
 OVER = 0.09  # over the cube's middle: where the gripper travels [m]
 LOW = -0.03  # over the cube's middle less the gripper's: above, fingers would sweep the cube aside [m]
@@ -22,7 +22,17 @@ ALIGNED = 0.012  # across: as near to the cube, the gripper goes down [m]
 AROUND = 0.02  # from the cube's middle: as near, fingers close [m]
 HELD = 0.028  # of each finger's opening: at most as wide, they hold the cube [m]
 GRASPED = 0.035  # from the cube's middle: as near it stays while it is held [m]
-PAST = Gains(along=6.0, side=20.0, back=0.055, ahead=0.02, beside=0.02, arrived=0.03, lead=0.008, fastest=0.06)
+PAST = Gains(
+    along=6.0,
+    side=24.0,
+    back=0.055,
+    ahead=0.015,
+    beside=0.018,
+    arrived=0.035,
+    lead=0.005,
+    fastest=0.06,
+    pushed=0.025,
+)
 
 
 def past(
@@ -79,4 +89,13 @@ def pick(obs: Float[Array, "n obs"]) -> Float[Array, "n 4"]:
     return jnp.clip(jnp.concatenate([move, fingers], -1), -1.0, 1.0)
 
 
-SCRIPTS: dict[str, Script] = {"reach": fetch.reach, "push": past, "pick": pick}
+def act(
+    skill: str, obs: Float[Array, "n obs"], side: Amount = 0.0, friction: Amount = 1.0, post: Amount = 1.0
+) -> Float[Array, "n 4"]:
+    """Return what the script of a skill does; `side`, `friction` and `post` as `past` has them."""
+    if skill == "push":
+        return past(obs, side, friction, post)
+    return pick(obs) if skill == "pick" else fetch.reach(obs)
+
+
+reach, straight = fetch.reach, fetch.push  # Fetch's, which act here too

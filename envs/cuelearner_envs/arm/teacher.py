@@ -7,8 +7,7 @@ from flax import struct
 from jaxtyping import Array, Float
 
 from cuelearner_envs.arm.environment import Arm, Camera, Situation
-from cuelearner_envs.arm.scripts import past, pick
-from cuelearner_envs.fetch.scripts import reach
+from cuelearner_envs.arm.scripts import act
 
 
 class ScriptTeacher(struct.PyTreeNode):
@@ -20,8 +19,6 @@ class ScriptTeacher(struct.PyTreeNode):
     def best_action(self, state: Situation, obs: Float[Array, " obs"]) -> Float[Array, "4"]:
         """Return the script's action, of what an unchanged camera would show."""
         true = self.env.observe(state, Camera())[None]
-        if self.env.skill == "reach":
-            return reach(true)[0]
-        if self.env.skill == "pick":
-            return pick(true)[0]
-        return past(true, self.side, jnp.asarray(self.env.ground.friction), jnp.asarray(self.env.ground.post))[0]
+        ground = self.env.ground
+        friction, post = jnp.asarray(ground.friction), jnp.asarray(ground.post)
+        return act(self.env.skill, true, self.side, friction, post)[0]
