@@ -102,7 +102,7 @@ SCENARIOS = {
     "hand_eye": Scenario(
         "the camera stands 2 cm to the right of where the arm believes", {"camera_offset": (0.0, 0.02, 0.0)}, **_CAMERA
     ),
-    "slippery": Scenario("the cube is slippery", {"friction": 0.2}),
+    "slippery": Scenario("the cube is slippery", {"friction": 0.12}),
     **{
         f"past_{side}": Scenario(
             f"a wish: push the cube past the post on the {side}",

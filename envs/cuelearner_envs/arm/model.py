@@ -31,7 +31,7 @@ TIP = 0.0185  # how far fingers reach below the gripper's place [m]
 STIFFNESS, FINGER_STIFFNESS = 47.0, 60.0  # natural frequency of a drive, which is damped critically [rad/s]
 GRIPPER_MASS, FINGER_MASS, FINGER_ARMATURE, CUBE_MASS = 10.0, 0.05, 1.5, 0.5  # [kg]
 GRAVITY = 9.81  # [m/s^2]
-ITERATIONS, LINE_SEARCHES = 3, 4  # of the solver, at most
+ITERATIONS, LINE_SEARCHES = 2, 3  # of the solver, at most
 
 
 def load(has_object: bool, timestep: float | None = None, iterations: int | None = None) -> mujoco.MjModel:

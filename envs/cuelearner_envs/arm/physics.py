@@ -16,9 +16,6 @@ from jaxtyping import Array, Float
 
 from cuelearner_envs.arm import model as arm
 
-with contextlib.redirect_stdout(None):  # it tells of an optional engine that is not installed
-    from mujoco import mjx
-
 Scalar = float | Float[Array, ""]
 REACH = 0.05  # of an action of 1: how far its target lies from where the gripper is [m]
 WORKSPACE = ((1.05, 0.4, arm.LOWEST), (1.6, 1.1, 0.95))  # where targets may lie, lowest and highest x, y, z [m]
@@ -57,10 +54,17 @@ class Command(NamedTuple):
         return jnp.concatenate(self) if has_object else self.gripper
 
 
+def _mjx() -> Any:
+    """MJX, which takes seconds to load and not every command needs."""
+    with contextlib.redirect_stdout(None):  # it tells of an optional engine that is not installed
+        from mujoco import mjx
+    return mjx
+
+
 @functools.cache
 def _compiled(has_object: bool) -> tuple[Any, Any, int]:
     """MJX's model and an empty `mjx.Data`, and the number of the post."""
-    model = arm.load(has_object)
+    mjx, model = _mjx(), arm.load(has_object)
     post = model.geom("post").id if has_object else 0
     return mjx.put_model(model, impl="jax"), mjx.make_data(model, impl="jax"), post
 
@@ -115,7 +119,7 @@ def control(body: Body, targets: Command, ground: Ground) -> Body:
             pair_friction=model.pair_friction.at[:, :2].set(ground.friction),
             geom_pos=model.geom_pos.at[post, 2].add(jnp.where(ground.post > 0, 0.0, -1.0)),
         )
-    ctrl = targets.all(has_object)
+    mjx, ctrl = _mjx(), targets.all(has_object)
 
     def one(carry: Body, _: None) -> tuple[Body, None]:
         begun = data.replace(qpos=carry.qpos, qvel=carry.qvel, qacc_warmstart=carry.warmstart, ctrl=ctrl)

@@ -33,24 +33,26 @@ PAST = Gains(
     fastest=0.06,
     pushed=0.025,
 )
+# For a slippery cube, which slides on when the gripper stops, and leaves a gripper that is not behind it.
+SLIPPERY, CAREFUL = 0.5, PAST._replace(along=5.5, side=20.0, beside=0.014, lead=0.0, pushed=0.015)
+CARRIED = 0.35  # the largest entry of an action that carries a slippery cube
 
 
 def past(
-    obs: Float[Array, "n obs"], side: Amount = 0.0, friction: Amount = 1.0, post: Amount = 1.0, gains: Gains = PAST
+    obs: Float[Array, "n obs"], side: Amount = 0.0, friction: Amount = 1.0, post: Amount = 1.0
 ) -> Float[Array, "n 4"]:
     """Push the cube past the post to the goal, on the shorter side or on a given one.
 
     Args:
         obs: observations.
         side: +1 left, -1 right, as the robot sees the post; 0: the shorter.
-        friction: of the cube; the more slippery, the slower.
+        friction: of the cube, as far as it is known; with a slippery one care is taken.
         post: 1 where it stands; 0: the cube is pushed straight.
-        gains: how.
     """
     cube, goal = obs[:, OBJECT], obs[:, GOAL]
     aim = jnp.where(post > 0, _aim(cube[:, :2], goal[:, :2], side), goal[:, :2])
-    slower = jnp.sqrt(jnp.minimum(friction, 1.0))
-    gains = gains._replace(along=gains.along * slower)
+    slips = jnp.asarray(friction) < SLIPPERY
+    gains = Gains(*(jnp.where(slips, careful, usual) for careful, usual in zip(CAREFUL, PAST, strict=True)))
     return fetch.push(obs.at[:, GOAL].set(jnp.concatenate([aim, goal[:, 2:]], -1)), gains)
 
 
@@ -71,8 +73,11 @@ def _aim(cube: Float[Array, "n 2"], goal: Float[Array, "n 2"], side: Amount) -> 
     return jnp.where(is_free, goal, cube + STRETCH * tangent)
 
 
-def pick(obs: Float[Array, "n obs"]) -> Float[Array, "n 4"]:
-    """Travel over the cube with open fingers, go down, close, and carry the cube to the goal."""
+def pick(obs: Float[Array, "n obs"], friction: Amount = 1.0) -> Float[Array, "n 4"]:
+    """Travel over the cube with open fingers, go down, close, and carry the cube to the goal.
+
+    `friction` is that of the cube, as far as it is known; a slippery one is carried slowly.
+    """
     cube, goal, gripper = obs[:, OBJECT], obs[:, GOAL], obs[:, GRIPPER]
     off = cube - gripper
     across, down = off[:, :2], off[:, 2:]
@@ -84,7 +89,9 @@ def pick(obs: Float[Array, "n obs"]) -> Float[Array, "n 4"]:
     is_between = is_over & (jnp.abs(down) < AROUND)
     opening = jnp.max(obs[:, FINGERS], -1, keepdims=True)
     is_held = (jnp.linalg.norm(off, axis=-1, keepdims=True) < GRASPED) & (opening < HELD)
-    move = jnp.where(is_held, CARRY_GAIN * (goal - cube), jnp.where(is_between, GAIN * off, coming))
+    most = jnp.where(jnp.asarray(friction) < SLIPPERY, CARRIED, 1.0)
+    carrying = jnp.clip(CARRY_GAIN * (goal - cube), -most, most)
+    move = jnp.where(is_held, carrying, jnp.where(is_between, GAIN * off, coming))
     fingers = jnp.where(is_held | is_between, -1.0, 1.0)
     return jnp.clip(jnp.concatenate([move, fingers], -1), -1.0, 1.0)
 
@@ -95,7 +102,7 @@ def act(
     """Return what the script of a skill does; `side`, `friction` and `post` as `past` has them."""
     if skill == "push":
         return past(obs, side, friction, post)
-    return pick(obs) if skill == "pick" else fetch.reach(obs)
+    return pick(obs, friction) if skill == "pick" else fetch.reach(obs)
 
 
 reach, straight = fetch.reach, fetch.push  # Fetch's, which act here too
