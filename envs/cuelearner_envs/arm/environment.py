@@ -51,7 +51,9 @@ class Camera(struct.PyTreeNode):
         """Return where a place seems to be [m]."""
         cos, sin, base = jnp.cos(self.turn), jnp.sin(self.turn), jnp.asarray(BASE)
         x, y = place[:2] - base
-        return jnp.stack([cos * x - sin * y + base[0], sin * x + cos * y + base[1], place[2]]) + jnp.asarray(self.offset)
+        return jnp.stack([cos * x - sin * y + base[0], sin * x + cos * y + base[1], place[2]]) + jnp.asarray(
+            self.offset
+        )
 
 
 class Arm(WholeObservations, struct.PyTreeNode):
@@ -205,7 +207,7 @@ def _spread(key: PRNGKeyArray, middle: Float[Array, "2"]) -> Float[Array, "2"]:
 def _placed(key: PRNGKeyArray, middle: Float[Array, "2"]) -> Float[Array, "2"]:
     """A place for the cube, not near the gripper: of several draws the first that will do."""
     draws = jax.vmap(lambda one: _spread(one, middle))(jax.random.split(key, PLACEMENTS))
-    away = jnp.linalg.norm(draws - middle, axis=-1)
+    away = jnp.linalg.norm(draws - middle[None], axis=-1)
     return draws[jnp.argmax(jnp.where(away >= APART, 1.0, away))]
 
 
@@ -214,6 +216,5 @@ def _in_lane(key: PRNGKeyArray) -> tuple[Float[Array, "2"], Float[Array, "2"]]:
     (near, far), wide = LANE
     along, across = jax.random.uniform(key, (2, 2))
     along, across = near + (far - near) * along, wide * (2.0 * across - 1.0)
-    places = jnp.asarray(arm.POST_PLACE) + jnp.stack([jnp.array([-1.0, 1.0]) * along, across], -1)
+    places = jnp.asarray(arm.POST_PLACE)[None] + jnp.stack([jnp.array([-1.0, 1.0]) * along, across], -1)
     return places[0], places[1]
-

@@ -59,9 +59,7 @@ def _xml(has_object: bool) -> str:
     )
     solids, fingers, cube, pairs = _objects() if has_object else ("", "", "", "")
     if has_object:
-        drives += "".join(
-            _drive(side, FINGER_MASS + FINGER_ARMATURE, FINGER_STIFFNESS) for side in ("right", "left")
-        )
+        drives += "".join(_drive(side, FINGER_MASS + FINGER_ARMATURE, FINGER_STIFFNESS) for side in ("right", "left"))
     return f"""
 <mujoco model="arm">
   <option timestep="{CONTROL_PERIOD / SUBSTEPS}" iterations="{ITERATIONS}" ls_iterations="{LINE_SEARCHES}"

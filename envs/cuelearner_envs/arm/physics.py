@@ -123,7 +123,8 @@ def control(body: Body, targets: Command, ground: Ground) -> Body:
 
     def one(carry: Body, _: None) -> tuple[Body, None]:
         begun = data.replace(qpos=carry.qpos, qvel=carry.qvel, qacc_warmstart=carry.warmstart, ctrl=ctrl)
-        with jax.default_matmul_precision("highest"):  # an accelerator would round the factors to three digits
+        # An accelerator would round the factors of products to three digits. MJX promotes ranks.
+        with jax.default_matmul_precision("highest"), jax.numpy_rank_promotion("allow"):
             done = mjx.step(model, begun)
         return Body(done.qpos, done.qvel, done.qacc_warmstart), None
 

@@ -13,8 +13,8 @@ from cuelearner_envs.fetch import scripts as fetch
 from cuelearner_envs.fetch.scripts import GOAL, GRIPPER, OBJECT, Amount, Gains
 
 FINGERS = slice(15, 17)
-CLEARANCE = 0.08  # from the post's axis: as far the cube's middle goes by [m]
-STRETCH = 0.04  # how far along a tangent the script aims [m]
+CLEARANCE = 0.075  # from the post's axis: as far the cube's middle goes by [m]
+STRETCH = 0.05  # how far along a tangent the script aims [m]
 GAIN, CARRY_GAIN = 20.0, 12.0  # of a way, per metre: of the gripper alone, and with the cube
 OVER = 0.09  # over the cube's middle: where the gripper travels [m]
 LOW = -0.03  # over the cube's middle less the gripper's: above, fingers would sweep the cube aside [m]

@@ -37,8 +37,6 @@ class Gains(NamedTuple):
     pushed: Amount = 0.012  # from object to goal: as near, nothing is left to do
 
 
-
-
 def reach(obs: Float[Array, "n obs"]) -> Float[Array, "n 4"]:
     """Go straight to the goal."""
     return _action(REACH_GAIN * (obs[:, GOAL] - obs[:, GRIPPER]))
