@@ -9,6 +9,7 @@ import jax.numpy as jnp
 
 from cuelearner_envs.arm import config as arm
 from cuelearner_envs.arm.config import SIDES, ArmConfig
+from cuelearner_envs.arm.environment import ACTIONS
 from cuelearner_envs.arm.places import BASE
 from cuelearner_jax.adaptation.adapting import plain_scalars
 from cuelearner_jax.agents import ddqn
@@ -17,8 +18,7 @@ from cuelearner_jax.config import Schedule, Sizes
 from cuelearner_jax.environment import OWN, Environment, Quantity
 from cuelearner_jax.policies import Heuristic
 from cuelearner_jax.run_config import RunConfig
-from cuelearner_jax.spaces import Box
-from cuelearner_jax.task import Body, Pictures, Preset, Scenario, Task
+from cuelearner_jax.task import PAPERS_FIT, Body, Pictures, Preset, Scenario, Task
 from cuelearner_jax.tasks import fetch_layout
 from cuelearner_jax.types import Policy, Teacher
 
@@ -113,47 +113,46 @@ SCENARIOS = {
     },
 }
 
-NUM_ENVS = 16
-
-
-def _quickstart() -> Preset:
-    config = ArmConfig()
-    space = arm.make_environment(config, ()).actions
-    assert isinstance(space, Box)
-    run = RunConfig(
-        config,
-        Sizes(num_envs=NUM_ENVS, feedback_layers=(64, 64), fit_steps=400, fit_batch_size=64),
-        dataclasses.replace(plain_scalars(space), discount=0.95, max_grad_norm=10.0),
-        Schedule(
-            total_steps=32_000,
-            random_steps=800,
-            learn_after=800,
-            guidance_until=16_000,
-            eval_every=4_000,
-            eval_steps=1_000,
-            eval_envs=20,
-            checkpoint_every=8_000,
-        ),
-        ddqn.Config(
-            q_layers=(128, 128),
-            directions=256,
-            target_directions=64,
-            batch_size=64,
-            replay_capacity=64_000,
-            optimizer="adam",
-            learning_rate=0.001,
-            polyak=0.05,
-        ),
-        paced.Config(),
-    )
-    return Preset(
-        "small networks, 32,000 steps a seed; --task.skill chooses the skill",
-        run,
-        guidance=("none", "relative"),
-        labels=(100,),
-        seeds=1,
-    )
-
+QUICKSTART = RunConfig(
+    ArmConfig(),
+    Sizes(num_envs=16, feedback_layers=(64, 64), fit_steps=400, fit_batch_size=64),
+    dataclasses.replace(plain_scalars(ACTIONS), discount=0.95, max_grad_norm=10.0),
+    Schedule(
+        total_steps=32_000,
+        random_steps=800,
+        learn_after=800,
+        guidance_until=16_000,
+        eval_every=4_000,
+        eval_steps=1_000,
+        eval_envs=20,
+        checkpoint_every=8_000,
+    ),
+    ddqn.Config(
+        q_layers=(128, 128),
+        directions=256,
+        target_directions=64,
+        batch_size=64,
+        replay_capacity=64_000,
+        optimizer="adam",
+        learning_rate=0.001,
+        polyak=0.05,
+    ),
+    paced.Config(),
+)
+PAPER = dataclasses.replace(
+    QUICKSTART,
+    sizes=dataclasses.replace(QUICKSTART.sizes, **PAPERS_FIT),
+    schedule=dataclasses.replace(
+        QUICKSTART.schedule,
+        total_steps=1_000_000,
+        guidance_until=500_000,
+        eval_every=50_000,
+        eval_steps=5_000,
+        eval_envs=100,
+        checkpoint_every=100_000,
+    ),
+    agent=dataclasses.replace(QUICKSTART.agent, q_layers=(256, 256), batch_size=256, replay_capacity=1_000_000),
+)
 
 ARM = Task(
     name="arm",
@@ -167,5 +166,21 @@ ARM = Task(
     judge_by=lambda config: "success",
     labels_hold=("reward", "max_steps", "within"),  # a label is of what one observation shows
     scenarios=SCENARIOS,
-    presets={"quickstart": _quickstart()},
+    presets={
+        "paper": Preset(
+            "larger networks, 1 million steps a seed; --task.skill chooses the skill",
+            PAPER,
+            guidance=("none", "relative"),
+            labels=(100, 500),
+            takes="one seed: hours on 2 cores, by arithmetic",
+        ),
+        "quickstart": Preset(
+            "small networks, 32,000 steps a seed; --task.skill chooses the skill",
+            QUICKSTART,
+            guidance=("none", "relative"),
+            labels=(100,),
+            seeds=1,
+            takes="one seed under two kinds of guidance: minutes on 2 cores",
+        ),
+    },
 )

@@ -9,7 +9,14 @@ import pytest
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.tasks import registry
 
-NEGATIVE = {"action_turn_deg", "observation_bias", "acceleration", "lidar_rotation_deg"}  # where -1 makes sense
+NEGATIVE = {
+    "action_turn_deg",
+    "observation_bias",
+    "acceleration",
+    "lidar_rotation_deg",
+    "camera_turn_deg",
+    "camera_offset",
+}  # where -1 makes sense
 SENSELESS = (math.nan, math.inf, -math.inf, 1e39, 10**400, "many", None, True)  # 1e39: infinite in single precision
 
 
@@ -26,7 +33,7 @@ FIELDS = [(name, *field) for name in OWN for field in numeric(registry.find(name
 
 
 def test_there_are_as_many_as_there_were():
-    assert len(FIELDS) >= 14  # 6 of billiards, 8 of navigation
+    assert len(FIELDS) >= 19  # 5 of the arm, 6 of billiards, 8 of navigation
 
 
 @pytest.mark.parametrize(("task", "field", "valid"), FIELDS, ids=[f"{name}-{field}" for name, field, _ in FIELDS])

@@ -22,7 +22,7 @@ class ArmConfig:
     """A skill of the arm and the world in which it is asked for."""
 
     skill: Skill = "push"
-    """reach: the gripper to a goal. push: a cube to a goal on the table. pick: a cube to a goal on or over the table."""
+    """reach: the gripper to a goal. push: a cube to a goal on the table. pick: a cube to one on or over the table."""
     reward: Reward = "shaped"
     """sparse: -1 a step until success, then 0. dense: minus the distance from the goal. shaped: also half the distance
     from gripper to cube."""

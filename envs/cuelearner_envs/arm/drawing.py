@@ -141,10 +141,10 @@ def _solids(scene: Scene) -> Iterator[tuple[Faces, tuple[int, int, int]]]:
     gripper = np.asarray(scene.gripper, float)
     radius, wide = arm.FINGER_RADIUS, arm.FINGER_HALF_WIDTH
     for way, opening in ((1.0, float(scene.fingers[0])), (-1.0, float(scene.fingers[1]))):
-        middle = gripper + [0.0, way * (radius + opening), 0.03 - arm.TIP / 2]
+        middle = gripper + np.array([0.0, way * (radius + opening), 0.03 - arm.TIP / 2])
         yield _box(middle, (wide, radius, 0.03 + arm.TIP / 2)), STEEL
-    yield _box(gripper + [0.0, 0.0, 0.075], (0.02, 0.068, 0.015)), PALM
-    yield _box(gripper + [0.0, 0.0, 0.12], (0.016, 0.016, 0.03)), STEEL
+    yield _box(gripper + np.array([0.0, 0.0, 0.075]), (0.02, 0.068, 0.015)), PALM
+    yield _box(gripper + np.array([0.0, 0.0, 0.12]), (0.016, 0.016, 0.03)), STEEL
     if scene.has_post:
         yield _column(), POST
     if scene.cube is not None:

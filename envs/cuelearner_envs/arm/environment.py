@@ -161,10 +161,8 @@ class Arm(WholeObservations, struct.PyTreeNode):
         moving = body.qvel[physics.CUBE_VELOCITY] * arm.CONTROL_PERIOD - velocity
         turning = jnp.sum(turn * body.qvel[physics.CUBE_TURNING][None], -1) * arm.CONTROL_PERIOD
         fingers = body.qpos[physics.FINGERS], body.qvel[physics.FINGERS] * arm.CONTROL_PERIOD
-        return jnp.concatenate(
-            [cube, goal, place, cube, cube - place, fingers[0], physics.euler(turn), moving, turning, velocity]
-            + [fingers[1]]
-        )
+        parts = [cube, goal, place, cube, cube - place, fingers[0], physics.euler(turn), moving, turning, velocity]
+        return jnp.concatenate([*parts, fingers[1]])
 
     def heuristic(self, obs: Float[Array, " obs"]) -> Float[Array, "4"]:
         """Return the script's action: the teacher's of what is seen, on a table that nobody has changed."""

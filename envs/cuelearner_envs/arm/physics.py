@@ -88,8 +88,8 @@ def command(
 ) -> Command:
     """Return the targets that an action means.
 
-    As Fetch has it: an action of 1 names a place 5 cm from where the gripper is now, and opens the fingers. Targets keep
-    within the workspace and out of the post.
+    As Fetch has it: an action of 1 names a place 5 cm from where the gripper is now, and opens the fingers. Targets
+    keep within the workspace and out of the post.
 
     Args:
         gripper, fingers: where they are [m].

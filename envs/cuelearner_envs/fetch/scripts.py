@@ -37,12 +37,15 @@ class Gains(NamedTuple):
     pushed: Amount = 0.012  # from object to goal: as near, nothing is left to do
 
 
+USUAL = Gains()
+
+
 def reach(obs: Float[Array, "n obs"]) -> Float[Array, "n 4"]:
     """Go straight to the goal."""
     return _action(REACH_GAIN * (obs[:, GOAL] - obs[:, GRIPPER]))
 
 
-def push(obs: Float[Array, "n obs"], gains: Gains = Gains()) -> Float[Array, "n 4"]:
+def push(obs: Float[Array, "n obs"], gains: Gains = USUAL) -> Float[Array, "n 4"]:
     """Rise, travel behind the object, go down, and push along the line from object to goal."""
     goal, gripper, thing = obs[:, GOAL], obs[:, GRIPPER], obs[:, OBJECT]
     way = goal[:, :2] - thing[:, :2]

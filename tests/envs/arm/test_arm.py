@@ -4,6 +4,7 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 from PIL import Image
@@ -37,7 +38,7 @@ def test_the_task_keeps_its_laws(tmp_path):
 
 def test_an_action_of_1_is_5_cm_and_opens_the_fingers():
     gripper, fingers = told([1.0, -0.5, 0.0, 1.0])
-    assert np.allclose(gripper, np.array(HOME) + [0.05, -0.025, 0.0])
+    assert np.allclose(gripper, np.array(HOME) + np.array([0.05, -0.025, 0.0]))
     assert np.allclose(fingers, arm.OPEN)
     assert np.allclose(told([0, 0, 0, -1.0], fingers=(0.03, 0.03))[1], 0.0)
     assert np.allclose(told([0, 0, 0, 1.0], grasps=0.0)[1], 0.0)
@@ -58,10 +59,8 @@ def test_targets_keep_out_of_the_post():
 
 
 def test_a_step_goes_3_cm_as_in_fetch():
-    """Fetch's gripper goes 3.0 cm in the first step of an action of 1, then 3.3 cm a step, and 0.2 cm after the last."""
+    """Fetch's goes 3.0 cm in the first step of an action of 1, then 3.3 cm a step, and 0.2 cm after the last."""
     model = arm.load(False)
-    import mujoco
-
     data, x = mujoco.MjData(model), [0.0]
     for action in (1.0, 1.0, 1.0, 1.0, 0.0, 0.0):
         data.ctrl[0] = data.qpos[0] + 0.05 * action
@@ -75,7 +74,8 @@ def test_a_step_goes_3_cm_as_in_fetch():
 def test_a_turned_camera_turns_places_about_the_base():
     base = np.array([*BASE, 0.5])
     quarter = Camera(turn=F(np.pi / 2), offset=jnp.array([0.0, 0.02, 0.0]))
-    assert np.allclose(quarter.seen(jnp.asarray(base + [0.6, 0.0, 0.0], F)), base + [0.0, 0.62, 0.0], atol=1e-6)
+    ahead, left = (base + np.array(off) for off in ([0.6, 0.0, 0.0], [0.0, 0.62, 0.0]))
+    assert np.allclose(quarter.seen(jnp.asarray(ahead, F)), left, atol=1e-6)
 
 
 @pytest.mark.parametrize("skill", ["reach", "push", "pick"])
@@ -129,7 +129,7 @@ def test_the_teacher_sees_true_places_and_the_heuristic_what_is_seen():
     ],
 )
 def test_what_makes_no_world_is_refused_in_one_line(changes, said):
-    with pytest.raises(UserError, match="^[^\n]*$") as refusal:
+    with pytest.raises(UserError, match=r"^[^\n]*$") as refusal:
         dataclasses.replace(ArmConfig(), **changes)
     assert said in str(refusal.value)
 
