@@ -19,8 +19,8 @@ Picture = UInt8[np.ndarray, "height width 3"]
 Faces = list[Float[np.ndarray, "corners 3"]]
 SIZE = (480, 360)  # width and height [pixels]
 FINER = 2  # pixels are averaged over so many squared
-AZIMUTH, ELEVATION, DISTANCE = math.radians(28.0), math.radians(-32.0), 1.0  # [rad, rad, m]
-LOOK_AT = np.array([1.33, 0.75, 0.49])  # [m]
+AZIMUTH, ELEVATION, DISTANCE = math.radians(28.0), math.radians(-45.0), 0.98  # [rad, rad, m]
+LOOK_AT = np.array([1.34, 0.75, 0.47])  # [m]
 FOCAL = 1.6  # of the picture's height
 BACKGROUND, TABLE, EDGE = (236, 240, 243), (214, 205, 190), (170, 160, 145)
 CUBE, POST, STEEL, PALM, GOAL, SHADOW = (
@@ -143,8 +143,8 @@ def _solids(scene: Scene) -> Iterator[tuple[Faces, tuple[int, int, int]]]:
     for way, opening in ((1.0, float(scene.fingers[0])), (-1.0, float(scene.fingers[1]))):
         middle = gripper + np.array([0.0, way * (radius + opening), 0.03 - arm.TIP / 2])
         yield _box(middle, (wide, radius, 0.03 + arm.TIP / 2)), STEEL
-    yield _box(gripper + np.array([0.0, 0.0, 0.075]), (0.02, 0.068, 0.015)), PALM
-    yield _box(gripper + np.array([0.0, 0.0, 0.12]), (0.016, 0.016, 0.03)), STEEL
+    yield _box(gripper + np.array([0.0, 0.0, 0.075]), (0.014, 0.02 + float(np.max(scene.fingers)), 0.01)), PALM
+    yield _box(gripper + np.array([0.0, 0.0, 0.12]), (0.01, 0.01, 0.03)), STEEL
     if scene.has_post:
         yield _column(), POST
     if scene.cube is not None:

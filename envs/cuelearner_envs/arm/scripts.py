@@ -49,6 +49,7 @@ def past(
         friction: of the cube, as far as it is known; with a slippery one care is taken.
         post: 1 where it stands; 0: the cube is pushed straight.
     """
+    obs = jnp.asarray(obs)
     cube, goal = obs[:, OBJECT], obs[:, GOAL]
     aim = jnp.where(post > 0, _aim(cube[:, :2], goal[:, :2], side), goal[:, :2])
     slips = jnp.asarray(friction) < SLIPPERY
