@@ -82,5 +82,6 @@ def reel(env: Arm, state: Situation, action: Float[Array, "4"]) -> Reel:
     states = jax.device_get(_held(env, state, jnp.asarray(action)))
     each = [jax.tree.map(lambda leaf, number=number: leaf[number], states) for number in range(HELD)]
     frames = [draw(scene_of(env, one)) for one in (state, *each)]
-    words = "at the goal" if float(env.distance(each[-1])) < float(env.within) else ""
+    end = jax.tree.map(jnp.asarray, each[-1])
+    words = "at the goal" if float(env.distance(end)) < float(env.within) else ""
     return pictures.clip(frames, PERIOD, words)

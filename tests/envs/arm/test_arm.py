@@ -165,6 +165,15 @@ def test_a_picture_shows_cube_post_and_goal(tmp_path):
     assert fingers is None
 
 
+def test_a_clip_holds_the_action_for_five_steps():
+    env = ARM.environment(ARM.configured(skill="reach"))
+    state, _ = env.reset(jax.random.key(3))
+    reel = recording.reel(env, state, jnp.array([0.0, 0.0, 1.0, 0.0]))
+    assert len(reel.pictures) == 6  # the situation, and where each step leads
+    assert len({*reel.pictures}) == 6
+    assert reel.period == recording.PERIOD
+
+
 def test_faces_look_outward():
     for face in drawing._box(np.zeros(3), (1.0, 2.0, 3.0)):
         assert drawing._normal(face) @ face.mean(0) > 0.9
