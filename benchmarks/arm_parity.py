@@ -4,7 +4,8 @@
 
 Without a post the script of push is the one that acts in FetchPush. In changed worlds "teacher" is the script that sees
 true places, knows the friction and prefers a side; "base" is the script of what is seen. C MuJoCo makes steps of 2 ms
-and solves to convergence. Writes benchmarks/results/arm_parity.json with --write.
+and solves to convergence. Writes benchmarks/results/arm_parity.json with
+--write; rows that were not measured anew stay there.
 """
 
 from __future__ import annotations
@@ -74,7 +75,7 @@ def fetch_rows(episodes: int) -> list[dict[str, Any]]:
     found = []
     for name, (skill, script) in FETCH.items():
         measured = cl.measure(script, cl.from_gymnasium(name), episodes=episodes)
-        rate = float(measured.metrics["success"])
+        rate = float(np.mean(measured.metrics["success"]))
         values = np.repeat([1.0, 0.0], [round(rate * episodes), episodes - round(rate * episodes)])
         found.append(_row(skill, None, {}, "script", name, "success", values))
     return found
@@ -93,14 +94,20 @@ def main() -> None:
     """Measure and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--episodes", type=int, default=100)
-    parser.add_argument("--skills", nargs="+", default=list(WORLDS), choices=list(WORLDS))
+    parser.add_argument("--skills", nargs="*", default=list(WORLDS), choices=list(WORLDS))
     parser.add_argument("--fetch", action="store_true", help="also in Gymnasium-Robotics' Fetch")
     parser.add_argument("--write", type=Path, nargs="?", const=RESULTS, help="file (default: %(const)s)")
     asked = parser.parse_args()
     rows = [row for skill in asked.skills for row in rows_of(skill, asked.episodes)]
     rows += fetch_rows(asked.episodes) if asked.fetch else []
     if asked.write:
-        asked.write.write_text(json.dumps({**provenance(), "rows": rows}, indent=1) + "\n")
+        before = json.loads(asked.write.read_text())["rows"] if asked.write.exists() else []
+        kept = [row for row in before if all(_named(row) != _named(new) for new in rows)]
+        asked.write.write_text(json.dumps({**provenance(), "rows": [*kept, *rows]}, indent=1) + "\n")
+
+
+def _named(row: dict[str, Any]) -> tuple[str, ...]:
+    return row["skill"], row["world"], row["policy"], row["engine"]
 
 
 if __name__ == "__main__":
