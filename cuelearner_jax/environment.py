@@ -30,6 +30,10 @@ class Quantity(NamedTuple):
     # robot measures of itself, which no displaced sensor shifts
     kind: str = ""
     step_deg: float = 0.0  # of beams: the angle between two neighbours
+    # Of a place in metres (x, y, perhaps z): the point about which a sensor that is turned turns the place; None: no
+    # sensor turns, or nobody says about which point
+    origin: tuple[float, float] | None = None
+    follows: str = ""  # name of the place from which this difference is taken, and with which it is displaced
 
 
 # What `spaces.DIRECTIONS` are, where an environment does not say more by its own `action`.

@@ -117,8 +117,8 @@ def check_family(family: Sequence[Distortion]) -> Family:
 def declared(env: Any, gains: bool = False, teacher_bias: bool = False) -> Family:
     """Derive the distortions of an environment from what it declares of its observation and actions.
 
-    Slices in metres or radians of the same size shift together. Beams at equal angles roll. Directions turn. Actions
-    turn or shift along their cues.
+    Slices in metres or radians of the same size shift together. Beams at equal angles roll. Directions turn, and places
+    with an `origin` turn about that. Actions turn or shift along their cues.
 
     Args:
         env: an environment, or its view.
@@ -134,6 +134,7 @@ def declared(env: Any, gains: bool = False, teacher_bias: bool = False) -> Famil
         found.append(_shift(unit, size, slices))
         if gains and unit == "m":
             found.append(_gain(slices))
+    found += _turned_places(places)
     found += [_roll(quantity, start) for quantity, start in places if quantity.kind == "beams"]
     found += [_turned(quantity, start) for quantity, start in places if quantity.kind == "directions"]
     space, name = actions_of(env), action_of(env).name
@@ -218,6 +219,45 @@ def _turned(quantity: Quantity, start: int) -> Distortion:
         return along * obs + jnp.zeros(len(obs)).at[x].set(sin).at[y].set(-sin) * other
 
     name = f"{quantity.name}: turn"
+    return Distortion(name, (Unknown(name, "degrees", most=180.0),), sees)
+
+
+def _turned_places(places: list[tuple[Quantity, int]]) -> list[Distortion]:
+    """One turn for each origin: of all places with that origin, and of the differences that follow these."""
+    starts = {quantity.name: start for quantity, start in places}
+    groups: dict[tuple[float, float], list[tuple[Quantity, int]]] = {}
+    for quantity, start in places:
+        if quantity.follows and quantity.follows not in starts:
+            raise UserError(f"slice {quantity.name!r} follows {quantity.follows!r}, which is no slice: name one")
+        if quantity.origin is not None:
+            if quantity.unit != "m" or quantity.size < 2:
+                raise UserError(f"slice {quantity.name!r} has an origin and is no place: give x and y in metres")
+            groups.setdefault(quantity.origin, []).append((quantity, start))
+    found = []
+    for origin, slices in groups.items():
+        names = {quantity.name for quantity, _ in slices}
+        followers = [(start, starts[one.follows]) for one, start in places if one.follows in names]
+        found.append(_turned_about(origin, slices, followers))
+    return found
+
+
+def _turned_about(
+    origin: tuple[float, float], slices: list[tuple[Quantity, int]], followers: list[tuple[int, int]]
+) -> Distortion:
+    """Places as they were before they were turned about a point.
+
+    `followers`: first entries of differences, each with the first entry of the place that it is displaced with.
+    """
+    pairs = [(start, start) for _, start in slices] + followers
+    moved, by = (jnp.array(column) for column in zip(*pairs, strict=True))
+
+    def sees(theta: Array, obs: Array) -> Array:
+        cos, sin = jnp.cos(jnp.deg2rad(theta[0])), jnp.sin(jnp.deg2rad(theta[0]))
+        x, y = obs[by] - origin[0], obs[by + 1] - origin[1]
+        change_x, change_y = cos * x + sin * y - x, cos * y - sin * x - y
+        return obs + jnp.zeros(len(obs)).at[moved].set(change_x).at[moved + 1].set(change_y)
+
+    name = f"{_called(slices)}: turn"
     return Distortion(name, (Unknown(name, "degrees", most=180.0),), sees)
 
 

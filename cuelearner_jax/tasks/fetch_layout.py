@@ -9,7 +9,10 @@ import json
 import math
 from typing import Any
 
+from cuelearner_envs.fetch.cues import CUE_NAMES, CUES
 from cuelearner_jax.environment import OWN, Quantity
+
+__all__ = ["CUES", "CUE_NAMES", "drawn_with", "layout_of", "points_of"]
 
 # What a camera tells of the object and the goal is in metres, and shifts with the camera. What the robot measures of
 # itself does not.
@@ -29,8 +32,6 @@ _GRIPPER_MOTION = (
     Quantity("finger velocities", 2, "m a step"),
 )
 _DESIRED = Quantity("desired goal", 3, "m", "where the gripper, or the object, is to be")
-CUES = ("forward,backward", "left,right", "up,down", "open,close")
-CUE_NAMES = ("x", "y", "z", "fingers")
 # Of pictures: over the robot's shoulder, so that its left is to the left. Fetch's own camera faces the robot.
 CAMERA = {"distance": 1.6, "azimuth": 45.0, "elevation": -30.0, "lookat": [1.3, 0.75, 0.5]}
 FETCH = "FetchReach", "FetchPush", "FetchSlide", "FetchPickAndPlace"

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 GROUP = "cuelearner.tasks"  # of entry points: the task's name = "package.module:name"
 BUILT_IN = {
+    "arm": "cuelearner_jax.tasks.arm:ARM",
     "billiards": "cuelearner_jax.tasks.billiards:BILLIARDS",
     "gymnasium": "cuelearner_jax.tasks.gymnasium:GYMNASIUM",
     "logs": "cuelearner_jax.tasks.logs:LOGS",

@@ -10,6 +10,7 @@ from cuelearner_envs.billiards.config import BilliardsConfig, make_environment
 from cuelearner_envs.navigation.environment import Navigation
 from cuelearner_jax.calibration.corrected import Calibrated
 from cuelearner_jax.calibration.families import Distortion, Unknown, acted, check_family, declared, seen, unknowns_of
+from cuelearner_jax.environment import OWN, Quantity
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.policies import policy_of
 from cuelearner_jax.spaces import DIRECTIONS
@@ -55,6 +56,44 @@ def test_a_change_of_the_sensors_is_undone(name, theta, change):
     _, obs = situations(jax.random.key(0), None, 8)
     before = jax.vmap(lambda row: seen(family, jnp.array(theta), row))(obs)
     np.testing.assert_allclose(before, changed(obs, **change), atol=1e-5)
+
+
+class Table:
+    """Two places that a camera tells, the difference of one from the hand, and the hand's own place."""
+
+    actions = BOX
+    observation = (
+        Quantity("cup", 3, "m", origin=(1.0, 2.0)),
+        Quantity("hand", 3, "m", kind=OWN),
+        Quantity("cup less hand", 3, "m", follows="cup"),
+        Quantity("plate", 2, "m", origin=(1.0, 2.0)),
+    )
+
+
+def test_places_turn_about_their_origin_and_differences_follow():
+    (turn,) = [one for one in declared(Table()) if one.name.endswith("turn")]
+    assert turn.name == "cup and 1 more: turn"
+    assert [(unknown.unit, unknown.most) for unknown in turn.unknowns] == [("degrees", 180.0)]
+    # Turned by 90 degrees, a cup 1 m ahead of the origin is seen 1 m to its left, and the plate 2 m behind the origin.
+    shown = jnp.array([1.0, 3.0, 0.5, 0.2, 0.3, 0.4, 0.8, 2.7, 0.1, 1.0, 0.0])
+    before = seen((turn,), jnp.array([90.0]), shown)
+    np.testing.assert_allclose(before, [2, 2, 0.5, 0.2, 0.3, 0.4, 1.8, 1.7, 0.1, -1, 2], atol=1e-6)
+    np.testing.assert_array_equal(seen((turn,), jnp.zeros(1), shown), shown)
+
+
+@pytest.mark.parametrize(
+    ("slices", "said"),
+    [
+        ((Quantity("cup", 1, "m", origin=(0.0, 0.0)),), "'cup' has an origin and is no place: give x and y in metres"),
+        ((Quantity("cup", 3, "1", origin=(0.0, 0.0)),), "'cup' has an origin and is no place: give x and y in metres"),
+        ((Quantity("way", 3, "m", follows="cup"),), "'way' follows 'cup', which is no slice: name one"),
+    ],
+)
+def test_slices_that_cannot_turn_are_refused(slices, said):
+    table = Table()
+    table.observation = slices
+    with pytest.raises(UserError, match=said):
+        declared(table)
 
 
 def test_beams_between_two_are_interpolated_and_nothing_is_seen_beyond_the_last():

@@ -15,6 +15,8 @@ NEGATIVE = {
     "acceleration",
     "lidar_rotation_deg",
     "goal_rotation_deg",
+    "camera_turn_deg",
+    "camera_offset",
 }  # where -1 makes sense
 SENSELESS = (math.nan, math.inf, -math.inf, 1e39, 10**400, "many", None, True)  # 1e39: infinite in single precision
 
@@ -32,7 +34,7 @@ FIELDS = [(name, *field) for name in OWN for field in numeric(registry.find(name
 
 
 def test_there_are_as_many_as_there_were():
-    assert len(FIELDS) >= 14  # 6 of billiards, 8 of navigation
+    assert len(FIELDS) >= 19  # 5 of the arm, 6 of billiards, 8 of navigation
 
 
 @pytest.mark.parametrize(("task", "field", "valid"), FIELDS, ids=[f"{name}-{field}" for name, field, _ in FIELDS])

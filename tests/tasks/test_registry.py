@@ -74,10 +74,12 @@ def test_the_papers_changed_worlds():
     worlds = {name: registry.find(name).scenarios for name in registry.BUILT_IN}
     bounds = {scenario: one.bound_deg for own in worlds.values() for scenario, one in own.items()}
     assert bounds == {
+        **dict.fromkeys(("turned_camera", "hand_eye", "slippery", "past_left", "past_right")),  # a quarter of the reach
         **{"turned_strike": 1.0, "shifted_balls": 0.3, "tilted_table": 0.3},
         **{"turned_lidar": 60.0, "rooms": 180.0, "corridor": 60.0, "corridor_left": 180.0, "corridor_right": 180.0},
     }
     assert worlds["billiards"]["shifted_balls"].changes["observation_bias"] == (0.0071, 0.0071)
+    assert worlds["arm"]["turned_camera"].changes == {"camera_turn_deg": 10.0}
     assert worlds["navigation"]["turned_lidar"].changes == {"lidar_rotation_deg": 15.0}
     assert worlds["navigation"]["corridor_left"].changes == {"style": "corridor", "preferred_side": "left"}
 

@@ -1,0 +1,186 @@
+"""The arm as a task: its skills, presets, changed worlds and pictures."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import jax.numpy as jnp
+
+from cuelearner_envs.arm import config as arm
+from cuelearner_envs.arm.config import SIDES, ArmConfig
+from cuelearner_envs.arm.environment import ACTIONS
+from cuelearner_envs.arm.places import BASE
+from cuelearner_jax.adaptation.adapting import plain_scalars
+from cuelearner_jax.agents import ddqn
+from cuelearner_jax.arbiters import paced
+from cuelearner_jax.config import Schedule, Sizes
+from cuelearner_jax.environment import OWN, Environment, Quantity
+from cuelearner_jax.policies import Heuristic
+from cuelearner_jax.run_config import RunConfig
+from cuelearner_jax.task import PAPERS_FIT, Body, Pictures, Preset, Scenario, Task
+from cuelearner_jax.tasks import fetch_layout
+from cuelearner_jax.types import Policy, Teacher
+
+FETCH = {"reach": "FetchReach", "push": "FetchPush", "pick": "FetchPickAndPlace"}
+RELATIVE = "object relative position"
+PLACES = ("achieved goal", "desired goal", "object position")  # that a camera tells
+
+
+def observation_of(skill: str) -> tuple[Quantity, ...]:
+    """Return the slices of a skill's observation: Fetch's, with the point about which a camera turns what it tells."""
+    layout = fetch_layout.layout_of(FETCH[skill])
+    assert layout is not None
+    return tuple(_seen(quantity) for quantity in layout)
+
+
+def _seen(quantity: Quantity) -> Quantity:
+    if quantity.name in PLACES and quantity.kind != OWN:
+        return quantity._replace(origin=BASE)
+    return quantity._replace(follows="object position") if quantity.name == RELATIVE else quantity
+
+
+def make_environment(config: ArmConfig, split: str = "training") -> Environment:
+    """Return the world of a configuration; whatever the split is, episodes differ by their keys alone."""
+    return arm.make_environment(config, observation_of(config.skill))
+
+
+def make_teacher(config: ArmConfig, env: Any) -> Teacher:
+    """Return the script of the skill, which sees true places."""
+    from cuelearner_envs.arm.teacher import ScriptTeacher
+
+    return ScriptTeacher(env, jnp.float32(SIDES[config.preferred_side]))
+
+
+def _wants(config: ArmConfig) -> str:
+    side = "" if config.preferred_side == "none" else f", past the post on the {config.preferred_side}"
+    return {
+        "reach": "The gripper is to be at the green ring.",
+        "push": f"The gripper is to push the cube to the green ring{side}.",
+        "pick": "The gripper is to take the cube to the green ring and hold the cube there.",
+    }[config.skill]
+
+
+def _judged(*arguments: Any) -> dict[str, Any]:
+    from cuelearner_envs.arm.judged import rollout
+
+    return rollout(*arguments)
+
+
+def _pictures() -> Pictures:
+    from cuelearner_envs.arm import recording
+    from cuelearner_jax import pictures
+
+    return Pictures(
+        record=recording.record,
+        still=lambda env, frames, file: pictures.still(frames, file),
+        animate=lambda env, frames, file: pictures.animate(frames, file, recording.FPS),
+        question=recording.question,
+        sketch=recording.sketch,
+        reel=recording.reel,
+        legend="A clip holds the action for five steps.",
+    )
+
+
+def _proposed(env: Any) -> Policy:
+    return Heuristic(env)
+
+
+GRIPPER = Body(
+    name="gripper",
+    about="three slides and two fingers with contacts, simulated by MJX",
+    environment=make_environment,
+    engines={"mujoco": _judged},
+    pictures=_pictures,
+)
+
+_CAMERA: dict[str, Any] = {"guidance": "calibration"}
+SCENARIOS = {
+    "turned_camera": Scenario(
+        "the camera is turned by 10 degrees about the robot's base", {"camera_turn_deg": 10.0}, **_CAMERA
+    ),
+    "hand_eye": Scenario(
+        "the camera stands 2 cm to the right of where the arm believes", {"camera_offset": (0.0, 0.02, 0.0)}, **_CAMERA
+    ),
+    "slippery": Scenario("the cube is slippery", {"friction": 0.12}),
+    **{
+        f"past_{side}": Scenario(
+            f"a wish: push the cube past the post on the {side}",
+            {"preferred_side": side},
+            judge_by=f"passed_{side}",
+        )
+        for side in ("left", "right")
+    },
+}
+
+QUICKSTART = RunConfig(
+    ArmConfig(),
+    Sizes(num_envs=16, feedback_layers=(64, 64), fit_steps=400, fit_batch_size=64),
+    dataclasses.replace(plain_scalars(ACTIONS), discount=0.95, max_grad_norm=10.0),
+    Schedule(
+        total_steps=32_000,
+        random_steps=800,
+        learn_after=800,
+        guidance_until=16_000,
+        eval_every=4_000,
+        eval_steps=1_000,
+        eval_envs=20,
+        checkpoint_every=8_000,
+    ),
+    ddqn.Config(
+        q_layers=(128, 128),
+        directions=256,
+        target_directions=64,
+        batch_size=64,
+        replay_capacity=64_000,
+        optimizer="adam",
+        learning_rate=0.001,
+        polyak=0.05,
+    ),
+    paced.Config(),
+)
+PAPER = dataclasses.replace(
+    QUICKSTART,
+    sizes=dataclasses.replace(QUICKSTART.sizes, **PAPERS_FIT),
+    schedule=dataclasses.replace(
+        QUICKSTART.schedule,
+        total_steps=1_000_000,
+        guidance_until=500_000,
+        eval_every=50_000,
+        eval_steps=5_000,
+        eval_envs=100,
+        checkpoint_every=100_000,
+    ),
+    agent=dataclasses.replace(QUICKSTART.agent, q_layers=(256, 256), batch_size=256, replay_capacity=1_000_000),
+)
+
+ARM = Task(
+    name="arm",
+    about="a gripper over a table: reach a place, push a cube past a post, pick a cube and place it",
+    wants=_wants,
+    config=ArmConfig,
+    bodies=(GRIPPER,),
+    teacher=make_teacher,
+    proposed=_proposed,
+    longest=lambda config: config.max_steps,
+    judge_by=lambda config: "success",
+    labels_hold=("reward", "max_steps", "within"),  # a label is of what one observation shows
+    scenarios=SCENARIOS,
+    presets={
+        "paper": Preset(
+            "larger networks, 1 million steps a seed; --task.skill chooses the skill",
+            PAPER,
+            guidance=("none", "relative"),
+            labels=(100, 500),
+            takes="one seed: hours on 2 cores, by arithmetic",
+        ),
+        "quickstart": Preset(
+            "small networks, 32,000 steps a seed; --task.skill chooses the skill",
+            QUICKSTART,
+            guidance=("none", "relative"),
+            labels=(100,),
+            seeds=1,
+            takes="one seed under two kinds of guidance: minutes on 2 cores",
+        ),
+    },
+)

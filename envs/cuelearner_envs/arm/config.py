@@ -1,0 +1,83 @@
+"""Configuration of the arm: which skill, which reward, which changes of the world and of the wish."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import jax.numpy as jnp
+
+from cuelearner_envs.arm.environment import REWARDS, Arm, Camera, Reward, Skill
+from cuelearner_envs.arm.physics import Ground
+from cuelearner_envs.bounds import MOST_STEPS, check_number, check_vector, check_word
+from cuelearner_jax.environment import Quantity
+from cuelearner_jax.errors import UserError
+
+SIDES = {"none": 0.0, "left": 1.0, "right": -1.0}
+
+
+@dataclass(frozen=True)
+class ArmConfig:
+    """A skill of the arm and the world in which it is asked for."""
+
+    skill: Skill = "push"
+    """reach: the gripper to a goal. push: a cube to a goal on the table. pick: a cube to one on or over the table."""
+    reward: Reward = "shaped"
+    """sparse: -1 a step until success, then 0. dense: minus the distance from the goal. shaped: also half the distance
+    from gripper to cube."""
+    obstacle: bool = True
+    """Skill push: stands a post between cube and goal? Without it cube and goal lie as in FetchPush."""
+    max_steps: int = 50
+    """Steps of 0.04 s after which an episode is truncated."""
+    within: float = 0.05
+    """An episode is a success if it ends within this distance of the goal [m]."""
+    camera_turn_deg: float = 0.0
+    """Changed world: the camera is turned by this about the robot's base, counterclockwise [deg]; the goal and the cube
+    seem turned."""
+    camera_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Changed world: added to where the goal and the cube are seen, x, y and z [m]."""
+    friction: float = 1.0
+    """Changed world: friction of the cube on table, fingers and post."""
+    preferred_side: Literal["none", "left", "right"] = "none"
+    """Changed wish, where a post stands: the teacher pushes the cube past it on this side."""
+
+    def __post_init__(self) -> None:
+        """Raises UserError with one line for the first value that cannot work."""
+        check(self)
+
+    @property
+    def has_post(self) -> bool:
+        """Whether a post stands on the table."""
+        return self.skill == "push" and self.obstacle
+
+
+def check(config: ArmConfig) -> None:
+    """Raises UserError with one line for the first value that cannot work."""
+    check_word("skill", config.skill, get_args(Skill))
+    check_word("reward", config.reward, REWARDS)
+    check_word("preferred_side", config.preferred_side, SIDES)
+    if config.preferred_side != "none" and not config.has_post:
+        raise UserError(f"task.preferred_side is {config.preferred_side}: that needs --task.skill push and its post")
+    check_number("max_steps", config.max_steps, 1, MOST_STEPS, whole=True)
+    check_number("within", config.within, positive=True, unit="metres")
+    check_number("camera_turn_deg", config.camera_turn_deg, -180, 180, unit="degrees")
+    check_vector("camera_offset", config.camera_offset, 3, -1, 1, "metres")
+    check_number("friction", config.friction, 0.01, 10)
+
+
+def make_environment(config: ArmConfig, observation: Sequence[Quantity]) -> Arm:
+    """Return the environment of a configuration; `observation`: names of its slices."""
+    return Arm(
+        camera=Camera(
+            turn=jnp.deg2rad(jnp.float32(config.camera_turn_deg)),
+            offset=jnp.array(config.camera_offset, jnp.float32),
+        ),
+        ground=Ground(friction=jnp.float32(config.friction), post=jnp.float32(config.has_post)),
+        grasps=jnp.float32(config.skill == "pick"),
+        within=jnp.float32(config.within),
+        max_steps=jnp.int32(config.max_steps),
+        skill=config.skill,
+        reward=config.reward,
+        observation=tuple(observation),
+    )

@@ -1,0 +1,218 @@
+"""The arm as a task: what the gripper perceives, when an episode ends, what it earns. Laid out as Fetch's tasks are.
+
+One step is one step of control, 0.04 s. An episode is 50 steps long and never ends before. Success: at the end the
+gripper, or the cube, is within 5 cm of the goal.
+"""
+
+from __future__ import annotations
+
+from typing import Literal, get_args
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+
+from cuelearner_envs.arm import model as arm
+from cuelearner_envs.arm import physics
+from cuelearner_envs.arm.physics import Body, Ground
+from cuelearner_envs.arm.places import APART, BASE, HIGHEST, HOME, LANE, LOW_HOME, SPREAD
+from cuelearner_envs.arm.scripts import act
+from cuelearner_envs.fetch.cues import CUE_NAMES, CUES
+from cuelearner_jax.environment import Quantity, WholeObservations
+from cuelearner_jax.spaces import Box, cues_from
+from cuelearner_jax.types import Step
+
+Scalar = float | Float[Array, ""]
+Skill = Literal["reach", "push", "pick"]
+Reward = Literal["shaped", "dense", "sparse"]
+REWARDS = get_args(Reward)
+PLACEMENTS = 16  # places tried for a cube that must not lie near the gripper
+WAY = 0.5  # of the way from gripper to cube in a shaped reward, to that from cube to goal
+ACTIONS = Box((-1.0,) * 4, (1.0,) * 4, cues_from(CUES, CUE_NAMES))
+
+
+class Situation(struct.PyTreeNode):
+    """State between steps."""
+
+    body: Body
+    goal: Float[Array, "3"]  # of the gripper, or of the cube's middle [m]
+    steps: Int[Array, ""]  # taken in this episode
+    passed: Float[Array, ""]  # on which side of the post the cube went by: +1 left, -1 right, 0 not yet
+
+
+class Camera(struct.PyTreeNode):
+    """How what a camera tells is displaced: the goal and the cube, with all that derives from these."""
+
+    turn: Scalar = 0.0  # about the vertical through the robot's base, counterclockwise [rad]
+    offset: Float[Array, "3"] | tuple[float, ...] = (0.0, 0.0, 0.0)  # added afterwards [m]
+
+    def seen(self, place: Float[Array, "3"]) -> Float[Array, "3"]:
+        """Return where a place seems to be [m]."""
+        cos, sin, base = jnp.cos(self.turn), jnp.sin(self.turn), jnp.asarray(BASE)
+        x, y = place[:2] - base
+        return jnp.stack([cos * x - sin * y + base[0], sin * x + cos * y + base[1], place[2]]) + jnp.asarray(
+            self.offset
+        )
+
+
+class Arm(WholeObservations, struct.PyTreeNode):
+    """The environment (`cuelearner_jax.environment.Environment`). Everything but the last three fields is traced."""
+
+    camera: Camera = Camera()
+    ground: Ground = Ground()
+    grasps: Scalar = 1.0  # 1: fingers move, goals may lie in the air (`pick`); 0: fingers stay closed
+    within: Scalar = 0.05  # of the goal: as near, the episode is a success [m]
+    max_steps: Int[Array, ""] | int = 50  # an episode is truncated after this many
+    skill: Skill = struct.field(pytree_node=False, default="reach")
+    reward: Reward = struct.field(pytree_node=False, default="shaped")
+    observation: tuple[Quantity, ...] = struct.field(pytree_node=False, default=())
+
+    actions = ACTIONS
+    action = Quantity("step", 4, "5 cm", "x forward, y to the left, z up, and how far the fingers are to open")
+
+    @property
+    def has_object(self) -> bool:
+        """Whether there is a cube."""
+        return self.skill != "reach"
+
+    def reset(self, key: PRNGKeyArray) -> tuple[Situation, Float[Array, " obs"]]:
+        """Begin an episode: the gripper at home, cube and goal drawn as Fetch draws them.
+
+        Where a post stands, the cube lies before it and the goal behind it, as the robot sees them.
+        """
+        state = self._start(key)
+        return state, self.observe(state)
+
+    def step(self, key: PRNGKeyArray, state: Situation, action: Float[Array, "4"]) -> tuple[Situation, Step]:
+        """Execute an action; a new episode follows the end of one."""
+        body = physics.control(state.body, self.command(state, action), self.ground)
+        return self.followed(key, self.after(state, body))
+
+    def command(self, state: Situation, action: Float[Array, "4"]) -> physics.Command:
+        """Return the targets of the drives that an action means."""
+        fingers = state.body.qpos[physics.FINGERS] if self.has_object else jnp.zeros(2)
+        return physics.command(self.gripper(state), fingers, action, self._post, self.grasps)
+
+    @property
+    def _post(self) -> Scalar:
+        return self.ground.post if self.has_object else 0.0
+
+    def after(self, state: Situation, body: Body) -> Situation:
+        """Return the state that physics has led to; what blew up stays where it was."""
+        sound = jnp.isfinite(body.qpos).all() & jnp.isfinite(body.qvel).all()
+        body = jax.tree.map(lambda new, old: jnp.where(sound, new, old), body, state.body)
+        after = state.replace(body=body, steps=state.steps + 1)
+        return after.replace(passed=self._passed(state, after)) if self.has_object else after
+
+    def followed(self, key: PRNGKeyArray, after: Situation) -> tuple[Situation, Step]:
+        """Return the state to act in next, and what the step to `after` has led to."""
+        outcome, truncated = self.ends(after)
+        following = jax.tree.map(lambda new, old: jnp.where(truncated, new, old), self._start(key), after)
+        final_obs = self.observe(after)
+        step = Step(
+            obs=jnp.where(truncated, self.observe(following), final_obs),
+            final_obs=final_obs,
+            aftermath=final_obs,
+            reward=self._earned(after),
+            terminated=jnp.array(False),
+            truncated=truncated,
+            metrics={"within": (self.distance(after) < self.within).astype(jnp.float32)},
+            outcome=outcome,
+        )
+        return following, step
+
+    def ends(self, after: Situation) -> tuple[dict[str, Float[Array, ""]], Array]:
+        """Return what an episode that ended in a state came to, and whether time is up.
+
+        "passed_left", "passed_right": success, and the cube went by the post on that side, as the robot sees it.
+        """
+        distance = self.distance(after)
+        success = (distance < self.within).astype(jnp.float32)
+        outcome = {"success": success, "distance": distance}
+        if self.skill == "push":
+            outcome["passed_left"] = success * (after.passed > 0)
+            outcome["passed_right"] = success * (after.passed < 0)
+        return outcome, after.steps >= self.max_steps
+
+    def gripper(self, state: Situation) -> Float[Array, "3"]:
+        """Return the gripper's place [m]."""
+        return state.body.qpos[physics.GRIPPER]
+
+    def cube(self, state: Situation) -> Float[Array, "3"]:
+        """Return the place of the cube's middle [m]."""
+        return state.body.qpos[physics.CUBE][:3]
+
+    def distance(self, state: Situation) -> Float[Array, ""]:
+        """Return how far it is from the goal to what is to be there [m]."""
+        place = self.cube(state) if self.has_object else self.gripper(state)
+        return jnp.linalg.norm(place - state.goal)
+
+    def observe(self, state: Situation, camera: Camera | None = None) -> Float[Array, " obs"]:
+        """Return what is seen, in the order of Fetch's flattened observations; `camera`: in place of the own one."""
+        camera = self.camera if camera is None else camera
+        place, velocity = self.gripper(state), state.body.qvel[physics.GRIPPER] * arm.CONTROL_PERIOD
+        goal = camera.seen(state.goal)
+        if not self.has_object:
+            return jnp.concatenate([place, goal, place, jnp.zeros(2), velocity, jnp.zeros(2)])
+        body = state.body
+        cube = camera.seen(self.cube(state))
+        turn = physics.rotation(body.qpos[physics.CUBE][3:])
+        moving = body.qvel[physics.CUBE_VELOCITY] * arm.CONTROL_PERIOD - velocity
+        turning = jnp.sum(turn * body.qvel[physics.CUBE_TURNING][None], -1) * arm.CONTROL_PERIOD
+        fingers = body.qpos[physics.FINGERS], body.qvel[physics.FINGERS] * arm.CONTROL_PERIOD
+        parts = [cube, goal, place, cube, cube - place, fingers[0], physics.euler(turn), moving, turning, velocity]
+        return jnp.concatenate([*parts, fingers[1]])
+
+    def heuristic(self, obs: Float[Array, " obs"]) -> Float[Array, "4"]:
+        """Return the script's action: the teacher's of what is seen, on a table that nobody has changed."""
+        return act(self.skill, obs[None], post=self.ground.post)[0]
+
+    def _earned(self, after: Situation) -> Float[Array, ""]:
+        distance = self.distance(after)
+        if self.reward == "sparse":
+            return -(distance >= self.within).astype(jnp.float32)
+        if self.reward == "dense" or not self.has_object:
+            return -distance
+        return -distance - WAY * jnp.linalg.norm(self.cube(after) - self.gripper(after))
+
+    def _passed(self, before: Situation, after: Situation) -> Float[Array, ""]:
+        """The side on which the cube has passed the post: that of its last crossing of the line through it, away."""
+        (x, y), was, now = arm.POST_PLACE, self.cube(before), self.cube(after)
+        crosses = (was[0] < x) & (now[0] >= x)
+        return jnp.where(crosses, jnp.where(now[1] > y, 1.0, -1.0), jnp.where(now[0] < x, 0.0, before.passed))
+
+    def _start(self, key: PRNGKeyArray) -> Situation:
+        k_cube, k_goal, k_air, k_lane = jax.random.split(key, 4)
+        high = jnp.asarray(HOME)
+        zero = {"steps": jnp.zeros((), jnp.int32), "passed": jnp.zeros(())}
+        if not self.has_object:
+            goal = high + jax.random.uniform(k_goal, (3,), minval=-SPREAD, maxval=SPREAD)
+            return Situation(physics.standing(high, None), goal, **zero)
+        home = jnp.where((self.grasps > 0) | (self.ground.post > 0), high, jnp.asarray(LOW_HOME))
+        cube, goal = _placed(k_cube, home[:2]), _spread(k_goal, home[:2])
+        before, behind = _in_lane(k_lane)
+        cube, goal = (jnp.where(self.ground.post > 0, *both) for both in ((before, cube), (behind, goal)))
+        up, share = jax.random.uniform(k_air, (2,))
+        height = arm.RESTING + jnp.where((up < 0.5) & (self.grasps > 0), HIGHEST * share, 0.0)
+        return Situation(physics.standing(home, cube), jnp.append(goal, height), **zero)
+
+
+def _spread(key: PRNGKeyArray, middle: Float[Array, "2"]) -> Float[Array, "2"]:
+    return middle + jax.random.uniform(key, (2,), minval=-SPREAD, maxval=SPREAD)
+
+
+def _placed(key: PRNGKeyArray, middle: Float[Array, "2"]) -> Float[Array, "2"]:
+    """A place for the cube, not near the gripper: of several draws the first that will do."""
+    draws = jax.vmap(lambda one: _spread(one, middle))(jax.random.split(key, PLACEMENTS))
+    away = jnp.linalg.norm(draws - middle[None], axis=-1)
+    return draws[jnp.argmax(jnp.where(away >= APART, 1.0, away))]
+
+
+def _in_lane(key: PRNGKeyArray) -> tuple[Float[Array, "2"], Float[Array, "2"]]:
+    """Places for the cube before the post and for the goal behind it."""
+    (near, far), wide = LANE
+    along, across = jax.random.uniform(key, (2, 2))
+    along, across = near + (far - near) * along, wide * (2.0 * across - 1.0)
+    places = jnp.asarray(arm.POST_PLACE)[None] + jnp.stack([jnp.array([-1.0, 1.0]) * along, across], -1)
+    return places[0], places[1]

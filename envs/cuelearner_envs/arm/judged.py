@@ -1,0 +1,112 @@
+"""Episodes of the arm in C MuJoCo: the same starts and policies; finer steps of physics, solved to convergence."""
+
+# pyright: reportAttributeAccessIssue=false
+# (MuJoCo's compiled module has no stubs)
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jaxtyping import Array, Key, PRNGKeyArray
+
+from cuelearner_envs.arm import model as arm
+from cuelearner_envs.arm.environment import Arm
+from cuelearner_envs.arm.physics import Body
+from cuelearner_jax.types import Policy
+
+TIMESTEP, ITERATIONS = 0.002, 100  # [s]; of the solver
+
+
+class Judge:
+    """Grippers side by side in one world."""
+
+    def __init__(self, env: Arm, count: int, timestep: float = TIMESTEP, iterations: int | None = ITERATIONS) -> None:
+        """Make `count` of them; `iterations`: of the solver, as `model.load` has them."""
+        self.model = arm.load(env.has_object, timestep, iterations)
+        if env.has_object:
+            self.model.pair_friction[:, :2] = float(env.ground.friction)
+            self.model.geom("post").pos[2] -= 0.0 if float(env.ground.post) > 0 else 1.0
+        self.data = [mujoco.MjData(self.model) for _ in range(count)]
+        self.steps = round(arm.CONTROL_PERIOD / timestep)
+
+    def place(self, body: Body) -> None:
+        """Put each of them into a configuration, leaves (count, ...)."""
+        for data, qpos, qvel in zip(self.data, np.asarray(body.qpos), np.asarray(body.qvel), strict=True):
+            mujoco.mj_resetData(self.model, data)
+            data.qpos[:], data.qvel[:] = qpos, qvel
+            mujoco.mj_forward(self.model, data)
+
+    def control(self, targets: np.ndarray) -> Body:
+        """Step control (0.04 s) of each with targets (count, drives); return where that led."""
+
+        def one(number: int) -> None:
+            self.data[number].ctrl[:] = targets[number]
+            mujoco.mj_step(self.model, self.data[number], nstep=self.steps)
+
+        with ThreadPoolExecutor(os.cpu_count()) as pool:  # MuJoCo lets go of Python's lock
+            list(pool.map(one, range(len(self.data)), chunksize=max(1, len(self.data) // 8)))
+        return self.body
+
+    @property
+    def body(self) -> Body:
+        """Where they are."""
+        rows = [(data.qpos, data.qvel, data.qacc_warmstart) for data in self.data]
+        return Body(*(jnp.asarray(np.stack(column), jnp.float32) for column in zip(*rows, strict=True)))
+
+
+@jax.jit
+def _begin(env: Arm, keys: Key[Array, " grippers"]) -> Any:
+    return jax.vmap(env.reset)(keys)
+
+
+@jax.jit
+def _targets(env: Arm, states: Any, actions: Array) -> Array:
+    return jax.vmap(lambda state, action: env.command(state, action).all(env.has_object))(states, actions)
+
+
+@jax.jit
+def _after(env: Arm, states: Any, body: Body) -> Any:
+    after = jax.vmap(env.after)(states, body)
+    return after, jax.vmap(env.observe)(after), jax.vmap(env.ends)(after)
+
+
+def rollout(
+    policy: Policy,
+    env: Arm,
+    key: PRNGKeyArray,
+    num_envs: int,
+    steps: int,
+    tell: Callable[[int, int], None] = lambda done, count: None,
+) -> dict[str, np.ndarray]:
+    """Roll out first episodes alone, those of `cuelearner_jax.evaluate.rollout`, in C MuJoCo.
+
+    `tell` is told how many steps of how many each gripper has made.
+
+    Returns:
+        Outcomes of each episode (num_envs,), nan where it has not ended within `steps` shared by all, and "finished".
+    """
+    k_reset, k_run = jax.random.split(key)
+    states, obs = _begin(env, jax.random.split(k_reset, num_envs))
+    judge, choose = Judge(env, num_envs), jax.jit(policy.act)
+    judge.place(states.body)
+    running, found = np.ones(num_envs, bool), {}
+    for index in range(steps // num_envs):
+        tell(index, steps // num_envs)
+        k_act, _ = jax.random.split(jax.random.fold_in(k_run, index))
+        body = judge.control(np.asarray(_targets(env, states, choose(k_act, states, obs))))
+        states, obs, (outcome, truncated) = _after(env, states, body)
+        ended = running & np.asarray(truncated)
+        for name, values in outcome.items():
+            kept = found.setdefault(name, np.full(num_envs, np.nan))
+            kept[ended] = np.asarray(values)[ended]
+        running &= ~ended
+        if not running.any():
+            break
+    return {**found, "finished": 1.0 - running}

@@ -1,0 +1,24 @@
+"""The arm's teacher: a script that sees true places, knows the friction, and prefers a side of the post."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Float
+
+from cuelearner_envs.arm.environment import Arm, Camera, Situation
+from cuelearner_envs.arm.scripts import act
+
+
+class ScriptTeacher(struct.PyTreeNode):
+    """Knows what the script of the skill would do where the gripper, the cube and the goal truly are."""
+
+    env: Arm
+    side: Float[Array, ""] | float = 0.0  # of the post: +1 left, -1 right, 0 the shorter way
+
+    def best_action(self, state: Situation, obs: Float[Array, " obs"]) -> Float[Array, "4"]:
+        """Return the script's action, of what an unchanged camera would show."""
+        true = self.env.observe(state, Camera())[None]
+        ground = self.env.ground
+        friction, post = jnp.asarray(ground.friction), jnp.asarray(ground.post)
+        return act(self.env.skill, true, self.side, friction, post)[0]

@@ -1,0 +1,197 @@
+"""Whole episodes of the arm with a cube, in MJX and in C MuJoCo. One compiled program serves the whole file."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from cuelearner_envs.arm import model as arm
+from cuelearner_envs.arm import physics
+from cuelearner_envs.arm.config import ArmConfig, make_environment
+from cuelearner_envs.arm.environment import Arm
+from cuelearner_envs.arm.judged import Judge, rollout
+from cuelearner_envs.arm.physics import Ground
+from cuelearner_envs.arm.scripts import past, pick
+
+EPISODES, STEPS = 24, 50
+F = jnp.float32
+
+
+def script(env, side, obs):
+    """The scripts of both skills in one program."""
+    friction = env.ground.friction
+    return jnp.where(env.grasps > 0, pick(obs, friction), past(obs, side, friction, env.ground.post))
+
+
+@partial(jax.jit, static_argnames="episodes")
+def walked(env, side, key, episodes=EPISODES):
+    """Final outcomes, and each state with the targets that were told there."""
+
+    def one(carry, number):
+        states, obs = carry
+        keys = jax.random.split(jax.random.fold_in(key, number), episodes)
+        actions = script(env, side, obs)
+        targets = jax.vmap(lambda state, action: env.command(state, action).all(True))(states, actions)
+        following, step = jax.vmap(env.step)(keys, states, actions)
+        return (following, step.obs), (states, obs, targets, step)
+
+    begun = jax.vmap(env.reset)(jax.random.split(key, episodes))
+    states, obs, targets, steps = jax.lax.scan(one, begun, jnp.arange(STEPS))[1]
+    return jax.tree.map(lambda leaf: leaf[-1], steps.outcome), states, obs, targets, steps
+
+
+class Scripted:
+    """The script of `pick` as a policy."""
+
+    def act(self, key, states, obs):
+        return pick(obs)
+
+
+def world(post=1.0, grasps=0.0, friction=1.0):
+    """Both skills as values of one environment's fields."""
+    return Arm(
+        ground=Ground(friction=F(friction), post=F(post)),
+        grasps=F(grasps),
+        within=F(0.05),
+        max_steps=jnp.int32(STEPS),
+        skill="push",
+    )
+
+
+def run(side=0.0, seed=0, episodes=EPISODES, **changes):
+    return jax.device_get(walked(world(**changes), F(side), jax.random.key(seed), episodes))
+
+
+@pytest.fixture(scope="module")
+def pushed():
+    return run()
+
+
+@pytest.fixture(scope="module")
+def picked():
+    return run(post=0.0, grasps=1.0)
+
+
+def test_the_fields_of_a_pick_are_those_of_its_configuration():
+    made = make_environment(ArmConfig("pick"), ())
+    assert (float(made.grasps), float(made.ground.post)) == (1.0, 0.0)
+    made = make_environment(ArmConfig("push"), ())
+    assert (float(made.grasps), float(made.ground.post)) == (0.0, 1.0)
+
+
+def test_scripts_succeed(pushed, picked):
+    assert pushed[0]["success"].mean() >= 0.95
+    assert picked[0]["success"].mean() >= 0.95
+    assert run(post=0.0)[0]["success"].mean() >= 0.95
+
+
+def test_cubes_pass_the_post_on_both_sides_or_on_the_preferred_one(pushed):
+    assert pushed[0]["passed_left"].sum() > 3
+    assert pushed[0]["passed_right"].sum() > 3
+    assert run(side=1.0)[0]["passed_left"].mean() >= 0.9
+    assert run(side=-1.0)[0]["passed_right"].mean() >= 0.9
+
+
+def test_cubes_begin_before_the_post_and_goals_lie_behind(pushed):
+    first = jax.tree.map(lambda leaf: leaf[0], pushed[1])
+    cubes, x = first.body.qpos[:, physics.CUBE][:, :3], arm.POST_PLACE[0]
+    assert (cubes[:, 0] < x - 0.08).all()
+    assert (first.goal[:, 0] > x + 0.08).all()
+    assert np.allclose(cubes[:, 2], arm.RESTING)
+    assert np.allclose(first.goal[:, 2], arm.RESTING)
+
+
+def test_without_a_post_cubes_lie_as_in_fetch(picked):
+    first = jax.tree.map(lambda leaf: leaf[0], picked[1])
+    home = first.body.qpos[:, physics.GRIPPER]
+    off = np.abs(first.body.qpos[:, physics.CUBE][:, :2] - home[:, :2])
+    assert (off <= 0.15 + 1e-5).all()
+    assert (np.linalg.norm(off, axis=-1) >= 0.1).all()
+    heights = first.goal[:, 2] - arm.RESTING
+    assert (heights >= -1e-6).all()
+    assert (heights <= 0.45).all()
+    assert 4 < (heights > 1e-4).sum() < EPISODES - 4  # half of the goals lie in the air
+
+
+def test_nothing_goes_through_anything(pushed, picked):
+    for _, states, *_ in (pushed, picked):
+        cubes = states.body.qpos[..., physics.CUBE]
+        assert cubes[..., 2].min() > arm.RESTING - 0.006  # of the cube, on the table
+        fingers = states.body.qpos[..., physics.FINGERS]
+        assert fingers.min() > -0.008  # a cube may press a finger, whose drive gives way
+        assert fingers.max() < arm.OPEN + 0.008
+    post = np.linalg.norm(pushed[1].body.qpos[..., physics.CUBE][..., :2] - np.array(arm.POST_PLACE), axis=-1)
+    assert post.min() > arm.CUBE + arm.POST_RADIUS - 0.004
+    low = pushed[1].body.qpos[..., 2] < arm.TABLE + arm.POST_HEIGHT + arm.TIP - 0.01
+    gripper = np.linalg.norm(pushed[1].body.qpos[..., :2] - np.array(arm.POST_PLACE), axis=-1)
+    assert gripper[low].min() > arm.POST_RADIUS + arm.FINGER_RADIUS
+
+
+def test_a_slippery_cube_slides_farther(pushed):
+    slid = run(friction=0.05)
+    speed = lambda walk: np.abs(np.diff(walk[1].body.qpos[..., physics.CUBE][..., :2], axis=0)).max()  # noqa: E731
+    assert speed(slid) < 0.1
+    assert slid[0]["success"].mean() < pushed[0]["success"].mean()
+
+
+def test_observations_are_laid_out_as_fetchs(picked):
+    _, states, obs, _, _ = picked
+    body, gripper = states.body, states.body.qpos[..., physics.GRIPPER]
+    cube = body.qpos[..., physics.CUBE][..., :3]
+    for first, wanted in (
+        (0, cube),
+        (3, states.goal),
+        (6, gripper),
+        (9, cube),
+        (12, cube - gripper),
+        (15, body.qpos[..., physics.FINGERS]),
+        (20, (body.qvel[..., physics.CUBE_VELOCITY] - body.qvel[..., physics.GRIPPER]) * 0.04),
+        (26, body.qvel[..., physics.GRIPPER] * 0.04),
+        (29, body.qvel[..., physics.FINGERS] * 0.04),
+    ):
+        assert np.allclose(obs[..., first : first + wanted.shape[-1]], wanted, atol=1e-6)
+    assert obs.shape[-1] == 31
+
+
+def test_reward_is_minus_the_ways_from_gripper_to_cube_to_goal(pushed):
+    _, states, _, _, steps = pushed
+    after = jax.tree.map(lambda leaf: leaf[1:], states)  # no episode ends before the last step
+    cube = after.body.qpos[..., physics.CUBE][..., :3]
+    ways = np.linalg.norm(cube - after.goal, axis=-1)
+    ways += 0.5 * np.linalg.norm(cube - after.body.qpos[..., physics.GRIPPER], axis=-1)
+    assert np.allclose(steps.reward[:-1], -ways, atol=1e-5)
+    assert steps.truncated[-1].all()
+    assert not steps.truncated[:-1].any()
+    assert not steps.terminated.any()
+
+
+@pytest.mark.parametrize("which", ["pushed", "picked"])
+def test_c_mujoco_agrees_step_by_step(which, request):
+    """Each step of control begins where MJX stood."""
+    _, states, _, targets, _ = request.getfixturevalue(which)
+    judge = Judge(world(post=float(which == "pushed")), EPISODES, arm.CONTROL_PERIOD / arm.SUBSTEPS, None)
+    off = []
+    for step in range(0, STEPS - 1, 6):
+        now, following = (jax.tree.map(lambda leaf, n=n: leaf[n], states.body) for n in (step, step + 1))
+        judge.place(now)
+        found = np.asarray(judge.control(targets[step]).qpos)
+        off.append(np.abs(found - following.qpos)[:, :8].max(-1))
+    middle, most = np.quantile(np.array(off), [0.5, 0.9])  # [m]; in hard contacts the few iterations of MJX tell
+    assert middle < 1e-5
+    assert most < 3e-3
+
+
+def test_c_mujoco_judges_the_scripts_alike():
+    """Finer steps, solved to convergence; the gripper's own engine is named by `--engine mujoco`."""
+    found = rollout(Scripted(), world(post=0.0, grasps=1.0), jax.random.key(0), EPISODES, EPISODES * STEPS)
+    assert found["finished"].all()
+    assert found["success"].mean() >= 0.95
+    assert found["distance"].shape == (EPISODES,)
+
+
+@pytest.mark.long
+def test_scripts_succeed_in_nearly_all_of_many_episodes():
+    for changes in ({}, {"post": 0.0}, {"post": 0.0, "grasps": 1.0}):
+        assert run(episodes=500, seed=1, **changes)[0]["success"].mean() >= 0.98
