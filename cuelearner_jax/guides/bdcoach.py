@@ -23,7 +23,6 @@ cue, as no answer is. A cue of which nothing was said teaches H nothing, and H t
 
 from __future__ import annotations
 
-import dataclasses
 from functools import partial
 from typing import Annotated, Any
 
@@ -35,7 +34,7 @@ from jaxtyping import Array, Int, PRNGKeyArray
 from cuelearner_jax.config import GuideScalars
 from cuelearner_jax.config.parts import POSITIVE, part
 from cuelearner_jax.feedback.answers import RELATIVE
-from cuelearner_jax.guides.base import Kind
+from cuelearner_jax.guides.base import Guide, Kind
 from cuelearner_jax.guides.dcoach import Coached, DeepCoach
 from cuelearner_jax.guides.fitting import Lesson, optimizer, squared
 from cuelearner_jax.guides.model import for_each
@@ -92,14 +91,14 @@ class BatchCoach(DeepCoach):
         self, key: PRNGKeyArray, env: Any, labels: Label, former: GuidanceModel, scalars: GuideScalars
     ) -> GuidanceModel:
         """The former policy and human model, moved on by each label that is new, in the order in which they came."""
-        rows = self.lessons(labels, scalars)
+        rows, answered = self.lessons(labels, scalars), Guide.lessons(self, labels, scalars)
         order = jnp.argsort(~rows.valid, stable=True)
         count, adam = rows.valid.sum(), optimizer(scalars)
 
-        def batch_of(key: PRNGKeyArray, number: Int[Array, ""]) -> Lesson:
-            """A minibatch of the first labels up to `number`, which is the first row of it."""
+        def batch_of(key: PRNGKeyArray, number: Int[Array, ""]) -> tuple[Lesson, Lesson]:
+            """A minibatch of the first labels up to `number`, its first row: for the policy, for the human model."""
             numbers = jax.random.randint(key, (self.sizes.fit_batch_size,), 0, number + 1).at[0].set(number)
-            return jax.tree.map(lambda leaf: leaf[order[numbers]], rows)
+            return jax.tree.map(lambda leaf: leaf[order[numbers]], (rows, answered))
 
         def taught(coached: BatchCoached, batch: Lesson) -> BatchCoached:
             gradient = jax.grad(lambda human: self.modelled(env, human, batch, scalars))(coached.human)
@@ -124,18 +123,18 @@ class BatchCoach(DeepCoach):
         def corrected(key: PRNGKeyArray, number: Int[Array, ""], coached: BatchCoached) -> BatchCoached:
             """By label `number` of those that count, then by the buffer up to it."""
             keys = jax.random.split(jax.random.fold_in(key, number), 3)
-            batch = batch_of(keys[0], number)
+            batch, told = batch_of(keys[0], number)
             first = jnp.arange(self.sizes.fit_batch_size) == 0
-            coached = moved(keys[1], taught(coached, batch), batch, first)
+            coached = moved(keys[1], taught(coached, told), batch, first)
 
             def turn(coached: BatchCoached, key: PRNGKeyArray) -> tuple[BatchCoached, None]:
                 k_human, k_batch, k_see = jax.random.split(key, 3)
 
                 def one(coached: BatchCoached, key: PRNGKeyArray) -> tuple[BatchCoached, None]:
-                    return taught(coached, batch_of(key, number)), None
+                    return taught(coached, batch_of(key, number)[1]), None
 
                 coached, _ = jax.lax.scan(one, coached, jax.random.split(k_human, self.options.human_steps))
-                return moved(k_see, coached, batch_of(k_batch, number), jnp.zeros_like(first)), None
+                return moved(k_see, coached, batch_of(k_batch, number)[0], jnp.zeros_like(first)), None
 
             coached, _ = jax.lax.scan(turn, coached, jax.random.split(keys[2], self.options.batch_steps))
             return coached.replace(learned=number + 1)
@@ -146,8 +145,12 @@ class BatchCoach(DeepCoach):
         return GuidanceModel(for_each(self.sizes.ensemble, learned, key, former.params), former.fitted | (count > 0))
 
 
-KIND = dataclasses.replace(
-    Kind("bdcoach", "a policy moved by a model of its teacher", BatchCoach, form=RELATIVE, colour="#CC6677"),
+KIND = Kind(
+    "bdcoach",
+    "a policy moved by a model of its teacher",
+    BatchCoach,
+    form=RELATIVE,
     title="BD-COACH",
+    colour="#CC6677",
     config=Config,
 )

@@ -59,7 +59,7 @@ class Searching:
 
     sampled_actions: Annotated[int, Bounds(4)] = 32
     """Actions between which the energy is compared in a step of a fit, for each label."""
-    searched_actions: Annotated[int, POSITIVE] = 256
+    searched_actions: Annotated[int, Bounds(2)] = 256
     """Actions among which the least energy is looked for at first."""
 
 
@@ -91,6 +91,7 @@ class Contrast(struct.PyTreeNode):
     answer: Float[Array, " answer"]
     valid: Bool[Array, ""]
     draw: Int[Array, ""]  # number of the random numbers with which it is sampled
+    base: Float[Array, " action"]  # what a finished policy did, where labels keep it; else the action
 
 
 def log_nearer(apart: Float[Array, "..."], closer: Float[Array, "..."], softness: float) -> Float[Array, "..."]:
@@ -99,47 +100,44 @@ def log_nearer(apart: Float[Array, "..."], closer: Float[Array, "..."], softness
 
 
 def log_desired(
-    x: Float[Array, "b cues"], h: Float[Array, " cues"], implicit: Float[Array, "pairs cues"], gamma: Array | float
-) -> Float[Array, " b"]:
-    """Return the mean over pairs of the log-probabilities that actions lie on the desired side, see the module.
+    x: Float[Array, " cues"], h: Float[Array, " cues"], implicit: Float[Array, "pairs cues"], gamma: Array | float
+) -> Float[Array, ""]:
+    """Return the mean over pairs of the log-probabilities that an action lies on the desired side, see the module.
 
     Args:
-        x: actions as seen from the one asked about, along the cues, in units of eps.
+        x: the action as seen from the one asked about, along the cues, in units of eps.
         h: the answer, with `UNSAID`.
         implicit: directions u_i, as long as h.
         gamma: see `Config`.
     """
     spoken = said(h)
     x, h = jnp.where(spoken, x, 0.0), jnp.where(spoken, h, 0.0)
-    size = lambda vectors: jnp.sqrt(jnp.sum(jnp.square(vectors), -1) + 1e-12)  # noqa: E731
-    half = log_nearer(size(x), size(x - gamma * h), SOFTNESS)
+    half = log_nearer(_size(x), _size(x - gamma * h), SOFTNESS)
     if len(h) > 1:
-        worse = size(x[:, None] - gamma * h - (1 - gamma) * implicit)
-        pairs = log_nearer(worse, size(x - h)[:, None], SOFTNESS).mean(-1)
-        half = (pairs + FIRST_PAIRS * half) / (1 + FIRST_PAIRS)
-    sides = jnp.array([1.0, -1.0])
-    right = log_nearer(jnp.abs(x[..., None] - sides), jnp.abs(x)[..., None], SOFTNESS).mean(-1)
+        worse = jax.vmap(lambda u: _size(x - gamma * h - (1 - gamma) * u))(implicit)
+        half = (log_nearer(worse, _size(x - h), SOFTNESS).mean() + FIRST_PAIRS * half) / (1 + FIRST_PAIRS)
+    right = [log_nearer(jnp.abs(x - side), jnp.abs(x), SOFTNESS) for side in (1.0, -1.0)]
     still, moving = spoken & (h == 0), (h != 0).sum()
-    held = jnp.sum(right, -1, where=still)
+    held = jnp.sum((right[0] + right[1]) / 2, where=still)
     return (moving * half + held) / jnp.maximum(moving + still.sum(), 1)
 
 
-def directions_at(
-    key: PRNGKeyArray, h: Float[Array, " cues"], angle: Array | float, count: int
-) -> Float[Array, "count cues"]:
-    """Return random directions, as long as h and `angle` [rad] away from it, along the cues of which h speaks.
+def direction_at(key: PRNGKeyArray, h: Float[Array, " cues"], angle: Array | float) -> Float[Array, " cues"]:
+    """Return a random direction, as long as h and `angle` [rad] away from it, along the cues of which h speaks.
 
     Along one such cue alone there is no other direction: h itself.
     """
     spoken = said(h)
     h = jnp.where(spoken, h, 0.0)
-    long = jnp.sqrt(jnp.sum(jnp.square(h)) + 1e-12)
-    drawn = jnp.where(spoken, jax.random.normal(key, (count, len(h))), 0.0)
-    across = drawn - (drawn @ h)[:, None] * h / long**2
-    size = jnp.sqrt(jnp.sum(jnp.square(across), -1, keepdims=True))
-    found = size > 1e-3
-    unit = across / jnp.where(found, size, 1.0)
-    return jnp.where(found, jnp.cos(angle) * h + jnp.sin(angle) * long * unit, h)
+    drawn = jnp.where(spoken, jax.random.normal(key, h.shape), 0.0)
+    across = drawn - jnp.sum(drawn * h) / jnp.maximum(jnp.sum(h * h), 1.0) * h
+    size = _size(across)
+    aside = jnp.cos(angle) * h + jnp.sin(angle) * _size(h) / size * across
+    return jnp.where(size > 1e-3, aside, h)
+
+
+def _size(vector: Float[Array, " cues"]) -> Float[Array, ""]:
+    return jnp.sqrt(jnp.sum(jnp.square(vector)) + 1e-12)
 
 
 class Clic(Guide):
@@ -159,9 +157,15 @@ class Clic(Guide):
         )
 
     def energy(
-        self, env: Any, params: Params, obs: Float[Array, " obs"], actions: Float[Array, "m action"]
+        self,
+        env: Any,
+        params: Params,
+        obs: Float[Array, " obs"],
+        actions: Float[Array, "m action"],
+        base: Float[Array, " action"] | None,
+        scalars: GuideScalars,
     ) -> Float[Array, " m"]:
-        """Return E of actions in one situation."""
+        """Return E of actions in one situation; whatever the policy did there (`base`), it is the same."""
         return -self.network.predict(env, params, obs, actions)[:, 0]
 
     def around(self, row: Contrast, scalars: GuideScalars) -> Float[Array, " action"]:
@@ -174,9 +178,10 @@ class Clic(Guide):
     ) -> Float[Array, " m"]:
         """Return log p(b in A) of actions, A the desired set of one label."""
         space, options = self.spaces.actions, self.options
-        x = space.log(row.action, actions) / space.from_unit(scalars.eps_deg)
-        implicit = directions_at(key, row.answer, jnp.deg2rad(options.angle_deg), options.implicit_pairs)
-        return SHARPNESS * log_desired(x, row.answer, implicit, options.gamma)
+        x = space.log(jnp.broadcast_to(row.action, actions.shape), actions) / space.from_unit(scalars.eps_deg)
+        angle, keys = jnp.deg2rad(options.angle_deg), jax.random.split(key, options.implicit_pairs)
+        implicit = jax.vmap(lambda key: direction_at(key, row.answer, angle))(keys)
+        return SHARPNESS * jax.vmap(lambda x: log_desired(x, row.answer, implicit, options.gamma))(x)
 
     def sampled(self, key: PRNGKeyArray, row: Contrast, scalars: GuideScalars) -> Float[Array, "m action"]:
         """Return the actions among which one label's are told apart: two known ones, uniform ones, and ones near a."""
@@ -193,15 +198,15 @@ class Clic(Guide):
         def one(row: Contrast) -> Array:
             k_pairs, k_sample = jax.random.split(jax.random.fold_in(jax.random.key(0), row.draw))
             actions = self.sampled(k_sample, row, scalars)
-            log_pi = jax.nn.log_softmax(-self.energy(env, params, row.obs, actions))
+            log_pi = jax.nn.log_softmax(-self.energy(env, params, row.obs, actions, row.base, scalars))
             return -jax.nn.logsumexp(log_pi + self.membership(k_pairs, row, actions, scalars))
 
         return jax.vmap(one)(rows)
 
     def contrasts(self, labels: Label) -> Contrast:
         """Return what is learned of labels (slots, ...); one that says nothing of any cue does not count."""
-        numbers = jnp.arange(len(labels.valid))
-        return Contrast(labels.obs, labels.action, labels.answer, labels.valid & self.told(labels), numbers)
+        numbers, base = jnp.arange(len(labels.valid)), labels.action if labels.base is None else labels.base
+        return Contrast(labels.obs, labels.action, labels.answer, labels.valid & self.told(labels), numbers, base)
 
     def told(self, labels: Label) -> Bool[Array, " slots"]:
         """Return which labels say anything."""
@@ -227,21 +232,27 @@ class Clic(Guide):
         params: Params,
         obs: Float[Array, " obs"],
         base: Float[Array, " action"],
-        bound: Float[Array, ""],
+        scalars: GuideScalars,
     ) -> Float[Array, " action"]:
-        """Return the action of least energy within `bound` of `base`, as a deterministic search finds it."""
-        space, count, cues = self.spaces.actions, self.options.searched_actions, len(self.spaces.actions.cues)
-        offsets = Box((-1.0,) * cues, (1.0,) * cues).spread(AROUND)
+        """Return the action of least energy within tau_max of `base`, as a deterministic search finds it."""
+        space, cues = self.spaces.actions, len(self.spaces.actions.cues)
+        bound = jnp.minimum(space.from_unit(scalars.tau_max_deg), space.from_unit(space.reach))
+        count = self.options.searched_actions
 
         def best(actions: Float[Array, "m action"]) -> Float[Array, " action"]:
             actions = space.clip(actions, jnp.broadcast_to(base, actions.shape), bound)
-            return actions[jnp.argmin(self.energy(env, params, obs, actions))]
+            return actions[jnp.argmin(self.energy(env, params, obs, actions, base, scalars))]
 
-        found = best(jnp.concatenate([base[None], space.spread(count)]))
-        wide = 2.0 * jnp.minimum(space.from_unit(space.reach), bound) * count ** (-1.0 / cues)
+        def box(center: Array, half: Array, count: int) -> Float[Array, "count action"]:
+            """Actions spread evenly around one, up to `half` away along each cue."""
+            offsets = Box((-1.0,) * cues, (1.0,) * cues).spread(count)
+            return space.exp(jnp.broadcast_to(center, (count, space.size)), half * offsets)
+
+        everywhere = count // 2
+        found = best(jnp.concatenate([base[None], space.spread(everywhere), box(base, bound, count - everywhere)]))
+        half = 2.0 * bound * count ** (-1.0 / cues)
         for number in range(PASSES):
-            near = space.exp(jnp.broadcast_to(found, (AROUND, space.size)), 0.5**number * wide * offsets)
-            found = best(jnp.concatenate([found[None], near]))
+            found = best(jnp.concatenate([found[None], box(found, 0.5**number * half, AROUND)]))
         return found
 
     def act(
@@ -254,12 +265,11 @@ class Clic(Guide):
         scalars: GuideScalars,
     ) -> Refined:
         """The action of least energy within tau_max of a, in active rows of a fitted model."""
-        bound = self.spaces.actions.from_unit(scalars.tau_max_deg)
         guided = active & model.fitted
 
         def choose(where: Array) -> Array:
             seen, base = jnp.split(where, [obs.shape[1]])
-            return self.least(env, model.params, seen, base, bound)
+            return self.least(env, model.params, seen, base, scalars)
 
         chosen = each_in_portions(choose, jnp.concatenate([obs, actions], -1), self.options.searched_actions)
         return Refined(jnp.where(guided[:, None], chosen, actions), guided.astype(jnp.int32))
@@ -273,7 +283,7 @@ class Clic(Guide):
         scalars: GuideScalars,
     ) -> Float[Array, " m"]:
         """-E of actions; 0 of all before the first fit."""
-        return jnp.where(model.fitted, -self.energy(env, model.params, obs, actions), 0.0)
+        return jnp.where(model.fitted, -self.energy(env, model.params, obs, actions, None, scalars), 0.0)
 
 
 class ClicShown(Clic):
@@ -293,9 +303,9 @@ class ClicShown(Clic):
         """Return log p(b in A) of actions, A the ball around what was shown."""
         space = self.spaces.actions
         eps = space.from_unit(scalars.eps_deg)
-        away, base = space.log(row.answer, actions) / eps, space.log(row.answer, row.action) / eps
-        size = lambda vectors: jnp.sqrt(jnp.sum(jnp.square(vectors), -1))  # noqa: E731
-        return SHARPNESS * log_nearer(self.options.radius * size(base), size(away), SOFTNESS / 2)
+        away = jax.vmap(lambda action: _size(space.log(row.answer, action) / eps))(actions)
+        radius = self.options.radius * _size(space.log(row.answer, row.action) / eps)
+        return SHARPNESS * log_nearer(radius, away, SOFTNESS / 2)
 
 
 KIND = Kind(
