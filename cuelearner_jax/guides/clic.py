@@ -50,7 +50,7 @@ SOFTNESS = 0.5  # of a set's edge, in units of eps: 0.1 in actions from -1 to 1,
 NEAR = 2.0  # standard deviation of the actions sampled around the one asked about, in units of eps
 FIRST_PAIRS = 0.3  # weight of the half-space beside all implicit pairs together
 PASSES = 6  # of the search around the best action so far, each in a box of half the size
-AROUND = 16  # actions of such a pass
+AROUND = 4  # actions of such a pass, for each cue
 
 
 @part
@@ -252,7 +252,7 @@ class Clic(Guide):
         found = best(jnp.concatenate([base[None], space.spread(everywhere), box(base, bound, count - everywhere)]))
         half = 2.0 * bound * count ** (-1.0 / cues)
         for number in range(PASSES):
-            found = best(jnp.concatenate([found[None], box(found, 0.5**number * half, AROUND)]))
+            found = best(jnp.concatenate([found[None], box(found, 0.5**number * half, AROUND * cues)]))
         return found
 
     def act(
