@@ -95,7 +95,7 @@ def halls(split: str) -> Opened:
     from cuelearner_envs.navigation.config import NavigationConfig, make_environment
     from cuelearner_jax.tasks.navigation import NAVIGATION_SCALARS, make_teacher
 
-    config = NavigationConfig(worlds=256)
+    config = NavigationConfig(worlds=64)
     env, shown = make_environment(config, "training"), make_environment(config, split)
     scalars = dataclasses.replace(NAVIGATION_SCALARS, tau_deg=1.0)
 
@@ -213,7 +213,10 @@ def configured(kind: Kind, settings: Settings, scalars: Scalars, condition: Cond
 def learned(
     world: World, opened: Opened, name: str, settings: Settings, condition: Condition, seeds: Sequence[int], most: int
 ) -> Iterator[tuple[int, Any]]:
-    """The policies of all seeds after each round of questions, up to `most` labels: (labels so far, policies)."""
+    """The policies of all seeds after each round of questions, up to `most` labels: (labels so far, policies).
+
+    Whoever needs fewer labels stops before: the program is the same.
+    """
     kind = kind_of(world, name)
     sizes, scalars, options = configured(kind, settings, opened.scalars, condition)
     guide = kind.make(sizes, spaces_of(opened.env), options)
@@ -241,8 +244,12 @@ def measured(
     seeds: Sequence[int],
     budgets: Sequence[int],
     count: int,
+    most: int,
 ) -> Iterator[list[Row]]:
-    """The rows of a kind: success of each seed after each budget, a list as soon as all of one run are there."""
+    """The rows of a kind: success of each seed after each budget, a list as soon as all of one run are there.
+
+    `most`: labels for which there is room, as in `learned`.
+    """
     cues = len(actions_of(opened.env).cues)
     for condition in conditions:
         if not means(cues, condition, kind_of(world, name)):
@@ -250,12 +257,14 @@ def measured(
         for group in [tuple(seeds)] if opened.at_once else [(seed,) for seed in seeds]:
             rows = []
             at = {max(budgets)} if condition.name == "shuffled" else set(budgets)
-            for asked, policies in learned(world, opened, name, settings, condition, group, max(budgets)):
+            for asked, policies in learned(world, opened, name, settings, condition, group, most):
                 if asked in at:
                     success = opened.play(policies, group, count).mean(-1)
                     about = {"condition": condition.name, "labels": asked}
                     told = zip(group, success, strict=True)
                     rows += [{**about, "seed": seed, "success": round(float(each), 4)} for seed, each in told]
+                if asked == max(budgets):
+                    break
             yield rows
 
 

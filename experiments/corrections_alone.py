@@ -140,7 +140,7 @@ def runs_of(piece: str, scale: Scale, tuning: bool, known: set[tuple[Any, ...]])
     """The rows of a piece, a list a run, but for conditions that are known."""
     world, kind = piece.split("/")
     split = "tuning" if tuning else "validation"
-    seeds = [FIRST_SEED[split] + number for number in range(min(scale.seeds, 2) if tuning else scale.seeds)]
+    seeds = [FIRST_SEED[split] + number for number in range(scale.seeds)]
     if kind == "base":
         if not known:
             yield without_labels(opened(world, split), seeds, scale.episodes)
@@ -153,12 +153,12 @@ def runs_of(piece: str, scale: Scale, tuning: bool, known: set[tuple[Any, ...]])
     place = WORLDS[world], opened(world, split), kind
     if not tuning:
         settings = {**CHOSEN.get(WORLDS[world].tuned_in or world, {}).get(kind, {}), **(scale.settings or {})}
-        yield from measured(*place, settings, conditions, seeds, scale.budgets, scale.episodes)
+        yield from measured(*place, settings, conditions, seeds, scale.budgets, scale.episodes, max(scale.budgets))
         return
     budgets = (min(TUNED_LABELS, max(scale.budgets)),)
     for settings in settings_of(world, kind):
         tried = {**settings, **(scale.settings or {})}
-        for rows in measured(*place, tried, CONDITIONS[:1], seeds, budgets, scale.episodes):
+        for rows in measured(*place, tried, CONDITIONS[:1], seeds, budgets, scale.episodes, max(scale.budgets)):
             yield [{**row, "settings": settings} for row in rows]
 
 
