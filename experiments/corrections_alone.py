@@ -83,7 +83,30 @@ def settings_of(world: str, kind: str) -> list[dict[str, Any]]:
 
 
 FRAMES: Mapping[str, dict[str, Any]] = {"halls": {"sizes.frame": "action"}}  # as the adaptation studies found best
-CHOSEN: Mapping[str, Mapping[str, Settings]] = {}
+SLOW, FAST = ({"scalars.feedback_learning_rate": rate} for rate in (1e-3, 3e-3))
+IN_HALLS = FRAMES["halls"]
+CHOSEN: Mapping[str, Mapping[str, Settings]] = {
+    "halls": {
+        "relative": {**IN_HALLS, **FAST, "scalars.eps_deg": 20.0},
+        "dcoach": {**IN_HALLS, **SLOW, "scalars.eps_deg": 40.0},
+        "bdcoach": {**IN_HALLS, **FAST, "scalars.eps_deg": 40.0},
+        "clic": {**IN_HALLS, **SLOW, "scalars.eps_deg": 40.0},
+    },
+    "grasp": {
+        "relative": {**FAST, "scalars.eps_deg": 0.1},
+        "dcoach": {**FAST, "scalars.eps_deg": 0.2},
+        "bdcoach": {**SLOW, "scalars.eps_deg": 0.1},
+        "clic": {**SLOW, "scalars.eps_deg": 0.1},
+        "demonstration": {**FAST, "sizes.fit_steps": 600},
+        "scalar": {**SLOW, "scalars.scalar_within_deg": 0.2},
+        "clic-shown": {**FAST, "radius": 0.1},
+    },
+    # Not compared there at the scale `quick`: step sizes of `grasp`, and the strength of answers of fetch_hand_eye.py.
+    "reach": {
+        **dict.fromkeys(("offset", "relative", "dcoach", "demonstration"), FAST),
+        **dict.fromkeys(("bdcoach", "clic", "scalar"), SLOW),
+    },
+}
 
 
 class Scale(NamedTuple):
@@ -92,15 +115,20 @@ class Scale(NamedTuple):
     about: str
     budgets: tuple[int, ...]
     seeds: int
+    seeds_played: int  # of worlds that Gymnasium plays, one environment at a time
     episodes: int
     settings: Settings | None = None  # of the networks
+
+    def seeds_in(self, world: str) -> int:
+        """Label seeds of a world."""
+        return self.seeds_played if WORLDS[world].adapts else self.seeds
 
 
 TINY = {"sizes.feedback_layers": (8,), "sizes.fit_steps": 20, "sizes.fit_batch_size": 8}
 SCALES = {
-    "smoke": Scale("seconds a piece", (25,), 1, 2, TINY),
-    "quick": Scale("a minute a piece on one core", (25, 100, 250), 4, 25),
-    "paper": Scale("what is to be reported at length", (25, 100, 250, 500), 10, 100),
+    "smoke": Scale("seconds a piece", (25,), 1, 1, 2, TINY),
+    "quick": Scale("a minute a piece on one core", (25, 100, 250), 4, 2, 25),
+    "paper": Scale("what is to be reported at length", (25, 100, 250, 500), 10, 10, 100),
 }
 
 
@@ -121,7 +149,7 @@ def calibrated(world: str, conditions: Sequence[Condition], scale: Scale, split:
     from cuelearner_jax.policies import policy_of
 
     environment = {"reach": "FetchReach-v4", "push": "FetchPush-v4"}[world]
-    for number in range(scale.seeds):
+    for number in range(scale.seeds_in(world)):
         seed = FIRST_SEED[split] + number
         for condition, labels in product(conditions, scale.budgets):
             if condition.name == "shuffled":  # measured in fetch_hand_eye.py
@@ -140,7 +168,7 @@ def runs_of(piece: str, scale: Scale, tuning: bool, known: set[tuple[Any, ...]])
     """The rows of a piece, a list a run, but for conditions that are known."""
     world, kind = piece.split("/")
     split = "tuning" if tuning else "validation"
-    seeds = [FIRST_SEED[split] + number for number in range(scale.seeds)]
+    seeds = [FIRST_SEED[split] + number for number in range(scale.seeds_in(world))]
     if kind == "base":
         if not known:
             yield without_labels(opened(world, split), seeds, scale.episodes)
