@@ -91,6 +91,8 @@ CHOSEN: Mapping[str, Mapping[str, Settings]] = {
         "dcoach": {**IN_HALLS, **SLOW, "scalars.eps_deg": 40.0},
         "bdcoach": {**IN_HALLS, **FAST, "scalars.eps_deg": 40.0},
         "clic": {**IN_HALLS, **SLOW, "scalars.eps_deg": 40.0},
+        "demonstration": {**IN_HALLS, **FAST, "sizes.fit_steps": 600},
+        "scalar": {**IN_HALLS, **SLOW, "scalars.scalar_within_deg": 20.0},
     },
     "grasp": {
         "relative": {**FAST, "scalars.eps_deg": 0.1},
@@ -190,6 +192,16 @@ def runs_of(piece: str, scale: Scale, tuning: bool, known: set[tuple[Any, ...]])
             yield [{**row, "settings": settings} for row in rows]
 
 
+def whole(rows: Sequence[Row], seeds: int) -> list[Row]:
+    """The rows of conditions that were measured with all seeds and budgets: others are measured anew."""
+    kept = []
+    for condition in dict.fromkeys(row["condition"] for row in rows):
+        own = [row for row in rows if row["condition"] == condition]
+        if len(own) == seeds * len({row["labels"] for row in own}):
+            kept += own
+    return kept
+
+
 def run(piece: str, scale: str, tuning: bool, out: Path, resume: bool) -> None:
     """Measure a piece and write after each run. Raises UserError for a file that is there and is not gone on with."""
     file, rows = out / f"{piece}.json", []
@@ -201,7 +213,7 @@ def run(piece: str, scale: str, tuning: bool, out: Path, resume: bool) -> None:
             raise UserError(f"{file} is of the scale {found['scale']}, tuning {found['tuning']}: give another --out")
         if found["finished"]:
             return
-        rows = [] if tuning else found["rows"]
+        rows = [] if tuning else whole(found["rows"], SCALES[scale].seeds_in(piece.split("/", maxsplit=1)[0]))
     command = f"corrections_alone.py --scale {scale} {'--tuning ' if tuning else ''}--pieces {piece}"
     about = {"scale": scale, "tuning": tuning, **provenance(), "command": command}
 

@@ -84,3 +84,12 @@ def test_labels_that_match_the_reference_are_read_between_budgets(page):
 
 def test_the_page_is_what_was_recorded(page):
     assert page.table(page.read(DATA)) in PAGE.read_text(encoding="utf-8")
+
+
+def test_a_condition_that_was_interrupted_is_measured_anew(study):
+    def rows(condition, *cells):
+        return [{"condition": condition, "seed": seed, "labels": labels} for seed, labels in cells]
+
+    plain = rows("plain", (0, 25), (0, 100), (1, 25), (1, 100))
+    assert study.whole([*plain, *rows("wrong", (0, 25), (0, 100), (1, 25))], seeds=2) == plain
+    assert study.whole(rows("one", (0, 25), (0, 100)), seeds=2) == []
