@@ -47,14 +47,14 @@ class CorrectingEnergy(clic.Clic):
         space = self.spaces.actions
         first = jnp.broadcast_to(actions[0] if base is None else base, actions.shape)
         turns = space.log(first, actions) / space.from_unit(scalars.eps_deg)
-        return super().energy(env, params, obs, jnp.concatenate([actions, turns], -1), base, scalars)
+        return -self.network.predict(env, params, obs, jnp.concatenate([actions, turns], -1))[:, 0]
 
     def disagreement(
         self, model: Any, env: Any, obs: Float[Array, "n obs"], actions: Float[Array, "n action"]
     ) -> Float[Array, " n"]:
         """Variance of the members' energies of actions that nothing has turned."""
         still = jnp.zeros((len(actions), len(self.spaces.actions.cues)))
-        return super().disagreement(model, env, obs, jnp.concatenate([actions, still], -1))
+        return self.network.disagreement(env, model.params, obs, jnp.concatenate([actions, still], -1))
 
 
 KIND = replace(
