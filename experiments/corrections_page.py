@@ -143,6 +143,7 @@ def draw(curves: Curves, stem: Path) -> None:
             base = curves.get((world, "base", "plain"))
             if base is not None:
                 axes.axhline(100 * float(base.success.mean()), color=GREY, linestyle=":", label="no labels")
+            axes.set_visible(any((world, kind, teacher) in curves for kind in KINDS[world]))
             for kind in KINDS[world]:
                 curve = curves.get((world, kind, teacher))
                 if kind != "base" and curve is not None and len(curve.budgets) > 1:

@@ -325,4 +325,5 @@ SHOWN = Kind(
     title="CLIC, demonstrations",
     colour="#44AA99",
     config=ShownConfig,
+    by_cues=True,
 )

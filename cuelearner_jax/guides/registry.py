@@ -83,7 +83,7 @@ def possible(env: Any, taught: bool) -> tuple[str, ...]:
     """Names of the kinds that an agent can be trained with; `taught`: is there a teacher to ask?"""
     trained = (kind for kind in known() if not kind.adapts_only and (taught or not kind.asks))
     cues = actions_of(env).cues
-    said = (kind for kind in trained if cues or kind.form is None or not kind.form.by_eps)
+    said = (kind for kind in trained if cues or not kind.needs_cues)
     return tuple(kind.name for kind in said if all(offers(env, need) for need in kind.needs))
 
 

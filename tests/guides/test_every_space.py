@@ -189,7 +189,7 @@ def test_lessons_of_one_cue_count_whole():
     assert float(squared(lesson, jnp.array([[3.0]]))[0]) == 9.0
 
 
-@pytest.mark.parametrize("kind", ["relative", "offset", "dcoach", "bdcoach", "clic", "calibration"])
+@pytest.mark.parametrize("kind", ["relative", "offset", "dcoach", "bdcoach", "clic", "clic-shown", "calibration"])
 def test_a_kind_of_cues_refuses_choices_without_an_order_in_one_line(kind):
     with pytest.raises(UserError, match="have no order: give them one") as refusal:
         registry.make(kind, SIZES, Anywhere(FRUIT))
