@@ -1,11 +1,11 @@
-"""Deep COACH as a correction of a finished policy, which begins at nothing: what adaptation is compared with.
+"""Deep COACH and BD-COACH as corrections of a finished policy, which begin at nothing: for comparison with adaptation.
 
 Source: Perez-Dattari et al. (ISER 2018), see `cuelearner_jax/guides/dcoach.py`. There the policy that is corrected is
 one network, which would begin at random where a finished policy is at hand. So the network is what is added to that
 policy's action. Its last layer begins at zero: before the first correction the policy stays what it was.
 
-It is a kind of guidance, so the program of adaptation runs it as it runs relative feedback; on the command line it is
-named as `_coach:KIND`, with this folder on the path of Python.
+They are kinds of guidance, so the program of adaptation runs them as it runs relative feedback; on the command line
+they are named as `_coach:KIND` and `_coach:BATCH`, with this folder on the path of Python.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from cuelearner_jax.config import GuideScalars
-from cuelearner_jax.guides import dcoach
+from cuelearner_jax.guides import bdcoach, dcoach
 from cuelearner_jax.guides.fitting import Lesson
 from cuelearner_jax.guides.refining import Refined
 from cuelearner_jax.types import GuidanceModel, Label, Params
@@ -62,10 +62,21 @@ class CoachedCorrection(dcoach.DeepCoach):
         return self.act(model, env, labels.obs, labels.base, active, scalars)
 
 
+class BatchCoachedCorrection(CoachedCorrection, bdcoach.BatchCoach):
+    """A correction moved by a model of the teacher, which is asked about the corrected actions."""
+
+
 KIND = replace(
     dcoach.KIND,
     name="dcoach-correction",
     about="a correction moved by each label, which begins at nothing",
     guide=CoachedCorrection,
+    sees_base=True,
+)
+BATCH = replace(
+    bdcoach.KIND,
+    name="bdcoach-correction",
+    about="a correction moved by a model of the teacher, which begins at nothing",
+    guide=BatchCoachedCorrection,
     sees_base=True,
 )

@@ -41,6 +41,7 @@ class Kind:
     colour: str | None = None  # in figures
     config: type | None = None  # a frozen dataclass of the options that this kind alone has; None: it has none
     sees_base: bool = False  # does it look at what a finished policy did? Then it serves adaptation alone
+    by_cues: bool = False  # does its model measure along cues, whatever its answers say?
     by_evidence: bool = False  # does `calibration` read its answers? Then it has no model, and serves adaptation alone
 
     def __post_init__(self) -> None:
@@ -51,6 +52,11 @@ class Kind:
     def asks(self) -> bool:
         """Whether it asks a teacher."""
         return self.form is not None
+
+    @property
+    def needs_cues(self) -> bool:
+        """Whether it means nothing in a space whose actions have no cues."""
+        return self.by_cues or (self.form is not None and self.form.by_eps)
 
     @property
     def adapts_only(self) -> bool:
@@ -93,10 +99,11 @@ class Guide:
     options: Any = None  # a `Kind.config`
 
     def __post_init__(self) -> None:
-        """Raises UserError for a kind whose answers say which way, in a space where there is no way."""
-        if self.form is not None and self.form.by_eps and not self.spaces.actions.cues:
+        """Raises UserError for a kind whose answers or model are about ways, in a space where there is no way."""
+        if self.kind.needs_cues and not self.spaces.actions.cues:
+            told = "measures" if self.kind.by_cues else "asks"
             raise UserError(
-                f"guidance {self.name!r} asks which way to change an action, and the {self.spaces.actions.name} have "
+                f"guidance {self.name!r} {told} which way to change an action, and the {self.spaces.actions.name} have "
                 "no order: give them one (`Choices(count, order)`), or guidance demonstration or scalar"
             )
 

@@ -13,14 +13,27 @@ from typing import Any
 from cuelearner_jax.config import GuideSizes
 from cuelearner_jax.environment import actions_of, offers, spaces_of
 from cuelearner_jax.errors import UserError, closest
-from cuelearner_jax.guides import aims, calibration, dcoach, demonstration, intent, offset, relative, scalar, untaught
+from cuelearner_jax.guides import (
+    aims,
+    bdcoach,
+    calibration,
+    clic,
+    dcoach,
+    demonstration,
+    intent,
+    offset,
+    relative,
+    scalar,
+    untaught,
+)
 from cuelearner_jax.guides.base import Guide, Kind
 from cuelearner_jax.plugins import load
 
 ENTRY_POINTS = "cuelearner.guidances"
 
 _TAUGHT = (demonstration.KIND, scalar.KIND, dcoach.KIND, offset.KIND, calibration.KIND)
-_BUILT_IN = (untaught.NONE, relative.KIND, intent.KIND, untaught.HEURISTIC, aims.ANY_AIM, aims.RULE, *_TAUGHT)
+_PEERS = (bdcoach.KIND, clic.KIND, clic.SHOWN)
+_BUILT_IN = (untaught.NONE, relative.KIND, intent.KIND, untaught.HEURISTIC, aims.ANY_AIM, aims.RULE, *_TAUGHT, *_PEERS)
 _KINDS: dict[str, Kind] = {kind.name: kind for kind in _BUILT_IN}
 
 
@@ -70,7 +83,7 @@ def possible(env: Any, taught: bool) -> tuple[str, ...]:
     """Names of the kinds that an agent can be trained with; `taught`: is there a teacher to ask?"""
     trained = (kind for kind in known() if not kind.adapts_only and (taught or not kind.asks))
     cues = actions_of(env).cues
-    said = (kind for kind in trained if cues or kind.form is None or not kind.form.by_eps)
+    said = (kind for kind in trained if cues or not kind.needs_cues)
     return tuple(kind.name for kind in said if all(offers(env, need) for need in kind.needs))
 
 

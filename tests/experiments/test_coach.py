@@ -1,10 +1,12 @@
 """Deep COACH as a correction: it begins at nothing, and labels turn it, through the program of adaptation."""
 
 import _coach as coach
+import _energy as energy
 import jax
 import jax.numpy as jnp
 import numpy as np
 import probes
+import pytest
 
 from cuelearner_jax.adaptation.judging import judged_by_labels
 from cuelearner_jax.adaptation.lanes import Adaptation, ask_round, begin, product, rounds
@@ -45,9 +47,13 @@ def test_lessons_are_seen_from_the_base_and_ask_for_the_action_told_about_turned
     np.testing.assert_allclose(rows.target, directions.rotate(OBS, jnp.deg2rad(7.0)), atol=1e-6)
 
 
-def test_labels_turn_a_finished_policy_and_held_out_ones_say_so():
+@pytest.mark.parametrize(
+    "kind", [coach.KIND, *(pytest.param(k, marks=pytest.mark.long) for k in (coach.BATCH, energy.KIND))]
+)
+def test_labels_turn_a_finished_policy_and_held_out_ones_say_so(kind):
+    guidance = kind.make(SIZES, spaces_of(ENV))
     lanes = product(bases=1, seeds=(0,), budgets=(60,), bounds_deg=(BOUND_DEG,))
-    of = Adaptation(GUIDANCE, SIZES, SCALARS, ENV, Common(Finished()))
+    of = Adaptation(guidance, SIZES, SCALARS, ENV, Common(Finished()))
     block = begin(of, lanes)
     for _ in range(rounds(lanes, SIZES)):
         block = ask_round(of, probes.Expert(ENV), block)

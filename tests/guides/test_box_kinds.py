@@ -48,9 +48,12 @@ def away(kind, rounds=3, **faults):
     return tuple(np.asarray(SMALL.distance(actions, goals)) for actions in (first, acted.actions))
 
 
+LONG = [pytest.param(kind, 0.12, marks=pytest.mark.long) for kind in ("bdcoach", "clic", "clic-shown")]
+
+
 @pytest.mark.parametrize(
     ("kind", "within"),
-    [("demonstration", 0.06), ("intent", 0.06), ("dcoach", 0.3), ("scalar", 0.3)],
+    [("demonstration", 0.06), ("intent", 0.06), ("dcoach", 0.3), ("scalar", 0.3), *LONG],
 )
 def test_every_kind_that_asks_leads_toward_the_goal_of_a_box(kind, within):
     first, after = away(kind, scalar_within_deg=0.3)  # by chance a fifth of the actions are good

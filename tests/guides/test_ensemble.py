@@ -65,7 +65,8 @@ def test_one_member_is_the_network_itself():
 
 
 @pytest.mark.parametrize(
-    "kind", probes.long_but(["relative"], ["relative", "demonstration", "scalar", "dcoach", "intent"])
+    "kind",
+    probes.long_but(["relative"], ["relative", "demonstration", "scalar", "dcoach", "bdcoach", "clic", "intent"]),
 )
 def test_members_that_are_the_same_do_what_one_does_and_do_not_disagree(kind):
     single, several = (registry.make(kind, sizes, ENV) for sizes in (ONE, FOUR))

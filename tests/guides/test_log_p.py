@@ -86,7 +86,7 @@ def test_any_aim_leads_to_the_nearest():
 
 
 def test_without_labels_all_actions_are_alike_to_other_kinds():
-    for kind in ("none", "relative", "demonstration", "dcoach", "scalar"):
+    for kind in ("none", "relative", "demonstration", "dcoach", "scalar", "bdcoach", "clic"):
         bundle, model = made(kind)
         assert bundle.candidates(ENV, OBS) is None
         assert not np.asarray(bundle.log_p(model, ENV, OBS, CIRCLE[:50], SCALARS)).any(), kind

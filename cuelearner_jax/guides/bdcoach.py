@@ -1,0 +1,156 @@
+"""BD-COACH: a model of the teacher says how to correct the policy in every situation of the buffer.
+
+Source: Lopez Bosque, "Towards corrective deep imitation learning in data intensive environments" (MSc thesis, TU Delft,
+2021), Batch Deep COACH, with the numbers that the public code of CLIC has for this method. Deep COACH replays old
+corrections as they were given, of a policy that has changed since. BD-COACH replays situations instead: a human model H
+learns what the teacher says of any action, and is asked about what the policy does there now. Of the buffer of all
+labels (s, a, h), h_c in {-1, 0, 1} or not said of each cue c:
+
+    H <- H - Adam(grad of sum over said cues of (H(s, a) - h)_c^2)
+    y = clip(exp(pi(s), eps H(s, pi(s))), pi(s), eps),  fixed while the policy is moved
+    pi <- pi - Adam(grad of sum over cues of (d log (pi(s) - y))_c^2)
+    a <- clip(retract(pi(s)), a, tau_max)
+
+A new label is in a minibatch of H, then in one of the policy, with its own target exp(a, eps h). `batch_steps` times
+`human_steps` minibatches of H and one of the policy follow (3 to 1, as in that code).
+
+What differs, and why: that code takes 500 such turns at the end of an episode, of which it may have many corrections or
+one; here each label has its turns, since rounds of questions are no episodes. "Already right" is an answer here, on
+which H is trained towards 0; there it is silence, and the label is left out. H gives vectors in units of eps, in the
+frame in which networks of this package see, as the model of `relative` does; and no step is longer than eps along any
+cue, as no answer is. A cue of which nothing was said teaches H nothing, and H then says what the policy learns of it.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Annotated, Any
+
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Int, PRNGKeyArray
+
+from cuelearner_jax.config import GuideScalars
+from cuelearner_jax.config.parts import POSITIVE, part
+from cuelearner_jax.feedback.answers import RELATIVE
+from cuelearner_jax.guides.base import Guide, Kind
+from cuelearner_jax.guides.dcoach import Coached, DeepCoach
+from cuelearner_jax.guides.fitting import Lesson, optimizer, squared
+from cuelearner_jax.guides.model import for_each
+from cuelearner_jax.types import GuidanceModel, Label, Params
+
+
+@part
+class Config:
+    """Options of BD-COACH."""
+
+    batch_steps: Annotated[int, POSITIVE] = 5
+    """Gradient steps of the policy on the whole buffer after each new label."""
+    human_steps: Annotated[int, POSITIVE] = 3
+    """Gradient steps of the human model before each of these."""
+
+
+class BatchCoached(Coached):
+    """A policy on its way beside its human model, as the parameters of a model."""
+
+    human: Params
+    human_optimizer: Any  # state
+
+
+class BatchCoach(DeepCoach):
+    """A policy that acts as a cloned one does, and learns from a model of its teacher."""
+
+    options: Config  # pyright: ignore[reportIncompatibleVariableOverride]
+
+    def init(self, key: PRNGKeyArray) -> GuidanceModel:
+        """A policy that nothing has corrected, and a human model that nobody has taught."""
+
+        def begin(key: PRNGKeyArray) -> BatchCoached:
+            policy, human = (self.member.network.init(one) for one in jax.random.split(key))
+            states = (optimizer(GuideScalars()).init(params) for params in (policy, human))
+            return BatchCoached(policy, next(states), jnp.zeros((), jnp.int32), human, next(states))
+
+        return GuidanceModel(for_each(self.sizes.ensemble, begin, key), jnp.array(False))
+
+    def modelled(self, env: Any, human: Params, rows: Lesson, scalars: GuideScalars) -> Array:
+        """Return the loss of the human model: what it says of the actions asked about, beside what was answered."""
+        eps = self.spaces.actions.from_unit(scalars.eps_deg)
+        answered = rows.replace(target=(rows.target - rows.action) / eps)
+        return jnp.mean(squared(answered, self.member.network.predict(env, human, rows.obs, rows.action)))
+
+    def wanted(self, env: Any, human: Params, rows: Lesson, acted: Array, scalars: GuideScalars) -> Lesson:
+        """Return rows whose targets are what the human model makes of what the policy does there, in all cues."""
+        space = self.spaces.actions
+        eps, does = space.from_unit(scalars.eps_deg), space.retract(acted)
+        toward = space.retract(does + eps * self.member.network.predict(env, human, rows.obs, does))
+        target = jax.lax.stop_gradient(space.clip(toward, does, eps))
+        return rows.replace(target=target, said=None if rows.said is None else jnp.ones_like(rows.said))
+
+    def fit(
+        self, key: PRNGKeyArray, env: Any, labels: Label, former: GuidanceModel, scalars: GuideScalars
+    ) -> GuidanceModel:
+        """The former policy and human model, moved on by each label that is new, in the order in which they came."""
+        rows, answered = self.lessons(labels, scalars), Guide.lessons(self, labels, scalars)
+        order = jnp.argsort(~rows.valid, stable=True)
+        count, adam = rows.valid.sum(), optimizer(scalars)
+
+        def batch_of(key: PRNGKeyArray, number: Int[Array, ""]) -> tuple[Lesson, Lesson]:
+            """A minibatch of the first labels up to `number`, its first row: for the policy, for the human model."""
+            numbers = jax.random.randint(key, (self.sizes.fit_batch_size,), 0, number + 1).at[0].set(number)
+            return jax.tree.map(lambda leaf: leaf[order[numbers]], (rows, answered))
+
+        def taught(coached: BatchCoached, batch: Lesson) -> BatchCoached:
+            gradient = jax.grad(lambda human: self.modelled(env, human, batch, scalars))(coached.human)
+            updates, state = adam.update(gradient, coached.human_optimizer, coached.human)
+            return coached.replace(human=optax.apply_updates(coached.human, updates), human_optimizer=state)
+
+        def moved(key: PRNGKeyArray, coached: BatchCoached, batch: Lesson, own: Array) -> BatchCoached:
+            """One step of the policy; `own`: rows that keep the target of their label."""
+            seen = self.redrawn(key, batch)
+
+            def loss(policy: Params) -> Array:
+                acted = self.member.predict(env, policy, seen.obs, seen.action)
+                targets = self.wanted(env, coached.human, seen, acted, scalars)
+                keep = lambda one, other: jnp.where(own[:, None], one, other)  # noqa: E731
+                target, said = keep(seen.target, targets.target), seen.said
+                said = None if said is None else keep(said, targets.said)
+                return jnp.mean(squared(seen.replace(target=target, said=said), acted))
+
+            updates, state = adam.update(jax.grad(loss)(coached.policy), coached.optimizer, coached.policy)
+            return coached.replace(policy=optax.apply_updates(coached.policy, updates), optimizer=state)
+
+        def corrected(key: PRNGKeyArray, number: Int[Array, ""], coached: BatchCoached) -> BatchCoached:
+            """By label `number` of those that count, then by the buffer up to it."""
+            keys = jax.random.split(jax.random.fold_in(key, number), 3)
+            batch, told = batch_of(keys[0], number)
+            first = jnp.arange(self.sizes.fit_batch_size) == 0
+            coached = moved(keys[1], taught(coached, told), batch, first)
+
+            def turn(coached: BatchCoached, key: PRNGKeyArray) -> tuple[BatchCoached, None]:
+                k_human, k_batch, k_see = jax.random.split(key, 3)
+
+                def one(coached: BatchCoached, key: PRNGKeyArray) -> tuple[BatchCoached, None]:
+                    return taught(coached, batch_of(key, number)[1]), None
+
+                coached, _ = jax.lax.scan(one, coached, jax.random.split(k_human, self.options.human_steps))
+                return moved(k_see, coached, batch_of(k_batch, number)[0], jnp.zeros_like(first)), None
+
+            coached, _ = jax.lax.scan(turn, coached, jax.random.split(keys[2], self.options.batch_steps))
+            return coached.replace(learned=number + 1)
+
+        def learned(key: PRNGKeyArray, coached: BatchCoached) -> BatchCoached:
+            return jax.lax.fori_loop(coached.learned, count, partial(corrected, key), coached)
+
+        return GuidanceModel(for_each(self.sizes.ensemble, learned, key, former.params), former.fitted | (count > 0))
+
+
+KIND = Kind(
+    "bdcoach",
+    "a policy moved by a model of its teacher",
+    BatchCoach,
+    form=RELATIVE,
+    title="BD-COACH",
+    colour="#CC6677",
+    config=Config,
+)

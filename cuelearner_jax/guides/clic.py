@@ -1,0 +1,329 @@
+"""CLIC: an energy over actions, low in the sets of actions that corrections leave possible.
+
+Source: Li, Perez-Dattari, Babuska, Della Santina, Kober, "From action labels to sets: rethinking action supervision for
+imitation learning from corrective feedback" (arXiv 2502.07645), with the numbers of its public code. With
+x = log(a, b) / eps along the cues of which a label (s, a, h) speaks, zero along the others:
+
+    pi(b | s) = exp(-E(s, b)) / Z,  over sampled actions b
+    A = {b : |x - gamma h| < |x|}                        (half-space: nearer to the better action than to a)
+      and {b : |x - h| < |x - g_i|},  g_i = gamma h + (1 - gamma) u_i, u_i as long as h and `angle` away from it
+      and {b : |x_c| < |x_c - 1|, |x_c| < |x_c + 1|}     (of a cue c that is already right)
+    log p(b in A) = SHARPNESS * mean over these pairs of log sigmoid(difference of the two distances / SOFTNESS)
+    E = argmin over labels of -log sum over b of pi(b | s) p(b in A)
+    a <- argmin over b within tau_max of a of E(s, b)
+
+A demonstration a+ of what to do in place of a (`clic-shown`, absolute corrections) has one set in place of these,
+A = {b : |log(a+, b)| < radius |log(a+, a)|}, of the same form and half that softness.
+
+What differs, and why. The paper's loss is KL(target || pi) with target ~ pi p held fixed; the one above has the same
+gradient, is a likelihood of labels, and so can choose parameters by held-out labels. As for every kind here these are
+fitted from scratch in each round; there one network goes on. There b are drawn by Langevin dynamics; here half are
+uniform and half lie around a, so that a fit takes seconds on a CPU, and no penalty on the energy's gradient is needed.
+There one b is drawn to act; here the least energy is searched, first over `space.spread`, then around the best so far
+in ever smaller boxes: no random number, no gradient, and a graph that can be exported. "Already right" is an answer
+here where silence is meant there. A cue of which nothing was said is no part of any distance.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import Annotated, Any
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+from cuelearner_jax.agents.choice import each_in_portions
+from cuelearner_jax.config import GuideScalars
+from cuelearner_jax.config.parts import POSITIVE, SHARE, Bounds, part
+from cuelearner_jax.feedback.answers import DEMONSTRATION, RELATIVE
+from cuelearner_jax.guides.base import Footprint, Guide, Kind
+from cuelearner_jax.guides.fitting import fit_model
+from cuelearner_jax.guides.model import GuideModel, guide_model
+from cuelearner_jax.guides.refining import Refined
+from cuelearner_jax.spaces import Box, said
+from cuelearner_jax.types import GuidanceModel, Label, Params
+
+SHARPNESS = 10.0  # of the observation model: its weight beside the policy
+SOFTNESS = 0.5  # of a set's edge, in units of eps: 0.1 in actions from -1 to 1, where eps is 0.2
+NEAR = 2.0  # standard deviation of the actions sampled around the one asked about, in units of eps
+FIRST_PAIRS = 0.3  # weight of the half-space beside all implicit pairs together
+PASSES = 6  # of the search around the best action so far, each in a box of half the size
+AROUND = 4  # actions of such a pass, for each cue
+
+
+@part
+class Searching:
+    """Options of an energy, however it is taught."""
+
+    sampled_actions: Annotated[int, Bounds(4)] = 32
+    """Actions between which the energy is compared in a step of a fit, for each label."""
+    searched_actions: Annotated[int, Bounds(2)] = 256
+    """Actions among which the least energy is looked for at first."""
+
+
+@part
+class Config(Searching):
+    """Options of CLIC."""
+
+    implicit_pairs: Annotated[int, POSITIVE] = 8
+    """Pairs of actions that narrow a half-space, drawn anew in each step of a fit."""
+    angle_deg: Annotated[float, Bounds(0, 90)] = 30.0
+    """How far the worse actions of these pairs lie from the answer's direction [deg]: 0 leaves the half-space."""
+    gamma: Annotated[float, SHARE] = 0.1
+    """How far along the answer the better action of the half-space lies, in units of eps."""
+
+
+@part
+class ShownConfig(Searching):
+    """Options of CLIC from demonstrations."""
+
+    radius: Annotated[float, SHARE] = 0.5
+    """Radius of the set around what was shown, as a share of the way there from the action asked about."""
+
+
+class Contrast(struct.PyTreeNode):
+    """What the energy is to learn of one label."""
+
+    obs: Float[Array, " obs"]
+    action: Float[Array, " action"]
+    answer: Float[Array, " answer"]
+    valid: Bool[Array, ""]
+    draw: Int[Array, ""]  # number of the random numbers with which it is sampled
+    base: Float[Array, " action"]  # what a finished policy did, where labels keep it; else the action
+
+
+def log_nearer(apart: Float[Array, "..."], closer: Float[Array, "..."], softness: float) -> Float[Array, "..."]:
+    """Return log sigmoid((apart - closer) / softness): how surely the second distance is the smaller one."""
+    return jax.nn.log_sigmoid((apart - closer) / softness)
+
+
+def log_desired(
+    x: Float[Array, " cues"], h: Float[Array, " cues"], implicit: Float[Array, "pairs cues"], gamma: Array | float
+) -> Float[Array, ""]:
+    """Return the mean over pairs of the log-probabilities that an action lies on the desired side, see the module.
+
+    Args:
+        x: the action as seen from the one asked about, along the cues, in units of eps.
+        h: the answer, with `UNSAID`.
+        implicit: directions u_i, as long as h.
+        gamma: see `Config`.
+    """
+    spoken = said(h)
+    x, h = jnp.where(spoken, x, 0.0), jnp.where(spoken, h, 0.0)
+    half = log_nearer(_size(x), _size(x - gamma * h), SOFTNESS)
+    if len(h) > 1:
+        worse = jax.vmap(lambda u: _size(x - gamma * h - (1 - gamma) * u))(implicit)
+        half = (log_nearer(worse, _size(x - h), SOFTNESS).mean() + FIRST_PAIRS * half) / (1 + FIRST_PAIRS)
+    right = [log_nearer(jnp.abs(x - side), jnp.abs(x), SOFTNESS) for side in (1.0, -1.0)]
+    still, moving = spoken & (h == 0), (h != 0).sum()
+    held = jnp.sum((right[0] + right[1]) / 2, where=still)
+    return (moving * half + held) / jnp.maximum(moving + still.sum(), 1)
+
+
+def direction_at(key: PRNGKeyArray, h: Float[Array, " cues"], angle: Array | float) -> Float[Array, " cues"]:
+    """Return a random direction, as long as h and `angle` [rad] away from it, along the cues of which h speaks.
+
+    Along one such cue alone there is no other direction: h itself.
+    """
+    spoken = said(h)
+    h = jnp.where(spoken, h, 0.0)
+    drawn = jnp.where(spoken, jax.random.normal(key, h.shape), 0.0)
+    across = drawn - jnp.sum(drawn * h) / jnp.maximum(jnp.sum(h * h), 1.0) * h
+    size = _size(across)
+    aside = jnp.cos(angle) * h + jnp.sin(angle) * _size(h) / size * across
+    return jnp.where(size > 1e-3, aside, h)
+
+
+def _size(vector: Float[Array, " cues"]) -> Float[Array, ""]:
+    return jnp.sqrt(jnp.sum(jnp.square(vector)) + 1e-12)
+
+
+class Clic(Guide):
+    """A guide that does what has the least energy."""
+
+    options: Any
+
+    @cached_property
+    def network(self) -> GuideModel:
+        """The network, or ensemble, whose output is the energy of an action, with its sign changed."""
+        return guide_model(self.sizes, self.spaces, outputs=1)
+
+    def footprint(self, env: Any) -> Footprint:
+        """Beside the layers the actions among which the least energy is searched."""
+        return (
+            super().footprint(env)._replace(searched=(f"--{self.name}.searched-actions", self.options.searched_actions))
+        )
+
+    def energy(
+        self,
+        env: Any,
+        params: Params,
+        obs: Float[Array, " obs"],
+        actions: Float[Array, "m action"],
+        base: Float[Array, " action"] | None,
+        scalars: GuideScalars,
+    ) -> Float[Array, " m"]:
+        """Return E of actions in one situation; whatever the policy did there (`base`), it is the same."""
+        return -self.network.predict(env, params, obs, actions)[:, 0]
+
+    def around(self, row: Contrast, scalars: GuideScalars) -> Float[Array, " action"]:
+        """Return what a label says would be better than the action asked about."""
+        space = self.spaces.actions
+        return space.toward(row.action, row.answer, space.from_unit(scalars.eps_deg))
+
+    def membership(
+        self, key: PRNGKeyArray, row: Contrast, actions: Float[Array, "m action"], scalars: GuideScalars
+    ) -> Float[Array, " m"]:
+        """Return log p(b in A) of actions, A the desired set of one label."""
+        space, options = self.spaces.actions, self.options
+        x = space.log(jnp.broadcast_to(row.action, actions.shape), actions) / space.from_unit(scalars.eps_deg)
+        angle, keys = jnp.deg2rad(options.angle_deg), jax.random.split(key, options.implicit_pairs)
+        implicit = jax.vmap(lambda key: direction_at(key, row.answer, angle))(keys)
+        return SHARPNESS * jax.vmap(lambda x: log_desired(x, row.answer, implicit, options.gamma))(x)
+
+    def sampled(self, key: PRNGKeyArray, row: Contrast, scalars: GuideScalars) -> Float[Array, "m action"]:
+        """Return the actions among which one label's are told apart: two known ones, uniform ones, and ones near a."""
+        space, count = self.spaces.actions, self.options.sampled_actions - 2
+        k_any, k_near = jax.random.split(key)
+        change = NEAR * space.from_unit(scalars.eps_deg) * jax.random.normal(k_near, (count // 2, len(space.cues)))
+        known = jnp.stack([row.action, self.around(row, scalars)])
+        near = space.exp(jnp.broadcast_to(row.action, (count // 2, space.size)), change)
+        return jnp.concatenate([known, space.sample(k_any, (count - count // 2,)), near])
+
+    def losses(self, env: Any, scalars: GuideScalars, params: Params, rows: Contrast) -> Float[Array, " n"]:
+        """Return of each row -log of the probability that the policy's action lies in the desired set."""
+
+        def one(row: Contrast) -> Array:
+            k_pairs, k_sample = jax.random.split(jax.random.fold_in(jax.random.key(0), row.draw))
+            actions = self.sampled(k_sample, row, scalars)
+            log_pi = jax.nn.log_softmax(-self.energy(env, params, row.obs, actions, row.base, scalars))
+            return -jax.nn.logsumexp(log_pi + self.membership(k_pairs, row, actions, scalars))
+
+        return jax.vmap(one)(rows)
+
+    def contrasts(self, labels: Label) -> Contrast:
+        """Return what is learned of labels (slots, ...); one that says nothing of any cue does not count."""
+        numbers, base = jnp.arange(len(labels.valid)), labels.action if labels.base is None else labels.base
+        return Contrast(labels.obs, labels.action, labels.answer, labels.valid & self.told(labels), numbers, base)
+
+    def told(self, labels: Label) -> Bool[Array, " slots"]:
+        """Return which labels say anything."""
+        return said(labels.answer).any(-1) if len(self.spaces.actions.cues) > 1 else jnp.ones_like(labels.valid)
+
+    def fit(
+        self, key: PRNGKeyArray, env: Any, labels: Label, former: GuidanceModel, scalars: GuideScalars
+    ) -> GuidanceModel:
+        """The energy of labels (slots, ...), fitted from scratch."""
+
+        def redrawn(key: PRNGKeyArray, batch: Contrast) -> Contrast:
+            return batch.replace(draw=jax.random.randint(key, batch.draw.shape, 0, 2**30))
+
+        def losses(params: Params, rows: Contrast) -> Array:
+            return self.losses(env, scalars, params, rows)
+
+        rows, sizes = self.contrasts(labels), self.sizes
+        return fit_model(key, rows, scalars, init=self.network.init, losses=losses, sizes=sizes, redrawn=redrawn)
+
+    def least(
+        self,
+        env: Any,
+        params: Params,
+        obs: Float[Array, " obs"],
+        base: Float[Array, " action"],
+        scalars: GuideScalars,
+    ) -> Float[Array, " action"]:
+        """Return the action of least energy within tau_max of `base`, as a deterministic search finds it."""
+        space, cues = self.spaces.actions, len(self.spaces.actions.cues)
+        bound = jnp.minimum(space.from_unit(scalars.tau_max_deg), space.from_unit(space.reach))
+        count = self.options.searched_actions
+
+        def best(actions: Float[Array, "m action"]) -> Float[Array, " action"]:
+            actions = space.clip(actions, jnp.broadcast_to(base, actions.shape), bound)
+            return actions[jnp.argmin(self.energy(env, params, obs, actions, base, scalars))]
+
+        def box(center: Array, half: Array, count: int) -> Float[Array, "count action"]:
+            """Actions spread evenly around one, up to `half` away along each cue."""
+            offsets = Box((-1.0,) * cues, (1.0,) * cues).spread(count)
+            return space.exp(jnp.broadcast_to(center, (count, space.size)), half * offsets)
+
+        everywhere = count // 2
+        found = best(jnp.concatenate([base[None], space.spread(everywhere), box(base, bound, count - everywhere)]))
+        half = 2.0 * bound * count ** (-1.0 / cues)
+        for number in range(PASSES):
+            found = best(jnp.concatenate([found[None], box(found, 0.5**number * half, AROUND * cues)]))
+        return found
+
+    def act(
+        self,
+        model: GuidanceModel,
+        env: Any,
+        obs: Float[Array, "n obs"],
+        actions: Float[Array, "n action"],
+        active: Bool[Array, " n"],
+        scalars: GuideScalars,
+    ) -> Refined:
+        """The action of least energy within tau_max of a, in active rows of a fitted model."""
+        guided = active & model.fitted
+
+        def choose(where: Array) -> Array:
+            seen, base = jnp.split(where, [obs.shape[1]])
+            return self.least(env, model.params, seen, base, scalars)
+
+        chosen = each_in_portions(choose, jnp.concatenate([obs, actions], -1), self.options.searched_actions)
+        return Refined(jnp.where(guided[:, None], chosen, actions), guided.astype(jnp.int32))
+
+    def log_p(
+        self,
+        model: GuidanceModel,
+        env: Any,
+        obs: Float[Array, " obs"],
+        actions: Float[Array, "m action"],
+        scalars: GuideScalars,
+    ) -> Float[Array, " m"]:
+        """-E of actions; 0 of all before the first fit."""
+        return jnp.where(model.fitted, -self.energy(env, model.params, obs, actions, None, scalars), 0.0)
+
+
+class ClicShown(Clic):
+    """A guide that learns from what a teacher shows in place of an action, by a set around what is shown."""
+
+    def around(self, row: Contrast, scalars: GuideScalars) -> Float[Array, " action"]:
+        """Return what was shown."""
+        return row.answer
+
+    def told(self, labels: Label) -> Bool[Array, " slots"]:
+        """Return all labels: each shows an action."""
+        return jnp.ones_like(labels.valid)
+
+    def membership(
+        self, key: PRNGKeyArray, row: Contrast, actions: Float[Array, "m action"], scalars: GuideScalars
+    ) -> Float[Array, " m"]:
+        """Return log p(b in A) of actions, A the ball around what was shown."""
+        space = self.spaces.actions
+        eps = space.from_unit(scalars.eps_deg)
+        away = jax.vmap(lambda action: _size(space.log(row.answer, action) / eps))(actions)
+        radius = self.options.radius * _size(space.log(row.answer, row.action) / eps)
+        return SHARPNESS * log_nearer(radius, away, SOFTNESS / 2)
+
+
+KIND = Kind(
+    "clic",
+    "an energy over actions, low in the sets that corrections leave possible",
+    Clic,
+    form=RELATIVE,
+    title="CLIC",
+    colour="#117733",
+    config=Config,
+)
+SHOWN = Kind(
+    "clic-shown",
+    "an energy over actions, low around what the teacher shows",
+    ClicShown,
+    form=DEMONSTRATION,
+    title="CLIC, demonstrations",
+    colour="#44AA99",
+    config=ShownConfig,
+    by_cues=True,
+)

@@ -1,0 +1,203 @@
+"""Writes the table and the figure of docs/results/corrections.md from recorded pieces, and nothing else of it.
+
+    python experiments/corrections_page.py --data docs/data/corrections_alone --page docs/results/corrections.md
+
+The data are what `corrections_alone.py` leaves in its `--out`. The table goes between the lines `<!-- corrections -->`
+and `<!-- end of corrections -->` of the page, in place of what was there; beside the data are written the figure and
+`success.csv`, success of each kind, teacher and budget with its interval over label seeds. How many labels a kind needs
+to match 100 of the reference is read off nondecreasing curves, on straight lines over the logarithm of the labels.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from _efficiency_statistics import Bounds, isotonic, labels_for, percentiles
+from bootstrapping_page import rendered
+from corrections_alone import KINDS, SCALES, whole
+from jaxtyping import Float
+from matplotlib.figure import Figure
+
+from cuelearner_jax.guides import registry
+from cuelearner_jax.report import statistics
+from cuelearner_jax.report.figures import colour_of, save_figure
+
+REFERENCE = {"halls": "relative", "grasp": "relative", "reach": "offset", "push": "offset"}
+MATCHED = 100  # labels of the reference
+TEACHERS = {"plain": "no fault", "wrong": "20% wrong", "one": "one cue a label"}
+SHUFFLED = "shuffled"
+GREY = "#9a9a9a"
+
+
+class Curve(NamedTuple):
+    """Success of one kind under one teacher."""
+
+    budgets: tuple[int, ...]
+    success: Float[np.ndarray, "seeds budgets"]
+
+    def at(self, labels: int) -> statistics.Interval | None:
+        """The interquartile mean over seeds, with its interval; None: not measured."""
+        if labels not in self.budgets:
+            return None
+        return statistics.interval(self.success[:, self.budgets.index(labels)])
+
+
+Curves = Mapping[tuple[str, str, str], Curve]  # by world, kind, teacher
+
+
+def read(folder: Path) -> dict[tuple[str, str, str], Curve]:
+    """All curves of the recorded pieces, but for conditions that some seeds lack."""
+    found = {}
+    for world, kinds in KINDS.items():
+        for kind in kinds:
+            file = folder / world / f"{kind}.json"
+            told = json.loads(file.read_text()) if file.exists() else {"scale": "smoke", "rows": []}
+            rows = whole(told["rows"], SCALES[told["scale"]].seeds_in(world))
+            for condition in dict.fromkeys(row["condition"] for row in rows):
+                own = [row for row in rows if row["condition"] == condition]
+                seeds = sorted({row["seed"] for row in own})
+                cells = {(row["seed"], row["labels"]): row["success"] for row in own}
+                budgets = tuple(sorted({row["labels"] for row in own}))
+                table = [[cells[seed, labels] for labels in budgets] for seed in seeds]
+                found[world, kind, condition] = Curve(budgets, np.array(table))
+    return found
+
+
+def ratio(kind: Curve, reference: Curve) -> tuple[Bounds, tuple[float, float]] | None:
+    """Labels of a kind that match `MATCHED` of the reference, over `MATCHED`; and their 95% interval over seeds.
+
+    None where the reference never had so many, or the kind has one budget alone.
+    """
+    if MATCHED not in reference.budgets or len(kind.budgets) < 2:
+        return None
+    own = [statistics.interquartile_mean(kind.success)[None], statistics.resampled(kind.success, seed=1)]
+    other = [statistics.interquartile_mean(reference.success)[None], statistics.resampled(reference.success, seed=2)]
+    wanted = isotonic(np.concatenate(other))[:, reference.budgets.index(MATCHED)]
+    found = labels_for(np.array(kind.budgets), isotonic(np.concatenate(own)), wanted)
+    shares = Bounds(found.lower / MATCHED, found.upper / MATCHED)
+    first = Bounds(shares.lower[0], shares.upper[0])
+    return first, percentiles(Bounds(shares.lower[1:], shares.upper[1:]))
+
+
+def ratio_words(found: tuple[Bounds, tuple[float, float]] | None) -> str:
+    """A ratio as the table shows it."""
+    if found is None:
+        return ""
+    (low, high), (lower, upper) = found
+    told = f"{low:.2f}" if low == high else (f"above {low:.2f}" if np.isinf(high) else f"below {high:.2f}")
+    return f"{told} [{lower:.2f}, {'no bound' if np.isinf(upper) else f'{upper:.2f}'}]"
+
+
+def percent(found: statistics.Interval | None) -> str:
+    """Success as the table shows it."""
+    if found is None:
+        return ""
+    bounds = "" if np.isnan(found.lower) else f" [{100 * found.lower:.0f}, {100 * found.upper:.0f}]"
+    return f"{100 * found.estimate:.0f}{bounds}"
+
+
+def title_of(kind: str) -> str:
+    """What a kind is called."""
+    known = registry.registered(kind)
+    return "no labels" if kind == "base" else (known.title or kind if known else kind)
+
+
+def table(curves: Curves) -> str:
+    """The page's table in Markdown."""
+    heads = ["world", "kind"]
+    heads += [f"{MATCHED} labels, {told} [%]" for told in TEACHERS.values()]
+    heads += [f"most labels, answers {SHUFFLED} [%]"]
+    heads += [f"times the labels of the reference, {told}" for told in TEACHERS.values()]
+    rows = [heads, ["---"] * len(heads)]
+    for world, kinds in KINDS.items():
+        for kind in kinds:
+            own = {teacher: curves.get((world, kind, teacher)) for teacher in (*TEACHERS, SHUFFLED)}
+            if not any(own.values()):
+                continue
+            labels = 0 if kind == "base" else MATCHED
+            cells = [percent(curve.at(labels)) if (curve := own[teacher]) else "" for teacher in TEACHERS]
+            control = own[SHUFFLED]
+            cells.append(percent(control.at(control.budgets[-1])) if control else "")
+            for teacher in TEACHERS:
+                reference, curve = curves.get((world, REFERENCE[world], teacher)), own[teacher]
+                said = kind != REFERENCE[world] and curve is not None and reference is not None
+                cells.append(ratio_words(ratio(curve, reference)) if said else "")  # pyright: ignore[reportArgumentType]
+            rows.append([world, title_of(kind), *cells])
+    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+
+
+def draw(curves: Curves, stem: Path) -> None:
+    """Draw success over labels: a row of panels a teacher, a column a world."""
+    worlds = [world for world in KINDS if any(world == key[0] for key in curves)]
+    figure = Figure(figsize=(1 + 2.9 * len(worlds), 7.2), layout="constrained")
+    panels = figure.subplots(len(TEACHERS), len(worlds), squeeze=False, sharey=True)
+    for column, world in enumerate(worlds):
+        for row, (teacher, told) in enumerate(TEACHERS.items()):
+            axes = panels[row][column]
+            base = curves.get((world, "base", "plain"))
+            if base is not None:
+                axes.axhline(100 * float(base.success.mean()), color=GREY, linestyle=":", label="no labels")
+            axes.set_visible(any((world, kind, teacher) in curves for kind in KINDS[world]))
+            for kind in KINDS[world]:
+                curve = curves.get((world, kind, teacher))
+                if kind != "base" and curve is not None and len(curve.budgets) > 1:
+                    _draw_curve(axes, kind, curve)
+            axes.set(ylim=(0, 100), title=f"{world}, {told}")
+            axes.set_xscale("log")
+            axes.spines[["top", "right"]].set_visible(False)
+            axes.set_xticks([25, 100, 250], ["25", "100", "250"], minor=False)
+            axes.minorticks_off()
+        panels[-1][column].set_xlabel("labels")
+    for row in panels:
+        row[0].set_ylabel("success [%]")
+    named = {label: handle for axes in panels.ravel() for handle, label in zip(*axes.get_legend_handles_labels())}  # noqa: B905
+    figure.legend(named.values(), named.keys(), loc="outside lower center", ncols=5, fontsize=8, frameon=False)
+    save_figure(figure, stem)
+
+
+def _draw_curve(axes: object, kind: str, curve: Curve) -> None:
+    found = statistics.interval(curve.success)
+    drawn = {"color": colour_of(kind), "linewidth": 1.4, "label": title_of(kind)}
+    axes.plot(curve.budgets, 100 * found.estimate, marker="o", markersize=3, **drawn)  # pyright: ignore
+    if not np.isnan(found.lower).any():
+        bounds = 100 * found.lower, 100 * found.upper
+        axes.fill_between(curve.budgets, *bounds, color=drawn["color"], alpha=0.12, linewidth=0)  # pyright: ignore
+
+
+def write_all(curves: Curves, file: Path) -> None:
+    """Write success of everything that was measured."""
+    with file.open("w", newline="", encoding="utf-8") as opened:
+        writer = csv.writer(opened, lineterminator="\n")
+        writer.writerow(["world", "kind", "teacher", "labels", "seeds", "success", "lower", "upper"])
+        for (world, kind, teacher), curve in curves.items():
+            for labels in curve.budgets:
+                found = curve.at(labels)
+                assert found is not None
+                values = ["" if np.isnan(value) else f"{float(value):.4f}" for value in found]
+                writer.writerow([world, kind, teacher, labels, len(curve.success), *values])
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Write the page's table, the figure and the CSV."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path, default=Path("docs/data/corrections_alone"))
+    parser.add_argument("--page", type=Path, default=Path("docs/results/corrections.md"))
+    given = parser.parse_args(arguments)
+    curves = read(given.data)
+    if not curves:
+        parser.error(f"{given.data} holds no pieces: give the --out of corrections_alone.py")
+    draw(curves, given.data / "success")
+    write_all(curves, given.data / "success.csv")
+    page = rendered(given.page.read_text(encoding="utf-8"), {"corrections": table(curves)})
+    given.page.write_text(page, encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,233 @@
+"""BD-COACH and CLIC: what their papers say of single labels, by numbers that a hand can compute."""
+
+import dataclasses
+from functools import cache
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import probes
+import pytest
+from box_task import SCALARS, SMALL, Reach
+
+from cuelearner_jax.config import GuideSizes
+from cuelearner_jax.environment import Spaces
+from cuelearner_jax.guides import bdcoach, clic, registry
+from cuelearner_jax.spaces import DIRECTIONS, UNSAID, directions
+from cuelearner_jax.types import Label
+
+ENV = Reach()
+SIZES = GuideSizes(feedback_layers=(16,), labels_per_round=10, fit_steps=100, fit_batch_size=16)
+KEY = jax.random.key(3)
+SEEN = jnp.array([[1.0, 0.0], [0.0, 1.0]])
+MIDDLE = SMALL.middle()
+
+
+def log_sigmoid(value):
+    return -np.log1p(np.exp(-np.asarray(value)))
+
+
+def log_desired(x, h, implicit, gamma):
+    return jax.vmap(lambda x: clic.log_desired(x, h, implicit, gamma))(x)
+
+
+def directions_at(h, angle_deg, count):
+    return jax.vmap(lambda key: clic.direction_at(key, h, np.deg2rad(angle_deg)))(jax.random.split(KEY, count))
+
+
+@cache
+def made(kind, **sizes):
+    return registry.make(kind, dataclasses.replace(SIZES, **sizes), ENV)
+
+
+# CLIC's sets.
+
+
+def test_a_half_space_along_one_cue_ends_halfway_to_the_better_action():
+    """|x| - |x - 1| is -1, 0, 0.5, 1 at x = -2, 1/2, 3/4, 2: twice that, for the softness is 1/2."""
+    x = jnp.array([[-2.0], [0.5], [0.75], [2.0]])
+    found = log_desired(x, jnp.array([1.0]), jnp.ones((4, 1)), gamma=1.0)
+    np.testing.assert_allclose(found, log_sigmoid([-2.0, 0.0, 1.0, 2.0]), atol=1e-5)
+    np.testing.assert_allclose(log_desired(-x, jnp.array([-1.0]), -jnp.ones((4, 1)), 1.0), found, atol=1e-6)
+    near = log_desired(x, jnp.array([1.0]), jnp.ones((4, 1)), gamma=0.1)  # the edge lies at 0.05
+    np.testing.assert_allclose(near, log_sigmoid([-0.2, 0.2, 0.2, 0.2]), atol=1e-5)
+
+
+def test_implicit_pairs_narrow_the_half_space():
+    """h = (1, 0), u = (0, 1), gamma 1/2: the worse action is (1/2, 1/2). At (0, 2) and (1, 0) by Pythagoras."""
+    x = jnp.array([[0.0, 2.0], [1.0, 0.0]])
+    found = log_desired(x, jnp.array([1.0, 0.0]), jnp.array([[0.0, 1.0]]), gamma=0.5)
+    pair = log_sigmoid([2 * (np.sqrt(2.5) - np.sqrt(5.0)), 2 * (np.sqrt(0.5) - 0.0)])
+    half = log_sigmoid([2 * (2.0 - np.sqrt(4.25)), 2 * (1.0 - 0.5)])
+    moving = (pair + 0.3 * half) / 1.3
+    right = [(log_sigmoid(2 * (1.0 - 2.0)) + log_sigmoid(2 * (3.0 - 2.0))) / 2, log_sigmoid(2.0)]
+    np.testing.assert_allclose(found, (moving + np.array(right)) / 2, atol=1e-5)  # the second cue is already right
+
+
+def test_already_right_holds_the_action_between_its_neighbours():
+    x = jnp.array([[-1.0], [0.0], [0.4], [1.0]])
+    found = np.asarray(log_desired(x, jnp.zeros(1), jnp.zeros((4, 1)), 0.1))
+    assert found.argmax() == 1
+    assert found[0] == pytest.approx(found[3], abs=1e-6)
+    np.testing.assert_allclose(found[3], (log_sigmoid(-2.0) + log_sigmoid(2.0)) / 2, atol=1e-5)
+
+
+def test_a_cue_of_which_nothing_was_said_is_no_evidence():
+    h = jnp.array([1.0, UNSAID, 0.0])
+    x = jax.random.normal(KEY, (5, 3))
+    implicit = directions_at(h, 30.0, 4)
+    elsewhere = x.at[:, 1].add(jnp.arange(5.0))
+    np.testing.assert_array_equal(implicit[:, 1], 0.0)
+    one, other = (log_desired(rows, h, implicit, 0.1) for rows in (x, elsewhere))
+    np.testing.assert_array_equal(one, other)
+
+
+def test_implicit_directions_are_as_long_as_the_answer_and_lie_at_their_angle():
+    h = jnp.array([1.0, -1.0, 0.0])
+    found = directions_at(h, 30.0, 7)
+    np.testing.assert_allclose(np.linalg.norm(found, axis=-1), np.sqrt(2.0), rtol=1e-5)
+    np.testing.assert_allclose(found @ h / 2.0, np.cos(np.deg2rad(30.0)), rtol=1e-5)
+    alone = jnp.array([UNSAID, -1.0, UNSAID])  # there is no other direction along one cue
+    np.testing.assert_allclose(directions_at(alone, 30.0, 2), [[0.0, -1.0, 0.0]] * 2, atol=1e-6)
+
+
+def test_what_was_shown_has_a_ball_whose_radius_is_a_share_of_the_way_there():
+    """Shown two eps away, radius one eps: members at 0, 1 and 2 eps from it by (1 - distance) / softness."""
+    guide, eps = made("clic-shown"), SCALARS.eps_deg
+    shown = SMALL.exp(MIDDLE, jnp.array([2 * eps, 0.0, 0.0]))
+    row = contrast("clic-shown", MIDDLE, shown)
+    actions = jax.vmap(lambda away: SMALL.exp(shown, away * jnp.array([0.0, eps, 0.0])))(jnp.array([0.0, 1.0, 2.0]))
+    found = guide.membership(KEY, row, actions, SCALARS)
+    np.testing.assert_allclose(found, clic.SHARPNESS * log_sigmoid(np.array([1.0, 0.0, -1.0]) / 0.25), rtol=1e-4)
+
+
+# CLIC's loss and its policy.
+
+
+def contrast(kind, action, answer):
+    """One label as CLIC learns from it."""
+    return jax.tree.map(lambda leaf: leaf[0], made(kind).contrasts(labels(action[None], answer[None])))
+
+
+def labels(action, answer, obs=None, base=None):
+    count = len(action)
+    obs = jnp.broadcast_to(SEEN[0], (count, 2)) if obs is None else obs
+    return Label(obs, action, answer, jnp.ones(count, bool), base)
+
+
+def test_the_loss_has_the_gradient_of_the_papers_divergence():
+    """-log sum pi p has the gradient of KL(target || pi), target ~ pi p held fixed."""
+    guide = made("clic")
+    params = guide.network.init(KEY)
+    rows = guide.contrasts(labels(MIDDLE[None], jnp.array([[1.0, 0.0, UNSAID]])))
+    k_pairs, k_sample = jax.random.split(jax.random.fold_in(jax.random.key(0), 0))
+    row = jax.tree.map(lambda leaf: leaf[0], rows)
+    actions = guide.sampled(k_sample, row, SCALARS)
+    inside = guide.membership(k_pairs, row, actions, SCALARS)
+
+    def divergence(params):
+        log_pi = jax.nn.log_softmax(-guide.energy(ENV, params, row.obs, actions, None, SCALARS))
+        target = jax.lax.stop_gradient(jax.nn.softmax(log_pi + inside))
+        return jnp.sum(target * (jnp.log(target) - log_pi))
+
+    wanted = jax.jit(jax.grad(divergence))(params)
+    found = jax.jit(jax.grad(lambda params: guide.losses(ENV, SCALARS, params, rows).sum()))(params)
+    for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(wanted), strict=True):
+        np.testing.assert_allclose(one, other, atol=2e-5)
+
+
+def test_the_least_energy_lies_on_the_corrected_side():
+    guide = made("clic")
+    answer = jnp.array([1.0, -1.0, UNSAID])
+    told = labels(jnp.tile(MIDDLE, (10, 1)), jnp.tile(answer, (10, 1)))
+    scalars = dataclasses.replace(SCALARS, feedback_learning_rate=1e-2)
+    model = jax.jit(guide.fit)(KEY, ENV, told, guide.init(KEY), scalars)
+    acted = jax.jit(guide.act)(model, ENV, SEEN, jnp.tile(MIDDLE, (2, 1)), jnp.ones(2, bool), scalars)
+    moved = SMALL.log(MIDDLE, acted.actions[0])
+    assert moved[0] > 0.05
+    assert moved[1] < -0.05
+    better, worse = (SMALL.exp(MIDDLE, sign * 0.3 * answer.at[2].set(0.0)) for sign in (1, -1))
+    log_p = guide.log_p(model, ENV, SEEN[0], jnp.stack([better, MIDDLE, worse]), scalars)
+    assert log_p[0] > log_p[1] > log_p[2]
+
+
+class Bowl(clic.Clic):
+    """An energy whose least place is known, a corner of it beyond most bounds."""
+
+    def energy(self, env, params, obs, actions, base, scalars):
+        least = SMALL.exp(MIDDLE, jnp.array([0.21, -0.37, 0.0]))
+        return jnp.sum(jnp.square(SMALL.log(jnp.broadcast_to(least, actions.shape), actions)), -1)
+
+
+def test_the_search_finds_the_least_energy_within_the_bound_and_always_the_same():
+    guide = Bowl(clic.KIND, SIZES, Spaces(2, SMALL), clic.Config())
+    model = guide.init(KEY).replace(fitted=jnp.array(True))
+    act, first = jax.jit(guide.act), SMALL.sample(KEY, (4,)).at[0].set(MIDDLE)
+    obs, active = jnp.zeros((4, 2)), jnp.array([True, True, True, False])
+    far, again = (act(model, ENV, obs, first, active, SCALARS).actions for _ in range(2))
+    np.testing.assert_array_equal(far, again)
+    np.testing.assert_array_equal(far[3], first[3])
+    np.testing.assert_allclose(SMALL.log(MIDDLE, far[:3]), [[0.21, -0.37, 0.0]] * 3, atol=0.02)
+    near = act(model, ENV, obs, first, active, dataclasses.replace(SCALARS, tau_max_deg=0.1)).actions
+    assert np.abs(SMALL.log(first, near)).max() <= 0.1 + 1e-5
+    np.testing.assert_allclose(SMALL.log(MIDDLE, near[0]), [0.1, -0.1, 0.0], atol=0.02)
+
+
+@pytest.mark.parametrize("kind", ["clic", "bdcoach"])
+def test_labels_that_say_nothing_fit_nothing(kind):
+    guide = made(kind)
+    silent = labels(jnp.tile(MIDDLE, (5, 1)), jnp.full((5, 3), UNSAID))
+    assert not bool(jax.jit(guide.fit)(KEY, ENV, silent, guide.init(KEY), SCALARS).fitted)
+
+
+# BD-COACH.
+
+
+def test_the_human_model_leads_the_policy_by_eps_at_most_and_along_all_cues():
+    guide = made("bdcoach")
+    params = jax.tree.map(jnp.zeros_like, guide.init(KEY).params.human)
+    acted = jnp.tile(MIDDLE, (2, 1))
+    rows = guide.lessons(labels(acted, jnp.array([[1.0, UNSAID, 0.0]] * 2)), SCALARS)
+    still = guide.wanted(ENV, params, rows, acted, SCALARS)
+    np.testing.assert_allclose(still.target, acted, atol=1e-6)  # it says "already right"
+    assert still.said.all()
+    loud = jax.tree.map(lambda leaf: jnp.full_like(leaf, 9.0) if leaf.shape == (3,) else leaf, params)
+    moved = guide.wanted(ENV, loud, rows, acted, SCALARS)
+    np.testing.assert_allclose(SMALL.log(acted, moved.target), SCALARS.eps_deg, rtol=1e-5)
+
+
+def test_the_human_model_is_taught_answers_and_nothing_of_other_cues():
+    """Ranges 2, 4, 2: an answer of 1 is missed by a whole range of 2, so by one in the space's unit."""
+    guide = made("bdcoach")
+    params = jax.tree.map(jnp.zeros_like, guide.init(KEY).params.human)
+    told = [[1.0, UNSAID, UNSAID], [1.0, 0.0, UNSAID], [1.0, -1.0, 0.0]]
+    rows = [guide.lessons(labels(MIDDLE[None], jnp.array([answer])), SCALARS) for answer in told]
+    found = [float(guide.modelled(ENV, params, row, SCALARS)) for row in rows]
+    np.testing.assert_allclose(found, [1.0, 1.0, 2.0], rtol=1e-4)
+
+
+def test_bd_coach_goes_on_from_where_it_was_by_what_is_new():
+    guide = made("bdcoach")
+    action = SMALL.sample(KEY, (8,))
+    given = labels(action, SMALL.sense(action, ENV.best(SEEN[0])))
+    fit, fresh = jax.jit(guide.fit), guide.init(KEY)
+    half = fit(KEY, ENV, given.replace(valid=jnp.arange(8) < 4), fresh, SCALARS)
+    assert int(half.params.learned) == 4
+    whole, at_once = (fit(KEY, ENV, given, former, SCALARS) for former in (half, fresh))
+    jax.tree.map(np.testing.assert_array_equal, whole, at_once)
+    jax.tree.map(np.testing.assert_array_equal, fit(KEY, ENV, given, whole, SCALARS), whole)  # nothing is new
+
+
+def test_the_buffer_moves_the_policy_by_what_its_own_actions_would_be_told():
+    """Labels about other actions than the policy's lead it on as well: deep COACH would replay their targets."""
+    env = probes.Window()
+    sizes = dataclasses.replace(SIZES, feedback_layers=(32, 32))
+    guide = bdcoach.KIND.make(sizes, Spaces(2, DIRECTIONS), bdcoach.Config(batch_steps=10))
+    asked = directions.evenly_spaced(24)
+    obs = jnp.tile(SEEN[:1], (24, 1))
+    best = env.best(SEEN[0])
+    given = Label(obs, asked, DIRECTIONS.sense(asked, best), jnp.ones(24, bool))
+    scalars = dataclasses.replace(probes.SCALARS, eps_deg=20.0, feedback_learning_rate=1e-2)
+    model = jax.jit(guide.fit)(KEY, env, given, guide.init(KEY), scalars)
+    acted = guide.act(model, env, SEEN[:1], -SEEN[:1], jnp.ones(1, bool), scalars).actions[0]
+    assert np.degrees(DIRECTIONS.distance(acted, best)) < 20
