@@ -55,7 +55,7 @@ WORLDS: Mapping[str, World] = {
     )
 }
 RELATIVE_KINDS = ("relative", "dcoach", "bdcoach", "clic")
-LEARNED = (*RELATIVE_KINDS, "demonstration", "scalar", "clic-shown")
+LEARNED = (*RELATIVE_KINDS, "demonstration", "scalar", "clic_shown")
 ADAPTED = ("calibration", "offset", *RELATIVE_KINDS, "demonstration", "scalar")
 KINDS: Mapping[str, tuple[str, ...]] = {
     name: ("base", *(ADAPTED if world.adapts else LEARNED)) for name, world in WORLDS.items()
@@ -75,7 +75,7 @@ def settings_of(world: str, kind: str) -> list[dict[str, Any]]:
         second = {"scalars.scalar_within_deg": WITHIN[world]}
     if kind == "demonstration":
         second = {"sizes.fit_steps": (300, 600)}
-    if kind == "clic-shown":
+    if kind == "clic_shown":
         second = {"radius": (0.5, 0.1)}
     grid = {**RATES, **second}
     found = [dict(zip(grid, values, strict=True)) for values in product(*grid.values())]
@@ -101,7 +101,7 @@ CHOSEN: Mapping[str, Mapping[str, Settings]] = {
         "clic": {**SLOW, "scalars.eps_deg": 0.1},
         "demonstration": {**FAST, "sizes.fit_steps": 600},
         "scalar": {**SLOW, "scalars.scalar_within_deg": 0.2},
-        "clic-shown": {**FAST, "radius": 0.1},
+        "clic_shown": {**FAST, "radius": 0.1},
     },
     # Of BD-COACH as compared there. Of others, not yet: step sizes of `grasp`, and answers as in fetch_hand_eye.py.
     "reach": {

@@ -12,7 +12,7 @@ x = log(a, b) / eps along the cues of which a label (s, a, h) speaks, zero along
     E = argmin over labels of -log sum over b of pi(b | s) p(b in A)
     a <- argmin over b within tau_max of a of E(s, b)
 
-A demonstration a+ of what to do in place of a (`clic-shown`, absolute corrections) has one set in place of these,
+A demonstration a+ of what to do in place of a (`clic_shown`, absolute corrections) has one set in place of these,
 A = {b : |log(a+, b)| < radius |log(a+, a)|}, of the same form and half that softness.
 
 What differs, and why. The paper's loss is KL(target || pi) with target ~ pi p held fixed; the one above has the same
@@ -318,7 +318,7 @@ KIND = Kind(
     config=Config,
 )
 SHOWN = Kind(
-    "clic-shown",
+    "clic_shown",
     "an energy over actions, low around what the teacher shows",
     ClicShown,
     form=DEMONSTRATION,

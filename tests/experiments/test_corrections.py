@@ -52,7 +52,7 @@ def test_one_cue_a_label_means_nothing_where_there_is_one_cue(study):
     corrections = imported("_corrections")
     one = next(condition for condition in study.CONDITIONS if condition.name == "one")
     plain = study.CONDITIONS[0]
-    clic, shown = registry.find("clic"), registry.find("clic-shown")
+    clic, shown = registry.find("clic"), registry.find("clic_shown")
     assert [corrections.means(cues, one, clic) for cues in (1, 3)] == [False, True]
     assert not corrections.means(3, one, shown)
     assert corrections.means(1, plain, shown)

@@ -48,7 +48,7 @@ def away(kind, rounds=3, **faults):
     return tuple(np.asarray(SMALL.distance(actions, goals)) for actions in (first, acted.actions))
 
 
-LONG = [pytest.param(kind, 0.12, marks=pytest.mark.long) for kind in ("bdcoach", "clic", "clic-shown")]
+LONG = [pytest.param(kind, 0.12, marks=pytest.mark.long) for kind in ("bdcoach", "clic", "clic_shown")]
 
 
 @pytest.mark.parametrize(

@@ -132,7 +132,7 @@ PEERS = (("1", "all", 0.7), ("3", "one", 0.9), ("7", "all", 0.9), ("gears", "all
         long("demonstration", "7", "all", 0.1),
         long("demonstration", "gears", "all", 0.1),
         long("scalar", "1", "all", 0.6),
-        *(long(kind, *case) for kind in ("bdcoach", "clic", "clic-shown") for case in PEERS),
+        *(long(kind, *case) for kind in ("bdcoach", "clic", "clic_shown") for case in PEERS),
         long("scalar", "gears", "all", 0.6),
     ],
 )
@@ -189,7 +189,7 @@ def test_lessons_of_one_cue_count_whole():
     assert float(squared(lesson, jnp.array([[3.0]]))[0]) == 9.0
 
 
-@pytest.mark.parametrize("kind", ["relative", "offset", "dcoach", "bdcoach", "clic", "clic-shown", "calibration"])
+@pytest.mark.parametrize("kind", ["relative", "offset", "dcoach", "bdcoach", "clic", "clic_shown", "calibration"])
 def test_a_kind_of_cues_refuses_choices_without_an_order_in_one_line(kind):
     with pytest.raises(UserError, match="have no order: give them one") as refusal:
         registry.make(kind, SIZES, Anywhere(FRUIT))

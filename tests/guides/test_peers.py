@@ -93,9 +93,9 @@ def test_implicit_directions_are_as_long_as_the_answer_and_lie_at_their_angle():
 
 def test_what_was_shown_has_a_ball_whose_radius_is_a_share_of_the_way_there():
     """Shown two eps away, radius one eps: members at 0, 1 and 2 eps from it by (1 - distance) / softness."""
-    guide, eps = made("clic-shown"), SCALARS.eps_deg
+    guide, eps = made("clic_shown"), SCALARS.eps_deg
     shown = SMALL.exp(MIDDLE, jnp.array([2 * eps, 0.0, 0.0]))
-    row = contrast("clic-shown", MIDDLE, shown)
+    row = contrast("clic_shown", MIDDLE, shown)
     actions = jax.vmap(lambda away: SMALL.exp(shown, away * jnp.array([0.0, eps, 0.0])))(jnp.array([0.0, 1.0, 2.0]))
     found = guide.membership(KEY, row, actions, SCALARS)
     np.testing.assert_allclose(found, clic.SHARPNESS * log_sigmoid(np.array([1.0, 0.0, -1.0]) / 0.25), rtol=1e-4)
