@@ -13,8 +13,8 @@ from cuelearner_envs.arm.config import SIDES, ArmConfig
 from cuelearner_envs.arm.environment import ACTIONS
 from cuelearner_envs.arm.places import BASE
 from cuelearner_jax.adaptation.adapting import plain_scalars
-from cuelearner_jax.agents import ddqn
-from cuelearner_jax.arbiters import paced
+from cuelearner_jax.agents import sac
+from cuelearner_jax.arbiters import by_value
 from cuelearner_jax.config import Schedule, Sizes
 from cuelearner_jax.environment import OWN, Environment, Quantity
 from cuelearner_jax.errors import UserError
@@ -152,17 +152,18 @@ QUICKSTART = RunConfig(
         eval_envs=20,
         checkpoint_every=8_000,
     ),
-    ddqn.Config(
-        q_layers=(128, 128),
-        directions=256,
-        target_directions=64,
-        batch_size=64,
+    sac.Config(
+        actor_layers=(64, 64),
+        critic_layers=(64, 64),
+        batch_size=128,
         replay_capacity=64_000,
-        optimizer="adam",
-        learning_rate=0.001,
-        polyak=0.05,
+        actor_rate=1e-3,
+        critic_rate=1e-3,
+        temperature_rate=1e-3,
+        first_temperature=0.1,  # rewards are ways in metres
+        polyak=0.02,
     ),
-    paced.Config(),
+    by_value.Config(),
 )
 PAPER = dataclasses.replace(
     QUICKSTART,
@@ -176,7 +177,14 @@ PAPER = dataclasses.replace(
         eval_envs=100,
         checkpoint_every=100_000,
     ),
-    agent=dataclasses.replace(QUICKSTART.agent, q_layers=(256, 256), batch_size=256, replay_capacity=1_000_000),
+    agent=dataclasses.replace(
+        QUICKSTART.agent,
+        actor_layers=(256, 256),
+        critic_layers=(256, 256),
+        layer_norm=True,
+        batch_size=256,
+        replay_capacity=1_000_000,
+    ),
 )
 
 ARM = Task(

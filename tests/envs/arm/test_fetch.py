@@ -134,7 +134,7 @@ def test_a_policy_is_adapted_in_fetch_by_labels():
     world = cl.make("arm", robot="fetch", scenario="turned_camera", skill="reach")
     script = policy_of(jax.jit(scripts.reach))
     before = cl.measure(script, world, episodes=20).metrics["success"]
-    found = cl.adapt(script, world, labels=100)
+    found = cl.adapt(script, world, cl.teacher_of(world), labels=100)
     (turn,) = [one for one in found.estimates if "turn" in one.name and one.changed]
     assert turn.mean == pytest.approx(10.0, abs=0.3)
     assert float(np.mean(before)) <= 0.1
