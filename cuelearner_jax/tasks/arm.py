@@ -14,7 +14,7 @@ from cuelearner_envs.arm.environment import ACTIONS
 from cuelearner_envs.arm.places import BASE
 from cuelearner_jax.adaptation.adapting import plain_scalars
 from cuelearner_jax.agents import sac
-from cuelearner_jax.arbiters import by_value
+from cuelearner_jax.arbiters import paced
 from cuelearner_jax.config import Schedule, Sizes
 from cuelearner_jax.environment import OWN, Environment, Quantity
 from cuelearner_jax.errors import UserError
@@ -163,7 +163,7 @@ QUICKSTART = RunConfig(
         first_temperature=0.1,  # rewards are ways in metres
         polyak=0.02,
     ),
-    by_value.Config(),
+    paced.Config(lead=0.0),
 )
 PAPER = dataclasses.replace(
     QUICKSTART,
