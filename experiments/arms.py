@@ -14,7 +14,7 @@ A piece of adaptation corrects a script, or in Fetch a trained agent, by labels.
 rewarded. A piece is done once `measured.json` lies in its folder.
 
 Last come a table and FOLDER/arms.json: labels and rewarded steps of each variant, success with its 95% interval, how
-many seeds reach 80%, and their median step.
+many seeds reach 80%, their median step, and the ratio of steps to those of the agent alone.
 """
 
 from __future__ import annotations
@@ -199,24 +199,52 @@ def reached(rows: Sequence[dict[str, Any]]) -> list[float]:
     return [steps_to(LEVEL, curve) for curve in curves]
 
 
-def table(rows: Sequence[dict[str, Any]], guides: Sequence[dict[str, Any]], shown: Sequence[dict[str, Any]]) -> str:
+def compared(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Steps to the level for each variant, and their ratio to those of the agent alone with its 95% interval.
+
+    For the ratio a seed that never gets there counts with all of its steps: with such seeds among the unguided ones the
+    true ratio is smaller. The interval draws seeds of both, each by itself.
+    """
+    found, lines = dict(_grouped(rows, "world", "run", "guidance", "labels")), []
+    for names, own in found.items():
+        at, alone = reached(own), found.get((names[0], "alone", "none", 0))
+        row = dict(zip(("world", "run", "guidance", "labels"), names, strict=True))
+        row |= {"steps": [step if np.isfinite(step) else None for step in at], "reached": int(np.isfinite(at).sum())}
+        row["median"] = float(np.median(at)) if np.isfinite(np.median(at)) else None
+        if alone is not None and alone is not own:
+            row["ratio"] = _ratio(
+                np.minimum(at, own[-1]["step"]),
+                np.minimum(reached(alone), alone[-1]["step"]),
+            )
+        end = {name: own[-1][name] for name in ("step", "rewarded_steps", "mean", "low", "high")}
+        lines.append({**row, "end": end})
+    return lines
+
+
+def _ratio(steps: np.ndarray, others: np.ndarray) -> list[float]:
+    """Ratio of the means of two samples, and the ends of its 95% interval."""
+    draw = np.random.default_rng(0)
+    tops, bottoms = (draw.choice(sample, (2_000, len(sample))).mean(-1) for sample in (steps, others))
+    ends = np.quantile(tops / np.maximum(bottoms, 1), (0.025, 0.975))
+    return [float(steps.mean() / max(others.mean(), 1)), *ends.tolist()]
+
+
+def table(steps: Sequence[dict[str, Any]], guides: Sequence[dict[str, Any]], shown: Sequence[dict[str, Any]]) -> str:
     """A line for each variant of training, each guide of all its labels, and each adaptation."""
-    lines = [f"{'world':<11}{'run':<13}{'guidance':<15}{'labels':>6}  success at the end, seeds at {LEVEL:.0%}"]
-    for names, own in _grouped(rows, "world", "run", "guidance", "labels"):
-        at = reached(own)
-        median = float(np.median(at))
-        there = f"{sum(np.isfinite(at))} of {len(at)}" + (f", median step {median:,.0f}" if median < np.inf else "")
-        lines.append(_line(names, own[-1]) + f" at {own[-1]['step']:,}; {there}")
-    for (*names, budget), own in _grouped(guides, "world", "run", "guidance", "budget"):
-        if own[-1]["labels"] == budget:
-            lines.append(_line([*names, budget], own[-1]) + " of the guide alone")
-    lines += [_line([row["world"], row["run"], row["guidance"], row["labels"]], row) for row in shown]
-    return "\n".join(lines)
+    lines = [f"{'world':<16}{'run':<15}{'guidance':<15}{'labels':>6}  success at the end; seeds at {LEVEL:.0%}"]
+    for row in steps:
+        told = f" at {row['end']['step']:,}; {row['reached']} of {len(row['steps'])}"
+        told += "" if row["median"] is None else f", median step {row['median']:,.0f}"
+        if "ratio" in row:
+            told += "; {:.2f} [{:.2f}, {:.2f}] of the steps alone".format(*row["ratio"])
+        lines.append(_line({**row, **row["end"]}) + told)
+    lines += [_line(row) + " of the guide alone" for row in guides if row["labels"] == row["budget"]]
+    return "\n".join([*lines, *map(_line, shown)])
 
 
-def _line(names: Sequence[Any], row: dict[str, Any]) -> str:
-    world, run, guidance, labels = names
-    return f"{world:<11}{run:<13}{guidance:<15}{labels:>6}  {row['mean']:.3f} [{row['low']:.3f}, {row['high']:.3f}]"
+def _line(row: dict[str, Any]) -> str:
+    names = f"{row['world']:<16}{row['run']:<15}{row['guidance']:<15}{row['labels']:>6}"
+    return f"{names}  {row['mean']:.3f} [{row['low']:.3f}, {row['high']:.3f}]"
 
 
 def done(pieces: Sequence[Piece | Corrected], scale: str, out: Path) -> int:
@@ -243,9 +271,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     status = 0 if asked.report else within(asked.minutes, lambda: done(pieces, asked.scale, out))
     rows, guides, shown = rows_of(out, TRAINED), guides_of(out, TRAINED), measured(out, CORRECTED)
     if rows or shown:
-        told = {**provenance(), "scale": asked.scale, "training": rows, "guides": guides, "adaptation": shown}
+        steps_taken = compared(rows)
+        told = {**provenance(), "scale": asked.scale, "training": rows, "steps": steps_taken}
+        told |= {"guides": guides, "adaptation": shown}
         (out / "arms.json").write_text(json.dumps(told, indent=1) + "\n")
-        print(table(rows, guides, shown))
+        print(table(steps_taken, guides, shown))
     return status
 
 

@@ -6,6 +6,7 @@ import math
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from cuelearner_jax.cli import main
@@ -100,9 +101,17 @@ def test_the_table_counts_the_seeds_that_reach_the_level(study):
     steps = study.reached(rows)
     assert steps[:2] == [100, pytest.approx(100 + 100 * 0.4 / 0.6)]
     assert math.isinf(steps[2])
-    (line,) = study.table(rows, [], []).splitlines()[1:]
+    faster = [{**row, "run": "by_value", "each": dict.fromkeys(row["each"], 0.8)} for row in rows[1:]]
+    alone, guided = sorted(study.compared([*rows, *faster]), key=lambda row: row["run"])
+    assert alone["reached"] == 2
+    assert "ratio" not in alone
+    ratio, low, high = guided["ratio"]
+    assert ratio == pytest.approx(100 / np.mean([100, 100 + 100 * 0.4 / 0.6, 200]))
+    assert low < ratio < high
+    line, other = study.table([alone, guided], [], []).splitlines()[1:]
     assert "0.733 [" in line
     assert "at 200; 2 of 3, median step 167" in line
+    assert "3 of 3, median step 100; 0.64 [" in other
 
 
 @pytest.mark.long
