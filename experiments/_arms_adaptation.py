@@ -78,6 +78,7 @@ def _in_world(world: str) -> list[Corrected]:
     rows = [
         Corrected(world, "script", "unchanged", (), 1, {}, 1, "the script, nothing changed", where=plain),
         Corrected(world, "script", "changed", (), 1, {}, 1, "the script in the changed world", where=there),
+        Corrected(world, "script", "teacher", (), 1, {}, 1, "who answers, in the changed world", where=there),
     ]
     for run, options in VARIANTS.items():
         for kind in VARIED.get(run, KINDS):
@@ -141,7 +142,9 @@ def commands(piece: Corrected, out: Path, scale: str) -> list[list[str]]:
     shown += ["--out", str(folder / "measured.json")]
     where = [word for name, value in piece.where.items() for word in option(name, value)]
     if not piece.kinds:
-        whose = [str(run)] if piece.source else ["arm", "--policy", "heuristic"]
+        whose = (
+            [str(run)] if piece.source else ["arm", "--policy", "teacher" if piece.name == "teacher" else "heuristic"]
+        )
         return [["evaluate", *whose, *where, *shown]]
     given = {} if piece.kinds == (EVIDENCE,) else dict(ADAPTED_SCALES[scale].options)
     given |= {**piece.options, "guidance": piece.kinds, "labels": left.labels, "judge-by": "labels"}

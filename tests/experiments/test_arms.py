@@ -131,6 +131,7 @@ def test_pieces_run_are_told_and_are_not_run_again(study, tmp_path, capsys):
     assert {(row["guidance"], row["mean"]) for row in told["adaptation"] if row["run"] == "script"} == {
         ("unchanged", 1.0),
         ("changed", 0.0),
+        ("teacher", 1.0),
     }
     first = capsys.readouterr()
     assert study.main(command) == 0
