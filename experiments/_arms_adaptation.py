@@ -142,9 +142,8 @@ def commands(piece: Corrected, out: Path, scale: str) -> list[list[str]]:
     shown += ["--out", str(folder / "measured.json")]
     where = [word for name, value in piece.where.items() for word in option(name, value)]
     if not piece.kinds:
-        whose = (
-            [str(run)] if piece.source else ["arm", "--policy", "teacher" if piece.name == "teacher" else "heuristic"]
-        )
+        who = "teacher" if piece.name == "teacher" else "heuristic"
+        whose = [str(run)] if piece.source else ["arm", "--policy", who]
         return [["evaluate", *whose, *where, *shown]]
     given = {} if piece.kinds == (EVIDENCE,) else dict(ADAPTED_SCALES[scale].options)
     given |= {**piece.options, "guidance": piece.kinds, "labels": left.labels, "judge-by": "labels"}
