@@ -1,4 +1,8 @@
-"""Scripts of the arm in changed worlds, and trained agents in Fetch, corrected by labels without a rewarded step."""
+"""Scripts of the arm in changed worlds, and trained agents in Fetch, corrected by labels.
+
+Held-out answers judge whether a model is used: no step is rewarded. Demonstrations and good/bad labels cannot judge:
+20 tuning episodes do, whose steps are counted.
+"""
 
 from __future__ import annotations
 
@@ -36,6 +40,7 @@ VARIANTS: dict[str, Options] = {
 }
 VARIED = {"wrong": (EVIDENCE, "relative"), "one_cue": (EVIDENCE, "relative"), "shuffled": ("relative",)}
 LABELS, FETCH_LABELS, SEEDS, EPISODES = 100, 200, 8, 200
+JUDGED = 20  # episodes that judge where held-out answers cannot
 FETCH_BUDGET = 500  # of the agents that act in Fetch
 
 
@@ -146,7 +151,7 @@ def commands(piece: Corrected, out: Path, scale: str) -> list[list[str]]:
         whose = [str(run)] if piece.source else ["arm", "--policy", who]
         return [["evaluate", *whose, *where, *shown]]
     given = {} if piece.kinds == (EVIDENCE,) else dict(ADAPTED_SCALES[scale].options)
-    given |= {**piece.options, "guidance": piece.kinds, "labels": left.labels, "judge-by": "labels"}
+    given |= {**piece.options, "guidance": piece.kinds, "labels": left.labels, **_judge(piece)}
     policy = str(folder / "policy")
     if piece.source:
         budget, seeds = AGENTS.get(scale, FETCH_BUDGET), _seeds_in(run)
@@ -158,6 +163,14 @@ def commands(piece: Corrected, out: Path, scale: str) -> list[list[str]]:
         again = [policy, "--base", script, *shown]
     more = [word for name, value in given.items() for word in option(name, value)]
     return [["adapt", *whose, *where, *more, "--out", policy, "--overwrite"], ["evaluate", *again]]
+
+
+def _judge(piece: Corrected) -> Options:
+    """Who decides whether a model is used: held-out answers, or a few tuning episodes where answers are no cues."""
+    form = registry.find(piece.kinds[0]).form
+    if piece.kinds == (EVIDENCE,) or (form is not None and form.by_eps):
+        return {"judge-by": "labels"}
+    return {"judge-by": piece.metric, "judge-episodes": JUDGED}
 
 
 def _seeds_in(run: Path) -> tuple[int, ...]:
@@ -180,3 +193,9 @@ def measured(out: Path, pieces: Sequence[Corrected]) -> list[dict[str, Any]]:
             )
             found[-1] |= {"rewarded_steps": 0}
     return found
+
+
+def _paid(folder: Path) -> int:
+    """Rewarded steps of a lane that judged a model."""
+    file = folder / "policy" / "policy.json"
+    return max(json.loads(file.read_text())["judged"]["rewarded_steps"]) if file.exists() else 0
