@@ -30,7 +30,7 @@ CHANGED: dict[str, tuple[str, str, Options, str]] = {
     "push_left": ("push", "past_left", {}, "passed_left"),
     "push_right": ("push", "past_right", {}, "passed_right"),
 }
-FORMS = ("relative", "demonstration", "scalar", "dcoach", "bdcoach", "clic")
+FORMS = ("relative", "offset", "demonstration", "scalar", "dcoach", "bdcoach", "clic")
 KINDS = (EVIDENCE, *(kind for kind in FORMS if registry.registered(kind)))
 VARIANTS: dict[str, Options] = {
     "adapted": {},
@@ -168,7 +168,7 @@ def commands(piece: Corrected, out: Path, scale: str) -> list[list[str]]:
 def _judge(piece: Corrected) -> Options:
     """Who decides whether a model is used: held-out answers, or a few tuning episodes where answers are no cues."""
     form = registry.find(piece.kinds[0]).form
-    if piece.kinds == (EVIDENCE,) or (form is not None and form.by_eps):
+    if form is not None and form.by_eps:
         return {"judge-by": "labels"}
     return {"judge-by": piece.metric, "judge-episodes": JUDGED}
 

@@ -11,8 +11,8 @@ half of all episodes are that policy's, and so is half of every minibatch (RLPD:
 the agent never learns: what counts is the guide of uniform actions.
 
 A piece of adaptation corrects a script, or in Fetch a trained agent, by labels. Held-out labels judge: no step is
-rewarded. Demonstrations and good/bad labels cannot judge: 20 tuning episodes do, and their steps are counted. A piece is
-done once `measured.json` lies in its folder.
+rewarded. Demonstrations and good/bad labels cannot judge: 20 tuning episodes do, and their steps are counted. A piece
+is done once `measured.json` lies in its folder.
 
 Last come a table and FOLDER/arms.json: labels and rewarded steps of each variant, success with its 95% interval, how
 many seeds reach 80%, their median step, and the ratio of steps to those of the agent alone.

@@ -69,7 +69,7 @@ def test_every_adaptation_is_a_command_that_would_begin(study, corrections, monk
         main(study.commands(piece, tmp_path, "paper")[0])
         assert len(asked) == number + 1, piece.path
         if piece.kinds:
-            by_labels = piece.kinds[0] == "calibration" or registry.find(piece.kinds[0]).form.by_eps
+            by_labels = registry.find(piece.kinds[0]).form.by_eps
             assert asked[-1].judge_by == ("labels" if by_labels else piece.metric)
             assert (asked[-1].guidance,) == piece.kinds
             assert asked[-1].labels == (100,)
