@@ -260,6 +260,8 @@ class Task:
         if name is None:
             return None
         engines = self.bodies[0].engines
+        if name not in engines and name in (body.name for body in self.bodies[1:]):
+            raise UserError(f"{name} is a robot of {self.name}, not an engine: give --robot {name}")
         if not engines:
             others = [body.name for body in self.bodies if body.engines]
             raise UserError(f"--engine {name} needs --robot: choose one of {', '.join(others) or 'none'}")

@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping, Sequence
+import itertools
+import os
+import signal
+import threading
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -11,6 +15,7 @@ import label_efficiency
 
 from cuelearner_jax.cli import main as cuelearner
 from cuelearner_jax.guides.registry import resolve
+from cuelearner_jax.signals import Interrupted
 
 FIRST_SEED = 4000  # of reported runs; settings are chosen on seeds from 0 on, with --tuning
 LABEL_EFFICIENCY = "label_efficiency"  # in the place of a command's name: the report of that file
@@ -183,3 +188,63 @@ def run(experiment: Experiment, about: str, arguments: Sequence[str] | None = No
     worlds = dict.fromkeys(piece.world for piece in pieces)
     reports = [report_command(experiment, world, out, asked.scale) for world in worlds]
     return next((status for command in reports if command and (status := reported(command))), 0)
+
+
+def asked_of(
+    about: str, pieces: Sequence[Any], scales: Mapping[str, Any], name: str, arguments: Sequence[str] | None
+) -> tuple[argparse.Namespace, list[Any]]:
+    """Return what a study of its own table is asked for, and the pieces that are meant.
+
+    `name`: of its folder below runs/. Ends the process for options that make no sense.
+    """
+    form = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser(description=about, formatter_class=form, allow_abbrev=False)
+    told = "; ".join(f"{known}: {scale.about}" for known, scale in scales.items())
+    parser.add_argument("--scale", choices=list(scales), default="paper", help=told)
+    parser.add_argument("--pieces", nargs="+", default=[], metavar="NAME", help="these alone, or all below a folder")
+    parser.add_argument("--labels", nargs="+", type=int, default=[], help="these of the pieces' budgets alone")
+    parser.add_argument("--out", type=Path, default=Path("runs") / name, help="folder")
+    parser.add_argument("--minutes", type=float, help="save and end after so many; the same command goes on")
+    parser.add_argument("--list", action="store_true", help="list the pieces and stop")
+    parser.add_argument("--report", action="store_true", help="tell what there is, and run nothing")
+    asked = parser.parse_args(arguments)
+    try:
+        meant = chosen(argparse.Namespace(pieces=pieces), asked.pieces)
+    except ValueError as error:
+        parser.error(str(error))
+    if asked.labels:
+        kept = [piece._replace(labels=tuple(one for one in piece.labels if one in asked.labels)) for piece in meant]
+        meant = [new for old, new in zip(meant, kept, strict=True) if new.labels or not old.labels]
+    return asked, meant
+
+
+def within(minutes: float | None, work: Callable[[], int]) -> int:
+    """Return the exit status of work that saves and ends after so many minutes, as at Ctrl-C (None: no limit).
+
+    That the time was up is no failure: 0.
+    """
+    timer = threading.Timer(60 * (minutes or 0.0), lambda: os.kill(os.getpid(), signal.SIGINT))
+    timer.daemon = True
+    if minutes:
+        timer.start()
+    try:
+        status = work()
+    except KeyboardInterrupt:  # between two pieces
+        status = Interrupted.status
+    finally:
+        timer.cancel()
+    if status == Interrupted.status and minutes:
+        print("the time is up: the same command goes on")
+        status = 0
+    return status
+
+
+def steps_to(level: float, rows: Sequence[Mapping[str, Any]]) -> float:
+    """Steps after which the mean curve first reaches a level, on straight lines between evaluations; inf: never."""
+    for before, after in itertools.pairwise(rows):
+        if before["mean"] >= level:
+            return before["step"]
+        if after["mean"] >= level:
+            share = (level - before["mean"]) / (after["mean"] - before["mean"])
+            return before["step"] + share * (after["step"] - before["step"])
+    return rows[-1]["step"] if rows and rows[-1]["mean"] >= level else float("inf")

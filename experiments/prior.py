@@ -16,25 +16,19 @@ but the prior's, `paced` and `papers` are the ways that were there before, `by_v
 
 from __future__ import annotations
 
-import argparse
-import itertools
 import json
-import os
-import signal
-import threading
 from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from _pieces import Options, Piece, Scale, chosen, folder_at, listed, scaled, sweep_command
+from _pieces import Options, Piece, Scale, asked_of, folder_at, listed, scaled, steps_to, sweep_command, within
 
 from cuelearner_jax.arbiters.prior import ARMS
 from cuelearner_jax.cli import main as cuelearner
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import mean_interval
-from cuelearner_jax.signals import Interrupted
 from cuelearner_jax.storage import formats, results
 from cuelearner_jax.storage.provenance import provenance
 
@@ -172,17 +166,6 @@ def rows_of(out: Path, pieces: Sequence[Piece]) -> list[dict[str, Any]]:
     return found
 
 
-def steps_to(level: float, rows: Sequence[dict[str, Any]]) -> float:
-    """Steps after which the mean curve first reaches a level, on straight lines between evaluations; inf: never."""
-    for before, after in itertools.pairwise(rows):
-        if before["mean"] >= level:
-            return before["step"]
-        if after["mean"] >= level:
-            share = (level - before["mean"]) / (after["mean"] - before["mean"])
-            return before["step"] + share * (after["step"] - before["step"])
-    return rows[-1]["step"] if rows and rows[-1]["mean"] >= level else float("inf")
-
-
 def table(rows: Sequence[dict[str, Any]]) -> str:
     """One line a variant: at the start, after a tenth and at the end, and in navigation the steps to the level."""
     groups = defaultdict(list)
@@ -199,59 +182,22 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
-def interrupting(minutes: float) -> threading.Timer:
-    """A timer that asks this process to save and to end, as Ctrl-C does."""
-    timer = threading.Timer(60 * minutes, lambda: os.kill(os.getpid(), signal.SIGINT))
-    timer.daemon = True
-    return timer
-
-
-def trained(pieces: Sequence[Piece], scale: Scale, out: Path, minutes: float | None) -> int:
+def trained(pieces: Sequence[Piece], scale: Scale, out: Path) -> int:
     """Run pieces, each from where it stands; the status of the first that did not end well."""
-    timer = interrupting(minutes) if minutes else None
-    if timer:
-        timer.start()
-    try:
-        for piece in filter(None, (scaled(piece, scale) for piece in pieces)):
-            if status := cuelearner(sweep_command(TASKS[piece.world], piece, out, resume=True)):
-                return status
-    except KeyboardInterrupt:  # between two pieces
-        return Interrupted.status
-    finally:
-        if timer:
-            timer.cancel()
+    for piece in filter(None, (scaled(piece, scale) for piece in pieces)):
+        if status := cuelearner(sweep_command(TASKS[piece.world], piece, out, resume=True)):
+            return status
     return 0
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run, then tell; returns the exit status, 0 also where the time was up."""
-    about = argparse.RawDescriptionHelpFormatter
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=about, allow_abbrev=False)
-    scales = "; ".join(f"{name}: {scale.about}" for name, scale in SCALES.items())
-    parser.add_argument("--scale", choices=list(SCALES), default="paper", help=scales)
-    parser.add_argument("--pieces", nargs="+", default=[], metavar="NAME", help="these alone, or all below a folder")
-    parser.add_argument("--labels", nargs="+", type=int, default=[], help="these of the pieces' budgets alone")
-    parser.add_argument("--out", type=Path, default=Path("runs/prior"), help="folder")
-    parser.add_argument("--minutes", type=float, help="save and end after so many; the same command goes on")
-    parser.add_argument("--list", action="store_true", help="list the pieces and stop")
-    parser.add_argument("--report", action="store_true", help="tell what there is, and run nothing")
-    asked = parser.parse_args(arguments)
-    experiment = argparse.Namespace(pieces=PIECES)
-    try:
-        pieces = chosen(experiment, asked.pieces)
-    except ValueError as error:
-        parser.error(str(error))
-    if asked.labels:
-        kept = [piece._replace(labels=tuple(one for one in piece.labels if one in asked.labels)) for piece in pieces]
-        pieces = [new for old, new in zip(pieces, kept, strict=True) if new.labels or not old.labels]
+    asked, pieces = asked_of(__doc__ or "", PIECES, SCALES, "prior", arguments)
     if asked.list:
         print(listed(pieces))
         return 0
     out = folder_at(asked.out, asked.scale)
-    status = 0 if asked.report else trained(pieces, SCALES[asked.scale], out, asked.minutes)
-    if status == Interrupted.status and asked.minutes:
-        print("the time is up: the same command goes on")
-        status = 0
+    status = 0 if asked.report else within(asked.minutes, lambda: trained(pieces, SCALES[asked.scale], out))
     if rows := rows_of(out, PIECES):
         told = {**provenance(), "scale": asked.scale, "rows": rows}
         (out / "prior.json").write_text(json.dumps(told, indent=1) + "\n")

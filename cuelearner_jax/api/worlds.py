@@ -89,7 +89,8 @@ def make(name: str | Task, *, scenario: str | None = None, robot: str | None = N
     Args:
         name: of the task ("billiards", "navigation", one of an installed package, `package.module:NAME`), or the task.
         scenario: a changed world of the task's by name.
-        robot: what acts there (default: the task's own), "anymal" in navigation, "pooltool" in billiards.
+        robot: what acts there (default: the task's own): "anymal" in navigation, "pooltool" in billiards, "fetch" in
+            arm.
         changes: fields of its configuration, as `cuelearner evaluate TASK --help-all` lists them under "task options".
 
     Raises:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from importlib.util import find_spec
 from typing import Any
 
 import jax.numpy as jnp
@@ -12,10 +13,11 @@ from cuelearner_envs.arm.config import SIDES, ArmConfig
 from cuelearner_envs.arm.environment import ACTIONS
 from cuelearner_envs.arm.places import BASE
 from cuelearner_jax.adaptation.adapting import plain_scalars
-from cuelearner_jax.agents import ddqn
+from cuelearner_jax.agents import sac
 from cuelearner_jax.arbiters import paced
 from cuelearner_jax.config import Schedule, Sizes
 from cuelearner_jax.environment import OWN, Environment, Quantity
+from cuelearner_jax.errors import UserError
 from cuelearner_jax.policies import Heuristic
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.task import PAPERS_FIT, Body, Pictures, Preset, Scenario, Task
@@ -43,6 +45,23 @@ def _seen(quantity: Quantity) -> Quantity:
 def make_environment(config: ArmConfig, split: str = "training") -> Environment:
     """Return the world of a configuration; whatever the split is, episodes differ by their keys alone."""
     return arm.make_environment(config, observation_of(config.skill))
+
+
+def make_fetch(config: ArmConfig, split: str = "training") -> Environment:
+    """Return the world of a configuration in Fetch, played by the Gymnasium bridge in processes of their own.
+
+    Raises UserError for a change that Fetch cannot have, or where Gymnasium-Robotics is not installed.
+    """
+    from cuelearner_envs.arm import fetch
+    from cuelearner_jax.bridges.gymnasium.environment import GymnasiumTask
+    from cuelearner_jax.bridges.gymnasium.source import Source
+
+    if find_spec("gymnasium_robotics") is None:
+        raise UserError("Gymnasium-Robotics is not installed: pip install 'cuelearner-jax[gymnasium]'")
+    observation = observation_of(config.skill)
+    size = sum(quantity.size for quantity in observation)
+    source = Source(f"{FETCH[config.skill]}-v4", "{}", config.max_steps, 0, size)
+    return fetch.make_environment(config, GymnasiumTask(source=source, observation=observation, actions=ACTIONS))
 
 
 def make_teacher(config: ArmConfig, env: Any) -> Teacher:
@@ -94,6 +113,12 @@ GRIPPER = Body(
     pictures=_pictures,
 )
 
+ROBOT = Body(
+    name="fetch",
+    about="Gymnasium-Robotics' Fetch, a whole arm in C MuJoCo, in processes of their own; no post stands there",
+    environment=make_fetch,
+)
+
 _CAMERA: dict[str, Any] = {"guidance": "calibration"}
 SCENARIOS = {
     "turned_camera": Scenario(
@@ -127,17 +152,18 @@ QUICKSTART = RunConfig(
         eval_envs=20,
         checkpoint_every=8_000,
     ),
-    ddqn.Config(
-        q_layers=(128, 128),
-        directions=256,
-        target_directions=64,
-        batch_size=64,
+    sac.Config(
+        actor_layers=(64, 64),
+        critic_layers=(64, 64),
+        batch_size=128,
         replay_capacity=64_000,
-        optimizer="adam",
-        learning_rate=0.001,
-        polyak=0.05,
+        actor_rate=1e-3,
+        critic_rate=1e-3,
+        temperature_rate=1e-3,
+        first_temperature=0.1,  # rewards are ways in metres
+        polyak=0.02,
     ),
-    paced.Config(),
+    paced.Config(lead=0.0),
 )
 PAPER = dataclasses.replace(
     QUICKSTART,
@@ -151,7 +177,14 @@ PAPER = dataclasses.replace(
         eval_envs=100,
         checkpoint_every=100_000,
     ),
-    agent=dataclasses.replace(QUICKSTART.agent, q_layers=(256, 256), batch_size=256, replay_capacity=1_000_000),
+    agent=dataclasses.replace(
+        QUICKSTART.agent,
+        actor_layers=(256, 256),
+        critic_layers=(256, 256),
+        layer_norm=True,
+        batch_size=256,
+        replay_capacity=1_000_000,
+    ),
 )
 
 ARM = Task(
@@ -159,7 +192,7 @@ ARM = Task(
     about="a gripper over a table: reach a place, push a cube past a post, pick a cube and place it",
     wants=_wants,
     config=ArmConfig,
-    bodies=(GRIPPER,),
+    bodies=(GRIPPER, ROBOT),
     teacher=make_teacher,
     proposed=_proposed,
     longest=lambda config: config.max_steps,

@@ -260,7 +260,9 @@ def explained(command, out, err):
     assert err == ""
     if command in ("train", "sweep", "evaluate", "render"):
         assert "(--preset; paper where none is given)" in out
-        assert re.search(r"\):\n  paper +.*\n  regulation +.*\n  shaped +.*\n  easy +.*\n  quickstart  .*minutes on 2 cores\)\n", out)
+        assert re.search(
+            r"\):\n  paper +.*\n  regulation +.*\n  shaped +.*\n  easy +.*\n  quickstart  .*minutes on 2 cores\)\n", out
+        )
 
 
 def test_the_installed_command_fails_in_one_line(tmp_path):

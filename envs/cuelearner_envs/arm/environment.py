@@ -21,7 +21,7 @@ from cuelearner_envs.arm.scripts import act
 from cuelearner_envs.fetch.cues import CUE_NAMES, CUES
 from cuelearner_jax.environment import Quantity, WholeObservations
 from cuelearner_jax.spaces import Box, cues_from
-from cuelearner_jax.types import Step
+from cuelearner_jax.types import EnvState, Step
 
 Scalar = float | Float[Array, ""]
 Skill = Literal["reach", "push", "pick"]
@@ -68,6 +68,7 @@ class Arm(WholeObservations, struct.PyTreeNode):
     reward: Reward = struct.field(pytree_node=False, default="shaped")
     observation: tuple[Quantity, ...] = struct.field(pytree_node=False, default=())
 
+    # States are `EnvState` where another body's may stand in the place of a `Situation`.
     actions = ACTIONS
     action = Quantity("step", 4, "5 cm", "x forward, y to the left, z up, and how far the fingers are to open")
 
@@ -76,7 +77,7 @@ class Arm(WholeObservations, struct.PyTreeNode):
         """Whether there is a cube."""
         return self.skill != "reach"
 
-    def reset(self, key: PRNGKeyArray) -> tuple[Situation, Float[Array, " obs"]]:
+    def reset(self, key: PRNGKeyArray) -> tuple[EnvState, Float[Array, " obs"]]:
         """Begin an episode: the gripper at home, cube and goal drawn as Fetch draws them.
 
         Where a post stands, the cube lies before it and the goal behind it, as the robot sees them.
@@ -84,7 +85,7 @@ class Arm(WholeObservations, struct.PyTreeNode):
         state = self._start(key)
         return state, self.observe(state)
 
-    def step(self, key: PRNGKeyArray, state: Situation, action: Float[Array, "4"]) -> tuple[Situation, Step]:
+    def step(self, key: PRNGKeyArray, state: EnvState, action: Float[Array, "4"]) -> tuple[EnvState, Step]:
         """Execute an action; a new episode follows the end of one."""
         body = physics.control(state.body, self.command(state, action), self.ground)
         return self.followed(key, self.after(state, body))
@@ -135,20 +136,20 @@ class Arm(WholeObservations, struct.PyTreeNode):
             outcome["passed_right"] = success * (after.passed < 0)
         return outcome, after.steps >= self.max_steps
 
-    def gripper(self, state: Situation) -> Float[Array, "3"]:
+    def gripper(self, state: EnvState) -> Float[Array, "3"]:
         """Return the gripper's place [m]."""
         return state.body.qpos[physics.GRIPPER]
 
-    def cube(self, state: Situation) -> Float[Array, "3"]:
+    def cube(self, state: EnvState) -> Float[Array, "3"]:
         """Return the place of the cube's middle [m]."""
         return state.body.qpos[physics.CUBE][:3]
 
-    def distance(self, state: Situation) -> Float[Array, ""]:
+    def distance(self, state: EnvState) -> Float[Array, ""]:
         """Return how far it is from the goal to what is to be there [m]."""
         place = self.cube(state) if self.has_object else self.gripper(state)
         return jnp.linalg.norm(place - state.goal)
 
-    def observe(self, state: Situation, camera: Camera | None = None) -> Float[Array, " obs"]:
+    def observe(self, state: EnvState, camera: Camera | None = None) -> Float[Array, " obs"]:
         """Return what is seen, in the order of Fetch's flattened observations; `camera`: in place of the own one."""
         camera = self.camera if camera is None else camera
         place, velocity = self.gripper(state), state.body.qvel[physics.GRIPPER] * arm.CONTROL_PERIOD
@@ -168,7 +169,7 @@ class Arm(WholeObservations, struct.PyTreeNode):
         """Return the script's action: the teacher's of what is seen, on a table that nobody has changed."""
         return act(self.skill, obs[None], post=self.ground.post)[0]
 
-    def _earned(self, after: Situation) -> Float[Array, ""]:
+    def _earned(self, after: EnvState) -> Float[Array, ""]:
         distance = self.distance(after)
         if self.reward == "sparse":
             return -(distance >= self.within).astype(jnp.float32)

@@ -6,8 +6,9 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float
 
-from cuelearner_envs.arm.environment import Arm, Camera, Situation
+from cuelearner_envs.arm.environment import Arm, Camera
 from cuelearner_envs.arm.scripts import act
+from cuelearner_jax.types import EnvState
 
 
 class ScriptTeacher(struct.PyTreeNode):
@@ -16,7 +17,7 @@ class ScriptTeacher(struct.PyTreeNode):
     env: Arm
     side: Float[Array, ""] | float = 0.0  # of the post: +1 left, -1 right, 0 the shorter way
 
-    def best_action(self, state: Situation, obs: Float[Array, " obs"]) -> Float[Array, "4"]:
+    def best_action(self, state: EnvState, obs: Float[Array, " obs"]) -> Float[Array, "4"]:
         """Return the script's action, of what an unchanged camera would show."""
         true = self.env.observe(state, Camera())[None]
         ground = self.env.ground

@@ -1,0 +1,107 @@
+"""The arm in Gymnasium-Robotics' Fetch: this camera and these rewards, the physics of what plays Fetch, no post."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from cuelearner_envs.arm.config import ArmConfig
+from cuelearner_envs.arm.config import make_environment as make_arm
+from cuelearner_envs.arm.environment import Arm, Camera
+from cuelearner_envs.arm.physics import Ground
+from cuelearner_envs.fetch.scripts import GOAL, GRIPPER, OBJECT
+from cuelearner_jax.environment import Environment
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.types import Step
+
+ACHIEVED, RELATIVE = slice(0, 3), slice(12, 15)  # in an observation
+
+
+class Played(struct.PyTreeNode):
+    """State between steps."""
+
+    episode: Any  # of what plays Fetch
+    true: Float[Array, " obs"]  # what an unchanged camera shows
+
+    @property
+    def goal(self) -> Float[Array, "3"]:
+        """The goal [m]."""
+        return self.true[GOAL]
+
+
+class FetchArm(Arm, kw_only=True):
+    """The environment (`cuelearner_jax.environment.Environment`), to agents the same as `Arm`.
+
+    Rewards, success and what a displaced camera shows follow from Fetch's observation.
+    """
+
+    plays: Environment  # Fetch, whose observations are those of an unchanged camera
+
+    def reset(self, key: PRNGKeyArray) -> tuple[Played, Float[Array, " obs"]]:
+        """Begin an episode, as Fetch draws it."""
+        state = Played(*self.plays.reset(key))
+        return state, self.observe(state)
+
+    def step(self, key: PRNGKeyArray, state: Played, action: Float[Array, "4"]) -> tuple[Played, Step]:
+        """Execute an action; a new episode follows the end of one."""
+        episode, step = self.plays.step(key, state.episode, action)
+        following, after = Played(episode, step.obs), Played(episode, step.final_obs)
+        final_obs, distance = self.observe(after), self.distance(after)
+        success = (distance < self.within).astype(jnp.float32)
+        return following, step.replace(
+            obs=self.observe(following),
+            final_obs=final_obs,
+            aftermath=final_obs,
+            reward=self._earned(after),
+            metrics={"within": success},
+            outcome={"success": success, "distance": distance},
+        )
+
+    def gripper(self, state: Played) -> Float[Array, "3"]:
+        """Return the gripper's place [m]."""
+        return state.true[GRIPPER]
+
+    def cube(self, state: Played) -> Float[Array, "3"]:
+        """Return the place of the cube's middle [m]."""
+        return state.true[OBJECT]
+
+    def observe(self, state: Played, camera: Camera | None = None) -> Float[Array, " obs"]:
+        """Return what is seen; `camera`: in place of the own one."""
+        camera, true = self.camera if camera is None else camera, state.true
+        seen = true.at[GOAL].set(camera.seen(state.goal))
+        if not self.has_object:
+            return seen
+        cube = camera.seen(self.cube(state))
+        return seen.at[ACHIEVED].set(cube).at[OBJECT].set(cube).at[RELATIVE].set(cube - self.gripper(state))
+
+
+def make_environment(config: ArmConfig, plays: Environment) -> FetchArm:
+    """Return the environment of a configuration. Raises UserError for a change that Fetch cannot have.
+
+    `plays`: Fetch in the skill and steps of the configuration. Whether a post is asked for does not count.
+    """
+    if config.friction != ArmConfig.friction:
+        raise UserError(
+            f"task.friction is {config.friction}, but Fetch's cube has a friction of its own: leave it out, or leave "
+            "out --robot fetch"
+        )
+    if config.preferred_side != "none":
+        raise UserError(
+            f"task.preferred_side is {config.preferred_side}, but no post stands in Fetch: leave it out, or leave out "
+            "--robot fetch"
+        )
+    plain = make_arm(config, plays.observation)
+    return FetchArm(
+        camera=plain.camera,
+        ground=Ground(friction=plain.ground.friction, post=jnp.zeros(())),
+        grasps=plain.grasps,
+        within=plain.within,
+        max_steps=plain.max_steps,
+        skill=plain.skill,
+        reward=plain.reward,
+        observation=plain.observation,
+        plays=plays,
+    )

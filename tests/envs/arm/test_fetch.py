@@ -1,0 +1,141 @@
+"""The arm in Fetch: observations, rewards and success against Gymnasium's own, the camera, what cannot be there."""
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import cuelearner_jax as cl
+from cuelearner_envs.arm import scripts
+from cuelearner_envs.arm.config import ArmConfig
+from cuelearner_envs.arm.environment import Camera
+from cuelearner_envs.arm.fetch import FetchArm
+from cuelearner_envs.arm.teacher import ScriptTeacher
+from cuelearner_jax.environment import WholeObservations
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.policies import policy_of
+from cuelearner_jax.tasks import arm
+
+CAMERA = {"camera_turn_deg": 90.0, "camera_offset": (0.0, 0.02, 0.0)}
+ACTIONS = np.array([[1.0, 0.5, -0.5, 1.0], [-1.0, 0.0, 0.25, 0.0], [0.1, -1.0, 1.0, -1.0]], np.float32)
+
+
+def here(config):
+    """The environment of a configuration, played in this process."""
+    env: Any = arm.make_fetch(config)
+    source = dataclasses.replace(env.plays.source, processes=1)
+    return env.replace(plays=env.plays.replace(source=source))
+
+
+def fetchs_own(name, seed, actions):
+    """What Gymnasium's environment gives for a seed and actions: flattened observations, rewards, success."""
+    from cuelearner_jax.bridges.gymnasium.layout import flatten, leaves_of
+    from cuelearner_jax.bridges.gymnasium.source import made
+
+    env = made(name, {}, 50)
+    leaves, rows, told = leaves_of(name, env.observation_space), [env.reset(seed=seed)[0]], []
+    for action in actions:
+        obs, reward, _, _, info = env.step(action)
+        rows.append(obs)
+        told.append((reward, info["is_success"]))
+    env.close()
+    return np.stack([flatten(leaves, row) for row in rows]), np.array(told)
+
+
+def turned(place):
+    """A place as the camera of these tests shows it, by hand: a quarter turn about (0.6918, 0.7441), then 2 cm left."""
+    x, y, z = np.moveaxis(np.asarray(place), -1, 0)
+    return np.stack([0.6918 - (y - 0.7441), 0.7441 + (x - 0.6918) + 0.02, z], -1)
+
+
+@pytest.mark.parametrize("skill", ["reach", "push"])
+def test_it_is_fetch_behind_the_camera(skill):
+    pytest.importorskip("gymnasium_robotics")
+    env = here(ArmConfig(skill, reward="sparse", max_steps=len(ACTIONS), **CAMERA))
+    reset, step = jax.jit(lambda env, key: env.reset(key)), jax.jit(lambda env, *rest: env.step(*rest))
+    state, obs = reset(env, jax.random.key(0))
+    seen, told, first = [obs], [], int(state.episode.seed)
+    for action in ACTIONS:
+        state, taken = step(env, jax.random.key(1), state, jnp.asarray(action))
+        seen.append(taken.final_obs)
+        told.append((taken.reward, taken.outcome["success"]))
+    true, wanted = fetchs_own({"reach": "FetchReach-v4", "push": "FetchPush-v4"}[skill], first, ACTIONS)
+    seen = np.stack(seen)
+    np.testing.assert_allclose(seen[:, 3:6], turned(true[:, 3:6]), atol=1e-6)
+    if skill == "push":
+        cube = turned(true[:, 9:12])
+        np.testing.assert_allclose(seen[:, 0:3], cube, atol=1e-6)
+        np.testing.assert_allclose(seen[:, 12:15], cube - true[:, 6:9], atol=1e-6)
+        np.testing.assert_array_equal(seen[:, 15:], true[:, 15:])
+    else:
+        np.testing.assert_array_equal(seen[:, :3], true[:, :3])
+        np.testing.assert_array_equal(seen[:, 6:], true[:, 6:])
+    np.testing.assert_allclose(np.array(told, float), wanted)
+    assert bool(taken.truncated)
+    assert int(state.episode.seed) != first
+    np.testing.assert_allclose(taken.obs, env.observe(state), atol=1e-6)
+
+
+class Still(WholeObservations):
+    """A stand-in for Fetch: one observation of a skill with a cube."""
+
+    observation = arm.observation_of("push")
+
+    def reset(self, key):
+        return (), jnp.arange(31.0) / 31
+
+    def step(self, key, state, action):
+        raise AssertionError("nobody steps here")
+
+
+def test_rewards_count_the_way_to_the_cube_and_the_teacher_sees_true_places():
+    from cuelearner_envs.arm import fetch
+
+    env = fetch.make_environment(ArmConfig("push", **CAMERA), Still())
+    state, obs = env.reset(jax.random.key(0))
+    true = np.arange(31) / 31
+    ways = [np.linalg.norm(true[9:12] - true[part]) for part in (slice(3, 6), slice(6, 9))]
+    assert float(env._earned(state)) == pytest.approx(-ways[0] - 0.5 * ways[1], rel=1e-5)
+    plain = fetch.make_environment(ArmConfig("push"), Still())
+    teacher = arm.make_teacher(ArmConfig("push", **CAMERA), env)
+    assert isinstance(teacher, ScriptTeacher)
+    np.testing.assert_allclose(teacher.best_action(state, obs), plain.heuristic(env.observe(state, Camera())))
+    assert float(env.ground.post) == 0.0
+
+
+def test_what_fetch_cannot_be_is_refused_in_one_line(monkeypatch):
+    monkeypatch.setattr(arm, "find_spec", lambda name: object())
+    with pytest.raises(UserError, match="Fetch's cube has a friction of its own: leave it out, or leave out --robot"):
+        cl.make("arm", robot="fetch", scenario="slippery").env  # noqa: B018
+    with pytest.raises(UserError, match="preferred_side is left, but no post stands in Fetch"):
+        cl.make("arm", robot="fetch", scenario="past_left").env  # noqa: B018
+    with pytest.raises(UserError, match="fetch is a robot of arm, not an engine: give --robot fetch"):
+        arm.ARM.engine("fetch")
+    monkeypatch.setattr(arm, "find_spec", lambda name: None)
+    with pytest.raises(UserError, match=r"is not installed: pip install 'cuelearner-jax\[gymnasium\]'"):
+        cl.make("arm", robot="fetch").env  # noqa: B018
+
+
+def test_policies_of_the_gripper_act_in_fetch(monkeypatch):
+    monkeypatch.setattr(arm, "find_spec", lambda name: object())
+    for skill in arm.FETCH:
+        ours, theirs = (cl.make("arm", robot=name, skill=skill) for name in ("gripper", "fetch"))
+        assert ours.observation == theirs.observation
+        assert ours.actions == theirs.actions
+        assert isinstance(theirs.env, FetchArm)
+
+
+@pytest.mark.long
+def test_a_policy_is_adapted_in_fetch_by_labels():
+    pytest.importorskip("gymnasium_robotics")
+    world = cl.make("arm", robot="fetch", scenario="turned_camera", skill="reach")
+    script = policy_of(jax.jit(scripts.reach))
+    before = cl.measure(script, world, episodes=20).metrics["success"]
+    found = cl.adapt(script, world, cl.teacher_of(world), labels=100)
+    (turn,) = [one for one in found.estimates if "turn" in one.name and one.changed]
+    assert turn.mean == pytest.approx(10.0, abs=0.3)
+    assert float(np.mean(before)) <= 0.1
+    assert float(np.mean(cl.measure(found.policy, world, episodes=20).metrics["success"])) >= 0.95
