@@ -94,7 +94,7 @@ def variants(world: str, options: Options) -> list[Piece]:
             "relative",
             (500,),
             {**valued, **OWN_POLICY},
-            "labels in training alone; these agents go to Fetch",
+            "labels in training alone, for Fetch",
         ),
         ("by_value", "demonstration", BUDGETS, valued, "demonstrations, compared by value"),
         ("by_value", "heuristic", (), valued, "control: the script without labels"),
