@@ -100,7 +100,7 @@ def _in_fetch(trained: str) -> list[Corrected]:
     plain: Options = {"task.skill": skill, "task.obstacle": False}
     fetch: Options = {**plain, "robot": "fetch"}
     turned: Options = {**fetch, "scenario": "turned_camera"}
-    source, world, labels = f"{trained}/by_value/relative", f"{trained}_fetch", (FETCH_LABELS,)
+    source, world, labels = f"{trained}/own_policy/relative", f"{trained}_fetch", (FETCH_LABELS,)
     rows = [
         Corrected(world, "agent", "mjx", (), SEEDS, {}, 1, "agents of 500 labels in MJX", where=plain),
         Corrected(world, "agent", "fetch", (), SEEDS, {}, 3, "the agents in Fetch", where=fetch),

@@ -63,6 +63,7 @@ WORLDS: dict[str, Options] = {
     "pick": {**steps(480_000, 24_000), "task.skill": "pick"},
 }
 BY_VALUE: Options = {"arbiter": "by_value"}
+OWN_POLICY: Options = {"arbiter.in-policy": False}  # the finished policy is the agent's, which a folder can keep
 EPISODES: Options = {"arbiter": "episodes"}
 SHUFFLED: Options = {"scalars.answer": "shuffled"}
 ENSEMBLE: Options = {"agent.critics": 10}
@@ -88,6 +89,13 @@ def variants(world: str, options: Options) -> list[Piece]:
         ("alone", "none", (), plain, "SAC alone"),
         ("alone_10", "none", (), {**plain, **ENSEMBLE}, "SAC alone, ten critics"),
         ("by_value", "relative", BUDGETS, valued, "labels, compared by value"),
+        (
+            "own_policy",
+            "relative",
+            (500,),
+            {**valued, **OWN_POLICY},
+            "labels in training alone, for Fetch",
+        ),
         ("by_value", "demonstration", BUDGETS, valued, "demonstrations, compared by value"),
         ("by_value", "heuristic", (), valued, "control: the script without labels"),
         ("shuffled", "relative", BUDGETS, {**valued, **SHUFFLED}, "control: shuffled answers"),

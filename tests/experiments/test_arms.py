@@ -79,7 +79,7 @@ def test_every_adaptation_is_a_command_that_would_begin(study, corrections, monk
 def test_agents_in_fetch_wait_until_they_are_trained_and_all_of_them_are_adapted(study, tmp_path, capsys):
     (piece,) = [one for one in study.CORRECTED if one.path == "reach_fetch/adapted/relative"]
     assert study.commands(piece, tmp_path, "paper") == []
-    assert "run --pieces reach/by_value/relative first" in capsys.readouterr().out
+    assert "run --pieces reach/own_policy/relative first" in capsys.readouterr().out
     run = tmp_path / piece.source
     run.mkdir(parents=True)
     (run / "config.json").write_text(json.dumps({"grid": {"seeds": [4000, 4001]}}))

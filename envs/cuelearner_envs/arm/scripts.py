@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from cuelearner_envs.arm import model as arm
 from cuelearner_envs.fetch import scripts as fetch
-from cuelearner_envs.fetch.scripts import GOAL, GRIPPER, OBJECT, Amount, Gains
+from cuelearner_envs.fetch.scripts import GOAL, GRIPPER, OBJECT, Amount, Gains, Observations
 
 FINGERS = slice(15, 17)
 CLEARANCE = 0.075  # from the post's axis: as far the cube's middle goes by [m]
@@ -38,9 +38,7 @@ SLIPPERY, CAREFUL = 0.5, PAST._replace(along=5.5, side=20.0, beside=0.014, lead=
 CARRIED = 0.35  # the largest entry of an action that carries a slippery cube
 
 
-def past(
-    obs: Float[Array, "n obs"], side: Amount = 0.0, friction: Amount = 1.0, post: Amount = 1.0
-) -> Float[Array, "n 4"]:
+def past(obs: Observations, side: Amount = 0.0, friction: Amount = 1.0, post: Amount = 1.0) -> Float[Array, "n 4"]:
     """Push the cube past the post to the goal, on the shorter side or on a given one.
 
     Args:
@@ -74,11 +72,12 @@ def _aim(cube: Float[Array, "n 2"], goal: Float[Array, "n 2"], side: Amount) -> 
     return jnp.where(is_free, goal, cube + STRETCH * tangent)
 
 
-def pick(obs: Float[Array, "n obs"], friction: Amount = 1.0) -> Float[Array, "n 4"]:
+def pick(obs: Observations, friction: Amount = 1.0) -> Float[Array, "n 4"]:
     """Travel over the cube with open fingers, go down, close, and carry the cube to the goal.
 
     `friction` is that of the cube, as far as it is known; a slippery one is carried slowly.
     """
+    obs = jnp.asarray(obs)
     cube, goal, gripper = obs[:, OBJECT], obs[:, GOAL], obs[:, GRIPPER]
     off = cube - gripper
     across, down = off[:, :2], off[:, 2:]

@@ -9,8 +9,10 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
+Observations = Float[Array, "n obs"] | Float[np.ndarray, "n obs"]  # the command line gives NumPy's
 Script = Callable[[Float[Array, "n obs"]], Float[Array, "n 4"]]
 Amount = float | Float[Array, ""]
 
@@ -40,13 +42,15 @@ class Gains(NamedTuple):
 USUAL = Gains()
 
 
-def reach(obs: Float[Array, "n obs"]) -> Float[Array, "n 4"]:
+def reach(obs: Observations) -> Float[Array, "n 4"]:
     """Go straight to the goal."""
+    obs = jnp.asarray(obs)
     return _action(REACH_GAIN * (obs[:, GOAL] - obs[:, GRIPPER]))
 
 
-def push(obs: Float[Array, "n obs"], gains: Gains = USUAL) -> Float[Array, "n 4"]:
+def push(obs: Observations, gains: Gains = USUAL) -> Float[Array, "n 4"]:
     """Rise, travel behind the object, go down, and push along the line from object to goal."""
+    obs = jnp.asarray(obs)
     goal, gripper, thing = obs[:, GOAL], obs[:, GRIPPER], obs[:, OBJECT]
     way = goal[:, :2] - thing[:, :2]
     left = jnp.linalg.norm(way, axis=-1, keepdims=True)
