@@ -7,6 +7,9 @@ polyak, seed. One JSON object a line comes out for each evaluation: step, return
 (of the training since the evaluation before). This file imports nothing of this project.
 """
 
+# Peers are installed by whoever compares with them.
+# pyright: reportMissingImports=false
+
 from __future__ import annotations
 
 import json
@@ -21,7 +24,7 @@ def model_of(library: str, setting: dict[str, Any], env: Any) -> Any:
     """A soft actor-critic of `sb3` (Stable-Baselines3, PyTorch) or `sbx` (its counterpart in JAX)."""
     options: dict[str, Any] = {}
     if library == "sbx":
-        from sbx import SAC  # pyright: ignore[reportMissingImports]
+        from sbx import SAC
     else:
         from stable_baselines3 import SAC
 
