@@ -1,6 +1,6 @@
 """Soft actor-critic here over brax's, Stable-Baselines3's and sbx's: return over steps, and steps over seconds.
 
-    python benchmarks/sac_speed.py --peer-python /tmp/sbx/bin/python --out benchmarks/results/sac_speed.json
+    python benchmarks/sac_speed.py --peer-python peers/bin/python --out benchmarks/results/sac_speed.json
     python benchmarks/sac_speed.py --environments halfcheetah --seeds 64 --ways brax --out sac_speed_h200.json
 
 All ways have the same networks, minibatches, updates a step, learning rates, discount and target entropy (-0.5 an
@@ -14,7 +14,7 @@ side by side, against one of the peer; its steps a second are then those of all 
 
 A peer that is not installed is skipped with a line. Give `--peer-python` a Python with sbx:
 
-    python -m venv /tmp/sbx && /tmp/sbx/bin/pip install sbx-rl
+    python -m venv peers && peers/bin/pip install sbx-rl
 """
 
 from __future__ import annotations

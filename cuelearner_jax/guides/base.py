@@ -47,8 +47,6 @@ class Kind:
     def __post_init__(self) -> None:
         if not NAME.fullmatch(self.name):
             raise ValueError(f"a guidance is called {self.name!r}: give lower-case letters, digits, - and _")
-        if self.config is not None and not self.name.isidentifier():
-            raise ValueError(f"guidance {self.name!r} has options, which are named after it: give it a name without -")
 
     @property
     def asks(self) -> bool:

@@ -142,6 +142,7 @@ def test_a_missing_package_is_told_with_its_extra(monkeypatch):
         registry.resolve("playground:NoSuchTask")
 
 
+@pytest.mark.long
 def test_the_command_line_trains_seeds_and_reads_the_folder_by_the_familys_name(tmp_path, capsys):
     run = tmp_path / "run"
     assert main(["sweep", "brax:fast", *TINY, "--seeds", "2", "--out", str(run)]) == 0

@@ -8,6 +8,8 @@ import cuelearner_jax as cl
 from cuelearner_jax.storage import situations
 from examples import logs_of_an_arm, ros2_correction
 
+pytestmark = pytest.mark.long
+
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):

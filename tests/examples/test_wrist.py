@@ -20,6 +20,7 @@ from cuelearner_jax.tasks import registry
 from cuelearner_jax.testing import check_environment, check_space, check_task
 from examples.wrist import TASK, WRIST, LidConfig, Lids
 
+pytestmark = pytest.mark.long
 ROOT = Path(__file__).resolve().parents[2]
 SMALL = shlex.split("""
     --agent.q-layers 16 --sizes.feedback-layers 32 32 --agent.directions 64 --schedule.total-steps 200

@@ -128,6 +128,7 @@ def test_rounds_of_chosen_questions_fill_the_budget_and_fit_each_member_from_num
         assert all(not np.array_equal(kernel[i], kernel[j]) for i in range(4) for j in range(i))
 
 
+@pytest.mark.long
 def test_members_of_deep_coach_are_corrected_each_as_one_alone_is_from_its_own_numbers():
     single, several = (registry.make("dcoach", sizes, ENV) for sizes in (ONE, dataclasses.replace(ONE, ensemble=2)))
     obs, asked = OBS[:4], BASE[:4]

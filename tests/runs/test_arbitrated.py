@@ -132,6 +132,7 @@ def test_aims_that_are_told_otherwise_are_refused(whole):
         of.check("agent", AimedConfig(features=3))
 
 
+@pytest.mark.long
 def test_the_finished_policy_by_value_is_the_agent(tmp_path):
     config = dataclasses.replace(CONFIG, arbiter=by_value.Config())
     run(tmp_path / "run", config)

@@ -161,7 +161,10 @@ def test_navigation_keeps_them():
 
 @pytest.mark.parametrize(
     ("table", "mirrors"),
-    [("one_ball", True), *(pytest.param("regulation", mirrors, marks=pytest.mark.long) for mirrors in (False, True))],
+    [
+        pytest.param(*case, marks=pytest.mark.long)
+        for case in (("one_ball", True), ("regulation", False), ("regulation", True))
+    ],
 )
 def test_billiards_keeps_them(table, mirrors):
     check_task(BILLIARDS, BilliardsConfig(table=table, mirrors=mirrors, search_directions=24), steps=12)

@@ -31,6 +31,7 @@ def told(action, gripper=HIGH, fingers=(0.0, 0.0), post=0.0, grasps=1.0):
     return np.asarray(found.gripper), np.asarray(found.fingers)
 
 
+@pytest.mark.long
 def test_the_task_keeps_its_laws(tmp_path):
     small = ArmConfig(skill="reach", max_steps=5, camera_offset=(0.0, 0.02, 0.0))
     check_task(ARM, small, steps=12, pictures=tmp_path)
