@@ -27,6 +27,7 @@ def walked(tmp_path_factory) -> Path:
     return folder
 
 
+@pytest.mark.long
 def test_every_evaluation_accounts_for_all_its_episodes(walked):
     rows = results.read(walked / "relative").to_pylist()
     assert [row["step"] for row in rows] == [0, 0, 100, 100, 200, 200]

@@ -16,6 +16,8 @@ from examples import exported_in_mujoco, ros2_node
 
 ROOT = Path(__file__).resolve().parents[2]
 
+pytestmark = pytest.mark.long
+
 
 @pytest.fixture(scope="module")
 def walker(tmp_path_factory):
@@ -27,7 +29,6 @@ def walker(tmp_path_factory):
     return out
 
 
-@pytest.mark.long
 def test_the_policy_crosses_a_hall_in_mujoco_without_jax(walker):
     """As its docstring tells, in a process of its own, which fails where JAX was loaded."""
     command = [sys.executable, "examples/exported_in_mujoco.py", str(walker)]

@@ -115,6 +115,7 @@ def labels(action, answer, obs=None, base=None):
     return Label(obs, action, answer, jnp.ones(count, bool), base)
 
 
+@pytest.mark.long
 def test_the_loss_has_the_gradient_of_the_papers_divergence():
     """-log sum pi p has the gradient of KL(target || pi), target ~ pi p held fixed."""
     guide = made("clic")
@@ -218,6 +219,7 @@ def test_bd_coach_goes_on_from_where_it_was_by_what_is_new():
     jax.tree.map(np.testing.assert_array_equal, fit(KEY, ENV, given, whole, SCALARS), whole)  # nothing is new
 
 
+@pytest.mark.long
 def test_the_buffer_moves_the_policy_by_what_its_own_actions_would_be_told():
     """Labels about other actions than the policy's lead it on as well: deep COACH would replay their targets."""
     env = probes.Window()

@@ -82,7 +82,9 @@ def test_what_is_loaded_acts_as_what_was_evaluated(whole):
     assert float(found["reward"]) == last["reward"]
 
 
-@pytest.mark.parametrize("format", ["numpy", "onnx", pytest.param("stablehlo", marks=pytest.mark.long)])
+@pytest.mark.parametrize(
+    "format", ["onnx", *(pytest.param(one, marks=pytest.mark.long) for one in ("numpy", "stablehlo"))]
+)
 def test_the_agent_and_the_better_of_both_are_exported_as_they_act(whole, tmp_path, format):
     policy = policy_of(whole)
     better = policy.replace(arm=jnp.int32(by_value.BETTER))
