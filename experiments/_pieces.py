@@ -7,15 +7,20 @@ import itertools
 import os
 import signal
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import label_efficiency
+import numpy as np
 
 from cuelearner_jax.cli import main as cuelearner
+from cuelearner_jax.errors import UserError
+from cuelearner_jax.evaluate import mean_interval
 from cuelearner_jax.guides.registry import resolve
 from cuelearner_jax.signals import Interrupted
+from cuelearner_jax.storage import formats, results
 
 FIRST_SEED = 4000  # of reported runs; settings are chosen on seeds from 0 on, with --tuning
 LABEL_EFFICIENCY = "label_efficiency"  # in the place of a command's name: the report of that file
@@ -237,6 +242,38 @@ def within(minutes: float | None, work: Callable[[], int]) -> int:
         print("the time is up: the same command goes on")
         status = 0
     return status
+
+
+def evaluations(
+    out: Path, pieces: Sequence[Piece]
+) -> Iterator[tuple[Piece, Mapping[str, Any], dict[str, Any], list[dict[str, Any]]]]:
+    """Yield each evaluation of pieces that have begun: the piece, its arbiter's options, row, results.
+
+    A row of a table begins with what the row here holds; the results are those of all seeds.
+    """
+    for piece in pieces:
+        try:
+            rows = results.read(out / piece.path).to_pylist()
+        except UserError:  # not begun
+            continue
+        arbiter = formats.read("config", out / piece.path / "config.json")["arbiter"]
+        for (labels, step), own in grouped(rows, "labels", "step"):
+            row = {"world": piece.world, "run": piece.run, "guidance": piece.kinds[0], "labels": labels, "step": step}
+            yield piece, arbiter, row, own
+
+
+def grouped(rows: Sequence[dict[str, Any]], *names: str) -> list[tuple[Any, list[dict[str, Any]]]]:
+    """Rows that are alike in some columns, by these."""
+    groups = defaultdict(list)
+    for row in rows:
+        groups[tuple(row[name] for name in names)].append(row)
+    return sorted(groups.items())
+
+
+def spread(values: Sequence[float]) -> dict[str, Any]:
+    """Mean of as many seeds with its 95% bootstrap interval."""
+    mean, low, high = mean_interval(np.array(values, float)).tolist()
+    return {"seeds": len(values), "mean": mean, "low": low, "high": high}
 
 
 def steps_to(level: float, rows: Sequence[Mapping[str, Any]]) -> float:

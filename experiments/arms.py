@@ -21,27 +21,37 @@ many seeds reach 80%, their median step, and the ratio of steps to those of the 
 from __future__ import annotations
 
 import json
-from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from _arms_adaptation import CORRECTED, Corrected, commands, measured
-from _pieces import Options, Piece, Scale, asked_of, folder_at, listed, scaled, steps_to, sweep_command, within
+from _pieces import (
+    Options,
+    Piece,
+    Scale,
+    asked_of,
+    evaluations,
+    folder_at,
+    grouped,
+    listed,
+    scaled,
+    spread,
+    steps_to,
+    sweep_command,
+    within,
+)
 
 from cuelearner_jax.arbiters import by_value
 from cuelearner_jax.cli import main as cuelearner
-from cuelearner_jax.errors import UserError
-from cuelearner_jax.evaluate import mean_interval
-from cuelearner_jax.guides import registry
-from cuelearner_jax.storage import formats, results
+from cuelearner_jax.storage import results
 from cuelearner_jax.storage.provenance import provenance
 
 TASK = "arm"
 SEEDS, BUDGETS, LEVEL = 8, (100, 500), 0.8
 FORMS = ("relative", "demonstration", "scalar", "dcoach")
-PEERS = tuple(kind for kind in ("bdcoach", "clic") if registry.registered(kind))
+PEERS = ("bdcoach", "clic")
 
 
 def steps(total: int, every: int) -> Options:
@@ -162,17 +172,10 @@ SCALES = {
 def rows_of(out: Path, pieces: Sequence[Piece]) -> list[dict[str, Any]]:
     """What pieces of training have come to so far: a row for each variant and evaluation, over its seeds."""
     found = []
-    for piece in pieces:
-        try:
-            rows = results.read(out / piece.path).to_pylist()
-        except UserError:  # not begun
-            continue
-        arbiter = formats.read("config", out / piece.path / "config.json")["arbiter"]
+    for piece, arbiter, row, own in evaluations(out, pieces):
         judged = len(by_value.ARMS) * arbiter.get("judge_steps", 0) if piece.kinds != ("none",) else 0
-        for (labels, step), own in _grouped(rows, "labels", "step"):
-            row = {"world": piece.world, "run": piece.run, "guidance": piece.kinds[0], "labels": labels, "step": step}
-            row |= _spread([one["success"] for one in own]) | {"rewarded_steps": step + judged}
-            found.append({**row, "each": {one["seed"]: one["success"] for one in own}})
+        told = {**row, **spread([one["success"] for one in own]), "rewarded_steps": row["step"] + judged}
+        found.append({**told, "each": {one["seed"]: one["success"] for one in own}})
     return found
 
 
@@ -181,22 +184,10 @@ def guides_of(out: Path, pieces: Sequence[Piece]) -> list[dict[str, Any]]:
     found = []
     for piece in pieces:
         table = results.read_guides([out / piece.path]) if (out / piece.path).exists() else None
-        for (budget, asked), own in _grouped(table.to_pylist() if table else [], "labels", "asked"):
+        for (budget, asked), own in grouped(table.to_pylist() if table else [], "labels", "asked"):
             row = {"world": piece.world, "run": piece.run, "guidance": piece.kinds[0], "budget": budget}
-            found.append({**row, "labels": asked, **_spread([one["guide_success"] for one in own])})
+            found.append({**row, "labels": asked, **spread([one["guide_success"] for one in own])})
     return found
-
-
-def _grouped(rows: Sequence[dict[str, Any]], *names: str) -> list[tuple[Any, list[dict[str, Any]]]]:
-    groups = defaultdict(list)
-    for row in rows:
-        groups[tuple(row[name] for name in names)].append(row)
-    return sorted(groups.items())
-
-
-def _spread(values: Sequence[float]) -> dict[str, Any]:
-    mean, low, high = mean_interval(np.array(values, float)).tolist()
-    return {"seeds": len(values), "mean": mean, "low": low, "high": high}
 
 
 def reached(rows: Sequence[dict[str, Any]]) -> list[float]:
@@ -214,7 +205,7 @@ def compared(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     For the ratio a seed that never gets there counts with all of its steps: with such seeds among the unguided ones the
     true ratio is smaller. The interval draws seeds of both, each by itself.
     """
-    found, lines = dict(_grouped(rows, "world", "run", "guidance", "labels")), []
+    found, lines = dict(grouped(rows, "world", "run", "guidance", "labels")), []
     for names, own in found.items():
         at, alone = reached(own), found.get((names[0], "alone", "none", 0))
         row = dict(zip(("world", "run", "guidance", "labels"), names, strict=True))

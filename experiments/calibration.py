@@ -149,7 +149,7 @@ def found_policy(row: dict[str, Any], base: Any, family: tuple[Distortion, ...])
 
 
 class Study(NamedTuple):
-    """What is asked of which policies."""
+    """Base policies, worlds and answers of one study."""
 
     task: Any
     own: Any  # the configuration of the unchanged world
@@ -241,7 +241,13 @@ def arguments() -> argparse.ArgumentParser:
 
 def main() -> None:
     """Calibrates each base in each world with each number of labels; prints a line each, then the table."""
-    asked = arguments().parse_args()
+    parser = arguments()
+    asked = parser.parse_args()
+    number, of = asked.shard
+    if not 1 <= number <= of:
+        parser.error(f"--shard {number} {of}: give the number of a share, from 1 on, and how many there are")
+    if missing := [file for file in asked.found if not file.is_file()]:
+        parser.error(f"--found {missing[0]}: there is no such file")
     task = registry.find(asked.task)
     own, scalars, bases = bases_of(task, asked.bases)
     study = Study(task, own, scalars, dict(list(bases.items())[: asked.most_bases]), asked, {})

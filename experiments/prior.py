@@ -23,13 +23,23 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from _pieces import Options, Piece, Scale, asked_of, folder_at, listed, scaled, steps_to, sweep_command, within
+from _pieces import (
+    Options,
+    Piece,
+    Scale,
+    asked_of,
+    evaluations,
+    folder_at,
+    listed,
+    scaled,
+    spread,
+    steps_to,
+    sweep_command,
+    within,
+)
 
 from cuelearner_jax.arbiters.prior import ARMS
 from cuelearner_jax.cli import main as cuelearner
-from cuelearner_jax.errors import UserError
-from cuelearner_jax.evaluate import mean_interval
-from cuelearner_jax.storage import formats, results
 from cuelearner_jax.storage.provenance import provenance
 
 TASKS = {"regulation": "billiards", "easy": "billiards", "halls": "navigation", "rooms": "navigation"}
@@ -145,24 +155,14 @@ SCALES = {
 def rows_of(out: Path, pieces: Sequence[Piece]) -> list[dict[str, Any]]:
     """What pieces have come to so far: a row for each variant and evaluation, over its seeds."""
     found = []
-    for piece in pieces:
-        try:
-            rows = results.read(out / piece.path).to_pylist()
-        except UserError:  # not begun
-            continue
-        arbiter = formats.read("config", out / piece.path / "config.json")["arbiter"]
+    for piece, arbiter, row, own in evaluations(out, pieces):
         judged = len(ARMS) * arbiter.get("judge_steps", 0)
-        groups = defaultdict(list)
-        for row in rows:
-            groups[row["labels"], row["step"]].append(row)
-        for (labels, step), own in sorted(groups.items()):
-            mean, low, high = mean_interval(np.array([row[METRIC[TASKS[piece.world]]] for row in own])).tolist()
-            row = {"world": piece.world, "run": piece.run, "guidance": piece.kinds[0], "labels": labels, "step": step}
-            row |= {"seeds": len(own), "mean": mean, "low": low, "high": high, "rewarded_steps": step + judged}
-            if judged:
-                row["arms"] = {arm: sum(one["arm"] == number for one in own) for number, arm in enumerate(ARMS)}
-                row["judged"] = {arm: float(np.mean([one[f"judged_{arm}"] for one in own])) for arm in ARMS}
-            found.append(row)
+        worth = spread([one[METRIC[TASKS[piece.world]]] for one in own])
+        told = {**row, **worth, "rewarded_steps": row["step"] + judged}
+        if judged:
+            told["arms"] = {arm: sum(one["arm"] == number for one in own) for number, arm in enumerate(ARMS)}
+            told["judged"] = {arm: float(np.mean([one[f"judged_{arm}"] for one in own])) for arm in ARMS}
+        found.append(told)
     return found
 
 

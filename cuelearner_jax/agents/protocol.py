@@ -17,9 +17,8 @@ from cuelearner_jax.environment import Spaces
 from cuelearner_jax.spaces import DIRECTIONS, Space
 from cuelearner_jax.types import Params
 
-Offer = Callable[
-    [Array, Array], Array
-]  # (observations (n, obs), actions (n, action)) -> actions offered in their place
+# (observations (n, obs), actions (n, action)) -> actions (n, action) offered in their place
+Offer = Callable[[Array, Array], Array]
 
 
 @runtime_checkable

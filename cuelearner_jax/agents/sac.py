@@ -202,7 +202,7 @@ class SoftActorCritic:
     def values(
         self, critics: Params, obs: Float[Array, "*n obs"], unit: Float[Array, "*m action"]
     ) -> Float[Array, "critics *m"]:
-        """What each critic expects of actions in unit coordinates."""
+        """Return the values by each critic of actions in unit coordinates."""
         one = lambda params: jnp.asarray(self._critic.apply(params, obs, unit))[..., 0]  # noqa: E731
         return jax.vmap(one)(critics)
 

@@ -18,7 +18,7 @@ validates better than the agent alone.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar, NamedTuple
+from typing import Annotated, Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -102,11 +102,11 @@ def chosen(
     return Refined(jnp.where(taken[:, None], guided.actions, own), jnp.where(taken, guided.passes, 0))
 
 
-class ByValue(NamedTuple):
-    """The arbiter's functions (`protocol.Chooses`, `protocol.HasCritic`)."""
+class Comparing:
+    """What arbiters that compare values share (`protocol.Chooses`)."""
 
     def init(self, num_envs: int) -> Compared:
-        """The first episodes, which begin with uniform actions, are the agent's own; there is no critic yet."""
+        """The first episodes, which begin with uniform actions, are the agent's own; there is no second critic yet."""
         return Compared(jnp.zeros(num_envs, bool))
 
     def guided(self, state: Compared) -> Bool[Array, " num_envs"]:
@@ -119,6 +119,32 @@ class ByValue(NamedTuple):
         """Draws for the episodes that begin."""
         return state.replace(arbitrated=redrawn(key, state.arbitrated, outcome.done, options.probability))
 
+    def compares(self, state: Compared, known: Known) -> Params:
+        """Parameters of the critics that compare."""
+        raise NotImplementedError(f"{type(self).__name__} does not say which critics compare: write `compares`")
+
+    def choose(
+        self,
+        state: Compared,
+        options: Config,
+        known: Known,
+        obs: Float[Array, "num_envs obs"],
+        base: Float[Array, "num_envs action"],
+        learns: Bool[Array, ""],
+        key: PRNGKeyArray,
+    ) -> Refined:
+        """The guide's action where the critics value it above the agent's, in arbitrated episodes."""
+        return chosen(known, self.compares(state, known), obs, base, state.arbitrated & learns)
+
+
+@dataclass(frozen=True)
+class ByValue(Comparing):
+    """The arbiter beside an agent that takes the argmax of its values (`protocol.HasCritic`)."""
+
+    def compares(self, state: Compared, known: Known) -> Params:
+        """Those of the second critic."""
+        return state.params
+
     def critic(self, state: Compared) -> tuple[Params, Any]:
         """The second critic."""
         return state.params, state.training
@@ -127,52 +153,16 @@ class ByValue(NamedTuple):
         """The state with another second critic."""
         return state.replace(params=critic[0], training=critic[1])
 
-    def choose(
-        self,
-        state: Compared,
-        options: Config,
-        known: Known,
-        obs: Float[Array, "num_envs obs"],
-        base: Float[Array, "num_envs action"],
-        learns: Bool[Array, ""],
-        key: PRNGKeyArray,
-    ) -> Refined:
-        """The guide's action where the second critic values it above the agent's, in arbitrated episodes."""
-        return chosen(known, state.params, obs, base, state.arbitrated & learns)
-
 
 @dataclass(frozen=True)
-class ByOwnValues:
-    """The arbiter beside an agent with an actor (`protocol.Chooses`, `protocol.InTargets`)."""
+class ByOwnValues(Comparing):
+    """The arbiter beside an agent with an actor (`protocol.InTargets`)."""
 
     in_targets: bool
 
-    def init(self, num_envs: int) -> Compared:
-        """The first episodes, which begin with uniform actions, are the agent's own."""
-        return Compared(jnp.zeros(num_envs, bool))
-
-    def guided(self, state: Compared) -> Bool[Array, " num_envs"]:
-        """The episodes that are arbitrated."""
-        return state.arbitrated
-
-    def follow(
-        self, state: Compared, options: Config, scalars: Scalars, outcome: Outcome, key: PRNGKeyArray
-    ) -> Compared:
-        """Draws for the episodes that begin."""
-        return ByValue().follow(state, options, scalars, outcome, key)
-
-    def choose(
-        self,
-        state: Compared,
-        options: Config,
-        known: Known,
-        obs: Float[Array, "num_envs obs"],
-        base: Float[Array, "num_envs action"],
-        learns: Bool[Array, ""],
-        key: PRNGKeyArray,
-    ) -> Refined:
-        """The guide's action where the agent's critics value it above the actor's, in arbitrated episodes."""
-        return chosen(known, known.params, obs, base, state.arbitrated & learns)
+    def compares(self, state: Compared, known: Known) -> Params:
+        """The agent's own."""
+        return known.params
 
 
 @dataclass(frozen=True)

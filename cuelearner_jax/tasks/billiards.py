@@ -227,7 +227,7 @@ BILLIARDS = Task(
             ),
             guidance=("rule", "intent"),
             labels=(100,),
-            takes="8 seeds under one guidance: a quarter of an hour on one H100; one: hours on 2 cores, by arithmetic",
+            takes="not run whole; one seed: hours on 2 cores, by arithmetic",
         ),
         "easy": Preset(
             "larger balls and pockets, seen from the strike, the paper's networks, 1 million steps a seed",

@@ -96,7 +96,7 @@ def test_agents_in_fetch_wait_until_they_are_trained_and_all_of_them_are_adapted
 def test_the_table_counts_the_seeds_that_reach_the_level(study):
     names = {"world": "reach", "run": "alone", "guidance": "none", "labels": 0}
     rows = [
-        {**names, "step": step, **study._spread(values), "rewarded_steps": step, "each": dict(enumerate(values))}
+        {**names, "step": step, **study.spread(values), "rewarded_steps": step, "each": dict(enumerate(values))}
         for step, values in ((0, [0.0, 0.0, 0.0]), (100, [0.8, 0.4, 0.0]), (200, [1.0, 1.0, 0.2]))
     ]
     steps = study.reached(rows)

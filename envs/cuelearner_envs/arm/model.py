@@ -81,7 +81,7 @@ def _xml(has_object: bool) -> str:
 
 
 def _objects() -> tuple[str, str, str, str]:
-    """What stands on the floor, the fingers, the cube and what touches it."""
+    """Table, gripper, cube and post, with their contacts."""
     x, y = POST_PLACE
     top = TABLE + POST_HEIGHT - POST_RADIUS
     solids = f'''<geom name="table" type="plane" pos="0 0 {TABLE}" size="0 0 0.01"/>
