@@ -130,6 +130,5 @@ def _in_docstrings(node: ast.AST) -> Iterator[Sentence]:
             if place == 0 or field:
                 text = inspect.cleandoc(child.value.value)
                 yield from in_markdown(text, docstring=True, first_line=child.lineno)
-        elif isinstance(child, ast.ClassDef | ast.FunctionDef) and not child.name.startswith("_"):
-            if not isinstance(node, ast.FunctionDef):
-                yield from _in_docstrings(child)
+        elif isinstance(child, ast.ClassDef | ast.FunctionDef) and not isinstance(node, ast.FunctionDef):
+            yield from () if child.name.startswith("_") else _in_docstrings(child)
