@@ -15,6 +15,7 @@ FENCE = re.compile(r"^\s*(?:[-*] )?(`{3,}|~{3,})")
 ITEM = re.compile(r"^\s*(?:[-*+]|\d+[.)])\s+")
 TITLE = re.compile(r"^\s*(?:#{1,6}\s|(?:\?\?\?\+?|!!!|===\+?)\s)")
 ENTRY = re.compile(r"^\s*[*\w][\w.*, |\[\]]*(?:\s\([^)]*\))?:(?:\s|$)")  # "name: text" and "Args:" of a docstring
+ROW = re.compile(r"^\s*\S+\s{2,}\S")  # "name    text" of a docstring
 CODE = re.compile(r"(`+)(?!`)(.+?)(?<!`)\1(?!`)", re.DOTALL)
 LINK = re.compile(r"!?\[((?:[^\[\]]|\[[^\]]*\])*)\]\([^)\s]*(?:\s\"[^\"]*\")?\)", re.DOTALL)
 ADDRESS = re.compile(r"https?://[^\s)>]+")
@@ -76,7 +77,7 @@ def _paragraphs(lines: list[str], *, docstring: bool) -> Iterator[tuple[int, str
         )  # indented after a blank line
         blank = not stripped
         header = docstring and stripped.endswith(":") and not block
-        entry = header or (docstring and indent > 0 and ENTRY.match(line))
+        entry = header or (docstring and (ROW.match(line) or (indent > 0 and ENTRY.match(line))))
         shown = example or stripped.startswith(("|", ">>>", "<!--", ":::", "$$")) or bool(opened)
         begins = bool(not stripped or shown or ITEM.match(line) or TITLE.match(line) or entry)
         if begins and block:
