@@ -5,7 +5,7 @@ gradient steps. `iterate` is the three with an environment of JAX between the fi
 
 Written for one lane (one seed with one label budget); lanes are put side by side once, in `make_program`. Random
 numbers come from the lane's own key folded with the shared counters, so a lane's result does not depend on its
-neighbours: not by a bit on a CPU, on an accelerator up to the order in which sums of matrix products are taken.
+neighbours. On a CPU this holds bitwise, on an accelerator up to the order of the sums in matrix products.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """The share of guided episodes follows what guided and own episodes have earned lately.
 
-A two-armed bandit whose arms change. Each arm (own, guided) keeps sums over its finished episodes, which fade with
-every episode of either arm (discounted UCB: Garivier and Moulines, "On upper-confidence bound policies for switching
-bandit problems", 2011), so that an arm that is seldom seen becomes uncertain again. The next episode is guided with the
+A two-armed bandit whose arms change. Each arm (own, guided) keeps sums over its finished episodes. The sums fade with
+every episode of either arm, so an arm that is seldom played becomes uncertain again (discounted UCB: Garivier and
+Moulines, "On upper-confidence bound policies for switching bandit problems", 2011). The next episode is guided with the
 probability that guidance is the better arm (Thompson sampling of the difference of two means, taken as normal), doubled
 and cut: a draw means the unpaced share.
 

@@ -1,8 +1,8 @@
 """Labels as a prior of the agent's choice, while it learns and in the finished policy.
 
-Policy shaping (Griffith, Subramanian, Scholz, Isbell, Thomaz, "Policy shaping: integrating human feedback with
-reinforcement learning", NeurIPS 2013): what the labels say of an action and what the critic says of its value are two
-opinions to be combined, not a reward and its bonus. The choice is
+What the labels say of an action and what the critic says of its value are two opinions to be combined, not a reward
+and its bonus. This is policy shaping (Griffith, Subramanian, Scholz, Isbell, Thomaz, "Policy shaping: integrating human
+feedback with reinforcement learning", NeurIPS 2013). The choice is
 
     argmax over actions of   Q(s, a) + beta_n log p(a | labels),   beta_n = beta * trust_after / n
 

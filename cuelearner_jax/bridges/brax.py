@@ -134,7 +134,7 @@ def to_brax(env: Environment) -> BraxView:
     Of directions in the plane n is 2, and only the direction counts. Of a box n is its size: -1 is each entry's lower
     bound, 1 its upper bound, and what lies beyond is brought back.
 
-    Episodes that our environment truncates arrive at brax's agents as truncated, under brax's own wrappers too; but
+    Episodes that our environment truncates arrive at brax's agents as truncated, under brax's own wrappers too. But
     `AutoResetWrapper` begins every episode of a lane at the same cached first state, and brax's evaluator then calls
     the length of a truncated episode infinite. `wrap_for_training` does neither:
     `ppo.train(to_brax(env), wrap_env_fn=wrap_for_training, ...)`.

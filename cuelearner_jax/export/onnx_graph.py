@@ -1,8 +1,8 @@
 """A decision's graph in ONNX: a scan over the rows of a batch, whose body is the graph of one observation.
 
-Written operation by operation from the graph that NumPy runs. (A converter of JAX programs, jax2onnx 0.17, was
-tried: it has no rule for a dense layer under vmap, which ensembles and aims are made of, misses navigation's features
-by 6e-5, and wants an older Orbax than checkpoints are written with.)
+Written operation by operation from the graph that NumPy runs. A converter of JAX programs, jax2onnx 0.17, was tried. It
+has no rule for a dense layer under vmap, which ensembles and aims need. Its values of navigation's features are off by
+6e-5, and it needs an older Orbax than checkpoints are written with.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Deep COACH: every correction moves a policy network itself, which is never fitted afresh.
 
 Source: Perez-Dattari, Celemin, Ruiz-del-Solar, Kober, "Interactive learning with corrective feedback for policies based
-on deep neural networks" (ISER 2018), Algorithm 1: of a correction h the target a + e h, a gradient step on it, and one
-on a minibatch of a replay of the newest corrections (their code: 200 of them, minibatches of 50). Here e is eps, and
-the sum is `exp` of the space, along the cues of which the label speaks:
+on deep neural networks" (ISER 2018), Algorithm 1. A correction h has the target a + e h. It gets a gradient step, and
+another on a minibatch of a replay of the newest corrections (their code: 200 of them, minibatches of 50). Here e is
+eps, and the sum is `exp` of the space, along the cues of which the label speaks:
 
     y = exp(a, eps h)
     pi <- pi - Adam(grad of sum over those cues of (d log (pi(s) - y))^2)

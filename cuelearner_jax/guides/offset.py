@@ -2,9 +2,9 @@
 
 Of a finished policy in a changed world much is wrong in the same way everywhere, and right once an action has been
 turned far enough from what the policy did. A few labels tell that, where no network of the situation can be learned
-from them. So a correction has two parts: one of the turn alone, a smoothing spline (Eilers, Marx, "Flexible smoothing
-with B-splines and penalties", Statistical Science 1996), and a network's, which sees the turn beside situation and
-action and is fitted to what the spline leaves. The network counts as much as held-out labels say that it should
+from them. So a correction has two parts. One is a smoothing spline of the turn alone (Eilers, Marx, "Flexible smoothing
+with B-splines and penalties", Statistical Science 1996). The other is a network, which sees the turn beside situation
+and action and is fitted to what the spline leaves. The network counts as much as held-out labels say that it should
 (stacked regressions: Breiman, Machine Learning 1996): by nothing, where it predicts them no better.
 
 With a_0 what the policy did, t = log(a_0, a) / eps the turn so far along each cue, m_c a spline for each cue c:

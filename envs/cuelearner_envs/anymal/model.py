@@ -1,7 +1,7 @@
 """The quadruped's model and the frames of its body, for MuJoCo and for MJX.
 
-A body's configuration is MuJoCo's: `qpos` (19,) is the trunk's place [m], its quaternion (w, x, y, z) and the joints
-[rad]; `qvel` (18,) is the trunk's velocity in the world's frame [m/s], its angular velocity in its own frame [rad/s]
+A body's configuration is MuJoCo's. `qpos` (19,) is the trunk's place [m], its quaternion (w, x, y, z) and the joints
+[rad]. `qvel` (18,) is the trunk's velocity in the world's frame [m/s], its angular velocity in its own frame [rad/s]
 and the joints' [rad/s]. Joints go by leg (left front, right front, left hind, right hind), each hip abduction, hip
 flexion, knee flexion.
 """

@@ -25,7 +25,7 @@ def normal_impulse(
     """Impulse along the normal: (1 + e) * approach / discs (Newton's restitution); `discs` = 1 or 2 movable bodies.
 
     `unseen` is the share of the true approach speed that the flight does not carry (the part of a kick due before the
-    impact but applied after it): the impact acts on the true speed and the flight keeps its bookkeeping.
+    impact but applied after it). The impact acts on the true speed; the flight keeps its bookkeeping.
     """
     true_approach = approach + unseen
     separation = jnp.where(true_approach > SOFT_SPEED, restitution, 1.0) * true_approach + unseen

@@ -202,9 +202,11 @@ class Navigation(Described, struct.PyTreeNode):
         """What lies ahead, to the left and to the right of a robot that walks in the direction.
 
         - own, 1: the distance to the goal
-        - turned, 370: nearness all round in steps of one degree, from behind by way of the right, the direction itself
-          in the middle (of the two nearest beams, by how near they are); `UNSEEN` where the lidar does not look; goal
-          and previous actions along and across the direction; the direction in the body's frame
+        - turned, 370: nearness all round in steps of one degree; goal and previous actions along and across the
+          direction; the direction in the body's frame
+
+        Nearness begins behind and goes by way of the right, so that the direction itself is in the middle. Between two
+        beams it is interpolated, and where the lidar does not look it is `UNSEEN`.
         """
         count = actions.shape[:-1]
         ring = jnp.concatenate([obs[:BEAMS], jnp.full(RING - BEAMS, UNSEEN)])  # from -135 degrees on, counterclockwise

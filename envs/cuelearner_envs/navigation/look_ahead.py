@@ -1,9 +1,9 @@
 """Several steps of look-ahead: a way is walked to a station, and from there on past what the scan shows.
 
 How far a body could walk along a way says nothing of what comes after the corner. Here a disc walks two straight legs,
-the second toward the goal or turned from it, and what the lidar has not seen counts as free: the free-space assumption
-of robots in unknown terrain (Koenig, Smirnov, "Sensor-based planning with the freespace assumption", ICRA 1997). It is
-geometry of one scan, in the body's frame, and nothing is remembered of former ones.
+the second toward the goal or turned from it. What the lidar has not seen counts as free: the free-space assumption of
+robots in unknown terrain (Koenig, Smirnov, "Sensor-based planning with the freespace assumption", ICRA 1997).
+Look-ahead uses one scan, in the body's frame, and remembers no former scan.
 
 Cost: 7 stations on each of 72 ways, 5 second legs from each, every second of 271 points: 340,000 tests of a disc
 against a point for an observation, where the ways themselves take 60,000.

@@ -83,8 +83,8 @@ def way(
         position: any place, also one too close to a solid for the map: the line from there may then be as close.
 
     Returns:
-        The next place to walk to in a straight line (the goal, if it is in view) [m]; the way's length [m], more than
-        `BLOCKED` if no line from here is clear: the place is then at the end of the clearest.
+        The next place to walk to in a straight line (the goal, if it is in view) [m]; the way's length [m]. If no line
+        from here is clear, the length is more than `BLOCKED` and the place is at the end of the clearest line.
     """
     places = jnp.concatenate([roadmap.nodes, goal[None]])
     rest = jnp.append(to_goal, 0.0)

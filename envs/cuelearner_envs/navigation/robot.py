@@ -1,8 +1,8 @@
 """How the quadruped moves when told a direction, and the room that its body takes.
 
-A stand-in for a legged robot with its walking controller (which MuJoCo simulates elsewhere): ANYmal's body (0.93 m by
-0.53 m) as three discs along its axis; its velocity follows the command with a first-order lag; it turns toward where it
-is told to go at a bounded rate. Everything is solved in closed form over a control step.
+A stand-in for a legged robot with its walking controller, which MuJoCo simulates elsewhere. ANYmal's body (0.93 m by
+0.53 m) is three discs along its axis. Its velocity follows the command with a first-order lag, and the body turns
+toward the commanded direction at a bounded rate. Everything is solved in closed form over a control step.
 """
 
 from __future__ import annotations

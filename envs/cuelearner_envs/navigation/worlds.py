@@ -1,8 +1,8 @@
 """Procedurally generated worlds: a layout, and routes that the robot is sure to be able to walk.
 
 Reachability is proved on a grid. A cell is passable if its middle keeps the body's reach and half a cell from every
-solid; then so does the straight line between the middles of two passable neighbours (distance changes no faster than
-place), however the body is turned.
+solid. Then the straight line between the middles of two passable neighbours keeps the body's reach too, however the
+body is turned, because distance changes no faster than place.
 """
 
 from __future__ import annotations
