@@ -18,7 +18,7 @@ import numpy as np
 from _finetuning import FineTuning, every
 
 from cuelearner_jax.adaptation import adapting
-from cuelearner_jax.adaptation import calibrated as calibration
+from cuelearner_jax.adaptation import by_calibration as calibration
 from cuelearner_jax.adaptation.adapting import Adapted
 from cuelearner_jax.adaptation.judging import LABELS, Judging, judged_by_labels
 from cuelearner_jax.adaptation.lanes import Adaptation, product

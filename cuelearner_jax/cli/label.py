@@ -15,7 +15,7 @@ import numpy as np
 import tyro
 
 from cuelearner_jax import config as configuration
-from cuelearner_jax.adaptation import adapting, calibrated, changes
+from cuelearner_jax.adaptation import adapting, by_calibration, changes
 from cuelearner_jax.calibration import declared
 from cuelearner_jax.calibration.families import Family
 from cuelearner_jax.cli.parsing import PAPER, about, check_numbers, code_of, is_code, out, parse, preset_of, taken
@@ -124,7 +124,7 @@ def run(arguments: list[str]) -> None:
     if finished_policy:  # as `adapt` corrects it
         frame = source.config.sizes.frame if source else sizes.frame
         sizes = adapting.SIZES if by_evidence else dataclasses.replace(adapting.SIZES, frame=frame)
-        settling = calibrated.settling if by_evidence else adapting.settling
+        settling = by_calibration.settling if by_evidence else adapting.settling
         scalars = settling(scalars, changed.eps_deg if changed else None)
         bound = changed.bound_deg if changed and not by_evidence else None
     default = kind(
@@ -134,7 +134,7 @@ def run(arguments: list[str]) -> None:
         Path("labels") / task.name,
         guidance=asking_kind(preset_kinds(task, preset)) if named is None else KIND.name,
         bound_deg=bound,
-        labels=max(preset.labels) if named is None else calibrated.USUAL if by_evidence else Label.labels,
+        labels=max(preset.labels) if named is None else by_calibration.USUAL if by_evidence else Label.labels,
         questions=UNIFORM if named is not None else _usual_questions(task),
     )
     asked = parse(kind, rest, f"label {task.name}", default, about(Label, task, preset=usual))
@@ -211,7 +211,7 @@ def _check_evidence(asked: Label[Any], named: str | None) -> None:
     if named is None or asked.again is not None:
         raise UserError("calibration asks about a policy: name one after the task, and leave out --again")
     scalars = dataclasses.replace(Scalars(), **dataclasses.asdict(asked.scalars))
-    calibrated.check_unused(asked.sizes, scalars, bound_deg=asked.bound_deg)
+    by_calibration.check_unused(asked.sizes, scalars, bound_deg=asked.bound_deg)
 
 
 def _family(asked: Label[Any], env: Any) -> Family:

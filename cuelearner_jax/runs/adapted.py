@@ -11,7 +11,7 @@ import jax
 import numpy as np
 
 from cuelearner_jax import config as configuration
-from cuelearner_jax.adaptation import calibrated, stored
+from cuelearner_jax.adaptation import by_calibration, stored
 from cuelearner_jax.adaptation.adapting import Adapted
 from cuelearner_jax.adaptation.judging import SPLIT
 from cuelearner_jax.adaptation.lanes import Lanes
@@ -177,7 +177,7 @@ def write(
             "difference": [_plain(ends) for ends in judged.difference],
             "rewarded_steps": judged.rewarded_steps.tolist(),
         },
-        **({"calibration": calibrated.to_json(adapted.results)} if adapted.results else {}),
+        **({"calibration": by_calibration.to_json(adapted.results)} if adapted.results else {}),
         **{name: value for name, value in (used or {}).items() if value},
         "observation": [quantity._asdict() for quantity in env.observation],
         "conventions": CONVENTIONS,

@@ -18,9 +18,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from cuelearner_jax import user_code
-from cuelearner_jax.adaptation import adapting, calibrated, changes, judging, stored
+from cuelearner_jax.adaptation import adapting, by_calibration, changes, judging, stored
 from cuelearner_jax.adaptation.adapting import Adapted
-from cuelearner_jax.adaptation.calibrated import Calibrating
+from cuelearner_jax.adaptation.by_calibration import Calibrating
 from cuelearner_jax.adaptation.judging import Judging
 from cuelearner_jax.adaptation.lanes import Adaptation, begin, one_each, product, side_by_side
 from cuelearner_jax.asking import label_slots
@@ -167,14 +167,14 @@ def suggested(
             rules = replace(rules, bound_deg=None, judge_by=None, judge_bounds=())
     if judge_by == judging.LABELS:
         rules = replace(rules, judge_bounds=())  # which are tried on episodes
-    labels = (calibrated.USUAL,) if kind.by_evidence else AdaptRequest.labels
+    labels = (by_calibration.USUAL,) if kind.by_evidence else AdaptRequest.labels
     if labels_from is not None:
         file = label_files.read(labels_from)
         eps_deg = file.eps if eps_deg is None else eps_deg
         labels = (file.budget,)
     frame, settling = {"frame": source.config.sizes.frame}, adapting.settling
     if kind.by_evidence:
-        frame, settling = {}, calibrated.settling
+        frame, settling = {}, by_calibration.settling
     sizes = sizes or replace(adapting.SIZES, **{**frame, **rules.sizes})
     if scalars is None:
         eps_deg = rules.eps_deg if eps_deg is None else eps_deg
@@ -223,7 +223,7 @@ def run(
     if subject.changes is not None and not kind.by_evidence:
         raise UserError(f"changes is given, but guidance {kind.name!r} knows none: give guidance calibration")
     if kind.by_evidence:
-        calibrated.check_unused(sizes, scalars, bound_deg=request.bound_deg, judge_bounds=request.judge_bounds)
+        by_calibration.check_unused(sizes, scalars, bound_deg=request.bound_deg, judge_bounds=request.judge_bounds)
     env = task.environment(request.task)
     for name, options in request.kinds.items():
         check_part(options, name)
@@ -250,7 +250,7 @@ def run(
         of = Calibrating(guidance, sizes, scalars, env, bases, *_family(subject, request, kind.name, env))
         if kept:
             stored.to_json(Calibrated(bases, jnp.zeros((lanes.number, 0)), (), of.named))
-        found = calibrated.adapt(of, lanes, how, teacher, rows, watch)
+        found = by_calibration.adapt(of, lanes, how, teacher, rows, watch)
     else:
         of = Adaptation(guidance, sizes, scalars, env, bases)
         if kept:
@@ -306,8 +306,8 @@ def _rows(
     grid = Grid((guidance.name,), seeds, request.labels)
     check_grid(grid, adapts=True)
     if guidance.kind.by_evidence:
-        if (least := min(request.labels)) < calibrated.LEAST:
-            raise UserError(f"labels is {least}: give at least {calibrated.LEAST}, of which some are held out")
+        if (least := min(request.labels)) < by_calibration.LEAST:
+            raise UserError(f"labels is {least}: give at least {by_calibration.LEAST}, of which some are held out")
         request = replace(request, bound_deg=(space.reach,))  # there is none
     file, form = None, guidance.form
     assert form is not None  # it asks
@@ -360,7 +360,7 @@ def _worth(difference: np.ndarray, steps: np.ndarray) -> str:
 def sentences(found: Adapted) -> list[str]:
     """What adaptation has led to, a line for each budget and bound."""
     if found.results:
-        return calibrated.sentences(found)
+        return by_calibration.sentences(found)
     lanes, judged, lines = found.lanes, found.judged, []
     unit = actions_of(found.of.env).unit
     for bound, budget in sorted({*zip(lanes.bound_deg.tolist(), lanes.budget.tolist(), strict=True)}):
