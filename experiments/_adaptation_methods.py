@@ -17,9 +17,9 @@ import jax.numpy as jnp
 import numpy as np
 from _finetuning import FineTuning, every
 
-from cuelearner_jax.adaptation import adapting
 from cuelearner_jax.adaptation import by_calibration as calibration
-from cuelearner_jax.adaptation.adapting import Adapted
+from cuelearner_jax.adaptation import by_model
+from cuelearner_jax.adaptation.by_model import Adapted
 from cuelearner_jax.adaptation.judging import LABELS, Judging, judged_by_labels
 from cuelearner_jax.adaptation.lanes import Adaptation, product
 from cuelearner_jax.calibration import UNEXPLAINED, declared
@@ -64,7 +64,7 @@ def by_labels(kind: Any, bench: Bench) -> Iterator[Row]:
     envs = min(bench.envs, JUDGED)
     judge = Judging(bench.env("tuning"), envs, envs * bench.steps, piece.judge_by, bounds=piece.judge_bounds)
     of = Adaptation(guidance, sizes, scalars, env, bench.agents)
-    found = adapting.adapt(of, lanes, judge, bench.task.make_teacher(bench.world, env))
+    found = by_model.adapt(of, lanes, judge, bench.task.make_teacher(bench.world, env))
     told = {"used": found.judged.used.astype(float), "failed": np.asarray(found.block.failed).astype(float)}
     told |= {
         "within_deg": found.judged.within_deg,
@@ -137,9 +137,9 @@ def calibrated(bench: Bench) -> Iterator[Row]:
     """By what answers tell of the world: held-out answers judge. Variant `SHUFFLED`: with answers of other rows."""
     piece, env = bench.piece, bench.env("training")
     kind, scalars = guidances.find("calibration"), calibration.settling(bench.scalars(), None)
-    guidance = kind.make(adapting.SIZES, spaces_of(env), None)
+    guidance = kind.make(by_model.SIZES, spaces_of(env), None)
     lanes = product(len(bench.seeds), range(piece.seeds), piece.labels, (actions_of(env).reach,))
-    of = calibration.Calibrating(guidance, adapting.SIZES, scalars, env, bench.agents, declared(env))
+    of = calibration.Calibrating(guidance, by_model.SIZES, scalars, env, bench.agents, declared(env))
     how = Judging(None, by=LABELS)
     found = calibration.adapt(of, lanes, how, bench.task.make_teacher(bench.world, env))
     if piece.variant == SHUFFLED:

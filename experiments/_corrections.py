@@ -20,7 +20,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float
 
-from cuelearner_jax.adaptation.adapting import plain_scalars
+from cuelearner_jax.adaptation.by_model import plain_scalars
 from cuelearner_jax.adaptation.lanes import Adaptation, LaneState, ask_round, begin, product
 from cuelearner_jax.config import GuideSizes, Scalars
 from cuelearner_jax.environment import Quantity, WholeObservations, actions_of, spaces_of

@@ -28,7 +28,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from cuelearner_envs.billiards.environment import Balls
-from cuelearner_jax.adaptation.adapting import settling
+from cuelearner_jax.adaptation.by_model import settling
 from cuelearner_jax.agents.choice import best_near_peaks
 from cuelearner_jax.calibration.calibrating import Result, calibrate
 from cuelearner_jax.calibration.corrected import Calibrated

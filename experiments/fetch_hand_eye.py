@@ -28,7 +28,7 @@ import numpy as np
 
 import cuelearner_jax as cl
 from cuelearner_envs.fetch.scripts import SCRIPTS
-from cuelearner_jax.adaptation.adapting import plain_scalars
+from cuelearner_jax.adaptation.by_model import plain_scalars
 from cuelearner_jax.bridges.gymnasium.layout import flatten, leaves_of
 from cuelearner_jax.bridges.gymnasium.source import made
 from cuelearner_jax.config import GuideSizes, Scalars

@@ -6,8 +6,8 @@ import jax
 import numpy as np
 import probes
 
-from cuelearner_jax.adaptation.adapting import Adapted
 from cuelearner_jax.adaptation.by_calibration import Calibrating, Evidence
+from cuelearner_jax.adaptation.by_model import Adapted
 from cuelearner_jax.adaptation.judging import Judged
 from cuelearner_jax.adaptation.lanes import Adaptation, Lanes, begin
 from cuelearner_jax.calibration.families import declared, unknowns_of

@@ -17,7 +17,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from cuelearner_jax.adaptation.adapting import SIZES, Adapted
+from cuelearner_jax.adaptation.by_model import SIZES, Adapted
 from cuelearner_jax.adaptation.judging import LABELS, Judge, Judged, Judging
 from cuelearner_jax.adaptation.lanes import Adaptation, Lanes
 from cuelearner_jax.calibration import CHANGED, Calibrated, Calibration, Distortion, Result, Walk, calibrate

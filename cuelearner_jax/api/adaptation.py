@@ -13,7 +13,7 @@ from typing import Any
 import jax
 
 from cuelearner_jax import user_code
-from cuelearner_jax.adaptation.adapting import plain_scalars
+from cuelearner_jax.adaptation.by_model import plain_scalars
 from cuelearner_jax.adaptation.lanes import blame
 from cuelearner_jax.api import arguments
 from cuelearner_jax.api.acting import CallablePolicy, as_policy, as_policy_in, source_of

@@ -14,7 +14,7 @@ import numpy as np
 
 from cuelearner_jax import config as configuration
 from cuelearner_jax import user_code
-from cuelearner_jax.adaptation.adapting import plain_scalars
+from cuelearner_jax.adaptation.by_model import plain_scalars
 from cuelearner_jax.adaptation.judging import LABELS
 from cuelearner_jax.api import arguments
 from cuelearner_jax.api.acting import CallablePolicy, as_policy, load_policy

@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Float
 
 from cuelearner_jax import user_code
-from cuelearner_jax.adaptation import adapting
+from cuelearner_jax.adaptation import by_model
 from cuelearner_jax.adaptation.lanes import Adaptation, blame, check_memory, product
 from cuelearner_jax.agents.networks import all_finite
 from cuelearner_jax.api import arguments
@@ -148,15 +148,15 @@ def ask(
     labels, seed = arguments.budget("labels", labels), arguments.seed("seed", seed)
     a_world("world", world)
     space = actions_of(world.env)
-    bound = arguments.optional(arguments.amount, "bound_deg", bound_deg, space) or adapting.usual_bound(space)
+    bound = arguments.optional(arguments.amount, "bound_deg", bound_deg, space) or by_model.usual_bound(space)
     sizes, scalars = settings(space, *given_settings(space, sizes, scalars, eps_deg))
     teacher = arguments.teacher("teacher", teacher, space)
     check_teacher(teacher, scalars)
-    adapting.check_amounts(space, [bound], scalars)
+    by_model.check_amounts(space, [bound], scalars)
     env, guidance = world.env, KIND.make(sizes, spaces_of(world.env))
     user_code.answers_in("teacher", teacher, env)
     of = Adaptation(guidance, sizes, scalars, env, Common(as_policy_in(policy, env)))
-    block = adapting.learned(of, product(1, (seed,), (labels,), (bound,)), teacher)
+    block = by_model.learned(of, product(1, (seed,), (labels,), (bound,)), teacher)
     if block.failed.any():
         blame(of, teacher, block)
         raise diverged()
@@ -194,7 +194,7 @@ def refine(policy: Any, model: FeedbackModel, bound_deg: float | None = None) ->
     width, seen = labels.obs.shape[1], entries_of(policy)
     if seen not in (0, width):
         raise UserError(f"model is of observations with {width} entries, the policy's have {seen}: give one of its own")
-    reach = max(adapting.reach(space, base, labels.obs, labels.action), model.scalars.eps_deg)
+    reach = max(by_model.reach(space, base, labels.obs, labels.action), model.scalars.eps_deg)
     if bound_deg is not None and bound_deg > reach * 1.05 and bound_deg > model.scalars.eps_deg:
         warnings.warn(
             f"the labels lie within {reach:.3g} {space.unit} of this policy's own actions, and refinement may lead "
@@ -237,7 +237,7 @@ def settings(
     space: Space, sizes: GuideSizes | None, scalars: Scalars | None, eps_deg: float | None
 ) -> tuple[GuideSizes, Scalars]:
     """Sizes and scalars, by default those of `adapting`. Raises UserError for what cannot work."""
-    sizes, scalars = sizes or adapting.SIZES, adapting.settling(scalars or adapting.plain_scalars(space), eps_deg)
+    sizes, scalars = sizes or by_model.SIZES, by_model.settling(scalars or by_model.plain_scalars(space), eps_deg)
     check_guide(sizes, scalars)
     return sizes, scalars
 

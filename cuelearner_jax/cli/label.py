@@ -15,7 +15,7 @@ import numpy as np
 import tyro
 
 from cuelearner_jax import config as configuration
-from cuelearner_jax.adaptation import adapting, by_calibration, changes
+from cuelearner_jax.adaptation import by_calibration, by_model, changes
 from cuelearner_jax.calibration import declared
 from cuelearner_jax.calibration.families import Family
 from cuelearner_jax.cli.parsing import PAPER, about, check_numbers, code_of, is_code, out, parse, preset_of, taken
@@ -123,8 +123,8 @@ def run(arguments: list[str]) -> None:
     sizes, scalars, bound = preset.config.sizes, preset.config.scalars, None
     if finished_policy:  # as `adapt` corrects it
         frame = source.config.sizes.frame if source else sizes.frame
-        sizes = adapting.SIZES if by_evidence else dataclasses.replace(adapting.SIZES, frame=frame)
-        settling = by_calibration.settling if by_evidence else adapting.settling
+        sizes = by_model.SIZES if by_evidence else dataclasses.replace(by_model.SIZES, frame=frame)
+        settling = by_calibration.settling if by_evidence else by_model.settling
         scalars = settling(scalars, changed.eps_deg if changed else None)
         bound = changed.bound_deg if changed and not by_evidence else None
     default = kind(

@@ -12,7 +12,7 @@ import numpy as np
 
 from cuelearner_jax import config as configuration
 from cuelearner_jax.adaptation import by_calibration, stored
-from cuelearner_jax.adaptation.adapting import Adapted
+from cuelearner_jax.adaptation.by_model import Adapted
 from cuelearner_jax.adaptation.judging import SPLIT
 from cuelearner_jax.adaptation.lanes import Lanes
 from cuelearner_jax.environment import actions_of

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from cuelearner_jax.adaptation.adapting import plain_scalars
+from cuelearner_jax.adaptation.by_model import plain_scalars
 from cuelearner_jax.arbiters.protocol import Finishes
 from cuelearner_jax.environment import actions_of, offers, spaces_of, view_of
 from cuelearner_jax.errors import UserError, closest, listed

@@ -18,9 +18,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from cuelearner_jax import user_code
-from cuelearner_jax.adaptation import adapting, by_calibration, changes, judging, stored
-from cuelearner_jax.adaptation.adapting import Adapted
+from cuelearner_jax.adaptation import by_calibration, by_model, changes, judging, stored
 from cuelearner_jax.adaptation.by_calibration import Calibrating
+from cuelearner_jax.adaptation.by_model import Adapted
 from cuelearner_jax.adaptation.judging import Judging
 from cuelearner_jax.adaptation.lanes import Adaptation, begin, one_each, product, side_by_side
 from cuelearner_jax.asking import label_slots
@@ -101,7 +101,7 @@ class AdaptRequest(Generic[TaskT, KindsT]):
     judge_bounds: tuple[float, ...] = ()
     """Also try the model within these shares of its bound (0.5 0.25), and use it within what is worth most on the
     tuning episodes."""
-    sizes: GuideSizes = adapting.SIZES
+    sizes: GuideSizes = by_model.SIZES
     scalars: Scalars = field(default_factory=Scalars)
     kinds: KindsT = field(default_factory=dict)  # pyright: ignore[reportAssignmentType]
     """Options of kinds by their names, as a run's."""
@@ -172,10 +172,10 @@ def suggested(
         file = label_files.read(labels_from)
         eps_deg = file.eps if eps_deg is None else eps_deg
         labels = (file.budget,)
-    frame, settling = {"frame": source.config.sizes.frame}, adapting.settling
+    frame, settling = {"frame": source.config.sizes.frame}, by_model.settling
     if kind.by_evidence:
         frame, settling = {}, by_calibration.settling
-    sizes = sizes or replace(adapting.SIZES, **{**frame, **rules.sizes})
+    sizes = sizes or replace(by_model.SIZES, **{**frame, **rules.sizes})
     if scalars is None:
         eps_deg = rules.eps_deg if eps_deg is None else eps_deg
         scalars = replace(settling(source.config.scalars, eps_deg), **rules.scalars)
@@ -234,7 +234,7 @@ def run(
         raise UserError("several base policies are adapted each with its own seed: leave out --seeds and --first-seed")
     seeds = seeds_of(request.first_seed, request.seeds) if shared else seeds
     rows, request = _rows(subject, request, guidance, env, bases, seeds)
-    if not kind.by_evidence and (note_of := adapting.check_amounts(actions_of(env), request.bound_deg, scalars)):
+    if not kind.by_evidence and (note_of := by_model.check_amounts(actions_of(env), request.bound_deg, scalars)):
         note(note_of)
     varied = seeds, request.labels, request.bound_deg
     lanes = product(1, *varied) if shared else one_each(*varied)
@@ -255,7 +255,7 @@ def run(
         of = Adaptation(guidance, sizes, scalars, env, bases)
         if kept:
             stored.to_json(of.policy(begin(of, lanes)))
-        found = adapting.adapt(of, lanes, how, teacher, rows, watch=watch)
+        found = by_model.adapt(of, lanes, how, teacher, rows, watch=watch)
     return AdaptedStudy(found, subject, request, origin)
 
 
@@ -320,11 +320,11 @@ def _rows(
         file = label_files.LabelFile({}, form.name, space, eps, np.full(len(rows.obs), seeds[0]), rows)
     if request.bound_deg:
         return file, request
-    widest = adapting.usual_bound(space)
+    widest = by_model.usual_bound(space)
     if file is not None:
         if lanes_in(bases) is not None:
             raise UserError("labels of several base policies reach differently far: give --bound-deg")
-        reach = adapting.reach(space, bases.policy, file.labels.obs, file.labels.action)
+        reach = by_model.reach(space, bases.policy, file.labels.obs, file.labels.action)
         widest = max(reach, request.scalars.eps_deg)
     return file, replace(request, bound_deg=(widest,))
 

@@ -18,7 +18,7 @@ from typing import Any
 
 from cuelearner_envs.bounds import MOST_STEPS, check_number
 from cuelearner_jax import plugins
-from cuelearner_jax.adaptation.adapting import plain_scalars
+from cuelearner_jax.adaptation.by_model import plain_scalars
 from cuelearner_jax.agents import ddqn
 from cuelearner_jax.arbiters import paced
 from cuelearner_jax.bridges.gymnasium.environment import SUCCESS, GymnasiumTask

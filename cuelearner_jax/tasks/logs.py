@@ -24,7 +24,7 @@ from flax import struct
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from cuelearner_jax import pictures
-from cuelearner_jax.adaptation.adapting import plain_scalars
+from cuelearner_jax.adaptation.by_model import plain_scalars
 from cuelearner_jax.adaptation.judging import LABELS
 from cuelearner_jax.config import Sizes
 from cuelearner_jax.environment import Features, Quantity, WholeObservations

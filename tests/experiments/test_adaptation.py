@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cuelearner_jax.adaptation.adapting import check_amounts
+from cuelearner_jax.adaptation.by_model import check_amounts
 from cuelearner_jax.agents import ddqn
 from cuelearner_jax.config import GuideSizes, check_guide
 from cuelearner_jax.errors import UserError

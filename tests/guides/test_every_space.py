@@ -12,7 +12,7 @@ import numpy as np
 import probes
 import pytest
 
-from cuelearner_jax.adaptation import adapting
+from cuelearner_jax.adaptation import by_model
 from cuelearner_jax.config import GuideSizes
 from cuelearner_jax.environment import Quantity, Spaces, WholeObservations
 from cuelearner_jax.errors import UserError
@@ -62,7 +62,7 @@ def missing(space, obs):
 def scalars_of(space, **faults):
     eps = 1.0 if space.grain else 0.08
     plain = dataclasses.replace(
-        adapting.plain_scalars(space), feedback_learning_rate=1e-2, max_grad_norm=10.0, k_max=20
+        by_model.plain_scalars(space), feedback_learning_rate=1e-2, max_grad_norm=10.0, k_max=20
     )
     most = 4.0 if space.grain else 0.4  # as far as the labels reach
     return dataclasses.replace(plain, eps_deg=eps, tau_deg=eps / 20, tau_max_deg=most, **faults)
@@ -199,11 +199,11 @@ def test_a_kind_of_cues_refuses_choices_without_an_order_in_one_line(kind):
 
 
 def test_answers_too_weak_to_move_a_choice_are_refused_and_never_the_default():
-    assert adapting.plain_scalars(GEARS).eps_deg == 1.0
-    assert adapting.usual_bound(Choices(3, GEARS.order)) == 1.0
+    assert by_model.plain_scalars(GEARS).eps_deg == 1.0
+    assert by_model.usual_bound(Choices(3, GEARS.order)) == 1.0
     weak = dataclasses.replace(scalars_of(GEARS), eps_deg=0.3, tau_deg=0.01)
     with pytest.raises(UserError, match=r"scalars\.eps_deg is 0\.3 steps: give at least 1"):
-        adapting.check_amounts(GEARS, [2.0], weak)
+        by_model.check_amounts(GEARS, [2.0], weak)
     assert FRUIT.reach == 1.0
 
 
