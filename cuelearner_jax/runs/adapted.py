@@ -11,7 +11,7 @@ import jax
 import numpy as np
 
 from cuelearner_jax import config as configuration
-from cuelearner_jax.adaptation import by_calibration, stored
+from cuelearner_jax.adaptation import by_calibration, serialization
 from cuelearner_jax.adaptation.by_model import Adapted
 from cuelearner_jax.adaptation.judging import SPLIT
 from cuelearner_jax.adaptation.lanes import Lanes
@@ -65,9 +65,9 @@ class AdaptedLanes:
     def policy(self, env: Any) -> Any:
         """A block of the lanes' policies. Raises UserError if it cannot be had."""
         values, arrays = self.values["policy"], self._arrays(env)
-        base = stored.from_json(values["base"], arrays["base"], env, self.code, self.changes)
+        base = serialization.from_json(values["base"], arrays["base"], env, self.code, self.changes)
         base = Common(base) if self.rows is None else base.lane(self.lanes.base)
-        made = stored.from_json({**values, "base": {"policy": "uniform"}}, arrays, env, changes=self.changes)
+        made = serialization.from_json({**values, "base": {"policy": "uniform"}}, arrays, env, changes=self.changes)
         return replace(made, base=base)
 
     def base(self, env: Any) -> Any:
@@ -77,8 +77,8 @@ class AdaptedLanes:
     def _arrays(self, env: Any) -> Any:
         values = self.values["policy"]
         try:
-            lanes = stored.shapes_of({**values, "base": {"policy": "uniform"}}, env, self.lanes.number)
-            like = {**lanes, "base": stored.shapes_of(values["base"], env, self.rows)}
+            lanes = serialization.shapes_of({**values, "base": {"policy": "uniform"}}, env, self.lanes.number)
+            like = {**lanes, "base": serialization.shapes_of(values["base"], env, self.rows)}
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise formats.damaged("policy", self.folder / policy_folders.POLICY) from error
         return policy_folders.read_arrays(self.folder, like, self.values)
@@ -102,7 +102,7 @@ def open_folder(
     values = formats.read("policy", path)
     try:
         task, world = world_of(values["task"], find, path)
-        stored.check(values["policy"])
+        serialization.check(values["policy"])
         lanes, used = _lanes(values["lanes"], values["rows"])
     except UserError as error:
         raise error if str(path) in str(error) else UserError(f"{path}: {error}") from error
@@ -154,7 +154,7 @@ def write(
     """
     lanes, judged, env = adapted.lanes, adapted.judged, shape_of(task, world)
     block = replace(adapted.policy(env), base=adapted.of.bases)
-    values, arrays = stored.to_json(block, origin.get("code")), stored.arrays_of(block)
+    values, arrays = serialization.to_json(block, origin.get("code")), serialization.arrays_of(block)
     described = {
         "task": {"name": task.name, **({"from": task.origin} if task.origin else {}), **configuration.to_json(world)},
         **({"files": files} if (files := task.files(world)) else {}),

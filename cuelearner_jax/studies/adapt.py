@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from cuelearner_jax import user_code
-from cuelearner_jax.adaptation import by_calibration, by_model, changes, judging, stored
+from cuelearner_jax.adaptation import by_calibration, by_model, changes, judging, serialization
 from cuelearner_jax.adaptation.by_calibration import Calibrating
 from cuelearner_jax.adaptation.by_model import Adapted
 from cuelearner_jax.adaptation.judging import Judging
@@ -249,12 +249,12 @@ def run(
     if kind.by_evidence:
         of = Calibrating(guidance, sizes, scalars, env, bases, *_family(subject, request, kind.name, env))
         if kept:
-            stored.to_json(Calibrated(bases, jnp.zeros((lanes.number, 0)), (), of.named))
+            serialization.to_json(Calibrated(bases, jnp.zeros((lanes.number, 0)), (), of.named))
         found = by_calibration.adapt(of, lanes, how, teacher, rows, watch)
     else:
         of = Adaptation(guidance, sizes, scalars, env, bases)
         if kept:
-            stored.to_json(of.policy(begin(of, lanes)))
+            serialization.to_json(of.policy(begin(of, lanes)))
         found = by_model.adapt(of, lanes, how, teacher, rows, watch=watch)
     return AdaptedStudy(found, subject, request, origin)
 

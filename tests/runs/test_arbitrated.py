@@ -11,7 +11,7 @@ import probes
 import pytest
 from small_runs import stopping_at
 
-from cuelearner_jax.adaptation import stored
+from cuelearner_jax.adaptation import serialization
 from cuelearner_jax.arbiters import by_value, prior
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import episodes, watched
@@ -121,7 +121,7 @@ def test_each_arm_is_exported_as_it_acts(whole, tmp_path, format):
 
 def test_a_policy_folder_refuses_it_in_one_line(whole):
     with pytest.raises(UserError, match="a policy of kind arbitrated cannot be kept in a folder") as told:
-        stored.to_json(agent_of(whole))
+        serialization.to_json(agent_of(whole))
     assert "\n" not in str(told.value)
 
 

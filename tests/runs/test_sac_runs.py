@@ -13,7 +13,7 @@ from small_runs import stopping_at
 from walk_task import SMALL, TASK, Walk, WalkConfig
 
 from cuelearner_jax import loop
-from cuelearner_jax.adaptation import stored
+from cuelearner_jax.adaptation import serialization
 from cuelearner_jax.arbiters import by_value
 from cuelearner_jax.evaluate import episodes, watched
 from cuelearner_jax.export import contract, decisions
@@ -99,7 +99,7 @@ def test_the_agent_and_the_better_of_both_are_exported_as_they_act(whole, tmp_pa
 
 def test_a_policy_folder_can_keep_the_agent(whole):
     agent = policy_of(whole).base
-    again = stored.from_json(stored.to_json(agent), stored.arrays_of(agent), ENV)
+    again = serialization.from_json(serialization.to_json(agent), serialization.arrays_of(agent), ENV)
     obs = jnp.linspace(-1.0, 1.0, 8).reshape(4, 2)
     np.testing.assert_array_equal(*(policy.act(jax.random.key(0), None, obs) for policy in (agent, again)))
 
