@@ -1,6 +1,7 @@
 """Calibration: relative answers read as evidence of what changed in the world."""
 
-from cuelearner_jax.calibration.calibrating import (
+from cuelearner_jax.calibration.corrected import Calibrated
+from cuelearner_jax.calibration.estimation import (
     CHANGED,
     UNCHANGED,
     UNEXPLAINED,
@@ -9,7 +10,6 @@ from cuelearner_jax.calibration.calibrating import (
     Result,
     calibrate,
 )
-from cuelearner_jax.calibration.corrected import Calibrated
 from cuelearner_jax.calibration.families import Distortion, Unknown, declared
 from cuelearner_jax.calibration.simulated import simulated
 from cuelearner_jax.calibration.walking import Walk
