@@ -30,9 +30,9 @@ import numpy as np
 from cuelearner_envs.billiards.environment import Balls
 from cuelearner_jax.adaptation.by_model import settling
 from cuelearner_jax.agents.choice import best_near_peaks
-from cuelearner_jax.calibration.corrected import Calibrated
 from cuelearner_jax.calibration.estimation import Result, calibrate
 from cuelearner_jax.calibration.families import Distortion, Unknown, declared
+from cuelearner_jax.calibration.policy import Calibrated
 from cuelearner_jax.calibration.simulated import simulated
 from cuelearner_jax.calibration.walking import Walk
 from cuelearner_jax.config import Scalars

@@ -1,6 +1,5 @@
 """Calibration: relative answers read as evidence of what changed in the world."""
 
-from cuelearner_jax.calibration.corrected import Calibrated
 from cuelearner_jax.calibration.estimation import (
     CHANGED,
     UNCHANGED,
@@ -11,6 +10,7 @@ from cuelearner_jax.calibration.estimation import (
     calibrate,
 )
 from cuelearner_jax.calibration.families import Distortion, Unknown, declared
+from cuelearner_jax.calibration.policy import Calibrated
 from cuelearner_jax.calibration.simulated import simulated
 from cuelearner_jax.calibration.walking import Walk
 

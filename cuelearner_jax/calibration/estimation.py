@@ -18,10 +18,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from cuelearner_jax.calibration.corrected import Calibrated
 from cuelearner_jax.calibration.families import Distortion, check_family, unknowns_of
 from cuelearner_jax.calibration.likelihood import GRID
 from cuelearner_jax.calibration.meaning import Meaning
+from cuelearner_jax.calibration.policy import Calibrated
 from cuelearner_jax.calibration.posterior import HELD_OUT, Answers, Fit
 from cuelearner_jax.calibration.questions import Questions, choose, drawn, ties
 from cuelearner_jax.calibration.response import Responses

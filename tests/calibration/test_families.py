@@ -8,8 +8,8 @@ from known_worlds import BOX, STEP_DEG, Yard, aims, changed, grips, situations
 
 from cuelearner_envs.billiards.config import BilliardsConfig, make_environment
 from cuelearner_envs.navigation.environment import Navigation
-from cuelearner_jax.calibration.corrected import Calibrated
 from cuelearner_jax.calibration.families import Distortion, Unknown, acted, check_family, declared, seen, unknowns_of
+from cuelearner_jax.calibration.policy import Calibrated
 from cuelearner_jax.environment import OWN, Quantity
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.policies import policy_of

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from flax import struct
 
-from cuelearner_jax.calibration.corrected import Calibrated
 from cuelearner_jax.calibration.families import Unknown
+from cuelearner_jax.calibration.policy import Calibrated
 from cuelearner_jax.calibration.simulated import simulated
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.policies import policy_of
