@@ -10,7 +10,7 @@ from flax import struct
 
 from cuelearner_jax.calibration.families import Unknown
 from cuelearner_jax.calibration.policy import Calibrated
-from cuelearner_jax.calibration.simulated import simulated
+from cuelearner_jax.calibration.simulator import simulated
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.policies import policy_of
 from cuelearner_jax.spaces import DIRECTIONS, Box
