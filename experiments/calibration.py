@@ -34,7 +34,7 @@ from cuelearner_jax.calibration.estimation import Result, calibrate
 from cuelearner_jax.calibration.families import Distortion, Unknown, declared
 from cuelearner_jax.calibration.policy import Calibrated
 from cuelearner_jax.calibration.simulator import simulated
-from cuelearner_jax.calibration.walking import Walk
+from cuelearner_jax.calibration.walk import Walk
 from cuelearner_jax.config import Scalars
 from cuelearner_jax.environment import actions_of
 from cuelearner_jax.evaluate import episodes, evaluate_policy

@@ -12,7 +12,7 @@ from cuelearner_jax.calibration.estimation import (
 from cuelearner_jax.calibration.families import Distortion, Unknown, declared
 from cuelearner_jax.calibration.policy import Calibrated
 from cuelearner_jax.calibration.simulator import simulated
-from cuelearner_jax.calibration.walking import Walk
+from cuelearner_jax.calibration.walk import Walk
 
 __all__ = [
     "CHANGED",
