@@ -4,7 +4,7 @@ A policy's `act` sees many environments at once. Its `axes` say which of its lea
 (`evaluate.watched_lanes` maps over them); what lanes share is there once.
 """
 
-from cuelearner_jax.policies.finished import Arbitrated, acting, arbiter_of, finished
+from cuelearner_jax.policies.final import Arbitrated, acting, arbiter_of, finished
 from cuelearner_jax.policies.layers import (
     Agent,
     Common,
