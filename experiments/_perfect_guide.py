@@ -21,8 +21,8 @@ from cuelearner_jax import teachers
 from cuelearner_jax.config import GuideScalars
 from cuelearner_jax.environment import spaces_of
 from cuelearner_jax.guides.base import Kind
+from cuelearner_jax.guides.baselines import Untaught
 from cuelearner_jax.guides.refining import Refined
-from cuelearner_jax.guides.untaught import Untaught
 from cuelearner_jax.tasks.billiards import AGENT, SHIPPED_TEACHERS
 from cuelearner_jax.teachers import LearnedTeacher
 from cuelearner_jax.types import GuidanceModel

@@ -11,8 +11,8 @@ from jaxtyping import Array, Bool, Float
 from cuelearner_jax.config import GuideScalars
 from cuelearner_jax.environment import Aims
 from cuelearner_jax.guides.base import Candidates, Kind
+from cuelearner_jax.guides.baselines import Untaught
 from cuelearner_jax.guides.refining import Refined
-from cuelearner_jax.guides.untaught import Untaught
 from cuelearner_jax.spaces import DIRECTIONS, Space
 from cuelearner_jax.types import GuidanceModel
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 from cuelearner_jax.config.parts import part
 from cuelearner_jax.feedback.answers import RELATIVE
 from cuelearner_jax.guides.base import Kind
-from cuelearner_jax.guides.untaught import Untaught
+from cuelearner_jax.guides.baselines import Untaught
 
 
 @part

@@ -15,6 +15,7 @@ from cuelearner_jax.environment import actions_of, offers, spaces_of
 from cuelearner_jax.errors import UserError, closest
 from cuelearner_jax.guides import (
     aims,
+    baselines,
     bdcoach,
     calibration,
     clic,
@@ -24,7 +25,6 @@ from cuelearner_jax.guides import (
     offset,
     relative,
     scalar,
-    untaught,
 )
 from cuelearner_jax.guides.base import Guide, Kind
 from cuelearner_jax.plugins import load
@@ -33,7 +33,16 @@ ENTRY_POINTS = "cuelearner.guidances"
 
 _TAUGHT = (demonstration.KIND, scalar.KIND, dcoach.KIND, offset.KIND, calibration.KIND)
 _PEERS = (bdcoach.KIND, clic.KIND, clic.SHOWN)
-_BUILT_IN = (untaught.NONE, relative.KIND, intent.KIND, untaught.HEURISTIC, aims.ANY_AIM, aims.RULE, *_TAUGHT, *_PEERS)
+_BUILT_IN = (
+    baselines.NONE,
+    relative.KIND,
+    intent.KIND,
+    baselines.HEURISTIC,
+    aims.ANY_AIM,
+    aims.RULE,
+    *_TAUGHT,
+    *_PEERS,
+)
 _KINDS: dict[str, Kind] = {kind.name: kind for kind in _BUILT_IN}
 
 

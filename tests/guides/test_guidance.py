@@ -15,7 +15,7 @@ from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides import intent
 from cuelearner_jax.guides import registry as guidance
 from cuelearner_jax.guides.base import Kind
-from cuelearner_jax.guides.untaught import NONE, Untaught
+from cuelearner_jax.guides.baselines import NONE, Untaught
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.spaces import directions
 from cuelearner_jax.types import Label
