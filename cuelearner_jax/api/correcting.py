@@ -24,7 +24,7 @@ from cuelearner_jax.api.worlds import World
 from cuelearner_jax.config import GuideSizes, Scalars
 from cuelearner_jax.environment import Spaces
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.feedback import given
+from cuelearner_jax.feedback import external_labels
 from cuelearner_jax.feedback.answers import RELATIVE
 from cuelearner_jax.guides.relative import KIND
 from cuelearner_jax.policies import in_space
@@ -184,7 +184,7 @@ def _given(labels: Any, space: Any, cues: Any, low: Any, high: Any) -> GivenLabe
                 f"low and high bound {len(low)} and {len(high)} entries, actions have {size}: give one an entry"
             )
         space = Box(tuple(map(float, low)), tuple(map(float, high)), cues_from(cues) if _is_told(cues) else ())
-    given.check(rows, Spaces(rows.obs.shape[1], space), RELATIVE)
+    external_labels.check(rows, Spaces(rows.obs.shape[1], space), RELATIVE)
     return GivenLabels(rows, space, None)
 
 
@@ -201,7 +201,7 @@ def of_file(path: Path) -> GivenLabels:
     file = label_files.read(path)
     if file.answers != RELATIVE.name:
         raise UserError(f"{path} holds {file.answers} answers: give a file of {RELATIVE.name} ones")
-    given.check_file(file, None, RELATIVE, str(path))
+    external_labels.check_file(file, None, RELATIVE, str(path))
     own = file.seeds == file.seeds[0]
     rows = jax.tree.map(lambda leaf: np.asarray(leaf)[own], file.labels)
     config = None

@@ -29,7 +29,7 @@ from cuelearner_jax.api.worlds import World, a_world
 from cuelearner_jax.config import GuideSizes, Scalars, check_guide
 from cuelearner_jax.environment import Quantity, Spaces, actions_of, spaces_of, view_of
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.feedback import given
+from cuelearner_jax.feedback import external_labels
 from cuelearner_jax.feedback.answers import RELATIVE, check_teacher
 from cuelearner_jax.guides.base import Guide
 from cuelearner_jax.guides.relative import KIND
@@ -92,7 +92,7 @@ def fit_feedback(
     if file is not None:
         if file.answers != RELATIVE.name:
             raise UserError(f"{labels} holds {file.answers} answers: give a file of {RELATIVE.name} ones")
-        given.check_file(file, None, RELATIVE, str(labels))
+        external_labels.check_file(file, None, RELATIVE, str(labels))
         if eps_deg is not None and not math.isclose(eps_deg, file.eps or 0.0, rel_tol=1e-6):
             raise UserError(f"{labels} holds answers of {file.eps:g} {file.space.unit}: leave out eps_deg")
         own = file.seeds == file.seeds[0]
@@ -102,7 +102,7 @@ def fit_feedback(
     if len(rows.obs) < 2:
         raise UserError(f"{len(rows.obs)} labels teach nothing: give more")
     spaces = Spaces(rows.obs.shape[1], space)
-    given.check(rows, spaces, RELATIVE)
+    external_labels.check(rows, spaces, RELATIVE)
     sizes, scalars = settings(space, sizes, scalars, eps_deg)
     guidance = KIND.make(sizes, spaces)
     k_init, k_fit = jax.random.split(jax.random.key(seed))

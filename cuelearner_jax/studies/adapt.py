@@ -29,7 +29,7 @@ from cuelearner_jax.config import GuideSizes, Scalars, check_guide, check_part
 from cuelearner_jax.environment import Environment, actions_of, spaces_of
 from cuelearner_jax.errors import UserError, closest
 from cuelearner_jax.evaluate import Tell, untold
-from cuelearner_jax.feedback import given
+from cuelearner_jax.feedback import external_labels
 from cuelearner_jax.feedback.answers import check_teacher
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.guides.base import Guide
@@ -314,7 +314,7 @@ def _rows(
     if path is not None:
         file = read_labels(path, task, request.task, request.sizes, request.scalars, grid)
     elif rows is not None:
-        given.check(rows, spaces_of(env), form)
+        external_labels.check(rows, spaces_of(env), form)
         request = replace(request, labels=(len(rows.obs),))
         eps = request.scalars.eps_deg if form.by_eps else None
         file = label_files.LabelFile({}, form.name, space, eps, np.full(len(rows.obs), seeds[0]), rows)

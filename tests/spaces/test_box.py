@@ -15,7 +15,7 @@ from cuelearner_jax import asking
 from cuelearner_jax.agents import ddqn
 from cuelearner_jax.environment import spaces_of
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.feedback import given
+from cuelearner_jax.feedback import external_labels
 from cuelearner_jax.feedback.answers import (
     DEMONSTRATION,
     RELATIVE,
@@ -220,10 +220,10 @@ def test_a_label_file_holds_answers_about_a_box(form, tmp_path):
     assert (file.space, file.answers, file.eps) == (SMALL, form.name, eps)
     np.testing.assert_array_equal(file.labels.action, action)
     np.testing.assert_array_equal(file.labels.answer, kinds[form.name])
-    given.check_file(file, None, form, "labels.parquet")
+    external_labels.check_file(file, None, form, "labels.parquet")
     spoilt = file._replace(labels=file.labels.replace(action=file.labels.action + np.float32([5, 0, 0])))
     with pytest.raises(UserError, match="vectors between the bounds"):
-        given.check_file(spoilt, None, form, "labels.parquet")
+        external_labels.check_file(spoilt, None, form, "labels.parquet")
 
 
 @pytest.mark.parametrize(
