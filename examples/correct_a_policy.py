@@ -9,7 +9,7 @@ over validation episodes. A few minutes on 2 cores.
 import numpy as np
 
 import cuelearner_jax as cl
-from cuelearner_jax.api.acting import as_policy
+from cuelearner_jax.api.policies import as_policy
 from cuelearner_jax.evaluate import episodes, watched
 
 ANGLE = np.radians(40.0)

@@ -16,8 +16,8 @@ from cuelearner_jax import user_code
 from cuelearner_jax.adaptation.by_model import plain_scalars
 from cuelearner_jax.adaptation.lanes import blame
 from cuelearner_jax.api import arguments
-from cuelearner_jax.api.acting import CallablePolicy, as_policy, as_policy_in, source_of
 from cuelearner_jax.api.feedback import Labels, diverged, given_settings, label_path, labels_of, rows_of
+from cuelearner_jax.api.policies import CallablePolicy, as_policy, as_policy_in, source_of
 from cuelearner_jax.api.worlds import World
 from cuelearner_jax.calibration import Estimate, Result
 from cuelearner_jax.config import GuideSizes, Scalars

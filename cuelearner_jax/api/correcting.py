@@ -17,9 +17,9 @@ from cuelearner_jax import user_code
 from cuelearner_jax.adaptation.by_model import plain_scalars
 from cuelearner_jax.adaptation.judging import LABELS
 from cuelearner_jax.api import arguments
-from cuelearner_jax.api.acting import CallablePolicy, as_policy, load_policy
 from cuelearner_jax.api.adaptation import AdaptedPolicy, adapt
 from cuelearner_jax.api.feedback import Labels, label_path, labels_of, rows_of
+from cuelearner_jax.api.policies import CallablePolicy, as_policy, load_policy
 from cuelearner_jax.api.worlds import World
 from cuelearner_jax.config import GuideSizes, Scalars
 from cuelearner_jax.environment import Spaces

@@ -6,7 +6,7 @@ from typing import Any
 
 from cuelearner_jax import user_code
 from cuelearner_jax.api import arguments
-from cuelearner_jax.api.acting import as_policy_in, source_of
+from cuelearner_jax.api.policies import as_policy_in, source_of
 from cuelearner_jax.api.worlds import World, a_world
 from cuelearner_jax.studies import evaluate as study
 from cuelearner_jax.studies.evaluate import Measured

@@ -7,7 +7,7 @@ from typing import Any
 
 from cuelearner_jax import user_code
 from cuelearner_jax.api import arguments
-from cuelearner_jax.api.acting import as_policy, as_policy_in
+from cuelearner_jax.api.policies import as_policy, as_policy_in
 from cuelearner_jax.api.worlds import World, a_world
 from cuelearner_jax.config import to_json
 from cuelearner_jax.errors import UserError

@@ -24,7 +24,7 @@ from cuelearner_jax.adaptation import by_model
 from cuelearner_jax.adaptation.lanes import Adaptation, blame, check_memory, product
 from cuelearner_jax.agents.networks import all_finite
 from cuelearner_jax.api import arguments
-from cuelearner_jax.api.acting import CallablePolicy, as_policy, as_policy_in, entries_of
+from cuelearner_jax.api.policies import CallablePolicy, as_policy, as_policy_in, entries_of
 from cuelearner_jax.api.worlds import World, a_world
 from cuelearner_jax.config import GuideSizes, Scalars, check_guide
 from cuelearner_jax.environment import Quantity, Spaces, actions_of, spaces_of, view_of

@@ -14,8 +14,8 @@ import pyarrow as pa
 from cuelearner_jax import config as configuration
 from cuelearner_jax import user_code
 from cuelearner_jax.api import arguments
-from cuelearner_jax.api.acting import CallablePolicy
 from cuelearner_jax.api.feedback import label_path
+from cuelearner_jax.api.policies import CallablePolicy
 from cuelearner_jax.api.worlds import World, a_world
 from cuelearner_jax.environment import view_of
 from cuelearner_jax.errors import UserError, closest
