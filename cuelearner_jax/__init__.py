@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from cuelearner_jax.api.adaptation import AdaptedPolicy, adapt
-    from cuelearner_jax.api.correcting import agreement, correct
+    from cuelearner_jax.api.correction import agreement, correct
     from cuelearner_jax.api.evaluation import measure
     from cuelearner_jax.api.exporting import export_correction, export_policy, load_exported
     from cuelearner_jax.api.feedback import FeedbackModel, Labels, ask, fit_feedback, refine
@@ -47,9 +47,9 @@ _PLACES = {
     "UserError": "errors",
     "World": "api.worlds",
     "adapt": "api.adaptation",
-    "agreement": "api.correcting",
+    "agreement": "api.correction",
     "ask": "api.feedback",
-    "correct": "api.correcting",
+    "correct": "api.correction",
     "export_correction": "api.exporting",
     "export_policy": "api.exporting",
     "fit_feedback": "api.feedback",
