@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from cuelearner_jax.api.adaptation import AdaptedPolicy, adapt
     from cuelearner_jax.api.correction import agreement, correct
     from cuelearner_jax.api.evaluation import measure
-    from cuelearner_jax.api.exporting import export_correction, export_policy, load_exported
+    from cuelearner_jax.api.export import export_correction, export_policy, load_exported
     from cuelearner_jax.api.feedback import FeedbackModel, Labels, ask, fit_feedback, refine
     from cuelearner_jax.api.policies import CallablePolicy, load_policy
     from cuelearner_jax.api.training import Run, train
@@ -50,11 +50,11 @@ _PLACES = {
     "agreement": "api.correction",
     "ask": "api.feedback",
     "correct": "api.correction",
-    "export_correction": "api.exporting",
-    "export_policy": "api.exporting",
+    "export_correction": "api.export",
+    "export_policy": "api.export",
     "fit_feedback": "api.feedback",
     "from_gymnasium": "api.worlds",
-    "load_exported": "api.exporting",
+    "load_exported": "api.export",
     "load_policy": "api.policies",
     "make": "api.worlds",
     "measure": "api.evaluation",
