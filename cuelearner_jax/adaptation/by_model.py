@@ -43,7 +43,7 @@ class Adapted:
 
     of: Adaptation
     lanes: Lanes
-    block: Any  # `LaneState`, or `calibrated.Evidence`
+    block: Any  # `LaneState`, or `by_calibration.Evidence`
     judged: Judged
     curve: list[dict[str, Any]]  # a row a measurement: "asked" (lanes,) labels so far, and metrics (lanes,) by name
     results: tuple[Result, ...] = ()  # of calibration, a lane each: what changed

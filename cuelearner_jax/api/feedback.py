@@ -236,7 +236,7 @@ def label_path(labels: Any) -> Path:
 def settings(
     space: Space, sizes: GuideSizes | None, scalars: Scalars | None, eps_deg: float | None
 ) -> tuple[GuideSizes, Scalars]:
-    """Sizes and scalars, by default those of `adapting`. Raises UserError for what cannot work."""
+    """Sizes and scalars, by default those of `by_model`. Raises UserError for what cannot work."""
     sizes, scalars = sizes or by_model.SIZES, by_model.settling(scalars or by_model.plain_scalars(space), eps_deg)
     check_guide(sizes, scalars)
     return sizes, scalars

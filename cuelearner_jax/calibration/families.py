@@ -44,7 +44,7 @@ class Distortion(NamedTuple):
     unknowns: tuple[Unknown, ...]
     sees: Undoing | None = None  # (unknowns, observation) -> observation before the change
     acts: Undoing | None = None  # (unknowns, meant action) -> action that leads to it after the change
-    plans: Planning | None = None  # (unknowns, observation, meant action) -> the same; see `simulated.simulated`
+    plans: Planning | None = None  # (unknowns, observation, meant action) -> the same; see `simulator.simulated`
     of_teacher: bool = False  # a fault of the answers, which is told and not corrected
 
     @property

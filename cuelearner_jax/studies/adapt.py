@@ -201,7 +201,7 @@ def suggested(
 
 
 def reads_evidence(request: AdaptRequest[Any, Any]) -> bool:
-    """Return whether answers are read as evidence of what changed, see `calibrated`."""
+    """Return whether answers are read as evidence of what changed, see `by_calibration`."""
     return guidances.resolve(request.guidance).by_evidence
 
 
