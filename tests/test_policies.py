@@ -12,7 +12,7 @@ import probes
 import pytest
 
 from cuelearner_jax.agents import ddqn
-from cuelearner_jax.agents.networks import applied, q_network
+from cuelearner_jax.agents.networks import as_function, q_network
 from cuelearner_jax.devices import lane_mesh
 from cuelearner_jax.environment import Aims
 from cuelearner_jax.errors import UserError
@@ -72,7 +72,7 @@ def test_actions_near_aims_are_near_each_of_them_and_anywhere_where_there_is_non
 
 
 def test_the_agent_takes_the_direction_of_the_largest_value():
-    expected = probes.greedy_actions(applied(Q), AGENT.params, OBS)
+    expected = probes.greedy_actions(as_function(Q), AGENT.params, OBS)
     np.testing.assert_array_equal(act(AGENT), expected)
     assert len(np.unique(expected, axis=0)) > 2
     np.testing.assert_array_equal(act(AGENT, jax.random.key(6)), expected)  # whatever the key

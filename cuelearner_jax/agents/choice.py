@@ -51,10 +51,10 @@ def best_near_peaks(
         near = jnp.mod(highest[:, None] * stride + jnp.arange(1 - stride, stride)[None], len(options)).ravel()
         return options[near][jnp.argmax(value(one, options[near]))]
 
-    return each_in_portions(choose, obs, looked_at(len(options), coarse, peaks))
+    return each_in_portions(choose, obs, values_per_choice(len(options), coarse, peaks))
 
 
-def looked_at(options: int, coarse: int, peaks: int) -> int:
+def values_per_choice(options: int, coarse: int, peaks: int) -> int:
     """Actions whose values one choice takes, of a set searched near the peaks of a first look (`coarse` 0: all)."""
     return coarse + peaks * (2 * options // coarse - 1) if coarse else options
 

@@ -17,8 +17,8 @@ from flax import struct
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from cuelearner_jax.agents import view
-from cuelearner_jax.agents.choice import best_near_peaks, best_of, looked_at
-from cuelearner_jax.agents.networks import applied, q_network, widened
+from cuelearner_jax.agents.choice import best_near_peaks, best_of, values_per_choice
+from cuelearner_jax.agents.networks import as_function, q_network, widen_layers
 from cuelearner_jax.agents.replay import Memory, Transition
 from cuelearner_jax.config import POSITIVE, SHARE, TRACED, Bounds, Frame, Layers, Scalars, Sizes, part
 from cuelearner_jax.environment import Spaces
@@ -115,7 +115,7 @@ class DoubleDQN:
     def working(self, num_envs: int, portion: int) -> dict[str, int]:
         """Activations of the widest passes: the argmax while acting, that inside targets, a batch with its gradient."""
         own = self.options
-        looked = looked_at(own.directions, own.coarse_directions, own.peaks)
+        looked = values_per_choice(own.directions, own.coarse_directions, own.peaks)
         rows = {
             "--agent.directions": min(num_envs * looked, max(portion, looked)),
             "--agent.batch-size": 3 * own.batch_size * len(own.q_layers),
@@ -148,11 +148,11 @@ class DoubleDQN:
             return self.act(env, params, obs, key)
         rough, layers = params, own.q_layers
         if own.coarse_dtype == "bfloat16":
-            rough, layers = widened(params, layers, ALIGNED)
-        look = applied(q_network(layers, jnp.dtype(own.coarse_dtype)))
+            rough, layers = widen_layers(params, layers, ALIGNED)
+        look = as_function(q_network(layers, jnp.dtype(own.coarse_dtype)))
         return best_near_peaks(
             partial(self.value, env, params),
-            lambda one, actions: look(rough, *view.seen(self.frame, env, one, actions))[:, 0],
+            lambda one, actions: look(rough, *view.network_inputs(self.frame, env, one, actions))[:, 0],
             self._directions,
             obs,
             own.coarse_directions,
@@ -163,8 +163,8 @@ class DoubleDQN:
         self, env: Any, params: Params, obs: Float[Array, "*n obs"], actions: Float[Array, "*m action"]
     ) -> Float[Array, "*m"]:
         """Q of each action, in a situation each or all in one."""
-        network = applied(q_network(self.options.q_layers))
-        return network(params, *view.seen(self.frame, env, obs, actions))[..., 0]
+        network = as_function(q_network(self.options.q_layers))
+        return network(params, *view.network_inputs(self.frame, env, obs, actions))[..., 0]
 
     def update(
         self,

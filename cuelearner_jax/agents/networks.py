@@ -70,7 +70,7 @@ def residual_network(layers: Sequence[int], outputs: int) -> MLP:
     return MLP(tuple(layers), outputs)
 
 
-def applied(network: MLP) -> Callable[[Params, jax.Array, jax.Array], jax.Array]:
+def as_function(network: MLP) -> Callable[[Params, jax.Array, jax.Array], jax.Array]:
     """A network as a function: (params, obs (..., obs), actions (..., action)) -> outputs (..., outputs)."""
     return lambda params, obs, actions: jnp.asarray(network.apply(params, obs, actions))
 
@@ -81,7 +81,7 @@ def all_finite(tree: Any) -> Bool[Array, ""]:
     return jnp.stack([jnp.isfinite(leaf).all() for leaf in numbers] or [jnp.array(True)]).all()
 
 
-def widened(params: Params, layers: Sequence[int], multiple: int) -> tuple[Params, tuple[int, ...]]:
+def widen_layers(params: Params, layers: Sequence[int], multiple: int) -> tuple[Params, tuple[int, ...]]:
     """The same function with hidden layers of widths that are multiples: a tensor core's rows must be aligned.
 
     The units that are added are zero throughout and add exactly nothing.

@@ -158,7 +158,7 @@ class Memory(NamedTuple):
         found = [self.one_step(self.buffer.read(self.rows, numbers))]
         if n_step > 1:
             found.append(self.n_step(numbers, n_step, discount))
-        return [mirrored(k_mirror, self.env, batch) for batch in found]
+        return [apply_symmetries(k_mirror, self.env, batch) for batch in found]
 
     def one_step(self, stored: StoredStep) -> Transition:
         """Stored steps (batch, ...) as transitions, their observations rebuilt."""
@@ -287,7 +287,7 @@ def stored_step(
     )
 
 
-def mirrored(key: PRNGKeyArray, env: Environment, batch: Transition) -> Transition:
+def apply_symmetries(key: PRNGKeyArray, env: Environment, batch: Transition) -> Transition:
     """Each transition of a batch under a random symmetry of the environment."""
     image = random_symmetries(key, env, batch.reward.shape[0])
     obs, action = image(batch.obs, batch.action)

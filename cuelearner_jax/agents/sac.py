@@ -116,7 +116,7 @@ class Actor(nn.Module):
         return mean, jnp.clip(log_std, *LOG_STD)
 
 
-class Drawn(NamedTuple):
+class ActionSample(NamedTuple):
     """Actions drawn from the squashed Gaussian."""
 
     unit: Float[Array, "n action"]  # in unit coordinates
@@ -192,12 +192,12 @@ class SoftActorCritic:
         """Actions in unit coordinates as actions of the box."""
         return self.spaces.actions.exp(self._box.middle(), unit / 2)
 
-    def draw(self, actor: Params, obs: Float[Array, "n obs"], key: PRNGKeyArray) -> Drawn:
+    def draw(self, actor: Params, obs: Float[Array, "n obs"], key: PRNGKeyArray) -> ActionSample:
         """Actions drawn from the squashed Gaussian, with the logarithm of their density; both have gradients."""
         mean, log_std = self._gaussian(actor, obs)
         noise = jax.random.normal(key, mean.shape)
         before = mean + jnp.exp(log_std) * noise
-        return Drawn(jnp.tanh(before), squashed_log_density(noise, log_std, before))
+        return ActionSample(jnp.tanh(before), squashed_log_density(noise, log_std, before))
 
     def values(
         self, critics: Params, obs: Float[Array, "*n obs"], unit: Float[Array, "*m action"]
@@ -234,7 +234,7 @@ class SoftActorCritic:
             unit = self.in_unit(batch.action)
             error = lambda critics: loss_of(self.values(critics, batch.obs, unit), targets)  # noqa: E731
             loss, gradient = jax.value_and_grad(error)(critics)
-            critics, opt_state = stepped(options.critic_rate, most, gradient, opt_state, critics)
+            critics, opt_state = optimizer_step(options.critic_rate, most, gradient, opt_state, critics)
             if self.bootstraps:
                 target_critics = optax.incremental_update(critics, target_critics, options.polyak)
             return (critics, opt_state, target_critics, batch.obs), (loss, optax.tree.norm(gradient))
@@ -246,9 +246,9 @@ class SoftActorCritic:
 
         climbed = jax.value_and_grad(self.actor_loss, has_aux=True)(actor, critics, temperature, obs, k_actor)
         (_, log_density), gradient = climbed
-        actor, actor_opt = stepped(options.actor_rate, most, gradient, rest.actor_opt, actor)
+        actor, actor_opt = optimizer_step(options.actor_rate, most, gradient, rest.actor_opt, actor)
         surplus = -log_density - options.target_entropy * self.spaces.actions.size
-        log_temperature, temperature_opt = stepped(
+        log_temperature, temperature_opt = optimizer_step(
             options.temperature_rate, most, temperature * surplus, rest.temperature_opt, rest.log_temperature
         )
         state = SACState(target_critics, log_temperature, actor_opt, critics_opt, temperature_opt)
@@ -348,7 +348,7 @@ def squashed_log_density(
     return jnp.sum(normal - squashed, -1)
 
 
-def stepped(
+def optimizer_step(
     rate: Float[Array, ""] | float, max_norm: Float[Array, ""] | float, gradient: Any, opt_state: Any, params: Any
 ) -> tuple[Any, Any]:
     """Parameters and Adam's state after a step with a gradient clipped to a norm."""

@@ -17,7 +17,7 @@ from cuelearner_jax.environment import Spaces
 from cuelearner_jax.errors import UserError
 
 
-def seen(
+def network_inputs(
     frame: Frame, env: Any, obs: Float[Array, "*n obs"], actions: Float[Array, "*m action"]
 ) -> tuple[Float[Array, "*n own"], Float[Array, "*m turned"]]:
     """What a network takes for observation and action.

@@ -25,7 +25,7 @@ def check_teacher(teacher: Any, faults: TeacherFaults) -> None:
         )
 
 
-def in_mind(
+def intended_action(
     space: Space,
     teacher: Teacher,
     state: EnvState,
@@ -41,12 +41,12 @@ def in_mind(
         return _taught(space, teacher, teacher.best_action(state, obs), action)
     assert isinstance(teacher, ValuesDirections)  # see `check_teacher`
     # One with a bias takes everything for changed by it: what it looks for lies round the action changed back.
-    seen = biased(space, action, -space.from_unit(scalars.teacher_bias_deg))
+    seen = add_bias(space, action, -space.from_unit(scalars.teacher_bias_deg))
     spread = space.from_unit(scalars.nearest_aim_deg)
     return _taught(space, teacher, teacher.nearest_good(state, obs, seen, spread, scalars.nearest_share), action)
 
 
-def biased(space: Space, action: Float[Array, " action"], bias: Float[Array, ""]) -> Float[Array, " action"]:
+def add_bias(space: Space, action: Float[Array, " action"], bias: Float[Array, ""]) -> Float[Array, " action"]:
     """Change an action by a constant error along every cue."""
     return space.toward(action, jnp.ones(len(space.cues)), bias)
 
@@ -91,7 +91,7 @@ def relative_answer(
 ) -> tuple[Float[Array, " cues"], Bool[Array, ""]]:
     """h of a teacher with the faults of `scalars`, and whether it answered."""
     space = actions_of(env)
-    return human_answer(key, space, action, in_mind(space, teacher, state, obs, action, scalars), scalars)
+    return human_answer(key, space, action, intended_action(space, teacher, state, obs, action, scalars), scalars)
 
 
 def human_answer(
@@ -103,7 +103,7 @@ def human_answer(
     others h is `UNSAID`. Who says nothing of any cue did not answer.
     """
     mistaken, spoken = _slips(key, scalars, (len(space.cues),))
-    believed = biased(space, best, space.from_unit(scalars.teacher_bias_deg))
+    believed = add_bias(space, best, space.from_unit(scalars.teacher_bias_deg))
     eps, indifference = space.from_unit(scalars.eps_deg), space.from_unit(scalars.indifference_deg)
     h = relative_feedback(space, action, believed, eps, indifference)
     h = jnp.where(mistaken, -h, h)
@@ -126,7 +126,7 @@ def _spoken_of(key: PRNGKeyArray, off: Float[Array, " cues"], says: str) -> Bool
     return number == jax.random.randint(jax.random.fold_in(key, len(off)), (), 0, len(off))
 
 
-def demonstrated(
+def demonstrate(
     key: PRNGKeyArray,
     env: Any,
     teacher: Teacher,
@@ -141,8 +141,8 @@ def demonstrated(
     other way: the mirror image of what it meant to show.
     """
     space, (mistaken, answered) = actions_of(env), _slips(key, scalars)
-    wanted = in_mind(space, teacher, state, obs, action, scalars)
-    wanted = biased(space, wanted, space.from_unit(scalars.teacher_bias_deg))
+    wanted = intended_action(space, teacher, state, obs, action, scalars)
+    wanted = add_bias(space, wanted, space.from_unit(scalars.teacher_bias_deg))
     right = space.distance(action, wanted) <= space.from_unit(scalars.indifference_deg)
     mirrored = space.exp(action, -space.log(action, wanted))
     return jnp.where(right, action, jnp.where(mistaken, mirrored, wanted)), answered
@@ -163,8 +163,8 @@ def scalar_answer(
     """
     mistaken, answered = _slips(key, scalars)
     space = actions_of(env)
-    wanted = in_mind(space, teacher, state, obs, action, scalars)
-    wanted = biased(space, wanted, space.from_unit(scalars.teacher_bias_deg))
+    wanted = intended_action(space, teacher, state, obs, action, scalars)
+    wanted = add_bias(space, wanted, space.from_unit(scalars.teacher_bias_deg))
     within = jnp.maximum(space.from_unit(scalars.scalar_within_deg), space.from_unit(scalars.indifference_deg))
     good = space.distance(action, wanted) <= within
     said = jnp.where(jnp.isfinite(wanted).all(), (good != mistaken).astype(jnp.float32), jnp.nan)
@@ -202,7 +202,7 @@ DEMONSTRATION = AnswerForm(
     name="demonstration",
     width=lambda space: space.size,
     meaning=lambda space: f"what to do instead, an action ({space.name})",
-    answer=demonstrated,
+    answer=demonstrate,
     is_action=True,
 )
 SCALAR = AnswerForm(

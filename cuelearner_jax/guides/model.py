@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from cuelearner_jax.agents import view
-from cuelearner_jax.agents.networks import applied, residual_network
+from cuelearner_jax.agents.networks import as_function, residual_network
 from cuelearner_jax.config import GuideSizes
 from cuelearner_jax.environment import Spaces
 from cuelearner_jax.types import GuidanceModel, Params
@@ -74,8 +74,8 @@ def guide_model(sizes: GuideSizes, spaces: Spaces, outputs: int | None = None, b
     ) -> Float[Array, "m outputs"]:
         """Of m situations with an action each, or of one with m actions."""
         bare, known = jnp.split(actions, [size], -1)
-        of_obs, of_action = view.seen(sizes.frame, env, obs, bare)
-        return applied(network)(params, of_obs, jnp.concatenate([of_action, known], -1) if beside else of_action)
+        of_obs, of_action = view.network_inputs(sizes.frame, env, obs, bare)
+        return as_function(network)(params, of_obs, jnp.concatenate([of_action, known], -1) if beside else of_action)
 
     made = ensemble(sizes.ensemble, init, predict)
     if outputs is not None:

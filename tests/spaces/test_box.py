@@ -20,7 +20,7 @@ from cuelearner_jax.feedback.answers import (
     DEMONSTRATION,
     RELATIVE,
     SCALAR,
-    demonstrated,
+    demonstrate,
     human_answer,
     relative_feedback,
     scalar_answer,
@@ -160,7 +160,7 @@ def test_good_is_an_action_near_the_goal_along_every_entry_and_a_demonstration_i
         action = SMALL.exp(best, jnp.array(change))
         answer, answered = scalar_answer(KEY, env, teacher, obs, obs, action, SCALARS)
         assert (float(answer[0]), bool(answered)) == (good, True)
-        shown, answered = demonstrated(KEY, env, teacher, obs, obs, action, SCALARS)
+        shown, answered = demonstrate(KEY, env, teacher, obs, obs, action, SCALARS)
         np.testing.assert_allclose(shown, best, atol=1e-6)
         assert bool(answered)
 
