@@ -16,7 +16,7 @@ from cuelearner_jax import user_code
 from cuelearner_jax.adaptation.by_model import plain_scalars
 from cuelearner_jax.adaptation.lanes import blame
 from cuelearner_jax.api import arguments
-from cuelearner_jax.api.feedback import Labels, diverged, given_settings, label_path, labels_of, rows_of
+from cuelearner_jax.api.feedback import Labels, check_settings, divergence_error, label_path, labels_of, rows_of
 from cuelearner_jax.api.policies import CallablePolicy, as_policy, as_policy_in, source_of
 from cuelearner_jax.api.worlds import World
 from cuelearner_jax.calibration import Estimate, Result
@@ -154,7 +154,7 @@ def adapt(
     source = _source(policy, world)
     env = world.env if isinstance(world, World) else world
     space = actions_of(env)
-    sizes, scalars, eps_deg = given_settings(space, sizes, scalars, eps_deg)
+    sizes, scalars, eps_deg = check_settings(space, sizes, scalars, eps_deg)
     guidance, judge_by = (
         arguments.optional(arguments.text, name, value)
         for name, value in (("guidance", guidance), ("judge_by", judge_by))
@@ -184,7 +184,7 @@ def adapt(
     outcome = study.run(subject, request, note=partial(warnings.warn, stacklevel=5))
     if outcome.found.failed.any():
         blame(outcome.found.of, teacher, outcome.found.block)
-        raise diverged()
+        raise divergence_error()
     if not outcome.found.judged.used.all():
         warnings.warn(study.sentences(outcome.found)[-1], stacklevel=3)
     adapted = outcome.found.policy(env).lane(0)
@@ -203,7 +203,7 @@ def _source(policy: Any, world: Any) -> PolicySource:
     if hasattr(world, "observation_space"):
         raise UserError("world is an environment of Gymnasium: give cl.from_gymnasium(its id, class or function)")
     if isinstance(world, type) or not all(callable(getattr(world, name, None)) for name in ("reset", "step")):
-        raise arguments.refused("world", world, "a world, as cl.make gives it, or an environment")
+        raise arguments.argument_error("world", world, "a world, as cl.make gives it, or an environment")
     task = Task("environment", "a bare environment", _Bare, (Body("own", "", lambda config, split: world),))
     config = getattr(policy, "trained", None) or RunConfig(_Bare(), scalars=plain_scalars(actions_of(world)))
     return PolicySource(task, config, None, Path(task.name))

@@ -31,7 +31,7 @@ FoundT = TypeVar("FoundT")
 KindT = TypeVar("KindT")
 
 
-def refused(name: str, value: Any, wanted: str) -> UserError:
+def argument_error(name: str, value: Any, wanted: str) -> UserError:
     """Build the error for an argument: what was given, and what is wanted."""
     return UserError(f"{name} is {shown(value)}: give {wanted}")
 
@@ -44,7 +44,7 @@ def optional(check: Callable[..., FoundT], name: str, value: Any, *more: Any) ->
 def instance(name: str, value: Any, kind: type[KindT], wanted: str) -> KindT:
     """An object of a class; `wanted` says where one comes from."""
     if not isinstance(value, kind):
-        raise refused(name, value, wanted)
+        raise argument_error(name, value, wanted)
     return value
 
 
@@ -56,7 +56,7 @@ def flag(name: str, value: Any) -> bool:
 def text(name: str, value: Any, known: Iterable[str] = ()) -> str:
     """A word: one of those that are known, if any are named."""
     if not isinstance(value, str) or not 0 < len(value) <= LONGEST or not value.isprintable():
-        raise refused(name, value, f"a name, in up to {LONGEST} printable characters")
+        raise argument_error(name, value, f"a name, in up to {LONGEST} printable characters")
     if (known := list(known)) and value not in known:
         raise UserError(f"{name} is {shown(value)}{closest(value, known)}")
     return value
@@ -69,7 +69,7 @@ def whole(name: str, value: Any, least: int, most: int) -> int:
     except TypeError:
         number = None
     if number is None or not least <= number <= most:
-        raise refused(name, value, f"a whole number from {least} to {most:,}")
+        raise argument_error(name, value, f"a whole number from {least} to {most:,}")
     return number
 
 
@@ -92,14 +92,14 @@ def number(name: str, value: Any, most: float, wanted: str) -> float:
     """A number above 0, up to a bound."""
     found = plain(value)
     if isinstance(found, bool) or not isinstance(found, int | float) or not 0 < found <= most:  # NaN is neither
-        raise refused(name, value, wanted)
+        raise argument_error(name, value, wanted)
     return float(found)
 
 
 def several(name: str, values: Any, of_what: str) -> list[Any]:
     """Values in a list, tuple, range or array of one axis; no text, whose letters would be meant."""
     if not isinstance(values, list | tuple | range) and getattr(values, "ndim", None) != 1:
-        raise refused(name, values, f"a list of {of_what}")
+        raise argument_error(name, values, f"a list of {of_what}")
     return list(values)
 
 
@@ -107,7 +107,7 @@ def path(name: str, value: Any) -> Path:
     """A path, of a file that need not be there."""
     given = os.fspath(value) if isinstance(value, str | os.PathLike) else None
     if not isinstance(given, str) or not given or "\0" in given:
-        raise refused(name, value, "a path, as text or pathlib.Path")
+        raise argument_error(name, value, "a path, as text or pathlib.Path")
     try:
         given.encode()
         Path(given).exists()
@@ -123,15 +123,15 @@ def key(name: str, value: Any) -> PRNGKeyArray:
         typed = jnp.issubdtype(value.dtype, jax.dtypes.prng_key)
         if value.shape == (() if typed else (2,)) and (typed or value.dtype == jnp.uint32):
             return value
-    raise refused(name, value, "a key, as jax.random.key(0) gives it")
+    raise argument_error(name, value, "a key, as jax.random.key(0) gives it")
 
 
-def like(name: str, value: Any, shapes: Any) -> Any:
+def tree_like(name: str, value: Any, shapes: Any) -> Any:
     """A tree of arrays such as these shapes, without more axes."""
     leaves, structure = jax.tree.flatten(value)
     wanted, known = jax.tree.flatten(shapes)
     if structure != known or not all(map(_is_like, leaves, wanted)):
-        raise refused(name, value, "a state of this world, as its reset and step give them")
+        raise argument_error(name, value, "a state of this world, as its reset and step give them")
     return value
 
 
@@ -148,7 +148,7 @@ def numbers(name: str, value: Any) -> Float[np.ndarray, "..."]:
     except Exception:  # rows of different lengths, an array of JAX's that was deleted, whatever else can be no array
         found = np.empty(0, object)
     if found.dtype.kind not in "fiu" and not jnp.issubdtype(found.dtype, jnp.floating):  # bfloat16 is of no kind
-        raise refused(name, value, "an array of real numbers")
+        raise argument_error(name, value, "an array of real numbers")
     if isinstance(value, np.ma.MaskedArray) and np.ma.getmaskarray(value).any():
         raise UserError(f"{name} is an array with masked numbers: leave these rows out")
     if not (np.abs(found.astype(np.float64)) <= LARGEST_FLOAT).all():
@@ -172,7 +172,7 @@ def action(name: str, value: Any, space: Space) -> Any:
     found = numbers(name, value)
     if found.shape != (space.size,) or not space.usable(found, np):
         example = np.asarray(space.spread(4))[0].round(2).tolist()
-        raise refused(name, value, f"an action of shape ({space.size},), for instance {example}")
+        raise argument_error(name, value, f"an action of shape ({space.size},), for instance {example}")
     return found
 
 
@@ -189,7 +189,7 @@ def teacher(name: str, value: Any, space: Space) -> Teacher:
     answers, acts = (callable(getattr(value, verb, None)) for verb in ("best_action", "act"))
     leaf = answers and any(leaf is value for leaf in jax.tree.leaves(value))  # no pytree: no program can be given it
     if isinstance(value, type) or leaf or not (answers or acts or callable(value)):
-        raise refused(name, value, "a teacher, for instance teacher_of(world), or a function of observations")
+        raise argument_error(name, value, "a teacher, for instance teacher_of(world), or a function of observations")
     if acts and not answers:
         value = getattr(value, "policy", value)  # of a `CallablePolicy`, which stands above this file
     try:

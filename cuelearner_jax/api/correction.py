@@ -171,7 +171,7 @@ def _given(labels: Any, space: Any, cues: Any, low: Any, high: Any) -> GivenLabe
     if isinstance(labels, str | os.PathLike):
         if told or space is not None:
             raise UserError(f"{labels} says its own space of actions: leave out {told[0] if told else 'space'}")
-        return of_file(label_path(labels))
+        return labels_from_file(label_path(labels))
     rows = rows_of(labels)
     if space is None:
         size = rows.action.shape[1]
@@ -196,7 +196,7 @@ def _numbers(name: str, value: Any) -> list[float]:
     return arguments.numbers(name, value).reshape(-1).tolist()
 
 
-def of_file(path: Path) -> GivenLabels:
+def labels_from_file(path: Path) -> GivenLabels:
     """The labels of a file's first seed. Raises UserError for a file of other answers."""
     file = label_files.read(path)
     if file.answers != RELATIVE.name:

@@ -88,7 +88,7 @@ def fit_feedback(
     seed = arguments.seed("seed", seed)
     file = None if isinstance(labels, tuple) else label_files.read(label_path(labels))
     space = arguments.instance("space", space, Space, "a space of actions") if file is None else file.space
-    sizes, scalars, eps_deg = given_settings(space, sizes, scalars, eps_deg)
+    sizes, scalars, eps_deg = check_settings(space, sizes, scalars, eps_deg)
     if file is not None:
         if file.answers != RELATIVE.name:
             raise UserError(f"{labels} holds {file.answers} answers: give a file of {RELATIVE.name} ones")
@@ -110,7 +110,7 @@ def fit_feedback(
     fit = jax.jit(lambda key, rows, former, scalars: guidance.fit(key, None, rows, former, scalars))
     model = fit(k_fit, jax.tree.map(jnp.asarray, rows), guidance.init(k_init), scalars)
     if not all_finite(model):
-        raise diverged()
+        raise divergence_error()
     return FeedbackModel(guidance, model, scalars, labels_of(rows), sizes, space)
 
 
@@ -149,7 +149,7 @@ def ask(
     a_world("world", world)
     space = actions_of(world.env)
     bound = arguments.optional(arguments.amount, "bound_deg", bound_deg, space) or by_model.usual_bound(space)
-    sizes, scalars = settings(space, *given_settings(space, sizes, scalars, eps_deg))
+    sizes, scalars = settings(space, *check_settings(space, sizes, scalars, eps_deg))
     teacher = arguments.teacher("teacher", teacher, space)
     check_teacher(teacher, scalars)
     by_model.check_amounts(space, [bound], scalars)
@@ -159,7 +159,7 @@ def ask(
     block = by_model.learned(of, product(1, (seed,), (labels,), (bound,)), teacher)
     if block.failed.any():
         blame(of, teacher, block)
-        raise diverged()
+        raise divergence_error()
     guide = jax.tree.map(lambda leaf: leaf[0], block.guide)
     return FeedbackModel(guidance, guide.model, scalars, labels_of(guide.labels), sizes, space, env)
 
@@ -214,7 +214,7 @@ def _checked_model(model: FeedbackModel) -> FeedbackModel:
     return model
 
 
-def given_settings(
+def check_settings(
     space: Space, sizes: Any, scalars: Any, eps_deg: Any
 ) -> tuple[GuideSizes | None, Scalars | None, float | None]:
     """These arguments as they are, each of them one of its kind or None. Raises UserError for the first that is not."""
@@ -245,7 +245,7 @@ def settings(
 def rows_of(labels: Any) -> Label:
     """Labels of finite floats as rows (labels, ...). Raises UserError if they are not three arrays of one length."""
     if not isinstance(labels, tuple) or len(labels) != 3:
-        raise arguments.refused("labels", labels, "a label file, or Labels(obs, action, answer)")
+        raise arguments.argument_error("labels", labels, "a label file, or Labels(obs, action, answer)")
     obs, action, answer = (
         arguments.numbers(f"labels.{name}", part) for name, part in zip(Labels._fields, labels, strict=True)
     )
@@ -258,6 +258,6 @@ def rows_of(labels: Any) -> Label:
     return Label(obs, action, answer, np.ones(len(obs), bool))  # pyright: ignore[reportArgumentType]
 
 
-def diverged() -> UserError:
+def divergence_error() -> UserError:
     """What is raised where a fit is no longer finite."""
     return UserError("the fit of the feedback model diverged: lower scalars.feedback_learning_rate")

@@ -53,7 +53,7 @@ class CallablePolicy:
         """Raises UserError for a policy that is none, or a description of observations that is none."""
         arguments.policy("policy", self.policy)
         if not all(isinstance(part, Quantity) for part in arguments.several("observation", self.observation, "slices")):
-            raise arguments.refused("observation", self.observation, "slices, as a world's observation has them")
+            raise arguments.argument_error("observation", self.observation, "slices, as a world's observation has them")
         arguments.flag("asks", self.asks)
         if self.trained is not None:
             arguments.instance("trained", self.trained, RunConfig, "a RunConfig")

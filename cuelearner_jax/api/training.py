@@ -139,7 +139,7 @@ def _suggested(world: World, config: RunConfig | str, taught: bool) -> TrainRequ
         kinds = guidances.possible(world.env, taught=taught)
         return TrainRequest(task, config, Grid(kinds, tuple(range(SEEDS)), LABELS))
     if not isinstance(config, str):
-        raise arguments.refused("config", config, "a RunConfig, or the name of a preset")
+        raise arguments.argument_error("config", config, "a RunConfig, or the name of a preset")
     if config not in task.presets:
         raise UserError(f"config: unknown preset {config!r}{closest(config, task.presets)}")
     request = study.suggested(task, task.presets[config])

@@ -77,7 +77,7 @@ class World:
 
         Raises UserError for what is no key, no state of this world, or no action.
         """
-        arguments.like("state", state, self._state)
+        arguments.tree_like("state", state, self._state)
         action = arguments.action("action", action, self.actions)
         return jax.jit(self.env.step)(arguments.key("key", key), state, action)
 

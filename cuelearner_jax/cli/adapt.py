@@ -88,7 +88,7 @@ def _source(arguments: list[str]) -> tuple[PolicySource, Any, str | None, list[s
 
 def _of_labels(named: str, path: str | None) -> PolicySource:
     """The situations of a label file in place of a task. Raises UserError unless its labels are about a recording."""
-    found = None if path is None else correction.of_file(Path(path))
+    found = None if path is None else correction.labels_from_file(Path(path))
     if found is None or found.config is None:
         why = "" if path is None else f", of which {path} does not hold labels of a recording"
         raise UserError(f"{named} is to act in some task{why}: name it, as --task navigation or --env gymnasium:NAME")
