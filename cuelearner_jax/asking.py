@@ -278,7 +278,7 @@ def blame(
         user_code.check_actions(given, f"teacher {type(teacher).__name__}")
 
 
-def walked(of: Inquiry, guide: GuideState, keys: Key[Array, " steps"]) -> GuideState:
+def walk_unanswered(of: Inquiry, guide: GuideState, keys: Key[Array, " steps"]) -> GuideState:
     """The guide after steps in which it acts as it would ask, and nobody answers."""
 
     def step(guide: GuideState, key: PRNGKeyArray) -> tuple[GuideState, None]:
@@ -300,7 +300,7 @@ def label_round(
         if sizes.question_every == 1:
             return asked, None
         key = jax.random.fold_in(jax.random.fold_in(lane_key, Stream.WALK), first + offset)
-        return walked(of, asked, jax.random.split(key, sizes.question_every - 1)), None
+        return walk_unanswered(of, asked, jax.random.split(key, sizes.question_every - 1)), None
 
     asked, _ = jax.lax.scan(one, guide, jnp.arange(0, sizes.labels_per_round, at_once))
     fitted = fit(of.guidance, of.env, of.scalars, asked, lane_key, first // sizes.labels_per_round)

@@ -73,7 +73,7 @@ class Compared(struct.PyTreeNode):
     best: Int[Array, ""] | None = None
 
 
-def better(
+def agent_values_higher(
     known: Known,
     critics: Params,
     obs: Float[Array, "n obs"],
@@ -89,7 +89,7 @@ def better(
     return jax.vmap(gain)(obs, own, other) > 0
 
 
-def chosen(
+def choose_by_value(
     known: Known,
     critics: Params,
     obs: Float[Array, "n obs"],
@@ -98,7 +98,7 @@ def chosen(
 ) -> Refined:
     """The guide's actions where critics value them above the agent's, in rows that are asked about."""
     guided = known.guide.act(known.model, known.env, obs, own, asked, known.scalars)
-    taken = asked & better(known, critics, obs, own, guided.actions)
+    taken = asked & agent_values_higher(known, critics, obs, own, guided.actions)
     return Refined(jnp.where(taken[:, None], guided.actions, own), jnp.where(taken, guided.passes, 0))
 
 
@@ -134,7 +134,7 @@ class Comparing:
         key: PRNGKeyArray,
     ) -> Refined:
         """The guide's action where the critics value it above the agent's, in arbitrated episodes."""
-        return chosen(known, self.compares(state, known), obs, base, state.arbitrated & learns)
+        return choose_by_value(known, self.compares(state, known), obs, base, state.arbitrated & learns)
 
 
 @dataclass(frozen=True)
@@ -193,4 +193,6 @@ class Finishing(ByOwnValues):
     ) -> Float[Array, "n action"]:
         """The actor's actions, or the better of these and the guide's."""
         own, every = known.agent.act(known.env, known.params, obs, key), jnp.ones(len(obs), bool)
-        return jax.lax.cond(arm == OWN, lambda: own, lambda: chosen(known, known.params, obs, own, every).actions)
+        return jax.lax.cond(
+            arm == OWN, lambda: own, lambda: choose_by_value(known, known.params, obs, own, every).actions
+        )
