@@ -22,7 +22,7 @@ from cuelearner_jax.adaptation import by_model
 from cuelearner_jax.adaptation.by_model import Adapted
 from cuelearner_jax.adaptation.judging import LABELS, Judging, judged_by_labels
 from cuelearner_jax.adaptation.lanes import Adaptation, product
-from cuelearner_jax.calibration import UNEXPLAINED, declared
+from cuelearner_jax.calibration import UNEXPLAINED, declared_distortions
 from cuelearner_jax.config import GuideSizes
 from cuelearner_jax.environment import actions_of, spaces_of
 from cuelearner_jax.guides import registry as guidances
@@ -139,7 +139,7 @@ def calibrated(bench: Bench) -> Iterator[Row]:
     kind, scalars = guidances.find("calibration"), calibration.settling(bench.scalars(), None)
     guidance = kind.make(by_model.SIZES, spaces_of(env), None)
     lanes = product(len(bench.seeds), range(piece.seeds), piece.labels, (actions_of(env).reach,))
-    of = calibration.Calibrating(guidance, by_model.SIZES, scalars, env, bench.agents, declared(env))
+    of = calibration.Calibrating(guidance, by_model.SIZES, scalars, env, bench.agents, declared_distortions(env))
     how = Judging(None, by=LABELS)
     found = calibration.adapt(of, lanes, how, bench.task.make_teacher(bench.world, env))
     if piece.variant == SHUFFLED:

@@ -10,7 +10,7 @@ from cuelearner_jax.adaptation.by_calibration import Calibrating, Evidence
 from cuelearner_jax.adaptation.by_model import Adapted
 from cuelearner_jax.adaptation.judging import Judged
 from cuelearner_jax.adaptation.lanes import Adaptation, Lanes, begin
-from cuelearner_jax.calibration.families import declared, unknowns_of
+from cuelearner_jax.calibration.families import declared_distortions, unknowns_of
 from cuelearner_jax.config import GuideSizes
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides import registry as guidances
@@ -39,7 +39,7 @@ def agent():
 
 def write(folder, overwrite=False, origin="run", calibrated=False):
     """Writes the folder; `origin`: what policy.json says was adapted."""
-    kind, family = ("calibration", (declared(ENV),)) if calibrated else ("relative", ())
+    kind, family = ("calibration", (declared_distortions(ENV),)) if calibrated else ("relative", ())
     guidance = guidances.make(kind, SIZES, ENV)
     of = (Calibrating if calibrated else Adaptation)(guidance, SIZES, probes.SCALARS, ENV, Common(agent()), *family)
     worth = np.zeros(2), np.ones(2), np.ones(2, bool), np.full(2, 45.0)

@@ -10,8 +10,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from cuelearner_jax import plugins
-from cuelearner_jax.calibration import Distortion, declared
-from cuelearner_jax.calibration.families import Family, acted, check_family, planned, seen, unknowns_of
+from cuelearner_jax.calibration import Distortion, declared_distortions
+from cuelearner_jax.calibration.families import (
+    Family,
+    check_family,
+    undo_action,
+    undo_observation,
+    undo_physics,
+    unknowns_of,
+)
 from cuelearner_jax.environment import Environment, actions_of
 from cuelearner_jax.errors import UserError, shown
 
@@ -56,9 +63,9 @@ def check_acts(family: Family, env: Environment) -> None:
     for one in family:
         nothing = jnp.zeros(len(one.unknowns))
         for name, given, found in (
-            ("sees", obs, jax.vmap(partial(seen, (one,), nothing))(obs)),
-            ("acts", actions, jax.vmap(partial(acted, (one,), nothing, corrects=False))(actions)),
-            ("plans", actions, jax.vmap(partial(planned, (one,), nothing))(obs, actions)),
+            ("sees", obs, jax.vmap(partial(undo_observation, (one,), nothing))(obs)),
+            ("acts", actions, jax.vmap(partial(undo_action, (one,), nothing, corrects=False))(actions)),
+            ("plans", actions, jax.vmap(partial(undo_physics, (one,), nothing))(obs, actions)),
         ):
             if found.shape != given.shape:
                 raise UserError(f"distortion {one.name!r}: {name} returns {found.shape[1:]}: give {given.shape[1:]}")
@@ -83,7 +90,7 @@ def rebuilt(layer: dict[str, Any], env: Any, changes: Any = None) -> Family:
             f"this policy corrects changes of code, {code}, which is not loaded because a file names it: add "
             f"--changes {code} (from Python changes=...) if you trust that code"
         )
-    known = {one.name: one for one in (family_of(changes, env) if code else declared(env, gains=True))}
+    known = {one.name: one for one in (family_of(changes, env) if code else declared_distortions(env, gains=True))}
     if missing := [name for name in names if name not in known]:
         raise UserError(f"this policy corrects {missing[0]!r}, which {code or 'this world'} lacks: give its own")
     family = tuple(known[name] for name in names)

@@ -9,9 +9,9 @@ from cuelearner_jax.calibration.estimation import (
     Result,
     calibrate,
 )
-from cuelearner_jax.calibration.families import Distortion, Unknown, declared
+from cuelearner_jax.calibration.families import Distortion, Unknown, declared_distortions
 from cuelearner_jax.calibration.policy import Calibrated
-from cuelearner_jax.calibration.simulator import simulated
+from cuelearner_jax.calibration.simulator import simulator_distortion
 from cuelearner_jax.calibration.walk import Walk
 
 __all__ = [
@@ -26,6 +26,6 @@ __all__ = [
     "Unknown",
     "Walk",
     "calibrate",
-    "declared",
-    "simulated",
+    "declared_distortions",
+    "simulator_distortion",
 ]

@@ -23,7 +23,7 @@ from cuelearner_jax.calibration.likelihood import GRID
 from cuelearner_jax.calibration.meaning import Meaning
 from cuelearner_jax.calibration.policy import Calibrated
 from cuelearner_jax.calibration.posterior import HELD_OUT, Answers, Fit
-from cuelearner_jax.calibration.questions import Questions, choose, drawn, ties
+from cuelearner_jax.calibration.questions import Questions, choose, draw_hypotheses, ties
 from cuelearner_jax.calibration.response import Responses
 from cuelearner_jax.calibration.scales import scales_of
 from cuelearner_jax.errors import UserError
@@ -92,7 +92,7 @@ class Calibration:
 
     Args:
         policy: a policy, or any function of a batch of observations.
-        family: what may have changed; see `families.declared`.
+        family: what may have changed; see `families.declared_distortions`.
         space: of the actions.
         eps_deg: strength of an answer, in the space's unit.
         seed: of everything random.
@@ -131,7 +131,7 @@ class Calibration:
         obs = np.asarray(obs, np.float32)
         self._scaled(obs)
         fits = list(self.fits.values()) or [self._new(names) for names in self._singles()]
-        draws = drawn(fits, self._odds(fits), self.random)
+        draws = draw_hypotheses(fits, self._odds(fits), self.random)
         places = np.concatenate([fit.places(thetas) for fit, thetas in draws])
         response = self.responses.of(obs, self.responses.covering(places, LOOKS))
         chosen = choose(draws, response, count, self.random)
@@ -198,7 +198,7 @@ class Calibration:
         assert self.answers is not None
         if self.fits:
             fits = list(self.fits.values())
-            draws = drawn(fits, self._odds(fits), self.random)
+            draws = draw_hypotheses(fits, self._odds(fits), self.random)
             places = np.concatenate([fit.places(thetas) for fit, thetas in draws])
             self.responses.drawn(places, FRESH, self.random)
         self.response = self.responses.of(self.answers.obs)

@@ -44,7 +44,9 @@ class Distortion(NamedTuple):
     unknowns: tuple[Unknown, ...]
     sees: Undoing | None = None  # (unknowns, observation) -> observation before the change
     acts: Undoing | None = None  # (unknowns, meant action) -> action that leads to it after the change
-    plans: Planning | None = None  # (unknowns, observation, meant action) -> the same; see `simulator.simulated`
+    plans: Planning | None = (
+        None  # (unknowns, observation, meant action) -> the same; see `simulator.simulator_distortion`
+    )
     of_teacher: bool = False  # a fault of the answers, which is told and not corrected
 
     @property
@@ -61,14 +63,16 @@ def unknowns_of(family: Family) -> tuple[Unknown, ...]:
     return tuple(unknown for distortion in family for unknown in distortion.unknowns)
 
 
-def seen(family: Family, theta: Float[Array, " unknowns"], obs: Float[Array, " obs"]) -> Float[Array, " obs"]:
+def undo_observation(
+    family: Family, theta: Float[Array, " unknowns"], obs: Float[Array, " obs"]
+) -> Float[Array, " obs"]:
     """Return an observation as it was before the changes."""
     for distortion, values in _parts(family, theta):
         obs = obs if distortion.sees is None else distortion.sees(values, obs)
     return obs
 
 
-def planned(
+def undo_physics(
     family: Family, theta: Float[Array, " unknowns"], obs: Float[Array, " obs"], action: Float[Array, " action"]
 ) -> Float[Array, " action"]:
     """Return the action that leads after changes of the physics to what `action` meant; `obs`: before the changes."""
@@ -77,7 +81,7 @@ def planned(
     return action
 
 
-def acted(
+def undo_action(
     family: Family, theta: Float[Array, " unknowns"], action: Float[Array, " action"], corrects: bool = True
 ) -> Float[Array, " action"]:
     """Return the action that leads after the changes to what `action` meant before them.
@@ -114,7 +118,7 @@ def check_family(family: Sequence[Distortion]) -> Family:
     return tuple(family)
 
 
-def declared(env: Any, gains: bool = False, teacher_bias: bool = False) -> Family:
+def declared_distortions(env: Any, gains: bool = False, teacher_bias: bool = False) -> Family:
     """Derive the distortions of an environment from what it declares of its observation and actions.
 
     Slices in metres or radians of the same size shift together. Beams at equal angles roll. Directions turn, and places

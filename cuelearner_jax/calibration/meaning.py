@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from cuelearner_jax import user_code
-from cuelearner_jax.calibration.families import Family, acted, planned, seen
+from cuelearner_jax.calibration.families import Family, undo_action, undo_observation, undo_physics
 from cuelearner_jax.policies import named
 from cuelearner_jax.spaces import Space
 
@@ -98,17 +98,21 @@ def _meant(family: Family, policy: Any, theta: Any, obs: Any) -> Any:
 
 @partial(jax.jit, static_argnums=0)
 def _planned(family: Family, theta: Any, before: Any, action: Any) -> Any:
-    return jax.vmap(partial(planned, family))(theta, before, action) if family else action
+    return jax.vmap(partial(undo_physics, family))(theta, before, action) if family else action
 
 
 @partial(jax.jit, static_argnums=0)
 def _seen(family: Family, theta: Any, obs: Any) -> Any:
-    return jax.vmap(partial(seen, family))(theta, obs) if family else obs
+    return jax.vmap(partial(undo_observation, family))(theta, obs) if family else obs
 
 
 @partial(jax.jit, static_argnums=0)
 def _right(family: Family, theta: Any, meant: Any) -> Any:
-    return jax.vmap(lambda one, action: acted(family, one, action, corrects=False))(theta, meant) if family else meant
+    return (
+        jax.vmap(lambda one, action: undo_action(family, one, action, corrects=False))(theta, meant)
+        if family
+        else meant
+    )
 
 
 @partial(jax.jit, static_argnums=(0, 1))

@@ -11,7 +11,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from cuelearner_jax.calibration.families import Family, acted, planned, seen, unknowns_of
+from cuelearner_jax.calibration.families import Family, undo_action, undo_observation, undo_physics, unknowns_of
 from cuelearner_jax.guides.calibration import KIND
 from cuelearner_jax.policies import BY_LANE, SHARED, PolicyNode, describe
 from cuelearner_jax.types import EnvState
@@ -27,9 +27,9 @@ class Calibrated(PolicyNode):
 
     def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
         """The base's actions, corrected."""
-        before = jax.vmap(partial(seen, self.family, self.theta))(obs)
-        meant = jax.vmap(partial(planned, self.family, self.theta))(before, self.base.act(key, states, before))
-        return jax.vmap(partial(acted, self.family, self.theta))(meant)
+        before = jax.vmap(partial(undo_observation, self.family, self.theta))(obs)
+        meant = jax.vmap(partial(undo_physics, self.family, self.theta))(before, self.base.act(key, states, before))
+        return jax.vmap(partial(undo_action, self.family, self.theta))(meant)
 
     @property
     def axes(self) -> Calibrated:

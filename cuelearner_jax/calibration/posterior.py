@@ -192,7 +192,7 @@ class Fit:
             return self.prior if not self.rounds else self.prior.closer()
         enough = min(0.25 * len(self.log_weight), ENOUGH * (1 + self.unknowns))
         # As long as few samples have all of the weight, the best are where to look, however they were found.
-        weight = self.weight if self.effective >= enough else tempered(self.log_density, enough)
+        weight = self.weight if self.effective >= enough else temper(self.log_density, enough)
         size = self.unknowns
         centres = self.theta[self.random.choice(len(self.theta), 32, p=weight)]
         away = self.theta - weight @ self.theta
@@ -289,7 +289,7 @@ def _summed(*rows: Any) -> Any:
     return jnp.sum(log_chances(*rows), 1)
 
 
-def tempered(log_weight: Floats, enough: float) -> Floats:
+def temper(log_weight: Floats, enough: float) -> Floats:
     """Return weights that add up to one, flattened until so many samples count."""
     low, high = 0.0, 1.0
     for step in range(24):

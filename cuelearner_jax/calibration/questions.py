@@ -52,7 +52,7 @@ def ties(
     return (np.abs(moved).max(-1, initial=0.0) > eps).mean(0)
 
 
-def drawn(
+def draw_hypotheses(
     fits: list[Fit], odds: Float[Floats, " fits"], random: np.random.Generator
 ) -> list[tuple[Fit, Float[Floats, "draws unknowns"]]]:
     """Return draws of what may have changed: of each family as many as it is likely."""

@@ -21,7 +21,7 @@ from cuelearner_jax.spaces import Space
 NARROW = 0.5  # standard deviation of the window in which rewards are compared, in reaches
 
 
-def simulated(
+def simulator_distortion(
     name: str,
     unknowns: tuple[Unknown, ...],
     env_of: Callable[[Float[Array, " unknowns"]], Any],

@@ -16,7 +16,7 @@ import tyro
 
 from cuelearner_jax import config as configuration
 from cuelearner_jax.adaptation import by_calibration, by_model, changes
-from cuelearner_jax.calibration import declared
+from cuelearner_jax.calibration import declared_distortions
 from cuelearner_jax.calibration.families import Family
 from cuelearner_jax.cli.parsing import PAPER, about, check_numbers, code_of, is_code, out, parse, preset_of, taken
 from cuelearner_jax.cli.shared_options import Flag, Lane, TaskT, asking_kind
@@ -216,7 +216,7 @@ def _check_evidence(asked: Label[Any], named: str | None) -> None:
 
 def _family(asked: Label[Any], env: Any) -> Family:
     """What may have changed. Raises UserError for changes that make no sense."""
-    return declared(env) if asked.changes is None else changes.family_of(changes.load(asked.changes), env)
+    return declared_distortions(env) if asked.changes is None else changes.family_of(changes.load(asked.changes), env)
 
 
 def _robot(task: Task, name: str | None) -> str:

@@ -17,7 +17,7 @@ from cuelearner_jax.guides.baselines import Untaught
 
 @part
 class Config:
-    """Which changes are derived from what the world declares; see `calibration.families.declared`."""
+    """Which changes are derived from what the world declares; see `calibration.families.declared_distortions`."""
 
     gains: bool = False
     """Also ask whether lengths that are seen, and the actions of a box, were scaled."""

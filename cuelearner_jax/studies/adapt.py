@@ -24,7 +24,7 @@ from cuelearner_jax.adaptation.by_model import Adapted
 from cuelearner_jax.adaptation.judging import Judging
 from cuelearner_jax.adaptation.lanes import Adaptation, begin, one_each, product, side_by_side
 from cuelearner_jax.asking import label_slots
-from cuelearner_jax.calibration import Calibrated, declared
+from cuelearner_jax.calibration import Calibrated, declared_distortions
 from cuelearner_jax.config import GuideSizes, Scalars, check_guide, check_part
 from cuelearner_jax.environment import Environment, actions_of, spaces_of
 from cuelearner_jax.errors import UserError, closest
@@ -264,7 +264,7 @@ def _family(subject: Subject, request: AdaptRequest, kind: str, env: Environment
     options = request.kinds.get(kind)
     asked = {} if options is None else dataclasses.asdict(options)
     if subject.changes is None:
-        return declared(env, **asked), ""
+        return declared_distortions(env, **asked), ""
     if given := [name for name, value in asked.items() if value]:
         raise UserError(f"{kind}.{given[0]} is about changes that the world declares: leave it out beside changes")
     family = changes.family_of(subject.changes, env)

@@ -25,7 +25,7 @@ from cuelearner_jax.bridges.gymnasium.environment import SUCCESS, GymnasiumTask
 from cuelearner_jax.bridges.gymnasium.instances import SUCCESS as TELLS
 from cuelearner_jax.bridges.gymnasium.instances import Running
 from cuelearner_jax.bridges.gymnasium.layout import Actions, actions_of
-from cuelearner_jax.bridges.gymnasium.source import Source, check_installed, find_spec
+from cuelearner_jax.bridges.gymnasium.source import Source, check_installed, registry_spec
 from cuelearner_jax.config import Schedule, Sizes
 from cuelearner_jax.environment import Quantity
 from cuelearner_jax.errors import UserError, raised_by, shown
@@ -238,7 +238,7 @@ def task_from(
         )
     name = given if isinstance(given, str) else called or _called(given)
     if factory is None and not max_steps:
-        max_steps = find_spec(name).max_episode_steps
+        max_steps = registry_spec(name).max_episode_steps
     text = _kept(name, arguments or {})
     source = Source(name, text, max_steps or 0, 1, factory=factory)
     actions, slices, limit, succeeds = _seen(source)

@@ -91,7 +91,7 @@ def check_installed() -> None:
         raise UserError(MISSING)
 
 
-def find_spec(name: str) -> Any:
+def registry_spec(name: str) -> Any:
     """Return the specification that Gymnasium's registry has of an id, without importing what the id names.
 
     Raises UserError for an id that is not there.
@@ -124,7 +124,7 @@ def find_spec(name: str) -> Any:
 
 def make_registered(name: str, arguments: dict[str, Any], max_steps: int) -> Any:
     """Return an environment of Gymnasium's registry. Raises UserError for an id that is not there."""
-    spec = find_spec(name)
+    spec = registry_spec(name)
     import gymnasium
 
     limited = {"max_episode_steps": max_steps} if max_steps else {}
