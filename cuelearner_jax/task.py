@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from cuelearner_jax.config import GuideSizes, Scalars, check_types
 from cuelearner_jax.environment import Environment, View, offers, view_of
-from cuelearner_jax.errors import UserError, closest, shown
+from cuelearner_jax.errors import UserError, format_value, suggestion
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.storage.room import check_room
 from cuelearner_jax.types import EnvState, Policy, Reel, Sketch, Teacher
@@ -247,7 +247,7 @@ class Task:
             raise UserError(f"{self.name} has no robots to choose from: leave out --robot")
         known = {one.name: one for one in self.bodies}
         if body not in known:
-            raise UserError(f"unknown robot {body!r}{closest(body, known)}")
+            raise UserError(f"unknown robot {body!r}{suggestion(body, known)}")
         others, found = tuple(one for one in self.bodies if one.name != body), known[body]
         if folder:
             if found.made_of is None:
@@ -266,7 +266,7 @@ class Task:
             others = [body.name for body in self.bodies if body.engines]
             raise UserError(f"--engine {name} needs --robot: choose one of {', '.join(others) or 'none'}")
         if name not in engines:
-            raise UserError(f"unknown engine {name!r}{closest(name, engines)}")
+            raise UserError(f"unknown engine {name!r}{suggestion(name, engines)}")
         return engines[name]
 
     def pictures(self, otherwise: str = "evaluate it instead") -> Pictures:
@@ -280,7 +280,7 @@ class Task:
         if not self.scenarios:
             raise UserError(f"{self.name} has no scenarios to choose from: leave out --scenario")
         if name not in self.scenarios:
-            raise UserError(f"unknown scenario {shown(name)}{closest(name, self.scenarios)}")
+            raise UserError(f"unknown scenario {format_value(name)}{suggestion(name, self.scenarios)}")
         return self.scenarios[name]
 
 

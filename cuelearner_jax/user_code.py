@@ -21,7 +21,7 @@ from typing import Any, ParamSpec, TypeVar
 import jax
 import numpy as np
 
-from cuelearner_jax.errors import NotFinite, UserError, no_space, raised_by
+from cuelearner_jax.errors import NotFinite, UserError, no_space, user_code_error
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -109,7 +109,7 @@ def raise_in_one_line(error: Exception) -> None:
     if code := _of_user(error):
         name = getattr(code, "co_qualname", code.co_name)
         role = METHODS.get(code.co_name, "code")
-        raise raised_by(f"{role} {name.replace('<locals>.', '')}", error) from error
+        raise user_code_error(f"{role} {name.replace('<locals>.', '')}", error) from error
 
 
 def _of_user(error: BaseException) -> Any:

@@ -20,7 +20,7 @@ from cuelearner_jax.calibration.families import (
     unknowns_of,
 )
 from cuelearner_jax.environment import Environment, actions_of
-from cuelearner_jax.errors import UserError, shown
+from cuelearner_jax.errors import UserError, format_value
 
 SITUATIONS = 8  # in which no change must change nothing
 SAME = 1e-4  # by which an entry may differ then
@@ -30,7 +30,7 @@ def load(reference: str) -> Any:
     """Return the changes that `package.module:NAME` leads to. Raises UserError if there are none."""
     found = plugins.load(reference, object, "changes of the world")
     if not (isinstance(found, Distortion | list | tuple) or callable(found)):
-        raise UserError(f"{reference} is {shown(found)}: {WANTED}")
+        raise UserError(f"{reference} is {format_value(found)}: {WANTED}")
     return found
 
 
@@ -51,7 +51,7 @@ def family_of(given: Any, env: Any) -> Family:
         given = given(env)
     several = (given,) if isinstance(given, Distortion) else given
     if not isinstance(several, list | tuple) or not all(isinstance(one, Distortion) for one in several):
-        raise UserError(f"changes is {shown(given)}: {WANTED}")
+        raise UserError(f"changes is {format_value(given)}: {WANTED}")
     return check_family(several)
 
 

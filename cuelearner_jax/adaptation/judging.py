@@ -21,7 +21,7 @@ from cuelearner_jax.adaptation.lanes import Adaptation, Lanes, LaneState
 from cuelearner_jax.asking import fitted_labels
 from cuelearner_jax.devices import each_lane
 from cuelearner_jax.environment import Environment, actions_of
-from cuelearner_jax.errors import UserError, closest
+from cuelearner_jax.errors import UserError, suggestion
 from cuelearner_jax.evaluate import Rolled, Tell, episodes, mean_interval, watched_lanes
 from cuelearner_jax.policies import PolicyBlock
 from cuelearner_jax.spaces import said
@@ -110,7 +110,7 @@ class Judge:
             return found, block
         assert after is not None  # a metric is of episodes
         if how.by not in after.means:
-            raise UserError(f"there is no metric {how.by!r} to judge by{closest(how.by, [*after.means, LABELS])}")
+            raise UserError(f"there is no metric {how.by!r} to judge by{suggestion(how.by, [*after.means, LABELS])}")
         bases = self._rolled(self.of.bases, "the policy as it was")
         own = np.zeros(lanes.number, int) if len(bases.means[how.by]) == 1 else lanes.base
         played = self._played(after) + self._played(bases)[own]

@@ -18,8 +18,8 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Float, PRNGKeyArray
 
-from cuelearner_jax.config import LARGEST_FLOAT, plain, settled
-from cuelearner_jax.errors import UserError, closest, shown
+from cuelearner_jax.config import LARGEST_FLOAT, normalize_options, plain
+from cuelearner_jax.errors import UserError, format_value, suggestion
 from cuelearner_jax.policies import Policy, policy_of, teaching
 from cuelearner_jax.runs.grid import LARGEST_BUDGET, LARGEST_SEED
 from cuelearner_jax.spaces import Space
@@ -33,7 +33,7 @@ KindT = TypeVar("KindT")
 
 def argument_error(name: str, value: Any, wanted: str) -> UserError:
     """Build the error for an argument: what was given, and what is wanted."""
-    return UserError(f"{name} is {shown(value)}: give {wanted}")
+    return UserError(f"{name} is {format_value(value)}: give {wanted}")
 
 
 def optional(check: Callable[..., FoundT], name: str, value: Any, *more: Any) -> FoundT | None:
@@ -58,7 +58,7 @@ def text(name: str, value: Any, known: Iterable[str] = ()) -> str:
     if not isinstance(value, str) or not 0 < len(value) <= LONGEST or not value.isprintable():
         raise argument_error(name, value, f"a name, in up to {LONGEST} printable characters")
     if (known := list(known)) and value not in known:
-        raise UserError(f"{name} is {shown(value)}{closest(value, known)}")
+        raise UserError(f"{name} is {format_value(value)}{suggestion(value, known)}")
     return value
 
 
@@ -200,4 +200,4 @@ def teacher(name: str, value: Any, space: Space) -> Teacher:
 
 def settings(name: str, value: Any, kind: type[KindT]) -> KindT:
     """A group of settings with values of its fields' types; their bounds are checked where they are used."""
-    return settled(instance(name, value, kind, f"a cuelearner_jax.config.{kind.__name__}"), name)
+    return normalize_options(instance(name, value, kind, f"a cuelearner_jax.config.{kind.__name__}"), name)

@@ -18,7 +18,7 @@ from cuelearner_jax.api.feedback import label_path
 from cuelearner_jax.api.policies import CallablePolicy
 from cuelearner_jax.api.worlds import World, a_world
 from cuelearner_jax.environment import view_of
-from cuelearner_jax.errors import UserError, closest
+from cuelearner_jax.errors import UserError, suggestion
 from cuelearner_jax.evaluate import SPLITS
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.run_config import RunConfig
@@ -57,7 +57,7 @@ class Run:
         seed = arguments.optional(arguments.seed, "seed", seed)
         name = list(self.trainings)[-1] if guidance is None else arguments.text("guidance", guidance)
         if name not in self.trainings:
-            raise UserError(f"no guidance {name!r} was trained{closest(name, self.trainings)}")
+            raise UserError(f"no guidance {name!r} was trained{suggestion(name, self.trainings)}")
         training = self.trainings[name]
         group = training.group
         budget = int(group.budgets.max()) if labels is None else labels
@@ -134,14 +134,14 @@ def _suggested(world: World, config: RunConfig | str, taught: bool) -> TrainRequ
     task = world.task
     if isinstance(config, RunConfig):
         groups = ("sizes", "scalars", "schedule", "agent", "arbiter")
-        settled = {name: configuration.settled(getattr(config, name), name) for name in groups}
+        settled = {name: configuration.normalize_options(getattr(config, name), name) for name in groups}
         config = dataclasses.replace(config, task=world.config, **settled)
         kinds = guidances.possible(world.env, taught=taught)
         return TrainRequest(task, config, Grid(kinds, tuple(range(SEEDS)), LABELS))
     if not isinstance(config, str):
         raise arguments.argument_error("config", config, "a RunConfig, or the name of a preset")
     if config not in task.presets:
-        raise UserError(f"config: unknown preset {config!r}{closest(config, task.presets)}")
+        raise UserError(f"config: unknown preset {config!r}{suggestion(config, task.presets)}")
     request = study.suggested(task, task.presets[config])
     possible = guidances.possible(world.env, taught=taught)
     grid = dataclasses.replace(request.grid, guidance=tuple(kind for kind in request.grid.guidance if kind in possible))

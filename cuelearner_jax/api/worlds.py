@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from cuelearner_jax import user_code
 from cuelearner_jax.api import arguments
 from cuelearner_jax.api import arguments as checks
-from cuelearner_jax.config import settled
+from cuelearner_jax.config import normalize_options
 from cuelearner_jax.environment import Environment, Quantity, actions_of
 from cuelearner_jax.evaluate import SPLITS
 from cuelearner_jax.policies import Teaching
@@ -36,7 +36,7 @@ class World:
         """Raises UserError for a configuration that is none of the task's."""
         arguments.instance("task", self.task, Task, "a task, as tasks.registry finds it")
         arguments.instance("config", self.config, self.task.config, f"a {self.task.config.__name__}, or use cl.make")
-        object.__setattr__(self, "config", settled(self.config, "task"))
+        object.__setattr__(self, "config", normalize_options(self.config, "task"))
         if self.scenario is not None:
             self.task.scenario(arguments.text("scenario", self.scenario))
 

@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from cuelearner_jax.config import Scalars, TeacherFaults
 from cuelearner_jax.environment import actions_of
-from cuelearner_jax.errors import UserError, shown
+from cuelearner_jax.errors import UserError, format_value
 from cuelearner_jax.feedback.forms import AnswerForm
 from cuelearner_jax.spaces import UNSAID, Space
 from cuelearner_jax.types import EnvState, Teacher, ValuesDirections
@@ -57,7 +57,7 @@ def _taught(space: Space, teacher: Any, given: Any, action: Float[Array, " actio
     try:
         found = jnp.asarray(given)
     except (TypeError, ValueError) as error:
-        raise UserError(f"teacher {type(teacher).__name__} gave {shown(given)}: {wanted}") from error
+        raise UserError(f"teacher {type(teacher).__name__} gave {format_value(given)}: {wanted}") from error
     if found.shape != action.shape:
         raise UserError(f"teacher {type(teacher).__name__} gave an action of shape {found.shape}: {wanted}")
     if not jnp.issubdtype(found.dtype, jnp.floating) and not jnp.issubdtype(found.dtype, jnp.integer):

@@ -12,7 +12,7 @@ from typing import Any
 
 from cuelearner_jax.config import GuideSizes
 from cuelearner_jax.environment import actions_of, offers, spaces_of
-from cuelearner_jax.errors import UserError, closest
+from cuelearner_jax.errors import UserError, suggestion
 from cuelearner_jax.guides import (
     aims,
     baselines,
@@ -70,7 +70,7 @@ def find(name: str) -> Kind:
     _register_installed()
     if name not in _KINDS:
         raise UserError(
-            f"unknown guidance {name!r}{closest(name, _KINDS)} (one of your own is named as package.module:NAME)"
+            f"unknown guidance {name!r}{suggestion(name, _KINDS)} (one of your own is named as package.module:NAME)"
         )
     return _KINDS[name]
 

@@ -13,7 +13,7 @@ from flax import struct
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from cuelearner_jax import types, user_code
-from cuelearner_jax.errors import UserError, raised_by, shown
+from cuelearner_jax.errors import UserError, format_value, user_code_error
 from cuelearner_jax.policies import foreign
 from cuelearner_jax.policies.node import PolicyNode
 from cuelearner_jax.spaces import DIRECTIONS, Choices, Space
@@ -67,7 +67,7 @@ class Opaque(PolicyNode):
         try:
             chosen = self.function(flat)
         except Exception as error:
-            raise raised_by(named(self), error) from error
+            raise user_code_error(named(self), error) from error
         return self._checked(chosen, len(flat), np.asarray).reshape(*rows.shape[:-1], self.actions.size)
 
     def _checked(self, chosen: Any, rows: int, as_array: Callable[..., Any]) -> Any:
@@ -82,7 +82,9 @@ class Opaque(PolicyNode):
         try:
             found = as_array(chosen)
         except (TypeError, ValueError) as error:
-            raise UserError(f"{named(self)} returned {shown(chosen)}: return an array of shape {wanted}") from error
+            raise UserError(
+                f"{named(self)} returned {format_value(chosen)}: return an array of shape {wanted}"
+            ) from error
         if getattr(found.dtype, "kind", "key") not in "fiu" and not jnp.issubdtype(found.dtype, jnp.floating):
             raise UserError(f"{named(self)} returned {found.dtype} numbers: return real ones, of shape {wanted}")
         if isinstance(self.actions, Choices) and found.shape == (rows,) and getattr(found.dtype, "kind", "") in "iu":
@@ -143,7 +145,7 @@ def policy_of(given: Any) -> Any:
         try:
             given = given()
         except Exception as error:
-            raise raised_by(f"policy {getattr(given, '__qualname__', given)}", error) from error
+            raise user_code_error(f"policy {getattr(given, '__qualname__', given)}", error) from error
         if (function := foreign.function_of(given)) is not None:
             return Opaque(function, on_host=True)
     if hasattr(given, "act"):
@@ -158,7 +160,7 @@ def policy_of(given: Any) -> Any:
     if callable(given) and not isinstance(given, type):
         return Opaque(given, on_host=True)
     raise UserError(
-        f"{shown(given)} is no policy: give a function of observations (n, obs), a module of PyTorch, a "
+        f"{format_value(given)} is no policy: give a function of observations (n, obs), a module of PyTorch, a "
         "model of Stable-Baselines3 or a file in ONNX, or load one"
     )
 

@@ -12,7 +12,7 @@ import numpy as np
 from cuelearner_jax.adaptation.by_model import plain_scalars
 from cuelearner_jax.arbiters.protocol import Finishes
 from cuelearner_jax.environment import actions_of, offers, spaces_of, view_of
-from cuelearner_jax.errors import UserError, closest, listed
+from cuelearner_jax.errors import UserError, format_numbers, suggestion
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.policies import Corrected, Guided, Heuristic, Policy, Taught, arbiter_of, final, uniform_in
 from cuelearner_jax.run_config import RunConfig
@@ -144,7 +144,7 @@ class PolicySource:
         something.
         """
         if policy not in POLICIES:
-            raise UserError(f"unknown policy {policy!r}{closest(policy, POLICIES)}")
+            raise UserError(f"unknown policy {policy!r}{suggestion(policy, POLICIES)}")
         named = POLICIES[policy]
         if named.trained and not self.grid:
             others = [name for name, one in POLICIES.items() if not one.kept or (one.adapted and self.adapted)]
@@ -323,7 +323,7 @@ def several(
                 found.append(block.policy.lane(int(index[0])))
                 break
         else:
-            known_seeds, known_budgets, known_bounds = (listed(values.tolist()) for values in known.values())
+            known_seeds, known_budgets, known_bounds = (format_numbers(values.tolist()) for values in known.values())
             of, bounds, others = "run", "", ""
             if source.grid is None:
                 unit, of = actions_of(view).unit, "folder"

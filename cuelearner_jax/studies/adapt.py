@@ -27,7 +27,7 @@ from cuelearner_jax.asking import label_slots
 from cuelearner_jax.calibration import Calibrated, declared_distortions
 from cuelearner_jax.config import GuideSizes, Scalars, check_guide, check_part
 from cuelearner_jax.environment import Environment, actions_of, spaces_of
-from cuelearner_jax.errors import UserError, closest
+from cuelearner_jax.errors import UserError, suggestion
 from cuelearner_jax.evaluate import Tell, untold
 from cuelearner_jax.feedback import external_labels
 from cuelearner_jax.feedback.answers import check_teacher
@@ -339,7 +339,7 @@ def _judging(task: Task, request: AdaptRequest, env: Environment) -> Judging:
     judging.check_bounds(request.judge_bounds, by)
     known = [*judging.metrics_of(env), judging.LABELS]
     if by not in known:
-        raise UserError(f"judge_by is {by!r}, no metric of {task.name}{closest(by, known)}")
+        raise UserError(f"judge_by is {by!r}, no metric of {task.name}{suggestion(by, known)}")
     steps = task.longest(request.task) if task.longest else judging.STEPS
     plays = by != judging.LABELS or request.judge_every
     tuned = task.environment(request.task, "tuning") if plays else None

@@ -12,7 +12,7 @@ from functools import partial
 from importlib.util import find_spec
 from typing import Any
 
-from cuelearner_jax.errors import UserError, closest
+from cuelearner_jax.errors import UserError, suggestion
 
 DRAWN = "render_mode"
 MISSING = "Gymnasium is not installed: pip install 'cuelearner-jax[gymnasium]'"
@@ -116,7 +116,7 @@ def registry_spec(name: str) -> Any:
         if not isinstance(error, gymnasium.error.Error):
             raise
         raise UserError(
-            f"Gymnasium has no environment {name!r}{closest(name, gymnasium.registry)[:300]}"
+            f"Gymnasium has no environment {name!r}{suggestion(name, gymnasium.registry)[:300]}"
             if gymnasium.registry
             else f"Gymnasium has no environment {name!r}"
         ) from error
