@@ -209,7 +209,7 @@ class Keys(NamedTuple):
     learn: PRNGKeyArray
 
 
-class Acted(NamedTuple):
+class ActStep(NamedTuple):
     """What `Lane.act` has chosen, to be executed and then given to `Lane.absorb`."""
 
     actions: Float[Array, "num_envs action"]
@@ -298,7 +298,7 @@ class Lane(NamedTuple):
         state, learned = self.learn(env, settings, clock, state, keys.learn)
         return state, {**met, **learned}
 
-    def act(self, env: Environment, settings: Settings, clock: Clock, state: TrainState, key: PRNGKeyArray) -> Acted:
+    def act(self, env: Environment, settings: Settings, clock: Clock, state: TrainState, key: PRNGKeyArray) -> ActStep:
         """Actions to execute in each environment.
 
         Uniform at first, then the agent's; refined by the guidance until the cut-off, where the arbiter says so. The
@@ -312,14 +312,14 @@ class Lane(NamedTuple):
         )
         if isinstance(self.arbiter, Chooses):
             refined = self._chosen(self.arbiter, env, settings, clock, state, base, key)
-            return Acted(refined.actions, refined.passes, jax.vmap(env.remember)(agent.env, agent.obs))
+            return ActStep(refined.actions, refined.passes, jax.vmap(env.remember)(agent.env, agent.obs))
         guided = self.arbiter.guided(state.arbiter)
         refined: Refined = jax.lax.cond(
             guides(clock, schedule),
             lambda: self.guidance.act(state.guide.model, env, agent.obs, base, guided, settings.scalars),
             lambda: untouched(base),
         )
-        return Acted(refined.actions, refined.passes, jax.vmap(env.remember)(agent.env, agent.obs))
+        return ActStep(refined.actions, refined.passes, jax.vmap(env.remember)(agent.env, agent.obs))
 
     def _chosen(
         self,
@@ -343,7 +343,7 @@ class Lane(NamedTuple):
         )
 
     def absorb(
-        self, settings: Settings, clock: Clock, state: TrainState, key: PRNGKeyArray, acted: Acted, step: Step
+        self, settings: Settings, clock: Clock, state: TrainState, key: PRNGKeyArray, acted: ActStep, step: Step
     ) -> tuple[TrainState, dict[str, Float[Array, ""]]]:
         """The lane after its actions were executed: they are in replay, and the next observations are there.
 

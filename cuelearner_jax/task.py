@@ -25,7 +25,7 @@ PAPER = "paper"  # the preset that holds where none is given
 # Of a scenario's sizes: the paper's networks and their fitting, in place of the smaller ones that `adapt` else has
 PAPERS_FIT = {name: getattr(GuideSizes, name) for name in ("feedback_layers", "fit_steps", "fit_batch_size")}
 
-# (policy, environment, key, environments, steps, tell) -> values (environments,) by name, as `evaluate.Rolled.each`;
+# (policy, environment, key, environments, steps, tell) -> values (environments,) by name, as `evaluate.Rollout.each`;
 # now and then it calls `tell` with how far it is, and of how much
 Rollout = Callable[[Any, Any, PRNGKeyArray, int, int, Callable[[int, int], None]], dict[str, Any]]
 

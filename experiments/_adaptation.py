@@ -22,7 +22,7 @@ from cuelearner_jax.adaptation import by_model
 from cuelearner_jax.adaptation.lanes import side_by_side
 from cuelearner_jax.cli import main as cuelearner
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.evaluate import episodes, watched_lanes
+from cuelearner_jax.evaluate import episodes, rollout_lanes
 from cuelearner_jax.policies import Agent
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs.trained import PolicySource, several
@@ -149,7 +149,7 @@ class Bench(NamedTuple):
     def measured(self, policy: Any, split: str | None = None) -> Row:
         """Metrics (lanes,) of a block of policies on the episodes of a split (default: the piece's)."""
         split = split or self.piece.split
-        return watched_lanes(self.env(split), policy, episodes(split), self.envs, self.envs * self.steps).means
+        return rollout_lanes(self.env(split), policy, episodes(split), self.envs, self.envs * self.steps).means
 
     def set(self, group: str, values: Any) -> Any:
         """A group of a configuration with the piece's settings of that name; tuples for lists."""

@@ -71,7 +71,7 @@ def test_the_agent_learns_a_bandit_by_itself():
 def reward_of(params):
     key = jax.random.key(7)
     agents = Agent(params, probes.FUNCTIONS)
-    measured = evaluate.watched_lanes(ENV, agents, key, 40, 80, mesh=MESH).means
+    measured = evaluate.rollout_lanes(ENV, agents, key, 40, 80, mesh=MESH).means
     np.testing.assert_array_equal(measured["reward"], measured["hit"])
     return np.asarray(measured["reward"])
 
@@ -305,7 +305,7 @@ def test_refined_uniform_actions_win_far_more_often_than_chance():
 
     def reward(model):
         guide = Guided(Uniform(), model, ENV, probes.SCALARS, guidance)
-        found = evaluate.watched_lanes(ENV, guide, jax.random.key(3), 100, 1000, mesh=MESH).means
+        found = evaluate.rollout_lanes(ENV, guide, jax.random.key(3), 100, 1000, mesh=MESH).means
         return np.asarray(found["reward"])
 
     guided = reward(state.guide.model)
@@ -547,7 +547,7 @@ def test_evaluation_compiles_once_for_all_parameters_and_worlds():
         params = probes.start(probes.window_program("none"), [index], [0]).agent.params
         env = probes.Window(0.1 * index, 0.6)
         agents = Agent(params, probes.FUNCTIONS)
-        evaluate.watched_lanes(env, agents, jax.random.key(index), 3, 6, mesh=MESH)
+        evaluate.rollout_lanes(env, agents, jax.random.key(index), 3, 6, mesh=MESH)
     assert probes.compilations(evaluate._on_mesh) == [before + 1]
 
 

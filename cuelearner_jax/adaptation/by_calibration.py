@@ -26,7 +26,7 @@ from cuelearner_jax.config import GuideSizes, Scalars, TeacherFaults
 from cuelearner_jax.devices import lane_mesh
 from cuelearner_jax.environment import actions_of
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.evaluate import Tell, untold
+from cuelearner_jax.evaluate import Tell, ignore_progress
 from cuelearner_jax.types import Label, Teacher
 
 USUAL = 100  # labels, where nobody says how many
@@ -95,7 +95,7 @@ def adapt(
     how: Judging,
     teacher: Teacher | None = None,
     labels: Label | None = None,
-    watch: Callable[[str], Tell] = lambda what: untold,
+    watch: Callable[[str], Tell] = lambda what: ignore_progress,
 ) -> Adapted:
     """Ask, read and judge all lanes.
 

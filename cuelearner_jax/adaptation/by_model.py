@@ -25,7 +25,7 @@ from cuelearner_jax.calibration import Result
 from cuelearner_jax.config import GuideSizes, Scalars
 from cuelearner_jax.devices import BY_LANE, SHARED, lane_mesh, place
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.evaluate import Tell, untold
+from cuelearner_jax.evaluate import Tell, ignore_progress
 from cuelearner_jax.policies import Policy, named
 from cuelearner_jax.spaces import DIRECTIONS, Space
 from cuelearner_jax.types import Label, Teacher
@@ -70,7 +70,7 @@ def adapt(
     teacher: Teacher | None = None,
     labels: Label | None = None,
     mesh: Mesh | None = None,
-    watch: Callable[[str], Tell] = lambda what: untold,
+    watch: Callable[[str], Tell] = lambda what: ignore_progress,
 ) -> Adapted:
     """Asks, fits and judges all lanes.
 
@@ -108,7 +108,7 @@ def learned(
     teacher: Teacher | None,
     labels: Label | None = None,
     mesh: Mesh | None = None,
-    watch: Callable[[str], Tell] = lambda what: untold,
+    watch: Callable[[str], Tell] = lambda what: ignore_progress,
     before_round: Callable[[LaneState, int], None] = lambda block, asked: None,
 ) -> LaneState:
     """Lanes with a model of a teacher's answers, or of given labels; arguments as `adapt` has them.

@@ -22,7 +22,7 @@ from cuelearner_jax.asking import fitted_labels
 from cuelearner_jax.devices import each_lane
 from cuelearner_jax.environment import Environment, actions_of
 from cuelearner_jax.errors import UserError, suggestion
-from cuelearner_jax.evaluate import Rolled, Tell, episodes, mean_interval, watched_lanes
+from cuelearner_jax.evaluate import Rollout, Tell, episodes, mean_interval, rollout_lanes
 from cuelearner_jax.policies import PolicyBlock
 from cuelearner_jax.spaces import said
 
@@ -121,7 +121,7 @@ class Judge:
         difference = mean_interval(np.asarray(after.each[how.by]) - np.asarray(bases.each[how.by])[own]).T
         return Judged(how.by, before, worth, used, bounds_of(self.of, block), difference, played + more), block
 
-    def _narrowed(self, block: Any, after: Rolled) -> tuple[Any, Rolled, np.ndarray]:
+    def _narrowed(self, block: Any, after: Rollout) -> tuple[Any, Rollout, np.ndarray]:
         """Lanes within the share of their bounds with which they are worth most, what they are worth so, and the
         rewarded steps (lanes,) that it took to know."""
         bound, played, by = block.bound, np.zeros(self.lanes.number, int), self.how.by
@@ -138,7 +138,7 @@ class Judge:
             bound = jnp.where(jnp.asarray(better), tried.bound, bound)
         return block.replace(bound=bound), after, played
 
-    def measure(self, block: Any) -> Rolled:
+    def measure(self, block: Any) -> Rollout:
         """Plays the lanes as they are, and adds a row to the curve."""
         found = self._rolled(self._policy(block), "the adapted policy")
         asked, failed = np.asarray(block.asked), np.asarray(block.failed)
@@ -148,13 +148,13 @@ class Judge:
     def _policy(self, block: Any) -> PolicyBlock:
         return self.of.policy(block, self.how.env)
 
-    def _rolled(self, policy: PolicyBlock, what: str) -> Rolled:
+    def _rolled(self, policy: PolicyBlock, what: str) -> Rollout:
         how = self.how
         assert how.env is not None
         mesh = None if policy is self.of.bases else self.mesh  # there may be another number of them
-        return watched_lanes(how.env, policy, episodes(SPLIT), how.num_envs, how.steps, self.watch(what), mesh)
+        return rollout_lanes(how.env, policy, episodes(SPLIT), how.num_envs, how.steps, self.watch(what), mesh)
 
-    def _played(self, rolled: Rolled) -> np.ndarray:
+    def _played(self, rolled: Rollout) -> np.ndarray:
         """Environment steps (lanes,) of a roll-out that decide: of an outcome those of first episodes alone."""
         assert self.how.env is not None
         first = np.asarray(rolled.episode_steps)

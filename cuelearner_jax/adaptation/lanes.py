@@ -10,7 +10,7 @@ compiled program: side by side on an accelerator, one by one on a CPU (`devices.
     block = begin(of, lanes)
     for _ in range(rounds(lanes, sizes)):
         block = ask_round(of, teacher, block)    # or once: take_labels(of, labels, block)
-    policy = of.policy(block)    # a block for `evaluate.watched_lanes`
+    policy = of.policy(block)    # a block for `evaluate.rollout_lanes`
 """
 
 from __future__ import annotations

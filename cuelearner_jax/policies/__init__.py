@@ -1,7 +1,7 @@
 """Policies: pytrees that act. What evaluation, pictures, labelling and adaptation are about.
 
 A policy's `act` sees many environments at once. Its `axes` say which of its leaves a block of lanes has one of each
-(`evaluate.watched_lanes` maps over them); what lanes share is there once.
+(`evaluate.rollout_lanes` maps over them); what lanes share is there once.
 """
 
 from cuelearner_jax.policies.final import Arbitrated, acting, arbiter_of, finished

@@ -14,7 +14,7 @@ from cuelearner_jax.arbiters.protocol import Finishes
 from cuelearner_jax.asking import blame, label_slots
 from cuelearner_jax.devices import BY_LANE, SHARED, place
 from cuelearner_jax.environment import Environment, view_of
-from cuelearner_jax.evaluate import Tell, episodes, untold
+from cuelearner_jax.evaluate import Tell, episodes, ignore_progress
 from cuelearner_jax.loop import Clock, TrainState, start_clock
 from cuelearner_jax.policies import Guided, PolicyBlock, acting, final, uniform_in
 from cuelearner_jax.runs.judging import Returns, judges_envs, judges_episodes, scores
@@ -35,7 +35,7 @@ class Training:
         group: LaneGroup,
         examined: Environment,
         split: str,
-        tell: Tell = untold,
+        tell: Tell = ignore_progress,
         judged: Environment | None = None,
     ) -> None:
         """At the beginning.

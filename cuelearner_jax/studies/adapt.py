@@ -28,7 +28,7 @@ from cuelearner_jax.calibration import Calibrated, declared_distortions
 from cuelearner_jax.config import GuideSizes, Scalars, check_guide, check_part
 from cuelearner_jax.environment import Environment, actions_of, spaces_of
 from cuelearner_jax.errors import UserError, suggestion
-from cuelearner_jax.evaluate import Tell, untold
+from cuelearner_jax.evaluate import Tell, ignore_progress
 from cuelearner_jax.feedback import external_labels
 from cuelearner_jax.feedback.answers import check_teacher
 from cuelearner_jax.guides import registry as guidances
@@ -208,7 +208,7 @@ def reads_evidence(request: AdaptRequest[Any, Any]) -> bool:
 def run(
     subject: Subject,
     request: AdaptRequest,
-    watch: Callable[[str], Tell] = lambda what: untold,
+    watch: Callable[[str], Tell] = lambda what: ignore_progress,
     note: Callable[[str], None] = console.print,
 ) -> AdaptedStudy:
     """Check a request and adapt; nothing is written. Raises UserError for what makes no sense, or cannot be adapted.

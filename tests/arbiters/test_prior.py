@@ -193,7 +193,7 @@ def test_the_arm_that_validates_best_acts_and_says_so(trained):
     assert (first["arm"] != prior.OWN).all()
     np.testing.assert_array_equal(first["reward"], 1.0)
     policies = training.policies(ENV)
-    measured = evaluate.watched_lanes(ENV, policies, evaluate.episodes(), 10, 20).means
+    measured = evaluate.rollout_lanes(ENV, policies, evaluate.episodes(), 10, 20).means
     np.testing.assert_array_equal(measured["reward"], rows[-1]["reward"])
     described = describe(policies.lane(1))
     assert described["arm"] == prior.ARMS[int(rows[-1]["arm"][1])]

@@ -15,7 +15,7 @@ from walk_task import SMALL, TASK, Walk, WalkConfig
 from cuelearner_jax import loop
 from cuelearner_jax.adaptation import serialization
 from cuelearner_jax.arbiters import by_value
-from cuelearner_jax.evaluate import episodes, watched
+from cuelearner_jax.evaluate import episodes, rollout_with_progress
 from cuelearner_jax.export import contract, decisions
 from cuelearner_jax.guides import registry
 from cuelearner_jax.policies import Arbitrated
@@ -78,7 +78,7 @@ def test_what_is_loaded_acts_as_what_was_evaluated(whole):
     assert isinstance(policy, Arbitrated)
     last = next(row for row in rows(whole) if (row["seed"], row["step"]) == (1, 48))
     assert int(policy.arm) == last["arm"] == int(last["judged_better"] > last["judged_own"])
-    found = watched(ENV, policy, episodes(), CONFIG.schedule.eval_envs, CONFIG.schedule.eval_steps).means
+    found = rollout_with_progress(ENV, policy, episodes(), CONFIG.schedule.eval_envs, CONFIG.schedule.eval_steps).means
     assert float(found["reward"]) == last["reward"]
 
 
