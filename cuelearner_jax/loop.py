@@ -47,7 +47,7 @@ from cuelearner_jax.devices import (
 )
 from cuelearner_jax.environment import Environment, actions_of, spaces_of
 from cuelearner_jax.guides.base import Guide
-from cuelearner_jax.guides.refining import Refined, untouched
+from cuelearner_jax.guides.refining import Refinement, no_refinement
 from cuelearner_jax.policies import uniform_in
 from cuelearner_jax.run_config import RunConfig, Settings
 from cuelearner_jax.types import EnvState, Label, Params, Step, Teacher
@@ -314,10 +314,10 @@ class Lane(NamedTuple):
             refined = self._chosen(self.arbiter, env, settings, clock, state, base, key)
             return ActStep(refined.actions, refined.passes, jax.vmap(env.remember)(agent.env, agent.obs))
         guided = self.arbiter.guided(state.arbiter)
-        refined: Refined = jax.lax.cond(
+        refined: Refinement = jax.lax.cond(
             guides(clock, schedule),
             lambda: self.guidance.act(state.guide.model, env, agent.obs, base, guided, settings.scalars),
-            lambda: untouched(base),
+            lambda: no_refinement(base),
         )
         return ActStep(refined.actions, refined.passes, jax.vmap(env.remember)(agent.env, agent.obs))
 
@@ -330,7 +330,7 @@ class Lane(NamedTuple):
         state: TrainState,
         base: Float[Array, "num_envs action"],
         key: PRNGKeyArray,
-    ) -> Refined:
+    ) -> Refinement:
         """What an arbiter chooses in place of the agent's own actions, until the cut-off."""
         agent, schedule, model = state.agent, settings.schedule, state.guide.model
         steps = jnp.asarray(schedule.learned_from(clock.step), jnp.float32)
@@ -339,7 +339,7 @@ class Lane(NamedTuple):
         return jax.lax.cond(
             clock.step < schedule.guidance_until,
             lambda: arbiter.choose(state.arbiter, settings.arbiter, known, agent.obs, base, learns, own),
-            lambda: untouched(base),
+            lambda: no_refinement(base),
         )
 
     def absorb(

@@ -170,7 +170,7 @@ def _agent(values: dict[str, Any], spaces: Spaces) -> AgentFunctions:
 def _guidance(values: dict[str, Any], env: Any) -> Guide:
     """The guide of a guided policy. Raises UserError if its kind is not known here."""
     name = values["guidance"]
-    if guidances.registered(name) is None:
+    if guidances.find_or_none(name) is None:
         raise UserError(
             f"the policy is under a guidance from outside, {name!r}: name its code by --guidance package.module:NAME, "
             "if you trust that code"

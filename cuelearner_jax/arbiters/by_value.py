@@ -29,7 +29,7 @@ from cuelearner_jax.agents.protocol import AgentOptions, has_actor
 from cuelearner_jax.arbiters.episodes import redrawn
 from cuelearner_jax.arbiters.protocol import Arbiter, Known, Outcome
 from cuelearner_jax.config import POSITIVE, SHARE, Scalars, part
-from cuelearner_jax.guides.refining import Refined
+from cuelearner_jax.guides.refining import Refinement
 from cuelearner_jax.types import Params
 
 ARMS = ("own", "better")
@@ -95,11 +95,11 @@ def choose_by_value(
     obs: Float[Array, "n obs"],
     own: Float[Array, "n action"],
     asked: Bool[Array, " n"],
-) -> Refined:
+) -> Refinement:
     """The guide's actions where critics value them above the agent's, in rows that are asked about."""
     guided = known.guide.act(known.model, known.env, obs, own, asked, known.scalars)
     taken = asked & agent_values_higher(known, critics, obs, own, guided.actions)
-    return Refined(jnp.where(taken[:, None], guided.actions, own), jnp.where(taken, guided.passes, 0))
+    return Refinement(jnp.where(taken[:, None], guided.actions, own), jnp.where(taken, guided.passes, 0))
 
 
 class Comparing:
@@ -132,7 +132,7 @@ class Comparing:
         base: Float[Array, "num_envs action"],
         learns: Bool[Array, ""],
         key: PRNGKeyArray,
-    ) -> Refined:
+    ) -> Refinement:
         """The guide's action where the critics value it above the agent's, in arbitrated episodes."""
         return choose_by_value(known, self.compares(state, known), obs, base, state.arbitrated & learns)
 

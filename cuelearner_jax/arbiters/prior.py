@@ -33,7 +33,7 @@ from cuelearner_jax.agents.choice import each_in_portions
 from cuelearner_jax.arbiters.protocol import Known, Outcome
 from cuelearner_jax.config import POSITIVE, SHARE, Bounds, Scalars, part
 from cuelearner_jax.guides.base import Candidates
-from cuelearner_jax.guides.refining import Refined
+from cuelearner_jax.guides.refining import Refinement
 from cuelearner_jax.spaces import Space
 
 ARMS = ("own", "prior", "near")
@@ -122,7 +122,7 @@ class Prior(NamedTuple):
         base: Float[Array, "num_envs action"],
         learns: Bool[Array, ""],
         key: PRNGKeyArray,
-    ) -> Refined:
+    ) -> Refinement:
         """Each environment's action by the arm that plays there; drawn from the prior in the random steps."""
         keys = jax.random.split(key, len(obs))
         choices = jax.lax.cond(
@@ -199,8 +199,8 @@ class Prior(NamedTuple):
         return Choices(drawn, space.exp(drawn, change), possible.any())
 
 
-def _of_arm(arm: Int[Array, " n"], choices: Choices, own: Float[Array, "n action"]) -> Refined:
+def _of_arm(arm: Int[Array, " n"], choices: Choices, own: Float[Array, "n action"]) -> Refinement:
     """The actions of each row's arm."""
     other = (arm != OWN) & choices.possible
     shaped = jnp.where((arm == NEAR)[:, None], choices.near, choices.prior)
-    return Refined(jnp.where(other[:, None], shaped, own), other.astype(jnp.int32))
+    return Refinement(jnp.where(other[:, None], shaped, own), other.astype(jnp.int32))

@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from cuelearner_jax.agents.protocol import AgentFunctions, AgentOptions, Offer
 from cuelearner_jax.config import GuideScalars, Scalars
 from cuelearner_jax.guides.base import Guide
-from cuelearner_jax.guides.refining import Refined
+from cuelearner_jax.guides.refining import Refinement
 from cuelearner_jax.types import GuidanceModel, Params
 
 
@@ -77,7 +77,7 @@ class Chooses(Arbiter, Protocol):
         base: Float[Array, "num_envs action"],
         learns: Bool[Array, ""],
         key: PRNGKeyArray,
-    ) -> Refined:
+    ) -> Refinement:
         """What to execute in place of the agent's actions until the cut-off.
 
         Args:

@@ -44,9 +44,7 @@ class Distortion(NamedTuple):
     unknowns: tuple[Unknown, ...]
     sees: Undoing | None = None  # (unknowns, observation) -> observation before the change
     acts: Undoing | None = None  # (unknowns, meant action) -> action that leads to it after the change
-    plans: Planning | None = (
-        None  # (unknowns, observation, meant action) -> the same; see `simulator.simulator_distortion`
-    )
+    plans: Planning | None = None  # (unknowns, observation, meant action) -> the same; see `simulator`
     of_teacher: bool = False  # a fault of the answers, which is told and not corrected
 
     @property

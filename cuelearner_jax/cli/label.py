@@ -157,7 +157,7 @@ def _usual_questions(task: Task) -> Literal["uniform", "near_aims", "proposed"]:
 
 def _reads_evidence(arguments: list[str]) -> bool:
     """Is calibration asked for? Raises UserError for a kind that is not known."""
-    name, _ = taken(arguments, "--guidance", ", ".join(kind.name for kind in guidances.known()))
+    name, _ = taken(arguments, "--guidance", ", ".join(kind.name for kind in guidances.kinds()))
     return name is not None and guidances.resolve(name).by_evidence
 
 
@@ -186,13 +186,13 @@ def planned(
         raise UserError(
             f"--bound-deg is {asked.bound_deg:g}: give a number above 0 and up to {space.reach:g} ({space.unit})"
         )
-    guidance = merged.guide_in(env, guidances.named(asked.guidance))
+    guidance = merged.guide_in(env, guidances.kind_name(asked.guidance))
     if guidance.kind.by_evidence:
         _check_evidence(asked, named)
     if guidance.kind.sees_base:
         raise UserError(f"guidance {guidance.name!r} is for `adapt --labels-from` alone: leave out --guidance here")
     if guidance.form is None:
-        asking = [kind.name for kind in guidances.known() if kind.asks]
+        asking = [kind.name for kind in guidances.kinds() if kind.asks]
         raise UserError(f"guidance {guidance.name!r} asks for no labels: give --guidance {' or '.join(asking)}")
     controls.check(guidance.form, space)
     if asked.one_cue and not (guidance.form.by_eps and len(space.cues) > 1):

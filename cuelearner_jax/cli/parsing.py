@@ -289,7 +289,7 @@ def world_of(source: PolicySource, arguments: list[str]) -> Any:
 
 def about(kind: type, task: Task, policies: bool = False, preset: str = PAPER) -> str:
     """The text above a command's options: what it does, and what there is to choose from."""
-    groups = {"guidance (--guidance; your own as package.module:NAME)": {k.name: k.about for k in guidances.known()}}
+    groups = {"guidance (--guidance; your own as package.module:NAME)": {k.name: k.about for k in guidances.kinds()}}
     if policies:
         trained = {name: named.about for name, named in POLICIES.items() if named.trained}
         adapted = {name: named.about for name, named in POLICIES.items() if named.adapted}

@@ -51,9 +51,9 @@ __all__ = [
     "defaults",
     "digest",
     "from_json",
+    "normalize_options",
     "part",
     "plain",
-    "settled",
     "static",
     "to_json",
 ]

@@ -12,7 +12,7 @@ from cuelearner_jax.config import GuideScalars
 from cuelearner_jax.environment import Aims
 from cuelearner_jax.guides.base import Candidates, Kind
 from cuelearner_jax.guides.baselines import Untaught
-from cuelearner_jax.guides.refining import Refined
+from cuelearner_jax.guides.refining import Refinement
 from cuelearner_jax.spaces import DIRECTIONS, Space
 from cuelearner_jax.types import GuidanceModel
 
@@ -85,7 +85,7 @@ class AnyAim(Untaught):
         actions: Float[Array, "n action"],
         active: Bool[Array, " n"],
         scalars: GuideScalars,
-    ) -> Refined:
+    ) -> Refinement:
         """Of the aims with the largest weight the nearest in active rows; where there is none, the action itself."""
 
         def one(obs: Array, action: Array) -> tuple[Array, Array]:
@@ -96,7 +96,7 @@ class AnyAim(Untaught):
 
         goals, there = jax.vmap(one)(obs, actions)
         moved = active & there
-        return Refined(jnp.where(moved[:, None], goals, actions), moved.astype(jnp.int32))
+        return Refinement(jnp.where(moved[:, None], goals, actions), moved.astype(jnp.int32))
 
 
 class Rule(AnyAim):

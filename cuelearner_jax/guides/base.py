@@ -22,7 +22,7 @@ from cuelearner_jax.errors import UserError
 from cuelearner_jax.feedback.forms import AnswerForm
 from cuelearner_jax.guides.fitting import Lesson, fit_least_squares, lessons
 from cuelearner_jax.guides.model import GuideModel, guide_model
-from cuelearner_jax.guides.refining import Refined, refine, within
+from cuelearner_jax.guides.refining import Refinement, bounded_scalars, refine
 from cuelearner_jax.types import GuidanceModel, Label, Params
 
 NAME = re.compile(r"[a-z][a-z0-9_-]*")  # of kinds, also in files: neither a path nor a reference to code
@@ -159,7 +159,7 @@ class Guide:
         actions: Float[Array, "n action"],
         active: Bool[Array, " n"],
         scalars: GuideScalars,
-    ) -> Refined:
+    ) -> Refinement:
         """What to execute in place of a batch of actions.
 
         Rows that are not active stay as they are, and so do all of them while a model that asks is not fitted.
@@ -235,7 +235,7 @@ class Guide:
 
     def moved_on(
         self, model: GuidanceModel, env: Any, labels: Label, active: Bool[Array, " n"], scalars: GuideScalars
-    ) -> Refined:
+    ) -> Refinement:
         """What `act` makes of the actions that labels (n, ...) are about."""
         return self.act(model, env, labels.obs, labels.action, active, scalars)
 
@@ -248,10 +248,10 @@ class Guide:
         actions: Float[Array, "n action"],
         active: Bool[Array, " n"],
         scalars: GuideScalars,
-    ) -> Refined:
+    ) -> Refinement:
         """`act` that leads no farther than `bound` from the actions, whatever its kind does."""
         space = self.spaces.actions
-        moved = self.act(model, env, obs, actions, active, within(space, scalars, bound))
+        moved = self.act(model, env, obs, actions, active, bounded_scalars(space, scalars, bound))
         return moved._replace(actions=space.clip(moved.actions, actions, bound))
 
     def refined(
@@ -261,7 +261,7 @@ class Guide:
         active: Bool[Array, " n"],
         scalars: GuideScalars,
         k_max: Int[Array, ""] | int | None = None,
-    ) -> Refined:
+    ) -> Refinement:
         """`refine` within the limits of the scalars; `k_max`: another number of passes."""
         space = self.spaces.actions
         return refine(

@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from cuelearner_jax.config import GuideScalars
 from cuelearner_jax.guides.base import Guide, Kind
-from cuelearner_jax.guides.refining import Refined, untouched
+from cuelearner_jax.guides.refining import Refinement, no_refinement
 from cuelearner_jax.types import GuidanceModel, Label
 
 
@@ -40,9 +40,9 @@ class Untaught(Guide):
         actions: Float[Array, "n action"],
         active: Bool[Array, " n"],
         scalars: GuideScalars,
-    ) -> Refined:
+    ) -> Refinement:
         """Every action as it is."""
-        return untouched(actions)
+        return no_refinement(actions)
 
 
 class HeuristicGuide(Untaught):
@@ -56,9 +56,9 @@ class HeuristicGuide(Untaught):
         actions: Float[Array, "n action"],
         active: Bool[Array, " n"],
         scalars: GuideScalars,
-    ) -> Refined:
+    ) -> Refinement:
         """The heuristic's action in active rows."""
-        return Refined(jnp.where(active[:, None], jax.vmap(env.heuristic)(obs), actions), active.astype(jnp.int32))
+        return Refinement(jnp.where(active[:, None], jax.vmap(env.heuristic)(obs), actions), active.astype(jnp.int32))
 
 
 NONE = Kind("none", "the agent alone", Untaught, title="no guidance", colour="#4d4d4d")

@@ -36,7 +36,7 @@ from cuelearner_jax.config.parts import POSITIVE, part
 from cuelearner_jax.feedback.answers import RELATIVE
 from cuelearner_jax.guides.base import Guide, Kind
 from cuelearner_jax.guides.dcoach import Coached, DeepCoach
-from cuelearner_jax.guides.fitting import Lesson, optimizer, squared
+from cuelearner_jax.guides.fitting import Lesson, optimizer, squared_errors
 from cuelearner_jax.guides.model import for_each
 from cuelearner_jax.types import GuidanceModel, Label, Params
 
@@ -77,7 +77,7 @@ class BatchCoach(DeepCoach):
         """Return the loss of the human model: what it says of the actions asked about, beside what was answered."""
         eps = self.spaces.actions.from_unit(scalars.eps_deg)
         answered = rows.replace(target=(rows.target - rows.action) / eps)
-        return jnp.mean(squared(answered, self.member.network.predict(env, human, rows.obs, rows.action)))
+        return jnp.mean(squared_errors(answered, self.member.network.predict(env, human, rows.obs, rows.action)))
 
     def wanted(self, env: Any, human: Params, rows: Lesson, acted: Array, scalars: GuideScalars) -> Lesson:
         """Return rows whose targets are what the human model makes of what the policy does there, in all cues."""
@@ -115,7 +115,7 @@ class BatchCoach(DeepCoach):
                 keep = lambda one, other: jnp.where(own[:, None], one, other)  # noqa: E731
                 target, said = keep(seen.target, targets.target), seen.said
                 said = None if said is None else keep(said, targets.said)
-                return jnp.mean(squared(seen.replace(target=target, said=said), acted))
+                return jnp.mean(squared_errors(seen.replace(target=target, said=said), acted))
 
             updates, state = adam.update(jax.grad(loss)(coached.policy), coached.optimizer, coached.policy)
             return coached.replace(policy=optax.apply_updates(coached.policy, updates), optimizer=state)

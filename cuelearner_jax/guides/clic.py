@@ -41,7 +41,7 @@ from cuelearner_jax.feedback.answers import DEMONSTRATION, RELATIVE
 from cuelearner_jax.guides.base import Footprint, Guide, Kind
 from cuelearner_jax.guides.fitting import fit_model
 from cuelearner_jax.guides.model import GuideModel, guide_model
-from cuelearner_jax.guides.refining import Refined
+from cuelearner_jax.guides.refining import Refinement
 from cuelearner_jax.spaces import Box, said
 from cuelearner_jax.types import GuidanceModel, Label, Params
 
@@ -263,7 +263,7 @@ class Clic(Guide):
         actions: Float[Array, "n action"],
         active: Bool[Array, " n"],
         scalars: GuideScalars,
-    ) -> Refined:
+    ) -> Refinement:
         """The action of least energy within tau_max of a, in active rows of a fitted model."""
         guided = active & model.fitted
 
@@ -272,7 +272,7 @@ class Clic(Guide):
             return self.least(env, model.params, seen, base, scalars)
 
         chosen = each_in_portions(choose, jnp.concatenate([obs, actions], -1), self.options.searched_actions)
-        return Refined(jnp.where(guided[:, None], chosen, actions), guided.astype(jnp.int32))
+        return Refinement(jnp.where(guided[:, None], chosen, actions), guided.astype(jnp.int32))
 
     def log_p(
         self,

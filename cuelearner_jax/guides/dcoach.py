@@ -34,9 +34,9 @@ from cuelearner_jax.config.parts import POSITIVE, part
 from cuelearner_jax.feedback.answers import RELATIVE
 from cuelearner_jax.guides.base import Kind
 from cuelearner_jax.guides.demonstration import Demonstration
-from cuelearner_jax.guides.fitting import Lesson, optimizer, squared
+from cuelearner_jax.guides.fitting import Lesson, optimizer, squared_errors
 from cuelearner_jax.guides.model import for_each
-from cuelearner_jax.guides.refining import Refined
+from cuelearner_jax.guides.refining import Refinement
 from cuelearner_jax.types import GuidanceModel, Label, Params
 
 
@@ -91,7 +91,7 @@ class DeepCoach(Demonstration):
         count = rows.valid.sum()
 
         def loss(params: Params, batch: Lesson) -> Array:
-            return jnp.mean(squared(batch, self.member.predict(env, params, batch.obs, batch.action)))
+            return jnp.mean(squared_errors(batch, self.member.predict(env, params, batch.obs, batch.action)))
 
         def step(coached: Coached, numbers: Int[Array, " batch"], key: PRNGKeyArray) -> Coached:
             batch = self.redrawn(key, jax.tree.map(lambda leaf: leaf[order[numbers]], rows))
@@ -126,7 +126,7 @@ class DeepCoach(Demonstration):
         actions: Float[Array, "n action"],
         active: Bool[Array, " n"],
         scalars: GuideScalars,
-    ) -> Refined:
+    ) -> Refinement:
         """The policy's action in place of a, as a cloned policy's."""
         return super().act(model.replace(params=model.params.policy), env, obs, actions, active, scalars)
 

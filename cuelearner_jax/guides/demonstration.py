@@ -23,7 +23,7 @@ from cuelearner_jax.config import GuideScalars
 from cuelearner_jax.feedback.answers import DEMONSTRATION
 from cuelearner_jax.guides.base import Guide, Kind
 from cuelearner_jax.guides.fitting import Lesson
-from cuelearner_jax.guides.refining import Refined
+from cuelearner_jax.guides.refining import Refinement
 from cuelearner_jax.types import GuidanceModel, Params
 
 
@@ -60,7 +60,7 @@ class Demonstration(Guide):
         actions: Float[Array, "n action"],
         active: Bool[Array, " n"],
         scalars: GuideScalars,
-    ) -> Refined:
+    ) -> Refinement:
         """The policy's action in place of a, in active rows of a fitted model, within the bound round a."""
 
         def phi(current: Float[Array, "n action"]) -> Float[Array, "n action"]:

@@ -51,7 +51,7 @@ def lessons(
     return rows.replace(valid=labels.valid & told.any(-1), said=told, space=space)
 
 
-def squared(rows: Lesson, predicted: Float[Array, "n outputs"]) -> Float[Array, " n"]:
+def squared_errors(rows: Lesson, predicted: Float[Array, "n outputs"]) -> Float[Array, " n"]:
     """Squared errors of predictions, L = |f - y|^2 (paper, Eq. 3).
 
     Where labels may leave cues out, L is the sum over the cues of which something was said of (d log (f - y))^2, the
@@ -77,7 +77,7 @@ def optimizer(scalars: GuideScalars) -> optax.GradientTransformation:
 Redrawn = Callable[[PRNGKeyArray, Any], Any]  # (key, batch of rows) -> what to train on in its place
 
 
-def as_drawn(key: PRNGKeyArray, batch: Any) -> Any:
+def keep_batch(key: PRNGKeyArray, batch: Any) -> Any:
     """The batch itself."""
     return batch
 
@@ -97,7 +97,7 @@ def fit_least_squares(
     init: Callable[[PRNGKeyArray], Params],
     apply: Callable[[Params, jax.Array, jax.Array], jax.Array],
     sizes: GuideSizes,
-    redrawn: Redrawn = as_drawn,
+    redrawn: Redrawn = keep_batch,
 ) -> GuidanceModel:
     """`fit_model` by least squares (paper, Eq. 3).
 
@@ -110,7 +110,7 @@ def fit_least_squares(
     """
 
     def errors(params: Params, rows: Lesson) -> Float[Array, " n"]:
-        return squared(rows, apply(params, rows.obs, rows.action))
+        return squared_errors(rows, apply(params, rows.obs, rows.action))
 
     return fit_model(key, rows, scalars, init=init, losses=errors, sizes=sizes, redrawn=redrawn)
 
@@ -123,7 +123,7 @@ def fit_model(
     init: Callable[[PRNGKeyArray], Params],
     losses: Callable[[Params, Any], Float[Array, " n"]],
     sizes: GuideSizes,
-    redrawn: Redrawn = as_drawn,
+    redrawn: Redrawn = keep_batch,
 ) -> GuidanceModel:
     """Fits a model from scratch and keeps the parameters that validated best.
 

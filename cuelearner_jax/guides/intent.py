@@ -31,7 +31,7 @@ from cuelearner_jax.guides.aims import SPREAD, log_density, open_aims
 from cuelearner_jax.guides.base import Candidates, Footprint, Guide, Kind
 from cuelearner_jax.guides.fitting import fit_model
 from cuelearner_jax.guides.model import GuideModel, ensemble
-from cuelearner_jax.guides.refining import Refined
+from cuelearner_jax.guides.refining import Refinement
 from cuelearner_jax.spaces import Space, said
 from cuelearner_jax.types import GuidanceModel, Label, Params
 
@@ -113,7 +113,7 @@ def evidence_of(aims: Aims, space: Space, label: Label, scalars: GuideScalars) -
     return Evidence(aims.features, aims.possible, jnp.concatenate([of_aims, of_none]), label.valid)
 
 
-def followed(
+def choose_aim(
     space: Space,
     share: Float[Array, " aims_and_none"],
     aims: Float[Array, "aims action"],
@@ -186,11 +186,11 @@ class Intent(Guide):
         actions: Float[Array, "n action"],
         active: Bool[Array, " n"],
         scalars: GuideScalars,
-    ) -> Refined:
+    ) -> Refinement:
         """By at most eps a pass toward the likeliest aim, in active rows of a fitted model that is sure enough."""
         space, aims = self.spaces.actions, jax.vmap(partial(self.aims, env))(obs)
         share = self.shares(model, env, aims)
-        find = partial(followed, space, doubt=self.options.aim_doubt)
+        find = partial(choose_aim, space, doubt=self.options.aim_doubt)
         goals, sure = jax.vmap(find)(share, aims.actions, actions)
 
         def phi(current: Float[Array, "n action"]) -> Float[Array, "n action"]:

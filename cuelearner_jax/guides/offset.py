@@ -30,7 +30,7 @@ from cuelearner_jax.feedback.answers import RELATIVE
 from cuelearner_jax.guides.base import Guide, Kind
 from cuelearner_jax.guides.fitting import Lesson, along_cues, fit_least_squares, held_out
 from cuelearner_jax.guides.model import GuideModel, guide_model
-from cuelearner_jax.guides.refining import Refined
+from cuelearner_jax.guides.refining import Refinement
 from cuelearner_jax.guides.relative import Relative
 from cuelearner_jax.spaces import Space
 from cuelearner_jax.types import GuidanceModel, Label, Params
@@ -55,7 +55,7 @@ class TwoParts(struct.PyTreeNode):
     share: Float[Array, ""]  # by which the network counts, from 0 to 1
 
 
-def turned(
+def accumulated_turn(
     space: Space, first: Float[Array, "n action"], actions: Float[Array, "n action"], eps: Float[Array, ""]
 ) -> Float[Array, "n cues"]:
     """How far actions lie from what they were first along each cue, in units of eps."""
@@ -73,7 +73,7 @@ def height(spline: Spline, turns: Float[Array, " n"]) -> Float[Array, " n"]:
     return _hats(turns, spline.reach) @ spline.heights
 
 
-def smoothed(turns: Float[Array, " n"], wanted: Float[Array, " n"], valid: Bool[Array, " n"]) -> Spline:
+def fit_spline(turns: Float[Array, " n"], wanted: Float[Array, " n"], valid: Bool[Array, " n"]) -> Spline:
     """The spline with the least penalised squared error.
 
     Args:
@@ -88,13 +88,11 @@ def smoothed(turns: Float[Array, " n"], wanted: Float[Array, " n"], valid: Bool[
     return Spline(jnp.linalg.solve(normal, hats.T @ jnp.where(valid, wanted, 0.0)), reach)
 
 
-def smoothed_cues(
-    turns: Float[Array, "n cues"], wanted: Float[Array, "n cues"], counts: Bool[Array, "n cues"]
-) -> Spline:
-    """`smoothed` for each cue by itself; a spline of one cue has no axis of cues."""
+def fit_splines(turns: Float[Array, "n cues"], wanted: Float[Array, "n cues"], counts: Bool[Array, "n cues"]) -> Spline:
+    """`fit_spline` for each cue by itself; a spline of one cue has no axis of cues."""
     if turns.shape[1] == 1:
-        return smoothed(turns[:, 0], wanted[:, 0], counts[:, 0])
-    return jax.vmap(smoothed, 1)(turns, wanted, counts)
+        return fit_spline(turns[:, 0], wanted[:, 0], counts[:, 0])
+    return jax.vmap(fit_spline, 1)(turns, wanted, counts)
 
 
 def heights_of(spline: Spline, turns: Float[Array, "n cues"]) -> Float[Array, "n cues"]:
@@ -151,10 +149,10 @@ class Offset(Relative):
         space, rows = self.spaces.actions, Guide.lessons(self, labels, scalars)
         eps = space.from_unit(scalars.eps_deg)
         asked = space.retract(rows.action + rows.target)
-        turns = turned(space, labels.base, rows.action, eps)
+        turns = accumulated_turn(space, labels.base, rows.action, eps)
         training = jnp.broadcast_to((rows.valid & ~held_out(len(rows.valid)))[:, None], turns.shape)
         training = training if rows.said is None else training & rows.said
-        spline = smoothed_cues(turns, turned(space, rows.action, asked, eps), training)
+        spline = fit_splines(turns, accumulated_turn(space, rows.action, asked, eps), training)
         left = rows.target / eps - vectors(space, heights_of(spline, turns), rows.action, eps)
         rows = rows.replace(action=jnp.concatenate([rows.action, turns], -1), target=left)
         predict = partial(self.network.predict, env)
@@ -172,13 +170,13 @@ class Offset(Relative):
         actions: Float[Array, "n action"],
         active: Bool[Array, " n"],
         scalars: GuideScalars,
-    ) -> Refined:
+    ) -> Refinement:
         """As `act`, of `actions` that were `first` before anything corrected them."""
         space, known = self.spaces.actions, model.params
         eps = space.from_unit(scalars.eps_deg)
 
         def phi(current: Float[Array, "n action"]) -> Float[Array, "n action"]:
-            turns = turned(space, first, current, eps)
+            turns = accumulated_turn(space, first, current, eps)
             seen = jnp.concatenate([current, turns], -1)
             of_turn = vectors(space, heights_of(known.spline, turns), current, eps)
             return eps * (of_turn + known.share * self.network.predict(env, known.network, obs, seen))
@@ -193,13 +191,13 @@ class Offset(Relative):
         actions: Float[Array, "n action"],
         active: Bool[Array, " n"],
         scalars: GuideScalars,
-    ) -> Refined:
+    ) -> Refinement:
         """The refinement of a policy's own actions."""
         return self.onward(model, env, obs, actions, actions, active, scalars)
 
     def moved_on(
         self, model: GuidanceModel, env: Any, labels: Label, active: Bool[Array, " n"], scalars: GuideScalars
-    ) -> Refined:
+    ) -> Refinement:
         """The refinement of the actions that labels (n, ...) are about, from what the policy did there."""
         assert labels.base is not None
         return self.onward(model, env, labels.obs, labels.base, labels.action, active, scalars)

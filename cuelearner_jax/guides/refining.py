@@ -20,19 +20,19 @@ from cuelearner_jax.spaces import Space
 GuideScalarsT = TypeVar("GuideScalarsT", bound=GuideScalars)
 
 
-class Refined(NamedTuple):
+class Refinement(NamedTuple):
     """Result of a refinement."""
 
     actions: Float[Array, "n action"]
     passes: Int[Array, " n"]  # how often each row was moved
 
 
-def untouched(actions: Float[Array, "n action"]) -> Refined:
+def no_refinement(actions: Float[Array, "n action"]) -> Refinement:
     """Actions that nothing refined."""
-    return Refined(actions, jnp.zeros(actions.shape[0], jnp.int32))
+    return Refinement(actions, jnp.zeros(actions.shape[0], jnp.int32))
 
 
-def within(space: Space, scalars: GuideScalarsT, bound: Float[Array, ""]) -> GuideScalarsT:
+def bounded_scalars(space: Space, scalars: GuideScalarsT, bound: Float[Array, ""]) -> GuideScalarsT:
     """Scalars with which refinement stays within `bound` of the first action, or nearer where it did before."""
     return dataclasses.replace(scalars, tau_max_deg=jnp.minimum(scalars.tau_max_deg, space.to_unit(bound)))
 
@@ -46,7 +46,7 @@ def refine(
     tau: Float[Array, ""] | float,
     tau_max: Float[Array, ""] | float,
     k_max: Int[Array, ""] | int,
-) -> Refined:
+) -> Refinement:
     """Refines a batch of actions.
 
     Args:
@@ -75,4 +75,4 @@ def refine(
 
     start = (first, ~active, jnp.zeros(first.shape[0], jnp.int32), jnp.zeros((), jnp.int32))
     refined, _, passes, _ = jax.lax.while_loop(unfinished, one_pass, start)
-    return Refined(refined, passes)
+    return Refinement(refined, passes)

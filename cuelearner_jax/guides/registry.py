@@ -53,13 +53,13 @@ def register(kind: Kind) -> Kind:
     return kind
 
 
-def known() -> tuple[Kind, ...]:
+def kinds() -> tuple[Kind, ...]:
     """The kinds that can be named, those of installed packages included."""
     _register_installed()
     return tuple(_KINDS.values())
 
 
-def registered(name: str) -> Kind | None:
+def find_or_none(name: str) -> Kind | None:
     """The kind of that name, or None: of results whose kind is not known here."""
     _register_installed()
     return _KINDS.get(name)
@@ -83,14 +83,14 @@ def resolve(text: str) -> Kind:
     return register(load(text, Kind, "a kind of guidance")) if ":" in text else find(text)
 
 
-def named(text: str) -> str:
+def kind_name(text: str) -> str:
     """Name of the kind that a user or caller names, as `resolve`; a name alone need not be known here."""
     return resolve(text).name if ":" in text else text
 
 
 def possible(env: Any, taught: bool) -> tuple[str, ...]:
     """Names of the kinds that an agent can be trained with; `taught`: is there a teacher to ask?"""
-    trained = (kind for kind in known() if not kind.adapts_only and (taught or not kind.asks))
+    trained = (kind for kind in kinds() if not kind.adapts_only and (taught or not kind.asks))
     cues = actions_of(env).cues
     said = (kind for kind in trained if cues or not kind.needs_cues)
     return tuple(kind.name for kind in said if all(offers(env, need) for need in kind.needs))

@@ -21,7 +21,7 @@ from cuelearner_jax.config import GuideScalars
 from cuelearner_jax.feedback.answers import RELATIVE
 from cuelearner_jax.guides.base import Guide, Kind
 from cuelearner_jax.guides.fitting import Lesson
-from cuelearner_jax.guides.refining import Refined
+from cuelearner_jax.guides.refining import Refinement
 from cuelearner_jax.types import GuidanceModel, Label
 
 
@@ -46,7 +46,7 @@ class Relative(Guide):
         actions: Float[Array, "n action"],
         active: Bool[Array, " n"],
         scalars: GuideScalars,
-    ) -> Refined:
+    ) -> Refinement:
         """Eq. 4: a <- a + phi(s, a), in active rows of a fitted model."""
         eps = self.spaces.actions.from_unit(scalars.eps_deg)
 

@@ -26,7 +26,7 @@ from cuelearner_jax.config.parts import POSITIVE, SHARE, part
 from cuelearner_jax.feedback.answers import SCALAR
 from cuelearner_jax.guides.base import Footprint, Guide, Kind
 from cuelearner_jax.guides.model import GuideModel, guide_model
-from cuelearner_jax.guides.refining import Refined
+from cuelearner_jax.guides.refining import Refinement
 from cuelearner_jax.types import GuidanceModel
 
 LEAST = 0.01  # that an action is called good: the model's values are no probabilities, and may be 0 or less
@@ -65,12 +65,12 @@ class Scalar(Guide):
         actions: Float[Array, "n action"],
         active: Bool[Array, " n"],
         scalars: GuideScalars,
-    ) -> Refined:
+    ) -> Refinement:
         """The best of all actions in active rows of a fitted model."""
         guided = active & model.fitted
         value = lambda obs, actions: self.network.predict(env, model.params, obs, actions)[:, 0]  # noqa: E731
         chosen = best_of(value, self.spaces.actions.spread(self.options.guide_directions), obs)
-        return Refined(jnp.where(guided[:, None], chosen, actions), guided.astype(jnp.int32))
+        return Refinement(jnp.where(guided[:, None], chosen, actions), guided.astype(jnp.int32))
 
     def log_p(
         self,

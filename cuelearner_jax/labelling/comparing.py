@@ -26,7 +26,7 @@ from cuelearner_jax.task import Task
 
 def form_of(file: LabelFile) -> AnswerForm | None:
     """The form of a file's answers; None: of a kind of guidance that is not known here."""
-    forms = {kind.form.name: kind.form for kind in guidances.known() if kind.form is not None}
+    forms = {kind.form.name: kind.form for kind in guidances.kinds() if kind.form is not None}
     return forms.get(file.answers)
 
 

@@ -181,7 +181,7 @@ class PolicySource:
     def _weighs_aims(self, chosen: tuple[str, ...] | None) -> bool:
         """Is a policy under a guidance that looks at the task's aims? `chosen`: of these kinds of a run alone."""
         kinds = self.adapted.kinds if self.adapted else chosen or (self.grid.guidance if self.grid else ())
-        found = (guidances.registered(kind) for kind in kinds)
+        found = (guidances.find_or_none(kind) for kind in kinds)
         return any(kind is not None and "aims" in kind.needs for kind in found)
 
     def load(self, kinds: tuple[str, ...] = ()) -> list[RunLanes]:
@@ -194,7 +194,7 @@ class PolicySource:
         for name in kinds or self.grid.guidance:
             if name not in self.grid.guidance:
                 raise UserError(f"{self.folder} has no guidance {name!r}: choose among {', '.join(self.grid.guidance)}")
-            if guidances.registered(name) is None:
+            if guidances.find_or_none(name) is None:
                 raise UserError(
                     f"{self.folder} has lanes of a guidance from outside, {name!r}: name its code by "
                     "--guidance package.module:NAME, if you trust that code"
@@ -305,7 +305,7 @@ def several(
     view = source.task.view(world) if env is None else view_of(env)
     if not named.kept:
         return [make(name, source.config, view, teacher)], (0,)
-    kinds = (guidances.named(kind),) if kind else (source.grid.guidance[-1],) if source.grid else ()
+    kinds = (guidances.kind_name(kind),) if kind else (source.grid.guidance[-1],) if source.grid else ()
     blocks = blocks_of(source, name, view, teacher, kinds, failed_too=True)
     known = {
         part: np.concatenate([getattr(block, part) for block in blocks]) for part in ("seeds", "budgets", "bounds")

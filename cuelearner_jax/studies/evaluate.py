@@ -114,7 +114,7 @@ def run(
         none = np.zeros(1, int)
         blocks = [Block("-", none, none, none, 0, Common(policy), none > 0)]
     else:
-        blocks = blocks_of(source, name, view_of(env), teacher, tuple(map(guidances.named, asked.guidance)))
+        blocks = blocks_of(source, name, view_of(env), teacher, tuple(map(guidances.kind_name, asked.guidance)))
     rows, unit = [], actions_of(env).unit.replace("degrees", "deg")
     for block in blocks:
         count, is_shared = len(block.seeds), lanes_in(block.policy) is None
