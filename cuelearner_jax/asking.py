@@ -20,7 +20,7 @@ from cuelearner_jax.config import GuideScalars, GuideSizes
 from cuelearner_jax.environment import Environment, actions_of
 from cuelearner_jax.guides.base import Guide
 from cuelearner_jax.guides.refining import bounded_scalars
-from cuelearner_jax.policies import Policy, acted, best_actions, named
+from cuelearner_jax.policies import Policy, best_actions, call_policy, policy_name
 from cuelearner_jax.types import EnvState, GuidanceModel, Label, Teacher
 
 LaneT = TypeVar("LaneT", bound=Any)
@@ -122,10 +122,10 @@ def question(
     """The action to ask about in the guide's situation, or in each of its candidates; and what the base policy does."""
     space, scalars, several = actions_of(of.env), of.scalars, guide.obs.ndim > 1
     if several:
-        first = acted(of.base, keys.base, guide.env, guide.obs, space)
+        first = call_policy(of.base, keys.base, guide.env, guide.obs, space)
     else:
         states = jax.tree.map(lambda leaf: leaf[None], guide.env)
-        first = acted(of.base, keys.base, states, guide.obs[None], space)[0]
+        first = call_policy(of.base, keys.base, states, guide.obs[None], space)[0]
     if of.bound is not None:
         scalars = bounded_scalars(space, scalars, of.bound)
 
@@ -272,7 +272,7 @@ def blame(
         states, obs = jax.tree.map(lambda leaf: leaf[None], (states, obs))
     if base is not None:
         assert key is not None
-        user_code.check_actions(space.only_actions(base.act(key, states, obs)), named(base))
+        user_code.check_actions(space.only_actions(base.act(key, states, obs)), policy_name(base))
     if teacher is not None:
         given = space.only_actions(best_actions(teacher, states, obs))
         user_code.check_actions(given, f"teacher {type(teacher).__name__}")

@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from cuelearner_jax import user_code
 from cuelearner_jax.devices import BY_LANE, SHARED, over_lanes, portions
 from cuelearner_jax.environment import Environment, actions_of
-from cuelearner_jax.policies import Policy, PolicyBlock, acted, lanes_in, named
+from cuelearner_jax.policies import Policy, PolicyBlock, call_policy, lanes_in, policy_name
 
 # Folded into the root key: episodes for reported figures only, and episodes for choosing settings.
 SPLITS = {"validation": 1_000_003, "tuning": 1_000_001}
@@ -89,7 +89,7 @@ def _walked(policy: Policy, env: Environment, key: PRNGKeyArray, walk: _Walk, in
 
     def one_step(walk: _Walk, index: jax.Array) -> tuple[_Walk, None]:
         k_act, k_env = jax.random.split(jax.random.fold_in(k_run, index))
-        action = acted(policy, k_act, walk.state, walk.obs, actions_of(env))
+        action = call_policy(policy, k_act, walk.state, walk.obs, actions_of(env))
         acts = walk.acts & jnp.isfinite(action).all(-1)
         state, step = jax.vmap(env.step)(jax.random.split(k_env, num_envs), walk.state, action)
         done = step.terminated | step.truncated
@@ -178,7 +178,7 @@ def rollout_with_progress(
 
     Raises UserError, which names the policy, once one of its actions is not finite.
     """
-    return _in_stretches(env, None, policy, key, num_envs, steps, tell, named(policy))
+    return _in_stretches(env, None, policy, key, num_envs, steps, tell, policy_name(policy))
 
 
 def rollout_lanes(

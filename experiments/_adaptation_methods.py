@@ -19,7 +19,7 @@ from _finetuning import FineTuning, every
 
 from cuelearner_jax.adaptation import by_calibration as calibration
 from cuelearner_jax.adaptation import by_model
-from cuelearner_jax.adaptation.by_model import Adapted
+from cuelearner_jax.adaptation.by_model import AdaptationResult
 from cuelearner_jax.adaptation.judging import LABELS, Judging, judged_by_labels
 from cuelearner_jax.adaptation.lanes import Adaptation, product
 from cuelearner_jax.calibration import UNEXPLAINED, declared_distortions
@@ -85,7 +85,7 @@ def by_labels(kind: Any, bench: Bench) -> Iterator[Row]:
     yield {**which, "steps": 0, **told, **metrics}
 
 
-def unrewarded(bench: Bench, found: Adapted) -> Row:
+def unrewarded(bench: Bench, found: AdaptationResult) -> Row:
     """Whether models are used where their held-out answers judge, and metrics (lanes,) of these policies."""
     judged = judged_by_labels(found.of, found.block)
     model = found.block.guide.model

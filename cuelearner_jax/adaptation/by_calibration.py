@@ -17,8 +17,8 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from cuelearner_jax.adaptation.by_model import SIZES, Adapted
-from cuelearner_jax.adaptation.judging import LABELS, Judge, Judged, Judging
+from cuelearner_jax.adaptation.by_model import SIZES, AdaptationResult
+from cuelearner_jax.adaptation.judging import LABELS, Judge, Judgement, Judging
 from cuelearner_jax.adaptation.lanes import Adaptation, Lanes
 from cuelearner_jax.calibration import CHANGED, Calibrated, Calibration, Distortion, Result, Walk, calibrate
 from cuelearner_jax.calibration.families import Family, unknowns_of
@@ -96,7 +96,7 @@ def adapt(
     teacher: Teacher | None = None,
     labels: Label | None = None,
     watch: Callable[[str], Tell] = lambda what: ignore_progress,
-) -> Adapted:
+) -> AdaptationResult:
     """Ask, read and judge all lanes.
 
     Args:
@@ -166,7 +166,7 @@ def _theta(policy: Calibrated) -> Theta:
 
 def _judged(
     of: Calibrating, lanes: Lanes, how: Judging, found: list[_Lane], labels: Label | None, watch: Any
-) -> Adapted:
+) -> AdaptationResult:
     results = tuple(lane.result for lane in found)
     thetas = [_theta(one.policy) if one.changes else {} for one in results]
     of = of.replace(family=_used(of.family, [*thetas, *(theta for lane in found for theta in lane.thetas)]))
@@ -190,11 +190,11 @@ def _judged(
             judge.measure(block)
         before, after = (np.array([one.held_out[end] for one in results]) for end in (0, 1))
         unknown, none = np.full((lanes.number, 3), np.nan), np.zeros(lanes.number, int)
-        judged = Judged(LABELS, before, after, corrects, lanes.bound_deg, unknown, none)
+        judged = Judgement(LABELS, before, after, corrects, lanes.bound_deg, unknown, none)
     else:
         judged, _ = judge.judged(block)
     theta = jnp.where(jnp.asarray(judged.used)[:, None], block.theta, 0.0)
-    return Adapted(of, lanes, block.replace(theta=theta), judged, judge.curve, results)
+    return AdaptationResult(of, lanes, block.replace(theta=theta), judged, judge.curve, results)
 
 
 def _used(family: Family, thetas: list[Theta]) -> Family:
@@ -224,7 +224,7 @@ def _padded(sets: list[Label]) -> Label:
     return jax.tree.map(lambda *leaves: np.stack([padded(leaf) for leaf in leaves]), *sets)
 
 
-def sentences(found: Adapted) -> list[str]:
+def sentences(found: AdaptationResult) -> list[str]:
     """What calibration has led to, for each lane: a line an estimate, then what it is worth."""
     lanes, judged, lines = found.lanes, found.judged, []
     for lane, result in enumerate(found.results):

@@ -19,14 +19,14 @@ from jax.sharding import Mesh
 from jaxtyping import Array
 
 from cuelearner_jax import user_code
-from cuelearner_jax.adaptation.judging import Judge, Judged, Judging
+from cuelearner_jax.adaptation.judging import Judge, Judgement, Judging
 from cuelearner_jax.adaptation.lanes import Adaptation, Lanes, LaneState, ask_round, begin, blame, rounds, take_labels
 from cuelearner_jax.calibration import Result
 from cuelearner_jax.config import GuideSizes, Scalars
 from cuelearner_jax.devices import BY_LANE, SHARED, lane_mesh, place
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import Tell, ignore_progress
-from cuelearner_jax.policies import Policy, named
+from cuelearner_jax.policies import Policy, policy_name
 from cuelearner_jax.spaces import DIRECTIONS, Space
 from cuelearner_jax.types import Label, Teacher
 
@@ -38,13 +38,13 @@ PASSES = 20  # of which one turn by eps: a pass that turns by less has settled
 
 
 @dataclass(frozen=True)
-class Adapted:
+class AdaptationResult:
     """What adaptation has led to. Where a lane's model is not used, its policy is its base."""
 
     of: Adaptation
     lanes: Lanes
     block: Any  # `LaneState`, or `by_calibration.Evidence`
-    judged: Judged
+    judged: Judgement
     curve: list[dict[str, Any]]  # a row a measurement: "asked" (lanes,) labels so far, and metrics (lanes,) by name
     results: tuple[Result, ...] = ()  # of calibration, a lane each: what changed
 
@@ -71,7 +71,7 @@ def adapt(
     labels: Label | None = None,
     mesh: Mesh | None = None,
     watch: Callable[[str], Tell] = lambda what: ignore_progress,
-) -> Adapted:
+) -> AdaptationResult:
     """Asks, fits and judges all lanes.
 
     Args:
@@ -91,7 +91,7 @@ def adapt(
     judge = Judge(of, lanes.rows(filled), how, mesh, watch)
     if labels is not None:
         labels = jax.tree.map(lambda leaf: jnp.asarray(leaf)[filled], labels)
-    block = learned(of, lanes.rows(filled), teacher, labels, mesh, watch, judge.measure_if_due)
+    block = learn_lanes(of, lanes.rows(filled), teacher, labels, mesh, watch, judge.measure_if_due)
     judged, block = judge.judged(block)
     model = block.guide.model  # one that is not used leaves actions alone
     block = block.replace(
@@ -99,10 +99,10 @@ def adapt(
     )
     block = jax.tree.map(lambda leaf: leaf[:count], block)
     curve = [{name: values[:count] for name, values in row.items()} for row in judge.curve]
-    return Adapted(of, lanes, block, Judged(judged.by, *(column[:count] for column in judged[1:])), curve)
+    return AdaptationResult(of, lanes, block, Judgement(judged.by, *(column[:count] for column in judged[1:])), curve)
 
 
-def learned(
+def learn_lanes(
     of: Adaptation,
     lanes: Lanes,
     teacher: Teacher | None,
@@ -171,7 +171,7 @@ def usual_bound(space: Space) -> float:
 def reach(space: Space, policy: Policy, obs: Any, action: Any) -> float:
     """The distance within which 95% of actions (labels, action) lie from a policy's own, in the space's unit."""
     away = _distances(space, policy, jnp.asarray(obs), jnp.asarray(action))
-    user_code.check_actions(away, named(policy))
+    user_code.check_actions(away, policy_name(policy))
     return float(space.to_unit(np.quantile(np.asarray(away), REACH_QUANTILE), np))
 
 

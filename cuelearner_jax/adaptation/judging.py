@@ -24,7 +24,7 @@ from cuelearner_jax.environment import Environment, actions_of
 from cuelearner_jax.errors import UserError, suggestion
 from cuelearner_jax.evaluate import Rollout, Tell, episodes, mean_interval, rollout_lanes
 from cuelearner_jax.policies import PolicyBlock
-from cuelearner_jax.spaces import said
+from cuelearner_jax.spaces import is_answered
 
 HELD_OUT = 5  # every fifth label
 LABELS = "labels"  # what is judged by, in place of a metric
@@ -45,7 +45,7 @@ class Judging:
     bounds: tuple[float, ...] = ()  # shares of a lane's bound within which its policy is tried as well
 
 
-class Judged(NamedTuple):
+class Judgement(NamedTuple):
     """What the base policies and the adapted ones are worth, lane by lane; more is better."""
 
     by: str  # a metric, or "labels": the share of held-out answers that are predicted
@@ -98,7 +98,7 @@ class Judge:
         if self.how.every and asked % self.how.every == 0:
             self.measure(block)
 
-    def judged(self, block: Any) -> tuple[Judged, Any]:
+    def judged(self, block: Any) -> tuple[Judgement, Any]:
         """What is used of the finished lanes, and these within the bounds that are used.
 
         Raises UserError if there is no such metric, or labels cannot judge.
@@ -119,7 +119,7 @@ class Judge:
         usable = ~np.asarray(block.failed) & np.asarray(block.corrects)
         used = usable & (worth >= before)  # NaN is worth less than anything
         difference = mean_interval(np.asarray(after.each[how.by]) - np.asarray(bases.each[how.by])[own]).T
-        return Judged(how.by, before, worth, used, bounds_of(self.of, block), difference, played + more), block
+        return Judgement(how.by, before, worth, used, bounds_of(self.of, block), difference, played + more), block
 
     def _narrowed(self, block: Any, after: Rollout) -> tuple[Any, Rollout, np.ndarray]:
         """Lanes within the share of their bounds with which they are worth most, what they are worth so, and the
@@ -161,7 +161,7 @@ class Judge:
         return first.sum(-1) if self.how.by in _step_of(self.how.env).outcome else np.full(len(first), self.how.steps)
 
 
-def judged_by_labels(of: Adaptation, block: LaneState) -> Judged:
+def judged_by_labels(of: Adaptation, block: LaneState) -> Judgement:
     """Compares a model with answering "already right" always, on every fifth label, to which it was not fitted.
 
     The model that is kept is fitted to all of them; this one is made for the comparison alone.
@@ -178,7 +178,7 @@ def judged_by_labels(of: Adaptation, block: LaneState) -> Judged:
     zero, right = jax.device_get(_predicted(of, block))
     used = ~np.asarray(block.failed) & (right >= zero)
     unknown, none = np.full((len(used), 3), np.nan), np.zeros(len(used), int)
-    return Judged(LABELS, zero, right, used, bounds_of(of, block), unknown, none)
+    return Judgement(LABELS, zero, right, used, bounds_of(of, block), unknown, none)
 
 
 @jax.jit
@@ -195,7 +195,9 @@ def _predicted(of: Adaptation, block: LaneState) -> tuple[Array, Array]:
         model = guidance.fit(key, env, others, guidance.init(key), of.scalars)
         moved = guidance.moved_on(model, env, labels, held, one_pass).actions
         moves = space.log(labels.action, moved) / space.from_unit(of.scalars.eps_deg)
-        told = said(labels.answer) & held[:, None]  # words about one cue each; of the other cues nothing is compared
+        told = (
+            is_answered(labels.answer) & held[:, None]
+        )  # words about one cue each; of the other cues nothing is compared
         count = jnp.maximum(told.sum(), 1)
         share = lambda flags: jnp.sum(flags, where=told) / count  # noqa: E731
         right = share(jnp.round(jnp.clip(moves, -1, 1)) == labels.answer)

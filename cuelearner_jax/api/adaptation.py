@@ -83,7 +83,7 @@ class AdaptedPolicy(CallablePolicy):
         """What `cuelearner adapt` prints of it, line by line."""
         return study.sentences(self.outcome.found)
 
-    @user_code.told
+    @user_code.report_user_errors
     def save(self, folder: str | Path, overwrite: bool = False) -> None:
         """Writes a policy folder, as `cuelearner adapt` does; `load_policy` and every command take it.
 
@@ -101,7 +101,7 @@ class AdaptedPolicy(CallablePolicy):
             self.outcome._replace(origin={"code": self.named}).write(place)
 
 
-@user_code.told
+@user_code.report_user_errors
 def adapt(
     policy: Any,
     world: World | Environment,

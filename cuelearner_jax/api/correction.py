@@ -47,7 +47,7 @@ class GivenLabels(NamedTuple):
     config: LogsConfig | None = None  # of the recording they are about; None: they do not say
 
 
-@user_code.told
+@user_code.report_user_errors
 def correct(
     policy: Any,
     labels: Labels | str | os.PathLike[str],
@@ -126,7 +126,7 @@ def correct(
     )
 
 
-@user_code.told
+@user_code.report_user_errors
 def agreement(
     policy: Any,
     labels: Labels | str | os.PathLike[str],

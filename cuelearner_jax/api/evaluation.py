@@ -12,7 +12,7 @@ from cuelearner_jax.studies import evaluate as study
 from cuelearner_jax.studies.evaluate import Measured
 
 
-@user_code.told
+@user_code.report_user_errors
 def measure(
     policy: Any,
     world: World,

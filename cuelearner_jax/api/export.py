@@ -14,7 +14,7 @@ from cuelearner_jax.errors import UserError
 from cuelearner_jax.export import contract, correction, decisions, runner
 
 
-@user_code.told
+@user_code.report_user_errors
 def export_policy(
     policy: Any, out: str | Path, world: World | None = None, format: str = "stablehlo"
 ) -> dict[str, Any]:
@@ -42,7 +42,7 @@ def export_policy(
     return contract.write(acting, env, drawn, format, out, _about(policy, world))
 
 
-@user_code.told
+@user_code.report_user_errors
 def export_correction(policy: Any, out: str | Path, world: World | None = None, format: str = "onnx") -> dict[str, Any]:
     """Writes the correction of a corrected policy alone: observation and base action in, action out.
 

@@ -62,7 +62,7 @@ class FeedbackModel:
     env: Any = None  # says how an observation looks from an action; nobody asks it in the raw frame
 
 
-@user_code.told
+@user_code.report_user_errors
 def fit_feedback(
     labels: Labels | str | os.PathLike[str],
     *,
@@ -114,7 +114,7 @@ def fit_feedback(
     return FeedbackModel(guidance, model, scalars, labels_of(rows), sizes, space)
 
 
-@user_code.told
+@user_code.report_user_errors
 def ask(
     policy: Any,
     world: World,
@@ -156,7 +156,7 @@ def ask(
     env, guidance = world.env, KIND.make(sizes, spaces_of(world.env))
     user_code.answers_in("teacher", teacher, env)
     of = Adaptation(guidance, sizes, scalars, env, Common(as_policy_in(policy, env)))
-    block = by_model.learned(of, product(1, (seed,), (labels,), (bound,)), teacher)
+    block = by_model.learn_lanes(of, product(1, (seed,), (labels,), (bound,)), teacher)
     if block.failed.any():
         blame(of, teacher, block)
         raise divergence_error()
@@ -171,7 +171,7 @@ def labels_of(rows: Label) -> Labels:
     return Labels(obs, action, answer[:, 0] if answer.shape[1] == 1 else answer)
 
 
-@user_code.told
+@user_code.report_user_errors
 def refine(policy: Any, model: FeedbackModel, bound_deg: float | None = None) -> CallablePolicy:
     """A policy's actions refined by a feedback model, within a bound (paper, Eqs. 2 to 5).
 

@@ -19,7 +19,7 @@ from cuelearner_jax.api.worlds import World, a_world
 from cuelearner_jax.config import LARGEST_FLOAT
 from cuelearner_jax.environment import Quantity, actions_of
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.policies import Policy, acted, in_space, named
+from cuelearner_jax.policies import Policy, call_policy, in_space, policy_name
 from cuelearner_jax.policies.foreign import ONNX
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs import trained
@@ -32,7 +32,7 @@ from cuelearner_jax.types import EnvState
 
 @partial(jax.jit, static_argnames="space")
 def _act(policy: Policy, key: PRNGKeyArray, obs: Float[Array, "n obs"], space: Space) -> Float[Array, "n action"]:
-    return acted(policy, key, None, obs, space)
+    return call_policy(policy, key, None, obs, space)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,7 +58,7 @@ class CallablePolicy:
         if self.trained is not None:
             arguments.instance("trained", self.trained, RunConfig, "a RunConfig")
 
-    @user_code.told
+    @user_code.report_user_errors
     def __call__(self, obs: Any, key: PRNGKeyArray | None = None) -> np.ndarray:
         """Actions for observations.
 
@@ -79,7 +79,7 @@ class CallablePolicy:
         key = jax.random.key(0) if key is None else arguments.key("key", key)
         # A copy, which the caller may write in.
         chosen = np.array(_act(self.policy, key, jnp.asarray(batch), self.actions))
-        user_code.check_actions(chosen, named(self.policy))
+        user_code.check_actions(chosen, policy_name(self.policy))
         return chosen[0] if rows.ndim == 1 else chosen
 
     def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
@@ -122,7 +122,7 @@ def source_of(policy: Any, world: World) -> trained.PolicySource:
     return trained.PolicySource(world.task, dataclasses.replace(config, task=world.config), None, Path(world.task.name))
 
 
-@user_code.told
+@user_code.report_user_errors
 def load_policy(
     folder: str | Path,
     *,

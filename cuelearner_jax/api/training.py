@@ -69,7 +69,7 @@ class Run:
         return CallablePolicy(agents.lane(int(found[0])), self.world.observation, actions=self.world.actions)
 
 
-@user_code.told
+@user_code.report_user_errors
 def train(
     world: World,
     teacher: Teacher | Any = None,

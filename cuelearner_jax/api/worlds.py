@@ -59,7 +59,7 @@ class World:
         """The action space."""
         return actions_of(self.env)
 
-    @user_code.told
+    @user_code.report_user_errors
     def reset(self, key: PRNGKeyArray) -> tuple[EnvState, Float[Array, " obs"]]:
         """Starts an episode: (state, observation). Raises UserError for what is no key."""
         return jax.jit(self.env.reset)(arguments.key("key", key))
@@ -69,7 +69,7 @@ class World:
         """A state with shapes in place of arrays."""
         return jax.eval_shape(self.env.reset, jax.random.key(0))[0]
 
-    @user_code.told
+    @user_code.report_user_errors
     def step(
         self, key: PRNGKeyArray, state: EnvState, action: Float[Array, " action"] | Float[np.ndarray, " action"]
     ) -> tuple[EnvState, Step]:
@@ -82,7 +82,7 @@ class World:
         return jax.jit(self.env.step)(arguments.key("key", key), state, action)
 
 
-@user_code.told
+@user_code.report_user_errors
 def make(name: str | Task, *, scenario: str | None = None, robot: str | None = None, **changes: Any) -> World:
     """A world of a task.
 
@@ -103,7 +103,7 @@ def make(name: str | Task, *, scenario: str | None = None, robot: str | None = N
     return World(task, task.configured(scenario, **changes), scenario)
 
 
-@user_code.told
+@user_code.report_user_errors
 def from_gymnasium(
     env: str | Any,
     *,
@@ -157,7 +157,7 @@ def a_world(name: str, value: Any) -> World:
     return arguments.instance(name, value, World, "a world, as cl.make gives it")
 
 
-@user_code.told
+@user_code.report_user_errors
 def teacher_of(source: World | Policy) -> Teacher:
     """Who teaches: in a world its task's own teacher, of a policy (a finished agent, say) that policy.
 

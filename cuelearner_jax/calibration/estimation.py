@@ -28,7 +28,7 @@ from cuelearner_jax.calibration.response import Responses
 from cuelearner_jax.calibration.scales import scales_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.policies import in_space, policy_of
-from cuelearner_jax.spaces import Space, said
+from cuelearner_jax.spaces import Space, is_answered
 
 Floats = np.ndarray
 Given = Array | np.ndarray  # what is taken
@@ -152,7 +152,7 @@ class Calibration:
         An answer that says nothing of any cue is none.
         """
         obs, action, answer = (np.asarray(rows, np.float32) for rows in (obs, action, answer))
-        there = np.asarray(said(jnp.asarray(answer)) & np.isfinite(answer)).any(-1)
+        there = np.asarray(is_answered(jnp.asarray(answer)) & np.isfinite(answer)).any(-1)
         obs, action, answer = obs[there], action[there], answer[there]
         if not len(obs):
             return
@@ -160,7 +160,7 @@ class Calibration:
         self._scaled(obs)
         if doubt is None:
             doubt = ties(self.meaning, (), np.zeros(0), obs, self.eps)
-        told = np.asarray(said(jnp.asarray(answer)), np.float32) * np.isfinite(answer)
+        told = np.asarray(is_answered(jnp.asarray(answer)), np.float32) * np.isfinite(answer)
         new = Answers(obs, action, answer, told, np.asarray(doubt, np.float32))
         old = self.answers
         self.answers = new if old is None else Answers._make(map(np.concatenate, zip(old, new, strict=True)))

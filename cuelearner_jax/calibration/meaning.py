@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from cuelearner_jax import user_code
 from cuelearner_jax.calibration.families import Family, undo_action, undo_observation, undo_physics
-from cuelearner_jax.policies import named
+from cuelearner_jax.policies import policy_name
 from cuelearner_jax.spaces import Space
 
 Floats = np.ndarray
@@ -46,7 +46,7 @@ class Meaning:
         else:
             portion = ROWS_CPU if jax.default_backend() == "cpu" else ROWS
             found = in_portions(partial(_meant, family, self.policy), portion, theta, rows)
-        user_code.check_actions(found, named(self.policy))
+        user_code.check_actions(found, policy_name(self.policy))
         return found.reshape(number, count, self.space.size)
 
     def offsets(

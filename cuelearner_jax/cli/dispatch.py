@@ -82,7 +82,7 @@ def _dispatch(arguments: list[str]) -> int:
         raise UserError(f"unknown command {command!r}{suggestion(command, COMMANDS)}; see cuelearner --help")
     from cuelearner_jax import user_code
 
-    user_code.told(_file(command).run)(arguments[1:])
+    user_code.report_user_errors(_file(command).run)(arguments[1:])
     return 0
 
 

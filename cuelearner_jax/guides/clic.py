@@ -42,7 +42,7 @@ from cuelearner_jax.guides.base import Footprint, Guide, Kind
 from cuelearner_jax.guides.fitting import fit_model
 from cuelearner_jax.guides.model import GuideModel, guide_model
 from cuelearner_jax.guides.refining import Refinement
-from cuelearner_jax.spaces import Box, said
+from cuelearner_jax.spaces import Box, is_answered
 from cuelearner_jax.types import GuidanceModel, Label, Params
 
 SHARPNESS = 10.0  # of the observation model: its weight beside the policy
@@ -110,7 +110,7 @@ def log_desired(
         implicit: directions u_i, as long as h.
         gamma: see `Config`.
     """
-    spoken = said(h)
+    spoken = is_answered(h)
     x, h = jnp.where(spoken, x, 0.0), jnp.where(spoken, h, 0.0)
     half = log_nearer(_size(x), _size(x - gamma * h), SOFTNESS)
     if len(h) > 1:
@@ -127,7 +127,7 @@ def direction_at(key: PRNGKeyArray, h: Float[Array, " cues"], angle: Array | flo
 
     Along one such cue alone there is no other direction: h itself.
     """
-    spoken = said(h)
+    spoken = is_answered(h)
     h = jnp.where(spoken, h, 0.0)
     drawn = jnp.where(spoken, jax.random.normal(key, h.shape), 0.0)
     across = drawn - jnp.sum(drawn * h) / jnp.maximum(jnp.sum(h * h), 1.0) * h
@@ -210,7 +210,7 @@ class Clic(Guide):
 
     def told(self, labels: Label) -> Bool[Array, " slots"]:
         """Return which labels say anything."""
-        return said(labels.answer).any(-1) if len(self.spaces.actions.cues) > 1 else jnp.ones_like(labels.valid)
+        return is_answered(labels.answer).any(-1) if len(self.spaces.actions.cues) > 1 else jnp.ones_like(labels.valid)
 
     def fit(
         self, key: PRNGKeyArray, env: Any, labels: Label, former: GuidanceModel, scalars: GuideScalars

@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Key, PRNGKeyArray
 
 from cuelearner_jax.config import GuideScalars, GuideSizes
 from cuelearner_jax.guides.model import fitted_members
-from cuelearner_jax.spaces import Space, said
+from cuelearner_jax.spaces import Space, is_answered
 from cuelearner_jax.types import GuidanceModel, Label, Params
 
 VALIDATION_STRIDE = 5  # every fifth label is a validation label: the 80/20 split of the paper's public code
@@ -47,7 +47,7 @@ def lessons(
     rows = Lesson(labels.obs, labels.action, jax.lax.optimization_barrier(targets), labels.valid)
     if space is None or len(space.cues) == 1:
         return rows
-    told = said(labels.answer)
+    told = is_answered(labels.answer)
     return rows.replace(valid=labels.valid & told.any(-1), said=told, space=space)
 
 

@@ -32,7 +32,7 @@ from cuelearner_jax.guides.base import Candidates, Footprint, Guide, Kind
 from cuelearner_jax.guides.fitting import fit_model
 from cuelearner_jax.guides.model import GuideModel, ensemble
 from cuelearner_jax.guides.refining import Refinement
-from cuelearner_jax.spaces import Space, said
+from cuelearner_jax.spaces import Space, is_answered
 from cuelearner_jax.types import GuidanceModel, Label, Params
 
 ELSEWHERE = 360  # evenly spaced actions that stand for "it means none of these"
@@ -102,7 +102,7 @@ def likelihood(
     above = jax.nn.sigmoid((offset - eps / 2) / width)
     below = jax.nn.sigmoid((-offset - eps / 2) / width)
     each = jnp.where(h > 0, above, jnp.where(h < 0, below, 1.0 - above - below))
-    return each[..., 0] if len(space.cues) == 1 else jnp.prod(each, -1, where=said(h))
+    return each[..., 0] if len(space.cues) == 1 else jnp.prod(each, -1, where=is_answered(h))
 
 
 def evidence_of(aims: Aims, space: Space, label: Label, scalars: GuideScalars) -> Evidence:

@@ -4,7 +4,7 @@ A policy's `act` sees many environments at once. Its `axes` say which of its lea
 (`evaluate.rollout_lanes` maps over them); what lanes share is there once.
 """
 
-from cuelearner_jax.policies.final import Arbitrated, acting, arbiter_of, finished
+from cuelearner_jax.policies.final import Arbitrated, acting_state, arbiter_of, final_policy
 from cuelearner_jax.policies.layers import (
     Agent,
     Common,
@@ -21,7 +21,7 @@ from cuelearner_jax.policies.layers import (
     wanted_actions,
 )
 from cuelearner_jax.policies.node import BY_LANE, SHARED, PolicyBlock, PolicyNode, describe, lanes_in, layers
-from cuelearner_jax.policies.opaque import Opaque, acted, in_space, named, policy_of
+from cuelearner_jax.policies.opaque import Opaque, call_policy, in_space, policy_name, policy_of
 from cuelearner_jax.types import Policy
 
 __all__ = [

@@ -54,11 +54,11 @@ class Opaque(PolicyNode):
             if not usable.all():
                 count = f"{(~usable).sum()} of {usable.size}"
                 raise UserError(
-                    f"{named(self)} gave zero or not finite numbers in place of actions, in {count} situations"
+                    f"{policy_name(self)} gave zero or not finite numbers in place of actions, in {count} situations"
                 )
             return chosen
         except UserError as error:
-            user_code.leave(named(self), error)
+            user_code.leave(policy_name(self), error)
             return nothing
 
     def _called(self, rows: np.ndarray) -> np.ndarray:
@@ -67,7 +67,7 @@ class Opaque(PolicyNode):
         try:
             chosen = self.function(flat)
         except Exception as error:
-            raise user_code_error(named(self), error) from error
+            raise user_code_error(policy_name(self), error) from error
         return self._checked(chosen, len(flat), np.asarray).reshape(*rows.shape[:-1], self.actions.size)
 
     def _checked(self, chosen: Any, rows: int, as_array: Callable[..., Any]) -> Any:
@@ -83,15 +83,15 @@ class Opaque(PolicyNode):
             found = as_array(chosen)
         except (TypeError, ValueError) as error:
             raise UserError(
-                f"{named(self)} returned {format_value(chosen)}: return an array of shape {wanted}"
+                f"{policy_name(self)} returned {format_value(chosen)}: return an array of shape {wanted}"
             ) from error
         if getattr(found.dtype, "kind", "key") not in "fiu" and not jnp.issubdtype(found.dtype, jnp.floating):
-            raise UserError(f"{named(self)} returned {found.dtype} numbers: return real ones, of shape {wanted}")
+            raise UserError(f"{policy_name(self)} returned {found.dtype} numbers: return real ones, of shape {wanted}")
         if isinstance(self.actions, Choices) and found.shape == (rows,) and getattr(found.dtype, "kind", "") in "iu":
             return as_array(found[:, None] == np.arange(self.actions.size)).astype(np.float32)
         if found.shape != wanted:
             raise UserError(
-                f"{named(self)} returned actions of shape {found.shape} for {rows} observations: return {wanted}"
+                f"{policy_name(self)} returned actions of shape {found.shape} for {rows} observations: return {wanted}"
             )
         with np.errstate(over="ignore"):
             return found.astype(np.float32)
@@ -101,17 +101,17 @@ class Opaque(PolicyNode):
         return {"policy": "code", "named": _called(self.function)}
 
 
-def acted(
+def call_policy(
     policy: types.Policy, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"], actions: Space
 ) -> Float[Array, "n action"]:
     """A policy's actions, NaN in place of each that is none. Raises UserError if they have another shape."""
     chosen, wanted = jnp.asarray(policy.act(key, states, obs)), (obs.shape[0], actions.size)
     if chosen.shape != wanted:
-        raise UserError(f"{named(policy)} returned actions of shape {chosen.shape}: return {wanted}")
+        raise UserError(f"{policy_name(policy)} returned actions of shape {chosen.shape}: return {wanted}")
     return actions.only_actions(chosen)
 
 
-def named(policy: Any) -> str:
+def policy_name(policy: Any) -> str:
     """A policy for a message: by the user's function or class that acts, below whatever changes its actions."""
     while (below := getattr(policy, "base", None) or getattr(policy, "policy", None)) is not None:
         policy = below

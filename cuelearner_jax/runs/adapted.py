@@ -12,7 +12,7 @@ import numpy as np
 
 from cuelearner_jax import config as configuration
 from cuelearner_jax.adaptation import by_calibration, serialization
-from cuelearner_jax.adaptation.by_model import Adapted
+from cuelearner_jax.adaptation.by_model import AdaptationResult
 from cuelearner_jax.adaptation.judging import SPLIT
 from cuelearner_jax.adaptation.lanes import Lanes
 from cuelearner_jax.environment import actions_of
@@ -134,7 +134,7 @@ def _lanes(told: dict[str, Any], rows: int | None) -> tuple[Lanes, np.ndarray]:
 
 def write(
     place: Place,
-    adapted: Adapted,
+    adapted: AdaptationResult,
     task: Task,
     world: Any,
     origin: dict[str, Any],
@@ -199,7 +199,7 @@ def labels_name(lanes: Lanes, bound_deg: float) -> str:
     return f"labels-{bound_deg:g}deg.parquet" if several else label_files.PARQUET
 
 
-def _write_labels(folder: Path, adapted: Adapted, task: Task, world: Any) -> None:
+def _write_labels(folder: Path, adapted: AdaptationResult, task: Task, world: Any) -> None:
     """One file a bound, with a set a seed: that of the largest budget, of which smaller ones have the first labels."""
     of, lanes = adapted.of, adapted.lanes
     form: AnswerForm | None = of.guidance.form
@@ -215,7 +215,7 @@ def _write_labels(folder: Path, adapted: Adapted, task: Task, world: Any) -> Non
         label_files.write(file, told, form.name, space, eps, lanes.seed[own], sets, form.meaning(space))
 
 
-def _write_curve(folder: Path, name: str, adapted: Adapted, task: Task) -> None:
+def _write_curve(folder: Path, name: str, adapted: AdaptationResult, task: Task) -> None:
     """What the policies were worth after so many labels, as runs keep it of their guides."""
     of = adapted.of
     if not adapted.curve:

@@ -20,7 +20,7 @@ import numpy as np
 from cuelearner_jax import user_code
 from cuelearner_jax.adaptation import by_calibration, by_model, changes, judging, serialization
 from cuelearner_jax.adaptation.by_calibration import Calibrating
-from cuelearner_jax.adaptation.by_model import Adapted
+from cuelearner_jax.adaptation.by_model import AdaptationResult
 from cuelearner_jax.adaptation.judging import Judging
 from cuelearner_jax.adaptation.lanes import Adaptation, begin, one_each, product, side_by_side
 from cuelearner_jax.asking import label_slots
@@ -123,7 +123,7 @@ class Subject(NamedTuple):
 class AdaptedStudy(NamedTuple):
     """What an adaptation has led to, and from what."""
 
-    found: Adapted
+    found: AdaptationResult
     subject: Subject
     request: AdaptRequest
     origin: dict[str, Any]  # what was adapted, in plain values
@@ -357,7 +357,7 @@ def _worth(difference: np.ndarray, steps: np.ndarray) -> str:
     return f"difference {estimate:+.3g} [{lower:+.3g}, {upper:+.3g}]{zero}; {told}"
 
 
-def sentences(found: Adapted) -> list[str]:
+def sentences(found: AdaptationResult) -> list[str]:
     """What adaptation has led to, a line for each budget and bound."""
     if found.results:
         return by_calibration.sentences(found)
