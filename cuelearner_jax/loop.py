@@ -176,7 +176,7 @@ def _program_of(
                 return (lane.advance(clock, settings.schedule), state), metrics
 
             (after, trained), metrics = jax.lax.scan(iteration, (clock, state), length=iterations)
-            return lane.kept_finite(trained, state), after, jax.tree.map(lambda leaf: leaf.mean(0), metrics)
+            return lane.keep_finite(trained, state), after, jax.tree.map(lambda leaf: leaf.mean(0), metrics)
 
         state, after, metrics = each_lane_in_place(run)(state)
         return after, state, metrics
@@ -264,7 +264,7 @@ class Lane(NamedTuple):
         """Labels that were given elsewhere, in place of questions, and the model fitted to them."""
         return asking.with_guide(state, asking.take_labels(self.guidance, env, scalars, labels, state.guide, state.key))
 
-    def kept_finite(self, state: TrainState, before: TrainState) -> TrainState:
+    def keep_finite(self, state: TrainState, before: TrainState) -> TrainState:
         """A lane after a stretch; one that has failed, in it or before, with what it had learned `before`.
 
         Asked once a stretch, not at each gradient step: that would read all parameters once more.

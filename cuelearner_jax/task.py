@@ -83,7 +83,7 @@ class Body:
     # hold; without them (None) of zeros, as far as shapes and views depend on it; None: as `environment` has it
     filled: Callable[[Any, Any, Any], Environment] | None = None
 
-    def shaped(self, config: Any) -> Environment:
+    def shape_environment(self, config: Any) -> Environment:
         """The environment of a configuration, as far as shapes and views depend on it."""
         return self.environment(config, "training") if self.filled is None else self.filled(config, None, None)
 
@@ -104,7 +104,7 @@ class Scenario:
     scalars: dict[str, Any] = field(default_factory=dict)  # fields of `Scalars`
     options: dict[str, Any] = field(default_factory=dict)  # of the kind of guidance: fields of its `Kind.config`
 
-    def applied(self, config: Any) -> Any:
+    def apply(self, config: Any) -> Any:
         """The configuration with the changes in it."""
         return dataclasses.replace(config, **self.changes)
 
@@ -168,7 +168,7 @@ class Task:
                 raise ValueError(f"{called} {verb} {unknown[0]!r}, no field of {group.__name__}")
         try:
             for base in [preset.config.task for preset in self.presets.values()] or [self.plain()]:
-                scenario.applied(base)
+                scenario.apply(base)
         except Exception as error:
             raise ValueError(f"{called} makes no configuration ({error})") from error
 
@@ -176,14 +176,14 @@ class Task:
         """Return the configuration that holds where nothing is given."""
         return self.config() if self.default is None else self.default
 
-    def configured(self, scenario: str | None = None, **changes: Any) -> Any:
+    def configure(self, scenario: str | None = None, **changes: Any) -> Any:
         """The task's configuration in a changed world, with fields changed.
 
         Raises UserError for no such scenario or field, or a value that its field cannot hold.
         """
         config = self.plain()
         if scenario is not None:
-            config = self.scenario(scenario).applied(config)
+            config = self.scenario(scenario).apply(config)
         values = check_types(config, "task", **changes) if changes else {}
         return dataclasses.replace(config, **values)
 
@@ -207,7 +207,7 @@ class Task:
 
     def view(self, config: Any) -> View:
         """What policies look at in a configuration; worlds that no policy looks at are not generated."""
-        make = lambda: self.bodies[0].shaped(config)  # noqa: E731
+        make = lambda: self.bodies[0].shape_environment(config)  # noqa: E731
         if not offers(jax.eval_shape(make), "view"):
             return self.environment(config)
         return jax.jit(lambda: view_of(make()))()
@@ -286,4 +286,4 @@ class Task:
 
 def shape_of(task: Task, config: Any) -> Any:
     """The environment of a configuration with shapes in place of arrays: costs next to nothing."""
-    return jax.eval_shape(lambda: task.bodies[0].shaped(config))
+    return jax.eval_shape(lambda: task.bodies[0].shape_environment(config))

@@ -201,7 +201,7 @@ def opened(folder: Path, study: Study, piece: Piece, scale: Scale, out: Path) ->
     source = source.on(piece.robot)
     assert source.grid is not None
     config = source.config
-    world = config.task if piece.world == UNCHANGED else source.task.scenario(piece.world).applied(config.task)
+    world = config.task if piece.world == UNCHANGED else source.task.scenario(piece.world).apply(config.task)
     own = {name.partition(".")[2]: value for name, value in piece.settings.items() if name.startswith("task.")}
     world = dataclasses.replace(world, **own)
     env = environment(source.task.name, world, "training", piece.robot)

@@ -54,7 +54,7 @@ class CoachedCorrection(dcoach.DeepCoach):
         assert labels.base is not None  # `asking` keeps it for a kind that `sees_base`
         return super().lessons(labels, scalars).replace(action=labels.base)
 
-    def moved_on(
+    def refine_labelled_actions(
         self, model: GuidanceModel, env: Any, labels: Label, active: Bool[Array, " n"], scalars: GuideScalars
     ) -> Refinement:
         """What the corrected policy does where labels (n, ...) are about."""

@@ -119,7 +119,7 @@ def _stretch(
             return (lane.advance(clock, own.schedule), state), metrics["reward"]
 
         (after, trained), rewards = jax.lax.scan(iteration, (clock, tuned.state), length=iterations)
-        return tuned.replace(state=lane.kept_finite(trained, tuned.state)), after, rewards.mean()
+        return tuned.replace(state=lane.keep_finite(trained, tuned.state)), after, rewards.mean()
 
     return each_lane_in_place(one)(block)
 

@@ -81,7 +81,7 @@ def world_of(task: Any, name: str, own: Any, scalars: Scalars, split: str, fault
     """The world of a scene, its teacher, and answers as its scenario has them; `faults`: of the teacher."""
     scenario, more = SCENES.get(name, (LIKE[task.name], {}))
     rules = task.scenario(scenario)
-    applied = dataclasses.replace(rules.applied(own), **more)
+    applied = dataclasses.replace(rules.apply(own), **more)
     config = dataclasses.replace(own, **({"teacher": applied.teacher} if task.name == "billiards" else {}))
     config = config if name == UNCHANGED else applied
     scalars = dataclasses.replace(settling(scalars, rules.eps_deg), **{**rules.scalars, **faults})

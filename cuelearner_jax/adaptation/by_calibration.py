@@ -192,7 +192,7 @@ def _judged(
         unknown, none = np.full((lanes.number, 3), np.nan), np.zeros(lanes.number, int)
         judged = Judgement(LABELS, before, after, corrects, lanes.bound_deg, unknown, none)
     else:
-        judged, _ = judge.judged(block)
+        judged, _ = judge.judge_lanes(block)
     theta = jnp.where(jnp.asarray(judged.used)[:, None], block.theta, 0.0)
     return AdaptationResult(of, lanes, block.replace(theta=theta), judged, judge.curve, results)
 

@@ -92,7 +92,7 @@ def adapt(
     if labels is not None:
         labels = jax.tree.map(lambda leaf: jnp.asarray(leaf)[filled], labels)
     block = learn_lanes(of, lanes.rows(filled), teacher, labels, mesh, watch, judge.measure_if_due)
-    judged, block = judge.judged(block)
+    judged, block = judge.judge_lanes(block)
     model = block.guide.model  # one that is not used leaves actions alone
     block = block.replace(
         guide=block.guide.replace(model=model.replace(fitted=model.fitted & jnp.asarray(judged.used)))

@@ -98,7 +98,7 @@ class Judge:
         if self.how.every and asked % self.how.every == 0:
             self.measure(block)
 
-    def judged(self, block: Any) -> tuple[Judgement, Any]:
+    def judge_lanes(self, block: Any) -> tuple[Judgement, Any]:
         """What is used of the finished lanes, and these within the bounds that are used.
 
         Raises UserError if there is no such metric, or labels cannot judge.
@@ -193,7 +193,7 @@ def _predicted(of: Adaptation, block: LaneState) -> tuple[Array, Array]:
         held = labels.valid & (jnp.arange(labels.valid.shape[0]) % HELD_OUT == HELD_OUT - 2)
         others = labels.replace(valid=labels.valid & ~held)
         model = guidance.fit(key, env, others, guidance.init(key), of.scalars)
-        moved = guidance.moved_on(model, env, labels, held, one_pass).actions
+        moved = guidance.refine_labelled_actions(model, env, labels, held, one_pass).actions
         moves = space.log(labels.action, moved) / space.from_unit(of.scalars.eps_deg)
         told = (
             is_answered(labels.answer) & held[:, None]

@@ -100,7 +100,7 @@ def make(name: str | Task, *, scenario: str | None = None, robot: str | None = N
     task = arguments.instance("name", task, Task, "the name of a task, or a task")
     task = task.on(arguments.optional(arguments.text, "robot", robot))
     arguments.optional(arguments.text, "scenario", scenario)
-    return World(task, task.configured(scenario, **changes), scenario)
+    return World(task, task.configure(scenario, **changes), scenario)
 
 
 @user_code.report_user_errors

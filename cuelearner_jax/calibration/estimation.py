@@ -262,7 +262,7 @@ class Calibration:
             raise UserError(f"{self.asked} answers tell too little: give at least {HELD_OUT}")
         self._settle()
         best, none = self.fits[self.chosen], self.fits[()]
-        before, after = none.predicted(), best.predicted()
+        before, after = none.predict_held_out(), best.predict_held_out()
         gain = after - before
         holds = bool(best.family) and gain.mean() > 0
         if not holds:

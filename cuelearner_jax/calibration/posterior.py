@@ -254,7 +254,7 @@ class Fit:
         joint = self.log_likelihood + self.log_origin[:, None]
         return np.exp(logsumexp(joint, axis=0) - logsumexp(joint))
 
-    def predicted(self) -> Float[Floats, " n"]:
+    def predict_held_out(self) -> Float[Floats, " n"]:
         """Return the logarithm of the probability of each answer, given those of the other four fifths."""
         log_each = self._log_each(*self._offsets(self.theta), summed=False)
         count = log_each.shape[1]

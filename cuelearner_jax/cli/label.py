@@ -116,7 +116,7 @@ def run(arguments: list[str]) -> None:
     changed = task.scenario(scenario) if scenario else None
     source = _source(task, named, taken(rest, "--changes", "package.module:NAME")[0])
     world = source.config.task if source else preset.config.task
-    world = changed.applied(world) if changed else world
+    world = changed.apply(world) if changed else world
     if (cues := taken(rest, "--cues", WORDS)[0]) is not None:
         world = with_cues(task, world, cues)
     by_evidence = _reads_evidence(rest)

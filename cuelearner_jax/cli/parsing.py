@@ -284,7 +284,7 @@ def world_of(source: PolicySource, arguments: list[str]) -> Any:
         UserError: there is no such scenario.
     """
     name, _ = taken(arguments, "--scenario", ", ".join(source.task.scenarios) or "none")
-    return source.config.task if name is None else source.task.scenario(name).applied(source.config.task)
+    return source.config.task if name is None else source.task.scenario(name).apply(source.config.task)
 
 
 def about(kind: type, task: Task, policies: bool = False, preset: str = PAPER) -> str:

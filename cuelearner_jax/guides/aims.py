@@ -55,7 +55,7 @@ class AnyAim(Untaught):
         """log-weights of a situation's aims: the same for all."""
         return jnp.zeros(len(aims.possible))
 
-    def weighed(self, env: Any, obs: Float[Array, " obs"]) -> tuple[Aims, Float[Array, " aims"]]:
+    def aim_weights(self, env: Any, obs: Float[Array, " obs"]) -> tuple[Aims, Float[Array, " aims"]]:
         """A situation's aims, and their log-weights: minus infinity of those that may not be followed."""
         aims = env.aims(obs)
         return aims, jnp.where(open_aims(aims).possible, self.preference(env, obs, aims), -jnp.inf)
@@ -73,7 +73,7 @@ class AnyAim(Untaught):
         scalars: GuideScalars,
     ) -> Float[Array, " m"]:
         """log of the density of actions (`log_density`), where "none of the aims" weighs as much as one of them."""
-        aims, weights = self.weighed(env, obs)
+        aims, weights = self.aim_weights(env, obs)
         share = jax.nn.softmax(jnp.append(weights, 0.0))
         return log_density(self.spaces.actions, aims.actions, share, actions)
 
@@ -89,7 +89,7 @@ class AnyAim(Untaught):
         """Of the aims with the largest weight the nearest in active rows; where there is none, the action itself."""
 
         def one(obs: Array, action: Array) -> tuple[Array, Array]:
-            aims, weights = self.weighed(env, obs)
+            aims, weights = self.aim_weights(env, obs)
             off = self.spaces.actions.distance(action[None], aims.actions)
             index = jnp.argmin(jnp.where(weights >= weights.max(), off, jnp.inf))
             return aims.actions[index], weights.max() > -jnp.inf

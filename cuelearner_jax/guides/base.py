@@ -233,7 +233,7 @@ class Guide:
         """Variance of an ensemble's members, summed over their outputs."""
         return self.network.disagreement(env, model.params, obs, actions)
 
-    def moved_on(
+    def refine_labelled_actions(
         self, model: GuidanceModel, env: Any, labels: Label, active: Bool[Array, " n"], scalars: GuideScalars
     ) -> Refinement:
         """What `act` makes of the actions that labels (n, ...) are about."""

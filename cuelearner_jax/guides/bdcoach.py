@@ -73,13 +73,13 @@ class BatchCoach(DeepCoach):
 
         return GuidanceModel(for_each(self.sizes.ensemble, begin, key), jnp.array(False))
 
-    def modelled(self, env: Any, human: Params, rows: Lesson, scalars: GuideScalars) -> Array:
+    def human_loss(self, env: Any, human: Params, rows: Lesson, scalars: GuideScalars) -> Array:
         """Return the loss of the human model: what it says of the actions asked about, beside what was answered."""
         eps = self.spaces.actions.from_unit(scalars.eps_deg)
         answered = rows.replace(target=(rows.target - rows.action) / eps)
         return jnp.mean(squared_errors(answered, self.member.network.predict(env, human, rows.obs, rows.action)))
 
-    def wanted(self, env: Any, human: Params, rows: Lesson, acted: Array, scalars: GuideScalars) -> Lesson:
+    def policy_targets(self, env: Any, human: Params, rows: Lesson, acted: Array, scalars: GuideScalars) -> Lesson:
         """Return rows whose targets are what the human model makes of what the policy does there, in all cues."""
         space = self.spaces.actions
         eps, does = space.from_unit(scalars.eps_deg), space.retract(acted)
@@ -101,7 +101,7 @@ class BatchCoach(DeepCoach):
             return jax.tree.map(lambda leaf: leaf[order[numbers]], (rows, answered))
 
         def taught(coached: BatchCoached, batch: Lesson) -> BatchCoached:
-            gradient = jax.grad(lambda human: self.modelled(env, human, batch, scalars))(coached.human)
+            gradient = jax.grad(lambda human: self.human_loss(env, human, batch, scalars))(coached.human)
             updates, state = adam.update(gradient, coached.human_optimizer, coached.human)
             return coached.replace(human=optax.apply_updates(coached.human, updates), human_optimizer=state)
 
@@ -111,7 +111,7 @@ class BatchCoach(DeepCoach):
 
             def loss(policy: Params) -> Array:
                 acted = self.member.predict(env, policy, seen.obs, seen.action)
-                targets = self.wanted(env, coached.human, seen, acted, scalars)
+                targets = self.policy_targets(env, coached.human, seen, acted, scalars)
                 keep = lambda one, other: jnp.where(own[:, None], one, other)  # noqa: E731
                 target, said = keep(seen.target, targets.target), seen.said
                 said = None if said is None else keep(said, targets.said)

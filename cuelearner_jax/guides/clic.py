@@ -168,7 +168,7 @@ class Clic(Guide):
         """Return E of actions in one situation; whatever the policy did there (`base`), it is the same."""
         return -self.network.predict(env, params, obs, actions)[:, 0]
 
-    def around(self, row: Contrast, scalars: GuideScalars) -> Float[Array, " action"]:
+    def target_action(self, row: Contrast, scalars: GuideScalars) -> Float[Array, " action"]:
         """Return what a label says would be better than the action asked about."""
         space = self.spaces.actions
         return space.toward(row.action, row.answer, space.from_unit(scalars.eps_deg))
@@ -183,12 +183,12 @@ class Clic(Guide):
         implicit = jax.vmap(lambda key: direction_at(key, row.answer, angle))(keys)
         return SHARPNESS * jax.vmap(lambda x: log_desired(x, row.answer, implicit, options.gamma))(x)
 
-    def sampled(self, key: PRNGKeyArray, row: Contrast, scalars: GuideScalars) -> Float[Array, "m action"]:
+    def sample_actions(self, key: PRNGKeyArray, row: Contrast, scalars: GuideScalars) -> Float[Array, "m action"]:
         """Return the actions among which one label's are told apart: two known ones, uniform ones, and ones near a."""
         space, count = self.spaces.actions, self.options.sampled_actions - 2
         k_any, k_near = jax.random.split(key)
         change = NEAR * space.from_unit(scalars.eps_deg) * jax.random.normal(k_near, (count // 2, len(space.cues)))
-        known = jnp.stack([row.action, self.around(row, scalars)])
+        known = jnp.stack([row.action, self.target_action(row, scalars)])
         near = space.exp(jnp.broadcast_to(row.action, (count // 2, space.size)), change)
         return jnp.concatenate([known, space.sample(k_any, (count - count // 2,)), near])
 
@@ -197,7 +197,7 @@ class Clic(Guide):
 
         def one(row: Contrast) -> Array:
             k_pairs, k_sample = jax.random.split(jax.random.fold_in(jax.random.key(0), row.draw))
-            actions = self.sampled(k_sample, row, scalars)
+            actions = self.sample_actions(k_sample, row, scalars)
             log_pi = jax.nn.log_softmax(-self.energy(env, params, row.obs, actions, row.base, scalars))
             return -jax.nn.logsumexp(log_pi + self.membership(k_pairs, row, actions, scalars))
 
@@ -206,9 +206,11 @@ class Clic(Guide):
     def contrasts(self, labels: Label) -> Contrast:
         """Return what is learned of labels (slots, ...); one that says nothing of any cue does not count."""
         numbers, base = jnp.arange(len(labels.valid)), labels.action if labels.base is None else labels.base
-        return Contrast(labels.obs, labels.action, labels.answer, labels.valid & self.told(labels), numbers, base)
+        return Contrast(
+            labels.obs, labels.action, labels.answer, labels.valid & self.informative(labels), numbers, base
+        )
 
-    def told(self, labels: Label) -> Bool[Array, " slots"]:
+    def informative(self, labels: Label) -> Bool[Array, " slots"]:
         """Return which labels say anything."""
         return is_answered(labels.answer).any(-1) if len(self.spaces.actions.cues) > 1 else jnp.ones_like(labels.valid)
 
@@ -226,7 +228,7 @@ class Clic(Guide):
         rows, sizes = self.contrasts(labels), self.sizes
         return fit_model(key, rows, scalars, init=self.network.init, losses=losses, sizes=sizes, redrawn=redrawn)
 
-    def least(
+    def minimise_energy(
         self,
         env: Any,
         params: Params,
@@ -269,7 +271,7 @@ class Clic(Guide):
 
         def choose(where: Array) -> Array:
             seen, base = jnp.split(where, [obs.shape[1]])
-            return self.least(env, model.params, seen, base, scalars)
+            return self.minimise_energy(env, model.params, seen, base, scalars)
 
         chosen = each_in_portions(choose, jnp.concatenate([obs, actions], -1), self.options.searched_actions)
         return Refinement(jnp.where(guided[:, None], chosen, actions), guided.astype(jnp.int32))
@@ -289,11 +291,11 @@ class Clic(Guide):
 class ClicShown(Clic):
     """A guide that learns from what a teacher shows in place of an action, by a set around what is shown."""
 
-    def around(self, row: Contrast, scalars: GuideScalars) -> Float[Array, " action"]:
+    def target_action(self, row: Contrast, scalars: GuideScalars) -> Float[Array, " action"]:
         """Return what was shown."""
         return row.answer
 
-    def told(self, labels: Label) -> Bool[Array, " slots"]:
+    def informative(self, labels: Label) -> Bool[Array, " slots"]:
         """Return all labels: each shows an action."""
         return jnp.ones_like(labels.valid)
 

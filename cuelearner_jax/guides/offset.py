@@ -195,7 +195,7 @@ class Offset(Relative):
         """The refinement of a policy's own actions."""
         return self.onward(model, env, obs, actions, actions, active, scalars)
 
-    def moved_on(
+    def refine_labelled_actions(
         self, model: GuidanceModel, env: Any, labels: Label, active: Bool[Array, " n"], scalars: GuideScalars
     ) -> Refinement:
         """The refinement of the actions that labels (n, ...) are about, from what the policy did there."""

@@ -14,7 +14,7 @@ from cuelearner_jax.arbiters.protocol import Finishes
 from cuelearner_jax.environment import actions_of, offers, spaces_of, view_of
 from cuelearner_jax.errors import UserError, format_numbers, suggestion
 from cuelearner_jax.guides import registry as guidances
-from cuelearner_jax.policies import Corrected, Guided, Heuristic, Policy, Taught, arbiter_of, final, uniform_in
+from cuelearner_jax.policies import Corrected, Guided, Heuristic, Policy, Taught, arbiter_of, final_policy, uniform_in
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs.adapted import AdaptedLanes, open_folder
 from cuelearner_jax.runs.failures import without_failed
@@ -81,7 +81,7 @@ def make(
         assert adapted is not None
         return adapted.policy(view) if name == "adapted" else adapted.base(view)
     assert lanes is not None
-    agent = final(config, lanes.guidance, view, lanes.step, lanes.policies)
+    agent = final_policy(config, lanes.guidance, view, lanes.step, lanes.policies)
     if name == "agent":
         return agent
     if name == "corrected":

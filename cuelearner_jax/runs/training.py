@@ -16,7 +16,7 @@ from cuelearner_jax.devices import BY_LANE, SHARED, place
 from cuelearner_jax.environment import Environment, view_of
 from cuelearner_jax.evaluate import Tell, episodes, ignore_progress
 from cuelearner_jax.loop import Clock, TrainState, start_clock
-from cuelearner_jax.policies import Guided, PolicyBlock, acting_state, final, uniform_in
+from cuelearner_jax.policies import Guided, PolicyBlock, acting_state, final_policy, uniform_in
 from cuelearner_jax.runs.judging import Returns, judges_envs, judges_episodes, scores
 from cuelearner_jax.runs.lanes import LaneGroup
 from cuelearner_jax.storage import label_files
@@ -167,13 +167,13 @@ class Training:
             acting_state(self.group.arbiter, lane.agent.params, lane.guide.model, lane.arbiter) for lane in self.blocks
         ]
         joined = jax.tree.map(lambda *leaves: np.concatenate([np.asarray(leaf) for leaf in leaves]), *known)
-        return final(self.group.config, self.group.guidance, view, self.step, joined)
+        return final_policy(self.group.config, self.group.guidance, view, self.step, joined)
 
     def _policy(self, lane: TrainState, view: Any, **arm: Any) -> PolicyBlock:
         """A block's finished policies; `arm`: the one by which all lanes act, in place of that which validated best."""
         group = self.group
         known = {**acting_state(group.arbiter, lane.agent.params, lane.guide.model, lane.arbiter), **arm}
-        return final(group.config, group.guidance, view, self.step, known)
+        return final_policy(group.config, group.guidance, view, self.step, known)
 
     def _judge(self) -> dict[str, np.ndarray]:
         """Let the arm that validates best act in each lane; columns (lanes,): its number, and the scores of all."""

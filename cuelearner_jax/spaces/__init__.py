@@ -21,7 +21,7 @@ __all__ = [
     "check_directions",
     "cues_from",
     "from_json",
-    "said",
+    "is_answered",
 ]
 
 

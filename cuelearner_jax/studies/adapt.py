@@ -186,7 +186,7 @@ def suggested(
     by = judging.LABELS if kind.by_evidence else source.task.judge_by(source.config.task)
     own = source.config.kinds.get(kind.name) or (kind.config and kind.config())
     return AdaptRequest(
-        task=rules.applied(source.config.task),
+        task=rules.apply(source.config.task),
         labels=labels,
         bound_deg=() if rules.bound_deg is None else (rules.bound_deg,),
         guidance=guidance or rules.guidance or AdaptRequest.guidance,

@@ -86,8 +86,9 @@ class GymnasiumConfig:
         rows = self.slices, self.slice_sizes, self.units, self.slice_kinds
         if not self.slices or len({len(row) for row in rows}) > 1 or not all(size > 0 for size in self.slice_sizes):
             raise UserError(
-                f"task.slices is {format_value(self.slices)} of task.slice_sizes {format_value(self.slice_sizes)}: give a name, a "
-                f"size, a unit and a kind for each slice, or name the task {FAMILY}:ENVIRONMENT, which fills them"
+                f"task.slices is {format_value(self.slices)} of task.slice_sizes {format_value(self.slice_sizes)}: give "
+                f"a name, a size, a unit and a kind for each slice, or name the task {FAMILY}:ENVIRONMENT, which fills "
+                "them"
             )
         known = {quantity.name: quantity.about for quantity in fetch_layout.layout_of(self.environment) or ()}
         return tuple(
@@ -105,8 +106,8 @@ def space_of(actions: Actions, cues: Sequence[str] = (), cue_names: Sequence[str
     if actions.choices:
         if cues:
             raise UserError(
-                f"cues is {format_value(tuple(cues))}, but actions are choices without an order: leave it out, and choose a "
-                "guidance without relative answers"
+                f"cues is {format_value(tuple(cues))}, but actions are choices without an order: leave it out, and "
+                "choose a guidance without relative answers"
             )
         return Choices(actions.choices)
     if cues and len(cues) != actions.size:
@@ -234,7 +235,8 @@ def task_from(
     factory = None if isinstance(given, str) else given
     if factory is not None and not callable(factory):
         raise UserError(
-            f"env is {format_value(given)}: give an id of Gymnasium's registry, or a class or function that gives environments"
+            f"env is {format_value(given)}: give an id of Gymnasium's registry, or a class or function that "
+            "gives environments"
         )
     name = given if isinstance(given, str) else called or _called(given)
     if factory is None and not max_steps:

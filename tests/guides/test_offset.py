@@ -75,7 +75,7 @@ def test_a_constant_miss_is_known_everywhere_from_forty_answers_a_fifth_of_them_
     # One pass from an action that was turned already is not one from an action of the base's own.
     there = jax.tree.map(lambda leaf: leaf[:4], labels.replace(action=directions.rotate(base, -jnp.deg2rad(60.0))))
     once = dataclasses.replace(SCALARS, k_max=1)
-    back = BUNDLE.moved_on(model, ENV, there, jnp.ones(4, bool), once).actions
+    back = BUNDLE.refine_labelled_actions(model, ENV, there, jnp.ones(4, bool), once).actions
     assert (np.asarray(directions.difference(there.action, back)) > 0).all()
 
 
