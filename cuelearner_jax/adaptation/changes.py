@@ -1,4 +1,4 @@
-"""What may have changed: derived from what a world declares, or distortions of the user's own."""
+"""The changes that calibration considers: derived from a world's declarations, or the user's own distortions."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from cuelearner_jax.calibration.families import (
 from cuelearner_jax.environment import Environment, actions_of
 from cuelearner_jax.errors import UserError, format_value
 
-SITUATIONS = 8  # in which no change must change nothing
-SAME = 1e-4  # by which an entry may differ then
+SITUATIONS = 8  # situations in which distortions at zero are checked to change nothing
+SAME = 1e-4  # largest difference of an entry in that check
 
 
 def load(reference: str) -> Any:
-    """Return the changes that `package.module:NAME` leads to. Raises UserError if there are none."""
+    """Return the changes that `package.module:NAME` names. Raises UserError if the object is not a distortion."""
     found = plugins.load(reference, object, "changes of the world")
     if not (isinstance(found, Distortion | list | tuple) or callable(found)):
         raise UserError(f"{reference} is {format_value(found)}: {WANTED}")
@@ -38,7 +38,7 @@ WANTED = "give a cuelearner_jax.Distortion, several, or a function of the enviro
 
 
 def family_of(given: Any, env: Any) -> Family:
-    """Return distortions that a user gives.
+    """Return the family of a user's distortions.
 
     Args:
         given: a distortion, a list of them, or a function of the environment that returns one of these.
@@ -56,7 +56,7 @@ def family_of(given: Any, env: Any) -> Family:
 
 
 def check_acts(family: Family, env: Environment) -> None:
-    """Raises UserError unless distortions fit a world, and change nothing where their unknowns are zero."""
+    """Raise UserError unless distortions fit a world, and change nothing where their unknowns are zero."""
     k_reset, k_action = jax.random.split(jax.random.key(0))
     space, keys = actions_of(env), jax.random.split(k_reset, SITUATIONS)
     obs, actions = jax.vmap(env.reset)(keys)[1], space.sample(k_action, (SITUATIONS,))
@@ -74,7 +74,7 @@ def check_acts(family: Family, env: Environment) -> None:
 
 
 def rebuilt(layer: dict[str, Any], env: Any, changes: Any = None) -> Family:
-    """Return the distortions of a stored policy.
+    """Return the distortions of a policy that was read from a file.
 
     Args:
         layer: what the file says of the policy.

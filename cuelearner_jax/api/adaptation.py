@@ -1,4 +1,4 @@
-"""Adaptation from Python: what `cuelearner adapt` does, with a policy to call as its result."""
+"""Adaptation from Python: what `cuelearner adapt` does. The result is a policy to call."""
 
 from __future__ import annotations
 
@@ -34,58 +34,59 @@ from cuelearner_jax.types import Label, Teacher
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class AdaptedPolicy(CallablePolicy):
-    """A policy under a feedback model, within a bound, or behind what changed in its world (guidance "calibration");
-    or the policy as it was, where neither is `used`."""
+    """A corrected policy: its base under a feedback model within a bound, or corrected for estimated changes.
+
+    Where `used` is False, it acts as its base.
+    """
 
     outcome: AdaptedStudy
     named: str | None  # the base, as Python calls it; None: its world has no name either
 
     @property
     def used(self) -> bool:
-        """Is the model used? Not if it made the policy worse, or where calibration finds no change."""
+        """Whether the correction is used. It is not if it made the policy worse, or calibration found no change."""
         return bool(self.outcome.found.judged.used[0])
 
     @property
     def judged(self) -> tuple[str, float, float]:
-        """(metric, before, after): what the policy was worth on the tuning episodes, and what the model makes of it."""
+        """The metric's name, and its value before and after the correction, on tuning episodes or held-out labels."""
         of = self.outcome.found.judged
         return of.by, float(of.before[0]), float(of.after[0])
 
     @property
     def difference(self) -> tuple[float, float, float]:
-        """After less before, and the ends of its 95% interval over the tuning episodes; nan where labels judge."""
+        """The metric after less before, and its 95% interval over the tuning episodes; NaN where labels judge."""
         estimate, lower, upper = (float(value) for value in self.outcome.found.judged.difference[0])
         return estimate, lower, upper
 
     @property
     def rewarded_steps(self) -> int:
-        """Environment steps whose rewards or outcomes decided whether the model is used; 0 where labels judge."""
+        """Number of environment steps whose rewards decided whether the correction is used; 0 where labels judge."""
         return int(self.outcome.found.judged.rewarded_steps[0])
 
     @property
     def labels(self) -> Labels:
-        """What was answered (of relative feedback)."""
+        """The labels so far (relative feedback)."""
         return labels_of(jax.tree.map(lambda leaf: leaf[0], self.outcome.found.labels))
 
     @property
     def result(self) -> Result | None:
-        """What calibration found: its verdict, and an estimate with its interval of each unknown; None: a model was
-        fitted."""
+        """The verdict of calibration and its estimates with intervals. None where a feedback model was fitted."""
         return next(iter(self.outcome.found.results), None)
 
     @property
     def estimates(self) -> tuple[Estimate, ...]:
-        """Of each unknown of calibration (name, unit, mean, low, high, changed); empty: a model was fitted."""
+        """Calibration's estimates (name, unit, mean, low, high, changed). Empty where a feedback model was fitted."""
         return self.result.estimates if self.result else ()
 
     @property
     def words(self) -> list[str]:
-        """What `cuelearner adapt` prints of it, line by line."""
+        """The lines that `cuelearner adapt` prints of this result."""
         return study.sentences(self.outcome.found)
 
     @user_code.report_user_errors
     def save(self, folder: str | Path, overwrite: bool = False) -> None:
-        """Writes a policy folder, as `cuelearner adapt` does; `load_policy` and every command take it.
+        """Write a policy folder, as `cuelearner adapt` does. `load_policy` and every command read it.
 
         Raises UserError if the folder is in use, or the policy was adapted in no world that can be named.
         """
@@ -119,14 +120,14 @@ def adapt(
     judge_bounds: Sequence[float] | None = None,
     changes: Any = None,
 ) -> AdaptedPolicy:
-    """Corrects a finished policy by labels about what it does in a (changed) world: what `cuelearner adapt` does.
+    """Correct a finished policy by labels about its actions in a (changed) world, as `cuelearner adapt` does.
 
     Labels are asked for in rounds, about actions refined by the model so far (DAgger), within a bound of the policy's
     own. A model that makes the policy worse than it was, on tuning episodes of the world, is not used, with a warning.
-    What is left out is as the world's scenario suggests, or else as for any world.
+    Arguments that are left out follow the world's scenario, else the defaults of `cuelearner adapt`.
 
     Args:
-        policy: what is to be corrected: a policy, or any function of a batch of observations (NumPy in, NumPy out; one
+        policy: the policy to correct: a policy, or any function of a batch of observations (NumPy in, NumPy out; one
             that `jax.jit` made is compiled in).
         world: where it acts; a bare environment will do.
         teacher: who answers: a teacher, or a function of observations (NumPy in, NumPy out) or another policy, which
@@ -142,7 +143,7 @@ def adapt(
         seed: of everything random.
         judge_by: the metric by which it is judged, or "labels": by the prediction of held-out ones (default: the
             scenario's, or "reward"; of calibration "labels").
-        judge_episodes: that many tuning episodes, each of 100 steps where the task does not count episodes.
+        judge_episodes: number of tuning episodes, each of 100 steps where the task does not count episodes.
         judge_bounds: shares of the bound, such as (0.5, 0.25), within which the model is tried on these episodes too;
             it is used within what is worth most (default: the scenario's, or none).
         changes: of guidance "calibration": what may have changed, as `Distortion`s of your own, or a function of the
@@ -197,7 +198,7 @@ def adapt(
 
 
 def _source(policy: Any, world: Any) -> PolicySource:
-    """Where a policy comes from: its task, and what it was trained with. Raises UserError for what is no world."""
+    """Return a world's task and the configuration of its training. Raises UserError for an object that is no world."""
     if isinstance(world, World):
         return source_of(policy, world)
     if hasattr(world, "observation_space"):
@@ -211,11 +212,11 @@ def _source(policy: Any, world: Any) -> PolicySource:
 
 @dataclasses.dataclass(frozen=True)
 class _Bare:
-    """The configuration of a bare environment: none."""
+    """The empty configuration of a bare environment."""
 
 
 def _given(labels: Any, world: Any) -> tuple[int | None, Path | None, Label | None]:
-    """Labels as a number of questions, as a file, or as rows (labels, ...). Raises UserError for others."""
+    """Return labels as a number of questions, as a file, or as rows (labels, ...). Raises UserError for others."""
     if isinstance(labels, str | os.PathLike):
         path = label_path(labels)
         if isinstance(world, World):
@@ -234,7 +235,7 @@ def _shares(name: str, given: Any) -> tuple[float, ...]:
 
 
 def _called(policy: Any) -> str:
-    """How Python calls a policy."""
+    """Return a policy's name in Python."""
     inner = as_policy(policy)
     inner = getattr(inner, "function", inner)
     name = getattr(inner, "__qualname__", type(inner).__qualname__)

@@ -1,4 +1,4 @@
-"""Evaluation from Python: what `cuelearner evaluate` measures, of any policy."""
+"""Evaluation from Python: what `cuelearner evaluate` measures, for any policy."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def measure(
         engine: other physics that the world's robot has (default: its own).
 
     Returns:
-        `metrics`: a mean (1,) by name; `each`: the values (1, envs) of the environments by name.
+        `metrics`: the mean (1,) of each metric by name; `each`: the environments' values (1, envs) of each metric.
 
     Raises:
         UserError: a policy that cannot act there, or amounts that make no sense.

@@ -1,6 +1,6 @@
-"""A feedback model of one's own labels, and policies refined by it: in rounds and within a bound by default.
+"""Fit a feedback model to labels, and refine policies by it, by default in rounds and within a bound.
 
-A model knows the actions that it was shown. Labels about a policy's own actions alone say nothing of what refinement
+A model knows only the actions in its labels. Labels about a policy's own actions alone say nothing of what refinement
 then leads to; followed far, such a model makes the policy worse without a word. So `ask` questions in rounds, about
 actions refined by the model so far (DAgger), and `refine` goes no farther than labels reach unless it is told to.
 """
@@ -40,7 +40,7 @@ from cuelearner_jax.types import GuidanceModel, Label, Teacher
 
 
 class Labels(NamedTuple):
-    """Labels as arrays: what was seen, the action asked about, and the answer."""
+    """Labels as arrays: observations, the actions asked about, and the answers."""
 
     obs: Float[np.ndarray, "labels obs"]
     action: Float[np.ndarray, "labels action"]  # directions: unit vectors
@@ -57,9 +57,9 @@ class FeedbackModel:
     model: GuidanceModel
     scalars: Scalars  # eps of the labels, and how actions are refined
     labels: Labels
-    sizes: GuideSizes  # that the guidance was made with
+    sizes: GuideSizes  # sizes that the guide was made with
     space: Space = DIRECTIONS  # of the actions
-    env: Any = None  # says how an observation looks from an action; nobody asks it in the raw frame
+    env: Any = None  # provides `features`, which the raw frame does not use
 
 
 @user_code.report_user_errors
@@ -72,7 +72,7 @@ def fit_feedback(
     scalars: Scalars | None = None,
     seed: int = 0,
 ) -> FeedbackModel:
-    """Fits a feedback model to relative labels (paper, Eq. 3).
+    """Fit a feedback model to relative labels (paper, Eq. 3).
 
     Args:
         labels: arrays, or a label file (its first seed's).
@@ -127,10 +127,10 @@ def ask(
     scalars: Scalars | None = None,
     seed: int = 0,
 ) -> FeedbackModel:
-    """Asks a teacher about a policy's actions in rounds, each about actions refined by the model so far (DAgger).
+    """Ask a teacher about a policy's actions in rounds, each about actions refined by the model so far (DAgger).
 
     Args:
-        policy: what is to be corrected: a policy, or any function of a batch of observations in NumPy.
+        policy: the policy to correct: a policy, or any function of a batch of observations in NumPy.
         world: where it acts.
         teacher: who answers; a function of observations, or another policy, teaches what it does itself.
         labels: number of questions.
@@ -165,7 +165,7 @@ def ask(
 
 
 def labels_of(rows: Label) -> Labels:
-    """A lane's labels that count, as arrays."""
+    """Return a lane's valid labels as arrays."""
     given = jax.device_get(rows)
     obs, action, answer = (np.asarray(part)[given.valid] for part in (given.obs, given.action, given.answer))
     return Labels(obs, action, answer[:, 0] if answer.shape[1] == 1 else answer)
@@ -173,7 +173,7 @@ def labels_of(rows: Label) -> Labels:
 
 @user_code.report_user_errors
 def refine(policy: Any, model: FeedbackModel, bound_deg: float | None = None) -> CallablePolicy:
-    """A policy's actions refined by a feedback model, within a bound (paper, Eqs. 2 to 5).
+    """Return a policy whose actions are refined by a feedback model, within a bound (paper, Eqs. 2 to 5).
 
     Args:
         policy: as for `ask`.
@@ -208,7 +208,7 @@ def refine(policy: Any, model: FeedbackModel, bound_deg: float | None = None) ->
 
 
 def _checked_model(model: FeedbackModel) -> FeedbackModel:
-    """A model whose parts are of their kinds. Raises UserError for any other."""
+    """Return a model whose parts are of the right types. Raises UserError for any other."""
     for name, kind in (("guidance", Guide), ("scalars", Scalars), ("labels", Labels), ("model", GuidanceModel)):
         arguments.instance(f"model.{name}", getattr(model, name), kind, "a model as cl.ask and cl.fit_feedback give it")
     return model
@@ -217,7 +217,7 @@ def _checked_model(model: FeedbackModel) -> FeedbackModel:
 def check_settings(
     space: Space, sizes: Any, scalars: Any, eps_deg: Any
 ) -> tuple[GuideSizes | None, Scalars | None, float | None]:
-    """These arguments as they are, each of them one of its kind or None. Raises UserError for the first that is not."""
+    """Return the arguments as given. Raises UserError for the first that is neither of its type nor None."""
     return (
         arguments.optional(arguments.settings, "sizes", sizes, GuideSizes),
         arguments.optional(arguments.settings, "scalars", scalars, Scalars),
@@ -226,7 +226,7 @@ def check_settings(
 
 
 def label_path(labels: Any) -> Path:
-    """The path of a label file. Raises UserError where nothing lies there."""
+    """Return the path of a label file. Raises UserError if no file lies there."""
     path = arguments.path("labels", labels)
     if not path.exists():
         raise UserError(f"labels: there is no label file at {path}: give one that a run or a person wrote, or arrays")
@@ -236,14 +236,17 @@ def label_path(labels: Any) -> Path:
 def settings(
     space: Space, sizes: GuideSizes | None, scalars: Scalars | None, eps_deg: float | None
 ) -> tuple[GuideSizes, Scalars]:
-    """Sizes and scalars, by default those of `by_model`. Raises UserError for what cannot work."""
+    """Return sizes and scalars, by default those of `by_model`. Raises UserError for values that cannot work."""
     sizes, scalars = sizes or by_model.SIZES, by_model.settling(scalars or by_model.plain_scalars(space), eps_deg)
     check_guide(sizes, scalars)
     return sizes, scalars
 
 
 def rows_of(labels: Any) -> Label:
-    """Labels of finite floats as rows (labels, ...). Raises UserError if they are not three arrays of one length."""
+    """Return labels as rows (labels, ...) of finite floats.
+
+    Raises UserError unless they are three arrays of one length.
+    """
     if not isinstance(labels, tuple) or len(labels) != 3:
         raise arguments.argument_error("labels", labels, "a label file, or Labels(obs, action, answer)")
     obs, action, answer = (
@@ -259,5 +262,5 @@ def rows_of(labels: Any) -> Label:
 
 
 def divergence_error() -> UserError:
-    """What is raised where a fit is no longer finite."""
+    """Return the UserError for a fit that is no longer finite."""
     return UserError("the fit of the feedback model diverged: lower scalars.feedback_learning_rate")

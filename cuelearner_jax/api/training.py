@@ -1,4 +1,4 @@
-"""Training from Python: what `cuelearner sweep` does, with the results in memory and nothing on the disk."""
+"""Training from Python: what `cuelearner sweep` does, with the results in memory and no files written."""
 
 from __future__ import annotations
 
@@ -30,20 +30,20 @@ from cuelearner_jax.storage import label_files
 from cuelearner_jax.studies import train as study
 from cuelearner_jax.types import Teacher
 
-SEEDS, LABELS = 8, (100,)  # where a configuration comes without them
+SEEDS, LABELS = 8, (100,)  # defaults where a configuration is given in place of a preset
 
 
 @dataclasses.dataclass(frozen=True)
 class Run:
-    """What a training has led to. Rows of `results` with `failed` 1 are of lanes that are no longer finite."""
+    """The results and agents of a training. Rows of `results` with `failed` 1 are lanes that are no longer finite."""
 
     world: World
     config: RunConfig
     results: pa.Table  # a row a lane and evaluation: guidance, labels, seed, step, wall_s, failed and metrics
-    trainings: dict[str, Training]  # by kind of guidance, at their end
+    trainings: dict[str, Training]  # the trained lanes, by kind of guidance
 
     def policy(self, guidance: str | None = None, labels: int | None = None, seed: int | None = None) -> CallablePolicy:
-        """One lane's trained agent.
+        """Return one lane's trained agent.
 
         Args:
             guidance: kind of guidance (default: the last).
@@ -81,10 +81,10 @@ def train(
     split: str = "validation",
     progress: bool = True,
 ) -> Run:
-    """Trains seeds x label budgets x kinds of guidance, as `cuelearner sweep` does: the same numbers.
+    """Train seeds x label budgets x kinds of guidance, as `cuelearner sweep` does, with the same numbers.
 
-    What is left out is as the preset has it. Warns of lanes that stopped being finite: their agents stay as they last
-    were, their rows have no metrics.
+    Arguments that are left out are the preset's. Lanes that stop being finite raise a warning: their agents keep their
+    last finite state, and their rows have no metrics.
 
     Args:
         world: where.
@@ -130,7 +130,7 @@ def train(
 
 
 def _suggested(world: World, config: RunConfig | str, taught: bool) -> TrainRequest:
-    """What holds where nothing else is given, in this world."""
+    """Return the defaults for this world."""
     task = world.task
     if isinstance(config, RunConfig):
         groups = ("sizes", "scalars", "schedule", "agent", "arbiter")
@@ -149,7 +149,7 @@ def _suggested(world: World, config: RunConfig | str, taught: bool) -> TrainRequ
 
 
 def _seeds(seeds: int | Sequence[int]) -> tuple[int, ...]:
-    """Seeds by their number, or one by one."""
+    """Return the seeds: of a number n the seeds 0 to n - 1, else the given ones."""
     if isinstance(seeds, list | tuple | range | np.ndarray):
         return tuple(arguments.seed("seeds", seed) for seed in arguments.several("seeds", seeds, "seeds"))
     return tuple(range(arguments.whole("seeds", seeds, 1, LARGEST_SEED)))

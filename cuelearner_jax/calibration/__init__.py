@@ -1,4 +1,4 @@
-"""Calibration: relative answers read as evidence of what changed in the world."""
+"""Calibration: estimate from relative answers what changed in the world."""
 
 from cuelearner_jax.calibration.estimation import (
     CHANGED,

@@ -1,4 +1,4 @@
-"""The kinds that learn nothing and never ask: the agent alone, and the task's obvious action."""
+"""Baseline kinds without a model or questions: the agent alone, and the task's heuristic."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from cuelearner_jax.types import GuidanceModel, Label
 
 
 class Untaught(Guide):
-    """A guide with an empty model; by itself no guidance, with which every other kind is compared."""
+    """A guide with an empty model: no guidance, the baseline of every other kind."""
 
     @property
     def moves(self) -> bool:
-        """Whether a class that inherits says how it acts."""
+        """Whether the guide changes actions; False for no guidance, True for subclasses."""
         return type(self).act is not Untaught.act
 
     def init(self, key: PRNGKeyArray) -> GuidanceModel:
-        """Nothing."""
+        """Return an empty model."""
         return GuidanceModel({}, jnp.array(False))
 
     def fit(
         self, key: PRNGKeyArray, env: Any, labels: Label, former: GuidanceModel, scalars: GuideScalars
     ) -> GuidanceModel:
-        """The former model."""
+        """Return the former model."""
         return former
 
     def act(
@@ -41,12 +41,12 @@ class Untaught(Guide):
         active: Bool[Array, " n"],
         scalars: GuideScalars,
     ) -> Refinement:
-        """Every action as it is."""
+        """Return every action unchanged."""
         return no_refinement(actions)
 
 
 class HeuristicGuide(Untaught):
-    """The environment's own obvious action."""
+    """The environment's heuristic as a guide."""
 
     def act(
         self,
@@ -57,7 +57,7 @@ class HeuristicGuide(Untaught):
         active: Bool[Array, " n"],
         scalars: GuideScalars,
     ) -> Refinement:
-        """The heuristic's action in active rows."""
+        """Return the heuristic's action in active rows."""
         return Refinement(jnp.where(active[:, None], jax.vmap(env.heuristic)(obs), actions), active.astype(jnp.int32))
 
 

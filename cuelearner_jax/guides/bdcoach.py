@@ -1,4 +1,4 @@
-"""BD-COACH: a model of the teacher says how to correct the policy in every situation of the buffer.
+"""BD-COACH: a model of the teacher corrects the policy in every situation of the buffer.
 
 Source: Lopez Bosque, "Towards corrective deep imitation learning in data intensive environments" (MSc thesis, TU Delft,
 2021), Batch Deep COACH, with the numbers that the public code of CLIC has for this method. Deep COACH replays old
@@ -52,19 +52,19 @@ class Config:
 
 
 class BatchCoached(Coached):
-    """A policy on its way beside its human model, as the parameters of a model."""
+    """The policy and its human model during training, as the parameters of a model."""
 
     human: Params
     human_optimizer: Any  # state
 
 
 class BatchCoach(DeepCoach):
-    """A policy that acts as a cloned one does, and learns from a model of its teacher."""
+    """A guide that acts as a cloned policy does, and learns from a model of its teacher."""
 
     options: Config  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def init(self, key: PRNGKeyArray) -> GuidanceModel:
-        """A policy that nothing has corrected, and a human model that nobody has taught."""
+        """Return a policy without corrections, and an untrained human model."""
 
         def begin(key: PRNGKeyArray) -> BatchCoached:
             policy, human = (self.member.network.init(one) for one in jax.random.split(key))
@@ -74,13 +74,13 @@ class BatchCoach(DeepCoach):
         return GuidanceModel(for_each(self.sizes.ensemble, begin, key), jnp.array(False))
 
     def human_loss(self, env: Any, human: Params, rows: Lesson, scalars: GuideScalars) -> Array:
-        """Return the loss of the human model: what it says of the actions asked about, beside what was answered."""
+        """Return the loss of the human model: its predictions about the asked actions against the answers."""
         eps = self.spaces.actions.from_unit(scalars.eps_deg)
         answered = rows.replace(target=(rows.target - rows.action) / eps)
         return jnp.mean(squared_errors(answered, self.member.network.predict(env, human, rows.obs, rows.action)))
 
     def policy_targets(self, env: Any, human: Params, rows: Lesson, acted: Array, scalars: GuideScalars) -> Lesson:
-        """Return rows whose targets are what the human model makes of what the policy does there, in all cues."""
+        """Return rows whose targets are the human model's corrections of the policy's own actions, in all cues."""
         space = self.spaces.actions
         eps, does = space.from_unit(scalars.eps_deg), space.retract(acted)
         toward = space.retract(does + eps * self.member.network.predict(env, human, rows.obs, does))
@@ -90,7 +90,7 @@ class BatchCoach(DeepCoach):
     def fit(
         self, key: PRNGKeyArray, env: Any, labels: Label, former: GuidanceModel, scalars: GuideScalars
     ) -> GuidanceModel:
-        """The former policy and human model, moved on by each label that is new, in the order in which they came."""
+        """Return the former policy and human model, updated by each new label in order."""
         rows, answered = self.lessons(labels, scalars), Guide.lessons(self, labels, scalars)
         order = jnp.argsort(~rows.valid, stable=True)
         count, adam = rows.valid.sum(), optimizer(scalars)

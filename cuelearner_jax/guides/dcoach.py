@@ -1,4 +1,4 @@
-"""Deep COACH: every correction moves a policy network itself, which is never fitted afresh.
+"""Deep COACH: every correction updates a policy network, which is never fitted from scratch.
 
 Source: Perez-Dattari, Celemin, Ruiz-del-Solar, Kober, "Interactive learning with corrective feedback for policies based
 on deep neural networks" (ISER 2018), Algorithm 1: of a correction h the target a + e h, a gradient step on it, and one
@@ -51,25 +51,25 @@ class Config:
 
 
 class Coached(struct.PyTreeNode):
-    """A policy on its way, as the parameters of a model; of several members with a leading axis."""
+    """The policy during training, as the parameters of a model; an ensemble has a leading axis of members."""
 
     policy: Params
     optimizer: Any  # state
-    learned: Int[Array, ""]  # labels that it has been corrected by: the next are new
+    learned: Int[Array, ""]  # labels that were used already; later ones are new
 
 
 class DeepCoach(Demonstration):
-    """A policy that acts as a cloned one does, and is moved by each correction."""
+    """A guide that acts as a cloned policy does, and is updated by each correction."""
 
     options: Config
 
     @cached_property
     def member(self) -> DeepCoach:
-        """One member of the ensemble, by itself."""
+        """Return the guide of one member of the ensemble."""
         return dataclasses.replace(self, sizes=dataclasses.replace(self.sizes, ensemble=1))
 
     def init(self, key: PRNGKeyArray) -> GuidanceModel:
-        """A policy that nothing has corrected."""
+        """Return a policy without corrections."""
 
         def begin(key: PRNGKeyArray) -> Coached:
             params = self.member.network.init(key)
@@ -78,14 +78,14 @@ class DeepCoach(Demonstration):
         return GuidanceModel(for_each(self.sizes.ensemble, begin, key), jnp.array(False))
 
     def target(self, label: Label, scalars: GuideScalars) -> Float[Array, " action"]:
-        """The action changed by h * eps along each cue."""
+        """Return the action changed by h * eps along each cue."""
         space = self.spaces.actions
         return space.toward(label.action, label.answer, space.from_unit(scalars.eps_deg))
 
     def fit(
         self, key: PRNGKeyArray, env: Any, labels: Label, former: GuidanceModel, scalars: GuideScalars
     ) -> GuidanceModel:
-        """The former policy, corrected by the labels that are new, in the order in which they were given."""
+        """Return the former policy, corrected by the new labels in order."""
         rows = self.lessons(labels, scalars)
         order = jnp.argsort(~rows.valid, stable=True)
         count = rows.valid.sum()
@@ -127,13 +127,13 @@ class DeepCoach(Demonstration):
         active: Bool[Array, " n"],
         scalars: GuideScalars,
     ) -> Refinement:
-        """The policy's action in place of a, as a cloned policy's."""
+        """Return the cloned policy's action in place of a."""
         return super().act(model.replace(params=model.params.policy), env, obs, actions, active, scalars)
 
     def disagreement(
         self, model: GuidanceModel, env: Any, obs: Float[Array, "n obs"], actions: Float[Array, "n action"]
     ) -> Float[Array, " n"]:
-        """Variance of the members' vectors, summed over their entries."""
+        """Return the variance of the members' vectors, summed over their entries."""
         return super().disagreement(model.replace(params=model.params.policy), env, obs, actions)
 
 

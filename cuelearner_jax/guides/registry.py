@@ -1,4 +1,4 @@
-"""The one place that lists the kinds of guidance: those of the package, of installed packages, and of one's own.
+"""The registry of kinds of guidance: those of the package, of installed packages, and of the user's own code.
 
 A kind of one's own is a `Kind`: pass it to `register`, offer it under the entry-point group `cuelearner.guidances`, or
 name it as `package.module:NAME` wherever the name of a kind is asked for.
@@ -47,26 +47,26 @@ _KINDS: dict[str, Kind] = {kind.name: kind for kind in _BUILT_IN}
 
 
 def register(kind: Kind) -> Kind:
-    """Makes a kind known under its name. Raises UserError if another one has the name."""
+    """Register a kind under its name. Raises UserError if another kind has the name."""
     if _KINDS.setdefault(kind.name, kind) != kind:
         raise UserError(f"there is another guidance called {kind.name!r}: give yours another name")
     return kind
 
 
 def kinds() -> tuple[Kind, ...]:
-    """The kinds that can be named, those of installed packages included."""
+    """Return the registered kinds, those of installed packages included."""
     _register_installed()
     return tuple(_KINDS.values())
 
 
 def find_or_none(name: str) -> Kind | None:
-    """The kind of that name, or None: of results whose kind is not known here."""
+    """Return the kind of that name, or None, for results whose kind is not known here."""
     _register_installed()
     return _KINDS.get(name)
 
 
 def find(name: str) -> Kind:
-    """The kind of that name; no code is loaded that the name leads to. Raises UserError if there is none."""
+    """Return the kind of that name without loading code. Raises UserError if no kind has the name."""
     _register_installed()
     if name not in _KINDS:
         raise UserError(
@@ -76,20 +76,20 @@ def find(name: str) -> Kind:
 
 
 def resolve(text: str) -> Kind:
-    """The kind that a user or caller names: by its name, or as `package.module:NAME`, whose code is loaded.
+    """Return the kind that a user or caller names: by its name, or as `package.module:NAME`, whose code is loaded.
 
-    Never call it with what a file says. Raises UserError if there is no such kind.
+    Never pass text from a file. Raises UserError if there is no such kind.
     """
     return register(load(text, Kind, "a kind of guidance")) if ":" in text else find(text)
 
 
 def kind_name(text: str) -> str:
-    """Name of the kind that a user or caller names, as `resolve`; a name alone need not be known here."""
+    """Return the name of the kind that a user or caller names (`resolve`); a plain name need not be registered."""
     return resolve(text).name if ":" in text else text
 
 
 def possible(env: Any, taught: bool) -> tuple[str, ...]:
-    """Names of the kinds that an agent can be trained with; `taught`: is there a teacher to ask?"""
+    """Return the names of the kinds that an agent can be trained with; `taught`: whether the world has a teacher."""
     trained = (kind for kind in kinds() if not kind.adapts_only and (taught or not kind.asks))
     cues = actions_of(env).cues
     said = (kind for kind in trained if cues or not kind.needs_cues)
@@ -97,7 +97,7 @@ def possible(env: Any, taught: bool) -> tuple[str, ...]:
 
 
 def make(name: str, sizes: GuideSizes, env: Any, options: Any = None) -> Guide:
-    """A kind's guide for an environment (shapes in place of arrays will do).
+    """Return a kind's guide for an environment (shapes in place of arrays will do).
 
     Args:
         name: of the kind.
