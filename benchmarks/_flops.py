@@ -12,7 +12,7 @@ from itertools import pairwise
 from typing import NamedTuple
 
 from cuelearner_jax.agents import view
-from cuelearner_jax.agents.choice import looked_at
+from cuelearner_jax.agents.choice import values_per_choice
 from cuelearner_jax.environment import Spaces
 from cuelearner_jax.run_config import RunConfig
 
@@ -35,7 +35,7 @@ def step_operations(config: RunConfig, spaces: Spaces) -> Operations:
     own, widths = config.agent, view.widths(config.sizes.frame, spaces)
     rows = own.batch_size * (2 if own.n_step > 1 else 1) if config.bootstraps else 0
     return Operations(
-        acting=forward(own.q_layers, widths, looked_at(own.directions, own.coarse_directions, own.peaks)),
+        acting=forward(own.q_layers, widths, values_per_choice(own.directions, own.coarse_directions, own.peaks)),
         gradient=own.batch_size * forward_and_backward(own.q_layers, widths),
         targets=rows * (forward(own.q_layers, widths, own.target_directions) + forward(own.q_layers, widths, 1)),
     )

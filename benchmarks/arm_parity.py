@@ -57,7 +57,7 @@ def rows_of(skill: str, episodes: int) -> list[dict[str, Any]]:
 
     found = []
     for scenario, changes in WORLDS[skill]:
-        config = TASK.configured(scenario, skill=skill, **changes)
+        config = TASK.configure(scenario, skill=skill, **changes)
         env, metric = TASK.environment(config), "success"
         if scenario is not None and TASK.scenario(scenario).judge_by:
             metric = TASK.scenario(scenario).judge_by

@@ -98,7 +98,7 @@ def main() -> None:
     asked = parser.parse_args()
     task, rows = registry.find("arm"), []
     for skill in asked.skills:
-        env: Any = task.environment(task.configured(skill=skill))
+        env: Any = task.environment(task.configure(skill=skill))
         for grippers in asked.grippers:
             middles = []
             for name, make in (("task", whole), ("mjx.step", bare)):

@@ -64,7 +64,7 @@ def worths(teacher: SearchTeacher, state: Any) -> Any:
 def compare(name: str, table: Any, tables: int, aim_error_deg: float) -> dict[str, Any]:
     """One world's row."""
     before = BilliardsConfig(table, teacher="local_search", aim_error_deg=aim_error_deg)
-    config = SCENARIOS[name].applied(before) if name in SCENARIOS else before
+    config = SCENARIOS[name].apply(before) if name in SCENARIOS else before
     env, plain = make_environment(config), make_environment(before)
     local = make_teacher(config, env)
     assert isinstance(local, LocalSearchTeacher)

@@ -19,12 +19,12 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from cuelearner_jax.api.acting import CallablePolicy, load_policy
     from cuelearner_jax.api.adaptation import AdaptedPolicy, adapt
-    from cuelearner_jax.api.correcting import agreement, correct
+    from cuelearner_jax.api.correction import agreement, correct
     from cuelearner_jax.api.evaluation import measure
-    from cuelearner_jax.api.exporting import export_correction, export_policy, load_exported
+    from cuelearner_jax.api.export import export_correction, export_policy, load_exported
     from cuelearner_jax.api.feedback import FeedbackModel, Labels, ask, fit_feedback, refine
+    from cuelearner_jax.api.policies import CallablePolicy, load_policy
     from cuelearner_jax.api.training import Run, train
     from cuelearner_jax.api.worlds import World, from_gymnasium, make, teacher_of
     from cuelearner_jax.calibration import Distortion, Unknown
@@ -37,7 +37,7 @@ __version__ = "0.1.0"
 # command line needs little of it at a time.
 _PLACES = {
     "AdaptedPolicy": "api.adaptation",
-    "CallablePolicy": "api.acting",
+    "CallablePolicy": "api.policies",
     "Distortion": "calibration",
     "FeedbackModel": "api.feedback",
     "Labels": "api.feedback",
@@ -47,15 +47,15 @@ _PLACES = {
     "UserError": "errors",
     "World": "api.worlds",
     "adapt": "api.adaptation",
-    "agreement": "api.correcting",
+    "agreement": "api.correction",
     "ask": "api.feedback",
-    "correct": "api.correcting",
-    "export_correction": "api.exporting",
-    "export_policy": "api.exporting",
+    "correct": "api.correction",
+    "export_correction": "api.export",
+    "export_policy": "api.export",
     "fit_feedback": "api.feedback",
     "from_gymnasium": "api.worlds",
-    "load_exported": "api.exporting",
-    "load_policy": "api.acting",
+    "load_exported": "api.export",
+    "load_policy": "api.policies",
     "make": "api.worlds",
     "measure": "api.evaluation",
     "refine": "api.feedback",

@@ -19,8 +19,8 @@ from cuelearner_jax.agents.networks import all_finite
 from cuelearner_jax.config import GuideScalars, GuideSizes
 from cuelearner_jax.environment import Environment, actions_of
 from cuelearner_jax.guides.base import Guide
-from cuelearner_jax.guides.refining import within
-from cuelearner_jax.policies import Policy, acted, best_actions, named
+from cuelearner_jax.guides.refining import bounded_scalars
+from cuelearner_jax.policies import Policy, best_actions, call_policy, policy_name
 from cuelearner_jax.types import EnvState, GuidanceModel, Label, Teacher
 
 LaneT = TypeVar("LaneT", bound=Any)
@@ -122,12 +122,12 @@ def question(
     """The action to ask about in the guide's situation, or in each of its candidates; and what the base policy does."""
     space, scalars, several = actions_of(of.env), of.scalars, guide.obs.ndim > 1
     if several:
-        first = acted(of.base, keys.base, guide.env, guide.obs, space)
+        first = call_policy(of.base, keys.base, guide.env, guide.obs, space)
     else:
         states = jax.tree.map(lambda leaf: leaf[None], guide.env)
-        first = acted(of.base, keys.base, states, guide.obs[None], space)[0]
+        first = call_policy(of.base, keys.base, states, guide.obs[None], space)[0]
     if of.bound is not None:
-        scalars = within(space, scalars, of.bound)
+        scalars = bounded_scalars(space, scalars, of.bound)
 
     def one(key: PRNGKeyArray, obs: Array, first: Array) -> Array:
         asked = of.guidance.question(key, guide.model, of.env, obs, first, scalars)
@@ -272,13 +272,13 @@ def blame(
         states, obs = jax.tree.map(lambda leaf: leaf[None], (states, obs))
     if base is not None:
         assert key is not None
-        user_code.check_actions(space.only_actions(base.act(key, states, obs)), named(base))
+        user_code.check_actions(space.only_actions(base.act(key, states, obs)), policy_name(base))
     if teacher is not None:
         given = space.only_actions(best_actions(teacher, states, obs))
         user_code.check_actions(given, f"teacher {type(teacher).__name__}")
 
 
-def walked(of: Inquiry, guide: GuideState, keys: Key[Array, " steps"]) -> GuideState:
+def walk_unanswered(of: Inquiry, guide: GuideState, keys: Key[Array, " steps"]) -> GuideState:
     """The guide after steps in which it acts as it would ask, and nobody answers."""
 
     def step(guide: GuideState, key: PRNGKeyArray) -> tuple[GuideState, None]:
@@ -300,7 +300,7 @@ def label_round(
         if sizes.question_every == 1:
             return asked, None
         key = jax.random.fold_in(jax.random.fold_in(lane_key, Stream.WALK), first + offset)
-        return walked(of, asked, jax.random.split(key, sizes.question_every - 1)), None
+        return walk_unanswered(of, asked, jax.random.split(key, sizes.question_every - 1)), None
 
     asked, _ = jax.lax.scan(one, guide, jnp.arange(0, sizes.labels_per_round, at_once))
     fitted = fit(of.guidance, of.env, of.scalars, asked, lane_key, first // sizes.labels_per_round)

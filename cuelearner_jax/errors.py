@@ -43,7 +43,7 @@ class NotFinite(Exception):
     status = 1
 
 
-def says(error: BaseException | None, numbers: Collection[int | None], *words: str) -> bool:
+def mentions(error: BaseException | None, numbers: Collection[int | None], *words: str) -> bool:
     """Does an exception, or what it came from, have one of these error numbers, or say one of these words?
 
     TensorStore tells in words alone what the system refused.
@@ -58,10 +58,10 @@ def says(error: BaseException | None, numbers: Collection[int | None], *words: s
 def no_space(error: BaseException) -> bool:
     """Does an exception, or what it came from, say that the disk is full?"""
     words = ("No space left on device", "Disk quota exceeded", "File too large")
-    return says(error, (errno.ENOSPC, errno.EDQUOT, errno.EFBIG), *words)
+    return mentions(error, (errno.ENOSPC, errno.EDQUOT, errno.EFBIG), *words)
 
 
-def blamed(error: BaseException, resumes: bool) -> str | None:
+def file_system_message(error: BaseException, resumes: bool) -> str | None:
     """What to tell of an exception that the file system is to blame for, in one line; None for any other.
 
     `resumes`: can the command go on with what it saved?
@@ -74,7 +74,7 @@ def blamed(error: BaseException, resumes: bool) -> str | None:
     return None
 
 
-def shown(value: Any) -> str:
+def format_value(value: Any) -> str:
     """A value for a message, on one short line: plain values as Python writes them, anything else by its type."""
     if isinstance(value, type):
         return f"the class {value.__name__}"
@@ -91,7 +91,7 @@ def shown(value: Any) -> str:
     return text if text.isprintable() and len(text) <= 120 else f"a {type(value).__name__}"
 
 
-def raised_by(named: str, error: Exception) -> UserError:
+def user_code_error(named: str, error: Exception) -> UserError:
     """What is told of an exception of the user's own code: one line that says whose it is and what was raised.
 
     Args:
@@ -105,7 +105,7 @@ def raised_by(named: str, error: Exception) -> UserError:
     return UserError(f"{named} raised {type(error).__name__}{': ' if words else ''}{words}: mend it first")
 
 
-def listed(numbers: Iterable[float]) -> str:
+def format_numbers(numbers: Iterable[float]) -> str:
     """Numbers in order for a message: as a range where no whole number between is absent, else 20 at most."""
     known = sorted(set(numbers))
     texts = [f"{number:g}" if isinstance(number, float) else str(number) for number in known]
@@ -114,7 +114,7 @@ def listed(numbers: Iterable[float]) -> str:
     return ", ".join(texts[:MOST_LISTED]) + (" and others" if len(texts) > MOST_LISTED else "")
 
 
-def closest(word: str, known: Iterable[str]) -> str:
+def suggestion(word: str, known: Iterable[str]) -> str:
     """The end of a message about an unknown word: the one that was probably meant, or all there are."""
     known = list(known)
     found = difflib.get_close_matches(str(word)[:100], known, n=1)

@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from cuelearner_jax import user_code
 from cuelearner_jax.devices import BY_LANE, SHARED, over_lanes, portions
 from cuelearner_jax.environment import Environment, actions_of
-from cuelearner_jax.policies import Policy, PolicyBlock, acted, lanes_in, named
+from cuelearner_jax.policies import Policy, PolicyBlock, call_policy, lanes_in, policy_name
 
 # Folded into the root key: episodes for reported figures only, and episodes for choosing settings.
 SPLITS = {"validation": 1_000_003, "tuning": 1_000_001}
@@ -44,7 +44,7 @@ def rollout(
     return _rolled(policy, env, key, num_envs, steps).means
 
 
-class Rolled(NamedTuple):
+class Rollout(NamedTuple):
     """A roll-out: what it came to over all environments, and in each of them, whose values are independent."""
 
     means: dict[str, Any]  # (*lanes,) over the environments, as `rollout` gives them
@@ -53,7 +53,7 @@ class Rolled(NamedTuple):
     episode_steps: Any  # (*lanes, envs) int: of each environment's first episode, as far as it went
 
 
-def _rolled(policy: Policy, env: Environment, key: PRNGKeyArray, num_envs: int, steps: int) -> Rolled:
+def _rolled(policy: Policy, env: Environment, key: PRNGKeyArray, num_envs: int, steps: int) -> Rollout:
     walk = _walked(policy, env, key, _begun(env, key, num_envs), jnp.arange(steps // num_envs))
     return _summed(walk, steps // num_envs)
 
@@ -89,7 +89,7 @@ def _walked(policy: Policy, env: Environment, key: PRNGKeyArray, walk: _Walk, in
 
     def one_step(walk: _Walk, index: jax.Array) -> tuple[_Walk, None]:
         k_act, k_env = jax.random.split(jax.random.fold_in(k_run, index))
-        action = acted(policy, k_act, walk.state, walk.obs, actions_of(env))
+        action = call_policy(policy, k_act, walk.state, walk.obs, actions_of(env))
         acts = walk.acts & jnp.isfinite(action).all(-1)
         state, step = jax.vmap(env.step)(jax.random.split(k_env, num_envs), walk.state, action)
         done = step.terminated | step.truncated
@@ -102,14 +102,14 @@ def _walked(policy: Policy, env: Environment, key: PRNGKeyArray, walk: _Walk, in
     return jax.lax.scan(one_step, walk, indices)[0]
 
 
-def _summed(walk: _Walk, steps: int) -> Rolled:
+def _summed(walk: _Walk, steps: int) -> Rollout:
     """What a walk of so many steps an environment has come to."""
     each = {name: total / steps for name, total in walk.sums.items()} | walk.outcomes
     # What follows from an action that is none means nothing.
     each = {name: jnp.where(walk.acts, values, jnp.nan) for name, values in each.items()}
     if walk.outcomes:
         each["finished"] = 1.0 - walk.first
-    return Rolled({name: values.mean() for name, values in each.items()}, each, walk.episode_steps)
+    return Rollout({name: values.mean() for name, values in each.items()}, each, walk.episode_steps)
 
 
 def _apart(policy: PolicyBlock) -> tuple[Any, Any]:
@@ -162,7 +162,7 @@ MOST_STRETCHES = 25  # of a roll-out that is watched
 Tell = Callable[[int, int], None]  # (done, of how many): called between stretches; what it raises ends the evaluation
 
 
-def untold(done: int, count: int) -> None:
+def ignore_progress(done: int, count: int) -> None:
     """Ignore progress."""
 
 
@@ -171,25 +171,25 @@ def part_of(tell: Tell, number: int, parts: int) -> Tell:
     return lambda done, count: tell(number * count + done, parts * count)
 
 
-def watched(
-    env: Environment, policy: Policy, key: PRNGKeyArray, num_envs: int, steps: int, tell: Tell = untold
-) -> Rolled:
+def rollout_with_progress(
+    env: Environment, policy: Policy, key: PRNGKeyArray, num_envs: int, steps: int, tell: Tell = ignore_progress
+) -> Rollout:
     """Roll out one policy, as `rollout` does, in stretches. Returns NumPy arrays: means (), values (envs,).
 
     Raises UserError, which names the policy, once one of its actions is not finite.
     """
-    return _in_stretches(env, None, policy, key, num_envs, steps, tell, named(policy))
+    return _in_stretches(env, None, policy, key, num_envs, steps, tell, policy_name(policy))
 
 
-def watched_lanes(
+def rollout_lanes(
     env: Environment,
     policy: PolicyBlock,
     key: PRNGKeyArray,
     num_envs: int,
     steps: int,
-    tell: Tell = untold,
+    tell: Tell = ignore_progress,
     mesh: Mesh | None = None,
-) -> Rolled:
+) -> Rollout:
     """Roll out a block of lanes, all on the same episodes; a policy that all lanes share is one lane.
 
     Without a mesh in stretches, as many lanes at once as the device takes well.
@@ -207,7 +207,9 @@ def watched_lanes(
     """
     lanes = lanes_in(policy)
     if lanes is None:
-        return jax.tree.map(lambda leaf: np.asarray(leaf)[None], watched(env, policy, key, num_envs, steps, tell))
+        return jax.tree.map(
+            lambda leaf: np.asarray(leaf)[None], rollout_with_progress(env, policy, key, num_envs, steps, tell)
+        )
     each, shared = _apart(policy)
     if mesh is not None:
         return jax.device_get(_on_mesh(env, each, shared, key, mesh=mesh, num_envs=num_envs, steps=steps))
@@ -222,8 +224,8 @@ def watched_lanes(
 
 
 @partial(jax.jit, static_argnames=("mesh", "num_envs", "steps"))
-def _on_mesh(env: Any, each: Any, shared: Any, key: PRNGKeyArray, *, mesh: Mesh, num_envs: int, steps: int) -> Rolled:
-    def share(env: Any, each: Any, shared: Any, key: PRNGKeyArray) -> Rolled:
+def _on_mesh(env: Any, each: Any, shared: Any, key: PRNGKeyArray, *, mesh: Mesh, num_envs: int, steps: int) -> Rollout:
+    def share(env: Any, each: Any, shared: Any, key: PRNGKeyArray) -> Rollout:
         one = lambda lane: _rolled(_together(lane, shared), env, key, num_envs, steps)  # noqa: E731
         lanes = jax.tree.leaves(each)[0].shape[0]
         return jax.lax.map(one, each, batch_size=min(lanes, portions().agents))
@@ -233,7 +235,7 @@ def _on_mesh(env: Any, each: Any, shared: Any, key: PRNGKeyArray, *, mesh: Mesh,
 
 def _in_stretches(
     env: Environment, each: Any, shared: Any, key: PRNGKeyArray, num_envs: int, steps: int, tell: Tell, whose: str = ""
-) -> Rolled:
+) -> Rollout:
     """A roll-out of one policy (`each` is None), or of the lanes of `each` side by side; a lane that fails is NaN."""
     count, lanes = _stretches(steps // num_envs), 0 if each is None else len(jax.tree.leaves(each)[0])
     walk = _begin(env, key, num_envs=num_envs, lanes=lanes)
@@ -268,6 +270,6 @@ def _walk(env: Any, each: Any, shared: Any, key: PRNGKeyArray, walk: _Walk, indi
 
 
 @partial(jax.jit, static_argnames=("steps", "lanes"))
-def _sum_up(walk: _Walk, *, steps: int, lanes: bool) -> Rolled:
+def _sum_up(walk: _Walk, *, steps: int, lanes: bool) -> Rollout:
     summed = partial(_summed, steps=steps)
     return jax.vmap(summed)(walk) if lanes else summed(walk)

@@ -47,7 +47,7 @@ from cuelearner_jax.devices import (
 )
 from cuelearner_jax.environment import Environment, actions_of, spaces_of
 from cuelearner_jax.guides.base import Guide
-from cuelearner_jax.guides.refining import Refined, untouched
+from cuelearner_jax.guides.refining import Refinement, no_refinement
 from cuelearner_jax.policies import uniform_in
 from cuelearner_jax.run_config import RunConfig, Settings
 from cuelearner_jax.types import EnvState, Label, Params, Step, Teacher
@@ -176,7 +176,7 @@ def _program_of(
                 return (lane.advance(clock, settings.schedule), state), metrics
 
             (after, trained), metrics = jax.lax.scan(iteration, (clock, state), length=iterations)
-            return lane.kept_finite(trained, state), after, jax.tree.map(lambda leaf: leaf.mean(0), metrics)
+            return lane.keep_finite(trained, state), after, jax.tree.map(lambda leaf: leaf.mean(0), metrics)
 
         state, after, metrics = each_lane_in_place(run)(state)
         return after, state, metrics
@@ -209,7 +209,7 @@ class Keys(NamedTuple):
     learn: PRNGKeyArray
 
 
-class Acted(NamedTuple):
+class ActStep(NamedTuple):
     """What `Lane.act` has chosen, to be executed and then given to `Lane.absorb`."""
 
     actions: Float[Array, "num_envs action"]
@@ -264,7 +264,7 @@ class Lane(NamedTuple):
         """Labels that were given elsewhere, in place of questions, and the model fitted to them."""
         return asking.with_guide(state, asking.take_labels(self.guidance, env, scalars, labels, state.guide, state.key))
 
-    def kept_finite(self, state: TrainState, before: TrainState) -> TrainState:
+    def keep_finite(self, state: TrainState, before: TrainState) -> TrainState:
         """A lane after a stretch; one that has failed, in it or before, with what it had learned `before`.
 
         Asked once a stretch, not at each gradient step: that would read all parameters once more.
@@ -298,7 +298,7 @@ class Lane(NamedTuple):
         state, learned = self.learn(env, settings, clock, state, keys.learn)
         return state, {**met, **learned}
 
-    def act(self, env: Environment, settings: Settings, clock: Clock, state: TrainState, key: PRNGKeyArray) -> Acted:
+    def act(self, env: Environment, settings: Settings, clock: Clock, state: TrainState, key: PRNGKeyArray) -> ActStep:
         """Actions to execute in each environment.
 
         Uniform at first, then the agent's; refined by the guidance until the cut-off, where the arbiter says so. The
@@ -312,14 +312,14 @@ class Lane(NamedTuple):
         )
         if isinstance(self.arbiter, Chooses):
             refined = self._chosen(self.arbiter, env, settings, clock, state, base, key)
-            return Acted(refined.actions, refined.passes, jax.vmap(env.remember)(agent.env, agent.obs))
+            return ActStep(refined.actions, refined.passes, jax.vmap(env.remember)(agent.env, agent.obs))
         guided = self.arbiter.guided(state.arbiter)
-        refined: Refined = jax.lax.cond(
+        refined: Refinement = jax.lax.cond(
             guides(clock, schedule),
             lambda: self.guidance.act(state.guide.model, env, agent.obs, base, guided, settings.scalars),
-            lambda: untouched(base),
+            lambda: no_refinement(base),
         )
-        return Acted(refined.actions, refined.passes, jax.vmap(env.remember)(agent.env, agent.obs))
+        return ActStep(refined.actions, refined.passes, jax.vmap(env.remember)(agent.env, agent.obs))
 
     def _chosen(
         self,
@@ -330,7 +330,7 @@ class Lane(NamedTuple):
         state: TrainState,
         base: Float[Array, "num_envs action"],
         key: PRNGKeyArray,
-    ) -> Refined:
+    ) -> Refinement:
         """What an arbiter chooses in place of the agent's own actions, until the cut-off."""
         agent, schedule, model = state.agent, settings.schedule, state.guide.model
         steps = jnp.asarray(schedule.learned_from(clock.step), jnp.float32)
@@ -339,11 +339,11 @@ class Lane(NamedTuple):
         return jax.lax.cond(
             clock.step < schedule.guidance_until,
             lambda: arbiter.choose(state.arbiter, settings.arbiter, known, agent.obs, base, learns, own),
-            lambda: untouched(base),
+            lambda: no_refinement(base),
         )
 
     def absorb(
-        self, settings: Settings, clock: Clock, state: TrainState, key: PRNGKeyArray, acted: Acted, step: Step
+        self, settings: Settings, clock: Clock, state: TrainState, key: PRNGKeyArray, acted: ActStep, step: Step
     ) -> tuple[TrainState, dict[str, Float[Array, ""]]]:
         """The lane after its actions were executed: they are in replay, and the next observations are there.
 

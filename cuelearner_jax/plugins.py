@@ -8,7 +8,7 @@ import re
 import sys
 from typing import Any, Generic, TypeVar
 
-from cuelearner_jax.errors import UserError, closest
+from cuelearner_jax.errors import UserError, suggestion
 
 REFERENCE = re.compile(r"[^\W\d]\w*(\.[^\W\d]\w*)*:[^\W\d]\w*")
 
@@ -44,7 +44,7 @@ def load(reference: str, kind: type[T], called: str) -> T:
         raise UserError(f"{module_name} fails to import ({type(error).__name__}: {told}): mend it first") from error
     if not hasattr(module, name):
         there = [other for other, value in vars(module).items() if isinstance(value, kind)]
-        raise UserError(f"{module_name} has no {name!r}{closest(name, there) if there else f', nor {called}'}")
+        raise UserError(f"{module_name} has no {name!r}{suggestion(name, there) if there else f', nor {called}'}")
     found = getattr(module, name)
     if not isinstance(found, kind):
         raise UserError(
@@ -76,7 +76,7 @@ class PartRegistry(Generic[T]):
         """The class of that name; no code is loaded that the name leads to. Raises UserError if there is none."""
         if name not in self._found:
             own = f"name your own by --{self._sort} package.module:NAME, if you trust that code"
-            raise UserError(f"unknown {self._sort} {name!r}{closest(name, self._found)} ({own})")
+            raise UserError(f"unknown {self._sort} {name!r}{suggestion(name, self._found)} ({own})")
         return self._found[name]
 
     def resolve(self, text: str) -> type[T]:

@@ -75,7 +75,7 @@ class RunConfig(Generic[TaskT, AgentT, ArbiterT, KindsT]):
         kinds: Any = self.kinds
         if isinstance(own := kinds.get(kind), dict):
             return kind_from_json(kind, own)
-        config = getattr(guidances.registered(kind), "config", None)
+        config = getattr(guidances.find_or_none(kind), "config", None)
         if own is not None and not (config and isinstance(own, config)):
             raise UserError(f"the options of guidance {kind!r} are {own!r}: give its own, or leave them out")
         return own
@@ -140,7 +140,7 @@ def kind_from_json(name: str, values: dict[str, Any] | None) -> Any:
     """
     if not isinstance(values, dict | None):
         raise TypeError(f"options of a kind are told by name, not as {values!r}")
-    kind = guidances.registered(name)
+    kind = guidances.find_or_none(name)
     if values is None or kind is None:
         return values
     if kind.config is None:

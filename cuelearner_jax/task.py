@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from cuelearner_jax.config import GuideSizes, Scalars, check_types
 from cuelearner_jax.environment import Environment, View, offers, view_of
-from cuelearner_jax.errors import UserError, closest, shown
+from cuelearner_jax.errors import UserError, format_value, suggestion
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.storage.room import check_room
 from cuelearner_jax.types import EnvState, Policy, Reel, Sketch, Teacher
@@ -25,7 +25,7 @@ PAPER = "paper"  # the preset that holds where none is given
 # Of a scenario's sizes: the paper's networks and their fitting, in place of the smaller ones that `adapt` else has
 PAPERS_FIT = {name: getattr(GuideSizes, name) for name in ("feedback_layers", "fit_steps", "fit_batch_size")}
 
-# (policy, environment, key, environments, steps, tell) -> values (environments,) by name, as `evaluate.Rolled.each`;
+# (policy, environment, key, environments, steps, tell) -> values (environments,) by name, as `evaluate.Rollout.each`;
 # now and then it calls `tell` with how far it is, and of how much
 Rollout = Callable[[Any, Any, PRNGKeyArray, int, int, Callable[[int, int], None]], dict[str, Any]]
 
@@ -83,7 +83,7 @@ class Body:
     # hold; without them (None) of zeros, as far as shapes and views depend on it; None: as `environment` has it
     filled: Callable[[Any, Any, Any], Environment] | None = None
 
-    def shaped(self, config: Any) -> Environment:
+    def shape_environment(self, config: Any) -> Environment:
         """The environment of a configuration, as far as shapes and views depend on it."""
         return self.environment(config, "training") if self.filled is None else self.filled(config, None, None)
 
@@ -104,7 +104,7 @@ class Scenario:
     scalars: dict[str, Any] = field(default_factory=dict)  # fields of `Scalars`
     options: dict[str, Any] = field(default_factory=dict)  # of the kind of guidance: fields of its `Kind.config`
 
-    def applied(self, config: Any) -> Any:
+    def apply(self, config: Any) -> Any:
         """The configuration with the changes in it."""
         return dataclasses.replace(config, **self.changes)
 
@@ -168,7 +168,7 @@ class Task:
                 raise ValueError(f"{called} {verb} {unknown[0]!r}, no field of {group.__name__}")
         try:
             for base in [preset.config.task for preset in self.presets.values()] or [self.plain()]:
-                scenario.applied(base)
+                scenario.apply(base)
         except Exception as error:
             raise ValueError(f"{called} makes no configuration ({error})") from error
 
@@ -176,14 +176,14 @@ class Task:
         """Return the configuration that holds where nothing is given."""
         return self.config() if self.default is None else self.default
 
-    def configured(self, scenario: str | None = None, **changes: Any) -> Any:
+    def configure(self, scenario: str | None = None, **changes: Any) -> Any:
         """The task's configuration in a changed world, with fields changed.
 
         Raises UserError for no such scenario or field, or a value that its field cannot hold.
         """
         config = self.plain()
         if scenario is not None:
-            config = self.scenario(scenario).applied(config)
+            config = self.scenario(scenario).apply(config)
         values = check_types(config, "task", **changes) if changes else {}
         return dataclasses.replace(config, **values)
 
@@ -207,7 +207,7 @@ class Task:
 
     def view(self, config: Any) -> View:
         """What policies look at in a configuration; worlds that no policy looks at are not generated."""
-        make = lambda: self.bodies[0].shaped(config)  # noqa: E731
+        make = lambda: self.bodies[0].shape_environment(config)  # noqa: E731
         if not offers(jax.eval_shape(make), "view"):
             return self.environment(config)
         return jax.jit(lambda: view_of(make()))()
@@ -247,7 +247,7 @@ class Task:
             raise UserError(f"{self.name} has no robots to choose from: leave out --robot")
         known = {one.name: one for one in self.bodies}
         if body not in known:
-            raise UserError(f"unknown robot {body!r}{closest(body, known)}")
+            raise UserError(f"unknown robot {body!r}{suggestion(body, known)}")
         others, found = tuple(one for one in self.bodies if one.name != body), known[body]
         if folder:
             if found.made_of is None:
@@ -266,7 +266,7 @@ class Task:
             others = [body.name for body in self.bodies if body.engines]
             raise UserError(f"--engine {name} needs --robot: choose one of {', '.join(others) or 'none'}")
         if name not in engines:
-            raise UserError(f"unknown engine {name!r}{closest(name, engines)}")
+            raise UserError(f"unknown engine {name!r}{suggestion(name, engines)}")
         return engines[name]
 
     def pictures(self, otherwise: str = "evaluate it instead") -> Pictures:
@@ -280,10 +280,10 @@ class Task:
         if not self.scenarios:
             raise UserError(f"{self.name} has no scenarios to choose from: leave out --scenario")
         if name not in self.scenarios:
-            raise UserError(f"unknown scenario {shown(name)}{closest(name, self.scenarios)}")
+            raise UserError(f"unknown scenario {format_value(name)}{suggestion(name, self.scenarios)}")
         return self.scenarios[name]
 
 
 def shape_of(task: Task, config: Any) -> Any:
     """The environment of a configuration with shapes in place of arrays: costs next to nothing."""
-    return jax.eval_shape(lambda: task.bodies[0].shaped(config))
+    return jax.eval_shape(lambda: task.bodies[0].shape_environment(config))

@@ -18,8 +18,8 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from cuelearner_jax.agents.networks import all_finite, applied, q_network
-from cuelearner_jax.agents.view import seen
+from cuelearner_jax.agents.networks import all_finite, as_function, q_network
+from cuelearner_jax.agents.view import network_inputs
 from cuelearner_jax.config import LARGEST, MOST_LAYERS, from_json, to_json
 from cuelearner_jax.errors import NotFinite, UserError
 from cuelearner_jax.spaces import directions as geometry
@@ -42,14 +42,14 @@ class Shape:
 
 def initial_params(layers: tuple[int, ...], env: Any, key: PRNGKeyArray) -> Params:
     """Fresh weights of a teacher's network."""
-    return q_network(layers).init(key, *seen("action", env, jnp.zeros(env.obs_size), jnp.array([1.0, 0.0])))
+    return q_network(layers).init(key, *network_inputs("action", env, jnp.zeros(env.obs_size), jnp.array([1.0, 0.0])))
 
 
 def expected_reward(
     layers: tuple[int, ...], env: Any, params: Params, obs: Float[Array, " obs"], actions: Float[Array, "*n 2"]
 ) -> Float[Array, "*n"]:
     """A teacher's network: the reward that it expects of actions in one situation, as it looks from them."""
-    return applied(q_network(layers))(params, *seen("action", env, obs, actions))[..., 0]
+    return as_function(q_network(layers))(params, *network_inputs("action", env, obs, actions))[..., 0]
 
 
 class LearnedTeacher(struct.PyTreeNode):

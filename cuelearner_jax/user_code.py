@@ -21,7 +21,7 @@ from typing import Any, ParamSpec, TypeVar
 import jax
 import numpy as np
 
-from cuelearner_jax.errors import NotFinite, UserError, no_space, raised_by
+from cuelearner_jax.errors import NotFinite, UserError, no_space, user_code_error
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -35,7 +35,7 @@ _OURS = (_PACKAGE, *(_PACKAGE.parent / place / "cuelearner_envs" for place in ("
 _LIBRARIES = tuple(Path(sysconfig.get_path(name)) for name in ("stdlib", "purelib", "platlib"))
 
 _left: dict[str, UserError] = {}  # by functions on the host, which other threads call; by what messages call them
-_working: Counter[int] = Counter()  # calls of `told` functions at work, by thread
+_working: Counter[int] = Counter()  # calls of `report_user_errors` functions at work, by thread
 _counting = threading.Lock()
 
 
@@ -81,7 +81,7 @@ def _at_work() -> Iterator[None]:
                 del _working[own]
 
 
-def told(function: Callable[P, T]) -> Callable[P, T]:
+def report_user_errors(function: Callable[P, T]) -> Callable[P, T]:
     """A function that users call, with the faults of their own code told in one line, the original as `__cause__`."""
 
     @functools.wraps(function)
@@ -109,7 +109,7 @@ def raise_in_one_line(error: Exception) -> None:
     if code := _of_user(error):
         name = getattr(code, "co_qualname", code.co_name)
         role = METHODS.get(code.co_name, "code")
-        raise raised_by(f"{role} {name.replace('<locals>.', '')}", error) from error
+        raise user_code_error(f"{role} {name.replace('<locals>.', '')}", error) from error
 
 
 def _of_user(error: BaseException) -> Any:

@@ -19,7 +19,7 @@ from cuelearner_jax.config import GuideScalars, Scalars
 from cuelearner_jax.config.parts import Bounds, part
 from cuelearner_jax.feedback.forms import AnswerForm
 from cuelearner_jax.guides.base import Guide, Kind
-from cuelearner_jax.guides.refining import Refined
+from cuelearner_jax.guides.refining import Refinement
 from cuelearner_jax.spaces.directions import evenly_spaced, rotate
 from cuelearner_jax.types import EnvState, GuidanceModel, Label, Params, Teacher
 
@@ -77,7 +77,7 @@ class Clone(Guide):
 
     def act(
         self, model: GuidanceModel, env: Any, obs: Array, actions: Array, active: Array, scalars: GuideScalars
-    ) -> Refined:
+    ) -> Refinement:
         """The network's actions in active rows, once it has been fitted."""
 
         def way(current: Array) -> Array:

@@ -14,7 +14,7 @@ import gymnasium
 import numpy as np
 
 import cuelearner_jax as cl
-from cuelearner_jax.adaptation.adapting import plain_scalars
+from cuelearner_jax.adaptation.by_model import plain_scalars
 
 WRONG = np.array([0.4, -0.3, 0.35])  # of actions between -1 and 1
 

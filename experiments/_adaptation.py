@@ -18,11 +18,11 @@ import numpy as np
 from _adaptation_methods import METHODS, Row
 from _pieces import chosen, listed
 
-from cuelearner_jax.adaptation import adapting
+from cuelearner_jax.adaptation import by_model
 from cuelearner_jax.adaptation.lanes import side_by_side
 from cuelearner_jax.cli import main as cuelearner
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.evaluate import episodes, watched_lanes
+from cuelearner_jax.evaluate import episodes, rollout_lanes
 from cuelearner_jax.policies import Agent
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs.trained import PolicySource, several
@@ -50,9 +50,9 @@ SMALL: Mapping[str, Any] = {  # what every method has at the scale smoke
     "schedule.learn_after": 20,
 }
 MODEST: Mapping[str, Any] = {  # models that 2 cores fit in seconds, as `cuelearner adapt` has them
-    "sizes.feedback_layers": adapting.SIZES.feedback_layers,
-    "sizes.fit_steps": adapting.SIZES.fit_steps,
-    "sizes.fit_batch_size": adapting.SIZES.fit_batch_size,
+    "sizes.feedback_layers": by_model.SIZES.feedback_layers,
+    "sizes.fit_steps": by_model.SIZES.fit_steps,
+    "sizes.fit_batch_size": by_model.SIZES.fit_batch_size,
 }
 
 
@@ -149,7 +149,7 @@ class Bench(NamedTuple):
     def measured(self, policy: Any, split: str | None = None) -> Row:
         """Metrics (lanes,) of a block of policies on the episodes of a split (default: the piece's)."""
         split = split or self.piece.split
-        return watched_lanes(self.env(split), policy, episodes(split), self.envs, self.envs * self.steps).means
+        return rollout_lanes(self.env(split), policy, episodes(split), self.envs, self.envs * self.steps).means
 
     def set(self, group: str, values: Any) -> Any:
         """A group of a configuration with the piece's settings of that name; tuples for lists."""
@@ -160,7 +160,7 @@ class Bench(NamedTuple):
     def scalars(self) -> Any:
         """The base agents' scalars with labels of the scenario's strength, refined within the bound."""
         eps = None if self.piece.world == UNCHANGED else self.task.scenario(self.piece.world).eps_deg
-        own = adapting.settling(self.config.scalars, self.piece.settings.get("scalars.eps_deg", eps))
+        own = by_model.settling(self.config.scalars, self.piece.settings.get("scalars.eps_deg", eps))
         reached = int(np.ceil(self.piece.bound_deg / own.eps_deg)) + 2  # passes of which each turns by eps
         own = dataclasses.replace(own, k_max=max(own.k_max, reached))  # a model that is not sure turns by less
         return self.set("scalars.", own)
@@ -201,7 +201,7 @@ def opened(folder: Path, study: Study, piece: Piece, scale: Scale, out: Path) ->
     source = source.on(piece.robot)
     assert source.grid is not None
     config = source.config
-    world = config.task if piece.world == UNCHANGED else source.task.scenario(piece.world).applied(config.task)
+    world = config.task if piece.world == UNCHANGED else source.task.scenario(piece.world).apply(config.task)
     own = {name.partition(".")[2]: value for name, value in piece.settings.items() if name.startswith("task.")}
     world = dataclasses.replace(world, **own)
     env = environment(source.task.name, world, "training", piece.robot)

@@ -17,12 +17,12 @@ import jax.numpy as jnp
 import numpy as np
 from _finetuning import FineTuning, every
 
-from cuelearner_jax.adaptation import adapting
-from cuelearner_jax.adaptation import calibrated as calibration
-from cuelearner_jax.adaptation.adapting import Adapted
+from cuelearner_jax.adaptation import by_calibration as calibration
+from cuelearner_jax.adaptation import by_model
+from cuelearner_jax.adaptation.by_model import AdaptationResult
 from cuelearner_jax.adaptation.judging import LABELS, Judging, judged_by_labels
 from cuelearner_jax.adaptation.lanes import Adaptation, product
-from cuelearner_jax.calibration import UNEXPLAINED, declared
+from cuelearner_jax.calibration import UNEXPLAINED, declared_distortions
 from cuelearner_jax.config import GuideSizes
 from cuelearner_jax.environment import actions_of, spaces_of
 from cuelearner_jax.guides import registry as guidances
@@ -64,7 +64,7 @@ def by_labels(kind: Any, bench: Bench) -> Iterator[Row]:
     envs = min(bench.envs, JUDGED)
     judge = Judging(bench.env("tuning"), envs, envs * bench.steps, piece.judge_by, bounds=piece.judge_bounds)
     of = Adaptation(guidance, sizes, scalars, env, bench.agents)
-    found = adapting.adapt(of, lanes, judge, bench.task.make_teacher(bench.world, env))
+    found = by_model.adapt(of, lanes, judge, bench.task.make_teacher(bench.world, env))
     told = {"used": found.judged.used.astype(float), "failed": np.asarray(found.block.failed).astype(float)}
     told |= {
         "within_deg": found.judged.within_deg,
@@ -85,7 +85,7 @@ def by_labels(kind: Any, bench: Bench) -> Iterator[Row]:
     yield {**which, "steps": 0, **told, **metrics}
 
 
-def unrewarded(bench: Bench, found: Adapted) -> Row:
+def unrewarded(bench: Bench, found: AdaptationResult) -> Row:
     """Whether models are used where their held-out answers judge, and metrics (lanes,) of these policies."""
     judged = judged_by_labels(found.of, found.block)
     model = found.block.guide.model
@@ -137,9 +137,9 @@ def calibrated(bench: Bench) -> Iterator[Row]:
     """By what answers tell of the world: held-out answers judge. Variant `SHUFFLED`: with answers of other rows."""
     piece, env = bench.piece, bench.env("training")
     kind, scalars = guidances.find("calibration"), calibration.settling(bench.scalars(), None)
-    guidance = kind.make(adapting.SIZES, spaces_of(env), None)
+    guidance = kind.make(by_model.SIZES, spaces_of(env), None)
     lanes = product(len(bench.seeds), range(piece.seeds), piece.labels, (actions_of(env).reach,))
-    of = calibration.Calibrating(guidance, adapting.SIZES, scalars, env, bench.agents, declared(env))
+    of = calibration.Calibrating(guidance, by_model.SIZES, scalars, env, bench.agents, declared_distortions(env))
     how = Judging(None, by=LABELS)
     found = calibration.adapt(of, lanes, how, bench.task.make_teacher(bench.world, env))
     if piece.variant == SHUFFLED:

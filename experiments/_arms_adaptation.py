@@ -31,7 +31,7 @@ CHANGED: dict[str, tuple[str, str, Options, str]] = {
     "push_right": ("push", "past_right", {}, "passed_right"),
 }
 FORMS = ("relative", "offset", "demonstration", "scalar", "dcoach", "bdcoach", "clic")
-KINDS = (EVIDENCE, *(kind for kind in FORMS if registry.registered(kind)))
+KINDS = (EVIDENCE, *(kind for kind in FORMS if registry.find_or_none(kind)))
 VARIANTS: dict[str, Options] = {
     "adapted": {},
     "wrong": {"scalars.mistake-probability": 0.2},

@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 from cuelearner_jax.config import GuideScalars
 from cuelearner_jax.guides import bdcoach, dcoach
 from cuelearner_jax.guides.fitting import Lesson
-from cuelearner_jax.guides.refining import Refined
+from cuelearner_jax.guides.refining import Refinement
 from cuelearner_jax.types import GuidanceModel, Label, Params
 
 
@@ -54,9 +54,9 @@ class CoachedCorrection(dcoach.DeepCoach):
         assert labels.base is not None  # `asking` keeps it for a kind that `sees_base`
         return super().lessons(labels, scalars).replace(action=labels.base)
 
-    def moved_on(
+    def refine_labelled_actions(
         self, model: GuidanceModel, env: Any, labels: Label, active: Bool[Array, " n"], scalars: GuideScalars
-    ) -> Refined:
+    ) -> Refinement:
         """What the corrected policy does where labels (n, ...) are about."""
         assert labels.base is not None
         return self.act(model, env, labels.obs, labels.base, active, scalars)

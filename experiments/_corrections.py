@@ -20,11 +20,11 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float
 
-from cuelearner_jax.adaptation.adapting import plain_scalars
+from cuelearner_jax.adaptation.by_model import plain_scalars
 from cuelearner_jax.adaptation.lanes import Adaptation, LaneState, ask_round, begin, product
 from cuelearner_jax.config import GuideSizes, Scalars
 from cuelearner_jax.environment import Quantity, WholeObservations, actions_of, spaces_of
-from cuelearner_jax.evaluate import episodes, watched_lanes
+from cuelearner_jax.evaluate import episodes, rollout_lanes
 from cuelearner_jax.guides import registry
 from cuelearner_jax.guides.base import Kind
 from cuelearner_jax.policies import Common, Heuristic, in_space, policy_of
@@ -100,7 +100,7 @@ def halls(split: str) -> Opened:
     scalars = dataclasses.replace(NAVIGATION_SCALARS, tau_deg=1.0)
 
     def play(policies: Any, seeds: Sequence[int], count: int) -> np.ndarray:
-        rolled = watched_lanes(shown, policies, episodes(split), count, count * config.max_steps)
+        rolled = rollout_lanes(shown, policies, episodes(split), count, count * config.max_steps)
         return np.asarray(rolled.each["success"])
 
     return Opened(env, Heuristic(env), make_teacher(config, env), 180.0, scalars, play)
@@ -160,7 +160,7 @@ def grasp(split: str) -> Opened:
 
     def play(policies: Any, seeds: Sequence[int], count: int) -> np.ndarray:
         several = 10 * count  # an episode is one step
-        return np.asarray(watched_lanes(env, policies, episodes(split), several, several).each["success"])
+        return np.asarray(rollout_lanes(env, policies, episodes(split), several, several).each["success"])
 
     return Opened(env, Heuristic(env), env, 1.0, scalars, play)
 

@@ -31,7 +31,7 @@ from cuelearner_jax.devices import compiler_options, each_lane, each_lane_in_pla
 from cuelearner_jax.environment import Environment, Spaces, view_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides import registry as guidances
-from cuelearner_jax.guides.untaught import NONE
+from cuelearner_jax.guides.baselines import NONE
 from cuelearner_jax.loop import Clock, Lane, TrainState, make_lane, start_clock
 from cuelearner_jax.policies import Agent
 from cuelearner_jax.run_config import RunConfig, Settings, check
@@ -119,7 +119,7 @@ def _stretch(
             return (lane.advance(clock, own.schedule), state), metrics["reward"]
 
         (after, trained), rewards = jax.lax.scan(iteration, (clock, tuned.state), length=iterations)
-        return tuned.replace(state=lane.kept_finite(trained, tuned.state)), after, rewards.mean()
+        return tuned.replace(state=lane.keep_finite(trained, tuned.state)), after, rewards.mean()
 
     return each_lane_in_place(one)(block)
 

@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from cuelearner_jax.config import GuideScalars
 from cuelearner_jax.guides import relative
-from cuelearner_jax.guides.refining import Refined
+from cuelearner_jax.guides.refining import Refinement
 from cuelearner_jax.types import GuidanceModel
 
 FACTOR = 0x9E3779B1  # Knuth's multiplicative hash: every entry's bits count, in their place
@@ -39,7 +39,7 @@ class FromChance(relative.Relative):
         actions: Float[Array, "n action"],
         active: Bool[Array, " n"],
         scalars: GuideScalars,
-    ) -> Refined:
+    ) -> Refinement:
         """Eq. 4 from a uniform action on, in active rows of a fitted model."""
         space = self.spaces.actions
         uniform = jax.vmap(lambda row: space.sample(key_of(row), ()))(obs)

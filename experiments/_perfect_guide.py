@@ -21,8 +21,8 @@ from cuelearner_jax import teachers
 from cuelearner_jax.config import GuideScalars
 from cuelearner_jax.environment import spaces_of
 from cuelearner_jax.guides.base import Kind
-from cuelearner_jax.guides.refining import Refined
-from cuelearner_jax.guides.untaught import Untaught
+from cuelearner_jax.guides.baselines import Untaught
+from cuelearner_jax.guides.refining import Refinement
 from cuelearner_jax.tasks.billiards import AGENT, SHIPPED_TEACHERS
 from cuelearner_jax.teachers import LearnedTeacher
 from cuelearner_jax.types import GuidanceModel
@@ -47,13 +47,13 @@ class Perfect(Untaught):
         actions: Float[Array, "n action"],
         active: Bool[Array, " n"],
         scalars: GuideScalars,
-    ) -> Refined:
+    ) -> Refinement:
         """Its best action in active rows; searched near the peaks, as agents search theirs: it is asked often."""
         told = teacher(self.name.removeprefix("perfect-"))
         agent = replace(AGENT, q_layers=told.layers, directions=told.directions)
         functions = agent.make("action", spaces_of(env))
         best = functions.explore(env, agent, told.params, obs, jax.random.key(0))  # draws nothing
-        return Refined(jnp.where(active[:, None], best, actions), active.astype(jnp.int32))
+        return Refinement(jnp.where(active[:, None], best, actions), active.astype(jnp.int32))
 
 
 def _kind(table: str) -> Kind:

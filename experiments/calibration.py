@@ -28,13 +28,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from cuelearner_envs.billiards.environment import Balls
-from cuelearner_jax.adaptation.adapting import settling
+from cuelearner_jax.adaptation.by_model import settling
 from cuelearner_jax.agents.choice import best_near_peaks
-from cuelearner_jax.calibration.calibrating import Result, calibrate
-from cuelearner_jax.calibration.corrected import Calibrated
-from cuelearner_jax.calibration.families import Distortion, Unknown, declared
-from cuelearner_jax.calibration.simulated import simulated
-from cuelearner_jax.calibration.walking import Walk
+from cuelearner_jax.calibration.estimation import Result, calibrate
+from cuelearner_jax.calibration.families import Distortion, Unknown, declared_distortions
+from cuelearner_jax.calibration.policy import Calibrated
+from cuelearner_jax.calibration.simulator import simulator_distortion
+from cuelearner_jax.calibration.walk import Walk
 from cuelearner_jax.config import Scalars
 from cuelearner_jax.environment import actions_of
 from cuelearner_jax.evaluate import episodes, evaluate_policy
@@ -81,7 +81,7 @@ def world_of(task: Any, name: str, own: Any, scalars: Scalars, split: str, fault
     """The world of a scene, its teacher, and answers as its scenario has them; `faults`: of the teacher."""
     scenario, more = SCENES.get(name, (LIKE[task.name], {}))
     rules = task.scenario(scenario)
-    applied = dataclasses.replace(rules.applied(own), **more)
+    applied = dataclasses.replace(rules.apply(own), **more)
     config = dataclasses.replace(own, **({"teacher": applied.teacher} if task.name == "billiards" else {}))
     config = config if name == UNCHANGED else applied
     scalars = dataclasses.replace(settling(scalars, rules.eps_deg), **{**rules.scalars, **faults})
@@ -92,7 +92,7 @@ def world_of(task: Any, name: str, own: Any, scalars: Scalars, split: str, fault
 def family_of(task: Any, own: Any, world: World, tilt: bool) -> tuple[Distortion, ...]:
     """What may have changed, as the world declares it; `tilt`: and the table, as a simulator has it."""
     if not tilt:
-        return declared(world.env)
+        return declared_distortions(world.env)
     known, space = task.environment(own), actions_of(world.env)
 
     def env_of(theta: Any) -> Any:
@@ -103,7 +103,10 @@ def family_of(task: Any, own: Any, world: World, tilt: bool) -> tuple[Distortion
         return Balls(balls[:, :2], balls[:, 2] > 0, jnp.zeros((), jnp.int32))
 
     unknowns = (Unknown("tilt x", "m/s^2"), Unknown("tilt y", "m/s^2"))
-    return (*declared(world.env), simulated("table: tilt", unknowns, env_of, state_of, space, REACH_DEG))
+    return (
+        *declared_distortions(world.env),
+        simulator_distortion("table: tilt", unknowns, env_of, state_of, space, REACH_DEG),
+    )
 
 
 def bases_of(task: Any, folder: Path | None) -> tuple[Any, Scalars, dict[int, Any]]:

@@ -23,7 +23,7 @@ import numpy as np
 import tyro
 
 import cuelearner_jax as cl
-from cuelearner_jax.adaptation.adapting import plain_scalars
+from cuelearner_jax.adaptation.by_model import plain_scalars
 from cuelearner_jax.feedback.answers import relative_feedback
 from cuelearner_jax.spaces import Box
 from cuelearner_jax.tasks import logs

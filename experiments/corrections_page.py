@@ -104,7 +104,7 @@ def percent(found: statistics.Interval | None) -> str:
 
 def title_of(kind: str) -> str:
     """What a kind is called."""
-    known = registry.registered(kind)
+    known = registry.find_or_none(kind)
     return "no labels" if kind == "base" else (known.title or kind if known else kind)
 
 

@@ -28,9 +28,9 @@ import numpy as np
 
 import cuelearner_jax as cl
 from cuelearner_envs.fetch.scripts import SCRIPTS
-from cuelearner_jax.adaptation.adapting import plain_scalars
+from cuelearner_jax.adaptation.by_model import plain_scalars
 from cuelearner_jax.bridges.gymnasium.layout import flatten, leaves_of
-from cuelearner_jax.bridges.gymnasium.source import made
+from cuelearner_jax.bridges.gymnasium.source import make_registered
 from cuelearner_jax.config import GuideSizes, Scalars
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.policies import in_space, policy_of
@@ -73,7 +73,7 @@ def hand_eye(environment: str, offset: Sequence[float]) -> Any:
     """An environment of Fetch whose camera is displaced."""
     from cuelearner_envs.fetch.hand_eye import HandEye  # loads Gymnasium
 
-    return HandEye(made(environment, {}, STEPS), offset, WITHIN[environment])
+    return HandEye(make_registered(environment, {}, STEPS), offset, WITHIN[environment])
 
 
 @cache

@@ -17,7 +17,7 @@ import jax
 import numpy as np
 
 from cuelearner_jax.calibration.meaning import Meaning
-from cuelearner_jax.calibration.walking import Walk
+from cuelearner_jax.calibration.walk import Walk
 from cuelearner_jax.environment import actions_of
 from cuelearner_jax.storage.provenance import provenance
 from cuelearner_jax.tasks import registry

@@ -32,9 +32,9 @@ from flax import struct
 from jaxtyping import Array, Float
 
 from cuelearner_envs.navigation.config import NavigationConfig
-from cuelearner_jax.agents.networks import applied, residual_network
+from cuelearner_jax.agents.networks import as_function, residual_network
 from cuelearner_jax.environment import Aims, spaces_of
-from cuelearner_jax.evaluate import episodes, evaluate_policy, watched_lanes
+from cuelearner_jax.evaluate import episodes, evaluate_policy, rollout_lanes
 from cuelearner_jax.guides.intent import Weights
 from cuelearner_jax.policies import BY_LANE, SHARED, PolicyNode, Taught, best_actions
 from cuelearner_jax.spaces import DIRECTIONS
@@ -94,7 +94,7 @@ class Clone(PolicyNode):
         """The network's output as a vector in the body's frame; it is one in the frame of the goal's direction."""
         goals = jax.vmap(self.env.heuristic)(obs)
         seen = jax.vmap(self.env.features)(obs, goals)
-        return DIRECTIONS.outward(applied(residual_network(self.layers, 2))(params, *seen), goals)
+        return DIRECTIONS.outward(as_function(residual_network(self.layers, 2))(params, *seen), goals)
 
     def loss(self, params: Any, obs: Float[Array, "n obs"], best: Float[Array, "n 2"]) -> Float[Array, ""]:
         """How far the clone is from what the road map does."""
@@ -195,7 +195,7 @@ def cloned(variant: str, scale: Scale) -> list[dict[str, Any]]:
         block = go_on(env, teacher, jnp.asarray(done), block)
         if (count := done + scale.each) in scale.counts:
             policy = clone.replace(params=block.params, env=shown)
-            found = watched_lanes(shown, policy, episodes(), scale.episodes, steps).means
+            found = rollout_lanes(shown, policy, episodes(), scale.episodes, steps).means
             rows += [_row(variant, count, seed, found, seed) for seed in range(scale.seeds)]
             print(f"{variant}: {count} actions, success {found['success'].mean():.3f}", flush=True)
     return rows

@@ -6,11 +6,11 @@ import jax
 import numpy as np
 import probes
 
-from cuelearner_jax.adaptation.adapting import Adapted
-from cuelearner_jax.adaptation.calibrated import Calibrating, Evidence
-from cuelearner_jax.adaptation.judging import Judged
+from cuelearner_jax.adaptation.by_calibration import Calibrating, Evidence
+from cuelearner_jax.adaptation.by_model import AdaptationResult
+from cuelearner_jax.adaptation.judging import Judgement
 from cuelearner_jax.adaptation.lanes import Adaptation, Lanes, begin
-from cuelearner_jax.calibration.families import declared, unknowns_of
+from cuelearner_jax.calibration.families import declared_distortions, unknowns_of
 from cuelearner_jax.config import GuideSizes
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides import registry as guidances
@@ -39,16 +39,16 @@ def agent():
 
 def write(folder, overwrite=False, origin="run", calibrated=False):
     """Writes the folder; `origin`: what policy.json says was adapted."""
-    kind, family = ("calibration", (declared(ENV),)) if calibrated else ("relative", ())
+    kind, family = ("calibration", (declared_distortions(ENV),)) if calibrated else ("relative", ())
     guidance = guidances.make(kind, SIZES, ENV)
     of = (Calibrating if calibrated else Adaptation)(guidance, SIZES, probes.SCALARS, ENV, Common(agent()), *family)
     worth = np.zeros(2), np.ones(2), np.ones(2, bool), np.full(2, 45.0)
-    judged = Judged("reward", *worth, difference=np.ones((2, 3)), rewarded_steps=np.zeros(2, int))
+    judged = Judgement("reward", *worth, difference=np.ones((2, 3)), rewarded_steps=np.zeros(2, int))
     block = begin(of, LANES)
     if calibrated:
         yes = np.ones(2, bool)
         theta = np.zeros((2, len(unknowns_of(of.family))), np.float32)
         block = Evidence(LANES.base, theta, block.labels, block.asked, block.bound, yes, ~yes)
-    found = Adapted(of, LANES, block, judged, [])
+    found = AdaptationResult(of, LANES, block, judged, [])
     with policy_folders.place_of(folder, overwrite) as place:
         adapted.write(place, found, TASK, probes.CONFIG.task, {"folder": origin})

@@ -53,7 +53,7 @@ def test_means_over_first_episodes_are_of_all_of_them_or_of_none():
 
 
 def test_each_environment_tells_its_own_steps_and_its_first_episode():
-    found = evaluate.watched(ENV, Uniform(), KEY, 400, 400 * (LONGEST - 1))
+    found = evaluate.rollout_with_progress(ENV, Uniform(), KEY, 400, 400 * (LONGEST - 1))
     ended = found.each["finished"] == 1
     np.testing.assert_array_equal(np.isnan(found.each["success"]), ~ended)
     np.testing.assert_array_equal(found.each["duration"][ended], found.episode_steps[ended])
@@ -65,7 +65,7 @@ def test_each_environment_tells_its_own_steps_and_its_first_episode():
 @pytest.mark.parametrize("steps", [1, 2, 5, 6, 48])
 def test_a_roll_out_in_stretches_is_bitwise_that_in_one(steps):
     told = []
-    watched = evaluate.watched(ENV, Uniform(), KEY, 20, 20 * steps, lambda *given: told.append(given))
+    watched = evaluate.rollout_with_progress(ENV, Uniform(), KEY, 20, 20 * steps, lambda *given: told.append(given))
     whole = rolled(20, steps)
     assert watched.means.keys() == whole.keys()
     for name, value in whole.items():
@@ -81,9 +81,9 @@ def test_lanes_in_stretches_are_bitwise_those_in_one(monkeypatch, at_once):
     program = probes.window_program("none")
     agents = Agent(probes.start(program, [0, 1, 2], [0, 0, 0]).agent.params, probes.FUNCTIONS)
     told = []
-    watched = evaluate.watched_lanes(ENV, agents, KEY, 10, 120, lambda *given: told.append(given))
+    watched = evaluate.rollout_lanes(ENV, agents, KEY, 10, 120, lambda *given: told.append(given))
     mesh = lane_mesh(jax.local_devices()[:1])
-    whole = evaluate.watched_lanes(ENV, agents, KEY, 10, 120, mesh=mesh).means
+    whole = evaluate.rollout_lanes(ENV, agents, KEY, 10, 120, mesh=mesh).means
     for name, value in whole.items():
         np.testing.assert_array_equal(watched.means[name], value, strict=True)
     assert len(set(watched.means["reward"])) > 1

@@ -12,8 +12,8 @@ import probes
 import pytest
 
 from cuelearner_jax import asking, evaluate, loop
-from cuelearner_jax.agents.networks import applied, q_network
-from cuelearner_jax.agents.replay import Transition, mirrored
+from cuelearner_jax.agents.networks import as_function, q_network
+from cuelearner_jax.agents.replay import Transition, apply_symmetries
 from cuelearner_jax.arbiters import episodes
 from cuelearner_jax.devices import lane_mesh
 from cuelearner_jax.guides import registry as guidances
@@ -24,7 +24,7 @@ from cuelearner_jax.types import Step
 ENV, EXPERT = probes.Window(), probes.Expert(probes.Window())
 MESH = lane_mesh()
 DEG = math.pi / 180
-q = applied(q_network(probes.AGENT.q_layers))
+q = as_function(q_network(probes.AGENT.q_layers))
 
 
 LARGEST = probes.LARGEST
@@ -71,7 +71,7 @@ def test_the_agent_learns_a_bandit_by_itself():
 def reward_of(params):
     key = jax.random.key(7)
     agents = Agent(params, probes.FUNCTIONS)
-    measured = evaluate.watched_lanes(ENV, agents, key, 40, 80, mesh=MESH).means
+    measured = evaluate.rollout_lanes(ENV, agents, key, 40, 80, mesh=MESH).means
     np.testing.assert_array_equal(measured["reward"], measured["hit"])
     return np.asarray(measured["reward"])
 
@@ -305,7 +305,7 @@ def test_refined_uniform_actions_win_far_more_often_than_chance():
 
     def reward(model):
         guide = Guided(Uniform(), model, ENV, probes.SCALARS, guidance)
-        found = evaluate.watched_lanes(ENV, guide, jax.random.key(3), 100, 1000, mesh=MESH).means
+        found = evaluate.rollout_lanes(ENV, guide, jax.random.key(3), 100, 1000, mesh=MESH).means
         return np.asarray(found["reward"])
 
     guided = reward(state.guide.model)
@@ -547,7 +547,7 @@ def test_evaluation_compiles_once_for_all_parameters_and_worlds():
         params = probes.start(probes.window_program("none"), [index], [0]).agent.params
         env = probes.Window(0.1 * index, 0.6)
         agents = Agent(params, probes.FUNCTIONS)
-        evaluate.watched_lanes(env, agents, jax.random.key(index), 3, 6, mesh=MESH)
+        evaluate.rollout_lanes(env, agents, jax.random.key(index), 3, 6, mesh=MESH)
     assert probes.compilations(evaluate._on_mesh) == [before + 1]
 
 
@@ -555,16 +555,16 @@ def test_transitions_are_mirrored_as_a_whole():
     rng = np.random.default_rng(0)
     obs, action, following = jnp.array(rng.normal(size=(3, 64, 2)), jnp.float32)
     batch = Transition(obs, action, jnp.arange(64.0), jnp.ones(64), following)
-    image = mirrored(jax.random.key(0), probes.Window(mirrors=True), batch)
+    image = apply_symmetries(jax.random.key(0), probes.Window(mirrors=True), batch)
     quarters = np.round(np.asarray(directions.difference(obs, image.obs)) / (math.pi / 2)).astype(int) % 4
     assert set(quarters) == {0, 1, 2, 3}
     for name in ("obs", "action", "next_obs"):
         expected = directions.rotate(getattr(batch, name), jnp.array(quarters * math.pi / 2))
         np.testing.assert_allclose(getattr(image, name), expected, atol=1e-5)
     np.testing.assert_array_equal(image.reward, batch.reward)
-    without = mirrored(jax.random.key(0), probes.Window(mirrors=True), batch.replace(next_obs=following[:, :0]))
+    without = apply_symmetries(jax.random.key(0), probes.Window(mirrors=True), batch.replace(next_obs=following[:, :0]))
     np.testing.assert_array_equal(without.obs, image.obs)
-    same = mirrored(jax.random.key(0), ENV, batch)
+    same = apply_symmetries(jax.random.key(0), ENV, batch)
     assert all(one is other for one, other in zip(jax.tree.leaves(same), jax.tree.leaves(batch), strict=True))
 
 

@@ -12,11 +12,11 @@ import probes
 import pytest
 
 from cuelearner_jax.agents import ddqn
-from cuelearner_jax.agents.networks import applied, q_network
+from cuelearner_jax.agents.networks import as_function, q_network
 from cuelearner_jax.devices import lane_mesh
 from cuelearner_jax.environment import Aims
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.evaluate import evaluate_policy, rollout, watched_lanes
+from cuelearner_jax.evaluate import evaluate_policy, rollout, rollout_lanes
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.loop import start_clock
 from cuelearner_jax.policies import (
@@ -72,7 +72,7 @@ def test_actions_near_aims_are_near_each_of_them_and_anywhere_where_there_is_non
 
 
 def test_the_agent_takes_the_direction_of_the_largest_value():
-    expected = probes.greedy_actions(applied(Q), AGENT.params, OBS)
+    expected = probes.greedy_actions(as_function(Q), AGENT.params, OBS)
     np.testing.assert_array_equal(act(AGENT), expected)
     assert len(np.unique(expected, axis=0)) > 2
     np.testing.assert_array_equal(act(AGENT, jax.random.key(6)), expected)  # whatever the key
@@ -249,7 +249,7 @@ BLOCKS = {
 @pytest.mark.parametrize("name", BLOCKS)
 def test_a_block_is_evaluated_as_each_of_its_lanes(name):
     policy = BLOCKS[name]()
-    together = watched_lanes(ENV, policy, KEY, 20, 400, mesh=MESH).means
+    together = rollout_lanes(ENV, policy, KEY, 20, 400, mesh=MESH).means
     alone = [evaluate_policy(ENV, policy.lane(lane), KEY, 20, 400) for lane in range(LANES)]
     assert together.keys() == alone[0].keys()
     for metric, values in together.items():

@@ -97,7 +97,7 @@ def test_bodies_and_engines_that_are_not_there_are_refused():
 
 
 def test_a_scenario_changes_its_fields_alone():
-    assert TASK.scenario("narrow").applied(probes.WindowConfig(28.0)) == probes.WindowConfig(5.0)
+    assert TASK.scenario("narrow").apply(probes.WindowConfig(28.0)) == probes.WindowConfig(5.0)
     with pytest.raises(UserError, match="unknown scenario 'narow', did you mean 'narrow'"):
         TASK.scenario("narow")
     with pytest.raises(UserError, match="window has no scenarios"):

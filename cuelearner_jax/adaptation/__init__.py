@@ -1,5 +1,6 @@
-"""Post-hoc adaptation: a base policy, a teacher or labels, and a kind of guidance give a refined policy, and its worth.
+"""Post-hoc adaptation: correct a finished policy by a teacher's answers, and judge the corrected policy.
 
-`lanes` asks and fits, `judging` compares a policy with its base, `adapting` runs both to the end, `stored` says how a
-policy is kept. A new way of correcting is a new kind (`guides.base.Kind`); `studies.adapt` checks what is asked for.
+`lanes` asks and fits, `judging` compares a policy with its base, `by_model` and `by_calibration` run both to the end,
+`serialization` stores policies. A new way of correcting is a new kind
+(`guides.base.Kind`). `studies.adapt` checks requests.
 """

@@ -1,4 +1,4 @@
-"""What may have changed: derived from what a world declares, or distortions of the user's own."""
+"""The changes that calibration considers: derived from a world's declarations, or the user's own distortions."""
 
 from __future__ import annotations
 
@@ -10,20 +10,27 @@ import jax.numpy as jnp
 import numpy as np
 
 from cuelearner_jax import plugins
-from cuelearner_jax.calibration import Distortion, declared
-from cuelearner_jax.calibration.families import Family, acted, check_family, planned, seen, unknowns_of
+from cuelearner_jax.calibration import Distortion, declared_distortions
+from cuelearner_jax.calibration.families import (
+    Family,
+    check_family,
+    undo_action,
+    undo_observation,
+    undo_physics,
+    unknowns_of,
+)
 from cuelearner_jax.environment import Environment, actions_of
-from cuelearner_jax.errors import UserError, shown
+from cuelearner_jax.errors import UserError, format_value
 
-SITUATIONS = 8  # in which no change must change nothing
-SAME = 1e-4  # by which an entry may differ then
+SITUATIONS = 8  # situations in which distortions at zero are checked to change nothing
+SAME = 1e-4  # largest difference of an entry in that check
 
 
 def load(reference: str) -> Any:
-    """Return the changes that `package.module:NAME` leads to. Raises UserError if there are none."""
+    """Return the changes that `package.module:NAME` names. Raises UserError if the object is not a distortion."""
     found = plugins.load(reference, object, "changes of the world")
     if not (isinstance(found, Distortion | list | tuple) or callable(found)):
-        raise UserError(f"{reference} is {shown(found)}: {WANTED}")
+        raise UserError(f"{reference} is {format_value(found)}: {WANTED}")
     return found
 
 
@@ -31,7 +38,7 @@ WANTED = "give a cuelearner_jax.Distortion, several, or a function of the enviro
 
 
 def family_of(given: Any, env: Any) -> Family:
-    """Return distortions that a user gives.
+    """Return the family of a user's distortions.
 
     Args:
         given: a distortion, a list of them, or a function of the environment that returns one of these.
@@ -44,21 +51,21 @@ def family_of(given: Any, env: Any) -> Family:
         given = given(env)
     several = (given,) if isinstance(given, Distortion) else given
     if not isinstance(several, list | tuple) or not all(isinstance(one, Distortion) for one in several):
-        raise UserError(f"changes is {shown(given)}: {WANTED}")
+        raise UserError(f"changes is {format_value(given)}: {WANTED}")
     return check_family(several)
 
 
 def check_acts(family: Family, env: Environment) -> None:
-    """Raises UserError unless distortions fit a world, and change nothing where their unknowns are zero."""
+    """Raise UserError unless distortions fit a world, and change nothing where their unknowns are zero."""
     k_reset, k_action = jax.random.split(jax.random.key(0))
     space, keys = actions_of(env), jax.random.split(k_reset, SITUATIONS)
     obs, actions = jax.vmap(env.reset)(keys)[1], space.sample(k_action, (SITUATIONS,))
     for one in family:
         nothing = jnp.zeros(len(one.unknowns))
         for name, given, found in (
-            ("sees", obs, jax.vmap(partial(seen, (one,), nothing))(obs)),
-            ("acts", actions, jax.vmap(partial(acted, (one,), nothing, corrects=False))(actions)),
-            ("plans", actions, jax.vmap(partial(planned, (one,), nothing))(obs, actions)),
+            ("sees", obs, jax.vmap(partial(undo_observation, (one,), nothing))(obs)),
+            ("acts", actions, jax.vmap(partial(undo_action, (one,), nothing, corrects=False))(actions)),
+            ("plans", actions, jax.vmap(partial(undo_physics, (one,), nothing))(obs, actions)),
         ):
             if found.shape != given.shape:
                 raise UserError(f"distortion {one.name!r}: {name} returns {found.shape[1:]}: give {given.shape[1:]}")
@@ -67,7 +74,7 @@ def check_acts(family: Family, env: Environment) -> None:
 
 
 def rebuilt(layer: dict[str, Any], env: Any, changes: Any = None) -> Family:
-    """Return the distortions of a stored policy.
+    """Return the distortions of a policy that was read from a file.
 
     Args:
         layer: what the file says of the policy.
@@ -83,7 +90,7 @@ def rebuilt(layer: dict[str, Any], env: Any, changes: Any = None) -> Family:
             f"this policy corrects changes of code, {code}, which is not loaded because a file names it: add "
             f"--changes {code} (from Python changes=...) if you trust that code"
         )
-    known = {one.name: one for one in (family_of(changes, env) if code else declared(env, gains=True))}
+    known = {one.name: one for one in (family_of(changes, env) if code else declared_distortions(env, gains=True))}
     if missing := [name for name in names if name not in known]:
         raise UserError(f"this policy corrects {missing[0]!r}, which {code or 'this world'} lacks: give its own")
     family = tuple(known[name] for name in names)

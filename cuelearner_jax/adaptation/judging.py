@@ -1,4 +1,4 @@
-"""Is an adapted policy worth more than its base? One that is worth less is not used.
+"""Judge whether an adapted policy is better than its base. An adapted policy that is worse is not used.
 
 With a simulator both play the same episodes, none of which reported figures are measured on: those of the "tuning"
 split of the changed world. Without one, held-out labels are predicted, against answering "already right" always.
@@ -21,37 +21,37 @@ from cuelearner_jax.adaptation.lanes import Adaptation, Lanes, LaneState
 from cuelearner_jax.asking import fitted_labels
 from cuelearner_jax.devices import each_lane
 from cuelearner_jax.environment import Environment, actions_of
-from cuelearner_jax.errors import UserError, closest
-from cuelearner_jax.evaluate import Rolled, Tell, episodes, mean_interval, watched_lanes
+from cuelearner_jax.errors import UserError, suggestion
+from cuelearner_jax.evaluate import Rollout, Tell, episodes, mean_interval, rollout_lanes
 from cuelearner_jax.policies import PolicyBlock
-from cuelearner_jax.spaces import said
+from cuelearner_jax.spaces import is_answered
 
-HELD_OUT = 5  # every fifth label
-LABELS = "labels"  # what is judged by, in place of a metric
-SPLIT = "tuning"  # of the episodes
-STEPS = 100  # of an environment, where a task counts steps
-MOST_BOUNDS = 16  # shares of a bound
+HELD_OUT = 5  # every fifth label is held out
+LABELS = "labels"  # `Judging.by` where held-out labels judge in place of a metric
+SPLIT = "tuning"  # the split that the judging episodes come from
+STEPS = 100  # steps of each environment, where a task counts steps
+MOST_BOUNDS = 16  # largest number of shares of a bound
 
 
 @dataclass(frozen=True)
 class Judging:
-    """How policies are compared with their bases, and how often on the way."""
+    """Settings of the comparison between policies and their bases, at the end and along the learning curve."""
 
     env: Environment | None  # the changed world with the episodes of `SPLIT`; None: there is no simulator
     num_envs: int = 100
-    steps: int = 10_000  # that the environments share
+    steps: int = 10_000  # environment steps, shared by the environments
     by: str = "reward"  # a metric, or "labels"
     every: int = 0  # labels between two measurements on the way (0: at the end alone)
     bounds: tuple[float, ...] = ()  # shares of a lane's bound within which its policy is tried as well
 
 
-class Judged(NamedTuple):
-    """What the base policies and the adapted ones are worth, lane by lane; more is better."""
+class Judgement(NamedTuple):
+    """The values of the base policies and of the adapted ones, one entry a lane; larger is better."""
 
     by: str  # a metric, or "labels": the share of held-out answers that are predicted
     before: np.ndarray  # (lanes,)
     after: np.ndarray  # (lanes,)
-    used: np.ndarray  # (lanes,) bool: is the model used? Not if it is worth less than nothing, or not finite
+    used: np.ndarray  # (lanes,) bool: is the model used? Not if it is worse than the base, or not finite
     within_deg: np.ndarray  # (lanes,) how far corrections then lead from the base's actions [the space's unit]
     # (lanes, 3) after less before and the ends of its 95% interval over episodes, paired; nan by labels
     difference: np.ndarray
@@ -59,7 +59,7 @@ class Judged(NamedTuple):
 
 
 def metrics_of(env: Environment) -> tuple[str, ...]:
-    """Names of what a roll-out measures in an environment."""
+    """Return the names of the metrics that a roll-out measures in an environment."""
     step = _step_of(env)
     return ("reward", *step.metrics, *step.outcome)
 
@@ -71,7 +71,7 @@ def _step_of(env: Environment) -> Any:
 
 
 def check_bounds(shares: tuple[float, ...], by: str) -> None:
-    """Raises UserError for shares of a bound that cannot be tried."""
+    """Raise UserError for shares of a bound outside (0, 1), or too many of them."""
     if len(shares) > MOST_BOUNDS:
         raise UserError(f"judge_bounds has {len(shares):,} shares, each played by itself: give at most {MOST_BOUNDS}")
     if not all(0 < share < 1 for share in shares) or len(set(shares)) < len(shares):
@@ -82,48 +82,49 @@ def check_bounds(shares: tuple[float, ...], by: str) -> None:
 
 
 class Judge:
-    """Measures the lanes of an adaptation on the way, and says in the end what is used of them.
+    """Measures the lanes of an adaptation along the learning curve, and decides in the end which models are used.
+
+    A block of lanes is a `LaneState`, or any record with `base`, `bound`, `asked`, `corrects` and `failed`.
 
     A block of lanes is a `LaneState`, or what else has `base`, `bound`, `asked`, `corrects` and `failed`.
     """
 
     def __init__(self, of: Adaptation, lanes: Lanes, how: Judging, mesh: Mesh, watch: Callable[[str], Tell]) -> None:
-        """`mesh`: devices that share the lanes; `watch`: by what is being done, who is told how far it is."""
+        """`mesh`: devices that share the lanes; `watch`: given the name of a piece of work, who is told progress."""
         self.of, self.lanes, self.how, self.watch = of, lanes, how, watch
         self.mesh = mesh if mesh.size > 1 else None
         self.curve: list[dict[str, np.ndarray]] = []
 
     def measure_if_due(self, block: Any, asked: int) -> None:
-        """Adds a row to the curve after so many labels."""
+        """Add a row to the learning curve if enough labels came since the last row."""
         if self.how.every and asked % self.how.every == 0:
             self.measure(block)
 
-    def judged(self, block: Any) -> tuple[Judged, Any]:
-        """What is used of the finished lanes, and these within the bounds that are used.
+    def judge_lanes(self, block: Any) -> tuple[Judgement, Any]:
+        """Return the judgement of the finished lanes, and the lanes with the bounds that are used.
 
-        Raises UserError if there is no such metric, or labels cannot judge.
+        Raises UserError if the world has no such metric, or labels cannot judge.
         """
         how, lanes = self.how, self.lanes
         found = judged_by_labels(self.of, block) if how.by == LABELS else None
         after = self.measure(block) if how.env is not None else None
         if found is not None:
             return found, block
-        assert after is not None  # a metric is of episodes
+        assert after is not None  # a metric needs episodes
         if how.by not in after.means:
-            raise UserError(f"there is no metric {how.by!r} to judge by{closest(how.by, [*after.means, LABELS])}")
+            raise UserError(f"there is no metric {how.by!r} to judge by{suggestion(how.by, [*after.means, LABELS])}")
         bases = self._rolled(self.of.bases, "the policy as it was")
         own = np.zeros(lanes.number, int) if len(bases.means[how.by]) == 1 else lanes.base
         played = self._played(after) + self._played(bases)[own]
         block, after, more = self._narrowed(block, after)
         before, worth = np.asarray(bases.means[how.by])[own], np.asarray(after.means[how.by])
         usable = ~np.asarray(block.failed) & np.asarray(block.corrects)
-        used = usable & (worth >= before)  # NaN is worth less than anything
+        used = usable & (worth >= before)  # NaN ranks below every value
         difference = mean_interval(np.asarray(after.each[how.by]) - np.asarray(bases.each[how.by])[own]).T
-        return Judged(how.by, before, worth, used, bounds_of(self.of, block), difference, played + more), block
+        return Judgement(how.by, before, worth, used, bounds_of(self.of, block), difference, played + more), block
 
-    def _narrowed(self, block: Any, after: Rolled) -> tuple[Any, Rolled, np.ndarray]:
-        """Lanes within the share of their bounds with which they are worth most, what they are worth so, and the
-        rewarded steps (lanes,) that it took to know."""
+    def _narrowed(self, block: Any, after: Rollout) -> tuple[Any, Rollout, np.ndarray]:
+        """Return lanes within the best share of their bounds, their value, and the rewarded steps (lanes,) of this."""
         bound, played, by = block.bound, np.zeros(self.lanes.number, int), self.how.by
         for share in self.how.bounds:
             tried = block.replace(bound=share * block.bound)
@@ -138,8 +139,8 @@ class Judge:
             bound = jnp.where(jnp.asarray(better), tried.bound, bound)
         return block.replace(bound=bound), after, played
 
-    def measure(self, block: Any) -> Rolled:
-        """Plays the lanes as they are, and adds a row to the curve."""
+    def measure(self, block: Any) -> Rollout:
+        """Roll out the lanes' current policies, and add a row to the learning curve."""
         found = self._rolled(self._policy(block), "the adapted policy")
         asked, failed = np.asarray(block.asked), np.asarray(block.failed)
         self.curve.append({"asked": asked, "failed": failed, **found.means})
@@ -148,23 +149,26 @@ class Judge:
     def _policy(self, block: Any) -> PolicyBlock:
         return self.of.policy(block, self.how.env)
 
-    def _rolled(self, policy: PolicyBlock, what: str) -> Rolled:
+    def _rolled(self, policy: PolicyBlock, what: str) -> Rollout:
         how = self.how
         assert how.env is not None
-        mesh = None if policy is self.of.bases else self.mesh  # there may be another number of them
-        return watched_lanes(how.env, policy, episodes(SPLIT), how.num_envs, how.steps, self.watch(what), mesh)
+        mesh = None if policy is self.of.bases else self.mesh  # the number of environments may differ
+        return rollout_lanes(how.env, policy, episodes(SPLIT), how.num_envs, how.steps, self.watch(what), mesh)
 
-    def _played(self, rolled: Rolled) -> np.ndarray:
-        """Environment steps (lanes,) of a roll-out that decide: of an outcome those of first episodes alone."""
+    def _played(self, rolled: Rollout) -> np.ndarray:
+        """Return the environment steps (lanes,) of a roll-out that count.
+
+        Where a metric is an outcome, only the steps of first episodes count.
+        """
         assert self.how.env is not None
         first = np.asarray(rolled.episode_steps)
         return first.sum(-1) if self.how.by in _step_of(self.how.env).outcome else np.full(len(first), self.how.steps)
 
 
-def judged_by_labels(of: Adaptation, block: LaneState) -> Judged:
-    """Compares a model with answering "already right" always, on every fifth label, to which it was not fitted.
+def judged_by_labels(of: Adaptation, block: LaneState) -> Judgement:
+    """Compare a model with answering "already right" always, on every fifth label, which the model was not fitted to.
 
-    The model that is kept is fitted to all of them; this one is made for the comparison alone.
+    The model in use is fitted to all labels; a second one is fitted for this comparison alone.
 
     Raises:
         UserError: answers that say nothing about turning an action, or fewer than five.
@@ -178,12 +182,12 @@ def judged_by_labels(of: Adaptation, block: LaneState) -> Judged:
     zero, right = jax.device_get(_predicted(of, block))
     used = ~np.asarray(block.failed) & (right >= zero)
     unknown, none = np.full((len(used), 3), np.nan), np.zeros(len(used), int)
-    return Judged(LABELS, zero, right, used, bounds_of(of, block), unknown, none)
+    return Judgement(LABELS, zero, right, used, bounds_of(of, block), unknown, none)
 
 
 @jax.jit
 def _predicted(of: Adaptation, block: LaneState) -> tuple[Array, Array]:
-    """Shares (lanes,) of what held-out answers say of a cue that is 0, and that a model of the others says too."""
+    """Return the shares (lanes,) of held-out answers that "already right" and a model of the other answers predict."""
     guidance, env, space = of.guidance, of.env, actions_of(of.env)
     one_pass = dataclasses.replace(of.scalars, k_max=1, tau_max_deg=space.reach)
 
@@ -193,9 +197,11 @@ def _predicted(of: Adaptation, block: LaneState) -> tuple[Array, Array]:
         held = labels.valid & (jnp.arange(labels.valid.shape[0]) % HELD_OUT == HELD_OUT - 2)
         others = labels.replace(valid=labels.valid & ~held)
         model = guidance.fit(key, env, others, guidance.init(key), of.scalars)
-        moved = guidance.moved_on(model, env, labels, held, one_pass).actions
+        moved = guidance.refine_labelled_actions(model, env, labels, held, one_pass).actions
         moves = space.log(labels.action, moved) / space.from_unit(of.scalars.eps_deg)
-        told = said(labels.answer) & held[:, None]  # words about one cue each; of the other cues nothing is compared
+        told = (
+            is_answered(labels.answer) & held[:, None]
+        )  # words about one cue each; of the other cues nothing is compared
         count = jnp.maximum(told.sum(), 1)
         share = lambda flags: jnp.sum(flags, where=told) / count  # noqa: E731
         right = share(jnp.round(jnp.clip(moves, -1, 1)) == labels.answer)
@@ -205,5 +211,5 @@ def _predicted(of: Adaptation, block: LaneState) -> tuple[Array, Array]:
 
 
 def bounds_of(of: Adaptation, block: Any) -> np.ndarray:
-    """The bounds (lanes,) of a block, in the unit of the space."""
+    """Return the bounds (lanes,) of a block of lanes, in the space's unit."""
     return actions_of(of.env).to_unit(np.asarray(block.bound), np)

@@ -10,7 +10,7 @@ compiled program: side by side on an accelerator, one by one on a CPU (`devices.
     block = begin(of, lanes)
     for _ in range(rounds(lanes, sizes)):
         block = ask_round(of, teacher, block)    # or once: take_labels(of, labels, block)
-    policy = of.policy(block)    # a block for `evaluate.watched_lanes`
+    policy = of.policy(block)    # a block for `evaluate.rollout_lanes`
 """
 
 from __future__ import annotations
@@ -39,24 +39,24 @@ from cuelearner_jax.storage.room import check_room
 from cuelearner_jax.types import Label, Teacher
 
 FLOAT = 4  # bytes
-OPTIMIZER = 4  # times the parameters: with their gradients and two moments
+OPTIMIZER = 4  # parameters, their gradients and Adam's two moments
 
 
 class Lanes(NamedTuple):
-    """What is adapted: one row a lane."""
+    """The lanes of an adaptation as arrays, one row a lane."""
 
     base: np.ndarray  # (lanes,) int: which of the base policies
-    seed: np.ndarray  # (lanes,) int: of everything random
-    budget: np.ndarray  # (lanes,) int: labels
-    bound_deg: np.ndarray  # (lanes,) float: how far from the base's actions [deg]
+    seed: np.ndarray  # (lanes,) int: seed of all random numbers
+    budget: np.ndarray  # (lanes,) int: label budget
+    bound_deg: np.ndarray  # (lanes,) float: largest distance from the base's actions [deg]
 
     @property
     def number(self) -> int:
-        """How many there are."""
+        """The number of lanes."""
         return len(self.seed)
 
     def rows(self, index: Any) -> Lanes:
-        """Some of the lanes."""
+        """Return the lanes with these row numbers."""
         return Lanes(*(column[index] for column in self))
 
 
@@ -66,19 +66,19 @@ def _lanes(rows: Sequence[tuple[int, int, int, float]]) -> Lanes:
 
 
 def product(bases: int, seeds: Sequence[int], budgets: Sequence[int], bounds_deg: Sequence[float]) -> Lanes:
-    """Every base policy with every seed, budget and bound."""
+    """Return the lanes of every combination of base policy, seed, label budget and bound."""
     rows = combinations(bounds_deg, budgets, range(bases), seeds)
     return _lanes([(base, seed, budget, bound) for bound, budget, base, seed in rows])
 
 
 def one_each(seeds: Sequence[int], budgets: Sequence[int], bounds_deg: Sequence[float]) -> Lanes:
-    """As many base policies as seeds, each with a seed of its own, with every budget and bound."""
+    """Return lanes that pair each base policy with a seed of its own, for every label budget and bound."""
     rows = combinations(bounds_deg, budgets, enumerate(seeds))
     return _lanes([(base, seed, budget, bound) for bound, budget, (base, seed) in rows])
 
 
 def side_by_side(policies: Sequence[Any]) -> Any:
-    """Single policies of one make as a block, whose leaves that are `BY_LANE` have a row for each of them."""
+    """Stack single policies of one structure into a block; leaves that are `BY_LANE` get a row for each policy."""
 
     def stacked(axis: Any, *parts: Any) -> Any:
         if axis is None:
@@ -89,41 +89,43 @@ def side_by_side(policies: Sequence[Any]) -> Any:
 
 
 class LaneState(struct.PyTreeNode):
-    """A lane on its way; of a block every leaf has a leading axis of lanes."""
+    """The state of one lane; in a block every leaf has a leading axis of lanes."""
 
     guide: GuideState
     base: Int[Array, ""]  # which of the base policies
-    bound: Float[Array, ""]  # as `log` of the space counts
+    bound: Float[Array, ""]  # in the unit of the space's `log`
     key: PRNGKeyArray
-    failed: Bool[Array, ""]  # did its model stop being finite? It stays as it was before then
+    failed: Bool[Array, ""]  # True once the model stopped being finite; the lane then keeps its last finite state
 
     @property
     def asked(self) -> Int[Array, "*lanes"]:
-        """Questions so far."""
+        """Number of questions so far."""
         return self.guide.asked
 
     @property
     def corrects(self) -> Bool[Array, "*lanes"]:
-        """Whether there is anything that could be used."""
+        """Whether the lane has a fitted model."""
         return self.guide.model.fitted
 
     @property
     def labels(self) -> Label:
-        """What was answered."""
+        """The labels so far."""
         return self.guide.labels
 
 
 class Adaptation(struct.PyTreeNode):
-    """What lanes share: a kind of guidance, a world to ask in, and the policies that are corrected."""
+    """The kind of guidance, the world and the base policies that all lanes of an adaptation share."""
 
-    guidance: Guide = struct.field(pytree_node=False)  # it must ask
-    sizes: GuideSizes = struct.field(pytree_node=False)  # that the guidance was made with
+    guidance: Guide = struct.field(pytree_node=False)  # a guide that asks for labels
+    sizes: GuideSizes = struct.field(pytree_node=False)  # sizes that the guide was made with
     scalars: Scalars  # of refinement, of fitting and of a simulated teacher's faults
     env: Environment  # the changed world
     bases: PolicyBlock  # leaves that are `BY_LANE` in its `axes` have a row for each base; or `policies.Common`
 
     def policy(self, block: LaneState, env: Any = None) -> Guided:
-        """Every lane's policy: its base's actions under its model, within its bound.
+        """Return every lane's policy: its base's actions under its model, within its bound.
+
+        `env`: where the policy is to act (default: the world of the questions).
 
         `env`: where it is to act (default: where was asked).
         """
@@ -132,7 +134,7 @@ class Adaptation(struct.PyTreeNode):
 
 
 def rounds(lanes: Lanes, sizes: GuideSizes) -> int:
-    """Rounds until the largest budget is asked for."""
+    """Return the number of rounds until the largest budget is asked for."""
     return asking.label_slots(int(lanes.budget.max()), sizes) // sizes.labels_per_round
 
 
@@ -147,7 +149,7 @@ def _begin(guidance: Guide, sizes: GuideSizes, slots: int, env: Any, columns: An
 
 
 def begin(of: Adaptation, lanes: Lanes) -> LaneState:
-    """Lanes that have asked nothing yet. Their number must divide among the devices of the mesh used later."""
+    """Return lanes that have asked nothing yet. Their number must divide among the devices of the mesh used later."""
     slots = rounds(lanes, of.sizes) * of.sizes.labels_per_round
     bound = actions_of(of.env).from_unit(lanes.bound_deg)
     columns = (*(jnp.asarray(column) for column in (lanes.base, lanes.seed, lanes.budget)), bound)
@@ -156,7 +158,10 @@ def begin(of: Adaptation, lanes: Lanes) -> LaneState:
 
 
 def check_memory(sizes: GuideSizes, kept: Any) -> None:
-    """Raises UserError if guides and their fitting need more memory than is free; `kept`: a tree of their shapes."""
+    """Raise UserError if guides and their fitting need more memory than is free.
+
+    `kept`: a tree of their shapes.
+    """
     size = sum(math.prod(leaf.shape) * leaf.dtype.itemsize for leaf in jax.tree.leaves(kept))
     fitting = 3 * FLOAT * sizes.ensemble * sizes.fit_batch_size * sum(sizes.feedback_layers)  # activations, gradients
     declared = f"sizes.feedback_layers {sizes.feedback_layers} with sizes.fit_batch_size {sizes.fit_batch_size}"
@@ -164,9 +169,9 @@ def check_memory(sizes: GuideSizes, kept: Any) -> None:
 
 
 def ask_round(of: Adaptation, teacher: Teacher, block: LaneState, mesh: Mesh | None = None) -> LaneState:
-    """One round of questions to a simulated teacher in every lane, and the fit that follows it (`asking.label_round`).
+    """Ask a simulated teacher one round of questions in every lane, then fit each lane's model (`asking.label_round`).
 
-    A lane that has its budget stays as it is. `mesh`: devices that share the lanes (default: the first one alone).
+    A lane whose budget is used up does not change. `mesh`: devices that share the lanes (default: the first one alone).
     """
     return _ask_round(of, teacher, block, mesh=mesh or lane_mesh(jax.local_devices()[:1]))
 
@@ -184,10 +189,10 @@ def _ask_round(of: Adaptation, teacher: Any, block: LaneState, *, mesh: Mesh) ->
 
 
 def take_labels(of: Adaptation, labels: Label, block: LaneState, mesh: Mesh | None = None) -> LaneState:
-    """Labels (lanes, slots, ...) that were given elsewhere, fitted once, as the last round of asking for them fits.
+    """Fit every lane once to given labels (lanes, slots, ...), as the last round of questions would.
 
-    A kind that fits from scratch has then the model of the lane that asked; one that goes on learning (deep COACH) is
-    corrected by all of them in one go, with other random numbers.
+    A kind that fits from scratch then has the same model as a lane that asked these questions. A kind that goes on
+    learning (deep COACH) is corrected by all labels in one go, with other random numbers.
     """
     return _take(of, labels, block, mesh=mesh or lane_mesh(jax.local_devices()[:1]))
 
@@ -196,10 +201,14 @@ def take_labels(of: Adaptation, labels: Label, block: LaneState, mesh: Mesh | No
 def _take(of: Adaptation, labels: Label, block: LaneState, *, mesh: Mesh) -> LaneState:
     def of_device(of: Adaptation, labels: Label, block: LaneState) -> LaneState:
         def one(labels: Label, lane: LaneState) -> LaneState:
-            if of.guidance.kind.sees_base:  # files do not keep what the base policy does: it tells again
+            if (
+                of.guidance.kind.sees_base
+            ):  # files do not keep the base policy's actions: the base policy is asked again
                 labels = labels.replace(base=of.bases.lane(lane.base).act(lane.key, None, labels.obs))
             guide = lane.guide.replace(labels=labels, asked=lane.guide.budget)
-            last = (lane.guide.budget - 1) // of.sizes.labels_per_round  # the fit that follows the last round
+            last = (
+                lane.guide.budget - 1
+            ) // of.sizes.labels_per_round  # the key of the fit that follows the last round
             return asking.with_guide(lane, asking.fit(of.guidance, of.env, of.scalars, guide, lane.key, last))
 
         return each_lane(one)(labels, block)
@@ -208,6 +217,6 @@ def _take(of: Adaptation, labels: Label, block: LaneState, *, mesh: Mesh) -> Lan
 
 
 def blame(of: Adaptation, teacher: Teacher | None, block: LaneState) -> None:
-    """Raises UserError if the first lane, which failed, did so for its policy or its teacher (see `asking.blame`)."""
+    """Raise UserError if the first lane failed because of its policy or its teacher (see `asking.blame`)."""
     lane = jax.tree.map(lambda leaf: leaf[0], block)
     asking.blame(of.env, teacher, lane.guide, of.bases.lane(lane.base), lane.key)

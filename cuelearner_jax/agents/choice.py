@@ -1,4 +1,4 @@
-"""The action of a set with the largest value, for many observations at once."""
+"""Find the action of a set with the largest value, for many observations at once."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ ChoiceT = TypeVar("ChoiceT", bound=Any)  # an action, or a record of actions
 def best_of(
     value: Callable[[Array, Array], Array], options: Float[Array, "m action"], obs: Float[Array, "n obs"]
 ) -> Float[Array, "n action"]:
-    """The best of a set of actions in each situation, a portion of the situations at a time.
+    """Return the best action of a set in each situation, computing one portion of the situations at a time.
 
     `value`: (observation (obs,), actions (m, action)) -> values (m,).
     """
@@ -32,7 +32,7 @@ def best_near_peaks(
     coarse: int,
     peaks: int,
 ) -> Float[Array, "n action"]:
-    """The choice that `best_of` makes, if the largest value lies next to one of the highest peaks of a first look.
+    """Return the choice of `best_of`, if the largest value lies next to a high peak of a coarse first look.
 
     Args:
         value: see `best_of`.
@@ -51,14 +51,17 @@ def best_near_peaks(
         near = jnp.mod(highest[:, None] * stride + jnp.arange(1 - stride, stride)[None], len(options)).ravel()
         return options[near][jnp.argmax(value(one, options[near]))]
 
-    return each_in_portions(choose, obs, looked_at(len(options), coarse, peaks))
+    return each_in_portions(choose, obs, values_per_choice(len(options), coarse, peaks))
 
 
-def looked_at(options: int, coarse: int, peaks: int) -> int:
-    """Actions whose values one choice takes, of a set searched near the peaks of a first look (`coarse` 0: all)."""
+def values_per_choice(options: int, coarse: int, peaks: int) -> int:
+    """Return how many action values one choice takes, in a search near the peaks of a coarse first look.
+
+    `coarse` 0: all actions of the set are valued.
+    """
     return coarse + peaks * (2 * options // coarse - 1) if coarse else options
 
 
 def each_in_portions(choose: Callable[[Array], ChoiceT], obs: Float[Array, "n obs"], looked: int) -> ChoiceT:
-    """A choice in each situation (leading axis: n), as many at once as values of `looked` actions each fit."""
+    """Return a choice in each situation (leading axis n), with as many situations at once as memory allows."""
     return jax.lax.map(choose, obs, batch_size=max(1, min(len(obs), portions().actions // looked)))

@@ -1,4 +1,4 @@
-"""Double DQN over a finite set of actions; the action is an input of the network.
+"""Double DQN over a finite set of actions. The action is an input of the network.
 
 Source: van Hasselt, Guez, Silver, "Deep reinforcement learning with double Q-learning", Eq. 4.
 """
@@ -17,8 +17,8 @@ from flax import struct
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from cuelearner_jax.agents import view
-from cuelearner_jax.agents.choice import best_near_peaks, best_of, looked_at
-from cuelearner_jax.agents.networks import applied, q_network, widened
+from cuelearner_jax.agents.choice import best_near_peaks, best_of, values_per_choice
+from cuelearner_jax.agents.networks import as_function, q_network, widen_layers
 from cuelearner_jax.agents.replay import Memory, Transition
 from cuelearner_jax.config import POSITIVE, SHARE, TRACED, Bounds, Frame, Layers, Scalars, Sizes, part
 from cuelearner_jax.environment import Spaces
@@ -67,14 +67,17 @@ class Config:
     """Gradient steps between two moves of the target network."""
 
     def make(self, frame: Frame, spaces: Spaces, bootstraps: bool = False) -> DoubleDQN:
-        """The agent for an environment's spaces. Raises UserError for a frame or a search that does not fit them."""
+        """Return the agent for an environment's spaces.
+
+        Raises UserError for a frame or a search that does not fit the spaces.
+        """
         if self.coarse_directions:
             check_directions(spaces.actions, "agent.coarse_directions", "give 0")
         view.widths(frame, spaces)
         return DoubleDQN(self, frame, spaces, bootstraps)
 
     def check(self, sizes: Sizes, bootstraps: bool) -> None:
-        """Raises UserError for options that do not work together."""
+        """Raise UserError for options that do not work together."""
         if self.coarse_directions and (self.coarse_directions < 3 or self.directions % self.coarse_directions):
             raise UserError(
                 f"agent.coarse_directions is {self.coarse_directions}: give a divisor of agent.directions "
@@ -92,7 +95,7 @@ class Config:
 
 
 class DDQNState(struct.PyTreeNode):
-    """What learning keeps beside the parameters."""
+    """The learning state of double DQN beside its parameters."""
 
     target_params: Params  # None where nothing bootstraps (discount 0)
     opt_state: Any
@@ -105,17 +108,17 @@ class DoubleDQN:
     options: Config
     frame: Frame
     spaces: Spaces
-    bootstraps: bool  # do targets look at the next observation?
+    bootstraps: bool  # whether targets use the next observation (discount above 0)
 
     @property
     def described(self) -> dict[str, Any]:
-        """Its set of actions, and what the network sees."""
+        """The set of actions and the network's frame, as JSON values for an export's contract."""
         return {"directions": self.options.directions, "frame": self.frame}
 
     def working(self, num_envs: int, portion: int) -> dict[str, int]:
-        """Activations of the widest passes: the argmax while acting, that inside targets, a batch with its gradient."""
+        """Return the number of activations of the widest passes: acting, targets, and a minibatch's gradient."""
         own = self.options
-        looked = looked_at(own.directions, own.coarse_directions, own.peaks)
+        looked = values_per_choice(own.directions, own.coarse_directions, own.peaks)
         rows = {
             "--agent.directions": min(num_envs * looked, max(portion, looked)),
             "--agent.batch-size": 3 * own.batch_size * len(own.q_layers),
@@ -126,13 +129,13 @@ class DoubleDQN:
         return {**needed, "--agent.n-step": 8 * own.batch_size * own.n_step}
 
     def init(self, key: PRNGKeyArray) -> tuple[Params, DDQNState]:
-        """Random parameters, the target network a copy of them."""
+        """Return random parameters, and a target network that is a copy of them."""
         params = q_network(self.options.q_layers).init(key, *map(jnp.zeros, view.widths(self.frame, self.spaces)))
         copy = jax.tree.map(jnp.copy, params) if self.bootstraps else None
         return params, DDQNState(copy, optimizer(self.options.optimizer, 0.0, 0.0).init(params))
 
     def act(self, env: Any, params: Params, obs: Float[Array, "n obs"], key: PRNGKeyArray) -> Float[Array, "n action"]:
-        """The action with the largest value of all in the set.
+        """Return the action of the whole set with the largest value.
 
         The rough first look (`coarse_directions`) is for play while learning alone: where values are sharp it misses
         peaks, which costs a finished agent reward (`benchmarks/search_agreement.py`).
@@ -142,17 +145,17 @@ class DoubleDQN:
     def explore(
         self, env: Any, options: Config, params: Params, obs: Float[Array, "n obs"], key: PRNGKeyArray
     ) -> Float[Array, "n action"]:
-        """The greedy action, searched near the peaks of a first look where the options say so."""
+        """Return the greedy action, searched near the peaks of a coarse first look where the options say so."""
         own = self.options
         if not own.coarse_directions:
             return self.act(env, params, obs, key)
         rough, layers = params, own.q_layers
         if own.coarse_dtype == "bfloat16":
-            rough, layers = widened(params, layers, ALIGNED)
-        look = applied(q_network(layers, jnp.dtype(own.coarse_dtype)))
+            rough, layers = widen_layers(params, layers, ALIGNED)
+        look = as_function(q_network(layers, jnp.dtype(own.coarse_dtype)))
         return best_near_peaks(
             partial(self.value, env, params),
-            lambda one, actions: look(rough, *view.seen(self.frame, env, one, actions))[:, 0],
+            lambda one, actions: look(rough, *view.network_inputs(self.frame, env, one, actions))[:, 0],
             self._directions,
             obs,
             own.coarse_directions,
@@ -162,9 +165,9 @@ class DoubleDQN:
     def value(
         self, env: Any, params: Params, obs: Float[Array, "*n obs"], actions: Float[Array, "*m action"]
     ) -> Float[Array, "*m"]:
-        """Q of each action, in a situation each or all in one."""
-        network = applied(q_network(self.options.q_layers))
-        return network(params, *view.seen(self.frame, env, obs, actions))[..., 0]
+        """Return Q of each action; `obs` is one situation for all actions, or one for each."""
+        network = as_function(q_network(self.options.q_layers))
+        return network(params, *view.network_inputs(self.frame, env, obs, actions))[..., 0]
 
     def update(
         self,
@@ -177,7 +180,7 @@ class DoubleDQN:
         memory: Memory,
         key: PRNGKeyArray,
     ) -> tuple[Params, DDQNState, Float[Array, ""], Float[Array, ""]]:
-        """One gradient step (`protocol.AgentFunctions.update`)."""
+        """Make one gradient step (`protocol.AgentFunctions.update`)."""
         own, target_params = self.options, rest.target_params
         batches = memory.batches(key, own.batch_size, own.n_step, scalars.discount)
         batch = batches[0]
@@ -208,7 +211,7 @@ class DoubleDQN:
         target_params: Params,
         batches: list[Transition],
     ) -> Float[Array, " batch"]:
-        """What the values of a batch are fitted to: of one-step and, if there are, n-step transitions."""
+        """Return the regression targets of a batch: of its one-step and, if given, n-step transitions."""
         if not self.bootstraps:
             return batches[0].reward
         actions = self.spaces.actions.spread(self.options.target_directions)
@@ -232,13 +235,13 @@ class DoubleDQN:
 def target(
     reward: Float[Array, ""], discount: Float[Array, ""] | float, next_value: Float[Array, ""]
 ) -> Float[Array, ""]:
-    """r + discount * Q'(s', argmax_a Q(s', a)); `discount` is 0 after a termination."""
+    """Return r + discount * Q'(s', argmax_a Q(s', a)); `discount` is 0 after a termination."""
     chex.assert_rank([reward, discount, next_value], 0)
     return reward + discount * next_value
 
 
 def loss(values: Float[Array, " batch"], targets: Float[Array, " batch"]) -> Float[Array, ""]:
-    """Mean squared error of the values of the actions taken."""
+    """Return the mean squared error of the values of the actions taken."""
     chex.assert_rank([values, targets], 1)
     return jnp.mean(jnp.square(values - targets))
 
@@ -246,6 +249,6 @@ def loss(values: Float[Array, " batch"], targets: Float[Array, " batch"]) -> Flo
 def optimizer(
     name: Literal["sgd", "adam"], learning_rate: Float[Array, ""] | float, max_norm: Float[Array, ""] | float
 ) -> optax.GradientTransformation:
-    """Gradients clipped to a global norm, then SGD or Adam. Both scalars may be traced."""
+    """Return SGD or Adam after clipping gradients to a global norm. Both scalars may be traced."""
     maker = {"sgd": optax.sgd, "adam": optax.adam}[name]
     return optax.chain(optax.clip_by_global_norm(max_norm), maker(learning_rate))

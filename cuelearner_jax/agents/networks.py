@@ -1,4 +1,4 @@
-"""The MLPs: action values and feedback models are functions of an observation and an action."""
+"""MLPs of an observation and an action, for action values and feedback models."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from cuelearner_jax.types import Params
 
 
 class Joined(nn.Module):
-    """A dense layer on the concatenation of observation and action, which is never built.
+    """A dense layer on the concatenation of observation and action, computed without building the concatenation.
 
     Of many actions in one state, the observation's share is computed once.
     """
@@ -43,7 +43,7 @@ class MLP(nn.Module):
     layers: Sequence[int]
     outputs: int
     dtype: DTypeLike = jnp.float32  # of the hidden layers' arithmetic; parameters and outputs are float32
-    layer_norm: bool = False  # are hidden layers normalised before their ReLU?
+    layer_norm: bool = False  # whether hidden layers are normalised before their ReLU
 
     @nn.compact
     def __call__(self, obs: Float[Array, "... obs"], action: Float[Array, "... action"]) -> Float[Array, "... outputs"]:
@@ -61,28 +61,28 @@ class MLP(nn.Module):
 
 
 def q_network(layers: Sequence[int], dtype: DTypeLike = jnp.float32, layer_norm: bool = False) -> MLP:
-    """Q(s, a): one output."""
+    """Return a network Q(s, a) with one output."""
     return MLP(tuple(layers), 1, dtype, layer_norm)
 
 
 def residual_network(layers: Sequence[int], outputs: int) -> MLP:
-    """phi(s, a): something to add to an action."""
+    """Return a network phi(s, a), whose output is added to an action."""
     return MLP(tuple(layers), outputs)
 
 
-def applied(network: MLP) -> Callable[[Params, jax.Array, jax.Array], jax.Array]:
-    """A network as a function: (params, obs (..., obs), actions (..., action)) -> outputs (..., outputs)."""
+def as_function(network: MLP) -> Callable[[Params, jax.Array, jax.Array], jax.Array]:
+    """Return a network as a function (params, obs (..., obs), actions (..., action)) -> (..., outputs)."""
     return lambda params, obs, actions: jnp.asarray(network.apply(params, obs, actions))
 
 
 def all_finite(tree: Any) -> Bool[Array, ""]:
-    """Is every number of a tree of arrays finite?"""
+    """Return whether every number of a tree of arrays is finite."""
     numbers = [leaf for leaf in jax.tree.leaves(tree) if jnp.issubdtype(leaf.dtype, jnp.floating)]
     return jnp.stack([jnp.isfinite(leaf).all() for leaf in numbers] or [jnp.array(True)]).all()
 
 
-def widened(params: Params, layers: Sequence[int], multiple: int) -> tuple[Params, tuple[int, ...]]:
-    """The same function with hidden layers of widths that are multiples: a tensor core's rows must be aligned.
+def widen_layers(params: Params, layers: Sequence[int], multiple: int) -> tuple[Params, tuple[int, ...]]:
+    """Return the same function with hidden widths rounded up to multiples, as tensor cores need aligned rows.
 
     The units that are added are zero throughout and add exactly nothing.
 

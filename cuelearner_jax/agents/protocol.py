@@ -1,4 +1,4 @@
-"""What an agent is: pure functions of one lane, made from options (`config.parts`), for any space and environment.
+"""The agent protocol: pure functions of one lane, made from options (`config.parts`), for any space and environment.
 
 The options are a class with a `NAME`, a line `ABOUT` it, and `make`; `registry` finds them by name. An agent made from
 equal options for equal spaces is equal, so that a program compiled for one serves the other.
@@ -27,44 +27,44 @@ class AgentFunctions(Protocol):
 
     @property
     def options(self) -> Any:
-        """What it was made from."""
+        """The options that the agent was made from."""
         ...
 
     @property
     def frame(self) -> Frame:
-        """What its networks see."""
+        """The frame of the networks' inputs."""
         ...
 
     @property
     def described(self) -> dict[str, Any]:
-        """What an export says of it, as JSON values."""
+        """Facts for an export's contract, as JSON values."""
         ...
 
     def working(self, num_envs: int, portion: int) -> dict[str, int]:
-        """The floats that one lane takes beside its state in each kind of work, by the option that decides it.
+        """Return the floats that one lane takes beside its state in each kind of work, by the option that decides it.
 
         `portion`: values of actions that are computed at once.
         """
         ...
 
     def init(self, key: PRNGKeyArray) -> tuple[Params, Any]:
-        """Parameters that act, and whatever else learning keeps beside them."""
+        """Return parameters that act, and the rest of the learning state."""
         ...
 
     def act(self, env: Any, params: Params, obs: Float[Array, "n obs"], key: PRNGKeyArray) -> Float[Array, "n action"]:
-        """Actions of the finished agent. `env` says how an observation looks from an action (`Sizes.frame`)."""
+        """Return actions of the finished agent. `env` gives the features of observations (`Sizes.frame`)."""
         ...
 
     def explore(
         self, env: Any, options: Any, params: Params, obs: Float[Array, "n obs"], key: PRNGKeyArray
     ) -> Float[Array, "n action"]:
-        """Actions while it learns; `options`: see `update`."""
+        """Return actions during learning; `options`: see `update`."""
         ...
 
     def value(
         self, env: Any, params: Params, obs: Float[Array, "*n obs"], actions: Float[Array, "*m action"]
     ) -> Float[Array, "*m"]:
-        """How much it expects of each action, in a situation each or all in one."""
+        """Return the expected value of each action; `obs` is one situation for all actions, or one for each."""
         ...
 
     def update(
@@ -78,7 +78,7 @@ class AgentFunctions(Protocol):
         memory: Memory,
         key: PRNGKeyArray,
     ) -> tuple[Params, Any, Float[Array, ""], Float[Array, ""]]:
-        """One gradient step.
+        """Make one gradient step.
 
         Args:
             env: see `act`; its `recall` has made the memory's observations.
@@ -104,23 +104,25 @@ class AgentOptions(Protocol):
 
     @property
     def replay_capacity(self) -> int:
-        """Transitions kept, a multiple of `Sizes.num_envs`."""
+        """Number of transitions in replay, a multiple of `Sizes.num_envs`."""
         ...
 
     def make(self, frame: Frame, spaces: Spaces, bootstraps: bool = False) -> AgentFunctions:
-        """The agent for an environment's spaces; floats of the options may be None. `bootstraps`: is discount above 0?
+        """Return the agent for an environment's spaces; floats of the options may be None.
+
+        `bootstraps`: whether the discount is above 0.
 
         Raises UserError for a frame in which the environment cannot be seen.
         """
         ...
 
     def check(self, sizes: Sizes, bootstraps: bool) -> None:
-        """Raises UserError for options that do not work together; each is within its bounds."""
+        """Raise UserError for options that do not work together; each is within its bounds."""
         ...
 
 
 class OptionalFacts(Protocol):
-    """What a class of options may say beside `AgentOptions`; ask by the functions below."""
+    """Optional members of a class of options, beside `AgentOptions`; read them by the functions below."""
 
     ACTOR: ClassVar[bool]  # does an actor choose, not the argmax of `value`? `update` then takes an `Offer`, `other`
     SORTS: ClassVar[bool]  # does `update` draw guided and own steps apart? Replay then counts the guided ones
@@ -128,7 +130,7 @@ class OptionalFacts(Protocol):
 
 
 def has_actor(options: Any) -> bool:
-    """Whether agents of these options act by an actor.
+    """Return whether agents of these options act by an actor.
 
     An argmax of values never finds another action better by the same values. An actor's choice can be compared by them,
     and `update(..., other=offer)` lets targets bootstrap from the better of the actor's action and the one offered.
@@ -137,10 +139,10 @@ def has_actor(options: Any) -> bool:
 
 
 def draws_sorts(options: Any) -> bool:
-    """Whether agents of these options draw guided and own steps apart (`Memory.batches`, `guided_share`)."""
+    """Return whether agents of these options draw guided and own steps separately (`guided_share`)."""
     return getattr(options, "SORTS", False)
 
 
 def stand_in(options: Any) -> Space:
-    """A small space in which agents of these options act, where the task's is not known."""
+    """Return a small space in which agents of these options act, for where the task's space is not known."""
     return getattr(options, "ACTS_IN", DIRECTIONS)

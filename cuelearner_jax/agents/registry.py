@@ -1,4 +1,4 @@
-"""The agents that can be named; add one's own with `AGENTS.register`, or name it as package.module:NAME."""
+"""The registry of agents. Add your own with `AGENTS.register`, or name it as package.module:NAME."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What has been met: steps as packed float32 rows of one ring buffer, so that sampling is a single gather.
+"""Replay: steps as packed float32 rows of one ring buffer, so that sampling is a single gather.
 
 The write position follows from the shared step counter and is therefore no part of the (vmapped) state: under vmap the
 write stays one in-place slice update.
@@ -52,7 +52,7 @@ class Following(NamedTuple):
 
 
 class RingBuffer(NamedTuple):
-    """Pure functions over rows (capacity, width). `step`: rows written so far, also those written over since."""
+    """Pure functions over rows (capacity, width). `step`: all rows written so far, overwritten ones included."""
 
     width: int
     empty: Callable[[int], Float[Array, "capacity width"]]
@@ -68,21 +68,21 @@ class RingBuffer(NamedTuple):
 def _write(
     rows: Num[Array, "*lanes capacity width"], packed: Num[Array, "*lanes n width"], start: Int[Array, ""]
 ) -> Num[Array, "*lanes capacity width"]:
-    """`packed` in place of the rows from `start` on."""
+    """Return the rows with `packed` written from row `start` on."""
     zero = jnp.zeros_like(start)
     return jax.lax.dynamic_update_slice(rows, packed, (*[zero] * (rows.ndim - 2), start, zero))
 
 
 @_write.def_vmap
 def _write_lanes(axis_size: int, batched: list[bool], rows: Array, packed: Array, start: Array) -> tuple[Array, bool]:
-    """One slice update for all lanes; JAX's own rule would make it a scatter."""
+    """Write one slice update for all lanes; JAX's own batching rule would make it a scatter."""
     if batched != [True, True, False]:
         raise ValueError("lanes have rows of their own and one step counter: vmap over rows and transitions alone")
     return _write(rows, packed, start), True
 
 
 def ring_buffer(example: StoredStep) -> RingBuffer:
-    """Builds the buffer for steps shaped like `example`.
+    """Build the buffer for steps shaped like `example`.
 
     `add` requires the capacity to be a multiple of the number of steps added at once: one of each environment. So the
     next step of an environment lies that many rows further.
@@ -125,15 +125,15 @@ def ring_buffer(example: StoredStep) -> RingBuffer:
 
 
 class Memory(NamedTuple):
-    """What one lane has met, to draw from."""
+    """One lane's replay, to draw minibatches from."""
 
     env: Any  # rebuilds observations
     buffer: RingBuffer
     rows: Float[Array, "capacity width"]
     filled: Int[Array, ""]  # rows written so far
     num_envs: int
-    bootstraps: bool  # do transitions have a next observation?
-    guided: Int[Array, "capacity 1"] | None = None  # see `count_guided`; None: guided steps are not counted
+    bootstraps: bool  # whether transitions have a next observation
+    guided: Int[Array, "capacity 1"] | None = None  # counts of `count_guided`; None: guided steps are not counted
 
     def batches(
         self,
@@ -143,7 +143,7 @@ class Memory(NamedTuple):
         discount: Float[Array, ""] | float = 0.0,
         guided_share: Float[Array, ""] | float | None = None,
     ) -> list[Transition]:
-        """Drawn transitions (size,), each under a random symmetry of the environment.
+        """Draw transitions (size,), each under a random symmetry of the environment.
 
         With `n_step` above 1 a second batch follows: from the same steps on, up to so many of one episode as one.
         All stored steps are as likely; with a `guided_share` the first of a batch, up to that share, are guided steps
@@ -158,10 +158,10 @@ class Memory(NamedTuple):
         found = [self.one_step(self.buffer.read(self.rows, numbers))]
         if n_step > 1:
             found.append(self.n_step(numbers, n_step, discount))
-        return [mirrored(k_mirror, self.env, batch) for batch in found]
+        return [apply_symmetries(k_mirror, self.env, batch) for batch in found]
 
     def one_step(self, stored: StoredStep) -> Transition:
-        """Stored steps (batch, ...) as transitions, their observations rebuilt."""
+        """Return stored steps (batch, ...) as transitions, with their observations rebuilt."""
         if self.bootstraps:
             next_obs = jax.vmap(self.env.recall_next)(stored.obs, stored.action, stored.aftermath)
             discount = stored.discount[:, 0]
@@ -170,7 +170,7 @@ class Memory(NamedTuple):
         return Transition(jax.vmap(self.env.recall)(stored.obs), stored.action, stored.reward, discount, next_obs)
 
     def n_step(self, numbers: Int[Array, " batch"], n: int, discount: Float[Array, ""] | float) -> Transition:
-        """The transitions that begin at rows `numbers` and span up to n steps of one episode."""
+        """Return the transitions that begin at rows `numbers` and span up to n steps of one episode."""
         after = self.buffer.follow(self.rows, self.filled, numbers, n, self.num_envs)
         summed = jax.vmap(partial(n_step_return, discount=discount))
         reward, factor, last = summed(after.rewards, after.discounts, after.ended, after.known)
@@ -238,7 +238,7 @@ def n_step_return(
     known: Bool[Array, " n"],
     discount: Float[Array, ""] | float,
 ) -> tuple[Float[Array, ""], Float[Array, ""], Int[Array, ""]]:
-    """Discounted rewards of up to n steps of one episode (Sutton and Barto, "Reinforcement learning", Eq. 7.1).
+    """Return the discounted rewards of up to n steps of one episode (Sutton and Barto, 2018, Eq. 7.1).
 
     The sum stops with the episode's last step, or with the last step that is known.
 
@@ -259,7 +259,7 @@ def n_step_return(
 
 
 def buffer_for(env: Environment, bootstraps: bool) -> RingBuffer:
-    """The ring buffer of an environment's steps, of which shapes alone are looked at."""
+    """Return the ring buffer for an environment's steps; shapes in place of arrays will do."""
     size = actions_of(env).size
 
     def one_step(env: Environment, key: PRNGKeyArray) -> StoredStep:
@@ -274,7 +274,7 @@ def buffer_for(env: Environment, bootstraps: bool) -> RingBuffer:
 def stored_step(
     obs: Float[Array, " memory"], action: Float[Array, " action"], step: Step, bootstraps: bool
 ) -> StoredStep:
-    """What replay keeps of one step from the remembered observation `obs`."""
+    """Return what replay stores of one step from the remembered observation `obs`."""
     kept = slice(None) if bootstraps else slice(0)
     ended: Bool[Array, ""] = step.terminated | step.truncated
     return StoredStep(
@@ -287,8 +287,8 @@ def stored_step(
     )
 
 
-def mirrored(key: PRNGKeyArray, env: Environment, batch: Transition) -> Transition:
-    """Each transition of a batch under a random symmetry of the environment."""
+def apply_symmetries(key: PRNGKeyArray, env: Environment, batch: Transition) -> Transition:
+    """Return each transition of a batch under a random symmetry of the environment."""
     image = random_symmetries(key, env, batch.reward.shape[0])
     obs, action = image(batch.obs, batch.action)
     next_obs = image(batch.next_obs, batch.action)[0] if batch.next_obs.shape[-1] else batch.next_obs

@@ -1,4 +1,4 @@
-"""Soft actor-critic in a box: a squashed Gaussian that maximises value and entropy, judged by any number of critics.
+"""Soft actor-critic (SAC) in a box: a squashed Gaussian actor and any number of critics.
 
 Source: Haarnoja et al., "Soft actor-critic algorithms and applications", 2018, with the temperature tuned (Eq. 18).
 More critics, of which each target takes a random subset: Chen et al., "Randomized ensembled double Q-learning", ICLR
@@ -80,7 +80,10 @@ class Config:
     """Rate at which the target critics follow."""
 
     def make(self, frame: Frame, spaces: Spaces, bootstraps: bool = False) -> SoftActorCritic:
-        """The agent for an environment's spaces. Raises UserError for actions of no box, or seen in another frame."""
+        """Return the agent for an environment's spaces.
+
+        Raises UserError if actions are not of a box, or the frame is not raw.
+        """
         if not isinstance(spaces.actions, Box):
             raise UserError(
                 f"agent 'sac' acts in boxes, not in {spaces.actions.name}: give --agent ddqn, which serves any space"
@@ -92,7 +95,7 @@ class Config:
         return SoftActorCritic(self, frame, spaces, bootstraps)
 
     def check(self, sizes: Sizes, bootstraps: bool) -> None:
-        """Raises UserError for options that do not work together."""
+        """Raise UserError for options that do not work together."""
         if self.target_critics > self.critics:
             raise UserError(
                 f"agent.target_critics is {self.target_critics}: give at most agent.critics ({self.critics})"
@@ -107,7 +110,7 @@ class Actor(nn.Module):
 
     @nn.compact
     def __call__(self, obs: Float[Array, "... obs"]) -> tuple[Float[Array, "... action"], Float[Array, "... action"]]:
-        """Mean and logarithm of the standard deviation of the Gaussian."""
+        """Return mean and logarithm of the standard deviation of the Gaussian."""
         x = obs
         for width in self.layers:
             x = nn.relu(nn.Dense(width, kernel_init=nn.initializers.xavier_uniform())(x))
@@ -116,7 +119,7 @@ class Actor(nn.Module):
         return mean, jnp.clip(log_std, *LOG_STD)
 
 
-class Drawn(NamedTuple):
+class ActionSample(NamedTuple):
     """Actions drawn from the squashed Gaussian."""
 
     unit: Float[Array, "n action"]  # in unit coordinates
@@ -124,7 +127,7 @@ class Drawn(NamedTuple):
 
 
 class SACState(struct.PyTreeNode):
-    """What learning keeps beside the parameters."""
+    """The learning state of SAC beside its parameters."""
 
     target_critics: Params  # None where nothing bootstraps (discount 0)
     log_temperature: Float[Array, ""]  # logarithm of the temperature over `Config.first_temperature`
@@ -135,20 +138,20 @@ class SACState(struct.PyTreeNode):
 
 @dataclass(frozen=True)
 class SoftActorCritic:
-    """The agent's functions (`protocol.AgentFunctions`); parameters are a dictionary of `actor` and `critics`."""
+    """The functions of SAC (`protocol.AgentFunctions`); parameters are a dictionary of `actor` and `critics`."""
 
     options: Config
     frame: Frame
     spaces: Spaces
-    bootstraps: bool  # do targets look at the next observation?
+    bootstraps: bool  # whether targets use the next observation (discount above 0)
 
     @property
     def described(self) -> dict[str, Any]:
-        """Its rule of choice, and what the networks see."""
+        """The rule of choice and the networks' frame, as JSON values for an export's contract."""
         return {"rule": "tanh of the actor's mean", "frame": self.frame}
 
     def working(self, num_envs: int, portion: int) -> dict[str, int]:
-        """Activations of a minibatch with its gradients, and of acting."""
+        """Return the number of activations of a minibatch with its gradients, and of acting."""
         own = self.options
         passes = 3 * own.critics * sum(own.critic_layers) + 3 * sum(own.actor_layers)
         return {
@@ -157,7 +160,7 @@ class SoftActorCritic:
         }
 
     def init(self, key: PRNGKeyArray) -> tuple[Params, SACState]:
-        """Random parameters, the target critics a copy of theirs, the temperature the first one."""
+        """Return random parameters, target critics that are copies, and the first temperature."""
         own, space = self.options, self.spaces.actions
         k_actor, k_critics = jax.random.split(key)
         obs, action = jnp.zeros(self.spaces.obs_size), jnp.zeros(space.size)
@@ -169,35 +172,35 @@ class SoftActorCritic:
         return {"actor": actor, "critics": critics}, SACState(copy, log_temperature, *opt_states)
 
     def act(self, env: Any, params: Params, obs: Float[Array, "n obs"], key: PRNGKeyArray) -> Float[Array, "n action"]:
-        """The action of the Gaussian's mean."""
+        """Return the squashed mean of the Gaussian."""
         return self.in_box(jnp.tanh(self._gaussian(params["actor"], obs)[0]))
 
     def explore(
         self, env: Any, options: Config, params: Params, obs: Float[Array, "n obs"], key: PRNGKeyArray
     ) -> Float[Array, "n action"]:
-        """Actions drawn from the squashed Gaussian."""
+        """Return actions drawn from the squashed Gaussian."""
         return self.in_box(self.draw(params["actor"], obs, key).unit)
 
     def value(
         self, env: Any, params: Params, obs: Float[Array, "*n obs"], actions: Float[Array, "*m action"]
     ) -> Float[Array, "*m"]:
-        """The smallest of the critics' values of each action, in a situation each or all in one."""
+        """Return the smallest critic's value of each action; `obs` is one situation for all, or one for each."""
         return self.values(params["critics"], obs, self.in_unit(actions)).min(0)
 
     def in_unit(self, actions: Float[Array, "*n action"]) -> Float[Array, "*n action"]:
-        """Actions of the box in unit coordinates."""
+        """Return actions of the box in unit coordinates."""
         return 2 * self.spaces.actions.log(self._box.middle(), actions)
 
     def in_box(self, unit: Float[Array, "*n action"]) -> Float[Array, "*n action"]:
-        """Actions in unit coordinates as actions of the box."""
+        """Return actions in unit coordinates as actions of the box."""
         return self.spaces.actions.exp(self._box.middle(), unit / 2)
 
-    def draw(self, actor: Params, obs: Float[Array, "n obs"], key: PRNGKeyArray) -> Drawn:
-        """Actions drawn from the squashed Gaussian, with the logarithm of their density; both have gradients."""
+    def draw(self, actor: Params, obs: Float[Array, "n obs"], key: PRNGKeyArray) -> ActionSample:
+        """Draw actions from the squashed Gaussian, with their log-densities; both have gradients."""
         mean, log_std = self._gaussian(actor, obs)
         noise = jax.random.normal(key, mean.shape)
         before = mean + jnp.exp(log_std) * noise
-        return Drawn(jnp.tanh(before), squashed_log_density(noise, log_std, before))
+        return ActionSample(jnp.tanh(before), squashed_log_density(noise, log_std, before))
 
     def values(
         self, critics: Params, obs: Float[Array, "*n obs"], unit: Float[Array, "*m action"]
@@ -218,7 +221,7 @@ class SoftActorCritic:
         key: PRNGKeyArray,
         other: Offer | None = None,
     ) -> tuple[Params, SACState, Float[Array, ""], Float[Array, ""]]:
-        """As many minibatches for the critics as the options say, then one step of actor and temperature.
+        """Make as many critic steps as the options say, then one step of actor and temperature.
 
         See `protocol.AgentFunctions.update`. `other`: see `targets`. The loss is the critics'.
         """
@@ -234,7 +237,7 @@ class SoftActorCritic:
             unit = self.in_unit(batch.action)
             error = lambda critics: loss_of(self.values(critics, batch.obs, unit), targets)  # noqa: E731
             loss, gradient = jax.value_and_grad(error)(critics)
-            critics, opt_state = stepped(options.critic_rate, most, gradient, opt_state, critics)
+            critics, opt_state = optimizer_step(options.critic_rate, most, gradient, opt_state, critics)
             if self.bootstraps:
                 target_critics = optax.incremental_update(critics, target_critics, options.polyak)
             return (critics, opt_state, target_critics, batch.obs), (loss, optax.tree.norm(gradient))
@@ -246,9 +249,9 @@ class SoftActorCritic:
 
         climbed = jax.value_and_grad(self.actor_loss, has_aux=True)(actor, critics, temperature, obs, k_actor)
         (_, log_density), gradient = climbed
-        actor, actor_opt = stepped(options.actor_rate, most, gradient, rest.actor_opt, actor)
+        actor, actor_opt = optimizer_step(options.actor_rate, most, gradient, rest.actor_opt, actor)
         surplus = -log_density - options.target_entropy * self.spaces.actions.size
-        log_temperature, temperature_opt = stepped(
+        log_temperature, temperature_opt = optimizer_step(
             options.temperature_rate, most, temperature * surplus, rest.temperature_opt, rest.log_temperature
         )
         state = SACState(target_critics, log_temperature, actor_opt, critics_opt, temperature_opt)
@@ -263,7 +266,7 @@ class SoftActorCritic:
         obs: Float[Array, "n obs"],
         key: PRNGKeyArray,
     ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-        """The mean of temperature * log p(a) - Q(s, a) of the actor's draws, and that of log p(a)."""
+        """Return the means of temperature * log p(a) - Q(s, a) and of log p(a) over the actor's draws."""
         drawn = self.draw(actor, obs, key)
         loss = temperature * drawn.log_density - self._climbed(critics, obs, drawn.unit)
         return loss.mean(), drawn.log_density.mean()
@@ -278,7 +281,7 @@ class SoftActorCritic:
         key: PRNGKeyArray,
         other: Offer | None = None,
     ) -> Float[Array, " batch"]:
-        """What the critics' values of a batch are fitted to: r + discount * (Q'(s', a') - temperature * log p(a')).
+        """Return the critics' targets of a batch: r + discount * (Q'(s', a') - temperature * log p(a')).
 
         Q' is the smallest value of the target critics drawn for this batch, a' the actor's draw. With an `other` it is
         r + discount * Q'(s', other) where that is larger. An offered action has no entropy; would Q' alone decide which
@@ -299,7 +302,7 @@ class SoftActorCritic:
         return jax.lax.stop_gradient(batch.reward + discount * batch.discount * value)
 
     def _judges(self, target_critics: Params, key: PRNGKeyArray) -> Params:
-        """The target critics of one batch: a random subset where there are more than the options ask for."""
+        """Return the target critics of one batch, a random subset where the options ask for fewer."""
         own = self.options
         if own.target_critics == own.critics:
             return target_critics
@@ -309,7 +312,7 @@ class SoftActorCritic:
     def _climbed(
         self, critics: Params, obs: Float[Array, "n obs"], unit: Float[Array, "n action"]
     ) -> Float[Array, " n"]:
-        """The value that the actor climbs."""
+        """Return the value that the actor maximises."""
         values = self.values(critics, obs, unit)
         return values.mean(0) if self.options.critics > self.options.target_critics else values.min(0)
 
@@ -334,7 +337,7 @@ class SoftActorCritic:
 def squashed_log_density(
     noise: Float[Array, "n action"], log_std: Float[Array, "n action"], before: Float[Array, "n action"]
 ) -> Float[Array, " n"]:
-    """log p(tanh(u)) of u = mean + std * noise, independent entries (Haarnoja et al., appendix C).
+    """Return log p(tanh(u)) of u = mean + std * noise, independent entries (Haarnoja et al., appendix C).
 
     log(1 - tanh(u)^2) is written as 2 (log 2 - u - softplus(-2 u)), which is finite for any u.
 
@@ -348,14 +351,14 @@ def squashed_log_density(
     return jnp.sum(normal - squashed, -1)
 
 
-def stepped(
+def optimizer_step(
     rate: Float[Array, ""] | float, max_norm: Float[Array, ""] | float, gradient: Any, opt_state: Any, params: Any
 ) -> tuple[Any, Any]:
-    """Parameters and Adam's state after a step with a gradient clipped to a norm."""
+    """Return parameters and Adam's state after a step whose gradient is clipped to a norm."""
     change, opt_state = optimizer("adam", rate, max_norm).update(gradient, opt_state, params)
     return optax.apply_updates(params, change), opt_state
 
 
 def loss_of(values: Float[Array, "critics batch"], targets: Float[Array, " batch"]) -> Float[Array, ""]:
-    """Mean squared error of all critics."""
+    """Return the mean squared error of all critics."""
     return jnp.mean(jnp.square(values - targets[None]))

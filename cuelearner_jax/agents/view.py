@@ -1,4 +1,4 @@
-"""What networks see of an observation and an action: the two as they are, or the one as it looks from the other.
+"""The inputs of networks: observation and action as they are, or the observation as it looks from the action.
 
 Seen from the action (`frame` "action"), situations that differ by a turn look alike, so a network's output for one
 holds for all of them. This is equivariance by the input. Sources: Wang, Walters, Platt, "SO(2)-equivariant
@@ -17,14 +17,14 @@ from cuelearner_jax.environment import Spaces
 from cuelearner_jax.errors import UserError
 
 
-def seen(
+def network_inputs(
     frame: Frame, env: Any, obs: Float[Array, "*n obs"], actions: Float[Array, "*m action"]
 ) -> tuple[Float[Array, "*n own"], Float[Array, "*m turned"]]:
-    """What a network takes for observation and action.
+    """Return a network's inputs for observation and action.
 
     Args:
         frame: "raw": the two as they are; "action": the environment's `features`.
-        env: whose features they are; nothing is asked of it in the raw frame.
+        env: provides the features; not used in the raw frame.
         obs: one observation (obs,) with any number of actions, or n observations with one action each.
         actions: (*m, action) or (n, action).
     """
@@ -35,7 +35,7 @@ def seen(
 
 
 def widths(frame: Frame, spaces: Spaces) -> tuple[int, int]:
-    """Entries of the two parts of what is seen. Raises UserError if the environment cannot be seen so."""
+    """Return the sizes of a network's two inputs. Raises UserError if the environment has no `features`."""
     if frame == "raw":
         return spaces.obs_size, spaces.actions.size
     if spaces.features is None:
@@ -49,5 +49,5 @@ def widths(frame: Frame, spaces: Spaces) -> tuple[int, int]:
 def outward(
     frame: Frame, spaces: Spaces, residual: Float[Array, "*n action"], actions: Float[Array, "*n action"]
 ) -> Float[Array, "*n action"]:
-    """A network's residual as a vector to be added to the actions: in the action's frame it is a turn from there."""
+    """Return a network's output as a vector to add to the actions; in the action's frame it is a turn from there."""
     return residual if frame == "raw" else spaces.actions.outward(residual, actions)

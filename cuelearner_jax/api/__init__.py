@@ -1,1 +1,1 @@
-"""The face for Python: what `import cuelearner_jax as cl` offers. Small on purpose; the rooms behind it offer more."""
+"""The public Python API: what `import cuelearner_jax as cl` offers. All other modules are internal."""

@@ -1,4 +1,4 @@
-"""Adaptation from Python: what `cuelearner adapt` does, with a policy to call as its result."""
+"""Adaptation from Python: what `cuelearner adapt` does. The result is a policy to call."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from typing import Any
 import jax
 
 from cuelearner_jax import user_code
-from cuelearner_jax.adaptation.adapting import plain_scalars
+from cuelearner_jax.adaptation.by_model import plain_scalars
 from cuelearner_jax.adaptation.lanes import blame
 from cuelearner_jax.api import arguments
-from cuelearner_jax.api.acting import CallablePolicy, as_policy, as_policy_in, source_of
-from cuelearner_jax.api.feedback import Labels, diverged, given_settings, label_path, labels_of, rows_of
+from cuelearner_jax.api.feedback import Labels, check_settings, divergence_error, label_path, labels_of, rows_of
+from cuelearner_jax.api.policies import CallablePolicy, as_policy, as_policy_in, source_of
 from cuelearner_jax.api.worlds import World
 from cuelearner_jax.calibration import Estimate, Result
 from cuelearner_jax.config import GuideSizes, Scalars
@@ -34,58 +34,59 @@ from cuelearner_jax.types import Label, Teacher
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class AdaptedPolicy(CallablePolicy):
-    """A policy under a feedback model, within a bound, or behind what changed in its world (guidance "calibration");
-    or the policy as it was, where neither is `used`."""
+    """A corrected policy: its base under a feedback model within a bound, or corrected for estimated changes.
+
+    Where `used` is False, it acts as its base.
+    """
 
     outcome: AdaptedStudy
     named: str | None  # the base, as Python calls it; None: its world has no name either
 
     @property
     def used(self) -> bool:
-        """Is the model used? Not if it made the policy worse, or where calibration finds no change."""
+        """Whether the correction is used. It is not if it made the policy worse, or calibration found no change."""
         return bool(self.outcome.found.judged.used[0])
 
     @property
     def judged(self) -> tuple[str, float, float]:
-        """(metric, before, after): what the policy was worth on the tuning episodes, and what the model makes of it."""
+        """The metric's name, and its value before and after the correction, on tuning episodes or held-out labels."""
         of = self.outcome.found.judged
         return of.by, float(of.before[0]), float(of.after[0])
 
     @property
     def difference(self) -> tuple[float, float, float]:
-        """After less before, and the ends of its 95% interval over the tuning episodes; nan where labels judge."""
+        """The metric after less before, and its 95% interval over the tuning episodes; NaN where labels judge."""
         estimate, lower, upper = (float(value) for value in self.outcome.found.judged.difference[0])
         return estimate, lower, upper
 
     @property
     def rewarded_steps(self) -> int:
-        """Environment steps whose rewards or outcomes decided whether the model is used; 0 where labels judge."""
+        """Number of environment steps whose rewards decided whether the correction is used; 0 where labels judge."""
         return int(self.outcome.found.judged.rewarded_steps[0])
 
     @property
     def labels(self) -> Labels:
-        """What was answered (of relative feedback)."""
+        """The labels so far (relative feedback)."""
         return labels_of(jax.tree.map(lambda leaf: leaf[0], self.outcome.found.labels))
 
     @property
     def result(self) -> Result | None:
-        """What calibration found: its verdict, and an estimate with its interval of each unknown; None: a model was
-        fitted."""
+        """The verdict of calibration and its estimates with intervals. None where a feedback model was fitted."""
         return next(iter(self.outcome.found.results), None)
 
     @property
     def estimates(self) -> tuple[Estimate, ...]:
-        """Of each unknown of calibration (name, unit, mean, low, high, changed); empty: a model was fitted."""
+        """Calibration's estimates (name, unit, mean, low, high, changed). Empty where a feedback model was fitted."""
         return self.result.estimates if self.result else ()
 
     @property
     def words(self) -> list[str]:
-        """What `cuelearner adapt` prints of it, line by line."""
+        """The lines that `cuelearner adapt` prints of this result."""
         return study.sentences(self.outcome.found)
 
-    @user_code.told
+    @user_code.report_user_errors
     def save(self, folder: str | Path, overwrite: bool = False) -> None:
-        """Writes a policy folder, as `cuelearner adapt` does; `load_policy` and every command take it.
+        """Write a policy folder, as `cuelearner adapt` does. `load_policy` and every command read it.
 
         Raises UserError if the folder is in use, or the policy was adapted in no world that can be named.
         """
@@ -101,7 +102,7 @@ class AdaptedPolicy(CallablePolicy):
             self.outcome._replace(origin={"code": self.named}).write(place)
 
 
-@user_code.told
+@user_code.report_user_errors
 def adapt(
     policy: Any,
     world: World | Environment,
@@ -119,14 +120,14 @@ def adapt(
     judge_bounds: Sequence[float] | None = None,
     changes: Any = None,
 ) -> AdaptedPolicy:
-    """Corrects a finished policy by labels about what it does in a (changed) world: what `cuelearner adapt` does.
+    """Correct a finished policy by labels about its actions in a (changed) world, as `cuelearner adapt` does.
 
     Labels are asked for in rounds, about actions refined by the model so far (DAgger), within a bound of the policy's
     own. A model that makes the policy worse than it was, on tuning episodes of the world, is not used, with a warning.
-    What is left out is as the world's scenario suggests, or else as for any world.
+    Arguments that are left out follow the world's scenario, else the defaults of `cuelearner adapt`.
 
     Args:
-        policy: what is to be corrected: a policy, or any function of a batch of observations (NumPy in, NumPy out; one
+        policy: the policy to correct: a policy, or any function of a batch of observations (NumPy in, NumPy out; one
             that `jax.jit` made is compiled in).
         world: where it acts; a bare environment will do.
         teacher: who answers: a teacher, or a function of observations (NumPy in, NumPy out) or another policy, which
@@ -142,7 +143,7 @@ def adapt(
         seed: of everything random.
         judge_by: the metric by which it is judged, or "labels": by the prediction of held-out ones (default: the
             scenario's, or "reward"; of calibration "labels").
-        judge_episodes: that many tuning episodes, each of 100 steps where the task does not count episodes.
+        judge_episodes: number of tuning episodes, each of 100 steps where the task does not count episodes.
         judge_bounds: shares of the bound, such as (0.5, 0.25), within which the model is tried on these episodes too;
             it is used within what is worth most (default: the scenario's, or none).
         changes: of guidance "calibration": what may have changed, as `Distortion`s of your own, or a function of the
@@ -154,7 +155,7 @@ def adapt(
     source = _source(policy, world)
     env = world.env if isinstance(world, World) else world
     space = actions_of(env)
-    sizes, scalars, eps_deg = given_settings(space, sizes, scalars, eps_deg)
+    sizes, scalars, eps_deg = check_settings(space, sizes, scalars, eps_deg)
     guidance, judge_by = (
         arguments.optional(arguments.text, name, value)
         for name, value in (("guidance", guidance), ("judge_by", judge_by))
@@ -184,7 +185,7 @@ def adapt(
     outcome = study.run(subject, request, note=partial(warnings.warn, stacklevel=5))
     if outcome.found.failed.any():
         blame(outcome.found.of, teacher, outcome.found.block)
-        raise diverged()
+        raise divergence_error()
     if not outcome.found.judged.used.all():
         warnings.warn(study.sentences(outcome.found)[-1], stacklevel=3)
     adapted = outcome.found.policy(env).lane(0)
@@ -197,13 +198,13 @@ def adapt(
 
 
 def _source(policy: Any, world: Any) -> PolicySource:
-    """Where a policy comes from: its task, and what it was trained with. Raises UserError for what is no world."""
+    """Return a world's task and the configuration of its training. Raises UserError for an object that is no world."""
     if isinstance(world, World):
         return source_of(policy, world)
     if hasattr(world, "observation_space"):
         raise UserError("world is an environment of Gymnasium: give cl.from_gymnasium(its id, class or function)")
     if isinstance(world, type) or not all(callable(getattr(world, name, None)) for name in ("reset", "step")):
-        raise arguments.refused("world", world, "a world, as cl.make gives it, or an environment")
+        raise arguments.argument_error("world", world, "a world, as cl.make gives it, or an environment")
     task = Task("environment", "a bare environment", _Bare, (Body("own", "", lambda config, split: world),))
     config = getattr(policy, "trained", None) or RunConfig(_Bare(), scalars=plain_scalars(actions_of(world)))
     return PolicySource(task, config, None, Path(task.name))
@@ -211,11 +212,11 @@ def _source(policy: Any, world: Any) -> PolicySource:
 
 @dataclasses.dataclass(frozen=True)
 class _Bare:
-    """The configuration of a bare environment: none."""
+    """The empty configuration of a bare environment."""
 
 
 def _given(labels: Any, world: Any) -> tuple[int | None, Path | None, Label | None]:
-    """Labels as a number of questions, as a file, or as rows (labels, ...). Raises UserError for others."""
+    """Return labels as a number of questions, as a file, or as rows (labels, ...). Raises UserError for others."""
     if isinstance(labels, str | os.PathLike):
         path = label_path(labels)
         if isinstance(world, World):
@@ -234,7 +235,7 @@ def _shares(name: str, given: Any) -> tuple[float, ...]:
 
 
 def _called(policy: Any) -> str:
-    """How Python calls a policy."""
+    """Return a policy's name in Python."""
     inner = as_policy(policy)
     inner = getattr(inner, "function", inner)
     name = getattr(inner, "__qualname__", type(inner).__qualname__)

@@ -1,7 +1,7 @@
-"""Arguments of the face, checked at the door: each function returns its argument ready for use, or names it.
+"""Check the arguments of the public API. Each function returns its argument ready for use, or raises UserError.
 
-Every function takes the argument's name and its value, and raises UserError with one line that says what was given and
-what is wanted. They look at values alone and compile nothing.
+Every function takes the argument's name and its value. Its UserError is one line that says what was given and what is
+wanted. The functions check values alone and compile nothing.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Float, PRNGKeyArray
 
-from cuelearner_jax.config import LARGEST_FLOAT, plain, settled
-from cuelearner_jax.errors import UserError, closest, shown
+from cuelearner_jax.config import LARGEST_FLOAT, normalize_options, plain
+from cuelearner_jax.errors import UserError, format_value, suggestion
 from cuelearner_jax.policies import Policy, policy_of, teaching
 from cuelearner_jax.runs.grid import LARGEST_BUDGET, LARGEST_SEED
 from cuelearner_jax.spaces import Space
@@ -31,83 +31,83 @@ FoundT = TypeVar("FoundT")
 KindT = TypeVar("KindT")
 
 
-def refused(name: str, value: Any, wanted: str) -> UserError:
-    """Build the error for an argument: what was given, and what is wanted."""
-    return UserError(f"{name} is {shown(value)}: give {wanted}")
+def argument_error(name: str, value: Any, wanted: str) -> UserError:
+    """Return the UserError for an argument: its name, the given value, and what is wanted."""
+    return UserError(f"{name} is {format_value(value)}: give {wanted}")
 
 
 def optional(check: Callable[..., FoundT], name: str, value: Any, *more: Any) -> FoundT | None:
-    """An argument that may be left out (None), else as `check` has it."""
+    """Return an argument that may be left out (None), else the result of `check`."""
     return None if value is None else check(name, value, *more)
 
 
 def instance(name: str, value: Any, kind: type[KindT], wanted: str) -> KindT:
-    """An object of a class; `wanted` says where one comes from."""
+    """Return an object of a class; `wanted` says where such an object comes from."""
     if not isinstance(value, kind):
-        raise refused(name, value, wanted)
+        raise argument_error(name, value, wanted)
     return value
 
 
 def flag(name: str, value: Any) -> bool:
-    """True or False, and nothing that merely counts as such."""
+    """Return True or False; numbers such as 1 are refused."""
     return bool(instance(name, value, bool | np.bool_, "True or False"))  # pyright: ignore[reportArgumentType]
 
 
 def text(name: str, value: Any, known: Iterable[str] = ()) -> str:
-    """A word: one of those that are known, if any are named."""
+    """Return a word; if `known` words are given, it must be one of these."""
     if not isinstance(value, str) or not 0 < len(value) <= LONGEST or not value.isprintable():
-        raise refused(name, value, f"a name, in up to {LONGEST} printable characters")
+        raise argument_error(name, value, f"a name, in up to {LONGEST} printable characters")
     if (known := list(known)) and value not in known:
-        raise UserError(f"{name} is {shown(value)}{closest(value, known)}")
+        raise UserError(f"{name} is {format_value(value)}{suggestion(value, known)}")
     return value
 
 
 def whole(name: str, value: Any, least: int, most: int) -> int:
-    """A whole number between two bounds, both of which it may be."""
+    """Return a whole number between two bounds, both included."""
     try:
         number = None if isinstance(value, bool) else operator.index(value)
     except TypeError:
         number = None
     if number is None or not least <= number <= most:
-        raise refused(name, value, f"a whole number from {least} to {most:,}")
+        raise argument_error(name, value, f"a whole number from {least} to {most:,}")
     return number
 
 
 def seed(name: str, value: Any) -> int:
-    """A seed."""
+    """Return a seed: a whole number."""
     return whole(name, value, 0, LARGEST_SEED - 1)
 
 
 def budget(name: str, value: Any, least: int = 1) -> int:
-    """A number of labels."""
+    """Return a number of labels."""
     return whole(name, value, least, LARGEST_BUDGET - 1)
 
 
 def amount(name: str, value: Any, space: Space) -> float:
-    """A strength or a bound, above 0 and up to a space's reach, in the space's unit."""
+    """Return a strength or a bound, above 0 and up to a space's reach, in the space's unit."""
     return number(name, value, space.reach, f"a number above 0 and up to {space.reach:g} ({space.unit})")
 
 
 def number(name: str, value: Any, most: float, wanted: str) -> float:
-    """A number above 0, up to a bound."""
+    """Return a number above 0, up to a bound."""
     found = plain(value)
     if isinstance(found, bool) or not isinstance(found, int | float) or not 0 < found <= most:  # NaN is neither
-        raise refused(name, value, wanted)
+        raise argument_error(name, value, wanted)
     return float(found)
 
 
 def several(name: str, values: Any, of_what: str) -> list[Any]:
-    """Values in a list, tuple, range or array of one axis; no text, whose letters would be meant."""
+    """Return the values of a list, tuple, range or array of one axis; text is refused."""
     if not isinstance(values, list | tuple | range) and getattr(values, "ndim", None) != 1:
-        raise refused(name, values, f"a list of {of_what}")
+        raise argument_error(name, values, f"a list of {of_what}")
     return list(values)
 
 
 def path(name: str, value: Any) -> Path:
-    """A path, of a file that need not be there."""
+    """Return the path of a file, which need not exist."""
     given = os.fspath(value) if isinstance(value, str | os.PathLike) else None
     if not isinstance(given, str) or not given or "\0" in given:
-        raise refused(name, value, "a path, as text or pathlib.Path")
+        raise argument_error(name, value, "a path, as text or pathlib.Path")
     try:
         given.encode()
         Path(given).exists()
@@ -118,20 +118,20 @@ def path(name: str, value: Any) -> Path:
 
 
 def key(name: str, value: Any) -> PRNGKeyArray:
-    """One key of random numbers, typed or as older code has it."""
+    """Return one random key, typed or of the older raw kind."""
     if isinstance(value, jax.Array):  # traced ones too
         typed = jnp.issubdtype(value.dtype, jax.dtypes.prng_key)
         if value.shape == (() if typed else (2,)) and (typed or value.dtype == jnp.uint32):
             return value
-    raise refused(name, value, "a key, as jax.random.key(0) gives it")
+    raise argument_error(name, value, "a key, as jax.random.key(0) gives it")
 
 
-def like(name: str, value: Any, shapes: Any) -> Any:
-    """A tree of arrays such as these shapes, without more axes."""
+def tree_like(name: str, value: Any, shapes: Any) -> Any:
+    """Return a tree of arrays with these shapes and without more axes."""
     leaves, structure = jax.tree.flatten(value)
     wanted, known = jax.tree.flatten(shapes)
     if structure != known or not all(map(_is_like, leaves, wanted)):
-        raise refused(name, value, "a state of this world, as its reset and step give them")
+        raise argument_error(name, value, "a state of this world, as its reset and step give them")
     return value
 
 
@@ -142,13 +142,15 @@ def _is_like(leaf: Any, shape: Any) -> bool:
 
 
 def numbers(name: str, value: Any) -> Float[np.ndarray, "..."]:
-    """Numbers that single precision holds, of any shape, all of them finite."""
+    """Return numbers of any shape, all finite in single precision."""
     try:
         found = np.asarray(value)
     except Exception:  # rows of different lengths, an array of JAX's that was deleted, whatever else can be no array
         found = np.empty(0, object)
-    if found.dtype.kind not in "fiu" and not jnp.issubdtype(found.dtype, jnp.floating):  # bfloat16 is of no kind
-        raise refused(name, value, "an array of real numbers")
+    if found.dtype.kind not in "fiu" and not jnp.issubdtype(
+        found.dtype, jnp.floating
+    ):  # NumPy has no kind for bfloat16
+        raise argument_error(name, value, "an array of real numbers")
     if isinstance(value, np.ma.MaskedArray) and np.ma.getmaskarray(value).any():
         raise UserError(f"{name} is an array with masked numbers: leave these rows out")
     if not (np.abs(found.astype(np.float64)) <= LARGEST_FLOAT).all():
@@ -157,7 +159,7 @@ def numbers(name: str, value: Any) -> Float[np.ndarray, "..."]:
 
 
 def observations(name: str, value: Any, size: int | None) -> Float[np.ndarray, "*n obs"]:
-    """One observation (size,) or many (n, size); None: of any size above 0."""
+    """Return one observation (size,) or many (n, size); `size` None: any size above 0."""
     rows = numbers(name, value)
     width = "obs" if size is None else size
     if rows.ndim not in (1, 2) or rows.shape[-1] != (rows.shape[-1] if size is None else size) or not rows.shape[-1]:
@@ -166,18 +168,18 @@ def observations(name: str, value: Any, size: int | None) -> Float[np.ndarray, "
 
 
 def action(name: str, value: Any, space: Space) -> Any:
-    """One action, which may be traced."""
+    """Return one action, which may be traced."""
     if isinstance(value, Tracer):
         return value
     found = numbers(name, value)
     if found.shape != (space.size,) or not space.usable(found, np):
         example = np.asarray(space.spread(4))[0].round(2).tolist()
-        raise refused(name, value, f"an action of shape ({space.size},), for instance {example}")
+        raise argument_error(name, value, f"an action of shape ({space.size},), for instance {example}")
     return found
 
 
 def policy(name: str, value: Any) -> Policy:
-    """Anything that acts as a policy, as a policy: see `policies.policy_of`."""
+    """Return anything that acts as a policy: see `policies.policy_of`."""
     try:
         return policy_of(value)
     except UserError as error:
@@ -185,11 +187,13 @@ def policy(name: str, value: Any) -> Policy:
 
 
 def teacher(name: str, value: Any, space: Space) -> Teacher:
-    """Who answers: a teacher, or whatever acts as a policy in a space of actions, which teaches what it does itself."""
+    """Return a teacher: the given one, or one that shows what a given policy does itself."""
     answers, acts = (callable(getattr(value, verb, None)) for verb in ("best_action", "act"))
-    leaf = answers and any(leaf is value for leaf in jax.tree.leaves(value))  # no pytree: no program can be given it
+    leaf = answers and any(
+        leaf is value for leaf in jax.tree.leaves(value)
+    )  # not a pytree, so no compiled program could take it
     if isinstance(value, type) or leaf or not (answers or acts or callable(value)):
-        raise refused(name, value, "a teacher, for instance teacher_of(world), or a function of observations")
+        raise argument_error(name, value, "a teacher, for instance teacher_of(world), or a function of observations")
     if acts and not answers:
         value = getattr(value, "policy", value)  # of a `CallablePolicy`, which stands above this file
     try:
@@ -199,5 +203,8 @@ def teacher(name: str, value: Any, space: Space) -> Teacher:
 
 
 def settings(name: str, value: Any, kind: type[KindT]) -> KindT:
-    """A group of settings with values of its fields' types; their bounds are checked where they are used."""
-    return settled(instance(name, value, kind, f"a cuelearner_jax.config.{kind.__name__}"), name)
+    """Return a group of settings whose fields have values of the right types.
+
+    Bounds are checked where they are used.
+    """
+    return normalize_options(instance(name, value, kind, f"a cuelearner_jax.config.{kind.__name__}"), name)

@@ -1,4 +1,4 @@
-"""Evaluation from Python: what `cuelearner evaluate` measures, of any policy."""
+"""Evaluation from Python: what `cuelearner evaluate` measures, for any policy."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ from typing import Any
 
 from cuelearner_jax import user_code
 from cuelearner_jax.api import arguments
-from cuelearner_jax.api.acting import as_policy_in, source_of
+from cuelearner_jax.api.policies import as_policy_in, source_of
 from cuelearner_jax.api.worlds import World, a_world
 from cuelearner_jax.studies import evaluate as study
 from cuelearner_jax.studies.evaluate import Measured
 
 
-@user_code.told
+@user_code.report_user_errors
 def measure(
     policy: Any,
     world: World,
@@ -33,7 +33,7 @@ def measure(
         engine: other physics that the world's robot has (default: its own).
 
     Returns:
-        `metrics`: a mean (1,) by name; `each`: the values (1, envs) of the environments by name.
+        `metrics`: the mean (1,) of each metric by name; `each`: the environments' values (1, envs) of each metric.
 
     Raises:
         UserError: a policy that cannot act there, or amounts that make no sense.

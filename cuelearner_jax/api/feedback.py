@@ -1,6 +1,6 @@
-"""A feedback model of one's own labels, and policies refined by it: in rounds and within a bound by default.
+"""Fit a feedback model to labels, and refine policies by it, by default in rounds and within a bound.
 
-A model knows the actions that it was shown. Labels about a policy's own actions alone say nothing of what refinement
+A model knows only the actions in its labels. Labels about a policy's own actions alone say nothing of what refinement
 then leads to; followed far, such a model makes the policy worse without a word. So `ask` questions in rounds, about
 actions refined by the model so far (DAgger), and `refine` goes no farther than labels reach unless it is told to.
 """
@@ -20,16 +20,16 @@ import numpy as np
 from jaxtyping import Float
 
 from cuelearner_jax import user_code
-from cuelearner_jax.adaptation import adapting
+from cuelearner_jax.adaptation import by_model
 from cuelearner_jax.adaptation.lanes import Adaptation, blame, check_memory, product
 from cuelearner_jax.agents.networks import all_finite
 from cuelearner_jax.api import arguments
-from cuelearner_jax.api.acting import CallablePolicy, as_policy, as_policy_in, entries_of
+from cuelearner_jax.api.policies import CallablePolicy, as_policy, as_policy_in, entries_of
 from cuelearner_jax.api.worlds import World, a_world
 from cuelearner_jax.config import GuideSizes, Scalars, check_guide
 from cuelearner_jax.environment import Quantity, Spaces, actions_of, spaces_of, view_of
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.feedback import given
+from cuelearner_jax.feedback import external_labels
 from cuelearner_jax.feedback.answers import RELATIVE, check_teacher
 from cuelearner_jax.guides.base import Guide
 from cuelearner_jax.guides.relative import KIND
@@ -40,7 +40,7 @@ from cuelearner_jax.types import GuidanceModel, Label, Teacher
 
 
 class Labels(NamedTuple):
-    """Labels as arrays: what was seen, the action asked about, and the answer."""
+    """Labels as arrays: observations, the actions asked about, and the answers."""
 
     obs: Float[np.ndarray, "labels obs"]
     action: Float[np.ndarray, "labels action"]  # directions: unit vectors
@@ -57,12 +57,12 @@ class FeedbackModel:
     model: GuidanceModel
     scalars: Scalars  # eps of the labels, and how actions are refined
     labels: Labels
-    sizes: GuideSizes  # that the guidance was made with
+    sizes: GuideSizes  # sizes that the guide was made with
     space: Space = DIRECTIONS  # of the actions
-    env: Any = None  # says how an observation looks from an action; nobody asks it in the raw frame
+    env: Any = None  # provides `features`, which the raw frame does not use
 
 
-@user_code.told
+@user_code.report_user_errors
 def fit_feedback(
     labels: Labels | str | os.PathLike[str],
     *,
@@ -72,7 +72,7 @@ def fit_feedback(
     scalars: Scalars | None = None,
     seed: int = 0,
 ) -> FeedbackModel:
-    """Fits a feedback model to relative labels (paper, Eq. 3).
+    """Fit a feedback model to relative labels (paper, Eq. 3).
 
     Args:
         labels: arrays, or a label file (its first seed's).
@@ -88,11 +88,11 @@ def fit_feedback(
     seed = arguments.seed("seed", seed)
     file = None if isinstance(labels, tuple) else label_files.read(label_path(labels))
     space = arguments.instance("space", space, Space, "a space of actions") if file is None else file.space
-    sizes, scalars, eps_deg = given_settings(space, sizes, scalars, eps_deg)
+    sizes, scalars, eps_deg = check_settings(space, sizes, scalars, eps_deg)
     if file is not None:
         if file.answers != RELATIVE.name:
             raise UserError(f"{labels} holds {file.answers} answers: give a file of {RELATIVE.name} ones")
-        given.check_file(file, None, RELATIVE, str(labels))
+        external_labels.check_file(file, None, RELATIVE, str(labels))
         if eps_deg is not None and not math.isclose(eps_deg, file.eps or 0.0, rel_tol=1e-6):
             raise UserError(f"{labels} holds answers of {file.eps:g} {file.space.unit}: leave out eps_deg")
         own = file.seeds == file.seeds[0]
@@ -102,7 +102,7 @@ def fit_feedback(
     if len(rows.obs) < 2:
         raise UserError(f"{len(rows.obs)} labels teach nothing: give more")
     spaces = Spaces(rows.obs.shape[1], space)
-    given.check(rows, spaces, RELATIVE)
+    external_labels.check(rows, spaces, RELATIVE)
     sizes, scalars = settings(space, sizes, scalars, eps_deg)
     guidance = KIND.make(sizes, spaces)
     k_init, k_fit = jax.random.split(jax.random.key(seed))
@@ -110,11 +110,11 @@ def fit_feedback(
     fit = jax.jit(lambda key, rows, former, scalars: guidance.fit(key, None, rows, former, scalars))
     model = fit(k_fit, jax.tree.map(jnp.asarray, rows), guidance.init(k_init), scalars)
     if not all_finite(model):
-        raise diverged()
+        raise divergence_error()
     return FeedbackModel(guidance, model, scalars, labels_of(rows), sizes, space)
 
 
-@user_code.told
+@user_code.report_user_errors
 def ask(
     policy: Any,
     world: World,
@@ -127,10 +127,10 @@ def ask(
     scalars: Scalars | None = None,
     seed: int = 0,
 ) -> FeedbackModel:
-    """Asks a teacher about a policy's actions in rounds, each about actions refined by the model so far (DAgger).
+    """Ask a teacher about a policy's actions in rounds, each about actions refined by the model so far (DAgger).
 
     Args:
-        policy: what is to be corrected: a policy, or any function of a batch of observations in NumPy.
+        policy: the policy to correct: a policy, or any function of a batch of observations in NumPy.
         world: where it acts.
         teacher: who answers; a function of observations, or another policy, teaches what it does itself.
         labels: number of questions.
@@ -148,32 +148,32 @@ def ask(
     labels, seed = arguments.budget("labels", labels), arguments.seed("seed", seed)
     a_world("world", world)
     space = actions_of(world.env)
-    bound = arguments.optional(arguments.amount, "bound_deg", bound_deg, space) or adapting.usual_bound(space)
-    sizes, scalars = settings(space, *given_settings(space, sizes, scalars, eps_deg))
+    bound = arguments.optional(arguments.amount, "bound_deg", bound_deg, space) or by_model.usual_bound(space)
+    sizes, scalars = settings(space, *check_settings(space, sizes, scalars, eps_deg))
     teacher = arguments.teacher("teacher", teacher, space)
     check_teacher(teacher, scalars)
-    adapting.check_amounts(space, [bound], scalars)
+    by_model.check_amounts(space, [bound], scalars)
     env, guidance = world.env, KIND.make(sizes, spaces_of(world.env))
     user_code.answers_in("teacher", teacher, env)
     of = Adaptation(guidance, sizes, scalars, env, Common(as_policy_in(policy, env)))
-    block = adapting.learned(of, product(1, (seed,), (labels,), (bound,)), teacher)
+    block = by_model.learn_lanes(of, product(1, (seed,), (labels,), (bound,)), teacher)
     if block.failed.any():
         blame(of, teacher, block)
-        raise diverged()
+        raise divergence_error()
     guide = jax.tree.map(lambda leaf: leaf[0], block.guide)
     return FeedbackModel(guidance, guide.model, scalars, labels_of(guide.labels), sizes, space, env)
 
 
 def labels_of(rows: Label) -> Labels:
-    """A lane's labels that count, as arrays."""
+    """Return a lane's valid labels as arrays."""
     given = jax.device_get(rows)
     obs, action, answer = (np.asarray(part)[given.valid] for part in (given.obs, given.action, given.answer))
     return Labels(obs, action, answer[:, 0] if answer.shape[1] == 1 else answer)
 
 
-@user_code.told
+@user_code.report_user_errors
 def refine(policy: Any, model: FeedbackModel, bound_deg: float | None = None) -> CallablePolicy:
-    """A policy's actions refined by a feedback model, within a bound (paper, Eqs. 2 to 5).
+    """Return a policy whose actions are refined by a feedback model, within a bound (paper, Eqs. 2 to 5).
 
     Args:
         policy: as for `ask`.
@@ -194,7 +194,7 @@ def refine(policy: Any, model: FeedbackModel, bound_deg: float | None = None) ->
     width, seen = labels.obs.shape[1], entries_of(policy)
     if seen not in (0, width):
         raise UserError(f"model is of observations with {width} entries, the policy's have {seen}: give one of its own")
-    reach = max(adapting.reach(space, base, labels.obs, labels.action), model.scalars.eps_deg)
+    reach = max(by_model.reach(space, base, labels.obs, labels.action), model.scalars.eps_deg)
     if bound_deg is not None and bound_deg > reach * 1.05 and bound_deg > model.scalars.eps_deg:
         warnings.warn(
             f"the labels lie within {reach:.3g} {space.unit} of this policy's own actions, and refinement may lead "
@@ -208,16 +208,16 @@ def refine(policy: Any, model: FeedbackModel, bound_deg: float | None = None) ->
 
 
 def _checked_model(model: FeedbackModel) -> FeedbackModel:
-    """A model whose parts are of their kinds. Raises UserError for any other."""
+    """Return a model whose parts are of the right types. Raises UserError for any other."""
     for name, kind in (("guidance", Guide), ("scalars", Scalars), ("labels", Labels), ("model", GuidanceModel)):
         arguments.instance(f"model.{name}", getattr(model, name), kind, "a model as cl.ask and cl.fit_feedback give it")
     return model
 
 
-def given_settings(
+def check_settings(
     space: Space, sizes: Any, scalars: Any, eps_deg: Any
 ) -> tuple[GuideSizes | None, Scalars | None, float | None]:
-    """These arguments as they are, each of them one of its kind or None. Raises UserError for the first that is not."""
+    """Return the arguments as given. Raises UserError for the first that is neither of its type nor None."""
     return (
         arguments.optional(arguments.settings, "sizes", sizes, GuideSizes),
         arguments.optional(arguments.settings, "scalars", scalars, Scalars),
@@ -226,7 +226,7 @@ def given_settings(
 
 
 def label_path(labels: Any) -> Path:
-    """The path of a label file. Raises UserError where nothing lies there."""
+    """Return the path of a label file. Raises UserError if no file lies there."""
     path = arguments.path("labels", labels)
     if not path.exists():
         raise UserError(f"labels: there is no label file at {path}: give one that a run or a person wrote, or arrays")
@@ -236,16 +236,19 @@ def label_path(labels: Any) -> Path:
 def settings(
     space: Space, sizes: GuideSizes | None, scalars: Scalars | None, eps_deg: float | None
 ) -> tuple[GuideSizes, Scalars]:
-    """Sizes and scalars, by default those of `adapting`. Raises UserError for what cannot work."""
-    sizes, scalars = sizes or adapting.SIZES, adapting.settling(scalars or adapting.plain_scalars(space), eps_deg)
+    """Return sizes and scalars, by default those of `by_model`. Raises UserError for values that cannot work."""
+    sizes, scalars = sizes or by_model.SIZES, by_model.settling(scalars or by_model.plain_scalars(space), eps_deg)
     check_guide(sizes, scalars)
     return sizes, scalars
 
 
 def rows_of(labels: Any) -> Label:
-    """Labels of finite floats as rows (labels, ...). Raises UserError if they are not three arrays of one length."""
+    """Return labels as rows (labels, ...) of finite floats.
+
+    Raises UserError unless they are three arrays of one length.
+    """
     if not isinstance(labels, tuple) or len(labels) != 3:
-        raise arguments.refused("labels", labels, "a label file, or Labels(obs, action, answer)")
+        raise arguments.argument_error("labels", labels, "a label file, or Labels(obs, action, answer)")
     obs, action, answer = (
         arguments.numbers(f"labels.{name}", part) for name, part in zip(Labels._fields, labels, strict=True)
     )
@@ -258,6 +261,6 @@ def rows_of(labels: Any) -> Label:
     return Label(obs, action, answer, np.ones(len(obs), bool))  # pyright: ignore[reportArgumentType]
 
 
-def diverged() -> UserError:
-    """What is raised where a fit is no longer finite."""
+def divergence_error() -> UserError:
+    """Return the UserError for a fit that is no longer finite."""
     return UserError("the fit of the feedback model diverged: lower scalars.feedback_learning_rate")

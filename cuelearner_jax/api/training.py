@@ -1,4 +1,4 @@
-"""Training from Python: what `cuelearner sweep` does, with the results in memory and nothing on the disk."""
+"""Training from Python: what `cuelearner sweep` does, with the results in memory and no files written."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ import pyarrow as pa
 from cuelearner_jax import config as configuration
 from cuelearner_jax import user_code
 from cuelearner_jax.api import arguments
-from cuelearner_jax.api.acting import CallablePolicy
 from cuelearner_jax.api.feedback import label_path
+from cuelearner_jax.api.policies import CallablePolicy
 from cuelearner_jax.api.worlds import World, a_world
 from cuelearner_jax.environment import view_of
-from cuelearner_jax.errors import UserError, closest
+from cuelearner_jax.errors import UserError, suggestion
 from cuelearner_jax.evaluate import SPLITS
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.run_config import RunConfig
@@ -30,20 +30,20 @@ from cuelearner_jax.storage import label_files
 from cuelearner_jax.studies import train as study
 from cuelearner_jax.types import Teacher
 
-SEEDS, LABELS = 8, (100,)  # where a configuration comes without them
+SEEDS, LABELS = 8, (100,)  # defaults where a configuration is given in place of a preset
 
 
 @dataclasses.dataclass(frozen=True)
 class Run:
-    """What a training has led to. Rows of `results` with `failed` 1 are of lanes that are no longer finite."""
+    """The results and agents of a training. Rows of `results` with `failed` 1 are lanes that are no longer finite."""
 
     world: World
     config: RunConfig
     results: pa.Table  # a row a lane and evaluation: guidance, labels, seed, step, wall_s, failed and metrics
-    trainings: dict[str, Training]  # by kind of guidance, at their end
+    trainings: dict[str, Training]  # the trained lanes, by kind of guidance
 
     def policy(self, guidance: str | None = None, labels: int | None = None, seed: int | None = None) -> CallablePolicy:
-        """One lane's trained agent.
+        """Return one lane's trained agent.
 
         Args:
             guidance: kind of guidance (default: the last).
@@ -57,7 +57,7 @@ class Run:
         seed = arguments.optional(arguments.seed, "seed", seed)
         name = list(self.trainings)[-1] if guidance is None else arguments.text("guidance", guidance)
         if name not in self.trainings:
-            raise UserError(f"no guidance {name!r} was trained{closest(name, self.trainings)}")
+            raise UserError(f"no guidance {name!r} was trained{suggestion(name, self.trainings)}")
         training = self.trainings[name]
         group = training.group
         budget = int(group.budgets.max()) if labels is None else labels
@@ -69,7 +69,7 @@ class Run:
         return CallablePolicy(agents.lane(int(found[0])), self.world.observation, actions=self.world.actions)
 
 
-@user_code.told
+@user_code.report_user_errors
 def train(
     world: World,
     teacher: Teacher | Any = None,
@@ -81,10 +81,10 @@ def train(
     split: str = "validation",
     progress: bool = True,
 ) -> Run:
-    """Trains seeds x label budgets x kinds of guidance, as `cuelearner sweep` does: the same numbers.
+    """Train seeds x label budgets x kinds of guidance, as `cuelearner sweep` does, with the same numbers.
 
-    What is left out is as the preset has it. Warns of lanes that stopped being finite: their agents stay as they last
-    were, their rows have no metrics.
+    Arguments that are left out are the preset's. Lanes that stop being finite raise a warning: their agents keep their
+    last finite state, and their rows have no metrics.
 
     Args:
         world: where.
@@ -130,18 +130,18 @@ def train(
 
 
 def _suggested(world: World, config: RunConfig | str, taught: bool) -> TrainRequest:
-    """What holds where nothing else is given, in this world."""
+    """Return the defaults for this world."""
     task = world.task
     if isinstance(config, RunConfig):
         groups = ("sizes", "scalars", "schedule", "agent", "arbiter")
-        settled = {name: configuration.settled(getattr(config, name), name) for name in groups}
+        settled = {name: configuration.normalize_options(getattr(config, name), name) for name in groups}
         config = dataclasses.replace(config, task=world.config, **settled)
         kinds = guidances.possible(world.env, taught=taught)
         return TrainRequest(task, config, Grid(kinds, tuple(range(SEEDS)), LABELS))
     if not isinstance(config, str):
-        raise arguments.refused("config", config, "a RunConfig, or the name of a preset")
+        raise arguments.argument_error("config", config, "a RunConfig, or the name of a preset")
     if config not in task.presets:
-        raise UserError(f"config: unknown preset {config!r}{closest(config, task.presets)}")
+        raise UserError(f"config: unknown preset {config!r}{suggestion(config, task.presets)}")
     request = study.suggested(task, task.presets[config])
     possible = guidances.possible(world.env, taught=taught)
     grid = dataclasses.replace(request.grid, guidance=tuple(kind for kind in request.grid.guidance if kind in possible))
@@ -149,7 +149,7 @@ def _suggested(world: World, config: RunConfig | str, taught: bool) -> TrainRequ
 
 
 def _seeds(seeds: int | Sequence[int]) -> tuple[int, ...]:
-    """Seeds by their number, or one by one."""
+    """Return the seeds: of a number n the seeds 0 to n - 1, else the given ones."""
     if isinstance(seeds, list | tuple | range | np.ndarray):
         return tuple(arguments.seed("seeds", seed) for seed in arguments.several("seeds", seeds, "seeds"))
     return tuple(range(arguments.whole("seeds", seeds, 1, LARGEST_SEED)))

@@ -1,4 +1,4 @@
-"""Worlds and teachers by name."""
+"""Find worlds and teachers by name."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from cuelearner_jax import user_code
 from cuelearner_jax.api import arguments
 from cuelearner_jax.api import arguments as checks
-from cuelearner_jax.config import settled
+from cuelearner_jax.config import normalize_options
 from cuelearner_jax.environment import Environment, Quantity, actions_of
 from cuelearner_jax.evaluate import SPLITS
 from cuelearner_jax.policies import Teaching
@@ -26,17 +26,17 @@ from cuelearner_jax.types import EnvState, Policy, Step, Teacher
 
 @dataclasses.dataclass(frozen=True)
 class World:
-    """A task in one configuration: an environment for training, others for validation, and who can teach in it."""
+    """A task in one configuration: environments for training and evaluation, and its teacher."""
 
     task: Task
     config: Any
-    scenario: str | None = None  # the changed world of the task's that it is; `adapt` follows its suggestions
+    scenario: str | None = None  # name of the scenario, whose suggestions `adapt` follows
 
     def __post_init__(self) -> None:
-        """Raises UserError for a configuration that is none of the task's."""
+        """Raise UserError for a configuration of another task."""
         arguments.instance("task", self.task, Task, "a task, as tasks.registry finds it")
         arguments.instance("config", self.config, self.task.config, f"a {self.task.config.__name__}, or use cl.make")
-        object.__setattr__(self, "config", settled(self.config, "task"))
+        object.__setattr__(self, "config", normalize_options(self.config, "task"))
         if self.scenario is not None:
             self.task.scenario(arguments.text("scenario", self.scenario))
 
@@ -46,7 +46,7 @@ class World:
         return self.environment("training")
 
     def environment(self, split: str) -> Environment:
-        """That of a split: "training", "tuning" or "validation". Raises UserError for any other."""
+        """Return the environment of a split: "training", "tuning" or "validation". Raises UserError for other names."""
         return self.task.environment(self.config, arguments.text("split", split, ("training", *SPLITS)))
 
     @property
@@ -59,32 +59,32 @@ class World:
         """The action space."""
         return actions_of(self.env)
 
-    @user_code.told
+    @user_code.report_user_errors
     def reset(self, key: PRNGKeyArray) -> tuple[EnvState, Float[Array, " obs"]]:
-        """Starts an episode: (state, observation). Raises UserError for what is no key."""
+        """Start an episode; return (state, observation). Raises UserError for a value that is not a key."""
         return jax.jit(self.env.reset)(arguments.key("key", key))
 
     @cached_property
     def _state(self) -> Any:
-        """A state with shapes in place of arrays."""
+        """Return a state with shapes in place of arrays."""
         return jax.eval_shape(self.env.reset, jax.random.key(0))[0]
 
-    @user_code.told
+    @user_code.report_user_errors
     def step(
         self, key: PRNGKeyArray, state: EnvState, action: Float[Array, " action"] | Float[np.ndarray, " action"]
     ) -> tuple[EnvState, Step]:
-        """Executes an action; a new episode begins by itself where one ends.
+        """Execute an action. Where an episode ends, a new one begins automatically.
 
-        Raises UserError for what is no key, no state of this world, or no action.
+        Raises UserError for a bad key, a state of another world, or a bad action.
         """
-        arguments.like("state", state, self._state)
+        arguments.tree_like("state", state, self._state)
         action = arguments.action("action", action, self.actions)
         return jax.jit(self.env.step)(arguments.key("key", key), state, action)
 
 
-@user_code.told
+@user_code.report_user_errors
 def make(name: str | Task, *, scenario: str | None = None, robot: str | None = None, **changes: Any) -> World:
-    """A world of a task.
+    """Return a world of a task.
 
     Args:
         name: of the task ("billiards", "navigation", one of an installed package, `package.module:NAME`), or the task.
@@ -100,10 +100,10 @@ def make(name: str | Task, *, scenario: str | None = None, robot: str | None = N
     task = arguments.instance("name", task, Task, "the name of a task, or a task")
     task = task.on(arguments.optional(arguments.text, "robot", robot))
     arguments.optional(arguments.text, "scenario", scenario)
-    return World(task, task.configured(scenario, **changes), scenario)
+    return World(task, task.configure(scenario, **changes), scenario)
 
 
-@user_code.told
+@user_code.report_user_errors
 def from_gymnasium(
     env: str | Any,
     *,
@@ -115,7 +115,7 @@ def from_gymnasium(
     processes: int = 0,
     **arguments: Any,
 ) -> World:
-    """A world of a Gymnasium environment; `gymnasium:FetchReach-v4` names the same in `make` and to every command.
+    """Return a world of a Gymnasium environment. `gymnasium:FetchReach-v4` names the same world elsewhere.
 
     One instance is made here and plays an episode, to see how observations and actions are made up. Training, roll-outs
     and evaluation play as many as they need in processes, each an exact function of its seed and the actions so far.
@@ -153,13 +153,13 @@ def from_gymnasium(
 
 
 def a_world(name: str, value: Any) -> World:
-    """A world, as an argument. Raises UserError for anything else."""
+    """Return an argument that is a world. Raises UserError for anything else."""
     return arguments.instance(name, value, World, "a world, as cl.make gives it")
 
 
-@user_code.told
+@user_code.report_user_errors
 def teacher_of(source: World | Policy) -> Teacher:
-    """Who teaches: in a world its task's own teacher, of a policy (a finished agent, say) that policy.
+    """Return the teacher of a world, or a teacher that shows what a given policy does.
 
     Raises:
         UserError: the task has no teacher, or it cannot be had; what is neither a world nor a policy.

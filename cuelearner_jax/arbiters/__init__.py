@@ -1,1 +1,1 @@
-"""Who acts in which episode: the protocol, guided and paced episodes, labels as a prior, a critic that compares."""
+"""Arbiters decide in which episodes the guide acts: guided or paced episodes, labels as prior, comparison by value."""

@@ -1,4 +1,4 @@
-"""The guide's action is executed where critics that did not choose it value it above the agent's.
+"""Arbiter by value: execute the guide's action where critics value it above the agent's.
 
 Imitation bootstrapped reinforcement learning takes whichever of two actions has the larger Q (Hu, Mirchandani, Sadigh,
 RSS 2024): while acting, in bootstrapped targets, and in the finished policy. The agent decides which critics compare:
@@ -29,7 +29,7 @@ from cuelearner_jax.agents.protocol import AgentOptions, has_actor
 from cuelearner_jax.arbiters.episodes import redrawn
 from cuelearner_jax.arbiters.protocol import Arbiter, Known, Outcome
 from cuelearner_jax.config import POSITIVE, SHARE, Scalars, part
-from cuelearner_jax.guides.refining import Refined
+from cuelearner_jax.guides.refining import Refinement
 from cuelearner_jax.types import Params
 
 ARMS = ("own", "better")
@@ -38,7 +38,7 @@ OWN, BETTER = range(len(ARMS))
 
 @part
 class Config:
-    """Options of comparing values."""
+    """Options of the arbiter by value."""
 
     NAME: ClassVar[str] = "by_value"
     ABOUT: ClassVar[str] = "the guide's action is executed where critics value it above the agent's"
@@ -53,11 +53,11 @@ class Config:
     """Steps in which the agent alone and the better of both are validated before an evaluation, where `in_policy`."""
 
     def make(self, bootstraps: bool) -> ByValue:
-        """The arbiter beside an agent that takes the argmax of its values."""
+        """Return the arbiter beside an agent that takes the argmax of its values."""
         return ByValue()
 
     def make_beside(self, agent: AgentOptions, bootstraps: bool) -> Arbiter:
-        """The arbiter beside an agent."""
+        """Return the arbiter beside any agent."""
         if not has_actor(agent):
             return self.make(bootstraps)
         in_targets = self.in_targets and bootstraps
@@ -65,22 +65,22 @@ class Config:
 
 
 class Compared(struct.PyTreeNode):
-    """The episodes that are arbitrated; the second critic, or the arm of the finished policy, where there is one."""
+    """The arbitrated episodes, with the second critic, or with the arm of the finished policy."""
 
     arbitrated: Bool[Array, " num_envs"]
     params: Params = None
-    training: Any = None  # what learning keeps beside the parameters
+    training: Any = None  # optimiser state and target parameters of the second critic
     best: Int[Array, ""] | None = None
 
 
-def better(
+def agent_values_higher(
     known: Known,
     critics: Params,
     obs: Float[Array, "n obs"],
     own: Float[Array, "n action"],
     other: Float[Array, "n action"],
 ) -> Bool[Array, " n"]:
-    """Where the agent's values under other parameters, `critics`, are larger of the other action."""
+    """Return where the critics `critics` value the other action above the agent's."""
 
     def gain(obs: Array, own: Array, other: Array) -> Array:
         values = known.agent.value(known.env, critics, obs, jnp.stack([own, other]))
@@ -89,38 +89,38 @@ def better(
     return jax.vmap(gain)(obs, own, other) > 0
 
 
-def chosen(
+def choose_by_value(
     known: Known,
     critics: Params,
     obs: Float[Array, "n obs"],
     own: Float[Array, "n action"],
     asked: Bool[Array, " n"],
-) -> Refined:
-    """The guide's actions where critics value them above the agent's, in rows that are asked about."""
+) -> Refinement:
+    """Return the guide's actions where critics value them above the agent's, in the rows `asked`."""
     guided = known.guide.act(known.model, known.env, obs, own, asked, known.scalars)
-    taken = asked & better(known, critics, obs, own, guided.actions)
-    return Refined(jnp.where(taken[:, None], guided.actions, own), jnp.where(taken, guided.passes, 0))
+    taken = asked & agent_values_higher(known, critics, obs, own, guided.actions)
+    return Refinement(jnp.where(taken[:, None], guided.actions, own), jnp.where(taken, guided.passes, 0))
 
 
 class Comparing:
-    """What arbiters that compare values share (`protocol.Chooses`)."""
+    """Base class of the arbiters that compare values (`protocol.Chooses`)."""
 
     def init(self, num_envs: int) -> Compared:
-        """The first episodes, which begin with uniform actions, are the agent's own; there is no second critic yet."""
+        """Return the state of the start. First episodes begin with uniform actions and belong to the agent."""
         return Compared(jnp.zeros(num_envs, bool))
 
     def guided(self, state: Compared) -> Bool[Array, " num_envs"]:
-        """The episodes that are arbitrated."""
+        """Return which episodes are arbitrated."""
         return state.arbitrated
 
     def follow(
         self, state: Compared, options: Config, scalars: Scalars, outcome: Outcome, key: PRNGKeyArray
     ) -> Compared:
-        """Draws for the episodes that begin."""
+        """Draw anew whether to arbitrate each episode that begins."""
         return state.replace(arbitrated=redrawn(key, state.arbitrated, outcome.done, options.probability))
 
     def compares(self, state: Compared, known: Known) -> Params:
-        """Parameters of the critics that compare."""
+        """Return the parameters of the critics that compare."""
         raise NotImplementedError(f"{type(self).__name__} does not say which critics compare: write `compares`")
 
     def choose(
@@ -132,9 +132,9 @@ class Comparing:
         base: Float[Array, "num_envs action"],
         learns: Bool[Array, ""],
         key: PRNGKeyArray,
-    ) -> Refined:
-        """The guide's action where the critics value it above the agent's, in arbitrated episodes."""
-        return chosen(known, self.compares(state, known), obs, base, state.arbitrated & learns)
+    ) -> Refinement:
+        """Return the guide's action where the critics value it above the agent's, in arbitrated episodes."""
+        return choose_by_value(known, self.compares(state, known), obs, base, state.arbitrated & learns)
 
 
 @dataclass(frozen=True)
@@ -142,15 +142,15 @@ class ByValue(Comparing):
     """The arbiter beside an agent that takes the argmax of its values (`protocol.HasCritic`)."""
 
     def compares(self, state: Compared, known: Known) -> Params:
-        """Those of the second critic."""
+        """Return the parameters of the second critic."""
         return state.params
 
     def critic(self, state: Compared) -> tuple[Params, Any]:
-        """The second critic."""
+        """Return the second critic."""
         return state.params, state.training
 
     def with_critic(self, state: Compared, critic: tuple[Params, Any]) -> Compared:
-        """The state with another second critic."""
+        """Return the state with another second critic."""
         return state.replace(params=critic[0], training=critic[1])
 
 
@@ -161,36 +161,38 @@ class ByOwnValues(Comparing):
     in_targets: bool
 
     def compares(self, state: Compared, known: Known) -> Params:
-        """The agent's own."""
+        """Return the parameters of the agent's own critics."""
         return known.params
 
 
 @dataclass(frozen=True)
 class Finishing(ByOwnValues):
-    """The arbiter that may act in the finished policy too (`protocol.Finishes`)."""
+    """The arbiter by value that may act in the finished policy too, for agents with an actor (`protocol.Finishes`)."""
 
     judge_steps: int
 
     @property
     def arms(self) -> tuple[str, ...]:
-        """The agent alone; the better of both actions."""
+        """Names of the arms: the agent alone, and the better of both actions."""
         return ARMS
 
     def init(self, num_envs: int) -> Compared:
-        """The agent acts until the better of both validates better."""
+        """Return the state of the start: the agent alone acts until another arm validates better."""
         return super().init(num_envs).replace(best=jnp.array(OWN, jnp.int32))
 
     def arm(self, state: Compared) -> Any:
-        """The arm that validated best."""
+        """Return the number of the arm that validated best."""
         return state.best
 
     def with_arm(self, state: Compared, arm: Int[Array, "*lanes"]) -> Compared:
-        """The state in which another arm validated best."""
+        """Return the state with another best arm."""
         return state.replace(best=arm)
 
     def act(
         self, arm: Int[Array, ""], options: Config, known: Known, obs: Float[Array, "n obs"], key: PRNGKeyArray
     ) -> Float[Array, "n action"]:
-        """The actor's actions, or the better of these and the guide's."""
+        """Return the actor's actions, or the better of these and the guide's, as the arm says."""
         own, every = known.agent.act(known.env, known.params, obs, key), jnp.ones(len(obs), bool)
-        return jax.lax.cond(arm == OWN, lambda: own, lambda: chosen(known, known.params, obs, own, every).actions)
+        return jax.lax.cond(
+            arm == OWN, lambda: own, lambda: choose_by_value(known, known.params, obs, own, every).actions
+        )

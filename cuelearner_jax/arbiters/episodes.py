@@ -1,4 +1,4 @@
-"""Whole episodes are guided, each with the same probability (paper: every second one)."""
+"""Arbiter by episodes: guide whole episodes, each with the same probability (paper: every second one)."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from cuelearner_jax.config import SHARE, Scalars, part
 
 @part
 class Config:
-    """Options of guiding whole episodes."""
+    """Options of the arbiter by episodes."""
 
     NAME: ClassVar[str] = "episodes"
     ABOUT: ClassVar[str] = "each episode is guided with the same probability"
@@ -23,7 +23,7 @@ class Config:
     """Probability that an episode is guided."""
 
     def make(self, bootstraps: bool) -> Episodes:
-        """The arbiter."""
+        """Return the arbiter."""
         return Episodes()
 
 
@@ -31,17 +31,17 @@ class Episodes(NamedTuple):
     """The arbiter's functions (`protocol.Arbiter`); its state says whether the running episodes are guided."""
 
     def init(self, num_envs: int) -> Bool[Array, " num_envs"]:
-        """The first episodes, which begin with uniform actions, are the agent's own."""
+        """Return the state of the start. First episodes begin with uniform actions and are the agent's own."""
         return jnp.zeros(num_envs, bool)
 
     def guided(self, state: Bool[Array, " num_envs"]) -> Bool[Array, " num_envs"]:
-        """The running episodes that are guided."""
+        """Return which running episodes are guided."""
         return state
 
     def follow(
         self, state: Bool[Array, " num_envs"], options: Config, scalars: Scalars, outcome: Outcome, key: PRNGKeyArray
     ) -> Bool[Array, " num_envs"]:
-        """Draws for the episodes that begin."""
+        """Draw anew whether to guide each episode that begins."""
         return redrawn(key, state, outcome.done, options.probability)
 
 
@@ -51,5 +51,5 @@ def redrawn(
     done: Bool[Array, " num_envs"],
     probability: Float[Array, ""] | float,
 ) -> Bool[Array, " num_envs"]:
-    """Whether episodes are guided, drawn anew where one is done."""
+    """Return which episodes are guided, drawn anew where an episode is done."""
     return jnp.where(done, jax.random.bernoulli(key, probability, done.shape), guided)

@@ -1,4 +1,4 @@
-"""The share of guided episodes follows what guided and own episodes have earned lately.
+"""Paced arbiter: the share of guided episodes follows the recent returns of guided and own episodes.
 
 A two-armed bandit whose arms change. Each arm (own, guided) keeps sums over its finished episodes. The sums fade with
 every episode of either arm, so an arm that is seldom played becomes uncertain again (discounted UCB: Garivier and
@@ -36,12 +36,12 @@ WINDOW = 200.0  # episodes, own and guided together, within which what they earn
 FLOOR = 0.02  # least share of guided episodes, and of own ones, so that both go on being seen
 ENOUGH = 2.0  # episodes, after fading, without which an arm has no variance
 RESOLUTION = 1e-6  # relative, of sums in single precision: scores closer than that are equal
-TINY = 1e-30  # keeps 0 / 0 at 0
+TINY = 1e-30  # added to denominators so that 0 / 0 is 0
 
 
 @part
 class Config:
-    """Options of pacing guided episodes."""
+    """Options of the paced arbiter."""
 
     NAME: ClassVar[str] = "paced"
     ABOUT: ClassVar[str] = "the share of guided episodes follows whether they earn more than the agent's own"
@@ -53,7 +53,7 @@ class Config:
     (0: any lead will do)."""
 
     def make(self, bootstraps: bool) -> Paced:
-        """The arbiter."""
+        """Return the arbiter."""
         return Paced(bootstraps)
 
 
@@ -69,12 +69,12 @@ class ArmSums(struct.PyTreeNode):
 
 
 class Pace(struct.PyTreeNode):
-    """What guided and own episodes have earned, and how far the running ones are."""
+    """The returns of guided and own episodes so far, and the running episodes' sums."""
 
-    guided: Bool[Array, " num_envs"]  # is the running episode a guided one?
+    guided: Bool[Array, " num_envs"]  # True where the running episode is guided
     gain: Float[Array, " num_envs"]  # of the running episode so far
     steps: Float[Array, " num_envs"]  # of the running episode so far
-    whole: Bool[Array, " num_envs"]  # has it been its arm's from its first step on?
+    whole: Bool[Array, " num_envs"]  # True where the running episode belonged to its arm from its first step on
     sums: ArmSums
 
 
@@ -84,7 +84,7 @@ class Paced(NamedTuple):
     bootstraps: bool  # do targets look at the next observation?
 
     def init(self, num_envs: int) -> Pace:
-        """Nothing seen yet."""
+        """Return the state before the first episode."""
         return Pace(
             guided=jnp.zeros(num_envs, bool),
             gain=jnp.zeros(num_envs),
@@ -94,11 +94,11 @@ class Paced(NamedTuple):
         )
 
     def guided(self, state: Pace) -> Bool[Array, " num_envs"]:
-        """The running episodes that are guided."""
+        """Return which running episodes are guided."""
         return state.guided
 
     def follow(self, state: Pace, options: Config, scalars: Scalars, outcome: Outcome, key: PRNGKeyArray) -> Pace:
-        """Adds finished episodes to their arms' sums, and draws for those that begin.
+        """Add finished episodes to their arms' sums, and draw an arm for each episode that begins.
 
         Steps outside the time of guidance belong to neither arm; no episode with such a step is counted.
         """
@@ -123,7 +123,7 @@ class Paced(NamedTuple):
 
 
 def scores(sums: ArmSums) -> tuple[Float[Array, "2"], Float[Array, "2"]]:
-    """Each arm's ratio of sums, and the variance that one episode gives it.
+    """Return each arm's ratio of sums, and the variance of that ratio for one episode.
 
     The standard error of a ratio of m episodes is sqrt(variance / m) (Cochran, Sampling Techniques, 1977, chapter 6,
     without the correction for a finite population: residuals gain - ratio * size, over the mean size).
@@ -135,13 +135,13 @@ def scores(sums: ArmSums) -> tuple[Float[Array, "2"], Float[Array, "2"]]:
 
 
 def probability(sums: ArmSums, options: Config) -> Float[Array, ""]:
-    """That the next episode is guided.
+    """Return the probability that the next episode is guided.
 
     At most the options' probability, which is also what holds until both arms have been seen; at least `FLOOR` (but
     never more than that probability), and as much below 1, so that both arms go on being seen.
     """
     (own, guided), variance = scores(sums)
-    # A few episodes that went alike would be believed for certain: no arm varies less than both do on average.
+    # A few similar episodes would look certain, so no arm's variance is below the mean variance of both arms.
     freedom = jnp.maximum(sums.episodes - 1, 0)
     pooled = (variance * freedom).sum() / jnp.maximum(freedom.sum(), 1)
     error = jnp.sqrt((jnp.maximum(variance, pooled) / jnp.maximum(sums.episodes, TINY)).sum())

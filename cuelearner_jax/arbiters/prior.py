@@ -1,4 +1,4 @@
-"""Labels as a prior of the agent's choice, while it learns and in the finished policy.
+"""Arbiter by prior: labels act as a prior on the agent's choice, during learning and in the finished policy.
 
 What the labels say of an action and what the critic says of its value are two opinions to be combined, not a reward
 and its bonus. This is policy shaping (Griffith, Subramanian, Scholz, Isbell, Thomaz, "Policy shaping: integrating human
@@ -33,7 +33,7 @@ from cuelearner_jax.agents.choice import each_in_portions
 from cuelearner_jax.arbiters.protocol import Known, Outcome
 from cuelearner_jax.config import POSITIVE, SHARE, Bounds, Scalars, part
 from cuelearner_jax.guides.base import Candidates
-from cuelearner_jax.guides.refining import Refined
+from cuelearner_jax.guides.refining import Refinement
 from cuelearner_jax.spaces import Space
 
 ARMS = ("own", "prior", "near")
@@ -42,7 +42,7 @@ OWN, PRIOR, NEAR = range(len(ARMS))
 
 @part
 class Config:
-    """Options of labels as a prior."""
+    """Options of the arbiter by prior."""
 
     NAME: ClassVar[str] = "prior"
     ABOUT: ClassVar[str] = "values and labels choose together: argmax of Q + beta log p(action | labels)"
@@ -65,23 +65,23 @@ class Config:
     """Steps in which each arm is validated before an evaluation; the best arm is evaluated."""
 
     def make(self, bootstraps: bool) -> Prior:
-        """The arbiter."""
+        """Return the arbiter."""
         return Prior(self.near_actions, self.directions, self.judge_steps)
 
 
 class Arms(struct.PyTreeNode):
-    """Which arm plays the running episodes, and which is the finished policy's."""
+    """The arm that plays each running episode, and the arm of the finished policy."""
 
     playing: Int[Array, " num_envs"]
     best: Int[Array, ""]
 
 
 class Choices(NamedTuple):
-    """What the arms but the agent's own would do in one situation."""
+    """The actions of the two arms other than `own`, in one situation."""
 
     prior: Float[Array, " action"]
     near: Float[Array, " action"]
-    possible: Bool[Array, ""]  # False: the guide has no candidate here, and the action is the agent's own
+    possible: Bool[Array, ""]  # False where the guide has no candidate; the action is then the agent's own
 
 
 class Prior(NamedTuple):
@@ -93,20 +93,20 @@ class Prior(NamedTuple):
 
     @property
     def arms(self) -> tuple[str, ...]:
-        """Own, prior, near."""
+        """Names of the arms: own, prior, near."""
         return ARMS
 
     def init(self, num_envs: int) -> Arms:
-        """The first episodes alternate between the arms that know something; the prior acts."""
+        """Return the state of the start. First episodes alternate between the arms other than `own`."""
         playing = jnp.where(jnp.arange(num_envs) % 2 == 0, PRIOR, NEAR).astype(jnp.int32)
         return Arms(playing, jnp.array(PRIOR, jnp.int32))
 
     def guided(self, state: Arms) -> Bool[Array, " num_envs"]:
-        """The episodes that are not the agent's own."""
+        """Return which episodes are not the agent's own."""
         return state.playing != OWN
 
     def follow(self, state: Arms, options: Config, scalars: Scalars, outcome: Outcome, key: PRNGKeyArray) -> Arms:
-        """Draws an arm for each episode that begins."""
+        """Draw an arm for each episode that begins."""
         k_own, k_near = jax.random.split(key)
         own = jax.random.bernoulli(k_own, options.own_share, outcome.done.shape)
         near = jax.random.bernoulli(k_near, options.near_share, outcome.done.shape)
@@ -122,8 +122,8 @@ class Prior(NamedTuple):
         base: Float[Array, "num_envs action"],
         learns: Bool[Array, ""],
         key: PRNGKeyArray,
-    ) -> Refined:
-        """Each environment's action by the arm that plays there; drawn from the prior in the random steps."""
+    ) -> Refinement:
+        """Return each environment's action by the arm of its episode; in the random steps drawn from the prior."""
         keys = jax.random.split(key, len(obs))
         choices = jax.lax.cond(
             learns,
@@ -133,17 +133,17 @@ class Prior(NamedTuple):
         return _of_arm(state.playing, choices, base)
 
     def arm(self, state: Arms) -> Any:
-        """The arm that validated best."""
+        """Return the number of the arm that validated best."""
         return state.best
 
     def with_arm(self, state: Arms, arm: Int[Array, "*lanes"]) -> Arms:
-        """The state in which another arm validated best."""
+        """Return the state with another best arm."""
         return state.replace(best=arm)
 
     def act(
         self, arm: Int[Array, ""], options: Config, known: Known, obs: Float[Array, "n obs"], key: PRNGKeyArray
     ) -> Float[Array, "n action"]:
-        """The choice of an arm, by all that was learned."""
+        """Return the actions of one arm, for the finished policy."""
         own = known.agent.act(known.env, known.params, obs, key)
         return jax.lax.cond(
             arm == OWN,
@@ -152,7 +152,7 @@ class Prior(NamedTuple):
         )
 
     def _candidates(self, known: Known, obs: Float[Array, " obs"]) -> Candidates:
-        """The guide's, or actions of all the space."""
+        """Return the guide's candidates, or evenly spaced actions of the whole space."""
         found = known.guide.candidates(known.env, obs)
         if found is not None:
             return found
@@ -160,7 +160,7 @@ class Prior(NamedTuple):
         return Candidates(actions, jnp.ones(len(actions), bool))
 
     def _best(self, options: Config, known: Known, obs: Float[Array, "n obs"]) -> Choices:
-        """The largest of Q + beta log p, among candidates and then near the best of these.
+        """Return the action with the largest Q + beta log p, among the candidates and then near the best candidate.
 
         The sum is taken times n / (n + trust_after): finite before the first step of learning, where log p decides.
         """
@@ -181,7 +181,7 @@ class Prior(NamedTuple):
         return each_in_portions(one, obs, looked)
 
     def _near(self, space: Space, options: Config, action: Float[Array, " action"]) -> Float[Array, "near action"]:
-        """An action, and those that lie evenly to either side of it along each cue."""
+        """Return an action and the actions evenly spaced to either side of it along each cue."""
         reach = space.from_unit(options.near_deg)
         # Both ends of a cue's stretch; the action itself stands first, and so wins where all are worth the same.
         along = jnp.linspace(-1.0, 1.0, self.near_actions)[:, None, None] * jnp.eye(len(space.cues))[None]
@@ -189,7 +189,7 @@ class Prior(NamedTuple):
         return space.exp(jnp.broadcast_to(action, (len(changes), *action.shape)), reach * changes)
 
     def _drawn(self, options: Config, known: Known, obs: Float[Array, " obs"], key: PRNGKeyArray) -> Choices:
-        """A candidate drawn from p, and an action drawn uniformly near it."""
+        """Return a candidate drawn from p, and an action drawn uniformly near it."""
         k_draw, k_near = jax.random.split(key)
         space, (actions, possible) = known.guide.spaces.actions, self._candidates(known, obs)
         log_p = known.guide.log_p(known.model, known.env, obs, actions, known.scalars)
@@ -199,8 +199,8 @@ class Prior(NamedTuple):
         return Choices(drawn, space.exp(drawn, change), possible.any())
 
 
-def _of_arm(arm: Int[Array, " n"], choices: Choices, own: Float[Array, "n action"]) -> Refined:
-    """The actions of each row's arm."""
+def _of_arm(arm: Int[Array, " n"], choices: Choices, own: Float[Array, "n action"]) -> Refinement:
+    """Return the actions of each row's arm."""
     other = (arm != OWN) & choices.possible
     shaped = jnp.where((arm == NEAR)[:, None], choices.near, choices.prior)
-    return Refined(jnp.where(other[:, None], shaped, own), other.astype(jnp.int32))
+    return Refinement(jnp.where(other[:, None], shaped, own), other.astype(jnp.int32))

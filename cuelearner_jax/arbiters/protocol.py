@@ -1,4 +1,4 @@
-"""What an arbiter is: pure functions of one lane that decide in which environments the guide's action is executed.
+"""The arbiter protocol: pure functions of one lane that decide where the guide's action is executed.
 
 An arbiter is made from options (`config.parts`), a class with a `NAME`, a line `ABOUT` it, and `make`; `registry` finds
 them by name.
@@ -15,16 +15,16 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from cuelearner_jax.agents.protocol import AgentFunctions, AgentOptions, Offer
 from cuelearner_jax.config import GuideScalars, Scalars
 from cuelearner_jax.guides.base import Guide
-from cuelearner_jax.guides.refining import Refined
+from cuelearner_jax.guides.refining import Refinement
 from cuelearner_jax.types import GuidanceModel, Params
 
 
 class Outcome(NamedTuple):
-    """What one step led to in each environment."""
+    """The outcome of one step in each environment."""
 
     reward: Float[Array, " num_envs"]
-    done: Bool[Array, " num_envs"]  # did the episode end with it?
-    counts: Bool[Array, ""]  # is this the time of guidance?
+    done: Bool[Array, " num_envs"]  # True where the episode ended with this step
+    counts: Bool[Array, ""]  # True in the time of guidance
 
 
 @runtime_checkable
@@ -32,15 +32,15 @@ class Arbiter(Protocol):
     """An arbiter's functions; hashable, without arrays of its own."""
 
     def init(self, num_envs: int) -> Any:
-        """Its state in environments at the start of their first episodes."""
+        """Return the arbiter's state for environments at the start of their first episodes."""
         ...
 
     def guided(self, state: Any) -> Bool[Array, " num_envs"]:
-        """In which environments the guide's action is executed next, in the time of guidance."""
+        """Return in which environments the guide's action is executed next, in the time of guidance."""
         ...
 
     def follow(self, state: Any, options: Any, scalars: Scalars, outcome: Outcome, key: PRNGKeyArray) -> Any:
-        """The state after one step in every environment.
+        """Return the state after one step in every environment.
 
         Args:
             state: before it.
@@ -53,7 +53,7 @@ class Arbiter(Protocol):
 
 
 class Known(NamedTuple):
-    """A lane's parts, and what they have learned, for an arbiter that chooses by them."""
+    """A lane's parts and what they have learned, for arbiters that choose by agent and guide."""
 
     env: Any  # or its view
     agent: AgentFunctions
@@ -66,7 +66,7 @@ class Known(NamedTuple):
 
 @runtime_checkable
 class Chooses(Arbiter, Protocol):
-    """An arbiter that chooses by what agent and guide say of actions, also in the random steps."""
+    """An arbiter that chooses by the agent's and the guide's values of actions, also in the random steps."""
 
     def choose(
         self,
@@ -77,8 +77,8 @@ class Chooses(Arbiter, Protocol):
         base: Float[Array, "num_envs action"],
         learns: Bool[Array, ""],
         key: PRNGKeyArray,
-    ) -> Refined:
-        """What to execute in place of the agent's actions until the cut-off.
+    ) -> Refinement:
+        """Return the actions to execute in place of the agent's, until the cut-off.
 
         Args:
             state: of the arbiter.
@@ -100,11 +100,11 @@ class HasCritic(Arbiter, Protocol):
     """An arbiter with a second agent, which learns from the same replay and never acts."""
 
     def critic(self, state: Any) -> tuple[Params, Any]:
-        """Its parameters, and what learning keeps beside them (`AgentFunctions.init`)."""
+        """Return the second agent's parameters, and the rest of its learning state (`AgentFunctions.init`)."""
         ...
 
     def with_critic(self, state: Any, critic: tuple[Params, Any]) -> Any:
-        """The state with another critic; `state` may be that of `init`, which has none."""
+        """Return the state with another critic; `state` may be that of `init`, which has none."""
         ...
 
 
@@ -114,39 +114,39 @@ class InTargets(Arbiter, Protocol):
 
     @property
     def in_targets(self) -> bool:
-        """Do targets bootstrap from the better of the actor's and the guide's action, in the time of guidance?"""
+        """Whether targets bootstrap from the better of the actor's and the guide's action, in the time of guidance."""
         ...
 
 
 @runtime_checkable
 class Finishes(Arbiter, Protocol):
-    """An arbiter that acts in the finished policy too, by one of several arms, whichever validates best."""
+    """An arbiter that also acts in the finished policy, by whichever of its arms validates best."""
 
     @property
     def arms(self) -> tuple[str, ...]:
-        """Names of the arms; of arms that validate alike the first acts."""
+        """Names of the arms. Of arms with equal validation the first acts."""
         ...
 
     @property
     def judge_steps(self) -> int:
-        """Steps in which each arm is validated, in episodes that no figure is of."""
+        """Environment steps that validate each arm, in episodes that no reported figure uses."""
         ...
 
     def arm(self, state: Any) -> Any:
-        """The number of the arm that acts in the finished policy, of a block of lanes one each (lanes,).
+        """Return the number of the finished policy's arm; for a block of lanes one number each (lanes,).
 
         Shapes in place of the state's arrays will do, of which the arm is the shape.
         """
         ...
 
     def with_arm(self, state: Any, arm: Int[Array, "*lanes"]) -> Any:
-        """The state in which another arm acts."""
+        """Return the state with another arm for the finished policy."""
         ...
 
     def act(
         self, arm: Int[Array, ""], options: Any, known: Known, obs: Float[Array, "n obs"], key: PRNGKeyArray
     ) -> Float[Array, "n action"]:
-        """Actions of the finished policy by one of the arms."""
+        """Return the finished policy's actions by one of the arms."""
         ...
 
 
@@ -158,12 +158,12 @@ class ArbiterOptions(Protocol):
     ABOUT: ClassVar[str]
 
     def make(self, bootstraps: bool) -> Arbiter:
-        """The arbiter; floats of the options may be None. `bootstraps`: is the discount factor above 0?"""
+        """Return the arbiter; floats of the options may be None. `bootstraps`: whether the discount is above 0."""
         ...
 
 
 def make_arbiter(options: ArbiterOptions, agent: AgentOptions, bootstraps: bool) -> Arbiter:
-    """The arbiter of options; those that look at the agent have `make_beside(agent, bootstraps)` too."""
+    """Return the arbiter of the options. Options that depend on the agent have `make_beside(agent, bootstraps)` too."""
     beside = getattr(options, "make_beside", None)
     return options.make(bootstraps) if beside is None else beside(agent, bootstraps)
 
@@ -171,7 +171,7 @@ def make_arbiter(options: ArbiterOptions, agent: AgentOptions, bootstraps: bool)
 def offer_of(
     arbiter: Arbiter, guide: Guide, model: GuidanceModel, env: Any, scalars: GuideScalars, counts: Bool[Array, ""]
 ) -> Offer | None:
-    """The guide's actions, for targets to compare with the actor's; None: the arbiter leaves targets alone.
+    """Return the guide's actions, for targets to compare with the actor's; None: targets ignore the guide.
 
     `counts`: is this the time of guidance? Outside it the actor's actions come back. It must not differ between lanes.
     """

@@ -1,4 +1,4 @@
-"""The arbiters that can be named; add one's own with `ARBITERS.register`, or name it as package.module:NAME."""
+"""The registry of arbiters. Add your own with `ARBITERS.register`, or name it as package.module:NAME."""
 
 from __future__ import annotations
 

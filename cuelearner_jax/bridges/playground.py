@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from cuelearner_jax.bridges.jax_environment import Given, JaxEnvironment, layout_of, space_of
-from cuelearner_jax.errors import UserError, closest
+from cuelearner_jax.errors import UserError, suggestion
 from cuelearner_jax.spaces import Cue
 
 
@@ -45,7 +45,7 @@ def make(name: str) -> Any:
             raise UserError(
                 f"playground:{name} downloads its robot: make that environment yourself, and pass it to from_playground"
             )
-        raise UserError(f"playground has no task {name!r}{closest(name, known.ALL_ENVS)}")
+        raise UserError(f"playground has no task {name!r}{suggestion(name, known.ALL_ENVS)}")
     try:
         with jax.ensure_compile_time_eval():  # a task holds arrays, and may be asked for while something is traced
             return known.load(name, config_overrides={"impl": "jax"})

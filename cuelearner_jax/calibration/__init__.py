@@ -1,6 +1,6 @@
-"""Calibration: relative answers read as evidence of what changed in the world."""
+"""Calibration: estimate from relative answers what changed in the world."""
 
-from cuelearner_jax.calibration.calibrating import (
+from cuelearner_jax.calibration.estimation import (
     CHANGED,
     UNCHANGED,
     UNEXPLAINED,
@@ -9,10 +9,10 @@ from cuelearner_jax.calibration.calibrating import (
     Result,
     calibrate,
 )
-from cuelearner_jax.calibration.corrected import Calibrated
-from cuelearner_jax.calibration.families import Distortion, Unknown, declared
-from cuelearner_jax.calibration.simulated import simulated
-from cuelearner_jax.calibration.walking import Walk
+from cuelearner_jax.calibration.families import Distortion, Unknown, declared_distortions
+from cuelearner_jax.calibration.policy import Calibrated
+from cuelearner_jax.calibration.simulator import simulator_distortion
+from cuelearner_jax.calibration.walk import Walk
 
 __all__ = [
     "CHANGED",
@@ -26,6 +26,6 @@ __all__ = [
     "Unknown",
     "Walk",
     "calibrate",
-    "declared",
-    "simulated",
+    "declared_distortions",
+    "simulator_distortion",
 ]

@@ -1,4 +1,4 @@
-"""What may have changed between a policy and its world, in named unknowns, and how each change is undone.
+"""Families of possible changes between a policy and its world, in named unknowns, and how each change is undone.
 
 A distortion says how observations or actions may have changed: balls are seen shifted, a lidar is mounted turned, every
 strike is turned. `sees` gives the observation as it was before the change, `acts` the action that leads there to what
@@ -20,17 +20,17 @@ from cuelearner_jax.errors import UserError
 from cuelearner_jax.spaces import Box, Space
 
 AXES = ("x", "y", "z")
-SHIFTING = ("m", "rad")  # units of what a displaced sensor adds a constant to
+SHIFTING = ("m", "rad")  # units of entries that a displaced sensor shifts by a constant
 PERCENT = 0.01
 
 
 class Unknown(NamedTuple):
-    """A number that says how much has changed; 0: nothing."""
+    """A number that says how large a change is; 0: no change."""
 
     name: str
     unit: str
-    scale: float | None = None  # how large it may well be, in its unit; None: found by what it makes a policy do
-    most: float = math.inf  # the largest that makes sense, in its unit
+    scale: float | None = None  # typical size in its unit; None: found from the policy's actions (`scales`)
+    most: float = math.inf  # largest possible size, in its unit
 
 
 Undoing = Callable[[Float[Array, " unknowns"], Float[Array, " size"]], Float[Array, " size"]]
@@ -44,12 +44,12 @@ class Distortion(NamedTuple):
     unknowns: tuple[Unknown, ...]
     sees: Undoing | None = None  # (unknowns, observation) -> observation before the change
     acts: Undoing | None = None  # (unknowns, meant action) -> action that leads to it after the change
-    plans: Planning | None = None  # (unknowns, observation, meant action) -> the same; see `simulated.simulated`
-    of_teacher: bool = False  # a fault of the answers, which is told and not corrected
+    plans: Planning | None = None  # (unknowns, observation, meant action) -> the same; see `simulator`
+    of_teacher: bool = False  # a fault of the teacher, which is reported and not corrected
 
     @property
     def asks(self) -> bool:
-        """Whether the policy, or a simulator, has to be asked anew when the unknowns change."""
+        """Whether the policy, or a simulator, must be asked again when the unknowns change."""
         return self.sees is not None or self.plans is not None
 
 
@@ -61,28 +61,33 @@ def unknowns_of(family: Family) -> tuple[Unknown, ...]:
     return tuple(unknown for distortion in family for unknown in distortion.unknowns)
 
 
-def seen(family: Family, theta: Float[Array, " unknowns"], obs: Float[Array, " obs"]) -> Float[Array, " obs"]:
-    """Return an observation as it was before the changes."""
+def undo_observation(
+    family: Family, theta: Float[Array, " unknowns"], obs: Float[Array, " obs"]
+) -> Float[Array, " obs"]:
+    """Return the observation as it would have been without the changes."""
     for distortion, values in _parts(family, theta):
         obs = obs if distortion.sees is None else distortion.sees(values, obs)
     return obs
 
 
-def planned(
+def undo_physics(
     family: Family, theta: Float[Array, " unknowns"], obs: Float[Array, " obs"], action: Float[Array, " action"]
 ) -> Float[Array, " action"]:
-    """Return the action that leads after changes of the physics to what `action` meant; `obs`: before the changes."""
+    """Return the action that has the effect which `action` had before the physics changed.
+
+    `obs`: the observation without the changes.
+    """
     for distortion, values in _parts(family, theta):
         action = action if distortion.plans is None else distortion.plans(values, obs, action)
     return action
 
 
-def acted(
+def undo_action(
     family: Family, theta: Float[Array, " unknowns"], action: Float[Array, " action"], corrects: bool = True
 ) -> Float[Array, " action"]:
-    """Return the action that leads after the changes to what `action` meant before them.
+    """Return the action that, after the changes, does what `action` did before them.
 
-    `corrects`: leave out what is a fault of the answers. Without, it is the action that the teacher would call right.
+    `corrects`: leave out faults of the teacher. If False, return the action that the teacher would call right.
     """
     for distortion, values in _parts(family, theta):
         if distortion.acts is not None and not (corrects and distortion.of_teacher):
@@ -114,7 +119,7 @@ def check_family(family: Sequence[Distortion]) -> Family:
     return tuple(family)
 
 
-def declared(env: Any, gains: bool = False, teacher_bias: bool = False) -> Family:
+def declared_distortions(env: Any, gains: bool = False, teacher_bias: bool = False) -> Family:
     """Derive the distortions of an environment from what it declares of its observation and actions.
 
     Slices in metres or radians of the same size shift together. Beams at equal angles roll. Directions turn, and places
@@ -146,13 +151,13 @@ def declared(env: Any, gains: bool = False, teacher_bias: bool = False) -> Famil
 
 
 def _places(observation: Sequence[Quantity]) -> list[tuple[Quantity, int]]:
-    """Each slice with the number of its first entry."""
+    """Return each slice with the number of its first entry."""
     starts = [sum(quantity.size for quantity in observation[:number]) for number in range(len(observation))]
     return list(zip(observation, starts, strict=True))
 
 
 def _alike(places: list[tuple[Quantity, int]]) -> dict[tuple[str, int], list[tuple[Quantity, int]]]:
-    """Slices that a displaced sensor shifts together: those of one unit and size."""
+    """Return the slices that a displaced sensor shifts together: those of one unit and size."""
     groups: dict[tuple[str, int], list[tuple[Quantity, int]]] = {}
     for quantity, start in places:
         if quantity.unit in SHIFTING and not quantity.kind:
@@ -223,7 +228,7 @@ def _turned(quantity: Quantity, start: int) -> Distortion:
 
 
 def _turned_places(places: list[tuple[Quantity, int]]) -> list[Distortion]:
-    """One turn for each origin: of all places with that origin, and of the differences that follow these."""
+    """Return one turn for each origin: of all places with that origin and the differences that follow them."""
     starts = {quantity.name: start for quantity, start in places}
     groups: dict[tuple[float, float], list[tuple[Quantity, int]]] = {}
     for quantity, start in places:
@@ -244,7 +249,7 @@ def _turned_places(places: list[tuple[Quantity, int]]) -> list[Distortion]:
 def _turned_about(
     origin: tuple[float, float], slices: list[tuple[Quantity, int]], followers: list[tuple[int, int]]
 ) -> Distortion:
-    """Places as they were before they were turned about a point.
+    """Return places as they were before a turn about a point.
 
     `followers`: first entries of differences, each with the first entry of the place that it is displaced with.
     """
@@ -266,7 +271,7 @@ def _along(space: Space, sign: float, theta: Array, action: Array) -> Array:
 
 
 def _acts(space: Space, name: str) -> Distortion:
-    """Executed actions lie a constant change away from those that were given."""
+    """Return the distortion that executes actions a constant change away from the given ones."""
     unknowns = tuple(Unknown(f"{name}: {cue.name}", space.unit, most=space.reach) for cue in space.cues)
     return Distortion(f"{name}: change", unknowns, acts=partial(_along, space, -1.0))
 
@@ -277,7 +282,7 @@ def _bias(space: Space) -> Distortion:
 
 
 def _action_gain(space: Box, name: str) -> Distortion:
-    """Executed actions are those that were given, times a factor an entry."""
+    """Return the distortion that multiplies each entry of a given action by a factor."""
 
     def acts(theta: Array, action: Array) -> Array:
         return space.retract(action * jnp.exp(-PERCENT * theta))

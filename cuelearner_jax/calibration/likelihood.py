@@ -1,4 +1,4 @@
-"""How likely a relative answer is, when it is known what the teacher means.
+"""The likelihood of a relative answer, given the action that the teacher means.
 
 An answer about an action is, with probability 1 - rho, an ordered logistic in the way from the action to what is meant:
 "already right" near it, with a width w. With probability rho, it is about something else: more and less are then as
@@ -18,9 +18,9 @@ from jaxtyping import Array, Float
 
 RHO = (0.02, 0.1, 0.25, 0.45, 0.75)
 WIDTH = (0.15, 0.5, 1.5, 5.0)  # [eps]
-RIGHT = (0.5, 1.5)  # how far from what is meant an action is still right [eps]: as asked, or what else is good too
-FAR = (10.0, 40.0)  # how far an answer is about what is meant [eps]
-ZERO = (1 / 3, 0.06)  # share of "already right" in answers about something else: careless ones; about other actions
+RIGHT = (0.5, 1.5)  # distance at which an action is still right [eps]: as asked, or with other good actions
+FAR = (10.0, 40.0)  # distance up to which an answer is about the meant action [eps]
+ZERO = (1 / 3, 0.06)  # share of "already right" in other answers: careless ones, or about other actions
 GRID = np.array(list(product(RHO, WIDTH, RIGHT, FAR, ZERO)))  # (grid, 5)
 LOG_PRIOR = np.log((1 - GRID[:, 0]) / (1 - GRID[:, 0]).sum())  # (grid,)
 LOGISTIC = np.pi**2 / 3  # variance of a logistic distribution of width 1
@@ -35,17 +35,17 @@ def chances(
     """Return the probability of an answer about one cue, for each point of the grid.
 
     Args:
-        offset: how far it is from the action to what is meant, on average [eps].
+        offset: mean distance from the asked action to the meant one [eps].
         spread: standard deviation of that [eps].
         answer: -1, 0 or 1.
-        doubt: probability that the situation itself makes the answer one about something else.
+        doubt: probability that the situation makes the answer one about another action.
     """
     shape = jnp.shape(offset)
     offset, spread, answer, doubt = (
         jnp.broadcast_to(jnp.asarray(part, jnp.float32), shape)[..., None, None, None, None, None]
         for part in (offset, spread, answer, doubt)
     )
-    # An axis each, so that what depends on few of them is computed once.
+    # One axis for each parameter, so that terms of few parameters are computed once.
     axes = np.meshgrid(RHO, WIDTH, RIGHT, FAR, ZERO, indexing="ij", sparse=True)
     rho, width, right, far, zero = (part.astype(np.float32)[(None,) * len(shape)] for part in axes)
     variance = jnp.square(spread)
@@ -71,10 +71,10 @@ def log_chances(
     """Return the logarithm of the probability of each answer, for each point of the grid.
 
     Args:
-        offset: how far it is from the asked action to what is meant, along each cue [eps].
+        offset: distance from the asked action to the meant one, along each cue [eps].
         spread: standard deviation of that [eps].
         answer: -1, 0 or 1 for each cue.
-        told: 1 where something was said of a cue, else 0.
+        told: 1 where the answer says something of a cue, else 0.
         doubt: of each answer's situation, see `chances`.
     """
     answer, told, doubt = (jnp.broadcast_to(part, offset.shape) for part in (answer, told, doubt[:, None]))

@@ -1,4 +1,4 @@
-"""What a policy means under given unknowns: the policy as a black box, asked in rows of one size."""
+"""The actions that a policy means under given unknowns; the policy is a black box, asked in batches of one size."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ import numpy as np
 from jaxtyping import Float
 
 from cuelearner_jax import user_code
-from cuelearner_jax.calibration.families import Family, acted, planned, seen
-from cuelearner_jax.policies import named
+from cuelearner_jax.calibration.families import Family, undo_action, undo_observation, undo_physics
+from cuelearner_jax.policies import policy_name
 from cuelearner_jax.spaces import Space
 
 Floats = np.ndarray
-ROWS_CPU, ROWS_PYTHON, ROWS = 64, 512, 2048  # observations that a policy sees at once
-CHEAP = 4096  # rows of what is computed without the policy
+ROWS_CPU, ROWS_PYTHON, ROWS = 64, 512, 2048  # observations in one call of a policy
+CHEAP = 4096  # rows in one call of programs without the policy
 
 
 class Meaning:
-    """A policy behind the changes of a family.
+    """A policy as a function of a family's unknowns.
 
     Args:
         policy: acts by its observations alone; opaque Python functions included.
@@ -35,7 +35,7 @@ class Meaning:
     def actions(
         self, family: Family, thetas: Float[Floats, "thetas unknowns"], obs: Float[Floats, "n obs"]
     ) -> Float[Floats, "thetas n action"]:
-        """Return what the policy does in each situation, seen as it was before the changes of each theta."""
+        """Return the policy's actions in each situation, seen as it was before the changes of each theta."""
         number, count = len(thetas), len(obs)
         theta, rows = np.repeat(thetas, count, 0), np.tile(obs, (number, 1))
         if is_python(self.policy):
@@ -46,7 +46,7 @@ class Meaning:
         else:
             portion = ROWS_CPU if jax.default_backend() == "cpu" else ROWS
             found = in_portions(partial(_meant, family, self.policy), portion, theta, rows)
-        user_code.check_actions(found, named(self.policy))
+        user_code.check_actions(found, policy_name(self.policy))
         return found.reshape(number, count, self.space.size)
 
     def offsets(
@@ -56,7 +56,7 @@ class Meaning:
         meant: Float[Floats, "thetas n action"],
         asked: Float[Floats, "n action"],
     ) -> Float[Floats, "thetas n cues"]:
-        """Return how far it is from asked actions to those that the changes make of what is meant, as `space.log`."""
+        """Return the vectors (`space.log`) from asked actions to the ones that undo the changes of meant actions."""
         number, count = meant.shape[:2]
         theta, action = np.repeat(thetas, count, 0), np.tile(asked, (number, 1))
         meant = meant.reshape(-1, self.space.size)
@@ -66,20 +66,20 @@ class Meaning:
     def right(
         self, family: Family, thetas: Float[Floats, "thetas unknowns"], meant: Float[Floats, "thetas n action"]
     ) -> Float[Floats, "thetas n action"]:
-        """Return the actions that the teacher would call right where the policy means these."""
+        """Return the actions that the teacher would call right where the policy means `meant`."""
         theta, rows = np.repeat(thetas, meant.shape[1], 0), meant.reshape(-1, self.space.size)
         return in_portions(partial(_right, family), CHEAP, theta, rows).reshape(meant.shape)
 
 
 def is_python(policy: Any) -> bool:
-    """Return whether plain Python acts. It may compute with JAX itself, and would wait for itself if compiled in."""
+    """Return whether plain Python acts. Such a policy may call JAX itself, and would deadlock if compiled in."""
     while (base := getattr(policy, "base", None)) is not None:
         policy = base
     return bool(getattr(policy, "on_host", False))
 
 
 def in_portions(program: Callable[..., Any], portion: int, *rows: Floats) -> Floats:
-    """Return a program's rows of any number of rows; each call sees as many, so that it is compiled once."""
+    """Return a program that takes any number of rows in calls of one size, so that it is compiled once."""
     count = len(rows[0])
     found = []
     for start in range(0, count, portion):
@@ -98,17 +98,21 @@ def _meant(family: Family, policy: Any, theta: Any, obs: Any) -> Any:
 
 @partial(jax.jit, static_argnums=0)
 def _planned(family: Family, theta: Any, before: Any, action: Any) -> Any:
-    return jax.vmap(partial(planned, family))(theta, before, action) if family else action
+    return jax.vmap(partial(undo_physics, family))(theta, before, action) if family else action
 
 
 @partial(jax.jit, static_argnums=0)
 def _seen(family: Family, theta: Any, obs: Any) -> Any:
-    return jax.vmap(partial(seen, family))(theta, obs) if family else obs
+    return jax.vmap(partial(undo_observation, family))(theta, obs) if family else obs
 
 
 @partial(jax.jit, static_argnums=0)
 def _right(family: Family, theta: Any, meant: Any) -> Any:
-    return jax.vmap(lambda one, action: acted(family, one, action, corrects=False))(theta, meant) if family else meant
+    return (
+        jax.vmap(lambda one, action: undo_action(family, one, action, corrects=False))(theta, meant)
+        if family
+        else meant
+    )
 
 
 @partial(jax.jit, static_argnums=(0, 1))

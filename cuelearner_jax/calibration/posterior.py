@@ -1,4 +1,4 @@
-"""What answers tell about a family's unknowns: weighted samples, by adaptive importance sampling (AMIS).
+"""The posterior of a family's unknowns: weighted samples, by adaptive importance sampling (AMIS).
 
 The policy is a black box and jumps from one action to another as the unknowns change, so nothing is differentiated.
 Samples of earlier rounds stay, weighted by the mixture of all proposals (Cornuet et al., 2012); new answers only change
@@ -21,34 +21,37 @@ from cuelearner_jax.calibration.meaning import in_portions
 from cuelearner_jax.calibration.response import Response, Responses
 
 Floats = np.ndarray
-PRIOR_FREEDOM, KERNEL_FREEDOM = 5, 5  # of Student's t: changes may be larger than thought
-SAMPLES = 96  # of a round for each unknown
-PORTION = 32  # samples that are weighed at once
-ENOUGH, MORE = 6.0, 4  # samples that must count, for each unknown and one; rounds that are added for these at most
-ANEW = 0.15  # share of the samples of a round that are drawn from the prior again
-FIRST, CLOSER = 2, 0.1  # rounds of the prior, and of one with so much smaller changes: they stay
-KEPT = 4  # later rounds that stay
+PRIOR_FREEDOM, KERNEL_FREEDOM = 5, 5  # degrees of freedom of Student's t, whose heavy tails allow for large changes
+SAMPLES = 96  # samples of a round for each unknown
+PORTION = 32  # samples weighed in one call
+ENOUGH, MORE = 6.0, 4  # least effective samples for each unknown and one; most extra rounds for these
+ANEW = 0.15  # share of a round's samples drawn from the prior
+FIRST, CLOSER = (
+    2,
+    0.1,
+)  # rounds from the prior and from a prior with scales smaller by this factor; these rounds are kept
+KEPT = 4  # later rounds that are kept
 HELD_OUT = 5  # every fifth answer is held out in turn
 
 
 class Answers(NamedTuple):
-    """Relative answers as evidence; rows."""
+    """Relative answers as evidence, one row each."""
 
     obs: Float[Floats, "n obs"]
     action: Float[Floats, "n action"]  # asked about
     answer: Float[Floats, "n cues"]  # -1, 0 or 1
-    told: Float[Floats, "n cues"]  # 1 where something was said of a cue, else 0
+    told: Float[Floats, "n cues"]  # 1 where the answer says something of a cue, else 0
     doubt: Float[Floats, " n"]  # probability that the situation is one of a tie, see `questions.ties`
 
 
 def log_student(x: Floats, freedom: float) -> Floats:
-    """The logarithm of the density of Student's t, entry by entry."""
+    """Return the logarithm of the density of Student's t, for each entry."""
     norm = gammaln((freedom + 1) / 2) - gammaln(freedom / 2) - 0.5 * np.log(freedom * np.pi)
     return norm - (freedom + 1) / 2 * np.log1p(np.square(x) / freedom)
 
 
 class Prior(NamedTuple):
-    """Student's t of each unknown's scale; what makes sense is a part of it."""
+    """Student's t with each unknown's scale, truncated to the possible sizes."""
 
     scale: Float[Floats, " unknowns"]
     most: Float[Floats, " unknowns"]
@@ -57,7 +60,9 @@ class Prior(NamedTuple):
         """Return samples (count, unknowns), evenly spread."""
         if not len(self.scale):
             return np.zeros((count, 0))
-        from scipy.stats import qmc  # takes seconds to load, and a stored policy needs none of it
+        from scipy.stats import (
+            qmc,
+        )  # imported here, since SciPy's module takes seconds to load and a stored policy does not need it
 
         even = qmc.Halton(len(self.scale), rng=random).random(count)
         return stdtrit(PRIOR_FREEDOM, np.clip(even, 1e-4, 1 - 1e-4)) * self.scale
@@ -67,16 +72,16 @@ class Prior(NamedTuple):
         return log_student(theta / self.scale, PRIOR_FREEDOM).sum(-1) - np.log(self.scale).sum()
 
     def closer(self) -> Prior:
-        """Return the same of changes that are much smaller."""
+        """Return the prior with much smaller scales."""
         return self._replace(scale=self.scale * CLOSER)
 
     def allows(self, theta: Floats) -> Floats:
-        """Return which rows (n,) make sense."""
+        """Return which rows (n,) are possible."""
         return np.asarray((np.abs(theta) <= self.most).all(-1))
 
 
 class Kernels(NamedTuple):
-    """A mixture of Student's t round centres, with one shape, and a share of the prior: nothing is ever given up."""
+    """A mixture of Student's t around centres, with one shape, and a share of the prior so that no region is excluded."""
 
     centres: Float[Floats, "kernels unknowns"]
     shape: Float[Floats, "unknowns unknowns"]  # lower triangle
@@ -99,16 +104,16 @@ class Kernels(NamedTuple):
 
 
 class Round(NamedTuple):
-    """Samples of one round, where they were drawn, and what answers make of them."""
+    """The samples of one round, their proposal, and their likelihoods."""
 
     proposal: Kernels | Prior
     theta: Float[Floats, "samples unknowns"]
-    offset: Float[Floats, "samples n cues"]  # from asked actions to what the teacher would call right [eps]
+    offset: Float[Floats, "samples n cues"]  # from asked actions to the ones that the teacher would call right [eps]
     log_likelihood: Float[Floats, "samples grid"]  # with the prior of the grid
 
 
 class Fit:
-    """Samples of a family's unknowns, weighted by answers.
+    """Weighted samples of the posterior of a family's unknowns.
 
     Args:
         family: what may have changed; empty: nothing.
@@ -121,7 +126,7 @@ class Fit:
         self.asks = tuple(one for one in family if one.asks)
         self.family = (*self.asks, *(one for one in family if not one.asks))
         self.responses, self.random = responses, np.random.default_rng(seed)
-        self.changes = len(unknowns_of(self.asks))  # unknowns that change what is seen; they come first
+        self.changes = len(unknowns_of(self.asks))  # number of unknowns that change the observation; they come first
         self.columns = [responses.names.index(one.name) for one in unknowns_of(self.asks)]
         self.prior = _prior(self.family, scales)
         self.rounds: list[Round] = []
@@ -133,7 +138,7 @@ class Fit:
         return len(unknowns_of(self.family))
 
     def learn(self, answers: Answers, response: Response, rounds: int = 1) -> None:
-        """Take all answers so far, and what the policy does where they were given; add rounds of samples."""
+        """Take all answers so far and the policy's responses in their situations; add rounds of samples."""
         self.answers, self.response = answers, response
         self.rounds = [self._round(one.proposal, one.theta) for one in self.rounds]
         if self.rounds:
@@ -143,7 +148,7 @@ class Fit:
         self.refine(ENOUGH * (1 + self.unknowns), MORE)
 
     def refine(self, enough: float, most: int) -> None:
-        """Add rounds of samples until the weights leave enough of them, at most so many."""
+        """Add rounds of samples until enough are effective, up to a largest number."""
         for _ in range(most if self.unknowns else 0):
             if self.effective >= enough:
                 return
@@ -156,13 +161,13 @@ class Fit:
         return self.theta[random.choice(len(self.theta), count, p=self.weight)]
 
     def places(self, theta: Float[Floats, "n unknowns"]) -> Float[Floats, "n all"]:
-        """Return where samples lie among the nodes of `responses`."""
+        """Return the samples' coordinates among the nodes of `responses`."""
         found = np.zeros((len(theta), len(self.responses.names)))
         found[:, self.columns] = theta[:, : self.changes] / self.responses.scale[self.columns]
         return found
 
     def right(self, theta: Floats, response: Response) -> tuple[Floats, Floats]:
-        """Return the actions (samples, n, action) that the teacher would call right, and their spread in cues [eps]."""
+        """Return the actions (samples, n, action) that the teacher would call right, and their spread along cues [eps]."""
         meaning, (mean, spread) = self.responses.meaning, response.at(self.places(theta))
         meant = np.asarray(
             meaning.space.exp(response.centre[None], jnp.asarray(mean * self.responses.eps, jnp.float32))
@@ -170,7 +175,7 @@ class Fit:
         return meaning.right(self.family, theta, meant), spread
 
     def _offsets(self, theta: Floats) -> tuple[Floats, Floats]:
-        """From asked actions to what the teacher would call right, on average, and the spread [eps]."""
+        """Return mean and spread of the vectors from asked actions to the right ones [eps]."""
         assert self.answers is not None
         right, spread = self.right(theta, self.response)
         none = np.zeros((len(theta), 0))
@@ -187,12 +192,12 @@ class Fit:
         self._weigh()
 
     def _proposal(self) -> Kernels | Prior:
-        """Where to draw next: the prior, then close to no change, then near what the answers so far leave likely."""
+        """Return the next proposal: first the prior, then near no change, then near the posterior so far."""
         if len(self.rounds) < FIRST or not self.unknowns:
             return self.prior if not self.rounds else self.prior.closer()
         enough = min(0.25 * len(self.log_weight), ENOUGH * (1 + self.unknowns))
-        # As long as few samples have all of the weight, the best are where to look, however they were found.
-        weight = self.weight if self.effective >= enough else tempered(self.log_density, enough)
+        # While few samples carry all the weight, the next proposal is centred on the best ones.
+        weight = self.weight if self.effective >= enough else temper(self.log_density, enough)
         size = self.unknowns
         centres = self.theta[self.random.choice(len(self.theta), 32, p=weight)]
         away = self.theta - weight @ self.theta
@@ -201,7 +206,7 @@ class Fit:
         return Kernels(centres, np.linalg.cholesky(spread), self.prior)
 
     def _weigh(self) -> None:
-        """Weights of all samples under all answers."""
+        """Compute the weights of all samples under all answers."""
         self.theta, self.offset, self.log_likelihood = map(np.concatenate, list(zip(*self.rounds, strict=True))[1:])
         prior, drawn = self._log_densities()
         self.log_origin = prior - drawn
@@ -209,10 +214,10 @@ class Fit:
         self.log_weight = self.log_density - drawn
 
     def _log_each(self, offset: Floats, spread: Floats, summed: bool) -> Floats:
-        """Logarithm of each answer's probability (samples, n, grid), or of all answers' and the grid's prior."""
+        """Return log probabilities of each answer (samples, n, grid), or of all answers with the grid's prior."""
         assert self.answers is not None
         count = offset.shape[1]
-        size = 1 << max(6, (count - 1).bit_length())  # few sizes, few programs
+        size = 1 << max(6, (count - 1).bit_length())  # few batch sizes, so that few programs are compiled
         answer, told, doubt = (
             np.pad(np.asarray(rows, np.float32), [(0, size - count)] + [(0, 0)] * (rows.ndim - 1))
             for rows in self.answers[2:]
@@ -223,7 +228,7 @@ class Fit:
         return found + LOG_PRIOR if summed else found[:, :count]
 
     def _log_densities(self) -> tuple[Floats, Floats]:
-        """Logarithm of the density of each sample: under the prior, and in the mixture of all proposals."""
+        """Return each sample's log density: under the prior, and under the mixture of all proposals."""
         if not self.unknowns:
             return np.zeros(len(self.theta)), np.zeros(len(self.theta))
         counts = np.array([len(one.theta) for one in self.rounds])
@@ -233,7 +238,7 @@ class Fit:
 
     @property
     def evidence(self) -> float:
-        """Logarithm of the probability of all answers, if this family is what changed."""
+        """Log probability of all answers, if this family is what changed."""
         return float(logsumexp(self.log_weight) - np.log(len(self.log_weight)))
 
     @property
@@ -243,19 +248,19 @@ class Fit:
 
     @property
     def effective(self) -> float:
-        """Number of samples that the weights leave."""
+        """Effective number of samples."""
         return float(1 / np.square(self.weight).sum())
 
     @property
     def nuisance(self) -> Float[Floats, " grid"]:
-        """Posterior of the grid of `likelihood`; before the first answer, their prior."""
+        """Posterior of the grid of `likelihood`; before the first answer, its prior."""
         if self.answers is None:
             return np.exp(LOG_PRIOR)
         joint = self.log_likelihood + self.log_origin[:, None]
         return np.exp(logsumexp(joint, axis=0) - logsumexp(joint))
 
-    def predicted(self) -> Float[Floats, " n"]:
-        """Return the logarithm of the probability of each answer, given those of the other four fifths."""
+    def predict_held_out(self) -> Float[Floats, " n"]:
+        """Return the log probability of each answer, given the other four fifths of the answers."""
         log_each = self._log_each(*self._offsets(self.theta), summed=False)
         count = log_each.shape[1]
         found = np.zeros(count)
@@ -268,7 +273,7 @@ class Fit:
         return found
 
     def interval(self, share: float = 0.95) -> tuple[Floats, Floats, Floats]:
-        """Return mean, lower and upper end (unknowns,) of the posterior of each unknown."""
+        """Return posterior mean, lower and upper end (unknowns,) of each unknown."""
         weight = self.weight
         ends = [[_quantile(column, weight, 0.5 + side * share / 2) for column in self.theta.T] for side in (-1, 1)]
         return weight @ self.theta, np.array(ends[0]), np.array(ends[1])
@@ -289,8 +294,8 @@ def _summed(*rows: Any) -> Any:
     return jnp.sum(log_chances(*rows), 1)
 
 
-def tempered(log_weight: Floats, enough: float) -> Floats:
-    """Return weights that add up to one, flattened until so many samples count."""
+def temper(log_weight: Floats, enough: float) -> Floats:
+    """Return weights that add up to one, flattened until so many samples are effective."""
     low, high = 0.0, 1.0
     for step in range(24):
         power = 1.0 if step == 0 else (low + high) / 2

@@ -1,4 +1,4 @@
-"""What to ask: actions of which an answer is expected to tell most about what changed, away from the policy's ties."""
+"""Choose questions: the actions whose answers are expected to tell most about the changes, away from the policy's ties."""
 
 from __future__ import annotations
 
@@ -17,30 +17,30 @@ from cuelearner_jax.calibration.response import Response
 
 Floats = np.ndarray
 ANSWERS = (-1.0, 0.0, 1.0)
-DRAWS = 24  # of what may have changed
+DRAWS = 24  # draws of the unknowns
 NUDGES, NUDGE = 4, 1e-3  # tiny changes of an observation, as a share of how much its entries differ
 TURNS = np.array(
     [-2.0, -1.3, -0.8, -0.4, 0.0, 0.4, 0.8, 1.3, 2.0]
-)  # of an action asked about, in spreads of what may be meant
+)  # offsets of an asked action, in spreads of the possibly meant actions
 LEAST_SPREAD = 0.75  # [eps]
-WIDEST = 5.0  # [eps]: beyond, a teacher may have something else in mind
+WIDEST = 5.0  # [eps]: beyond, a teacher may mean another action
 
 
 class Questions(NamedTuple):
     """Actions to ask about."""
 
-    index: Int[np.ndarray, " questions"]  # of the situations
+    index: Int[np.ndarray, " questions"]  # number of the situation
     action: Float[Floats, "questions action"]
     doubt: Float[Floats, " questions"]  # see `ties`
-    information: Float[Floats, " questions"]  # expected of an answer [nats]
+    information: Float[Floats, " questions"]  # expected information of the answer [nats]
 
 
 def ties(
     meaning: Meaning, family: Family, theta: Float[Floats, " unknowns"], obs: Float[Floats, "n obs"], eps: float
 ) -> Float[Floats, " n"]:
-    """Return the share of tiny changes of each observation after which the policy does something else.
+    """Return the share of tiny changes of each observation that make the policy choose another action.
 
-    There the policy is at a tie of two actions, and a word about one of them tells nothing about the unknowns.
+    There the policy is at a tie of two actions, and an answer about one of them tells nothing about the unknowns.
     """
     random = np.random.default_rng(0)
     size = NUDGE * obs.std(0)
@@ -52,10 +52,10 @@ def ties(
     return (np.abs(moved).max(-1, initial=0.0) > eps).mean(0)
 
 
-def drawn(
+def draw_hypotheses(
     fits: list[Fit], odds: Float[Floats, " fits"], random: np.random.Generator
 ) -> list[tuple[Fit, Float[Floats, "draws unknowns"]]]:
-    """Return draws of what may have changed: of each family as many as it is likely."""
+    """Return draws of the unknowns, of each family in proportion to its odds."""
     odds = np.exp(odds - odds.max())
     counts = np.bincount(random.choice(len(fits), DRAWS, p=odds / odds.sum()), minlength=len(fits))
     return [(fit, fit.draw(random, count)) for fit, count in zip(fits, counts.tolist(), strict=True) if count]
@@ -67,13 +67,13 @@ def choose(
     count: int,
     random: np.random.Generator,
 ) -> Questions:
-    """Return `count` questions: of each share of the situations, the one that is expected to tell most.
+    """Return `count` questions: from each share of the situations the most informative one.
 
     Args:
         draws: what may have changed.
-        response: what the policy does in the situations to choose from, at least `count`.
+        response: the policy's responses in the situations to choose from, at least `count`.
         count: number of questions.
-        random: of answers that are imagined.
+        random: source of the simulated answers.
     """
     meaning, eps = draws[0][0].responses.meaning, draws[0][0].responses.eps
     found = [fit.right(thetas, response) for fit, thetas in draws]
@@ -97,9 +97,10 @@ def choose(
 def _told_most(
     chance: Float[Floats, "cues answers draws turns n"], shares: list[Floats], random: np.random.Generator
 ) -> tuple[Floats, Floats, Floats]:
-    """Return of each share of the situations the one to ask in, how to turn the action there, and the information.
+    """Return for each share of the situations the most informative one, its turn of the action, and its information.
 
-    One after the other: each draw in turn is taken for the truth, answers those before, and weighs all draws by that.
+    Questions are chosen one after another. Each draw in turn is taken as the truth, answers the earlier questions, and so
+    weights all draws.
     """
     cues, _, draws = chance.shape[:3]
     weight = np.full((draws, draws), 1 / draws)  # (truth, draw)
@@ -121,7 +122,7 @@ def _told_most(
 
 
 def _medoid(meaning: Meaning, right: Float[Floats, "draws n action"], eps: float) -> Float[Floats, "n action"]:
-    """Of what may be meant in each situation, that which is nearest to the others."""
+    """Return for each situation the possible action that is nearest to the others."""
     nothing = np.zeros((len(right), 0))
     apart = [np.minimum(np.abs(meaning.offsets((), nothing, right, one)), WIDEST * eps).sum((0, 2)) for one in right]
     return np.take_along_axis(right, np.argmin(apart, 0)[None, :, None], 0)[0]
@@ -131,7 +132,7 @@ def _medoid(meaning: Meaning, right: Float[Floats, "draws n action"], eps: float
 def _chances(
     offset: Float[Array, "draws turns n"], spread: Float[Array, "draws turns n"], nuisance: Float[Array, "draws grid"]
 ) -> Float[Array, "answers draws turns n"]:
-    """Probability of each answer about one cue under each draw."""
+    """Return the probability of each answer about one cue under each draw."""
     return jnp.stack([jnp.einsum("dtng,dg->dtn", chances(offset, spread, h), nuisance) for h in ANSWERS])
 
 

@@ -1,4 +1,4 @@
-"""What a policy does as the world it sees is changed: asked at some nodes, and between them by kriging.
+"""A policy's response to changed observations: asked at few nodes, interpolated between them by kriging.
 
 A policy is expensive and jumps, and every family asks about the same changes of what is seen. So it is asked at few
 nodes in the unknowns of all families. Between these a Gaussian process with a linear trend and a nugget (Rasmussen and
@@ -17,13 +17,13 @@ from cuelearner_jax.calibration.families import Family, unknowns_of
 from cuelearner_jax.calibration.meaning import Meaning
 
 Floats = np.ndarray
-AXIS = (0.35, 1.2)  # where the first nodes stand on either side of no change, in prior scales
+AXIS = (0.35, 1.2)  # distances of the first nodes from no change, in prior scales
 MOST = 28  # nodes
-CLIP = 10.0  # [eps]: beyond, an action is another one
-TREND = 100.0  # variance of the trend, in that of the rest
+CLIP = 10.0  # [eps]: larger offsets are clipped
+TREND = 100.0  # variance of the trend, relative to the residual variance
 LENGTHS, NUGGETS = (0.15, 0.5, 2.0), (1e-3, 0.1, 0.6)  # in prior scales; as shares of the variance
-LEAST = 0.05  # [eps]: a policy that is smoother has that size
-RELEVANT = 0.02  # weight of nodes that the answers leave unlikely
+LEAST = 0.05  # [eps]: least standard deviation of a row
+RELEVANT = 0.02  # weight of nodes that are unlikely given the answers
 
 
 class Response(NamedTuple):
@@ -32,7 +32,7 @@ class Response(NamedTuple):
     nodes: Float[Floats, "nodes unknowns"]  # in prior scales
     centre: Float[Floats, "n action"]  # actions that offsets start from
     offset: Float[Floats, "nodes n cues"]  # [eps]
-    relevance: Float[Floats, " nodes"]  # how much what happens at a node counts for a row's size
+    relevance: Float[Floats, " nodes"]  # weight of each node in the estimate of a row's size
     length: float
     nugget: float
 
@@ -46,13 +46,13 @@ class Response(NamedTuple):
         own = 1 + TREND * (1 + np.square(theta).sum(-1))
         variance = np.maximum(own - np.einsum("sk,kl,sl->s", cross, inverse, cross), 0.0) + self.nugget
         weights = np.einsum("kl,lnc->knc", inverse, self.offset)
-        left_out = np.square(weights) / np.diag(inverse)[:, None, None]  # squared errors of leaving a node out, scaled
+        left_out = np.square(weights) / np.diag(inverse)[:, None, None]  # scaled squared leave-one-out errors
         size = np.einsum("k,knc->nc", self.relevance / self.relevance.sum(), left_out) + LEAST**2
         return np.einsum("sk,knc->snc", cross, weights), np.sqrt(variance[:, None, None] * size)
 
 
 class Responses:
-    """Asks a policy at nodes, and remembers what it did.
+    """Asks a policy at nodes, and caches its answers.
 
     Args:
         meaning: the policy.
@@ -73,7 +73,7 @@ class Responses:
         self.known: dict[tuple[bytes, bytes], Floats] = {}
 
     def drawn(self, draws: Float[Floats, "draws unknowns"], fresh: int, random: np.random.Generator) -> None:
-        """Take what answers leave likely, in prior scales: add nodes there, drop those farthest away."""
+        """Take draws of the posterior, in prior scales: add nodes there, and drop the nodes farthest away."""
         if not self.names:
             return
         spread = np.sqrt(draws.var(0) + 0.1**2)
@@ -87,7 +87,7 @@ class Responses:
         self.nodes, self.relevance = self.nodes[kept], self.relevance[kept]
 
     def covering(self, draws: Float[Floats, "draws unknowns"], count: int) -> Int[Floats, " nodes"]:
-        """Return numbers of so many nodes, spread over what answers leave likely."""
+        """Return the numbers of so many nodes, spread over the posterior."""
         apart = np.square(draws[:, None] - self.nodes[None]).sum(-1)
         chosen = [int(self.relevance.argmax())]
         while len(chosen) < min(count, len(self.nodes)):
@@ -99,7 +99,7 @@ class Responses:
     def of(
         self, obs: Float[Floats, "n obs"], among: Int[Floats, " nodes"] | None = None, learn: bool = True
     ) -> Response:
-        """Return what the policy does in these situations; `learn`: these also tell how smooth the policy is."""
+        """Return the policy's response in these situations; `learn`: also fit length and nugget to them."""
         among = np.arange(len(self.nodes)) if among is None else among
         nodes, relevance = self.nodes[among], self.relevance[among]
         actions = self._asked(nodes, obs)
@@ -111,10 +111,10 @@ class Responses:
         return Response(nodes, centre, offset, relevance, *self.smooth)
 
     def _asked(self, nodes: Floats, obs: Floats) -> Floats:
-        """Actions (nodes, n, action); the policy is asked about what is not known."""
+        """Return actions (nodes, n, action); ask the policy only for those that are not cached."""
         keys = [[(node.tobytes(), row.tobytes()) for row in obs] for node in nodes]
         missing = np.array([[key not in self.known for key in row] for row in keys])
-        for pattern in np.unique(missing, axis=1).T:  # nodes that the same rows miss are asked together
+        for pattern in np.unique(missing, axis=1).T:  # nodes with the same missing rows are asked together
             rows = np.flatnonzero((missing == pattern[:, None]).all(0))
             if not pattern.any():
                 continue

@@ -1,4 +1,4 @@
-"""How large an unknown may well be: so large that it changes what a policy does by a few answers' strength."""
+"""Prior scales of unknowns: so large that a change moves a policy's actions by a few answers' strength."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ Floats = np.ndarray
 CHANGED_BY = 10.0  # [eps]: the mean change of the policy's actions
 MOST = 1 / 4  # of the space's reach
 SITUATIONS = 16
-SIZES = np.geomspace(1e-4, 1e3, 29)  # that are tried, in the unknown's unit
+SIZES = np.geomspace(1e-4, 1e3, 29)  # scales that are tried, in the unknown's unit
 
 
 def scales_of(meaning: Meaning, family: Family, obs: Float[Floats, "n obs"], eps: float) -> dict[str, float]:
-    """Return the scale of each unknown by its name: the given one, or one found by what it makes the policy do."""
+    """Return the scale of each unknown by its name: the given one, or one found from the policy's actions."""
     obs = obs[:: max(1, len(obs) // SITUATIONS)][:SITUATIONS]
     target = min(CHANGED_BY * eps, float(meaning.space.from_unit(MOST * meaning.space.reach)))
     found = {}

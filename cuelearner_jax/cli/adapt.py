@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Annotated, Any, Generic
 
 from cuelearner_jax.adaptation import changes
-from cuelearner_jax.api import correcting
+from cuelearner_jax.api import correction
 from cuelearner_jax.cli.parsing import TASK_OPTIONS, about, code_of, is_code, out, parse, source_of, taken
 from cuelearner_jax.cli.shared_options import Flag, KindsT, TaskT, kinds_type, unprefixed
 from cuelearner_jax.errors import NotFinite, UserError
@@ -88,9 +88,9 @@ def _source(arguments: list[str]) -> tuple[PolicySource, Any, str | None, list[s
 
 def _of_labels(named: str, path: str | None) -> PolicySource:
     """The situations of a label file in place of a task. Raises UserError unless its labels are about a recording."""
-    found = None if path is None else correcting.of_file(Path(path))
+    found = None if path is None else correction.labels_from_file(Path(path))
     if found is None or found.config is None:
         why = "" if path is None else f", of which {path} does not hold labels of a recording"
         raise UserError(f"{named} is to act in some task{why}: name it, as --task navigation or --env gymnasium:NAME")
-    world = correcting.world_of(found)
+    world = correction.world_of(found)
     return PolicySource(world.task, world.task.start(), None, Path(world.task.name))

@@ -20,7 +20,7 @@ os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
 
 # What loads JAX, and takes seconds, is imported where a command needs it: `--version` and `--help` wait for nothing.
 from cuelearner_jax import __version__
-from cuelearner_jax.errors import NotFinite, UserError, blamed, closest
+from cuelearner_jax.errors import NotFinite, UserError, file_system_message, suggestion
 from cuelearner_jax.signals import Interrupted
 
 HELP, HELP_ALL = ("-h", "--help", "--help-all"), "--help-all"
@@ -51,7 +51,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         abandon(sys.stdout)
         return 141
     except Exception as error:
-        told = blamed(error, _resumes(arguments))
+        told = file_system_message(error, _resumes(arguments))
         if told is None:
             raise
         _tell(f"error: {told}")
@@ -79,10 +79,10 @@ def _dispatch(arguments: list[str]) -> int:
         print(f"cuelearner {__version__}")
         return 0
     if command not in COMMANDS:
-        raise UserError(f"unknown command {command!r}{closest(command, COMMANDS)}; see cuelearner --help")
+        raise UserError(f"unknown command {command!r}{suggestion(command, COMMANDS)}; see cuelearner --help")
     from cuelearner_jax import user_code
 
-    user_code.told(_file(command).run)(arguments[1:])
+    user_code.report_user_errors(_file(command).run)(arguments[1:])
     return 0
 
 

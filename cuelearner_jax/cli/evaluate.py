@@ -9,7 +9,7 @@ from typing import Any, Generic
 import numpy as np
 from rich.table import Table
 
-from cuelearner_jax.api import correcting
+from cuelearner_jax.api import correction
 from cuelearner_jax.cli.parsing import code_of, is_code, out, taken
 from cuelearner_jax.cli.shared_options import TaskT, asked_of_source
 from cuelearner_jax.errors import UserError
@@ -98,7 +98,7 @@ def run(arguments: list[str]) -> None:
 
 def _print_agreement(named: str, policy: Any, path: Any) -> None:
     """Prints how many answers of a label file a policy agrees with."""
-    found = correcting.agreement(policy, path)
+    found = correction.agreement(policy, path)
     table = Table(
         "", "share of answers", "95% interval", title=f"{named}: agreement with {found.labels} labels of {path}"
     )

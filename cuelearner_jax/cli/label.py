@@ -15,8 +15,8 @@ import numpy as np
 import tyro
 
 from cuelearner_jax import config as configuration
-from cuelearner_jax.adaptation import adapting, calibrated, changes
-from cuelearner_jax.calibration import declared
+from cuelearner_jax.adaptation import by_calibration, by_model, changes
+from cuelearner_jax.calibration import declared_distortions
 from cuelearner_jax.calibration.families import Family
 from cuelearner_jax.cli.parsing import PAPER, about, check_numbers, code_of, is_code, out, parse, preset_of, taken
 from cuelearner_jax.cli.shared_options import Flag, Lane, TaskT, asking_kind
@@ -116,15 +116,15 @@ def run(arguments: list[str]) -> None:
     changed = task.scenario(scenario) if scenario else None
     source = _source(task, named, taken(rest, "--changes", "package.module:NAME")[0])
     world = source.config.task if source else preset.config.task
-    world = changed.applied(world) if changed else world
+    world = changed.apply(world) if changed else world
     if (cues := taken(rest, "--cues", WORDS)[0]) is not None:
         world = with_cues(task, world, cues)
     by_evidence = _reads_evidence(rest)
     sizes, scalars, bound = preset.config.sizes, preset.config.scalars, None
     if finished_policy:  # as `adapt` corrects it
         frame = source.config.sizes.frame if source else sizes.frame
-        sizes = adapting.SIZES if by_evidence else dataclasses.replace(adapting.SIZES, frame=frame)
-        settling = calibrated.settling if by_evidence else adapting.settling
+        sizes = by_model.SIZES if by_evidence else dataclasses.replace(by_model.SIZES, frame=frame)
+        settling = by_calibration.settling if by_evidence else by_model.settling
         scalars = settling(scalars, changed.eps_deg if changed else None)
         bound = changed.bound_deg if changed and not by_evidence else None
     default = kind(
@@ -134,7 +134,7 @@ def run(arguments: list[str]) -> None:
         Path("labels") / task.name,
         guidance=asking_kind(preset_kinds(task, preset)) if named is None else KIND.name,
         bound_deg=bound,
-        labels=max(preset.labels) if named is None else calibrated.USUAL if by_evidence else Label.labels,
+        labels=max(preset.labels) if named is None else by_calibration.USUAL if by_evidence else Label.labels,
         questions=UNIFORM if named is not None else _usual_questions(task),
     )
     asked = parse(kind, rest, f"label {task.name}", default, about(Label, task, preset=usual))
@@ -157,7 +157,7 @@ def _usual_questions(task: Task) -> Literal["uniform", "near_aims", "proposed"]:
 
 def _reads_evidence(arguments: list[str]) -> bool:
     """Is calibration asked for? Raises UserError for a kind that is not known."""
-    name, _ = taken(arguments, "--guidance", ", ".join(kind.name for kind in guidances.known()))
+    name, _ = taken(arguments, "--guidance", ", ".join(kind.name for kind in guidances.kinds()))
     return name is not None and guidances.resolve(name).by_evidence
 
 
@@ -186,13 +186,13 @@ def planned(
         raise UserError(
             f"--bound-deg is {asked.bound_deg:g}: give a number above 0 and up to {space.reach:g} ({space.unit})"
         )
-    guidance = merged.guide_in(env, guidances.named(asked.guidance))
+    guidance = merged.guide_in(env, guidances.kind_name(asked.guidance))
     if guidance.kind.by_evidence:
         _check_evidence(asked, named)
     if guidance.kind.sees_base:
         raise UserError(f"guidance {guidance.name!r} is for `adapt --labels-from` alone: leave out --guidance here")
     if guidance.form is None:
-        asking = [kind.name for kind in guidances.known() if kind.asks]
+        asking = [kind.name for kind in guidances.kinds() if kind.asks]
         raise UserError(f"guidance {guidance.name!r} asks for no labels: give --guidance {' or '.join(asking)}")
     controls.check(guidance.form, space)
     if asked.one_cue and not (guidance.form.by_eps and len(space.cues) > 1):
@@ -211,12 +211,12 @@ def _check_evidence(asked: Label[Any], named: str | None) -> None:
     if named is None or asked.again is not None:
         raise UserError("calibration asks about a policy: name one after the task, and leave out --again")
     scalars = dataclasses.replace(Scalars(), **dataclasses.asdict(asked.scalars))
-    calibrated.check_unused(asked.sizes, scalars, bound_deg=asked.bound_deg)
+    by_calibration.check_unused(asked.sizes, scalars, bound_deg=asked.bound_deg)
 
 
 def _family(asked: Label[Any], env: Any) -> Family:
     """What may have changed. Raises UserError for changes that make no sense."""
-    return declared(env) if asked.changes is None else changes.family_of(changes.load(asked.changes), env)
+    return declared_distortions(env) if asked.changes is None else changes.family_of(changes.load(asked.changes), env)
 
 
 def _robot(task: Task, name: str | None) -> str:

@@ -16,7 +16,7 @@ from cuelearner_jax.cli.dispatch import HELP
 from cuelearner_jax.cli.parsing import out, parse, summary
 from cuelearner_jax.cli.shared_options import Flag
 from cuelearner_jax.config import Scalars
-from cuelearner_jax.errors import UserError, closest, one_line
+from cuelearner_jax.errors import UserError, one_line, suggestion
 from cuelearner_jax.labelling import comparing
 from cuelearner_jax.report.escaping import cell
 from cuelearner_jax.spaces import UNSAID
@@ -74,7 +74,7 @@ def run(arguments: list[str]) -> None:
         raise SystemExit(0 if arguments else 2)
     name, rest = arguments[0], arguments[1:]
     if name not in KINDS:
-        raise UserError(f"unknown command 'labels {name}'{closest(name, KINDS)}")
+        raise UserError(f"unknown command 'labels {name}'{suggestion(name, KINDS)}")
     asked = parse(KINDS[name], rest, f"labels {name}")
     if not asked.files:
         raise UserError(f"name a label file: cuelearner labels {name} FILE")

@@ -22,7 +22,7 @@ from cuelearner_jax import plugins
 from cuelearner_jax.adaptation import changes
 from cuelearner_jax.cli.dispatch import HELP, HELP_ALL
 from cuelearner_jax.environment import actions_of
-from cuelearner_jax.errors import UserError, closest, no_space
+from cuelearner_jax.errors import UserError, no_space, suggestion
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.policies import policy_of, teaching
 from cuelearner_jax.policies.foreign import ONNX
@@ -226,7 +226,7 @@ def preset_of(task: Task, arguments: list[str], default: str = PAPER) -> tuple[s
     name, rest = taken(arguments, "--preset", ", ".join(task.presets))
     name = task.first_preset(default) if name is None else name
     if name not in task.presets:
-        raise UserError(f"unknown preset {name!r}{closest(name, task.presets)}")
+        raise UserError(f"unknown preset {name!r}{suggestion(name, task.presets)}")
     return name, task.presets[name], rest
 
 
@@ -284,12 +284,12 @@ def world_of(source: PolicySource, arguments: list[str]) -> Any:
         UserError: there is no such scenario.
     """
     name, _ = taken(arguments, "--scenario", ", ".join(source.task.scenarios) or "none")
-    return source.config.task if name is None else source.task.scenario(name).applied(source.config.task)
+    return source.config.task if name is None else source.task.scenario(name).apply(source.config.task)
 
 
 def about(kind: type, task: Task, policies: bool = False, preset: str = PAPER) -> str:
     """The text above a command's options: what it does, and what there is to choose from."""
-    groups = {"guidance (--guidance; your own as package.module:NAME)": {k.name: k.about for k in guidances.known()}}
+    groups = {"guidance (--guidance; your own as package.module:NAME)": {k.name: k.about for k in guidances.kinds()}}
     if policies:
         trained = {name: named.about for name, named in POLICIES.items() if named.trained}
         adapted = {name: named.about for name, named in POLICIES.items() if named.adapted}

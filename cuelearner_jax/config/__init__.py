@@ -21,8 +21,8 @@ from cuelearner_jax.config.parts import (
     Layers,
     check_part,
     check_types,
+    normalize_options,
     part,
-    settled,
     static,
 )
 from cuelearner_jax.config.plain import defaults, digest, from_json, plain, to_json
@@ -51,9 +51,9 @@ __all__ = [
     "defaults",
     "digest",
     "from_json",
+    "normalize_options",
     "part",
     "plain",
-    "settled",
     "static",
     "to_json",
 ]

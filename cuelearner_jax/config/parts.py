@@ -20,7 +20,7 @@ from typing import Annotated, Any, NamedTuple, TypeVar, dataclass_transform, get
 import jax
 
 from cuelearner_jax.config.plain import fits, plain
-from cuelearner_jax.errors import UserError, closest, shown
+from cuelearner_jax.errors import UserError, format_value, suggestion
 
 LARGEST = 2**31 - 1  # counters and indices are 32-bit integers
 LARGEST_FLOAT = 3.4028234e38  # scalars are computed in single precision
@@ -94,17 +94,19 @@ def check_types(group: Any, prefix: str, **changes: Any) -> dict[str, Any]:
     kept = {}
     for name, given in values.items():
         if name not in fields:
-            raise UserError(f"{prefix} has no field {shown(name)}{closest(name, fields)}")
+            raise UserError(f"{prefix} has no field {format_value(name)}{suggestion(name, fields)}")
         value = plain(given)
         kind = kinds[name]
         if not fits(value, kind):
             words = " or ".join(map(str, get_args(kind))) if str(get_origin(kind)) == "typing.Literal" else ""
-            raise UserError(f"{prefix}.{name} is {shown(value)}: give {words or f'a value of type {_called(kind)}'}")
+            raise UserError(
+                f"{prefix}.{name} is {format_value(value)}: give {words or f'a value of type {_called(kind)}'}"
+            )
         kept[name] = value
     return kept
 
 
-def settled(group: PartT, prefix: str) -> PartT:
+def normalize_options(group: PartT, prefix: str) -> PartT:
     """A configuration with its values as they are kept. Raises UserError as `check_types`."""
     kept = check_types(group, prefix)
     changed = {name: value for name, value in kept.items() if value is not getattr(group, name)}

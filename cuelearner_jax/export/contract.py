@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Float
 
 from cuelearner_jax.environment import Quantity, action_of, actions_of
-from cuelearner_jax.errors import UserError, closest
+from cuelearner_jax.errors import UserError, suggestion
 from cuelearner_jax.export import operations, runner
 from cuelearner_jax.export.decisions import TOLERANCE, golden_cases
 from cuelearner_jax.export.formats import FORMATS, traced
@@ -42,7 +42,7 @@ ANGLE = "atan2(action[1], action[0]) [rad]: 0 along x, positive counterclockwise
 def check_request(format: str, out: Path) -> None:
     """Raises UserError unless a decision of that format can be written to a folder."""
     if format not in FORMATS:
-        raise UserError(f"unknown format {format!r}{closest(format, FORMATS)}")
+        raise UserError(f"unknown format {format!r}{suggestion(format, FORMATS)}")
     _check_free(out)
 
 

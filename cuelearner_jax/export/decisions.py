@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from cuelearner_jax import user_code
 from cuelearner_jax.environment import Environment
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.policies import Policy, describe, layers, named
+from cuelearner_jax.policies import Policy, describe, layers, policy_name
 
 TOLERANCE = 1e-5  # by which an entry of an action may differ elsewhere
 NUDGE = 1e-6  # of an entry of an observation, as much as rounding may do
@@ -76,7 +76,7 @@ def golden_cases(policy: Policy, drawn: Float[np.ndarray, "n obs"], most: int = 
     drawn = np.asarray(drawn, np.float32)
     decide = jax.jit(row_by_row(policy))
     actions = np.asarray(decide(jnp.asarray(drawn)))
-    user_code.check_actions(actions, named(policy))
+    user_code.check_actions(actions, policy_name(policy))
     random = np.random.default_rng(0)
     apart = np.zeros(len(drawn))
     for _ in range(NUDGES):

@@ -1,1 +1,1 @@
-"""Forms of answers, a simulated teacher, and a label's way: question, answer, record, fit."""
+"""Feedback: forms of answers, a simulated teacher, and checks of given labels."""

@@ -1,4 +1,4 @@
-"""What a teacher answers: the forms of feedback, and the faults of a simulated teacher (paper, section IV-A)."""
+"""Answers of a simulated teacher: the forms of feedback and the teacher's faults (paper, section IV-A)."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from cuelearner_jax.config import Scalars, TeacherFaults
 from cuelearner_jax.environment import actions_of
-from cuelearner_jax.errors import UserError, shown
+from cuelearner_jax.errors import UserError, format_value
 from cuelearner_jax.feedback.forms import AnswerForm
 from cuelearner_jax.spaces import UNSAID, Space
 from cuelearner_jax.types import EnvState, Teacher, ValuesDirections
 
 
 def check_teacher(teacher: Any, faults: TeacherFaults) -> None:
-    """Raises UserError if a teacher cannot answer about what it is to have in mind."""
+    """Raise UserError if a teacher cannot give the answers that `scalars.answer` asks for."""
     if faults.answer == "nearest" and not isinstance(teacher, ValuesDirections):
         raise UserError(
             "scalars.answer is nearest, but this teacher knows the best action alone, not what others are worth: "
@@ -25,7 +25,7 @@ def check_teacher(teacher: Any, faults: TeacherFaults) -> None:
         )
 
 
-def in_mind(
+def intended_action(
     space: Space,
     teacher: Teacher,
     state: EnvState,
@@ -33,31 +33,33 @@ def in_mind(
     action: Float[Array, " action"],
     scalars: Scalars,
 ) -> Float[Array, " action"]:
-    """What a teacher would have done instead of an action, but for its bias: its best, or the nearest that is good.
+    """Return the action that a teacher intends in place of `action`, apart from its bias.
 
-    The second is the paper's Eq. 2 to the letter, whose answers follow a local gradient.
+    The intended action is the teacher's best one or, with `scalars.answer` "nearest", the nearest good one.
+
+    The nearest good action is the paper's Eq. 2 to the letter, whose answers follow a local gradient.
     """
     if scalars.answer != "nearest":
         return _taught(space, teacher, teacher.best_action(state, obs), action)
     assert isinstance(teacher, ValuesDirections)  # see `check_teacher`
-    # One with a bias takes everything for changed by it: what it looks for lies round the action changed back.
-    seen = biased(space, action, -space.from_unit(scalars.teacher_bias_deg))
+    # A biased teacher sees every action with the bias, so it searches around the action without the bias.
+    seen = add_bias(space, action, -space.from_unit(scalars.teacher_bias_deg))
     spread = space.from_unit(scalars.nearest_aim_deg)
     return _taught(space, teacher, teacher.nearest_good(state, obs, seen, spread, scalars.nearest_share), action)
 
 
-def biased(space: Space, action: Float[Array, " action"], bias: Float[Array, ""]) -> Float[Array, " action"]:
-    """Change an action by a constant error along every cue."""
+def add_bias(space: Space, action: Float[Array, " action"], bias: Float[Array, ""]) -> Float[Array, " action"]:
+    """Return an action changed by a constant error along every cue."""
     return space.toward(action, jnp.ones(len(space.cues)), bias)
 
 
 def _taught(space: Space, teacher: Any, given: Any, action: Float[Array, " action"]) -> Float[Array, " action"]:
-    """A teacher's action; NaN where it is none. Raises UserError if it has another shape than actions have."""
+    """Return a teacher's action; NaN where it is not an action. Raises UserError for another shape."""
     wanted = f"give an action of shape {action.shape}, of real numbers"
     try:
         found = jnp.asarray(given)
     except (TypeError, ValueError) as error:
-        raise UserError(f"teacher {type(teacher).__name__} gave {shown(given)}: {wanted}") from error
+        raise UserError(f"teacher {type(teacher).__name__} gave {format_value(given)}: {wanted}") from error
     if found.shape != action.shape:
         raise UserError(f"teacher {type(teacher).__name__} gave an action of shape {found.shape}: {wanted}")
     if not jnp.issubdtype(found.dtype, jnp.floating) and not jnp.issubdtype(found.dtype, jnp.integer):
@@ -72,9 +74,9 @@ def relative_feedback(
     eps: Float[Array, ""] | float,
     indifference: Float[Array, ""] | float = 0.0,
 ) -> Float[Array, " cues"]:
-    """h of each cue, in {-1, 0, +1}: which of the changes by -eps, 0, +eps brings `action` nearest to `best`.
+    """Return h of each cue in {-1, 0, +1}: the change by -eps, 0 or +eps that brings `action` nearest to `best`.
 
-    0 ("already right") therefore means within eps / 2; `indifference` widens that. Both are as `space.log` counts.
+    0 ("already right") therefore means within eps / 2; `indifference` widens that. Both are in the unit of `space.log`.
     """
     off = space.log(action, best)
     return jnp.where(jnp.abs(off) <= jnp.maximum(eps / 2, indifference), 0.0, jnp.sign(off))
@@ -89,32 +91,32 @@ def relative_answer(
     action: Float[Array, " action"],
     scalars: Scalars,
 ) -> tuple[Float[Array, " cues"], Bool[Array, ""]]:
-    """h of a teacher with the faults of `scalars`, and whether it answered."""
+    """Return h of a teacher with the faults of `scalars`, and whether it answered."""
     space = actions_of(env)
-    return human_answer(key, space, action, in_mind(space, teacher, state, obs, action, scalars), scalars)
+    return human_answer(key, space, action, intended_action(space, teacher, state, obs, action, scalars), scalars)
 
 
 def human_answer(
     key: PRNGKeyArray, space: Space, action: Float[Array, " action"], best: Float[Array, " action"], scalars: Scalars
 ) -> tuple[Float[Array, " cues"], Bool[Array, ""]]:
-    """The answer of somebody with the faults of `scalars` who would do `best`: (h of each cue, answered).
+    """Return (h of each cue, answered) of a person with the faults of `scalars` who intends `best`.
 
-    Mistakes and silence come upon each cue by itself. `scalars.says` decides of which cues anything is said: of the
-    others h is `UNSAID`. Who says nothing of any cue did not answer.
+    Mistakes and silence are drawn for each cue by itself. `scalars.says` decides which cues an answer names; h is
+    `UNSAID` for the others. An answer that names no cue counts as not answered.
     """
     mistaken, spoken = _slips(key, scalars, (len(space.cues),))
-    believed = biased(space, best, space.from_unit(scalars.teacher_bias_deg))
+    believed = add_bias(space, best, space.from_unit(scalars.teacher_bias_deg))
     eps, indifference = space.from_unit(scalars.eps_deg), space.from_unit(scalars.indifference_deg)
     h = relative_feedback(space, action, believed, eps, indifference)
     h = jnp.where(mistaken, -h, h)
-    if len(space.cues) == 1:  # of one cue, nothing said is no answer
+    if len(space.cues) == 1:  # with one cue, silence about it is no answer
         return h, spoken[0]
     spoken = spoken & _spoken_of(key, space.log(action, believed), scalars.says)
     return jnp.where(spoken | ~jnp.isfinite(h), h, UNSAID), spoken.any()
 
 
 def _spoken_of(key: PRNGKeyArray, off: Float[Array, " cues"], says: str) -> Bool[Array, " cues"]:
-    """Of which cues a teacher speaks: of all, of the one with the largest difference (ties: the first), or of any one.
+    """Return which cues a teacher names: all, the one with the largest difference (ties: the first), or a random one.
 
     Cues of one space count in one unit, so the largest difference is also the largest in units of eps.
     """
@@ -126,7 +128,7 @@ def _spoken_of(key: PRNGKeyArray, off: Float[Array, " cues"], says: str) -> Bool
     return number == jax.random.randint(jax.random.fold_in(key, len(off)), (), 0, len(off))
 
 
-def demonstrated(
+def demonstrate(
     key: PRNGKeyArray,
     env: Any,
     teacher: Teacher,
@@ -135,14 +137,14 @@ def demonstrated(
     action: Float[Array, " action"],
     scalars: Scalars,
 ) -> tuple[Float[Array, " action"], Bool[Array, ""]]:
-    """What a teacher with the faults of `scalars` shows in place of an action, and whether it shows anything.
+    """Return the action that a teacher with the faults of `scalars` shows, and whether it shows any.
 
-    One that is indifferent shows the action itself where that is near enough. A mistaken one changes it as far the
-    other way: the mirror image of what it meant to show.
+    An indifferent teacher shows the given action where it is near enough. A mistaken teacher changes the action as far
+    the other way: the mirror image of the intended action.
     """
     space, (mistaken, answered) = actions_of(env), _slips(key, scalars)
-    wanted = in_mind(space, teacher, state, obs, action, scalars)
-    wanted = biased(space, wanted, space.from_unit(scalars.teacher_bias_deg))
+    wanted = intended_action(space, teacher, state, obs, action, scalars)
+    wanted = add_bias(space, wanted, space.from_unit(scalars.teacher_bias_deg))
     right = space.distance(action, wanted) <= space.from_unit(scalars.indifference_deg)
     mirrored = space.exp(action, -space.log(action, wanted))
     return jnp.where(right, action, jnp.where(mistaken, mirrored, wanted)), answered
@@ -157,14 +159,14 @@ def scalar_answer(
     action: Float[Array, " action"],
     scalars: Scalars,
 ) -> tuple[Float[Array, "1"], Bool[Array, ""]]:
-    """1 for a good action and 0 for another, of a teacher with the faults of `scalars`; and whether it answered.
+    """Return 1 for a good action and 0 for another, by a teacher with the faults of `scalars`; and whether it answered.
 
-    Good is an action within `scalar_within_deg` of what the teacher has in mind (paper, appendix).
+    An action within `scalar_within_deg` of the intended action is good (paper, appendix).
     """
     mistaken, answered = _slips(key, scalars)
     space = actions_of(env)
-    wanted = in_mind(space, teacher, state, obs, action, scalars)
-    wanted = biased(space, wanted, space.from_unit(scalars.teacher_bias_deg))
+    wanted = intended_action(space, teacher, state, obs, action, scalars)
+    wanted = add_bias(space, wanted, space.from_unit(scalars.teacher_bias_deg))
     within = jnp.maximum(space.from_unit(scalars.scalar_within_deg), space.from_unit(scalars.indifference_deg))
     good = space.distance(action, wanted) <= within
     said = jnp.where(jnp.isfinite(wanted).all(), (good != mistaken).astype(jnp.float32), jnp.nan)
@@ -174,7 +176,7 @@ def scalar_answer(
 def _slips(
     key: PRNGKeyArray, scalars: Scalars, shape: tuple[int, ...] = ()
 ) -> tuple[Bool[Array, "*shape"], Bool[Array, "*shape"]]:
-    """Is the teacher mistaken this time, and does it answer?"""
+    """Draw whether the teacher is mistaken, and whether it answers."""
     key_mistake, key_silence = jax.random.split(key)
     mistaken = jax.random.bernoulli(key_mistake, scalars.mistake_probability, shape)
     silent = jax.random.bernoulli(key_silence, scalars.silence_probability, shape)
@@ -182,7 +184,7 @@ def _slips(
 
 
 def _way(space: Space) -> str:
-    """What -1 and +1 mean, for a file and for messages."""
+    """Return the words for -1 and +1, for a file and for messages."""
     ways = [f"+1 {cue.words[0]}, -1 {cue.words[1]}" for cue in space.cues]
     if len(ways) == 1:
         return f"h: {ways[0]}, 0 already right, by eps"
@@ -202,7 +204,7 @@ DEMONSTRATION = AnswerForm(
     name="demonstration",
     width=lambda space: space.size,
     meaning=lambda space: f"what to do instead, an action ({space.name})",
-    answer=demonstrated,
+    answer=demonstrate,
     is_action=True,
 )
 SCALAR = AnswerForm(

@@ -1,4 +1,4 @@
-"""What a form of answers is, before anyone says what its answers mean to a guide."""
+"""Forms of answers, as label files and teachers know them, independent of any guide."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from cuelearner_jax.types import EnvState, Teacher
 
 @runtime_checkable
 class AnswerFunction(Protocol):
-    """What a simulated teacher with the faults of `scalars` says about an action in a situation."""
+    """A simulated teacher's answer, with the faults of `scalars`, about an action in a situation."""
 
     def __call__(
         self,
@@ -26,17 +26,17 @@ class AnswerFunction(Protocol):
         action: Float[Array, " action"],
         scalars: Scalars,
     ) -> tuple[Float[Array, " answer"], Bool[Array, ""]]:
-        """(answer, answered)."""
+        """Return (answer, answered)."""
         ...
 
 
 class AnswerForm(NamedTuple):
-    """A form of answer. Label files are marked with its name; every guidance of the same form can use them."""
+    """A form of answer. Label files hold its name; every guide with the same form can use them."""
 
     name: str
     width: Callable[[Space], int]  # entries of an answer
-    meaning: Callable[[Space], str]  # of its entries, in a few words
+    meaning: Callable[[Space], str]  # meaning of its entries, in a few words
     answer: AnswerFunction
-    values: Callable[[Space], tuple[float, ...]] | None = None  # that an entry may have; None: any finite number
-    is_action: bool = False  # is an answer an action itself?
-    by_eps: bool = False  # does it mean a change by eps? Label files then say how much that was
+    values: Callable[[Space], tuple[float, ...]] | None = None  # allowed values of an entry; None: any finite number
+    is_action: bool = False  # True if an answer is itself an action
+    by_eps: bool = False  # True if an answer means a change by eps, which label files then record

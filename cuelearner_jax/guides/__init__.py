@@ -1,1 +1,1 @@
-"""The forms of guidance: what a teacher answers, fitting a model to answers, refining actions; one file a kind."""
+"""Guides: fit a model to a teacher's answers and refine actions by the model; one file for each kind."""

@@ -1,4 +1,4 @@
-"""Aims as a distribution over actions, and the kinds that choose among aims without a label: controls of `intent`."""
+"""Aims as a distribution over actions, and two kinds that choose an aim without labels: controls of `intent`."""
 
 from __future__ import annotations
 
@@ -11,27 +11,27 @@ from jaxtyping import Array, Bool, Float
 from cuelearner_jax.config import GuideScalars
 from cuelearner_jax.environment import Aims
 from cuelearner_jax.guides.base import Candidates, Kind
-from cuelearner_jax.guides.refining import Refined
-from cuelearner_jax.guides.untaught import Untaught
+from cuelearner_jax.guides.baselines import Untaught
+from cuelearner_jax.guides.refining import Refinement
 from cuelearner_jax.spaces import DIRECTIONS, Space
 from cuelearner_jax.types import GuidanceModel
 
-SPREAD = 1 / 180  # of the space's reach: how far what a teacher means may lie from the aim that describes it
-LEAST = 1e-12  # of a probability whose logarithm is taken
+SPREAD = 1 / 180  # distance of a meant action from its aim, as a share of the space's reach
+LEAST = 1e-12  # least probability before a logarithm
 
 
 def open_aims(aims: Aims) -> Candidates:
-    """The aims that are possible and may be followed."""
+    """Return which aims are possible and may be followed."""
     return Candidates(aims.actions, aims.possible if aims.open is None else aims.possible & aims.open)
 
 
 def log_density(
     space: Space, aims: Float[Array, "aims action"], share: Float[Array, " aims_and_none"], actions: Float[Array, "m a"]
 ) -> Float[Array, " m"]:
-    """log of the probability density of actions, of which all alike have 0.
+    """Return the log density of actions, relative to the uniform density.
 
-    What is meant lies round one of the aims, along each cue with a logistic error of `SPREAD` (of choices it is the
-    aim itself), or, with the last probability of `share`, anywhere: no action is ruled out.
+    A meant action lies around one of the aims, with a logistic error of `SPREAD` along each cue; for choices it is the
+    aim itself. With the last probability of `share` it lies anywhere, so no action is ruled out.
     """
     if space.grain:
         same = space.distance(actions[:, None], aims[None]) < space.grain
@@ -39,7 +39,7 @@ def log_density(
     # The range of a cue in spreads: directions reach to either side of any of them.
     extent = (2.0 if space == DIRECTIONS else 1.0) / SPREAD
     off = space.to_unit(space.log(actions[:, None], aims[None])) / (SPREAD * space.reach)
-    each = extent * jax.nn.sigmoid(off) * jax.nn.sigmoid(-off)  # of a logistic distribution
+    each = extent * jax.nn.sigmoid(off) * jax.nn.sigmoid(-off)  # densities of logistic distributions
     near = each[..., 0] if len(space.cues) == 1 else each.prod(-1)
     return _log_mixed(share, near)
 
@@ -49,19 +49,19 @@ def _log_mixed(share: Float[Array, " aims_and_none"], near: Float[Array, "m aims
 
 
 class AnyAim(Untaught):
-    """A guide to whom all aims are alike: what `intent` is before its first label."""
+    """A guide that follows the nearest aim: what `intent` is before its first label."""
 
     def preference(self, env: Any, obs: Float[Array, " obs"], aims: Aims) -> Float[Array, " aims"]:
-        """log-weights of a situation's aims: the same for all."""
+        """Return the log-weights of a situation's aims: all equal."""
         return jnp.zeros(len(aims.possible))
 
-    def weighed(self, env: Any, obs: Float[Array, " obs"]) -> tuple[Aims, Float[Array, " aims"]]:
-        """A situation's aims, and their log-weights: minus infinity of those that may not be followed."""
+    def aim_weights(self, env: Any, obs: Float[Array, " obs"]) -> tuple[Aims, Float[Array, " aims"]]:
+        """Return a situation's aims and their log-weights; minus infinity for aims that may not be followed."""
         aims = env.aims(obs)
         return aims, jnp.where(open_aims(aims).possible, self.preference(env, obs, aims), -jnp.inf)
 
     def candidates(self, env: Any, obs: Float[Array, " obs"]) -> Candidates:
-        """The aims that may be followed."""
+        """Return the aims that may be followed."""
         return open_aims(env.aims(obs))
 
     def log_p(
@@ -72,8 +72,8 @@ class AnyAim(Untaught):
         actions: Float[Array, "m action"],
         scalars: GuideScalars,
     ) -> Float[Array, " m"]:
-        """log of the density of actions (`log_density`), where "none of the aims" weighs as much as one of them."""
-        aims, weights = self.weighed(env, obs)
+        """Return the log density of actions (`log_density`); "none of the aims" weighs as much as one aim."""
+        aims, weights = self.aim_weights(env, obs)
         share = jax.nn.softmax(jnp.append(weights, 0.0))
         return log_density(self.spaces.actions, aims.actions, share, actions)
 
@@ -85,25 +85,25 @@ class AnyAim(Untaught):
         actions: Float[Array, "n action"],
         active: Bool[Array, " n"],
         scalars: GuideScalars,
-    ) -> Refined:
-        """Of the aims with the largest weight the nearest in active rows; where there is none, the action itself."""
+    ) -> Refinement:
+        """Return the nearest of the aims with the largest weight, in active rows; without any aim, the given action."""
 
         def one(obs: Array, action: Array) -> tuple[Array, Array]:
-            aims, weights = self.weighed(env, obs)
+            aims, weights = self.aim_weights(env, obs)
             off = self.spaces.actions.distance(action[None], aims.actions)
             index = jnp.argmin(jnp.where(weights >= weights.max(), off, jnp.inf))
             return aims.actions[index], weights.max() > -jnp.inf
 
         goals, there = jax.vmap(one)(obs, actions)
         moved = active & there
-        return Refined(jnp.where(moved[:, None], goals, actions), moved.astype(jnp.int32))
+        return Refinement(jnp.where(moved[:, None], goals, actions), moved.astype(jnp.int32))
 
 
 class Rule(AnyAim):
     """A guide that weighs aims by the task's own rule."""
 
     def preference(self, env: Any, obs: Float[Array, " obs"], aims: Aims) -> Float[Array, " aims"]:
-        """log-weights of a situation's aims, as the rule has them."""
+        """Return the log-weights of a situation's aims by the task's rule."""
         return env.rule(obs)
 
 

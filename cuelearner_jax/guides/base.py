@@ -1,4 +1,4 @@
-"""What a guide is: a base class of pure functions over an explicit model; and what the registry knows of its kind.
+"""The base class of guides, pure functions over an explicit model; and `Kind`, what the registry knows of a guide.
 
 What a teacher *said* (its answer, kept in labels) and what a network *predicts* of it (the target) are two things.
 """
@@ -22,27 +22,31 @@ from cuelearner_jax.errors import UserError
 from cuelearner_jax.feedback.forms import AnswerForm
 from cuelearner_jax.guides.fitting import Lesson, fit_least_squares, lessons
 from cuelearner_jax.guides.model import GuideModel, guide_model
-from cuelearner_jax.guides.refining import Refined, refine, within
+from cuelearner_jax.guides.refining import Refinement, bounded_scalars, refine
 from cuelearner_jax.types import GuidanceModel, Label, Params
 
-NAME = re.compile(r"[a-z][a-z0-9_-]*")  # of kinds, also in files: neither a path nor a reference to code
+NAME = re.compile(
+    r"[a-z][a-z0-9_-]*"
+)  # pattern of names of kinds, also in files: neither a path nor a reference to code
 
 
 @dataclass(frozen=True)
 class Kind:
     """A kind of guidance, before sizes and an environment are known."""
 
-    name: str  # of options, folders and columns
+    name: str  # in options, folders and columns
     about: str  # in a few words
     guide: type[Guide]
-    form: AnswerForm | None = None  # of the answers that it asks for; None: it never asks
-    needs: tuple[str, ...] = ()  # optional members of an environment without which it means nothing
+    form: AnswerForm | None = None  # form of the answers that it asks for; None: it never asks
+    needs: tuple[str, ...] = ()  # optional members of an environment that it needs
     title: str = ""  # in figures, if other than the name
     colour: str | None = None  # in figures
     config: type | None = None  # a frozen dataclass of the options that this kind alone has; None: it has none
-    sees_base: bool = False  # does it look at what a finished policy did? Then it serves adaptation alone
-    by_cues: bool = False  # does its model measure along cues, whatever its answers say?
-    by_evidence: bool = False  # does `calibration` read its answers? Then it has no model, and serves adaptation alone
+    sees_base: bool = False  # True if it needs a finished policy's actions; it then serves adaptation only
+    by_cues: bool = False  # True if its model measures along cues, whatever its answers say
+    by_evidence: bool = (
+        False  # True if `calibration` reads its answers; it then has no model and serves adaptation only
+    )
 
     def __post_init__(self) -> None:
         if not NAME.fullmatch(self.name):
@@ -50,37 +54,37 @@ class Kind:
 
     @property
     def asks(self) -> bool:
-        """Whether it asks a teacher."""
+        """Whether its guides ask a teacher."""
         return self.form is not None
 
     @property
     def needs_cues(self) -> bool:
-        """Whether it means nothing in a space whose actions have no cues."""
+        """Whether its guides need a space whose actions have cues."""
         return self.by_cues or (self.form is not None and self.form.by_eps)
 
     @property
     def adapts_only(self) -> bool:
-        """Whether it corrects finished policies alone."""
+        """Whether its guides correct finished policies only."""
         return self.sees_base or self.by_evidence
 
     def make(self, sizes: GuideSizes, spaces: Spaces, options: Any = None) -> Guide:
-        """The guide for an environment's spaces; `options`: a `config` (None: its defaults)."""
+        """Return the guide for an environment's spaces; `options`: a `config` (None: its defaults)."""
         return self.guide(self, sizes, spaces, self.config() if options is None and self.config else options)
 
 
 class Candidates(NamedTuple):
-    """The actions of one situation among which a guide chooses."""
+    """The candidate actions of one situation, among which a guide chooses."""
 
     actions: Float[Array, "candidates action"]
-    possible: Bool[Array, " candidates"]  # False: not to be done here
+    possible: Bool[Array, " candidates"]  # False: not possible in this situation
 
 
 class Footprint(NamedTuple):
-    """What a guide's network has for one situation, from which its memory is reckoned."""
+    """The sizes of a guide's network for one situation, from which its memory is computed."""
 
-    option: str  # that decides its layers
+    option: str  # the option that sets its layers
     layers: tuple[int, ...]  # units
-    inputs: int = 0  # beside the observation
+    inputs: int = 0  # numbers that the network sees beside the observation
     searched: tuple[str, int] | None = None  # actions that the guide values at once, after the option that decides it
 
 
@@ -99,7 +103,7 @@ class Guide:
     options: Any = None  # a `Kind.config`
 
     def __post_init__(self) -> None:
-        """Raises UserError for a kind whose answers or model are about ways, in a space where there is no way."""
+        """Raise UserError for a kind that needs cues, in a space without cues."""
         if self.kind.needs_cues and not self.spaces.actions.cues:
             told = "measures" if self.kind.by_cues else "asks"
             raise UserError(
@@ -109,46 +113,46 @@ class Guide:
 
     @property
     def name(self) -> str:
-        """Name of its kind."""
+        """Name of the guide's kind."""
         return self.kind.name
 
     @property
     def form(self) -> AnswerForm | None:
-        """Form of the answers that it asks for; None: it never asks."""
+        """Form of the answers that the guide asks for; None: it never asks."""
         return self.kind.form
 
     @property
     def asks(self) -> bool:
-        """Whether it asks a teacher."""
+        """Whether the guide asks a teacher."""
         return self.kind.asks
 
     @property
     def moves(self) -> bool:
-        """Whether it ever does anything in place of an action."""
+        """Whether the guide ever changes an action."""
         return True
 
     @property
     def has_members(self) -> bool:
-        """Whether its model is an ensemble, whose members can disagree."""
+        """Whether the guide's model is an ensemble, whose members can disagree."""
         return self.asks and self.sizes.ensemble > 1
 
     @cached_property
     def network(self) -> GuideModel:
-        """The network, or ensemble, whose outputs are something to add to an action."""
+        """The network, or ensemble, whose outputs are added to an action."""
         return guide_model(self.sizes, self.spaces)
 
     def footprint(self, env: Any) -> Footprint:
-        """What memory its network takes; shapes in place of an environment's arrays will do."""
+        """Return the sizes that memory is computed from; shapes in place of an environment's arrays will do."""
         return Footprint("--sizes.feedback-layers", self.sizes.feedback_layers)
 
     def target(self, label: Label, scalars: GuideScalars) -> Float[Array, " outputs"]:
-        """What the network is to predict of one label, here its answer."""
+        """Return what the network is to predict for one label; here the answer."""
         return label.answer
 
     def predict(
         self, env: Any, params: Params, obs: Float[Array, "n obs"], actions: Float[Array, "n action"]
     ) -> Float[Array, "n outputs"]:
-        """What is fitted to the targets."""
+        """Return the predictions that are fitted to the targets."""
         return self.network.predict(env, params, obs, actions)
 
     def act(
@@ -159,30 +163,30 @@ class Guide:
         actions: Float[Array, "n action"],
         active: Bool[Array, " n"],
         scalars: GuideScalars,
-    ) -> Refined:
-        """What to execute in place of a batch of actions.
+    ) -> Refinement:
+        """Return the actions to execute in place of a batch of actions.
 
-        Rows that are not active stay as they are, and so do all of them while a model that asks is not fitted.
+        Rows that are not active do not change. Without a fitted model no row changes, if the guide asks for labels.
         """
         raise NotImplementedError(f"{type(self).__name__} does not say how it acts: write `act`")
 
     def init(self, key: PRNGKeyArray) -> GuidanceModel:
-        """An unfitted model."""
+        """Return an unfitted model."""
         return GuidanceModel(self.network.init(key), jnp.array(False))
 
     def lessons(self, labels: Label, scalars: GuideScalars) -> Lesson:
-        """Labels (slots, ...) with their targets."""
+        """Return labels (slots, ...) with their targets."""
         space = self.spaces.actions if self.form is not None and self.form.by_eps else None
         return lessons(labels, self.target, scalars, space)
 
     def redrawn(self, key: PRNGKeyArray, batch: Lesson) -> Lesson:
-        """What to train on in place of a batch (n, ...) of lessons."""
+        """Return the batch to train on in place of a batch (n, ...) of lessons."""
         return batch
 
     def fit(
         self, key: PRNGKeyArray, env: Any, labels: Label, former: GuidanceModel, scalars: GuideScalars
     ) -> GuidanceModel:
-        """The model of labels (slots, ...); `former` is the one before, which fitting from scratch ignores."""
+        """Return the model of labels (slots, ...); `former` is the previous model, which fitting from scratch ignores."""
         rows, predict = self.lessons(labels, scalars), partial(self.predict, env)
         return fit_least_squares(
             key, rows, scalars, init=self.network.init, apply=predict, sizes=self.sizes, redrawn=self.redrawn
@@ -197,7 +201,7 @@ class Guide:
         base: Float[Array, " action"],
         scalars: GuideScalars,
     ) -> Float[Array, " action"]:
-        """The action to ask about: what the guide makes of `base`, in a share `refined_fraction` of all questions.
+        """Return the action to ask about: refined from `base` in a share `refined_fraction` of questions, else `base`.
 
         Source: DAgger (Ross, Gordon, Bagnell, 2011): what is asked about follows what will be met.
         """
@@ -205,7 +209,7 @@ class Guide:
         return self.act(model, env, obs[None], base[None], refines[None], scalars).actions[0]
 
     def candidates(self, env: Any, obs: Float[Array, " obs"]) -> Candidates | None:
-        """The actions of one situation among which the teacher chooses, by this kind; here None: all of the space."""
+        """Return the candidate actions of one situation by this kind; here None: the whole space."""
         return None
 
     def log_p(
@@ -216,10 +220,10 @@ class Guide:
         actions: Float[Array, "m action"],
         scalars: GuideScalars,
     ) -> Float[Array, " m"]:
-        """log p(action | labels) of each action in one situation, up to a constant.
+        """Return log p(action | labels) of each action in one situation, up to a constant.
 
-        Here the less one pass of `act` changes an action, the likelier it is: a Laplace distribution of scale eps. All
-        actions are alike to a guide that leaves actions as they are, such as one whose model is not fitted.
+        Here an action is likelier, the less one pass of `act` changes it: a Laplace distribution of scale eps. All actions
+        are equally likely where a guide changes none, for example without a fitted model.
         """
         space, rows = self.spaces.actions, len(actions)
         once = dataclasses.replace(scalars, k_max=1)
@@ -230,13 +234,13 @@ class Guide:
     def disagreement(
         self, model: GuidanceModel, env: Any, obs: Float[Array, "n obs"], actions: Float[Array, "n action"]
     ) -> Float[Array, " n"]:
-        """Variance of an ensemble's members, summed over their outputs."""
+        """Return the variance of an ensemble's members, summed over their outputs."""
         return self.network.disagreement(env, model.params, obs, actions)
 
-    def moved_on(
+    def refine_labelled_actions(
         self, model: GuidanceModel, env: Any, labels: Label, active: Bool[Array, " n"], scalars: GuideScalars
-    ) -> Refined:
-        """What `act` makes of the actions that labels (n, ...) are about."""
+    ) -> Refinement:
+        """Return what `act` makes of the actions that labels (n, ...) are about."""
         return self.act(model, env, labels.obs, labels.action, active, scalars)
 
     def act_within(
@@ -248,10 +252,10 @@ class Guide:
         actions: Float[Array, "n action"],
         active: Bool[Array, " n"],
         scalars: GuideScalars,
-    ) -> Refined:
-        """`act` that leads no farther than `bound` from the actions, whatever its kind does."""
+    ) -> Refinement:
+        """Return `act`, limited to within `bound` of the given actions for every kind."""
         space = self.spaces.actions
-        moved = self.act(model, env, obs, actions, active, within(space, scalars, bound))
+        moved = self.act(model, env, obs, actions, active, bounded_scalars(space, scalars, bound))
         return moved._replace(actions=space.clip(moved.actions, actions, bound))
 
     def refined(
@@ -261,8 +265,8 @@ class Guide:
         active: Bool[Array, " n"],
         scalars: GuideScalars,
         k_max: Int[Array, ""] | int | None = None,
-    ) -> Refined:
-        """`refine` within the limits of the scalars; `k_max`: another number of passes."""
+    ) -> Refinement:
+        """Return `refine` within the limits of the scalars; `k_max`: another largest number of passes."""
         space = self.spaces.actions
         return refine(
             residual,

@@ -1,4 +1,4 @@
-"""BD-COACH: a model of the teacher says how to correct the policy in every situation of the buffer.
+"""BD-COACH: a model of the teacher corrects the policy in every situation of the buffer.
 
 Source: Lopez Bosque, "Towards corrective deep imitation learning in data intensive environments" (MSc thesis, TU Delft,
 2021), Batch Deep COACH, with the numbers that the public code of CLIC has for this method. Deep COACH replays old
@@ -36,7 +36,7 @@ from cuelearner_jax.config.parts import POSITIVE, part
 from cuelearner_jax.feedback.answers import RELATIVE
 from cuelearner_jax.guides.base import Guide, Kind
 from cuelearner_jax.guides.dcoach import Coached, DeepCoach
-from cuelearner_jax.guides.fitting import Lesson, optimizer, squared
+from cuelearner_jax.guides.fitting import Lesson, optimizer, squared_errors
 from cuelearner_jax.guides.model import for_each
 from cuelearner_jax.types import GuidanceModel, Label, Params
 
@@ -52,19 +52,19 @@ class Config:
 
 
 class BatchCoached(Coached):
-    """A policy on its way beside its human model, as the parameters of a model."""
+    """The policy and its human model during training, as the parameters of a model."""
 
     human: Params
     human_optimizer: Any  # state
 
 
 class BatchCoach(DeepCoach):
-    """A policy that acts as a cloned one does, and learns from a model of its teacher."""
+    """A guide that acts as a cloned policy does, and learns from a model of its teacher."""
 
     options: Config  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def init(self, key: PRNGKeyArray) -> GuidanceModel:
-        """A policy that nothing has corrected, and a human model that nobody has taught."""
+        """Return a policy without corrections, and an untrained human model."""
 
         def begin(key: PRNGKeyArray) -> BatchCoached:
             policy, human = (self.member.network.init(one) for one in jax.random.split(key))
@@ -73,14 +73,14 @@ class BatchCoach(DeepCoach):
 
         return GuidanceModel(for_each(self.sizes.ensemble, begin, key), jnp.array(False))
 
-    def modelled(self, env: Any, human: Params, rows: Lesson, scalars: GuideScalars) -> Array:
-        """Return the loss of the human model: what it says of the actions asked about, beside what was answered."""
+    def human_loss(self, env: Any, human: Params, rows: Lesson, scalars: GuideScalars) -> Array:
+        """Return the loss of the human model: its predictions about the asked actions against the answers."""
         eps = self.spaces.actions.from_unit(scalars.eps_deg)
         answered = rows.replace(target=(rows.target - rows.action) / eps)
-        return jnp.mean(squared(answered, self.member.network.predict(env, human, rows.obs, rows.action)))
+        return jnp.mean(squared_errors(answered, self.member.network.predict(env, human, rows.obs, rows.action)))
 
-    def wanted(self, env: Any, human: Params, rows: Lesson, acted: Array, scalars: GuideScalars) -> Lesson:
-        """Return rows whose targets are what the human model makes of what the policy does there, in all cues."""
+    def policy_targets(self, env: Any, human: Params, rows: Lesson, acted: Array, scalars: GuideScalars) -> Lesson:
+        """Return rows whose targets are the human model's corrections of the policy's own actions, in all cues."""
         space = self.spaces.actions
         eps, does = space.from_unit(scalars.eps_deg), space.retract(acted)
         toward = space.retract(does + eps * self.member.network.predict(env, human, rows.obs, does))
@@ -90,7 +90,7 @@ class BatchCoach(DeepCoach):
     def fit(
         self, key: PRNGKeyArray, env: Any, labels: Label, former: GuidanceModel, scalars: GuideScalars
     ) -> GuidanceModel:
-        """The former policy and human model, moved on by each label that is new, in the order in which they came."""
+        """Return the former policy and human model, updated by each new label in order."""
         rows, answered = self.lessons(labels, scalars), Guide.lessons(self, labels, scalars)
         order = jnp.argsort(~rows.valid, stable=True)
         count, adam = rows.valid.sum(), optimizer(scalars)
@@ -101,7 +101,7 @@ class BatchCoach(DeepCoach):
             return jax.tree.map(lambda leaf: leaf[order[numbers]], (rows, answered))
 
         def taught(coached: BatchCoached, batch: Lesson) -> BatchCoached:
-            gradient = jax.grad(lambda human: self.modelled(env, human, batch, scalars))(coached.human)
+            gradient = jax.grad(lambda human: self.human_loss(env, human, batch, scalars))(coached.human)
             updates, state = adam.update(gradient, coached.human_optimizer, coached.human)
             return coached.replace(human=optax.apply_updates(coached.human, updates), human_optimizer=state)
 
@@ -111,11 +111,11 @@ class BatchCoach(DeepCoach):
 
             def loss(policy: Params) -> Array:
                 acted = self.member.predict(env, policy, seen.obs, seen.action)
-                targets = self.wanted(env, coached.human, seen, acted, scalars)
+                targets = self.policy_targets(env, coached.human, seen, acted, scalars)
                 keep = lambda one, other: jnp.where(own[:, None], one, other)  # noqa: E731
                 target, said = keep(seen.target, targets.target), seen.said
                 said = None if said is None else keep(said, targets.said)
-                return jnp.mean(squared(seen.replace(target=target, said=said), acted))
+                return jnp.mean(squared_errors(seen.replace(target=target, said=said), acted))
 
             updates, state = adam.update(jax.grad(loss)(coached.policy), coached.optimizer, coached.policy)
             return coached.replace(policy=optax.apply_updates(coached.policy, updates), optimizer=state)

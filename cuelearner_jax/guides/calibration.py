@@ -1,4 +1,4 @@
-"""Calibration as a kind of guidance: relative answers as evidence of what changed in the world.
+"""Calibration as a kind of guidance: estimate from relative answers what changed in the world.
 
 No network is fitted and no action refined: `cuelearner_jax.calibration` reads the answers, outside compiled programs.
 With theta what changed, a*(theta) the action that the policy means behind that change, in any space with cues:
@@ -12,12 +12,12 @@ from __future__ import annotations
 from cuelearner_jax.config.parts import part
 from cuelearner_jax.feedback.answers import RELATIVE
 from cuelearner_jax.guides.base import Kind
-from cuelearner_jax.guides.untaught import Untaught
+from cuelearner_jax.guides.baselines import Untaught
 
 
 @part
 class Config:
-    """Which changes are derived from what the world declares; see `calibration.families.declared`."""
+    """Options for the changes that are derived from the world's declarations; see `calibration.families`."""
 
     gains: bool = False
     """Also ask whether lengths that are seen, and the actions of a box, were scaled."""

@@ -41,21 +41,21 @@ from cuelearner_jax.feedback.answers import DEMONSTRATION, RELATIVE
 from cuelearner_jax.guides.base import Footprint, Guide, Kind
 from cuelearner_jax.guides.fitting import fit_model
 from cuelearner_jax.guides.model import GuideModel, guide_model
-from cuelearner_jax.guides.refining import Refined
-from cuelearner_jax.spaces import Box, said
+from cuelearner_jax.guides.refining import Refinement
+from cuelearner_jax.spaces import Box, is_answered
 from cuelearner_jax.types import GuidanceModel, Label, Params
 
-SHARPNESS = 10.0  # of the observation model: its weight beside the policy
-SOFTNESS = 0.5  # of a set's edge, in units of eps: 0.1 in actions from -1 to 1, where eps is 0.2
+SHARPNESS = 10.0  # weight of the observation model against the policy
+SOFTNESS = 0.5  # softness of a set's edge, in units of eps: 0.1 in actions from -1 to 1, where eps is 0.2
 NEAR = 2.0  # standard deviation of the actions sampled around the one asked about, in units of eps
 FIRST_PAIRS = 0.3  # weight of the half-space beside all implicit pairs together
-PASSES = 6  # of the search around the best action so far, each in a box of half the size
+PASSES = 6  # passes of the search around the best action so far, each in a box of half the size
 AROUND = 4  # actions of such a pass, for each cue
 
 
 @part
 class Searching:
-    """Options of an energy, however it is taught."""
+    """Options of the search for the action of least energy."""
 
     sampled_actions: Annotated[int, Bounds(4)] = 32
     """Actions between which the energy is compared in a step of a fit, for each label."""
@@ -84,13 +84,13 @@ class ShownConfig(Searching):
 
 
 class Contrast(struct.PyTreeNode):
-    """What the energy is to learn of one label."""
+    """One label as the energy learns from it."""
 
     obs: Float[Array, " obs"]
     action: Float[Array, " action"]
     answer: Float[Array, " answer"]
     valid: Bool[Array, ""]
-    draw: Int[Array, ""]  # number of the random numbers with which it is sampled
+    draw: Int[Array, ""]  # number of its random stream for sampling
     base: Float[Array, " action"]  # what a finished policy did, where labels keep it; else the action
 
 
@@ -110,7 +110,7 @@ def log_desired(
         implicit: directions u_i, as long as h.
         gamma: see `Config`.
     """
-    spoken = said(h)
+    spoken = is_answered(h)
     x, h = jnp.where(spoken, x, 0.0), jnp.where(spoken, h, 0.0)
     half = log_nearer(_size(x), _size(x - gamma * h), SOFTNESS)
     if len(h) > 1:
@@ -123,11 +123,11 @@ def log_desired(
 
 
 def direction_at(key: PRNGKeyArray, h: Float[Array, " cues"], angle: Array | float) -> Float[Array, " cues"]:
-    """Return a random direction, as long as h and `angle` [rad] away from it, along the cues of which h speaks.
+    """Return a random direction as long as h, at `angle` [rad] from h, along the cues that h names.
 
     Along one such cue alone there is no other direction: h itself.
     """
-    spoken = said(h)
+    spoken = is_answered(h)
     h = jnp.where(spoken, h, 0.0)
     drawn = jnp.where(spoken, jax.random.normal(key, h.shape), 0.0)
     across = drawn - jnp.sum(drawn * h) / jnp.maximum(jnp.sum(h * h), 1.0) * h
@@ -141,17 +141,17 @@ def _size(vector: Float[Array, " cues"]) -> Float[Array, ""]:
 
 
 class Clic(Guide):
-    """A guide that does what has the least energy."""
+    """A guide that executes the action of least energy."""
 
     options: Any
 
     @cached_property
     def network(self) -> GuideModel:
-        """The network, or ensemble, whose output is the energy of an action, with its sign changed."""
+        """The network, or ensemble, whose output is minus the energy of an action."""
         return guide_model(self.sizes, self.spaces, outputs=1)
 
     def footprint(self, env: Any) -> Footprint:
-        """Beside the layers the actions among which the least energy is searched."""
+        """Return the sizes of the layers, and the number of actions that the search values."""
         return (
             super().footprint(env)._replace(searched=(f"--{self.name}.searched-actions", self.options.searched_actions))
         )
@@ -165,57 +165,59 @@ class Clic(Guide):
         base: Float[Array, " action"] | None,
         scalars: GuideScalars,
     ) -> Float[Array, " m"]:
-        """Return E of actions in one situation; whatever the policy did there (`base`), it is the same."""
+        """Return E of actions in one situation; `base`, the policy's own action, is ignored."""
         return -self.network.predict(env, params, obs, actions)[:, 0]
 
-    def around(self, row: Contrast, scalars: GuideScalars) -> Float[Array, " action"]:
-        """Return what a label says would be better than the action asked about."""
+    def target_action(self, row: Contrast, scalars: GuideScalars) -> Float[Array, " action"]:
+        """Return the action that a label calls better than the one asked about."""
         space = self.spaces.actions
         return space.toward(row.action, row.answer, space.from_unit(scalars.eps_deg))
 
     def membership(
         self, key: PRNGKeyArray, row: Contrast, actions: Float[Array, "m action"], scalars: GuideScalars
     ) -> Float[Array, " m"]:
-        """Return log p(b in A) of actions, A the desired set of one label."""
+        """Return log p(b in A) of actions b, where A is the desired set of one label."""
         space, options = self.spaces.actions, self.options
         x = space.log(jnp.broadcast_to(row.action, actions.shape), actions) / space.from_unit(scalars.eps_deg)
         angle, keys = jnp.deg2rad(options.angle_deg), jax.random.split(key, options.implicit_pairs)
         implicit = jax.vmap(lambda key: direction_at(key, row.answer, angle))(keys)
         return SHARPNESS * jax.vmap(lambda x: log_desired(x, row.answer, implicit, options.gamma))(x)
 
-    def sampled(self, key: PRNGKeyArray, row: Contrast, scalars: GuideScalars) -> Float[Array, "m action"]:
-        """Return the actions among which one label's are told apart: two known ones, uniform ones, and ones near a."""
+    def sample_actions(self, key: PRNGKeyArray, row: Contrast, scalars: GuideScalars) -> Float[Array, "m action"]:
+        """Return the sampled actions of one label: two known ones, uniform ones, and ones near a."""
         space, count = self.spaces.actions, self.options.sampled_actions - 2
         k_any, k_near = jax.random.split(key)
         change = NEAR * space.from_unit(scalars.eps_deg) * jax.random.normal(k_near, (count // 2, len(space.cues)))
-        known = jnp.stack([row.action, self.around(row, scalars)])
+        known = jnp.stack([row.action, self.target_action(row, scalars)])
         near = space.exp(jnp.broadcast_to(row.action, (count // 2, space.size)), change)
         return jnp.concatenate([known, space.sample(k_any, (count - count // 2,)), near])
 
     def losses(self, env: Any, scalars: GuideScalars, params: Params, rows: Contrast) -> Float[Array, " n"]:
-        """Return of each row -log of the probability that the policy's action lies in the desired set."""
+        """Return for each row -log of the probability that the policy's action lies in the desired set."""
 
         def one(row: Contrast) -> Array:
             k_pairs, k_sample = jax.random.split(jax.random.fold_in(jax.random.key(0), row.draw))
-            actions = self.sampled(k_sample, row, scalars)
+            actions = self.sample_actions(k_sample, row, scalars)
             log_pi = jax.nn.log_softmax(-self.energy(env, params, row.obs, actions, row.base, scalars))
             return -jax.nn.logsumexp(log_pi + self.membership(k_pairs, row, actions, scalars))
 
         return jax.vmap(one)(rows)
 
     def contrasts(self, labels: Label) -> Contrast:
-        """Return what is learned of labels (slots, ...); one that says nothing of any cue does not count."""
+        """Return labels (slots, ...) as contrasts; a label that names no cue is not valid."""
         numbers, base = jnp.arange(len(labels.valid)), labels.action if labels.base is None else labels.base
-        return Contrast(labels.obs, labels.action, labels.answer, labels.valid & self.told(labels), numbers, base)
+        return Contrast(
+            labels.obs, labels.action, labels.answer, labels.valid & self.informative(labels), numbers, base
+        )
 
-    def told(self, labels: Label) -> Bool[Array, " slots"]:
-        """Return which labels say anything."""
-        return said(labels.answer).any(-1) if len(self.spaces.actions.cues) > 1 else jnp.ones_like(labels.valid)
+    def informative(self, labels: Label) -> Bool[Array, " slots"]:
+        """Return which labels name any cue."""
+        return is_answered(labels.answer).any(-1) if len(self.spaces.actions.cues) > 1 else jnp.ones_like(labels.valid)
 
     def fit(
         self, key: PRNGKeyArray, env: Any, labels: Label, former: GuidanceModel, scalars: GuideScalars
     ) -> GuidanceModel:
-        """The energy of labels (slots, ...), fitted from scratch."""
+        """Return the energy model of labels (slots, ...), fitted from scratch."""
 
         def redrawn(key: PRNGKeyArray, batch: Contrast) -> Contrast:
             return batch.replace(draw=jax.random.randint(key, batch.draw.shape, 0, 2**30))
@@ -226,7 +228,7 @@ class Clic(Guide):
         rows, sizes = self.contrasts(labels), self.sizes
         return fit_model(key, rows, scalars, init=self.network.init, losses=losses, sizes=sizes, redrawn=redrawn)
 
-    def least(
+    def minimise_energy(
         self,
         env: Any,
         params: Params,
@@ -234,7 +236,7 @@ class Clic(Guide):
         base: Float[Array, " action"],
         scalars: GuideScalars,
     ) -> Float[Array, " action"]:
-        """Return the action of least energy within tau_max of `base`, as a deterministic search finds it."""
+        """Return the action of least energy within tau_max of `base`, by a deterministic search."""
         space, cues = self.spaces.actions, len(self.spaces.actions.cues)
         bound = jnp.minimum(space.from_unit(scalars.tau_max_deg), space.from_unit(space.reach))
         count = self.options.searched_actions
@@ -263,16 +265,16 @@ class Clic(Guide):
         actions: Float[Array, "n action"],
         active: Bool[Array, " n"],
         scalars: GuideScalars,
-    ) -> Refined:
-        """The action of least energy within tau_max of a, in active rows of a fitted model."""
+    ) -> Refinement:
+        """Return the action of least energy within tau_max of a, in active rows of a fitted model."""
         guided = active & model.fitted
 
         def choose(where: Array) -> Array:
             seen, base = jnp.split(where, [obs.shape[1]])
-            return self.least(env, model.params, seen, base, scalars)
+            return self.minimise_energy(env, model.params, seen, base, scalars)
 
         chosen = each_in_portions(choose, jnp.concatenate([obs, actions], -1), self.options.searched_actions)
-        return Refined(jnp.where(guided[:, None], chosen, actions), guided.astype(jnp.int32))
+        return Refinement(jnp.where(guided[:, None], chosen, actions), guided.astype(jnp.int32))
 
     def log_p(
         self,
@@ -282,25 +284,25 @@ class Clic(Guide):
         actions: Float[Array, "m action"],
         scalars: GuideScalars,
     ) -> Float[Array, " m"]:
-        """-E of actions; 0 of all before the first fit."""
+        """Return -E of actions; 0 for all actions before the first fit."""
         return jnp.where(model.fitted, -self.energy(env, model.params, obs, actions, None, scalars), 0.0)
 
 
 class ClicShown(Clic):
-    """A guide that learns from what a teacher shows in place of an action, by a set around what is shown."""
+    """A guide that learns from demonstrated actions, by a set around each demonstration."""
 
-    def around(self, row: Contrast, scalars: GuideScalars) -> Float[Array, " action"]:
-        """Return what was shown."""
+    def target_action(self, row: Contrast, scalars: GuideScalars) -> Float[Array, " action"]:
+        """Return the demonstrated action."""
         return row.answer
 
-    def told(self, labels: Label) -> Bool[Array, " slots"]:
-        """Return all labels: each shows an action."""
+    def informative(self, labels: Label) -> Bool[Array, " slots"]:
+        """Return True for all labels: each shows an action."""
         return jnp.ones_like(labels.valid)
 
     def membership(
         self, key: PRNGKeyArray, row: Contrast, actions: Float[Array, "m action"], scalars: GuideScalars
     ) -> Float[Array, " m"]:
-        """Return log p(b in A) of actions, A the ball around what was shown."""
+        """Return log p(b in A) of actions b, where A is the ball around the demonstration."""
         space = self.spaces.actions
         eps = space.from_unit(scalars.eps_deg)
         away = jax.vmap(lambda action: _size(space.log(row.answer, action) / eps))(actions)

@@ -1,4 +1,4 @@
-"""Deep COACH: every correction moves a policy network itself, which is never fitted afresh.
+"""Deep COACH: every correction updates a policy network, which is never fitted from scratch.
 
 Source: Perez-Dattari, Celemin, Ruiz-del-Solar, Kober, "Interactive learning with corrective feedback for policies based
 on deep neural networks" (ISER 2018), Algorithm 1. A correction h has the target a + e h. It gets a gradient step, and
@@ -34,9 +34,9 @@ from cuelearner_jax.config.parts import POSITIVE, part
 from cuelearner_jax.feedback.answers import RELATIVE
 from cuelearner_jax.guides.base import Kind
 from cuelearner_jax.guides.demonstration import Demonstration
-from cuelearner_jax.guides.fitting import Lesson, optimizer, squared
+from cuelearner_jax.guides.fitting import Lesson, optimizer, squared_errors
 from cuelearner_jax.guides.model import for_each
-from cuelearner_jax.guides.refining import Refined
+from cuelearner_jax.guides.refining import Refinement
 from cuelearner_jax.types import GuidanceModel, Label, Params
 
 
@@ -51,25 +51,25 @@ class Config:
 
 
 class Coached(struct.PyTreeNode):
-    """A policy on its way, as the parameters of a model; of several members with a leading axis."""
+    """The policy during training, as the parameters of a model; an ensemble has a leading axis of members."""
 
     policy: Params
     optimizer: Any  # state
-    learned: Int[Array, ""]  # labels that it has been corrected by: the next are new
+    learned: Int[Array, ""]  # labels that were used already; later ones are new
 
 
 class DeepCoach(Demonstration):
-    """A policy that acts as a cloned one does, and is moved by each correction."""
+    """A guide that acts as a cloned policy does, and is updated by each correction."""
 
     options: Config
 
     @cached_property
     def member(self) -> DeepCoach:
-        """One member of the ensemble, by itself."""
+        """Return the guide of one member of the ensemble."""
         return dataclasses.replace(self, sizes=dataclasses.replace(self.sizes, ensemble=1))
 
     def init(self, key: PRNGKeyArray) -> GuidanceModel:
-        """A policy that nothing has corrected."""
+        """Return a policy without corrections."""
 
         def begin(key: PRNGKeyArray) -> Coached:
             params = self.member.network.init(key)
@@ -78,20 +78,20 @@ class DeepCoach(Demonstration):
         return GuidanceModel(for_each(self.sizes.ensemble, begin, key), jnp.array(False))
 
     def target(self, label: Label, scalars: GuideScalars) -> Float[Array, " action"]:
-        """The action changed by h * eps along each cue."""
+        """Return the action changed by h * eps along each cue."""
         space = self.spaces.actions
         return space.toward(label.action, label.answer, space.from_unit(scalars.eps_deg))
 
     def fit(
         self, key: PRNGKeyArray, env: Any, labels: Label, former: GuidanceModel, scalars: GuideScalars
     ) -> GuidanceModel:
-        """The former policy, corrected by the labels that are new, in the order in which they were given."""
+        """Return the former policy, corrected by the new labels in order."""
         rows = self.lessons(labels, scalars)
         order = jnp.argsort(~rows.valid, stable=True)
         count = rows.valid.sum()
 
         def loss(params: Params, batch: Lesson) -> Array:
-            return jnp.mean(squared(batch, self.member.predict(env, params, batch.obs, batch.action)))
+            return jnp.mean(squared_errors(batch, self.member.predict(env, params, batch.obs, batch.action)))
 
         def step(coached: Coached, numbers: Int[Array, " batch"], key: PRNGKeyArray) -> Coached:
             batch = self.redrawn(key, jax.tree.map(lambda leaf: leaf[order[numbers]], rows))
@@ -126,14 +126,14 @@ class DeepCoach(Demonstration):
         actions: Float[Array, "n action"],
         active: Bool[Array, " n"],
         scalars: GuideScalars,
-    ) -> Refined:
-        """The policy's action in place of a, as a cloned policy's."""
+    ) -> Refinement:
+        """Return the cloned policy's action in place of a."""
         return super().act(model.replace(params=model.params.policy), env, obs, actions, active, scalars)
 
     def disagreement(
         self, model: GuidanceModel, env: Any, obs: Float[Array, "n obs"], actions: Float[Array, "n action"]
     ) -> Float[Array, " n"]:
-        """Variance of the members' vectors, summed over their entries."""
+        """Return the variance of the members' vectors, summed over their entries."""
         return super().disagreement(model.replace(params=model.params.policy), env, obs, actions)
 
 

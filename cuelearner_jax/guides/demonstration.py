@@ -1,4 +1,4 @@
-"""Guidance by demonstrations: an auxiliary policy is cloned from the actions that the teacher shows.
+"""Guidance by demonstrations: an auxiliary policy is cloned from the teacher's demonstrated actions.
 
 Source: paper, section V-A ("train an auxiliary policy that imitates the human teacher") and appendix. Questions are
 about what the policy itself would do, once there is one (DAgger: Ross, Gordon, Bagnell, 2011). On raw observations the
@@ -23,28 +23,28 @@ from cuelearner_jax.config import GuideScalars
 from cuelearner_jax.feedback.answers import DEMONSTRATION
 from cuelearner_jax.guides.base import Guide, Kind
 from cuelearner_jax.guides.fitting import Lesson
-from cuelearner_jax.guides.refining import Refined
+from cuelearner_jax.guides.refining import Refinement
 from cuelearner_jax.types import GuidanceModel, Params
 
 
 class Demonstration(Guide):
-    """A policy that is fitted to the actions shown, and acts in the agent's place."""
+    """A policy that is fitted to the demonstrated actions, and acts in the agent's place."""
 
     @property
     def looks_again(self) -> bool:
-        """Whether what the policy does depends on where it looks from."""
+        """Whether the policy's action depends on the action that the situation is seen from."""
         return self.sizes.frame == "action"
 
     def predict(
         self, env: Any, params: Params, obs: Float[Array, "n obs"], actions: Float[Array, "n action"]
     ) -> Float[Array, "n action"]:
-        """What the policy does, seen from `actions`."""
+        """Return the policy's action, seen from `actions`."""
         if not self.looks_again:
             return self.network.predict(env, params, obs, jnp.zeros_like(actions))
         return actions + self.network.predict(env, params, obs, actions)
 
     def redrawn(self, key: PRNGKeyArray, batch: Lesson) -> Lesson:
-        """Half of a batch seen from anywhere, for it may be asked from there; half from the actions asked about."""
+        """Return a batch seen half from uniform directions, half from the actions asked about."""
         if not self.looks_again:
             return batch
         k_half, k_where = jax.random.split(key)
@@ -60,8 +60,8 @@ class Demonstration(Guide):
         actions: Float[Array, "n action"],
         active: Bool[Array, " n"],
         scalars: GuideScalars,
-    ) -> Refined:
-        """The policy's action in place of a, in active rows of a fitted model, within the bound round a."""
+    ) -> Refinement:
+        """Return the policy's action in place of a, in active rows of a fitted model, within the bound around a."""
 
         def phi(current: Float[Array, "n action"]) -> Float[Array, "n action"]:
             return self.predict(env, model.params, obs, current) - current
@@ -71,7 +71,7 @@ class Demonstration(Guide):
     def disagreement(
         self, model: GuidanceModel, env: Any, obs: Float[Array, "n obs"], actions: Float[Array, "n action"]
     ) -> Float[Array, " n"]:
-        """Variance of the members' vectors, summed over their entries."""
+        """Return the variance of the members' vectors, summed over their entries."""
         return super().disagreement(model, env, obs, actions if self.looks_again else jnp.zeros_like(actions))
 
 

@@ -1,4 +1,4 @@
-"""Fitting a model to labels, by least squares (paper, Eq. 3) or another loss, whatever the form of their answers."""
+"""Fit a model to labels of any form, by least squares (paper, Eq. 3) or another loss."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from jaxtyping import Array, Bool, Float, Key, PRNGKeyArray
 
 from cuelearner_jax.config import GuideScalars, GuideSizes
 from cuelearner_jax.guides.model import fitted_members
-from cuelearner_jax.spaces import Space, said
+from cuelearner_jax.spaces import Space, is_answered
 from cuelearner_jax.types import GuidanceModel, Label, Params
 
 VALIDATION_STRIDE = 5  # every fifth label is a validation label: the 80/20 split of the paper's public code
 
 
 class Lesson(struct.PyTreeNode):
-    """What a network is to predict of one label."""
+    """A label's target: what a network is to predict of it."""
 
     obs: Float[Array, " obs"]
     action: Float[Array, " action"]
     target: Float[Array, " outputs"]
     valid: Bool[Array, ""]
-    said: Bool[Array, " cues"] | None = None  # the cues along which errors count; None: all of an error does
-    space: Space | None = struct.field(pytree_node=False, default=None)  # whose cues these are
+    said: Bool[Array, " cues"] | None = None  # the cues along which errors count; None: errors count as a whole
+    space: Space | None = struct.field(pytree_node=False, default=None)  # the space of these cues
 
 
 def lessons(
@@ -38,21 +38,21 @@ def lessons(
     scalars: GuideScalars,
     space: Space | None = None,
 ) -> Lesson:
-    """Labels (slots, ...) with what their answers mean to a network; `space`: of answers that may leave cues out.
+    """Return labels (slots, ...) with their targets; `space`: of answers that may leave cues out.
 
-    A label that says nothing of any cue is none.
+    A label that names no cue is not valid.
     """
     targets = jax.vmap(lambda label: target(label, scalars))(labels)
     # Rounded here, whatever is computed of them next: fused with that, their last bits would hang on the compiler.
     rows = Lesson(labels.obs, labels.action, jax.lax.optimization_barrier(targets), labels.valid)
     if space is None or len(space.cues) == 1:
         return rows
-    told = said(labels.answer)
+    told = is_answered(labels.answer)
     return rows.replace(valid=labels.valid & told.any(-1), said=told, space=space)
 
 
-def squared(rows: Lesson, predicted: Float[Array, "n outputs"]) -> Float[Array, " n"]:
-    """Squared errors of predictions, L = |f - y|^2 (paper, Eq. 3).
+def squared_errors(rows: Lesson, predicted: Float[Array, "n outputs"]) -> Float[Array, " n"]:
+    """Return the squared errors of predictions, L = |f - y|^2 (paper, Eq. 3).
 
     Where labels may leave cues out, L is the sum over the cues of which something was said of (d log (f - y))^2, the
     error along that cue in the space's unit. A cue of which nothing was said adds nothing, whatever is predicted.
@@ -64,26 +64,26 @@ def squared(rows: Lesson, predicted: Float[Array, "n outputs"]) -> Float[Array, 
 
 
 def along_cues(rows: Lesson, vectors: Float[Array, "n action"]) -> Float[Array, "n cues"]:
-    """What vectors added to the actions of lessons, which say of which cues they speak, change along each cue."""
+    """Return the change along each cue that vectors make when added to the actions of lessons."""
     assert rows.space is not None  # `lessons` gives it with `said`
     return jax.vmap(rows.space.along)(rows.action[..., : rows.space.size], vectors)
 
 
 def optimizer(scalars: GuideScalars) -> optax.GradientTransformation:
-    """Gradients clipped to a global norm, then Adam (paper, appendix): that of every guidance model."""
+    """Return the optimiser of every guidance model: gradients clipped to a global norm, then Adam (paper, appendix)."""
     return optax.chain(optax.clip_by_global_norm(scalars.max_grad_norm), optax.adam(scalars.feedback_learning_rate))
 
 
 Redrawn = Callable[[PRNGKeyArray, Any], Any]  # (key, batch of rows) -> what to train on in its place
 
 
-def as_drawn(key: PRNGKeyArray, batch: Any) -> Any:
-    """The batch itself."""
+def keep_batch(key: PRNGKeyArray, batch: Any) -> Any:
+    """Return the batch itself."""
     return batch
 
 
 def _subset(valid: Bool[Array, " labels"]) -> Callable[[PRNGKeyArray, int], jax.Array]:
-    """Sampler of indices, with replacement, among the true rows of `valid`."""
+    """Return a sampler of indices among the true rows of `valid`, with replacement."""
     order = jnp.argsort(~valid, stable=True)
     count = jnp.maximum(valid.sum(), 1)
     return lambda key, size: order[jax.random.randint(key, (size,), 0, count)]
@@ -97,12 +97,12 @@ def fit_least_squares(
     init: Callable[[PRNGKeyArray], Params],
     apply: Callable[[Params, jax.Array, jax.Array], jax.Array],
     sizes: GuideSizes,
-    redrawn: Redrawn = as_drawn,
+    redrawn: Redrawn = keep_batch,
 ) -> GuidanceModel:
-    """`fit_model` by least squares (paper, Eq. 3).
+    """Fit by least squares (paper, Eq. 3), as `fit_model`.
 
-    Lessons are never multiplied by an environment's symmetries: what a teacher would answer in the mirror image is its
-    own choice where several actions are as good, and mostly another than the mirror image of its answer.
+    Lessons are never augmented by an environment's symmetries. Where several actions are equally good, a teacher's answer
+    in the mirror image is mostly not the mirror image of its answer.
 
     Args:
         key, rows, scalars, init, sizes, redrawn: as `fit_model` has them.
@@ -110,7 +110,7 @@ def fit_least_squares(
     """
 
     def errors(params: Params, rows: Lesson) -> Float[Array, " n"]:
-        return squared(rows, apply(params, rows.obs, rows.action))
+        return squared_errors(rows, apply(params, rows.obs, rows.action))
 
     return fit_model(key, rows, scalars, init=init, losses=errors, sizes=sizes, redrawn=redrawn)
 
@@ -123,9 +123,9 @@ def fit_model(
     init: Callable[[PRNGKeyArray], Params],
     losses: Callable[[Params, Any], Float[Array, " n"]],
     sizes: GuideSizes,
-    redrawn: Redrawn = as_drawn,
+    redrawn: Redrawn = keep_batch,
 ) -> GuidanceModel:
-    """Fits a model from scratch and keeps the parameters that validated best.
+    """Fit a model from scratch, and keep the parameters with the least validation loss.
 
     A fixed number of Adam steps, so that vmapped seeds take equally long. With fewer than five nothing validates: the
     last parameters are kept. A fit that diverged before anything validated gives parameters that are NaN.
@@ -144,7 +144,7 @@ def fit_model(
 
 
 def held_out(count: int) -> Bool[np.ndarray, " count"]:
-    """Which of so many labels validate a fit and are not trained on."""
+    """Return which of so many labels are held out for validation."""
     return np.arange(count) % VALIDATION_STRIDE == VALIDATION_STRIDE - 1
 
 

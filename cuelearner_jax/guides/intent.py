@@ -1,4 +1,4 @@
-"""Relative feedback read as intent: of the aims that a situation offers, which one does the teacher have in mind?
+"""Relative feedback read as intent: which of a situation's aims does the teacher mean?
 
 "More to the left" says that what the teacher means lies to the left: of the aims there (`Environment.aims`) some remain
 likely, the others do not. One network weighs every aim by its features, with the same weights for all; it is fitted by
@@ -31,18 +31,18 @@ from cuelearner_jax.guides.aims import SPREAD, log_density, open_aims
 from cuelearner_jax.guides.base import Candidates, Footprint, Guide, Kind
 from cuelearner_jax.guides.fitting import fit_model
 from cuelearner_jax.guides.model import GuideModel, ensemble
-from cuelearner_jax.guides.refining import Refined
-from cuelearner_jax.spaces import Space, said
+from cuelearner_jax.guides.refining import Refinement
+from cuelearner_jax.spaces import Space, is_answered
 from cuelearner_jax.types import GuidanceModel, Label, Params
 
-ELSEWHERE = 360  # evenly spaced actions that stand for "it means none of these"
-SLIPS = 0.02  # share of answers that say nothing: any of the words
+ELSEWHERE = 360  # evenly spaced actions that stand for "the teacher means none of the aims"
+SLIPS = 0.02  # share of random answers
 WORDS = 3
 
 
 @part
 class Config:
-    """Options of a guide that reads intent."""
+    """Options of a guide that infers intent."""
 
     aim_layers: Layers = (32, 32)
     """Hidden layers of the network that weighs the task's aims: the same ones for every aim."""
@@ -53,21 +53,21 @@ class Config:
 
     @property
     def needs(self) -> tuple[str, ...]:
-        """What an environment must have, beside the kind's own needs."""
+        """Optional members of an environment that these options need, beside the kind's own."""
         return ("rule",) if self.from_rule else ()
 
 
 class Weights(nn.Module):
-    """log-weights of a situation's aims, and of none of them: every aim goes through the same layers."""
+    """Network of the log-weights of a situation's aims and of "none of them", with shared layers for all aims."""
 
     layers: tuple[int, ...]
-    from_last: bool = False  # is the last feature of an aim its log-weight before the first label?
+    from_last: bool = False  # True if an aim's last feature is its log-weight before the first label
 
     @nn.compact
     def __call__(
         self, features: Float[Array, "aims features"], possible: Bool[Array, " aims"]
     ) -> Float[Array, " aims_and_none"]:
-        """Starts out without a preference of its own."""
+        """Return the log-weights; without training they are uniform, or the rule's."""
         x = features
         for width in self.layers:
             x = nn.relu(nn.Dense(width, kernel_init=nn.initializers.xavier_uniform())(x))
@@ -78,11 +78,11 @@ class Weights(nn.Module):
 
 
 class Evidence(struct.PyTreeNode):
-    """What one answer says of what may have been meant."""
+    """One answer's likelihood under each possible aim."""
 
     features: Float[Array, "aims features"]
     possible: Bool[Array, " aims"]
-    likelihood: Float[Array, " aims_and_none"]  # of the answer, if this was meant
+    likelihood: Float[Array, " aims_and_none"]  # probability of the answer, if this aim is meant
     valid: Bool[Array, ""]
 
 
@@ -93,7 +93,7 @@ def likelihood(
     h: Float[Array, " cues"],
     eps: Float[Array, ""],
 ) -> Float[Array, " goals"]:
-    """Probability of the answer h about `action` from somebody who means each of the goals.
+    """Return the probability of the answer h about `action`, if the teacher means each of the goals.
 
     What is meant lies round the goal, along each cue by itself, with a logistic error of `SPREAD`; within eps / 2 of
     the action it is right. A cue of which nothing was said tells nothing.
@@ -102,40 +102,40 @@ def likelihood(
     above = jax.nn.sigmoid((offset - eps / 2) / width)
     below = jax.nn.sigmoid((-offset - eps / 2) / width)
     each = jnp.where(h > 0, above, jnp.where(h < 0, below, 1.0 - above - below))
-    return each[..., 0] if len(space.cues) == 1 else jnp.prod(each, -1, where=said(h))
+    return each[..., 0] if len(space.cues) == 1 else jnp.prod(each, -1, where=is_answered(h))
 
 
 def evidence_of(aims: Aims, space: Space, label: Label, scalars: GuideScalars) -> Evidence:
-    """What a label says of the aims of its situation."""
+    """Return a label's likelihood under each aim of its situation."""
     eps = space.from_unit(scalars.eps_deg)
     of_aims = likelihood(space, label.action, aims.actions, label.answer, eps)
     of_none = likelihood(space, label.action, space.spread(ELSEWHERE), label.answer, eps).mean(keepdims=True)
     return Evidence(aims.features, aims.possible, jnp.concatenate([of_aims, of_none]), label.valid)
 
 
-def followed(
+def choose_aim(
     space: Space,
     share: Float[Array, " aims_and_none"],
     aims: Float[Array, "aims action"],
     action: Float[Array, " action"],
     doubt: float,
 ) -> tuple[Float[Array, " action"], Bool[Array, ""]]:
-    """Of the aims as likely as the likeliest the nearest to an action, and whether it is likely enough at all."""
+    """Return the nearest of the likeliest aims, and whether the aim is likely enough to be followed."""
     most = share[:-1].max()
     goal = aims[jnp.argmin(jnp.where(share[:-1] >= most, space.distance(action[None], aims), jnp.inf))]
     return goal, (most > 0.0) & (doubt * most > share[-1])
 
 
 class Intent(Guide):
-    """A guide that weighs the task's aims by what was answered and goes for the likeliest."""
+    """A guide that weights the task's aims by the answers, and moves toward the likeliest."""
 
     options: Config
 
     @cached_property
     def network(self) -> GuideModel:
-        """The network, or ensemble, that gives the probability that each aim, or none, is meant.
+        """The network, or ensemble, of the probability that each aim, or none, is meant.
 
-        Aims' features and which of them are possible stand where other kinds have observations and actions.
+        Its inputs are the aims' features and a mask of possible aims, in place of observations and actions.
         """
         weights = Weights(self.options.aim_layers, self.options.from_rule)
         width = (self.spaces.aims or 0) + self.options.from_rule
@@ -151,14 +151,14 @@ class Intent(Guide):
         return ensemble(self.sizes.ensemble, init, shares)
 
     def aims(self, env: Any, obs: Float[Array, " obs"]) -> Aims:
-        """A situation's aims; with `from_rule` their features end with their log-weights by the task's rule."""
+        """Return a situation's aims; with `from_rule` their features end with their log-weights by the task's rule."""
         aims: Aims = env.aims(obs)
         if not self.options.from_rule:
             return aims
         return aims._replace(features=jnp.concatenate([aims.features, env.rule(obs)[:, None]], -1))
 
     def footprint(self, env: Any) -> Footprint:
-        """Every aim goes through the layers."""
+        """Return the sizes of the layers, which every aim goes through."""
         aims, features = jax.eval_shape(self.aims, env, jnp.zeros(self.spaces.obs_size)).features.shape
         layers = tuple(aims * width for width in self.options.aim_layers)
         return Footprint("--intent.aim-layers", layers, aims * features)
@@ -166,7 +166,7 @@ class Intent(Guide):
     def fit(
         self, key: PRNGKeyArray, env: Any, labels: Label, former: GuidanceModel, scalars: GuideScalars
     ) -> GuidanceModel:
-        """The model under which the answers are likeliest."""
+        """Return the maximum-likelihood model of the answers."""
         rows = jax.vmap(lambda label: evidence_of(self.aims(env, label.obs), self.spaces.actions, label, scalars))(
             labels
         )
@@ -186,11 +186,11 @@ class Intent(Guide):
         actions: Float[Array, "n action"],
         active: Bool[Array, " n"],
         scalars: GuideScalars,
-    ) -> Refined:
-        """By at most eps a pass toward the likeliest aim, in active rows of a fitted model that is sure enough."""
+    ) -> Refinement:
+        """Move each action by at most eps a pass toward the likeliest aim, in active rows with a sure, fitted model."""
         space, aims = self.spaces.actions, jax.vmap(partial(self.aims, env))(obs)
         share = self.shares(model, env, aims)
-        find = partial(followed, space, doubt=self.options.aim_doubt)
+        find = partial(choose_aim, space, doubt=self.options.aim_doubt)
         goals, sure = jax.vmap(find)(share, aims.actions, actions)
 
         def phi(current: Float[Array, "n action"]) -> Float[Array, "n action"]:
@@ -199,12 +199,12 @@ class Intent(Guide):
         return self.refined(phi, actions, active & sure & model.fitted, scalars)
 
     def shares(self, model: GuidanceModel, env: Any, aims: Aims) -> Float[Array, "n aims_and_none"]:
-        """Probability that each of the aims (n, aims) is meant and may be followed; last, that none is meant."""
+        """Return the probability that each aim (n, aims) is meant and may be followed; last, that none is meant."""
         share = self.network.predict(env, model.params, aims.features, aims.possible)
         return share if aims.open is None else share.at[:, :-1].multiply(aims.open)
 
     def candidates(self, env: Any, obs: Float[Array, " obs"]) -> Candidates:
-        """The aims that may be followed."""
+        """Return the aims that may be followed."""
         return open_aims(env.aims(obs))
 
     def log_p(
@@ -215,7 +215,9 @@ class Intent(Guide):
         actions: Float[Array, "m action"],
         scalars: GuideScalars,
     ) -> Float[Array, " m"]:
-        """log of the density of actions round the aims (`log_density`); before the first fit by the rule, or alike."""
+        """Return the log density of actions around the aims (`log_density`); before the first fit by the rule, or
+        uniform.
+        """
         aims = jax.vmap(partial(self.aims, env))(obs[None])
         share = self.shares(model, env, aims)[0]
         return log_density(self.spaces.actions, aims.actions[0], share, actions)
@@ -223,7 +225,7 @@ class Intent(Guide):
     def disagreement(
         self, model: GuidanceModel, env: Any, obs: Float[Array, "n obs"], actions: Float[Array, "n action"]
     ) -> Float[Array, " n"]:
-        """The variance of the members' probabilities, summed over aims; of situations, whatever the action."""
+        """Return the variance of the members' probabilities, summed over aims; it does not depend on the action."""
         aims = jax.vmap(partial(self.aims, env))(obs)
         return self.network.disagreement(env, model.params, aims.features, aims.possible)
 

@@ -1,4 +1,4 @@
-"""The model of a guide: one network, or an ensemble whose members predict their mean and disagree elsewhere.
+"""The model of a guide: one network, or an ensemble whose members' mean predicts and whose variance is disagreement.
 
 Members differ by their random initial parameters and by the batches that they are fitted to, as in Lakshminarayanan,
 Pritzel, Blundell, "Simple and scalable predictive uncertainty estimation using deep ensembles", NeurIPS 2017. Their
@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from cuelearner_jax.agents import view
-from cuelearner_jax.agents.networks import applied, residual_network
+from cuelearner_jax.agents.networks import as_function, residual_network
 from cuelearner_jax.config import GuideSizes
 from cuelearner_jax.environment import Spaces
 from cuelearner_jax.types import GuidanceModel, Params
@@ -32,7 +32,7 @@ class GuideModel(NamedTuple):
 
 
 def ensemble(members: int, init: Callable[[PRNGKeyArray], Params], predict: Predict) -> GuideModel:
-    """The model of one kind of network.
+    """Return the model of one kind of network.
 
     Args:
         members: their number.
@@ -51,7 +51,7 @@ def ensemble(members: int, init: Callable[[PRNGKeyArray], Params], predict: Pred
 
 
 def guide_model(sizes: GuideSizes, spaces: Spaces, outputs: int | None = None, beside: int = 0) -> GuideModel:
-    """The networks of these sizes.
+    """Return the networks of these sizes.
 
     Args:
         sizes: of the networks.
@@ -74,8 +74,8 @@ def guide_model(sizes: GuideSizes, spaces: Spaces, outputs: int | None = None, b
     ) -> Float[Array, "m outputs"]:
         """Of m situations with an action each, or of one with m actions."""
         bare, known = jnp.split(actions, [size], -1)
-        of_obs, of_action = view.seen(sizes.frame, env, obs, bare)
-        return applied(network)(params, of_obs, jnp.concatenate([of_action, known], -1) if beside else of_action)
+        of_obs, of_action = view.network_inputs(sizes.frame, env, obs, bare)
+        return as_function(network)(params, of_obs, jnp.concatenate([of_action, known], -1) if beside else of_action)
 
     made = ensemble(sizes.ensemble, init, predict)
     if outputs is not None:
@@ -88,7 +88,7 @@ def guide_model(sizes: GuideSizes, spaces: Spaces, outputs: int | None = None, b
 
 
 def for_each(members: int, function: Callable[..., Any], key: PRNGKeyArray, *parameters: Any) -> Any:
-    """What a function of a key and of one member's parameters makes of every member, each from its own random numbers.
+    """Return a function's result for every member, each from its own random key and parameters.
 
     Args:
         members: their number.
@@ -107,7 +107,7 @@ def fitted_members(
     key: PRNGKeyArray,
     init: Callable[[PRNGKeyArray], Params],
 ) -> GuidanceModel:
-    """Each member fitted by itself, from its own random numbers.
+    """Return each member fitted by itself, from its own random key.
 
     Args:
         members: their number.

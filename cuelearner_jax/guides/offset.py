@@ -1,4 +1,4 @@
-"""Relative feedback for adaptation: a correction that depends on how far the action has been turned already.
+"""Relative feedback for adaptation: a correction that depends on the action's offset from the finished policy's.
 
 Of a finished policy in a changed world much is wrong in the same way everywhere, and right once an action has been
 turned far enough from what the policy did. A few labels tell that, where no network of the situation can be learned
@@ -30,51 +30,51 @@ from cuelearner_jax.feedback.answers import RELATIVE
 from cuelearner_jax.guides.base import Guide, Kind
 from cuelearner_jax.guides.fitting import Lesson, along_cues, fit_least_squares, held_out
 from cuelearner_jax.guides.model import GuideModel, guide_model
-from cuelearner_jax.guides.refining import Refined
+from cuelearner_jax.guides.refining import Refinement
 from cuelearner_jax.guides.relative import Relative
 from cuelearner_jax.spaces import Space
 from cuelearner_jax.types import GuidanceModel, Label, Params
 
 KNOTS = 13  # evenly spaced, from the largest turn that was asked about on one side to that on the other
-ROUGHNESS = 3.0  # of the spline: what a unit of its squared second differences costs, in squared errors of labels
-RIDGE = 0.3  # the same of its squared heights: what nothing was asked about is left alone
+ROUGHNESS = 3.0  # penalty on the spline's squared second differences, in squared errors of labels
+RIDGE = 0.3  # penalty on its squared heights, which keeps unlabelled offsets uncorrected
 
 
 class Spline(struct.PyTreeNode):
     """A function of the turn: straight lines between knots, level beyond them. Of several cues each has its own."""
 
     heights: Float[Array, "*cues knots"]  # in units of eps; of directions counterclockwise
-    reach: Float[Array, "*cues"]  # turn of the outermost knots, in units of eps
+    reach: Float[Array, "*cues"]  # offset of the outermost knots, in units of eps
 
 
 class TwoParts(struct.PyTreeNode):
-    """A correction's two parts, as the parameters of a model."""
+    """The spline and the network of a correction, as the parameters of a model."""
 
     spline: Spline
     network: Params
-    share: Float[Array, ""]  # by which the network counts, from 0 to 1
+    share: Float[Array, ""]  # weight of the network, from 0 to 1
 
 
-def turned(
+def accumulated_turn(
     space: Space, first: Float[Array, "n action"], actions: Float[Array, "n action"], eps: Float[Array, ""]
 ) -> Float[Array, "n cues"]:
-    """How far actions lie from what they were first along each cue, in units of eps."""
+    """Return how far actions lie from the policy's own along each cue, in units of eps."""
     return space.log(first, actions) / eps
 
 
 def _hats(turns: Float[Array, " n"], reach: Float[Array, ""]) -> Float[Array, "n knots"]:
-    """The weight of each knot at each turn: they add up to 1."""
+    """Return the weight of each knot at each offset; the weights add up to 1."""
     place = (jnp.clip(turns / reach, -1, 1) + 1) * (KNOTS - 1) / 2
     return jnp.maximum(0.0, 1.0 - jnp.abs(place[:, None] - jnp.arange(KNOTS)[None]))
 
 
 def height(spline: Spline, turns: Float[Array, " n"]) -> Float[Array, " n"]:
-    """The spline's correction at each turn, in units of eps."""
+    """Return the spline's correction at each offset, in units of eps."""
     return _hats(turns, spline.reach) @ spline.heights
 
 
-def smoothed(turns: Float[Array, " n"], wanted: Float[Array, " n"], valid: Bool[Array, " n"]) -> Spline:
-    """The spline with the least penalised squared error.
+def fit_spline(turns: Float[Array, " n"], wanted: Float[Array, " n"], valid: Bool[Array, " n"]) -> Spline:
+    """Return the spline with the least penalised squared error.
 
     Args:
         turns: of the actions asked about, in units of eps.
@@ -88,17 +88,15 @@ def smoothed(turns: Float[Array, " n"], wanted: Float[Array, " n"], valid: Bool[
     return Spline(jnp.linalg.solve(normal, hats.T @ jnp.where(valid, wanted, 0.0)), reach)
 
 
-def smoothed_cues(
-    turns: Float[Array, "n cues"], wanted: Float[Array, "n cues"], counts: Bool[Array, "n cues"]
-) -> Spline:
-    """`smoothed` for each cue by itself; a spline of one cue has no axis of cues."""
+def fit_splines(turns: Float[Array, "n cues"], wanted: Float[Array, "n cues"], counts: Bool[Array, "n cues"]) -> Spline:
+    """Return a spline for each cue, by `fit_spline`; with one cue there is no axis of cues."""
     if turns.shape[1] == 1:
-        return smoothed(turns[:, 0], wanted[:, 0], counts[:, 0])
-    return jax.vmap(smoothed, 1)(turns, wanted, counts)
+        return fit_spline(turns[:, 0], wanted[:, 0], counts[:, 0])
+    return jax.vmap(fit_spline, 1)(turns, wanted, counts)
 
 
 def heights_of(spline: Spline, turns: Float[Array, "n cues"]) -> Float[Array, "n cues"]:
-    """`height` along each cue."""
+    """Return each cue's spline correction (`height`)."""
     if turns.shape[1] == 1:
         return height(spline, turns[:, 0])[:, None]
     return jax.vmap(height, (0, 1), 1)(spline, turns)
@@ -107,14 +105,14 @@ def heights_of(spline: Spline, turns: Float[Array, "n cues"]) -> Float[Array, "n
 def vectors(
     space: Space, heights: Float[Array, "n cues"], actions: Float[Array, "n action"], eps: Float[Array, ""]
 ) -> Float[Array, "n action"]:
-    """Corrections as vectors to be added to actions, in units of eps."""
+    """Return corrections in units of eps as vectors to add to actions."""
     return (space.exp(actions, heights * eps) - actions) / eps
 
 
 def share_of(
     left: Float[Array, "n action"], predicted: Float[Array, "n action"], valid: Bool[Array, " n"]
 ) -> Float[Array, ""]:
-    """The weight from 0 to 1 with which predictions come nearest to what is left, by least squares over valid rows."""
+    """Return the weight in [0, 1] that scales predictions nearest to the residuals, by least squares over valid rows."""
     product = jnp.sum(jnp.sum(left * predicted, -1), where=valid)
     size = jnp.sum(jnp.sum(jnp.square(predicted), -1), where=valid)
     return jnp.clip(product / jnp.where(size > 0, size, 1.0), 0, 1)
@@ -122,23 +120,23 @@ def share_of(
 
 @dataclass(frozen=True)
 class Offset(Relative):
-    """A guide that corrects actions by how far they have been turned; its labels keep what the policy did (`base`).
+    """A guide that corrects actions by their offset from the policy's own, which its labels keep (`base`).
 
-    Members of an ensemble disagree about actions as if they had not been turned.
+    The members' disagreement is computed at zero offset.
     """
 
     @cached_property
     def network(self) -> GuideModel:
-        """The network, or ensemble, that sees the turns beside situation and action."""
+        """The network, or ensemble, whose inputs are the offset, the situation and the action."""
         return guide_model(self.sizes, self.spaces, beside=self.cues)
 
     @property
     def cues(self) -> int:
-        """Number of cues, along each of which an action may have turned."""
+        """Number of cues, along each of which an action may be offset."""
         return len(self.spaces.actions.cues)
 
     def init(self, key: PRNGKeyArray) -> GuidanceModel:
-        """A model that corrects nothing."""
+        """Return a model that corrects nothing."""
         each = () if self.cues == 1 else (self.cues,)
         spline = Spline(jnp.zeros((*each, KNOTS)), jnp.ones(each))
         return GuidanceModel(TwoParts(spline, self.network.init(key), jnp.zeros(())), jnp.array(False))
@@ -146,15 +144,15 @@ class Offset(Relative):
     def fit(
         self, key: PRNGKeyArray, env: Any, labels: Label, former: GuidanceModel, scalars: GuideScalars
     ) -> GuidanceModel:
-        """The spline of the training labels, then the network of what it leaves, then the network's share."""
+        """Fit the spline to the training labels, then the network to its residuals, then the network's weight."""
         assert labels.base is not None  # `asking` keeps it for a kind that `sees_base`
         space, rows = self.spaces.actions, Guide.lessons(self, labels, scalars)
         eps = space.from_unit(scalars.eps_deg)
         asked = space.retract(rows.action + rows.target)
-        turns = turned(space, labels.base, rows.action, eps)
+        turns = accumulated_turn(space, labels.base, rows.action, eps)
         training = jnp.broadcast_to((rows.valid & ~held_out(len(rows.valid)))[:, None], turns.shape)
         training = training if rows.said is None else training & rows.said
-        spline = smoothed_cues(turns, turned(space, rows.action, asked, eps), training)
+        spline = fit_splines(turns, accumulated_turn(space, rows.action, asked, eps), training)
         left = rows.target / eps - vectors(space, heights_of(spline, turns), rows.action, eps)
         rows = rows.replace(action=jnp.concatenate([rows.action, turns], -1), target=left)
         predict = partial(self.network.predict, env)
@@ -172,13 +170,13 @@ class Offset(Relative):
         actions: Float[Array, "n action"],
         active: Bool[Array, " n"],
         scalars: GuideScalars,
-    ) -> Refined:
-        """As `act`, of `actions` that were `first` before anything corrected them."""
+    ) -> Refinement:
+        """Return `act` of `actions` whose uncorrected actions were `first`."""
         space, known = self.spaces.actions, model.params
         eps = space.from_unit(scalars.eps_deg)
 
         def phi(current: Float[Array, "n action"]) -> Float[Array, "n action"]:
-            turns = turned(space, first, current, eps)
+            turns = accumulated_turn(space, first, current, eps)
             seen = jnp.concatenate([current, turns], -1)
             of_turn = vectors(space, heights_of(known.spline, turns), current, eps)
             return eps * (of_turn + known.share * self.network.predict(env, known.network, obs, seen))
@@ -193,27 +191,27 @@ class Offset(Relative):
         actions: Float[Array, "n action"],
         active: Bool[Array, " n"],
         scalars: GuideScalars,
-    ) -> Refined:
-        """The refinement of a policy's own actions."""
+    ) -> Refinement:
+        """Return the refinement of a policy's own actions."""
         return self.onward(model, env, obs, actions, actions, active, scalars)
 
-    def moved_on(
+    def refine_labelled_actions(
         self, model: GuidanceModel, env: Any, labels: Label, active: Bool[Array, " n"], scalars: GuideScalars
-    ) -> Refined:
-        """The refinement of the actions that labels (n, ...) are about, from what the policy did there."""
+    ) -> Refinement:
+        """Return the refinement of the actions that labels (n, ...) are about, with offsets from the policy's."""
         assert labels.base is not None
         return self.onward(model, env, labels.obs, labels.base, labels.action, active, scalars)
 
     def disagreement(
         self, model: GuidanceModel, env: Any, obs: Float[Array, "n obs"], actions: Float[Array, "n action"]
     ) -> Float[Array, " n"]:
-        """Variance of the members' corrections, summed over their entries."""
+        """Return the variance of the members' corrections, summed over their entries."""
         seen = jnp.concatenate([actions, jnp.zeros((len(actions), self.cues))], -1)
         return self.network.disagreement(env, model.params.network, obs, seen)
 
 
 def _told(rows: Lesson, values: Float[Array, "n action"]) -> Float[Array, "n entries"]:
-    """Vectors along the cues of which labels speak; the vectors themselves where a label says all that there is."""
+    """Return vectors along the cues that labels name; whole vectors where labels are not about cues."""
     return values if rows.said is None else jnp.where(rows.said, along_cues(rows, values), 0.0)
 
 

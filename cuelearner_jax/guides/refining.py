@@ -1,4 +1,4 @@
-"""The refinement loop (paper, Eqs. 3-5): a <- a + phi(s, a) until it settles, within a ball round the first action.
+"""The refinement loop (paper, Eqs. 3-5): a <- a + phi(s, a) until a settles, within a ball around the first action.
 
 Batch-native: a mask says which rows are done, so one `lax.while_loop` serves any number of actions, compiles with
 everything round it and exports. No randomness.
@@ -20,20 +20,20 @@ from cuelearner_jax.spaces import Space
 GuideScalarsT = TypeVar("GuideScalarsT", bound=GuideScalars)
 
 
-class Refined(NamedTuple):
-    """Result of a refinement."""
+class Refinement(NamedTuple):
+    """The result of a refinement."""
 
     actions: Float[Array, "n action"]
-    passes: Int[Array, " n"]  # how often each row was moved
+    passes: Int[Array, " n"]  # number of passes that moved each row
 
 
-def untouched(actions: Float[Array, "n action"]) -> Refined:
-    """Actions that nothing refined."""
-    return Refined(actions, jnp.zeros(actions.shape[0], jnp.int32))
+def no_refinement(actions: Float[Array, "n action"]) -> Refinement:
+    """Return the result for actions that are not refined."""
+    return Refinement(actions, jnp.zeros(actions.shape[0], jnp.int32))
 
 
-def within(space: Space, scalars: GuideScalarsT, bound: Float[Array, ""]) -> GuideScalarsT:
-    """Scalars with which refinement stays within `bound` of the first action, or nearer where it did before."""
+def bounded_scalars(space: Space, scalars: GuideScalarsT, bound: Float[Array, ""]) -> GuideScalarsT:
+    """Return scalars that bound refinement to `bound` of the first action, or less where they did before."""
     return dataclasses.replace(scalars, tau_max_deg=jnp.minimum(scalars.tau_max_deg, space.to_unit(bound)))
 
 
@@ -46,15 +46,15 @@ def refine(
     tau: Float[Array, ""] | float,
     tau_max: Float[Array, ""] | float,
     k_max: Int[Array, ""] | int,
-) -> Refined:
-    """Refines a batch of actions.
+) -> Refinement:
+    """Refine a batch of actions.
 
     Args:
         residual: phi(s, .) of the rows' own observations: actions -> residuals.
         first: a_0.
         active: rows to refine; the others come back untouched.
         space: the action space.
-        tau: a row stops once a pass moves it by less than this along every cue, as `space.log` counts.
+        tau: a row stops once a pass moves it by less than this along every cue, in the unit of `space.log`.
         tau_max: bound on the way from `first` along each cue; every iterate is clipped to it.
         k_max: largest number of passes.
     """
@@ -75,4 +75,4 @@ def refine(
 
     start = (first, ~active, jnp.zeros(first.shape[0], jnp.int32), jnp.zeros((), jnp.int32))
     refined, _, passes, _ = jax.lax.while_loop(unfinished, one_pass, start)
-    return Refined(refined, passes)
+    return Refinement(refined, passes)

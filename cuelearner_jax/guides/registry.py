@@ -1,4 +1,4 @@
-"""The one place that lists the kinds of guidance: those of the package, of installed packages, and of one's own.
+"""The registry of kinds of guidance: those of the package, of installed packages, and of the user's own code.
 
 A kind of one's own is a `Kind`: pass it to `register`, offer it under the entry-point group `cuelearner.guidances`, or
 name it as `package.module:NAME` wherever the name of a kind is asked for.
@@ -12,9 +12,10 @@ from typing import Any
 
 from cuelearner_jax.config import GuideSizes
 from cuelearner_jax.environment import actions_of, offers, spaces_of
-from cuelearner_jax.errors import UserError, closest
+from cuelearner_jax.errors import UserError, suggestion
 from cuelearner_jax.guides import (
     aims,
+    baselines,
     bdcoach,
     calibration,
     clic,
@@ -24,7 +25,6 @@ from cuelearner_jax.guides import (
     offset,
     relative,
     scalar,
-    untaught,
 )
 from cuelearner_jax.guides.base import Guide, Kind
 from cuelearner_jax.plugins import load
@@ -33,62 +33,71 @@ ENTRY_POINTS = "cuelearner.guidances"
 
 _TAUGHT = (demonstration.KIND, scalar.KIND, dcoach.KIND, offset.KIND, calibration.KIND)
 _PEERS = (bdcoach.KIND, clic.KIND, clic.SHOWN)
-_BUILT_IN = (untaught.NONE, relative.KIND, intent.KIND, untaught.HEURISTIC, aims.ANY_AIM, aims.RULE, *_TAUGHT, *_PEERS)
+_BUILT_IN = (
+    baselines.NONE,
+    relative.KIND,
+    intent.KIND,
+    baselines.HEURISTIC,
+    aims.ANY_AIM,
+    aims.RULE,
+    *_TAUGHT,
+    *_PEERS,
+)
 _KINDS: dict[str, Kind] = {kind.name: kind for kind in _BUILT_IN}
 
 
 def register(kind: Kind) -> Kind:
-    """Makes a kind known under its name. Raises UserError if another one has the name."""
+    """Register a kind under its name. Raises UserError if another kind has the name."""
     if _KINDS.setdefault(kind.name, kind) != kind:
         raise UserError(f"there is another guidance called {kind.name!r}: give yours another name")
     return kind
 
 
-def known() -> tuple[Kind, ...]:
-    """The kinds that can be named, those of installed packages included."""
+def kinds() -> tuple[Kind, ...]:
+    """Return the registered kinds, those of installed packages included."""
     _register_installed()
     return tuple(_KINDS.values())
 
 
-def registered(name: str) -> Kind | None:
-    """The kind of that name, or None: of results whose kind is not known here."""
+def find_or_none(name: str) -> Kind | None:
+    """Return the kind of that name, or None, for results whose kind is not known here."""
     _register_installed()
     return _KINDS.get(name)
 
 
 def find(name: str) -> Kind:
-    """The kind of that name; no code is loaded that the name leads to. Raises UserError if there is none."""
+    """Return the kind of that name without loading code. Raises UserError if no kind has the name."""
     _register_installed()
     if name not in _KINDS:
         raise UserError(
-            f"unknown guidance {name!r}{closest(name, _KINDS)} (one of your own is named as package.module:NAME)"
+            f"unknown guidance {name!r}{suggestion(name, _KINDS)} (one of your own is named as package.module:NAME)"
         )
     return _KINDS[name]
 
 
 def resolve(text: str) -> Kind:
-    """The kind that a user or caller names: by its name, or as `package.module:NAME`, whose code is loaded.
+    """Return the kind that a user or caller names: by its name, or as `package.module:NAME`, whose code is loaded.
 
-    Never call it with what a file says. Raises UserError if there is no such kind.
+    Never pass text from a file. Raises UserError if there is no such kind.
     """
     return register(load(text, Kind, "a kind of guidance")) if ":" in text else find(text)
 
 
-def named(text: str) -> str:
-    """Name of the kind that a user or caller names, as `resolve`; a name alone need not be known here."""
+def kind_name(text: str) -> str:
+    """Return the name of the kind that a user or caller names (`resolve`); a plain name need not be registered."""
     return resolve(text).name if ":" in text else text
 
 
 def possible(env: Any, taught: bool) -> tuple[str, ...]:
-    """Names of the kinds that an agent can be trained with; `taught`: is there a teacher to ask?"""
-    trained = (kind for kind in known() if not kind.adapts_only and (taught or not kind.asks))
+    """Return the names of the kinds that an agent can be trained with; `taught`: whether the world has a teacher."""
+    trained = (kind for kind in kinds() if not kind.adapts_only and (taught or not kind.asks))
     cues = actions_of(env).cues
     said = (kind for kind in trained if cues or not kind.needs_cues)
     return tuple(kind.name for kind in said if all(offers(env, need) for need in kind.needs))
 
 
 def make(name: str, sizes: GuideSizes, env: Any, options: Any = None) -> Guide:
-    """A kind's guide for an environment (shapes in place of arrays will do).
+    """Return a kind's guide for an environment (shapes in place of arrays will do).
 
     Args:
         name: of the kind.

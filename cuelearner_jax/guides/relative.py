@@ -21,20 +21,20 @@ from cuelearner_jax.config import GuideScalars
 from cuelearner_jax.feedback.answers import RELATIVE
 from cuelearner_jax.guides.base import Guide, Kind
 from cuelearner_jax.guides.fitting import Lesson
-from cuelearner_jax.guides.refining import Refined
+from cuelearner_jax.guides.refining import Refinement
 from cuelearner_jax.types import GuidanceModel, Label
 
 
 class Relative(Guide):
-    """A guide that corrects actions until nothing moves."""
+    """A guide that corrects actions until a pass no longer moves them."""
 
     def target(self, label: Label, scalars: GuideScalars) -> Float[Array, " action"]:
-        """Eq. 3's eps * h as a vector: the action changed by h * eps along each cue, less the action."""
+        """Return eps * h of Eq. 3 as a vector: the action changed by h * eps along each cue, less the action."""
         space = self.spaces.actions
         return space.toward(label.action, label.answer, space.from_unit(scalars.eps_deg)) - label.action
 
     def lessons(self, labels: Label, scalars: GuideScalars) -> Lesson:
-        """Labels (slots, ...) with their targets in units of eps."""
+        """Return labels (slots, ...) with their targets in units of eps."""
         rows = super().lessons(labels, scalars)
         return rows.replace(target=rows.target / self.spaces.actions.from_unit(scalars.eps_deg))
 
@@ -46,8 +46,8 @@ class Relative(Guide):
         actions: Float[Array, "n action"],
         active: Bool[Array, " n"],
         scalars: GuideScalars,
-    ) -> Refined:
-        """Eq. 4: a <- a + phi(s, a), in active rows of a fitted model."""
+    ) -> Refinement:
+        """Refine active rows with a fitted model by Eq. 4: a <- a + phi(s, a)."""
         eps = self.spaces.actions.from_unit(scalars.eps_deg)
 
         def phi(current: Float[Array, "n action"]) -> Float[Array, "n action"]:

@@ -1,4 +1,4 @@
-"""Guidance by scalar feedback: a model of whether the teacher calls an action good, whose argmax acts.
+"""Guidance by scalar feedback: a model of whether the teacher calls an action good; its argmax acts.
 
 Source: paper, section V-A and appendix; its public code fits a network like the agent's to labels of 1 and 0, and has
 the network's own argmax labelled. Hardly any uniform action is good, so a model that is asked about its own choices
@@ -26,15 +26,15 @@ from cuelearner_jax.config.parts import POSITIVE, SHARE, part
 from cuelearner_jax.feedback.answers import SCALAR
 from cuelearner_jax.guides.base import Footprint, Guide, Kind
 from cuelearner_jax.guides.model import GuideModel, guide_model
-from cuelearner_jax.guides.refining import Refined
+from cuelearner_jax.guides.refining import Refinement
 from cuelearner_jax.types import GuidanceModel
 
-LEAST = 0.01  # that an action is called good: the model's values are no probabilities, and may be 0 or less
+LEAST = 0.01  # least value before a logarithm: the model's values may be 0 or less
 
 
 @part
 class Config:
-    """Options of a guide that values actions."""
+    """Options of guidance by scalar feedback."""
 
     guide_directions: Annotated[int, POSITIVE] = 360
     """Directions over which the guide takes its argmax."""
@@ -43,7 +43,7 @@ class Config:
 
 
 class Scalar(Guide):
-    """A guide that values actions."""
+    """A guide that executes the action of largest predicted value."""
 
     options: Config
 
@@ -53,7 +53,7 @@ class Scalar(Guide):
         return guide_model(self.sizes, self.spaces, outputs=1)
 
     def footprint(self, env: Any) -> Footprint:
-        """Beside the layers the actions among which the best is searched."""
+        """Return the sizes of the layers, and the number of actions that the search values."""
         searched = ("--scalar.guide-directions", self.options.guide_directions)
         return super().footprint(env)._replace(searched=searched)
 
@@ -65,12 +65,12 @@ class Scalar(Guide):
         actions: Float[Array, "n action"],
         active: Bool[Array, " n"],
         scalars: GuideScalars,
-    ) -> Refined:
-        """The best of all actions in active rows of a fitted model."""
+    ) -> Refinement:
+        """Return the best of all actions in active rows of a fitted model."""
         guided = active & model.fitted
         value = lambda obs, actions: self.network.predict(env, model.params, obs, actions)[:, 0]  # noqa: E731
         chosen = best_of(value, self.spaces.actions.spread(self.options.guide_directions), obs)
-        return Refined(jnp.where(guided[:, None], chosen, actions), guided.astype(jnp.int32))
+        return Refinement(jnp.where(guided[:, None], chosen, actions), guided.astype(jnp.int32))
 
     def log_p(
         self,
@@ -80,7 +80,7 @@ class Scalar(Guide):
         actions: Float[Array, "m action"],
         scalars: GuideScalars,
     ) -> Float[Array, " m"]:
-        """log of the probability that the teacher calls an action good; 0 of all before the first fit."""
+        """Return the log of the predicted value of each action; 0 for all actions before the first fit."""
         good = jnp.clip(self.network.predict(env, model.params, obs, actions)[:, 0], LEAST, 1.0)
         return jnp.where(model.fitted, jnp.log(good), 0.0)
 
@@ -93,7 +93,7 @@ class Scalar(Guide):
         base: Float[Array, " action"],
         scalars: GuideScalars,
     ) -> Float[Array, " action"]:
-        """The base action in a share `explored_fraction` of all questions, the guide's own in the others."""
+        """Return the base action in a share `explored_fraction` of questions, the guide's own action in the others."""
         k_explore, k_refined = jax.random.split(key)
         explores = jax.random.bernoulli(k_explore, self.options.explored_fraction)
         return jnp.where(explores, base, super().question(k_refined, model, env, obs, base, scalars))

@@ -15,7 +15,7 @@ from cuelearner_jax import config as configuration
 from cuelearner_jax.config import Scalars
 from cuelearner_jax.environment import Environment
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.feedback import given
+from cuelearner_jax.feedback import external_labels
 from cuelearner_jax.feedback.forms import AnswerForm
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.labelling.programs import Agreement, agreement, as_teacher, keys_of, lived
@@ -26,14 +26,14 @@ from cuelearner_jax.task import Task
 
 def form_of(file: LabelFile) -> AnswerForm | None:
     """The form of a file's answers; None: of a kind of guidance that is not known here."""
-    forms = {kind.form.name: kind.form for kind in guidances.known() if kind.form is not None}
+    forms = {kind.form.name: kind.form for kind in guidances.kinds() if kind.form is not None}
     return forms.get(file.answers)
 
 
 def checked(path: Path) -> LabelFile:
     """The labels of a file, as training would take them. Raises UserError if there are none, or one makes no sense."""
     file = label_files.read(path)
-    given.check_file(file, None, form_of(file), str(path))
+    external_labels.check_file(file, None, form_of(file), str(path))
     return file
 
 

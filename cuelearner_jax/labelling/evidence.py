@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from cuelearner_jax.adaptation.calibrated import LEAST
+from cuelearner_jax.adaptation.by_calibration import LEAST
 from cuelearner_jax.calibration import CHANGED, UNEXPLAINED, Calibrated, Calibration, Result, Walk
 from cuelearner_jax.calibration.families import Family, unknowns_of
 from cuelearner_jax.calibration.meaning import is_python

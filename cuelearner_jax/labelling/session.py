@@ -28,7 +28,7 @@ from cuelearner_jax.labelling.evidence import PROGRAMS, EvidenceLearner
 from cuelearner_jax.labelling.learner import Fitted, Learner
 from cuelearner_jax.labelling.plan import Plan
 from cuelearner_jax.labelling.programs import advance, begin, keys_of, lived, programs
-from cuelearner_jax.policies import named
+from cuelearner_jax.policies import policy_name
 from cuelearner_jax.storage import label_files
 from cuelearner_jax.storage.label_checks import ANSWERED, UNDONE, UNSURE
 from cuelearner_jax.storage.provenance import provenance
@@ -178,7 +178,7 @@ class Session:
         guide = guide.replace(model=self._learner.newest.model)
         scalars, base = self.plan.config.scalars, self.plan.base.policy
         action = self._programs.question(self.env, scalars, base, guide, keys, self._bound)
-        user_code.check_actions(np.isfinite(action), named(base))
+        user_code.check_actions(np.isfinite(action), policy_name(base))
         return Item(number, guide, np.asarray(action))
 
     def _refined(self, item: Item) -> Item:

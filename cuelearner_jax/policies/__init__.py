@@ -1,10 +1,10 @@
 """Policies: pytrees that act. What evaluation, pictures, labelling and adaptation are about.
 
 A policy's `act` sees many environments at once. Its `axes` say which of its leaves a block of lanes has one of each
-(`evaluate.watched_lanes` maps over them); what lanes share is there once.
+(`evaluate.rollout_lanes` maps over them); what lanes share is there once.
 """
 
-from cuelearner_jax.policies.finished import Arbitrated, acting, arbiter_of, finished
+from cuelearner_jax.policies.final import Arbitrated, acting_state, arbiter_of, final_policy
 from cuelearner_jax.policies.layers import (
     Agent,
     Common,
@@ -21,7 +21,7 @@ from cuelearner_jax.policies.layers import (
     wanted_actions,
 )
 from cuelearner_jax.policies.node import BY_LANE, SHARED, PolicyBlock, PolicyNode, describe, lanes_in, layers
-from cuelearner_jax.policies.opaque import Opaque, acted, in_space, named, policy_of
+from cuelearner_jax.policies.opaque import Opaque, call_policy, in_space, policy_name, policy_of
 from cuelearner_jax.types import Policy
 
 __all__ = [
@@ -41,16 +41,16 @@ __all__ = [
     "Taught",
     "Teaching",
     "Uniform",
-    "acted",
-    "acting",
+    "acting_state",
     "arbiter_of",
     "best_actions",
+    "call_policy",
     "describe",
-    "finished",
+    "final_policy",
     "in_space",
     "lanes_in",
     "layers",
-    "named",
+    "policy_name",
     "policy_of",
     "teaching",
     "uniform_in",

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from cuelearner_jax.errors import UserError, shown
+from cuelearner_jax.errors import UserError, format_value
 
 ONNX = ".onnx"
 ACTIONS = ("action", "actions")  # names of an output, where a file in ONNX has several
@@ -186,5 +186,5 @@ class _Onnx(Foreign):
     def _run(self, rows: np.ndarray) -> np.ndarray:
         found = self._session.run([self._output], {self._name: rows})[0]
         if not isinstance(found, np.ndarray):
-            raise UserError(f"{self.reference} gives {shown(found)} in place of actions: export the policy anew")
+            raise UserError(f"{self.reference} gives {format_value(found)} in place of actions: export the policy anew")
         return found

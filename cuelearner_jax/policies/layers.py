@@ -16,7 +16,7 @@ from cuelearner_jax.agents.protocol import AgentFunctions
 from cuelearner_jax.config import GuideScalars, GuideSizes, Scalars, to_json
 from cuelearner_jax.devices import portions
 from cuelearner_jax.environment import actions_of
-from cuelearner_jax.feedback.answers import in_mind, relative_feedback
+from cuelearner_jax.feedback.answers import intended_action, relative_feedback
 from cuelearner_jax.guides.base import Guide
 from cuelearner_jax.guides.refining import refine
 from cuelearner_jax.policies.node import BY_LANE, SHARED, PolicyNode, describe
@@ -261,7 +261,7 @@ def wanted_actions(
     """
     if getattr(scalars, "answer", "best") != "nearest":
         return best_actions(teacher, states, obs)
-    ask = lambda row: in_mind(space, teacher, row[0], row[1], row[2], scalars)  # noqa: E731
+    ask = lambda row: intended_action(space, teacher, row[0], row[1], row[2], scalars)  # noqa: E731
     return jax.lax.map(ask, (states, obs, actions), batch_size=min(len(obs), portions().states))
 
 

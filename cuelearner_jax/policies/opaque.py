@@ -13,7 +13,7 @@ from flax import struct
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from cuelearner_jax import types, user_code
-from cuelearner_jax.errors import UserError, raised_by, shown
+from cuelearner_jax.errors import UserError, format_value, user_code_error
 from cuelearner_jax.policies import foreign
 from cuelearner_jax.policies.node import PolicyNode
 from cuelearner_jax.spaces import DIRECTIONS, Choices, Space
@@ -54,11 +54,11 @@ class Opaque(PolicyNode):
             if not usable.all():
                 count = f"{(~usable).sum()} of {usable.size}"
                 raise UserError(
-                    f"{named(self)} gave zero or not finite numbers in place of actions, in {count} situations"
+                    f"{policy_name(self)} gave zero or not finite numbers in place of actions, in {count} situations"
                 )
             return chosen
         except UserError as error:
-            user_code.leave(named(self), error)
+            user_code.leave(policy_name(self), error)
             return nothing
 
     def _called(self, rows: np.ndarray) -> np.ndarray:
@@ -67,7 +67,7 @@ class Opaque(PolicyNode):
         try:
             chosen = self.function(flat)
         except Exception as error:
-            raise raised_by(named(self), error) from error
+            raise user_code_error(policy_name(self), error) from error
         return self._checked(chosen, len(flat), np.asarray).reshape(*rows.shape[:-1], self.actions.size)
 
     def _checked(self, chosen: Any, rows: int, as_array: Callable[..., Any]) -> Any:
@@ -82,14 +82,16 @@ class Opaque(PolicyNode):
         try:
             found = as_array(chosen)
         except (TypeError, ValueError) as error:
-            raise UserError(f"{named(self)} returned {shown(chosen)}: return an array of shape {wanted}") from error
+            raise UserError(
+                f"{policy_name(self)} returned {format_value(chosen)}: return an array of shape {wanted}"
+            ) from error
         if getattr(found.dtype, "kind", "key") not in "fiu" and not jnp.issubdtype(found.dtype, jnp.floating):
-            raise UserError(f"{named(self)} returned {found.dtype} numbers: return real ones, of shape {wanted}")
+            raise UserError(f"{policy_name(self)} returned {found.dtype} numbers: return real ones, of shape {wanted}")
         if isinstance(self.actions, Choices) and found.shape == (rows,) and getattr(found.dtype, "kind", "") in "iu":
             return as_array(found[:, None] == np.arange(self.actions.size)).astype(np.float32)
         if found.shape != wanted:
             raise UserError(
-                f"{named(self)} returned actions of shape {found.shape} for {rows} observations: return {wanted}"
+                f"{policy_name(self)} returned actions of shape {found.shape} for {rows} observations: return {wanted}"
             )
         with np.errstate(over="ignore"):
             return found.astype(np.float32)
@@ -99,17 +101,17 @@ class Opaque(PolicyNode):
         return {"policy": "code", "named": _called(self.function)}
 
 
-def acted(
+def call_policy(
     policy: types.Policy, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"], actions: Space
 ) -> Float[Array, "n action"]:
     """A policy's actions, NaN in place of each that is none. Raises UserError if they have another shape."""
     chosen, wanted = jnp.asarray(policy.act(key, states, obs)), (obs.shape[0], actions.size)
     if chosen.shape != wanted:
-        raise UserError(f"{named(policy)} returned actions of shape {chosen.shape}: return {wanted}")
+        raise UserError(f"{policy_name(policy)} returned actions of shape {chosen.shape}: return {wanted}")
     return actions.only_actions(chosen)
 
 
-def named(policy: Any) -> str:
+def policy_name(policy: Any) -> str:
     """A policy for a message: by the user's function or class that acts, below whatever changes its actions."""
     while (below := getattr(policy, "base", None) or getattr(policy, "policy", None)) is not None:
         policy = below
@@ -143,7 +145,7 @@ def policy_of(given: Any) -> Any:
         try:
             given = given()
         except Exception as error:
-            raise raised_by(f"policy {getattr(given, '__qualname__', given)}", error) from error
+            raise user_code_error(f"policy {getattr(given, '__qualname__', given)}", error) from error
         if (function := foreign.function_of(given)) is not None:
             return Opaque(function, on_host=True)
     if hasattr(given, "act"):
@@ -158,7 +160,7 @@ def policy_of(given: Any) -> Any:
     if callable(given) and not isinstance(given, type):
         return Opaque(given, on_host=True)
     raise UserError(
-        f"{shown(given)} is no policy: give a function of observations (n, obs), a module of PyTorch, a "
+        f"{format_value(given)} is no policy: give a function of observations (n, obs), a module of PyTorch, a "
         "model of Stable-Baselines3 or a file in ONNX, or load one"
     )
 

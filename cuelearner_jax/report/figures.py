@@ -128,7 +128,7 @@ def save_figure(figure: Figure, stem: Path) -> None:
 
 def colour_of(guidance: str) -> str:
     """The hue of a kind of guidance, of one that is not known here too."""
-    kind = registry.registered(guidance)
+    kind = registry.find_or_none(guidance)
     return kind.colour if kind and kind.colour else OTHER_COLOURS[sum(guidance.encode()) % len(OTHER_COLOURS)]
 
 

@@ -46,7 +46,7 @@ class Variant(NamedTuple):
 
 def guidance_name(guidance: str) -> str:
     """What figures call a kind of guidance, one that is not known here too."""
-    kind = registry.registered(guidance)
+    kind = registry.find_or_none(guidance)
     return shortened(kind.title if kind and kind.title else guidance)
 
 

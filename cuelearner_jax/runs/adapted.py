@@ -11,8 +11,8 @@ import jax
 import numpy as np
 
 from cuelearner_jax import config as configuration
-from cuelearner_jax.adaptation import calibrated, stored
-from cuelearner_jax.adaptation.adapting import Adapted
+from cuelearner_jax.adaptation import by_calibration, serialization
+from cuelearner_jax.adaptation.by_model import AdaptationResult
 from cuelearner_jax.adaptation.judging import SPLIT
 from cuelearner_jax.adaptation.lanes import Lanes
 from cuelearner_jax.environment import actions_of
@@ -65,9 +65,9 @@ class AdaptedLanes:
     def policy(self, env: Any) -> Any:
         """A block of the lanes' policies. Raises UserError if it cannot be had."""
         values, arrays = self.values["policy"], self._arrays(env)
-        base = stored.from_json(values["base"], arrays["base"], env, self.code, self.changes)
+        base = serialization.from_json(values["base"], arrays["base"], env, self.code, self.changes)
         base = Common(base) if self.rows is None else base.lane(self.lanes.base)
-        made = stored.from_json({**values, "base": {"policy": "uniform"}}, arrays, env, changes=self.changes)
+        made = serialization.from_json({**values, "base": {"policy": "uniform"}}, arrays, env, changes=self.changes)
         return replace(made, base=base)
 
     def base(self, env: Any) -> Any:
@@ -77,8 +77,8 @@ class AdaptedLanes:
     def _arrays(self, env: Any) -> Any:
         values = self.values["policy"]
         try:
-            lanes = stored.shapes_of({**values, "base": {"policy": "uniform"}}, env, self.lanes.number)
-            like = {**lanes, "base": stored.shapes_of(values["base"], env, self.rows)}
+            lanes = serialization.shapes_of({**values, "base": {"policy": "uniform"}}, env, self.lanes.number)
+            like = {**lanes, "base": serialization.shapes_of(values["base"], env, self.rows)}
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise formats.damaged("policy", self.folder / policy_folders.POLICY) from error
         return policy_folders.read_arrays(self.folder, like, self.values)
@@ -102,7 +102,7 @@ def open_folder(
     values = formats.read("policy", path)
     try:
         task, world = world_of(values["task"], find, path)
-        stored.check(values["policy"])
+        serialization.check(values["policy"])
         lanes, used = _lanes(values["lanes"], values["rows"])
     except UserError as error:
         raise error if str(path) in str(error) else UserError(f"{path}: {error}") from error
@@ -134,7 +134,7 @@ def _lanes(told: dict[str, Any], rows: int | None) -> tuple[Lanes, np.ndarray]:
 
 def write(
     place: Place,
-    adapted: Adapted,
+    adapted: AdaptationResult,
     task: Task,
     world: Any,
     origin: dict[str, Any],
@@ -154,7 +154,7 @@ def write(
     """
     lanes, judged, env = adapted.lanes, adapted.judged, shape_of(task, world)
     block = replace(adapted.policy(env), base=adapted.of.bases)
-    values, arrays = stored.to_json(block, origin.get("code")), stored.arrays_of(block)
+    values, arrays = serialization.to_json(block, origin.get("code")), serialization.arrays_of(block)
     described = {
         "task": {"name": task.name, **({"from": task.origin} if task.origin else {}), **configuration.to_json(world)},
         **({"files": files} if (files := task.files(world)) else {}),
@@ -177,7 +177,7 @@ def write(
             "difference": [_plain(ends) for ends in judged.difference],
             "rewarded_steps": judged.rewarded_steps.tolist(),
         },
-        **({"calibration": calibrated.to_json(adapted.results)} if adapted.results else {}),
+        **({"calibration": by_calibration.to_json(adapted.results)} if adapted.results else {}),
         **{name: value for name, value in (used or {}).items() if value},
         "observation": [quantity._asdict() for quantity in env.observation],
         "conventions": CONVENTIONS,
@@ -199,7 +199,7 @@ def labels_name(lanes: Lanes, bound_deg: float) -> str:
     return f"labels-{bound_deg:g}deg.parquet" if several else label_files.PARQUET
 
 
-def _write_labels(folder: Path, adapted: Adapted, task: Task, world: Any) -> None:
+def _write_labels(folder: Path, adapted: AdaptationResult, task: Task, world: Any) -> None:
     """One file a bound, with a set a seed: that of the largest budget, of which smaller ones have the first labels."""
     of, lanes = adapted.of, adapted.lanes
     form: AnswerForm | None = of.guidance.form
@@ -215,7 +215,7 @@ def _write_labels(folder: Path, adapted: Adapted, task: Task, world: Any) -> Non
         label_files.write(file, told, form.name, space, eps, lanes.seed[own], sets, form.meaning(space))
 
 
-def _write_curve(folder: Path, name: str, adapted: Adapted, task: Task) -> None:
+def _write_curve(folder: Path, name: str, adapted: AdaptationResult, task: Task) -> None:
     """What the policies were worth after so many labels, as runs keep it of their guides."""
     of = adapted.of
     if not adapted.curve:

@@ -14,7 +14,7 @@ from cuelearner_jax import user_code
 from cuelearner_jax.environment import Environment, actions_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import episodes
-from cuelearner_jax.policies import Policy, acted, named
+from cuelearner_jax.policies import Policy, call_policy, policy_name
 from cuelearner_jax.spaces import Space
 from cuelearner_jax.task import Pictures
 from cuelearner_jax.types import EnvState
@@ -64,7 +64,7 @@ def film(pictures: Pictures, env: Environment, policy: Policy, episode: int, ste
     acting = _Watched(policy, actions_of(env))
     frames, rewards = pictures.record(env, acting, _start(episode), steps)
     jax.effects_barrier()
-    user_code.check_actions(np.array(acting.sound, bool), named(policy))
+    user_code.check_actions(np.array(acting.sound, bool), policy_name(policy))
     to.film.parent.mkdir(parents=True, exist_ok=True)
     pictures.still(env, frames, to.still)
     pictures.animate(env, frames, to.film)
@@ -83,10 +83,10 @@ def question(pictures: Pictures, env: Environment, policy: Policy, episode: int,
         k_act, _ = jax.random.split(jax.random.fold_in(k_play, 0))  # as a film draws its first step
         state, obs = env.reset(k_reset)
         states = jax.tree.map(lambda leaf: leaf[None], state)
-        return state, obs, acted(policy, k_act, states, obs[None], actions_of(env))[0]
+        return state, obs, call_policy(policy, k_act, states, obs[None], actions_of(env))[0]
 
     state, obs, action = first(env, _start(episode))
-    user_code.check_actions(action, named(policy))
+    user_code.check_actions(action, policy_name(policy))
     to.parent.mkdir(parents=True, exist_ok=True)
     pictures.question(env, state, obs, action, to)
 
@@ -100,7 +100,7 @@ class _Watched:
 
     def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
         """What the policy does, NaN in place of what is no action."""
-        chosen = acted(self.policy, key, states, obs, self._actions)
+        chosen = call_policy(self.policy, key, states, obs, self._actions)
         jax.debug.callback(lambda sound: self.sound.append(bool(sound)), jnp.isfinite(chosen).all())
         return chosen
 

@@ -13,7 +13,7 @@ import pyarrow.compute as pc
 from cuelearner_jax.arbiters.protocol import Arbiter
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.loop import Clock, TrainState, start_clock
-from cuelearner_jax.policies import acting
+from cuelearner_jax.policies import acting_state
 from cuelearner_jax.runs.lanes import LaneGroup
 from cuelearner_jax.storage import formats, label_files, results
 from cuelearner_jax.storage import table as tables
@@ -25,7 +25,7 @@ DUE = "due.json"  # beside a checkpoint whose evaluation was ended: the columns 
 def items(blocks: list[TrainState], clock: Clock, wall: float, arbiter: Arbiter) -> dict[str, Any]:
     """A run's state as the items of a checkpoint: acting needs the first alone; the last says how lanes are cut."""
     return {
-        "policy": [acting(arbiter, block.agent.params, block.guide.model, block.arbiter) for block in blocks],
+        "policy": [acting_state(arbiter, block.agent.params, block.guide.model, block.arbiter) for block in blocks],
         "rest": [
             block.replace(agent=block.agent.replace(params=None), guide=block.guide.replace(model=None), failed=None)
             for block in blocks
@@ -138,7 +138,7 @@ def restore_policies(folder: Path, like: Any, lanes: int) -> tuple[dict[str, Any
 
     Args:
         folder: of one kind of guidance.
-        like: shapes of what one lane acts with (`policies.acting`).
+        like: shapes of what one lane acts with (`policies.acting_state`).
         lanes: their number.
 
     Returns:

@@ -17,7 +17,7 @@ from cuelearner_jax.arbiters.protocol import Arbiter
 from cuelearner_jax.asking import label_slots
 from cuelearner_jax.devices import BY_LANE, lane_mesh, place
 from cuelearner_jax.environment import Environment
-from cuelearner_jax.evaluate import Tell, untold, watched_lanes
+from cuelearner_jax.evaluate import Tell, ignore_progress, rollout_lanes
 from cuelearner_jax.guides.base import Guide
 from cuelearner_jax.loop import Clock, Program, TrainState, make_program
 from cuelearner_jax.policies import PolicyBlock, arbiter_of
@@ -162,7 +162,7 @@ class LaneGroup:
         num_envs: int,
         steps: int,
         blocks: list[TrainState],
-        tell: Tell = untold,
+        tell: Tell = ignore_progress,
     ) -> dict[str, np.ndarray]:
         """Metrics (lanes,) of a policy of each block on the same episodes.
 
@@ -171,7 +171,7 @@ class LaneGroup:
         mesh = self.mesh if self.mesh.size > 1 else None
 
         def measured(block: TrainState) -> dict[str, Any]:
-            return watched_lanes(env, policy_of(block), key, num_envs, steps, tell, mesh).means
+            return rollout_lanes(env, policy_of(block), key, num_envs, steps, tell, mesh).means
 
         return self.columns(self.each(measured, blocks))
 

@@ -14,7 +14,7 @@ from cuelearner_jax.asking import label_slots
 from cuelearner_jax.config import GuideSizes, Scalars
 from cuelearner_jax.environment import spaces_of
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.feedback import given
+from cuelearner_jax.feedback import external_labels
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs.grid import Grid, check_grid, defaults, describe
@@ -131,7 +131,7 @@ def read_labels(
     made = [guidances.find(kind) for kind in grid.guidance]
     asking = [guidance for guidance in made if guidance.form is not None]
     if not asking:
-        fitting = [kind.name for kind in guidances.known() if kind.form and kind.form.name == file.answers]
+        fitting = [kind.name for kind in guidances.kinds() if kind.form and kind.form.name == file.answers]
         raise UserError(f"--labels-from needs a guidance that uses labels: add --guidance {' or '.join(fitting)}")
     for guidance in asking:
         assert guidance.form is not None
@@ -140,7 +140,7 @@ def read_labels(
                 f"{path} holds {file.answers} answers, guidance {guidance.name} needs {guidance.form.name} ones: "
                 "give fitting labels"
             )
-        given.check_file(file, spaces_of(env), guidance.form, str(path))
+        external_labels.check_file(file, spaces_of(env), guidance.form, str(path))
     if file.eps is not None and not math.isclose(file.eps, scalars.eps_deg, rel_tol=1e-6):
         raise UserError(
             f"{path} holds labels of {file.eps:g} {file.space.unit}, the run's are of {scalars.eps_deg:g}: "

@@ -14,7 +14,7 @@ from jaxtyping import PRNGKeyArray
 
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides.base import Guide
-from cuelearner_jax.policies import acting, arbiter_of
+from cuelearner_jax.policies import acting_state, arbiter_of
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs import shards
 from cuelearner_jax.runs.grid import Grid, defaults, load
@@ -39,7 +39,7 @@ class RunLanes:
     guidance: Guide
     seeds: np.ndarray  # (lanes,)
     budgets: np.ndarray  # (lanes,)
-    policies: Any  # what they act with, see `policies.acting`, leading axis: lanes
+    policies: Any  # what they act with, see `policies.acting_state`, leading axis: lanes
     step: int
 
 
@@ -77,7 +77,7 @@ def lanes_of(task: Task, config: RunConfig, pieces: tuple[Piece, ...], kind: str
 
     def lane(key: PRNGKeyArray) -> dict[str, Any]:
         state = arbiter.init(config.sizes.num_envs)
-        return acting(arbiter, config.agent_in(env).init(key)[0], guidance.init(key), state)
+        return acting_state(arbiter, config.agent_in(env).init(key)[0], guidance.init(key), state)
 
     like = jax.eval_shape(lane, jax.random.key(0))
     found: dict[int, list[RunLanes]] = {}

@@ -9,12 +9,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from cuelearner_jax.adaptation.adapting import plain_scalars
+from cuelearner_jax.adaptation.by_model import plain_scalars
 from cuelearner_jax.arbiters.protocol import Finishes
 from cuelearner_jax.environment import actions_of, offers, spaces_of, view_of
-from cuelearner_jax.errors import UserError, closest, listed
+from cuelearner_jax.errors import UserError, format_numbers, suggestion
 from cuelearner_jax.guides import registry as guidances
-from cuelearner_jax.policies import Corrected, Guided, Heuristic, Policy, Taught, arbiter_of, finished, uniform_in
+from cuelearner_jax.policies import Corrected, Guided, Heuristic, Policy, Taught, arbiter_of, final_policy, uniform_in
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs.adapted import AdaptedLanes, open_folder
 from cuelearner_jax.runs.failures import without_failed
@@ -81,7 +81,7 @@ def make(
         assert adapted is not None
         return adapted.policy(view) if name == "adapted" else adapted.base(view)
     assert lanes is not None
-    agent = finished(config, lanes.guidance, view, lanes.step, lanes.policies)
+    agent = final_policy(config, lanes.guidance, view, lanes.step, lanes.policies)
     if name == "agent":
         return agent
     if name == "corrected":
@@ -144,7 +144,7 @@ class PolicySource:
         something.
         """
         if policy not in POLICIES:
-            raise UserError(f"unknown policy {policy!r}{closest(policy, POLICIES)}")
+            raise UserError(f"unknown policy {policy!r}{suggestion(policy, POLICIES)}")
         named = POLICIES[policy]
         if named.trained and not self.grid:
             others = [name for name, one in POLICIES.items() if not one.kept or (one.adapted and self.adapted)]
@@ -181,7 +181,7 @@ class PolicySource:
     def _weighs_aims(self, chosen: tuple[str, ...] | None) -> bool:
         """Is a policy under a guidance that looks at the task's aims? `chosen`: of these kinds of a run alone."""
         kinds = self.adapted.kinds if self.adapted else chosen or (self.grid.guidance if self.grid else ())
-        found = (guidances.registered(kind) for kind in kinds)
+        found = (guidances.find_or_none(kind) for kind in kinds)
         return any(kind is not None and "aims" in kind.needs for kind in found)
 
     def load(self, kinds: tuple[str, ...] = ()) -> list[RunLanes]:
@@ -194,7 +194,7 @@ class PolicySource:
         for name in kinds or self.grid.guidance:
             if name not in self.grid.guidance:
                 raise UserError(f"{self.folder} has no guidance {name!r}: choose among {', '.join(self.grid.guidance)}")
-            if guidances.registered(name) is None:
+            if guidances.find_or_none(name) is None:
                 raise UserError(
                     f"{self.folder} has lanes of a guidance from outside, {name!r}: name its code by "
                     "--guidance package.module:NAME, if you trust that code"
@@ -305,7 +305,7 @@ def several(
     view = source.task.view(world) if env is None else view_of(env)
     if not named.kept:
         return [make(name, source.config, view, teacher)], (0,)
-    kinds = (guidances.named(kind),) if kind else (source.grid.guidance[-1],) if source.grid else ()
+    kinds = (guidances.kind_name(kind),) if kind else (source.grid.guidance[-1],) if source.grid else ()
     blocks = blocks_of(source, name, view, teacher, kinds, failed_too=True)
     known = {
         part: np.concatenate([getattr(block, part) for block in blocks]) for part in ("seeds", "budgets", "bounds")
@@ -323,7 +323,7 @@ def several(
                 found.append(block.policy.lane(int(index[0])))
                 break
         else:
-            known_seeds, known_budgets, known_bounds = (listed(values.tolist()) for values in known.values())
+            known_seeds, known_budgets, known_bounds = (format_numbers(values.tolist()) for values in known.values())
             of, bounds, others = "run", "", ""
             if source.grid is None:
                 unit, of = actions_of(view).unit, "folder"

@@ -14,9 +14,9 @@ from cuelearner_jax.arbiters.protocol import Finishes
 from cuelearner_jax.asking import blame, label_slots
 from cuelearner_jax.devices import BY_LANE, SHARED, place
 from cuelearner_jax.environment import Environment, view_of
-from cuelearner_jax.evaluate import Tell, episodes, untold
+from cuelearner_jax.evaluate import Tell, episodes, ignore_progress
 from cuelearner_jax.loop import Clock, TrainState, start_clock
-from cuelearner_jax.policies import Guided, PolicyBlock, acting, finished, uniform_in
+from cuelearner_jax.policies import Guided, PolicyBlock, acting_state, final_policy, uniform_in
 from cuelearner_jax.runs.judging import Returns, judges_envs, judges_episodes, scores
 from cuelearner_jax.runs.lanes import LaneGroup
 from cuelearner_jax.storage import label_files
@@ -35,7 +35,7 @@ class Training:
         group: LaneGroup,
         examined: Environment,
         split: str,
-        tell: Tell = untold,
+        tell: Tell = ignore_progress,
         judged: Environment | None = None,
     ) -> None:
         """At the beginning.
@@ -163,15 +163,17 @@ class Training:
 
     def policies(self, view: Any) -> PolicyBlock:
         """The finished policies of all lanes as they stand, for a world of that view."""
-        known = [acting(self.group.arbiter, lane.agent.params, lane.guide.model, lane.arbiter) for lane in self.blocks]
+        known = [
+            acting_state(self.group.arbiter, lane.agent.params, lane.guide.model, lane.arbiter) for lane in self.blocks
+        ]
         joined = jax.tree.map(lambda *leaves: np.concatenate([np.asarray(leaf) for leaf in leaves]), *known)
-        return finished(self.group.config, self.group.guidance, view, self.step, joined)
+        return final_policy(self.group.config, self.group.guidance, view, self.step, joined)
 
     def _policy(self, lane: TrainState, view: Any, **arm: Any) -> PolicyBlock:
         """A block's finished policies; `arm`: the one by which all lanes act, in place of that which validated best."""
         group = self.group
-        known = {**acting(group.arbiter, lane.agent.params, lane.guide.model, lane.arbiter), **arm}
-        return finished(group.config, group.guidance, view, self.step, known)
+        known = {**acting_state(group.arbiter, lane.agent.params, lane.guide.model, lane.arbiter), **arm}
+        return final_policy(group.config, group.guidance, view, self.step, known)
 
     def _judge(self) -> dict[str, np.ndarray]:
         """Let the arm that validates best act in each lane; columns (lanes,): its number, and the scores of all."""

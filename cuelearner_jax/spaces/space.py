@@ -158,7 +158,7 @@ def _for_cues(amount: Amount) -> Array:
     return amount[..., None] if amount.ndim else amount
 
 
-def said(answer: Float[Array, "... cues"]) -> Bool[Array, "... cues"]:
+def is_answered(answer: Float[Array, "... cues"]) -> Bool[Array, "... cues"]:
     """Return of which cues a relative answer says something.
 
     "Not said" is a finite number (`UNSAID`): NaN means that a teacher failed, JSON knows no NaN, and answers that hold

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from cuelearner_jax.errors import UserError, shown
+from cuelearner_jax.errors import UserError, format_value
 from cuelearner_jax.spaces.box import KEYS, SHARE
 from cuelearner_jax.spaces.space import Cue
 
@@ -60,7 +60,9 @@ def _pairs(words: Any) -> list[tuple[str, str]]:
         pairs = []
     sound = all(len(pair) == 2 and pair[0] != pair[1] and all(map(_is_word, pair)) for pair in pairs)
     if not pairs or not sound:
-        raise UserError(f'cues is {shown(words)}: give two words for each entry of an action, as "left,right;up,down"')
+        raise UserError(
+            f'cues is {format_value(words)}: give two words for each entry of an action, as "left,right;up,down"'
+        )
     return [(pair[0], pair[1]) for pair in pairs]
 
 

@@ -29,7 +29,7 @@ import jax.numpy as jnp
 import numpy as np
 import orbax.checkpoint as ocp
 
-from cuelearner_jax.errors import UserError, no_space, says
+from cuelearner_jax.errors import UserError, mentions, no_space
 from cuelearner_jax.signals import saving
 
 KEPT = 2  # the newest checkpoints of a run
@@ -235,7 +235,7 @@ class Checkpoints:
                 # Orbax means to print TensorStore's details and prints the method that has them.
                 told = re.sub(r"\.? See full TensorStore details.*", "", str(error), flags=re.DOTALL).strip()
                 reason = told.splitlines()[0][:160] if told else type(error).__name__
-                forbidden = says(error, (errno.EACCES, errno.EPERM), "PERMISSION_DENIED", "Permission denied")
+                forbidden = mentions(error, (errno.EACCES, errno.EPERM), "PERMISSION_DENIED", "Permission denied")
                 remedy = OTHERS if isinstance(error, _OfAnother) else FORBIDDEN if forbidden else self._damaged
             _settle()
         raise UserError(f"checkpoint {number} in {self._folder} cannot be read ({reason}): {remedy}")

@@ -33,7 +33,7 @@ import numpy as np
 import pyarrow as pa
 
 from cuelearner_jax import spaces
-from cuelearner_jax.errors import UserError, listed
+from cuelearner_jax.errors import UserError, format_numbers
 from cuelearner_jax.spaces import Space
 from cuelearner_jax.storage import formats
 from cuelearner_jax.storage import table as tables
@@ -289,7 +289,7 @@ def for_lanes(file: LabelFile, seeds: np.ndarray, budgets: np.ndarray, slots: in
         chosen = np.flatnonzero(file.seeds == own)
         if own not in kept:
             raise UserError(
-                f"the label file has labels for the seeds {listed(kept.tolist())}, none for seed {seed}: "
+                f"the label file has labels for the seeds {format_numbers(kept.tolist())}, none for seed {seed}: "
                 "give --first-seed and --seeds (train: --seed) of these, or the labels of another run"
             )
         if len(chosen) < budget:

@@ -24,7 +24,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from jaxtyping import Float
 
-from cuelearner_jax.errors import UserError, shown
+from cuelearner_jax.errors import UserError, format_value
 from cuelearner_jax.storage.picture_files import Picture, inside
 from cuelearner_jax.storage.room import check_room, check_size
 
@@ -91,8 +91,8 @@ def _info(path: Path) -> dict[str, Any]:
         raise UserError(f"{file} is damaged: restore it from where the dataset came from") from error
     if version != VERSION:
         raise UserError(
-            f"{path} is a LeRobot dataset of the format {shown(version)}, {VERSION} is wanted: convert it by LeRobot's "
-            "own script first"
+            f"{path} is a LeRobot dataset of the format {format_value(version)}, {VERSION} is wanted: convert it by "
+            "LeRobot's own script first"
         )
     if not sound:
         raise UserError(f"{file} is damaged: restore it from where the dataset came from")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from cuelearner_jax.errors import UserError, shown
+from cuelearner_jax.errors import UserError, format_value
 
 KINDS = {
     ".png": "image/png",
@@ -32,7 +32,7 @@ def inside(folder: Path, name: str, what: str) -> Path:
     except (OSError, ValueError, RuntimeError):
         there = root
     if Path(name).is_absolute() or not there.is_relative_to(root) or there == root:
-        raise UserError(f"{what} {shown(name)} leads out of {folder}: give the name of a file in that folder")
+        raise UserError(f"{what} {format_value(name)} leads out of {folder}: give the name of a file in that folder")
     return there
 
 
@@ -50,11 +50,13 @@ class PictureFiles:
                 f"{table} has {len(names)} pictures for {rows} situations: give a name a row, or an empty one"
             )
         if wrong := next((name for name in names if name is not None and not isinstance(name, str)), None):
-            raise UserError(f"{table}: a picture is {shown(wrong)}: give the name of a file in the folder")
+            raise UserError(f"{table}: a picture is {format_value(wrong)}: give the name of a file in the folder")
         for name in {name for name in names if name is not None}:
             inside(self._folder, name, "picture")
             if Path(name).suffix.lower() not in KINDS:
-                raise UserError(f"picture {shown(name)} is of no kind that a page shows: give {', '.join(KINDS)}")
+                raise UserError(
+                    f"picture {format_value(name)} is of no kind that a page shows: give {', '.join(KINDS)}"
+                )
         self._names: list[str | None] = names
 
     def __call__(self, row: int) -> Picture | None:

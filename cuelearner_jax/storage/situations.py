@@ -29,7 +29,7 @@ import pyarrow.parquet as pq
 from jaxtyping import Float
 
 from cuelearner_jax.environment import Quantity
-from cuelearner_jax.errors import UserError, listed, shown
+from cuelearner_jax.errors import UserError, format_numbers, format_value
 from cuelearner_jax.storage import lerobot
 from cuelearner_jax.storage.picture_files import Picture, PictureFiles
 from cuelearner_jax.storage.room import check_room
@@ -95,7 +95,7 @@ def _whole(
             raise UserError(f"{path} holds no {name}s: record some situations first")
         if len(wrong := np.flatnonzero(~np.isfinite(rows).all(-1))):
             raise UserError(
-                f"{path}: {name}s of the rows {listed(wrong.tolist())} are not finite: leave these rows out"
+                f"{path}: {name}s of the rows {format_numbers(wrong.tolist())} are not finite: leave these rows out"
             )
     told = hashlib.sha256()
     for rows in (observations, actions):
@@ -212,7 +212,9 @@ def _numbers(table: Path, name: str, values: Any, axes: int) -> np.ndarray:
     except (TypeError, ValueError):
         sizes = {len(row) for row in values if isinstance(row, list | tuple)}
         why = (
-            f"rows of {listed(sizes)} entries" if len(sizes) > 1 else f"what is no number ({shown(values[0])[:60]} ...)"
+            f"rows of {format_numbers(sizes)} entries"
+            if len(sizes) > 1
+            else f"what is no number ({format_value(values[0])[:60]} ...)"
         )
         raise UserError(
             f"{table}: the column {name} holds {why}: give the same number of numbers in every row"

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from cuelearner_jax.errors import UserError, closest
+from cuelearner_jax.errors import UserError, suggestion
 
 LANE = ("seed", "labels", "step")  # columns that say which row it is
 
@@ -79,7 +79,7 @@ def check(name: str | None) -> None:
     if name is None:
         return
     if name not in TRACKERS:
-        raise UserError(f"unknown tracker {name!r}{closest(name, TRACKERS)}")
+        raise UserError(f"unknown tracker {name!r}{suggestion(name, TRACKERS)}")
     if find_spec(package := TRACKERS[name].package) is None:
         raise UserError(f"--track {name} needs {package}: pip install {package}")
 

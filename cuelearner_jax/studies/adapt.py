@@ -18,18 +18,18 @@ import jax.numpy as jnp
 import numpy as np
 
 from cuelearner_jax import user_code
-from cuelearner_jax.adaptation import adapting, calibrated, changes, judging, stored
-from cuelearner_jax.adaptation.adapting import Adapted
-from cuelearner_jax.adaptation.calibrated import Calibrating
+from cuelearner_jax.adaptation import by_calibration, by_model, changes, judging, serialization
+from cuelearner_jax.adaptation.by_calibration import Calibrating
+from cuelearner_jax.adaptation.by_model import AdaptationResult
 from cuelearner_jax.adaptation.judging import Judging
 from cuelearner_jax.adaptation.lanes import Adaptation, begin, one_each, product, side_by_side
 from cuelearner_jax.asking import label_slots
-from cuelearner_jax.calibration import Calibrated, declared
+from cuelearner_jax.calibration import Calibrated, declared_distortions
 from cuelearner_jax.config import GuideSizes, Scalars, check_guide, check_part
 from cuelearner_jax.environment import Environment, actions_of, spaces_of
-from cuelearner_jax.errors import UserError, closest
-from cuelearner_jax.evaluate import Tell, untold
-from cuelearner_jax.feedback import given
+from cuelearner_jax.errors import UserError, suggestion
+from cuelearner_jax.evaluate import Tell, ignore_progress
+from cuelearner_jax.feedback import external_labels
 from cuelearner_jax.feedback.answers import check_teacher
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.guides.base import Guide
@@ -101,7 +101,7 @@ class AdaptRequest(Generic[TaskT, KindsT]):
     judge_bounds: tuple[float, ...] = ()
     """Also try the model within these shares of its bound (0.5 0.25), and use it within what is worth most on the
     tuning episodes."""
-    sizes: GuideSizes = adapting.SIZES
+    sizes: GuideSizes = by_model.SIZES
     scalars: Scalars = field(default_factory=Scalars)
     kinds: KindsT = field(default_factory=dict)  # pyright: ignore[reportAssignmentType]
     """Options of kinds by their names, as a run's."""
@@ -123,7 +123,7 @@ class Subject(NamedTuple):
 class AdaptedStudy(NamedTuple):
     """What an adaptation has led to, and from what."""
 
-    found: Adapted
+    found: AdaptationResult
     subject: Subject
     request: AdaptRequest
     origin: dict[str, Any]  # what was adapted, in plain values
@@ -167,15 +167,15 @@ def suggested(
             rules = replace(rules, bound_deg=None, judge_by=None, judge_bounds=())
     if judge_by == judging.LABELS:
         rules = replace(rules, judge_bounds=())  # which are tried on episodes
-    labels = (calibrated.USUAL,) if kind.by_evidence else AdaptRequest.labels
+    labels = (by_calibration.USUAL,) if kind.by_evidence else AdaptRequest.labels
     if labels_from is not None:
         file = label_files.read(labels_from)
         eps_deg = file.eps if eps_deg is None else eps_deg
         labels = (file.budget,)
-    frame, settling = {"frame": source.config.sizes.frame}, adapting.settling
+    frame, settling = {"frame": source.config.sizes.frame}, by_model.settling
     if kind.by_evidence:
-        frame, settling = {}, calibrated.settling
-    sizes = sizes or replace(adapting.SIZES, **{**frame, **rules.sizes})
+        frame, settling = {}, by_calibration.settling
+    sizes = sizes or replace(by_model.SIZES, **{**frame, **rules.sizes})
     if scalars is None:
         eps_deg = rules.eps_deg if eps_deg is None else eps_deg
         scalars = replace(settling(source.config.scalars, eps_deg), **rules.scalars)
@@ -186,7 +186,7 @@ def suggested(
     by = judging.LABELS if kind.by_evidence else source.task.judge_by(source.config.task)
     own = source.config.kinds.get(kind.name) or (kind.config and kind.config())
     return AdaptRequest(
-        task=rules.applied(source.config.task),
+        task=rules.apply(source.config.task),
         labels=labels,
         bound_deg=() if rules.bound_deg is None else (rules.bound_deg,),
         guidance=guidance or rules.guidance or AdaptRequest.guidance,
@@ -201,14 +201,14 @@ def suggested(
 
 
 def reads_evidence(request: AdaptRequest[Any, Any]) -> bool:
-    """Return whether answers are read as evidence of what changed, see `calibrated`."""
+    """Return whether answers are read as evidence of what changed, see `by_calibration`."""
     return guidances.resolve(request.guidance).by_evidence
 
 
 def run(
     subject: Subject,
     request: AdaptRequest,
-    watch: Callable[[str], Tell] = lambda what: untold,
+    watch: Callable[[str], Tell] = lambda what: ignore_progress,
     note: Callable[[str], None] = console.print,
 ) -> AdaptedStudy:
     """Check a request and adapt; nothing is written. Raises UserError for what makes no sense, or cannot be adapted.
@@ -223,7 +223,7 @@ def run(
     if subject.changes is not None and not kind.by_evidence:
         raise UserError(f"changes is given, but guidance {kind.name!r} knows none: give guidance calibration")
     if kind.by_evidence:
-        calibrated.check_unused(sizes, scalars, bound_deg=request.bound_deg, judge_bounds=request.judge_bounds)
+        by_calibration.check_unused(sizes, scalars, bound_deg=request.bound_deg, judge_bounds=request.judge_bounds)
     env = task.environment(request.task)
     for name, options in request.kinds.items():
         check_part(options, name)
@@ -234,7 +234,7 @@ def run(
         raise UserError("several base policies are adapted each with its own seed: leave out --seeds and --first-seed")
     seeds = seeds_of(request.first_seed, request.seeds) if shared else seeds
     rows, request = _rows(subject, request, guidance, env, bases, seeds)
-    if not kind.by_evidence and (note_of := adapting.check_amounts(actions_of(env), request.bound_deg, scalars)):
+    if not kind.by_evidence and (note_of := by_model.check_amounts(actions_of(env), request.bound_deg, scalars)):
         note(note_of)
     varied = seeds, request.labels, request.bound_deg
     lanes = product(1, *varied) if shared else one_each(*varied)
@@ -249,13 +249,13 @@ def run(
     if kind.by_evidence:
         of = Calibrating(guidance, sizes, scalars, env, bases, *_family(subject, request, kind.name, env))
         if kept:
-            stored.to_json(Calibrated(bases, jnp.zeros((lanes.number, 0)), (), of.named))
-        found = calibrated.adapt(of, lanes, how, teacher, rows, watch)
+            serialization.to_json(Calibrated(bases, jnp.zeros((lanes.number, 0)), (), of.named))
+        found = by_calibration.adapt(of, lanes, how, teacher, rows, watch)
     else:
         of = Adaptation(guidance, sizes, scalars, env, bases)
         if kept:
-            stored.to_json(of.policy(begin(of, lanes)))
-        found = adapting.adapt(of, lanes, how, teacher, rows, watch=watch)
+            serialization.to_json(of.policy(begin(of, lanes)))
+        found = by_model.adapt(of, lanes, how, teacher, rows, watch=watch)
     return AdaptedStudy(found, subject, request, origin)
 
 
@@ -264,7 +264,7 @@ def _family(subject: Subject, request: AdaptRequest, kind: str, env: Environment
     options = request.kinds.get(kind)
     asked = {} if options is None else dataclasses.asdict(options)
     if subject.changes is None:
-        return declared(env, **asked), ""
+        return declared_distortions(env, **asked), ""
     if given := [name for name, value in asked.items() if value]:
         raise UserError(f"{kind}.{given[0]} is about changes that the world declares: leave it out beside changes")
     family = changes.family_of(subject.changes, env)
@@ -306,25 +306,25 @@ def _rows(
     grid = Grid((guidance.name,), seeds, request.labels)
     check_grid(grid, adapts=True)
     if guidance.kind.by_evidence:
-        if (least := min(request.labels)) < calibrated.LEAST:
-            raise UserError(f"labels is {least}: give at least {calibrated.LEAST}, of which some are held out")
+        if (least := min(request.labels)) < by_calibration.LEAST:
+            raise UserError(f"labels is {least}: give at least {by_calibration.LEAST}, of which some are held out")
         request = replace(request, bound_deg=(space.reach,))  # there is none
     file, form = None, guidance.form
     assert form is not None  # it asks
     if path is not None:
         file = read_labels(path, task, request.task, request.sizes, request.scalars, grid)
     elif rows is not None:
-        given.check(rows, spaces_of(env), form)
+        external_labels.check(rows, spaces_of(env), form)
         request = replace(request, labels=(len(rows.obs),))
         eps = request.scalars.eps_deg if form.by_eps else None
         file = label_files.LabelFile({}, form.name, space, eps, np.full(len(rows.obs), seeds[0]), rows)
     if request.bound_deg:
         return file, request
-    widest = adapting.usual_bound(space)
+    widest = by_model.usual_bound(space)
     if file is not None:
         if lanes_in(bases) is not None:
             raise UserError("labels of several base policies reach differently far: give --bound-deg")
-        reach = adapting.reach(space, bases.policy, file.labels.obs, file.labels.action)
+        reach = by_model.reach(space, bases.policy, file.labels.obs, file.labels.action)
         widest = max(reach, request.scalars.eps_deg)
     return file, replace(request, bound_deg=(widest,))
 
@@ -339,7 +339,7 @@ def _judging(task: Task, request: AdaptRequest, env: Environment) -> Judging:
     judging.check_bounds(request.judge_bounds, by)
     known = [*judging.metrics_of(env), judging.LABELS]
     if by not in known:
-        raise UserError(f"judge_by is {by!r}, no metric of {task.name}{closest(by, known)}")
+        raise UserError(f"judge_by is {by!r}, no metric of {task.name}{suggestion(by, known)}")
     steps = task.longest(request.task) if task.longest else judging.STEPS
     plays = by != judging.LABELS or request.judge_every
     tuned = task.environment(request.task, "tuning") if plays else None
@@ -357,10 +357,10 @@ def _worth(difference: np.ndarray, steps: np.ndarray) -> str:
     return f"difference {estimate:+.3g} [{lower:+.3g}, {upper:+.3g}]{zero}; {told}"
 
 
-def sentences(found: Adapted) -> list[str]:
+def sentences(found: AdaptationResult) -> list[str]:
     """What adaptation has led to, a line for each budget and bound."""
     if found.results:
-        return calibrated.sentences(found)
+        return by_calibration.sentences(found)
     lanes, judged, lines = found.lanes, found.judged, []
     unit = actions_of(found.of.env).unit
     for bound, budget in sorted({*zip(lanes.bound_deg.tolist(), lanes.budget.tolist(), strict=True)}):

@@ -16,8 +16,8 @@ from jaxtyping import Float
 from cuelearner_jax import user_code
 from cuelearner_jax.evaluate import mean_interval
 from cuelearner_jax.feedback.answers import relative_feedback
-from cuelearner_jax.policies import named
-from cuelearner_jax.spaces import Space, said
+from cuelearner_jax.policies import policy_name
+from cuelearner_jax.spaces import Space, is_answered
 from cuelearner_jax.types import Label
 
 Share = tuple[float, float, float]  # and the ends of its 95% interval
@@ -61,7 +61,9 @@ def agreement(policy: Any, rows: Label, space: Space, eps: float, base: Any = No
     Raises:
         UserError: a policy gives something else than actions.
     """
-    told = np.asarray(said(jnp.asarray(rows.answer))) if len(space.cues) > 1 else np.ones(rows.answer.shape, bool)
+    told = (
+        np.asarray(is_answered(jnp.asarray(rows.answer))) if len(space.cues) > 1 else np.ones(rows.answer.shape, bool)
+    )
     count = np.maximum(told.sum(-1), 1)
     share = lambda agreed: (agreed & told).sum(-1) / count  # noqa: E731
     own = share(_says(policy, rows, space, eps) == rows.answer)
@@ -86,5 +88,5 @@ def _says(policy: Any, rows: Label, space: Space, eps: float) -> Float[np.ndarra
         return own, jax.vmap(lambda asked, own: relative_feedback(space, asked, own, strength))(action, own)
 
     own, found = answered(policy, jnp.asarray(rows.obs), jnp.asarray(rows.action))
-    user_code.check_actions(own, named(policy))
+    user_code.check_actions(own, policy_name(policy))
     return np.asarray(found)

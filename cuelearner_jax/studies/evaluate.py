@@ -10,7 +10,7 @@ import numpy as np
 
 from cuelearner_jax.environment import actions_of, view_of
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.evaluate import Tell, episodes, part_of, untold, watched_lanes
+from cuelearner_jax.evaluate import Tell, episodes, ignore_progress, part_of, rollout_lanes
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.policies import Common, lanes_in
 from cuelearner_jax.runs.trained import POLICIES, Block, PolicySource, blocks_of, make
@@ -89,7 +89,7 @@ def amount(task: Task, asked: EvaluateRequest[Any]) -> tuple[int, int]:
 def run(
     source: PolicySource,
     asked: EvaluateRequest[Any],
-    watch: Callable[[str], Tell] = lambda kind: untold,
+    watch: Callable[[str], Tell] = lambda kind: ignore_progress,
     policy: Any = None,
 ) -> list[Measured]:
     """Metrics of a policy on validation episodes of a world, for each guidance and budget.
@@ -114,7 +114,7 @@ def run(
         none = np.zeros(1, int)
         blocks = [Block("-", none, none, none, 0, Common(policy), none > 0)]
     else:
-        blocks = blocks_of(source, name, view_of(env), teacher, tuple(map(guidances.named, asked.guidance)))
+        blocks = blocks_of(source, name, view_of(env), teacher, tuple(map(guidances.kind_name, asked.guidance)))
     rows, unit = [], actions_of(env).unit.replace("degrees", "deg")
     for block in blocks:
         count, is_shared = len(block.seeds), lanes_in(block.policy) is None
@@ -125,7 +125,7 @@ def run(
             each = {metric: np.stack([np.asarray(lane[metric], float) for lane in lanes]) for metric in lanes[0]}
             means = {metric: values.mean(-1) for metric, values in each.items()}
         else:
-            means, each, _ = watched_lanes(env, block.policy, key, num_envs, steps, tell)
+            means, each, _ = rollout_lanes(env, block.policy, key, num_envs, steps, tell)
         place = np.zeros(count, int) if is_shared and not engine else np.arange(count)  # of each lane's row
         for bound, budget in sorted(set(zip(block.bounds.tolist(), block.budgets.tolist(), strict=True))):
             own = (block.budgets == budget) & (block.bounds == bound)

@@ -12,7 +12,7 @@ from cuelearner_envs.arm import config as arm
 from cuelearner_envs.arm.config import SIDES, ArmConfig
 from cuelearner_envs.arm.environment import ACTIONS
 from cuelearner_envs.arm.places import BASE
-from cuelearner_jax.adaptation.adapting import plain_scalars
+from cuelearner_jax.adaptation.by_model import plain_scalars
 from cuelearner_jax.agents import sac
 from cuelearner_jax.arbiters import paced
 from cuelearner_jax.config import Schedule, Sizes

@@ -12,7 +12,7 @@ import jax
 
 from cuelearner_envs.bounds import check_word
 from cuelearner_jax.bridges.jax_environment import JaxEnvironment, Layout
-from cuelearner_jax.errors import UserError, closest
+from cuelearner_jax.errors import UserError, suggestion
 from cuelearner_jax.task import Body, Task
 from cuelearner_jax.tasks.simulators import SimulatorConfig, check_layout, described, environment_of, pictures, presets
 
@@ -49,7 +49,7 @@ def _made(name: str, backend: str) -> Any:
 
     known: dict[str, Any] = envs._envs  # brax lists its environments nowhere else
     if name not in known:
-        raise UserError(f"brax has no environment {name!r}{closest(name, known)}")
+        raise UserError(f"brax has no environment {name!r}{suggestion(name, known)}")
     with warnings.catch_warnings(), jax.ensure_compile_time_eval():  # it holds arrays, and something may be traced
         warnings.filterwarnings("ignore", message="Brax System")  # that brax is not being developed any more
         return envs.get_environment(name, backend=backend)

@@ -18,17 +18,17 @@ from typing import Any
 
 from cuelearner_envs.bounds import MOST_STEPS, check_number
 from cuelearner_jax import plugins
-from cuelearner_jax.adaptation.adapting import plain_scalars
+from cuelearner_jax.adaptation.by_model import plain_scalars
 from cuelearner_jax.agents import ddqn
 from cuelearner_jax.arbiters import paced
 from cuelearner_jax.bridges.gymnasium.environment import SUCCESS, GymnasiumTask
 from cuelearner_jax.bridges.gymnasium.instances import SUCCESS as TELLS
 from cuelearner_jax.bridges.gymnasium.instances import Running
 from cuelearner_jax.bridges.gymnasium.layout import Actions, actions_of
-from cuelearner_jax.bridges.gymnasium.source import Source, check_installed, known
+from cuelearner_jax.bridges.gymnasium.source import Source, check_installed, registry_spec
 from cuelearner_jax.config import Schedule, Sizes
 from cuelearner_jax.environment import Quantity
-from cuelearner_jax.errors import UserError, raised_by, shown
+from cuelearner_jax.errors import UserError, format_value, user_code_error
 from cuelearner_jax.plugins import REFERENCE
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.spaces import Box, Choices, Space, cues_from
@@ -86,8 +86,9 @@ class GymnasiumConfig:
         rows = self.slices, self.slice_sizes, self.units, self.slice_kinds
         if not self.slices or len({len(row) for row in rows}) > 1 or not all(size > 0 for size in self.slice_sizes):
             raise UserError(
-                f"task.slices is {shown(self.slices)} of task.slice_sizes {shown(self.slice_sizes)}: give a name, a "
-                f"size, a unit and a kind for each slice, or name the task {FAMILY}:ENVIRONMENT, which fills them"
+                f"task.slices is {format_value(self.slices)} of task.slice_sizes {format_value(self.slice_sizes)}: "
+                f"give a name, a size, a unit and a kind for each slice, or name the task {FAMILY}:ENVIRONMENT, which fills "
+                "them"
             )
         known = {quantity.name: quantity.about for quantity in fetch_layout.layout_of(self.environment) or ()}
         return tuple(
@@ -105,8 +106,8 @@ def space_of(actions: Actions, cues: Sequence[str] = (), cue_names: Sequence[str
     if actions.choices:
         if cues:
             raise UserError(
-                f"cues is {shown(tuple(cues))}, but actions are choices without an order: leave it out, and choose a "
-                "guidance without relative answers"
+                f"cues is {format_value(tuple(cues))}, but actions are choices without an order: leave it out, and "
+                "choose a guidance without relative answers"
             )
         return Choices(actions.choices)
     if cues and len(cues) != actions.size:
@@ -161,7 +162,7 @@ def _arguments(text: str) -> dict[str, Any]:
         found = None
     if not isinstance(found, dict):
         raise UserError(
-            f"task.arguments is {shown(text)}: give arguments by name as JSON, such as " + "'{\"size\": 3}'"
+            f"task.arguments is {format_value(text)}: give arguments by name as JSON, such as " + "'{\"size\": 3}'"
         )
     return found
 
@@ -234,11 +235,12 @@ def task_from(
     factory = None if isinstance(given, str) else given
     if factory is not None and not callable(factory):
         raise UserError(
-            f"env is {shown(given)}: give an id of Gymnasium's registry, or a class or function that gives environments"
+            f"env is {format_value(given)}: give an id of Gymnasium's registry, or a class or function that "
+            "gives environments"
         )
     name = given if isinstance(given, str) else called or _called(given)
     if factory is None and not max_steps:
-        max_steps = known(name).max_episode_steps
+        max_steps = registry_spec(name).max_episode_steps
     text = _kept(name, arguments or {})
     source = Source(name, text, max_steps or 0, 1, factory=factory)
     actions, slices, limit, succeeds = _seen(source)
@@ -307,7 +309,7 @@ def _seen(source: Source) -> tuple[Actions, list[Quantity], int, bool]:
     except UserError:
         raise
     except Exception as error:
-        raise raised_by(f"{whose}, while it was made,", error) from error
+        raise user_code_error(f"{whose}, while it was made,", error) from error
     try:
         actions = actions_of(whose, env.action_space)
         one = Running(env, source.name)
@@ -326,7 +328,7 @@ def _seen(source: Source) -> tuple[Actions, list[Quantity], int, bool]:
     except UserError:
         raise
     except Exception as error:
-        raise raised_by(f"{whose}, {when}", error) from error
+        raise user_code_error(f"{whose}, {when}", error) from error
     finally:
         env.close()
     return actions, slices, limit, succeeds
@@ -351,7 +353,7 @@ def _named(
             total = sum(quantity.size for quantity in found)
         except TypeError as error:
             raise UserError(
-                f'observation is {shown(given)}: give (name, entries, unit) for each slice, as ("goal", 3, "m")'
+                f'observation is {format_value(given)}: give (name, entries, unit) for each slice, as ("goal", 3, "m")'
             ) from error
         wanted = sum(quantity.size for quantity in slices)
         if total != wanted:

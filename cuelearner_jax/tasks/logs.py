@@ -24,11 +24,11 @@ from flax import struct
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from cuelearner_jax import pictures
-from cuelearner_jax.adaptation.adapting import plain_scalars
+from cuelearner_jax.adaptation.by_model import plain_scalars
 from cuelearner_jax.adaptation.judging import LABELS
 from cuelearner_jax.config import Sizes
 from cuelearner_jax.environment import Features, Quantity, WholeObservations
-from cuelearner_jax.errors import UserError, closest
+from cuelearner_jax.errors import UserError, suggestion
 from cuelearner_jax.guides.relative import KIND
 from cuelearner_jax.policies import PolicyNode
 from cuelearner_jax.run_config import RunConfig
@@ -196,7 +196,7 @@ def task_of(
     centre, spread = scales_of(found.observations)
     for name, value, kind in (("actions", actions, Actions), ("order", order, Order)):
         if value not in get_args(kind):
-            raise UserError(f"{name} is {value!r}{closest(value, get_args(kind))}")
+            raise UserError(f"{name} is {value!r}{suggestion(value, get_args(kind))}")
     size = found.actions.shape[1]
     if actions == "box":
         bounds = bounds_of(found.actions, low, high, found.entries, note)

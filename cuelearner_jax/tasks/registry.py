@@ -12,7 +12,7 @@ from importlib.metadata import EntryPoint, entry_points
 from typing import TYPE_CHECKING, Any
 
 from cuelearner_jax import plugins
-from cuelearner_jax.errors import UserError, closest
+from cuelearner_jax.errors import UserError, suggestion
 
 if TYPE_CHECKING:
     from cuelearner_jax.task import Task
@@ -53,7 +53,7 @@ def find(name: str) -> Task:
     installed = _installed()
     if name not in installed:
         raise UserError(
-            f"unknown task {name!r}{closest(name, names())} (one of your own is named as package.module:NAME)"
+            f"unknown task {name!r}{suggestion(name, names())} (one of your own is named as package.module:NAME)"
         )
     task = _loaded(installed[name].value)
     if task.name != name:

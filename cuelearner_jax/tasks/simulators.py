@@ -9,12 +9,12 @@ from typing import Any
 import jax.numpy as jnp
 
 from cuelearner_envs.bounds import MOST_STEPS, check_number
-from cuelearner_jax.adaptation.adapting import plain_scalars
+from cuelearner_jax.adaptation.by_model import plain_scalars
 from cuelearner_jax.agents import ddqn
 from cuelearner_jax.arbiters import paced
 from cuelearner_jax.bridges.jax_environment import JaxEnvironment, Layout, layout_of
 from cuelearner_jax.config import Schedule, Sizes
-from cuelearner_jax.errors import UserError, shown
+from cuelearner_jax.errors import UserError, format_value
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.task import Pictures, Preset
 
@@ -50,13 +50,13 @@ def environment_of(family: str, config: SimulatorConfig, simulator: Callable[[],
     """
     check_number("max_steps", config.max_steps, 1, MOST_STEPS, whole=True)
     if not isinstance(config.environment, str) or not config.environment:
-        raise UserError(f"task.environment is {shown(config.environment)}: name the task {family}:ENVIRONMENT")
+        raise UserError(f"task.environment is {format_value(config.environment)}: name the task {family}:ENVIRONMENT")
     layout = config.layout
     _check_row("slices", layout.slices, str)
     _check_row("slice_sizes", layout.sizes, int)
     _check_row("entries", layout.entries, str)
     if len(layout.sizes) != len(layout.slices):
-        raise UserError(f"task.slice_sizes is {shown(layout.sizes)}: give a number for each of task.slices")
+        raise UserError(f"task.slice_sizes is {format_value(layout.sizes)}: give a number for each of task.slices")
     return JaxEnvironment(
         max_steps=jnp.array(config.max_steps, jnp.int32),
         simulator=simulator,
@@ -72,7 +72,7 @@ def _check_row(name: str, values: Any, kind: type) -> None:
     row = isinstance(values, tuple) and len(values) > 0
     if not row or not all(type(value) is kind and value and (kind is str or value > 0) for value in values):
         what = "names" if kind is str else "whole numbers above 0"
-        raise UserError(f"task.{name} is {shown(values)}: give {what}, or name the task FAMILY:ENVIRONMENT")
+        raise UserError(f"task.{name} is {format_value(values)}: give {what}, or name the task FAMILY:ENVIRONMENT")
 
 
 def pictures() -> Pictures:

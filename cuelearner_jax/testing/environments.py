@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, PRNGKeyArray
 
 from cuelearner_jax.environment import Aims, Environment, Quantity, actions_of, offers, symmetries_of
-from cuelearner_jax.testing.laws import Laws, OnceTraced, changed, pytree
+from cuelearner_jax.testing.laws import Laws, OnceTraced, change_floats, pytree
 from cuelearner_jax.types import Step
 
 COMPARED = 8  # steps of the roll-out that are taken again in one batch, and actions that features are asked about
@@ -53,7 +53,7 @@ def check_environment(env: Any, steps: int = 64, key: PRNGKeyArray | None = None
     with laws.attempted("a compiled roll-out", mend):
         walk = jax.device_get(walked(env, key))
         again = jax.device_get(walked(env, key))
-        walked(changed(env), key)
+        walked(change_floats(env), key)
     exact = Laws(laws.subject, 0.0)
     laws.hold(exact.same(walk, again), "the same key gives another roll-out: draw all random numbers from the key")
     laws.hold(

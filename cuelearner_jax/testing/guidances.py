@@ -16,7 +16,7 @@ from cuelearner_jax.config import GuideScalars, GuideSizes, Scalars
 from cuelearner_jax.environment import Environment, actions_of, offers, spaces_of
 from cuelearner_jax.feedback.forms import AnswerForm
 from cuelearner_jax.guides.base import Guide, Kind
-from cuelearner_jax.testing.laws import Laws, OnceTraced, changed
+from cuelearner_jax.testing.laws import Laws, OnceTraced, change_floats
 from cuelearner_jax.types import EnvState, GuidanceModel, Label
 
 SMALL = GuideSizes(feedback_layers=(8, 8), labels_per_round=4, fit_steps=8, fit_batch_size=4, validate_every=4)
@@ -124,7 +124,7 @@ def _check_act(
     scalars = GuideScalars()
     with laws.attempted("`act` under jit", "it gets a batch of rows and returns Refined(actions, passes)"):
         refined = act(fitted, env, obs, actions, active, scalars)
-        act(fitted, env, obs, actions, active, changed(scalars))
+        act(fitted, env, obs, actions, active, change_floats(scalars))
         passes = refined.passes
     laws.hold(act.traces == 1, "`act` is traced anew for other scalars: no Python branch may look at them")
     laws.hold(refined.actions.shape == actions.shape, f"`act` returns actions of shape {refined.actions.shape}")

@@ -96,7 +96,7 @@ def pytree(laws: Laws, subject: Any, called: str) -> None:
         laws.hold(tree == again, f"{called} differs from itself: static fields must compare equal to themselves")
 
 
-def changed(tree: Any) -> Any:
+def change_floats(tree: Any) -> Any:
     """The same with another value of every float: what a changed world is to a compiled program."""
 
     def other(leaf: Any) -> Any:

@@ -10,7 +10,7 @@ import numpy as np
 
 from cuelearner_jax.environment import Environment, actions_of
 from cuelearner_jax.policies import BY_LANE, SHARED
-from cuelearner_jax.testing.laws import Laws, OnceTraced, changed, pytree
+from cuelearner_jax.testing.laws import Laws, OnceTraced, change_floats, pytree
 
 ROWS = 9
 
@@ -39,7 +39,7 @@ def check_policy(policy: Any, env: Environment, tolerance: float = 1e-5) -> None
         actions = act(policy, keys[0], states, obs)
         other = act(policy, keys[1], states, obs)
         again = act(policy, keys[0], states, obs)
-        act(changed(policy), keys[0], states, obs)
+        act(change_floats(policy), keys[0], states, obs)
     laws.hold(act.traces == 1, "other values of its floats are traced anew: keep them out of static fields")
     size = actions_of(env).size
     shape = np.shape(actions)

@@ -80,7 +80,7 @@ def _check_splits(laws: Laws, task: Task, config: Any, name: str) -> None:
 
 def _check_scenarios(laws: Laws, task: Task, config: Any, obs_size: int) -> None:
     for name, scenario in task.scenarios.items():
-        world = _shapes(laws, task, scenario.applied(config), f"scenario {name!r}")
+        world = _shapes(laws, task, scenario.apply(config), f"scenario {name!r}")
         laws.hold(
             world.obs_size == obs_size,
             f"scenario {name!r} has observations of {world.obs_size} entries, not {obs_size}: policies must act in it",

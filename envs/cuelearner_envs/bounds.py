@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from cuelearner_jax.errors import UserError, closest, shown
+from cuelearner_jax.errors import UserError, format_value, suggestion
 
 MOST_STEPS = 1_000_000  # of an episode: counters are of 32 bits
 MOST_SEED = 2**32 - 1  # of a key
@@ -43,19 +43,19 @@ def check_number(
     told = f"a {'whole' if whole else 'positive' if positive else 'finite'} number"
     told += f" from {_digits(least)}" if least > -math.inf else ""
     told += f" up to {_digits(most)}" if most < math.inf else ""
-    raise UserError(f"task.{name} is {shown(value)}: give {told}{f' ({unit})' if unit else ''}")
+    raise UserError(f"task.{name} is {format_value(value)}: give {told}{f' ({unit})' if unit else ''}")
 
 
 def check_word(name: str, value: Any, known: Iterable[str]) -> None:
     """Raises UserError unless a field holds one of the words that it can."""
     if not isinstance(value, str) or value not in tuple(known):
-        raise UserError(f"task.{name} is {shown(value)}{closest(str(value), known)}")
+        raise UserError(f"task.{name} is {format_value(value)}{suggestion(str(value), known)}")
 
 
 def check_vector(name: str, value: Any, size: int, least: float, most: float, unit: str = "") -> None:
     """The same of a field that holds `size` numbers."""
     if not isinstance(value, (tuple, list)) or len(value) != size:
-        raise UserError(f"task.{name} is {shown(value)}: give {size} numbers")
+        raise UserError(f"task.{name} is {format_value(value)}: give {size} numbers")
     for entry in value:
         check_number(name, entry, least, most, unit=unit)
 

@@ -10,7 +10,7 @@ import numpy as np
 import probes
 import pytest
 
-from cuelearner_jax.adaptation import adapting, judging
+from cuelearner_jax.adaptation import by_model, judging
 from cuelearner_jax.adaptation.judging import Judging
 from cuelearner_jax.adaptation.lanes import Adaptation, Lanes, ask_round, begin, one_each, product, rounds, side_by_side
 from cuelearner_jax.config import GuideSizes
@@ -57,7 +57,7 @@ def of(bases=BASES):
 @cache
 def found():
     """All lanes, measured on the way."""
-    return adapting.adapt(of(), LANES, dataclasses.replace(JUDGING, every=10), EXPERT, mesh=MESH)
+    return by_model.adapt(of(), LANES, dataclasses.replace(JUDGING, every=10), EXPERT, mesh=MESH)
 
 
 def degrees(turn):
@@ -152,7 +152,7 @@ def test_the_curve_says_what_policies_were_worth_on_the_way():
 
 def test_given_labels_lead_where_asking_for_them_did():
     labels = found().labels
-    given = adapting.adapt(of(), LANES, JUDGING, labels=labels, mesh=MESH)
+    given = by_model.adapt(of(), LANES, JUDGING, labels=labels, mesh=MESH)
     chex.assert_trees_all_equal(given.block.guide.model, found().block.guide.model)
     np.testing.assert_array_equal(given.judged.after, found().judged.after)
 
@@ -173,7 +173,7 @@ def test_without_a_simulator_held_out_answers_decide():
     chance = np.random.default_rng(1).choice([-1.0, 0.0, 0.0, 0.0, 1.0], (1, 40, 1)).astype(np.float32)
     noise = one.replace(answer=chance)
     both = jax.tree.map(lambda *leaves: np.concatenate(leaves), one, noise)
-    judged = adapting.adapt(of(base), lanes, how, labels=both, mesh=MESH).judged
+    judged = by_model.adapt(of(base), lanes, how, labels=both, mesh=MESH).judged
     assert judged.by == "labels"
     assert judged.rewarded_steps.tolist() == [0, 0]
     assert (judged.before[0], judged.after[0], judged.used[0]) == (0.0, 1.0, True)
@@ -190,7 +190,7 @@ def test_a_bound_is_narrowed_where_that_is_worth_more():
     lanes = product(1, (0,), (40,), (60.0,))
     base = Common(Shifted(jnp.array(0.0)))
     wide, narrow = (
-        adapting.adapt(of(base), lanes, dataclasses.replace(JUDGING, bounds=shares), labels=own_labels(0.0, 40))
+        by_model.adapt(of(base), lanes, dataclasses.replace(JUDGING, bounds=shares), labels=own_labels(0.0, 40))
         for shares in ((), (0.5, 0.05))
     )
     assert (wide.judged.before[0], wide.judged.after[0], wide.judged.used[0]) == (1.0, 0.0, False)
@@ -247,13 +247,13 @@ def test_what_is_a_policy():
 )
 def test_angles_that_do_not_go_together_are_refused(bounds, changes, says):
     with pytest.raises(UserError, match=says):
-        adapting.check_amounts(DIRECTIONS, bounds, dataclasses.replace(SCALARS, **changes))
+        by_model.check_amounts(DIRECTIONS, bounds, dataclasses.replace(SCALARS, **changes))
 
 
 def test_defaults_go_together():
     for eps in (0.1, 2.0, 20.0):
-        scalars = adapting.settling(probes.SCALARS, eps)
+        scalars = by_model.settling(probes.SCALARS, eps)
         assert scalars.tau_deg <= eps / 20
-        adapting.check_amounts(DIRECTIONS, [45.0], scalars)
-    assert "scalars.k_max 1800 would" in adapting.check_amounts(DIRECTIONS, [180.0], adapting.settling(SCALARS, 0.1))
+        by_model.check_amounts(DIRECTIONS, [45.0], scalars)
+    assert "scalars.k_max 1800 would" in by_model.check_amounts(DIRECTIONS, [180.0], by_model.settling(SCALARS, 0.1))
     assert judging.metrics_of(ENV) == ("reward", "hit")

@@ -10,7 +10,7 @@ import probes
 import pytest
 from box_task import GRIPPER, SCALARS, Reach
 
-from cuelearner_jax.adaptation import adapting, lanes
+from cuelearner_jax.adaptation import by_model, lanes
 from cuelearner_jax.adaptation.judging import Judging
 from cuelearner_jax.adaptation.lanes import Adaptation
 from cuelearner_jax.config import GuideSizes
@@ -40,7 +40,7 @@ def found():
     guidance = guidances.make("relative", SIZES, ENV)
     judging = Judging(ENV, num_envs=20, steps=40)
     asked = Adaptation(guidance, SIZES, scalars, ENV, lanes.side_by_side([Missing(MISS)]))
-    return adapting.adapt(asked, LANES, judging, probes.Expert(ENV), mesh=lane_mesh(jax.local_devices()[:1]))
+    return by_model.adapt(asked, LANES, judging, probes.Expert(ENV), mesh=lane_mesh(jax.local_devices()[:1]))
 
 
 def acted(lane):

@@ -12,7 +12,7 @@ import pytest
 from cuelearner_jax import run_config
 from cuelearner_jax.agents import choice as search
 from cuelearner_jax.agents import ddqn
-from cuelearner_jax.agents.networks import applied, q_network, widened
+from cuelearner_jax.agents.networks import as_function, q_network, widen_layers
 from cuelearner_jax.devices import Portions
 from cuelearner_jax.environment import Spaces
 from cuelearner_jax.errors import UserError
@@ -77,7 +77,7 @@ def test_a_first_look_in_bfloat16_gives_up_hardly_any_value():
     obs, params = jax.random.normal(jax.random.key(1), (64, 5)), agent()
     rough = dataclasses.replace(FULL, coarse_directions=60, coarse_dtype="bfloat16", peaks=4)
     found = chosen(rough, params, obs)
-    q = applied(q_network(LAYERS))
+    q = as_function(q_network(LAYERS))
     values = jax.vmap(lambda seen: q(params, seen, evenly_spaced(360))[:, 0])(obs)
     taken = jax.vmap(lambda seen, action: q(params, seen, action)[0])(obs, found)
     given_up = (values.max(1) - taken) / (values.max(1) - values.mean(1))
@@ -94,18 +94,21 @@ def test_actions_do_not_depend_on_how_many_states_are_searched_at_once(monkeypat
 
 def test_units_that_fill_up_a_layer_add_exactly_nothing():
     params, obs = agent(), jax.random.normal(jax.random.key(3), (5,))
-    wide, layers = widened(params, LAYERS, 16)
+    wide, layers = widen_layers(params, LAYERS, 16)
     assert layers == (32, 32, 32)
     chex.assert_shape(wide["params"]["Dense_1"]["kernel"], (32, 32))
     options = evenly_spaced(8)
-    before, after = applied(q_network(LAYERS))(params, obs, options), applied(q_network(layers))(wide, obs, options)
+    before, after = (
+        as_function(q_network(LAYERS))(params, obs, options),
+        as_function(q_network(layers))(wide, obs, options),
+    )
     np.testing.assert_allclose(after, before, rtol=1e-6, atol=1e-6)
 
 
 def test_values_are_counted_as_they_are_taken():
-    assert search.looked_at(360, 0, 8) == 360
+    assert search.values_per_choice(360, 0, 8) == 360
     # 36 at first, then 4 peaks of 2 * 9 neighbours and themselves.
-    assert search.looked_at(360, 36, 4) == 36 + 4 * 19
+    assert search.values_per_choice(360, 36, 4) == 36 + 4 * 19
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ import probes
 import pytest
 
 from cuelearner_jax import loop
-from cuelearner_jax.agents.networks import MLP, Joined, applied, q_network
+from cuelearner_jax.agents.networks import MLP, Joined, as_function, q_network
 from cuelearner_jax.agents.replay import Following, Memory, StoredStep, Transition, buffer_for, n_step_return
 from cuelearner_jax.environment import spaces_of
 from cuelearner_jax.errors import UserError
@@ -187,7 +187,7 @@ def learned(truncates, weight, polyak=LOOP.agent.polyak):
     agent = dataclasses.replace(LOOP.agent, n_step_weight=weight, polyak=polyak)
     state = probes.start(program(), [3], [0], env)
     _, state, _ = program().train(env, LOOP.settings._replace(agent=agent), loop.start_clock(), state, 1000)
-    q, params = applied(q_network(LOOP.agent.q_layers)), probes.lane(state.agent.params, 0)
+    q, params = as_function(q_network(LOOP.agent.q_layers)), probes.lane(state.agent.params, 0)
     return [np.asarray(q(params, env.observe(place), evenly_spaced(4)))[:, 0] for place in (0, 1)]
 
 

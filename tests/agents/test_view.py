@@ -27,13 +27,13 @@ class Turned(probes.Window):
 
 
 def test_raw_networks_see_what_there_is():
-    assert view.seen("raw", None, OBS, CHOSEN) == (OBS, CHOSEN)
+    assert view.network_inputs("raw", None, OBS, CHOSEN) == (OBS, CHOSEN)
     assert view.widths("raw", spaces_of(ENV)) == (2, 2)
     assert view.outward("raw", spaces_of(ENV), OBS, CHOSEN) is OBS
 
 
 def test_rows_are_seen_each_from_its_own_action():
-    own, turned = view.seen("action", ENV, OBS, CHOSEN)
+    own, turned = view.network_inputs("action", ENV, OBS, CHOSEN)
     for row in range(3):
         alone = ENV.features(OBS[row], CHOSEN[row])
         np.testing.assert_allclose(own[row], alone.own, atol=1e-6)

@@ -15,7 +15,7 @@ from cuelearner_jax.arbiters.protocol import Chooses, Finishes, Known, Outcome
 from cuelearner_jax.environment import spaces_of
 from cuelearner_jax.guides import registry
 from cuelearner_jax.guides.base import Candidates
-from cuelearner_jax.policies import Agent, describe, finished
+from cuelearner_jax.policies import Agent, describe, final
 from cuelearner_jax.runs import judging
 from cuelearner_jax.runs.grid import Grid
 from cuelearner_jax.runs.lanes import LaneGroup
@@ -193,7 +193,7 @@ def test_the_arm_that_validates_best_acts_and_says_so(trained):
     assert (first["arm"] != prior.OWN).all()
     np.testing.assert_array_equal(first["reward"], 1.0)
     policies = training.policies(ENV)
-    measured = evaluate.watched_lanes(ENV, policies, evaluate.episodes(), 10, 20).means
+    measured = evaluate.rollout_lanes(ENV, policies, evaluate.episodes(), 10, 20).means
     np.testing.assert_array_equal(measured["reward"], rows[-1]["reward"])
     described = describe(policies.lane(1))
     assert described["arm"] == prior.ARMS[int(rows[-1]["arm"][1])]
@@ -213,9 +213,7 @@ def test_of_arms_that_validate_alike_the_agent_acts():
 def test_another_arbiter_leaves_the_agent_alone():
     group = group_of("rule", probes.CONFIG)
     lane = group.start()[0]
-    policy = finished(
-        probes.CONFIG, group.guidance, ENV, 0, {"params": lane.agent.params, "guidance": lane.guide.model}
-    )
+    policy = final(probes.CONFIG, group.guidance, ENV, 0, {"params": lane.agent.params, "guidance": lane.guide.model})
     assert isinstance(policy, Agent)
     assert judging.judges_world(probes.CONFIG, lambda split: pytest.fail("made")) is None
 

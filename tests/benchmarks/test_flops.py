@@ -8,7 +8,7 @@ import pytest
 from _flops import forward, forward_and_backward, step_operations
 
 from cuelearner_jax.agents import ddqn
-from cuelearner_jax.agents.networks import applied, q_network
+from cuelearner_jax.agents.networks import as_function, q_network
 from cuelearner_jax.agents.replay import Transition
 from cuelearner_jax.config import Scalars
 from cuelearner_jax.environment import Spaces
@@ -19,7 +19,7 @@ from cuelearner_jax.tasks.billiards import BILLIARDS
 LAYERS, OBS = (64, 48), 10
 SPACES = Spaces(OBS, DIRECTIONS)
 WIDTHS = (OBS, DIRECTIONS.size)
-Q = applied(q_network(LAYERS))
+Q = as_function(q_network(LAYERS))
 
 
 def test_operations_are_those_counted_by_hand():

@@ -137,7 +137,7 @@ def test_fetch_reach_is_what_plain_gymnasium_plays():
         states, went = step(jax.random.split(jax.random.fold_in(KEY, number), 2), states, action)
         found.append(jax.device_get(went))
     for lane in range(2):
-        plain = source.made("FetchReach-v4", {}, 0)
+        plain = source.make_registered("FetchReach-v4", {}, 0)
         first, _ = plain.reset(seed=int(states.seed[lane]))
         flat = lambda given: np.concatenate([given[name] for name in ("achieved_goal", "desired_goal", "observation")])  # noqa: E731
         np.testing.assert_array_equal(obs[lane], flat(first).astype(np.float32))

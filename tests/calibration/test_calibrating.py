@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from known_worlds import BOX, Yard, aims, changed, grips, person, situations
 
-from cuelearner_jax.calibration.calibrating import CHANGED, UNCHANGED, UNEXPLAINED, Calibration, calibrate
-from cuelearner_jax.calibration.families import declared
+from cuelearner_jax.calibration.estimation import CHANGED, UNCHANGED, UNEXPLAINED, Calibration, calibrate
+from cuelearner_jax.calibration.families import declared_distortions
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.policies import policy_of
 from cuelearner_jax.spaces import DIRECTIONS, Choices, Space
@@ -15,7 +15,10 @@ from cuelearner_jax.spaces.directions import rotate
 
 EPS_DEG = 2.0
 # Once, so that programs are compiled once: shifted places, a turned lidar, a turned action.
-FAMILY, POLICY = tuple(one for one in declared(Yard()) if one.name != "wind: turn"), policy_of(jax.jit(aims))
+FAMILY, POLICY = (
+    tuple(one for one in declared_distortions(Yard()) if one.name != "wind: turn"),
+    policy_of(jax.jit(aims)),
+)
 TURN = FAMILY[-1:]
 EPS = float(np.deg2rad(EPS_DEG))
 TURNED = lambda obs: rotate(aims(obs), -jnp.deg2rad(30.0))  # noqa: E731
@@ -84,7 +87,7 @@ def test_a_change_outside_the_family_is_told_and_nothing_is_corrected():
 @pytest.mark.long
 def test_a_biased_teacher_is_told_from_a_change_of_the_world_where_that_is_asked_for():
     meant = lambda obs: rotate(SHIFTED(obs), jnp.deg2rad(8.0))  # noqa: E731
-    found = asked(meant, labels=80, family=(FAMILY[0], declared(Yard(), teacher_bias=True)[-1]))
+    found = asked(meant, labels=80, family=(FAMILY[0], declared_distortions(Yard(), teacher_bias=True)[-1]))
     assert found.changes == ("ball and 1 more: shift",)
     assert abs(estimates(found)["teacher: turn"].mean - 8) < 2
     assert missed(found, SHIFTED) < 2
@@ -94,7 +97,7 @@ def test_a_biased_teacher_is_told_from_a_change_of_the_world_where_that_is_asked
 def test_a_box_is_calibrated_cue_by_cue():
     eps = 0.05
     meant = lambda obs: BOX.exp(grips(obs), jnp.array([0.2, 0.0, -0.1]))  # noqa: E731
-    family = [one for one in declared(Yard(BOX)) if one.acts]
+    family = [one for one in declared_distortions(Yard(BOX)) if one.acts]
     found = calibrate(
         jax.jit(grips), family, situations, person(BOX, eps, meant), 60, jax.random.key(0), space=BOX, eps_deg=eps
     )

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from cuelearner_jax.calibration.calibrating import CHANGED, Calibration, calibrate
-from cuelearner_jax.calibration.families import declared
+from cuelearner_jax.calibration.estimation import CHANGED, Calibration, calibrate
+from cuelearner_jax.calibration.families import declared_distortions
 from cuelearner_jax.calibration.likelihood import log_chances
 from cuelearner_jax.config import Scalars
 from cuelearner_jax.environment import Quantity, WholeObservations
@@ -60,7 +60,14 @@ def asked(space, change, says, labels):
         return told
 
     found = calibrate(
-        policy, declared(Room(space)), situations, teacher, labels, jax.random.key(1), space=space, eps_deg=eps
+        policy,
+        declared_distortions(Room(space)),
+        situations,
+        teacher,
+        labels,
+        jax.random.key(1),
+        space=space,
+        eps_deg=eps,
     )
     obs = situations(jax.random.key(9), None, 100)[1]
     left = np.abs(space.log(found.policy.act(jax.random.key(0), None, obs), meant(obs))).mean()
@@ -102,7 +109,7 @@ def test_an_answer_is_as_likely_as_what_it_says_of_the_cues_it_speaks_of():
 
 def test_an_answer_that_says_nothing_is_no_answer():
     space = BOXES[3]
-    calibration = Calibration(jax.jit(partial(acts, space)), declared(Room(space)), space, 0.04)
+    calibration = Calibration(jax.jit(partial(acts, space)), declared_distortions(Room(space)), space, 0.04)
     obs = np.asarray(situations(jax.random.key(0), None, 5)[1])
     calibration.learn(obs, np.asarray(space.sample(jax.random.key(0), (5,))), np.full((5, 3), UNSAID))
     assert calibration.asked == 0

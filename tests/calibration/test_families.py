@@ -8,8 +8,16 @@ from known_worlds import BOX, STEP_DEG, Yard, aims, changed, grips, situations
 
 from cuelearner_envs.billiards.config import BilliardsConfig, make_environment
 from cuelearner_envs.navigation.environment import Navigation
-from cuelearner_jax.calibration.corrected import Calibrated
-from cuelearner_jax.calibration.families import Distortion, Unknown, acted, check_family, declared, seen, unknowns_of
+from cuelearner_jax.calibration.families import (
+    Distortion,
+    Unknown,
+    check_family,
+    declared_distortions,
+    undo_action,
+    undo_observation,
+    unknowns_of,
+)
+from cuelearner_jax.calibration.policy import Calibrated
 from cuelearner_jax.environment import OWN, Quantity
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.policies import policy_of
@@ -18,15 +26,18 @@ from cuelearner_jax.spaces.directions import from_angle, rotate
 
 
 def test_an_environment_declares_what_can_have_changed():
-    names = [distortion.name for distortion in declared(Yard())]
+    names = [distortion.name for distortion in declared_distortions(Yard())]
     assert names == ["ball and 1 more: shift", "lidar: turn", "wind: turn", "direction: change"]
-    units = [(unknown.name, unknown.unit) for unknown in unknowns_of(declared(make_environment(BilliardsConfig())))]
+    units = [
+        (unknown.name, unknown.unit)
+        for unknown in unknowns_of(declared_distortions(make_environment(BilliardsConfig())))
+    ]
     assert units == [
         ("cue ball: place and 3 more: shift x", "m"),
         ("cue ball: place and 3 more: shift y", "m"),
         ("direction: turn", "degrees"),
     ]
-    assert [distortion.name for distortion in declared(Navigation(worlds=None))] == [  # pyright: ignore
+    assert [distortion.name for distortion in declared_distortions(Navigation(worlds=None))] == [  # pyright: ignore
         "lidar: turn",
         "goal: direction: turn",
         "direction: change",
@@ -35,7 +46,7 @@ def test_an_environment_declares_what_can_have_changed():
 
 @pytest.mark.parametrize(("space", "policy"), [(DIRECTIONS, aims), (BOX, grips)])
 def test_without_a_change_the_policy_stays_what_it_was(space, policy):
-    family = declared(Yard(space), gains=True)
+    family = declared_distortions(Yard(space), gains=True)
     _, obs = situations(jax.random.key(0), None, 8)
     base = policy_of(jax.jit(policy)).replace(actions=space)
     corrected = Calibrated(base, jnp.zeros(len(unknowns_of(family))), family)
@@ -52,9 +63,9 @@ def test_without_a_change_the_policy_stays_what_it_was(space, policy):
     ],
 )
 def test_a_change_of_the_sensors_is_undone(name, theta, change):
-    family = tuple(one for one in declared(Yard()) if one.name == name)
+    family = tuple(one for one in declared_distortions(Yard()) if one.name == name)
     _, obs = situations(jax.random.key(0), None, 8)
-    before = jax.vmap(lambda row: seen(family, jnp.array(theta), row))(obs)
+    before = jax.vmap(lambda row: undo_observation(family, jnp.array(theta), row))(obs)
     np.testing.assert_allclose(before, changed(obs, **change), atol=1e-5)
 
 
@@ -71,14 +82,14 @@ class Table:
 
 
 def test_places_turn_about_their_origin_and_differences_follow():
-    (turn,) = [one for one in declared(Table()) if one.name.endswith("turn")]
+    (turn,) = [one for one in declared_distortions(Table()) if one.name.endswith("turn")]
     assert turn.name == "cup and 1 more: turn"
     assert [(unknown.unit, unknown.most) for unknown in turn.unknowns] == [("degrees", 180.0)]
     # Turned by 90 degrees, a cup 1 m ahead of the origin is seen 1 m to its left, and the plate 2 m behind the origin.
     shown = jnp.array([1.0, 3.0, 0.5, 0.2, 0.3, 0.4, 0.8, 2.7, 0.1, 1.0, 0.0])
-    before = seen((turn,), jnp.array([90.0]), shown)
+    before = undo_observation((turn,), jnp.array([90.0]), shown)
     np.testing.assert_allclose(before, [2, 2, 0.5, 0.2, 0.3, 0.4, 1.8, 1.7, 0.1, -1, 2], atol=1e-6)
-    np.testing.assert_array_equal(seen((turn,), jnp.zeros(1), shown), shown)
+    np.testing.assert_array_equal(undo_observation((turn,), jnp.zeros(1), shown), shown)
 
 
 @pytest.mark.parametrize(
@@ -93,23 +104,23 @@ def test_slices_that_cannot_turn_are_refused(slices, said):
     table = Table()
     table.observation = slices
     with pytest.raises(UserError, match=said):
-        declared(table)
+        declared_distortions(table)
 
 
 def test_beams_between_two_are_interpolated_and_nothing_is_seen_beyond_the_last():
-    (lidar,) = [one for one in declared(Navigation(worlds=None)) if one.name == "lidar: turn"]  # pyright: ignore
+    (lidar,) = [one for one in declared_distortions(Navigation(worlds=None)) if one.name == "lidar: turn"]  # pyright: ignore
     obs = jnp.zeros(280).at[:271].set(jnp.arange(271.0))
-    before = seen((lidar,), jnp.array([1.5]), obs)
+    before = undo_observation((lidar,), jnp.array([1.5]), obs)
     np.testing.assert_allclose(before[:4], [0.0, 0.0, 0.5, 1.5])  # turned by 1.5 beams: beam 2 is at 0.5
     assert before[270] == 268.5
 
 
 def test_an_action_leads_where_the_policy_meant_it_to():
-    (turn,) = [one for one in declared(Yard()) if one.acts]
-    given = acted((turn,), jnp.array([30.0]), from_angle(1.0))
+    (turn,) = [one for one in declared_distortions(Yard()) if one.acts]
+    given = undo_action((turn,), jnp.array([30.0]), from_angle(1.0))
     np.testing.assert_allclose(rotate(given, jnp.deg2rad(30.0)), from_angle(1.0), atol=1e-6)
-    faulty = [one for one in declared(Yard(), teacher_bias=True) if one.acts]
-    np.testing.assert_array_equal(acted(tuple(faulty), jnp.array([30.0]), from_angle(1.0)), from_angle(1.0))
+    faulty = [one for one in declared_distortions(Yard(), teacher_bias=True) if one.acts]
+    np.testing.assert_array_equal(undo_action(tuple(faulty), jnp.array([30.0]), from_angle(1.0)), from_angle(1.0))
 
 
 def test_families_that_make_no_sense_are_refused():

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from flax import struct
 
-from cuelearner_jax.calibration.corrected import Calibrated
 from cuelearner_jax.calibration.families import Unknown
-from cuelearner_jax.calibration.simulated import simulated
+from cuelearner_jax.calibration.policy import Calibrated
+from cuelearner_jax.calibration.simulator import simulator_distortion
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.policies import policy_of
 from cuelearner_jax.spaces import DIRECTIONS, Box
@@ -38,7 +38,7 @@ UNKNOWN = (Unknown("wind", "rad"),)
 
 
 def windy(reach=6.0, space: Any = DIRECTIONS, tried=61):
-    return simulated("wind", UNKNOWN, lambda theta: Windy(theta[0]), lambda obs: obs[0], space, reach, tried)
+    return simulator_distortion("wind", UNKNOWN, lambda theta: Windy(theta[0]), lambda obs: obs[0], space, reach, tried)
 
 
 @pytest.mark.parametrize("wind", [0.0, 0.03, -0.02])

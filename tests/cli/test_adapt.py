@@ -15,7 +15,7 @@ from damaged_folders import DAMAGES
 from small_runs import listing
 
 import cuelearner_jax as cl
-from cuelearner_jax.adaptation import stored
+from cuelearner_jax.adaptation import serialization
 from cuelearner_jax.cli import main
 from cuelearner_jax.config import GuideSizes
 from cuelearner_jax.policies import Guided
@@ -375,7 +375,9 @@ def _shapes(folder):
         formats.read("policy", folder / policy_folders.POLICY),
         registry.find("turned").environment(registry.find("turned").config()),
     )
-    lanes = stored.shapes_of({**values["policy"], "base": {"policy": "uniform"}}, env, len(values["lanes"]["seeds"]))
+    lanes = serialization.shapes_of(
+        {**values["policy"], "base": {"policy": "uniform"}}, env, len(values["lanes"]["seeds"])
+    )
     return {**lanes, "base": {}}
 
 

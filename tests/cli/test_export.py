@@ -5,7 +5,7 @@ from functools import partial
 
 import numpy as np
 
-from cuelearner_jax.api.acting import load_policy
+from cuelearner_jax.api.policies import load_policy
 from cuelearner_jax.cli import main
 from cuelearner_jax.export import contract, decisions, runner
 from cuelearner_jax.policies import layers

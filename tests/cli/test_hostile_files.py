@@ -32,7 +32,7 @@ from cuelearner_jax.teachers import LearnedTeacher, initial_params
 HOSTILE = "hostile:KIND"
 CODE = """
 from pathlib import Path
-from cuelearner_jax.guides.untaught import NONE as KIND
+from cuelearner_jax.guides.baselines import NONE as KIND
 Path(__file__).with_name("executed").touch()
 """
 STARTING = ("subprocess.Popen", "os.system", "os.exec", "os.posix_spawn")

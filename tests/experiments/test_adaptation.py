@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cuelearner_jax.adaptation.adapting import check_amounts
+from cuelearner_jax.adaptation.by_model import check_amounts
 from cuelearner_jax.agents import ddqn
 from cuelearner_jax.config import GuideSizes, check_guide
 from cuelearner_jax.errors import UserError
@@ -73,7 +73,7 @@ def test_a_scenario_holds_the_recipe_that_is_reported(name, path, modules):
         sizes = dataclasses.replace(sizes, frame=asked.sizes.frame, feedback_layers=asked.sizes.feedback_layers)
     assert asked.sizes == sizes
     own = {key.partition(".")[2]: value for key, value in piece.settings.items() if key.startswith("task.")}
-    world = bench.task.scenario(piece.world).applied(bench.config.task)
+    world = bench.task.scenario(piece.world).apply(bench.config.task)
     assert asked.task == dataclasses.replace(world, **own)
 
 
@@ -124,7 +124,7 @@ def test_the_teacher_of_billiards_knows_the_nearest_good_shot(modules):
         if piece.method in ("relative", "teacher") and piece.split != "tuning":
             bench = bench_of(modules, data.STUDY, piece)
             world = bench.config.task
-            world = world if piece.world == "unchanged" else task.scenario(piece.world).applied(world)
+            world = world if piece.world == "unchanged" else task.scenario(piece.world).apply(world)
             world = dataclasses.replace(world, teacher=piece.settings["task.teacher"])
             scalars = bench.scalars()
             assert (scalars.eps_deg, scalars.tau_max_deg) == (0.1, 180.0)

@@ -92,7 +92,7 @@ def test_every_form_of_feedback_has_every_budget(modules):
 
 
 def known_kind(name):
-    return ":" in name or registry.registered(name) is not None
+    return ":" in name or registry.find_or_none(name) is not None
 
 
 def options_known(piece):

@@ -72,7 +72,7 @@ def test_actions_are_turned_by_the_noise_and_no_step_is_uniform(tuned, agents):
 
 def test_it_learns_where_it_may(tuned):
     policy = tuned[0].policy(probes.Window())
-    found = evaluate.watched_lanes(probes.Window(), policy, evaluate.episodes("tuning"), 40, 80).means["reward"]
+    found = evaluate.rollout_lanes(probes.Window(), policy, evaluate.episodes("tuning"), 40, 80).means["reward"]
     assert found[6:].min() == 1.0  # without noise one of the two has stuck to a direction that misses
     assert found[:4].max() < 1.0
 

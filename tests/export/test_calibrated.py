@@ -9,7 +9,7 @@ import pytest
 from known_worlds import BOX, Yard, aims, grips, situations
 
 import cuelearner_jax as cl
-from cuelearner_jax.calibration import Calibrated, Distortion, Unknown, declared
+from cuelearner_jax.calibration import Calibrated, Distortion, Unknown, declared_distortions
 from cuelearner_jax.calibration.families import unknowns_of
 from cuelearner_jax.export import contract, runner
 from cuelearner_jax.policies import Opaque
@@ -21,7 +21,7 @@ WORLDS = {"directions": Yard(), "box": Yard(BOX)}
 
 def calibrated(space, family=None):
     """All changes that the world declares, each of them some way from zero."""
-    family = declared(WORLDS[space], gains=True) if family is None else family
+    family = declared_distortions(WORLDS[space], gains=True) if family is None else family
     sizes = {"m": 0.05, "degrees": 13.0, "percent": 7.0, "shares": 0.1}
     theta = [sizes[one.unit] * (-1) ** number for number, one in enumerate(unknowns_of(family))]
     return Calibrated(POLICIES[space], jnp.array(theta), family)

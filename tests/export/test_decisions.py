@@ -18,7 +18,7 @@ import pytest
 from probes import AGENT, SCALARS, SIZES, Aimed, Expert, Window, WindowConfig, edit_contract, long_but, make_task
 
 import cuelearner_jax as cl
-from cuelearner_jax.api.acting import CallablePolicy
+from cuelearner_jax.api.policies import CallablePolicy
 from cuelearner_jax.environment import Quantity, action_of, spaces_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.export import contract, decisions, formats, onnx_graph, operations, runner

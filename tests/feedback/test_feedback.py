@@ -10,7 +10,7 @@ import numpy as np
 import probes
 import pytest
 
-from cuelearner_jax.agents.networks import applied, residual_network
+from cuelearner_jax.agents.networks import as_function, residual_network
 from cuelearner_jax.config import Scalars, Sizes
 from cuelearner_jax.feedback.answers import human_answer, relative_feedback
 from cuelearner_jax.guides import registry as guidances
@@ -147,7 +147,7 @@ def fresh(key):
     return NETWORK.init(key, jnp.zeros(2), jnp.zeros(2))
 
 
-predict = applied(NETWORK)
+predict = as_function(NETWORK)
 
 
 @jax.jit

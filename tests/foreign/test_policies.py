@@ -21,7 +21,7 @@ def acted(given, obs=OBS, space=SPACE):
 
 def fault(given, obs=OBS, space=SPACE):
     """What is told of a policy, in one line."""
-    from cuelearner_jax.api.acting import CallablePolicy
+    from cuelearner_jax.api.policies import CallablePolicy
 
     with pytest.raises(UserError) as error:
         CallablePolicy(in_space(policy_of(given), space), actions=space)(obs)

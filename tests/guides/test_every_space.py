@@ -12,14 +12,14 @@ import numpy as np
 import probes
 import pytest
 
-from cuelearner_jax.adaptation import adapting
+from cuelearner_jax.adaptation import by_model
 from cuelearner_jax.config import GuideSizes
 from cuelearner_jax.environment import Quantity, Spaces, WholeObservations
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.feedback.answers import human_answer
 from cuelearner_jax.guides import registry
 from cuelearner_jax.guides.aims import log_density
-from cuelearner_jax.guides.fitting import Lesson, fit_least_squares, lessons, squared
+from cuelearner_jax.guides.fitting import Lesson, fit_least_squares, lessons, squared_errors
 from cuelearner_jax.guides.relative import KIND as RELATIVE
 from cuelearner_jax.spaces import UNSAID, Box, Choices, Cue
 from cuelearner_jax.types import Label
@@ -62,7 +62,7 @@ def missing(space, obs):
 def scalars_of(space, **faults):
     eps = 1.0 if space.grain else 0.08
     plain = dataclasses.replace(
-        adapting.plain_scalars(space), feedback_learning_rate=1e-2, max_grad_norm=10.0, k_max=20
+        by_model.plain_scalars(space), feedback_learning_rate=1e-2, max_grad_norm=10.0, k_max=20
     )
     most = 4.0 if space.grain else 0.4  # as far as the labels reach
     return dataclasses.replace(plain, eps_deg=eps, tau_deg=eps / 20, tau_max_deg=most, **faults)
@@ -152,8 +152,8 @@ def test_a_cue_of_which_nothing_is_said_adds_nothing_to_the_loss():
     eps = scalars.eps_deg
     np.testing.assert_allclose(rows.target, [[2 * eps, 0, 0], [0, -4 * eps, 0]], atol=1e-6)
     off = jnp.array([[0.2, 77.0, 0.0], [-5.0, 0.4, 3.0]])
-    np.testing.assert_allclose(squared(rows, rows.target + off), [0.1**2, 0.1**2], rtol=1e-3)
-    gradient = jax.grad(lambda predicted: squared(rows, predicted).sum())(rows.target + off)
+    np.testing.assert_allclose(squared_errors(rows, rows.target + off), [0.1**2, 0.1**2], rtol=1e-3)
+    gradient = jax.grad(lambda predicted: squared_errors(rows, predicted).sum())(rows.target + off)
     np.testing.assert_array_equal(gradient == 0, [[False, True, True], [True, False, True]])
     np.testing.assert_allclose(gradient[0, 0], 2 * 0.2 / 2**2, rtol=1e-3)  # d/dx (x / range)^2
 
@@ -186,7 +186,7 @@ def test_a_label_that_says_nothing_of_any_cue_is_none():
 
 def test_lessons_of_one_cue_count_whole():
     lesson = Lesson(jnp.zeros((1, 2)), jnp.zeros((1, 1)), jnp.zeros((1, 1)), jnp.ones(1, bool))
-    assert float(squared(lesson, jnp.array([[3.0]]))[0]) == 9.0
+    assert float(squared_errors(lesson, jnp.array([[3.0]]))[0]) == 9.0
 
 
 @pytest.mark.parametrize("kind", ["relative", "offset", "dcoach", "bdcoach", "clic", "clic_shown", "calibration"])
@@ -199,11 +199,11 @@ def test_a_kind_of_cues_refuses_choices_without_an_order_in_one_line(kind):
 
 
 def test_answers_too_weak_to_move_a_choice_are_refused_and_never_the_default():
-    assert adapting.plain_scalars(GEARS).eps_deg == 1.0
-    assert adapting.usual_bound(Choices(3, GEARS.order)) == 1.0
+    assert by_model.plain_scalars(GEARS).eps_deg == 1.0
+    assert by_model.usual_bound(Choices(3, GEARS.order)) == 1.0
     weak = dataclasses.replace(scalars_of(GEARS), eps_deg=0.3, tau_deg=0.01)
     with pytest.raises(UserError, match=r"scalars\.eps_deg is 0\.3 steps: give at least 1"):
-        adapting.check_amounts(GEARS, [2.0], weak)
+        by_model.check_amounts(GEARS, [2.0], weak)
     assert FRUIT.reach == 1.0
 
 

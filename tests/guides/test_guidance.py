@@ -15,7 +15,7 @@ from cuelearner_jax.errors import UserError
 from cuelearner_jax.guides import intent
 from cuelearner_jax.guides import registry as guidance
 from cuelearner_jax.guides.base import Kind
-from cuelearner_jax.guides.untaught import NONE, Untaught
+from cuelearner_jax.guides.baselines import NONE, Untaught
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.spaces import directions
 from cuelearner_jax.types import Label
@@ -159,12 +159,12 @@ def kind_of(name, about="left alone", **fields):
     return Kind(name, about, Untaught, **fields)
 
 
-@pytest.mark.parametrize("kind", guidance.known(), ids=lambda kind: kind.name)
+@pytest.mark.parametrize("kind", guidance.kinds(), ids=lambda kind: kind.name)
 def test_every_kind_is_called_by_its_name_and_made_as_it_is_announced(kind):
     bundle = guidance.make(kind.name, probes.SIZES, probes.Aimed())
     assert (bundle.name, bundle.form, bundle.asks) == (kind.name, kind.form, kind.asks)
     assert guidance.find(kind.name) is kind
-    assert kind in guidance.known()
+    assert kind in guidance.kinds()
     assert kind.about  # what help pages say of it
 
 
@@ -181,7 +181,7 @@ def test_a_kind_can_be_registered_again_but_not_another_of_its_name(registered):
     one = kind_of("calm")
     assert guidance.register(one) is one
     assert guidance.register(one) is one
-    assert [kind.name for kind in guidance.known()].count("calm") == 1
+    assert [kind.name for kind in guidance.kinds()].count("calm") == 1
     assert guidance.make("calm", probes.SIZES, ENV).name == "calm"
     with pytest.raises(UserError, match="there is another guidance called 'calm': give yours another name"):
         guidance.register(kind_of("calm", about="another"))

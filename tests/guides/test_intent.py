@@ -144,11 +144,11 @@ def test_actions_stay_where_it_is_likelier_by_far_that_none_is_meant():
     aims = directions.evenly_spaced(3)
     for none, sure in ((math.log(3.9), True), (math.log(4.1), False)):
         share = jax.nn.softmax(jnp.array([0.0, math.log(2.0), -jnp.inf, none]))
-        goal, found = intent.followed(DIRECTIONS, share, aims, aims[0], 2.0)
+        goal, found = intent.choose_aim(DIRECTIONS, share, aims, aims[0], 2.0)
         np.testing.assert_array_equal(goal, aims[1])
         assert bool(found) == sure
     impossible = jnp.array([0.0, 0.0, 0.0, 1.0])
-    assert not intent.followed(DIRECTIONS, impossible, aims, aims[0], 2.0)[1]
+    assert not intent.choose_aim(DIRECTIONS, impossible, aims, aims[0], 2.0)[1]
 
 
 def test_of_aims_as_likely_as_the_likeliest_the_nearest_is_followed():
@@ -156,7 +156,7 @@ def test_of_aims_as_likely_as_the_likeliest_the_nearest_is_followed():
     # Probabilities 4 : 4 : 3.1 : 0, the last impossible; three quarters of all that none is meant.
     share = jnp.array([4.0, 4.0, 3.1, 0.0, 33.3]) / 44.4
     for degrees, aim in ((80.0, 1), (30.0, 0), (170.0, 1), (200.0, 1), (271.0, 0)):
-        found, sure = intent.followed(space, share, aims, directions.from_angle(jnp.deg2rad(degrees)), 100.0)
+        found, sure = intent.choose_aim(space, share, aims, directions.from_angle(jnp.deg2rad(degrees)), 100.0)
         np.testing.assert_array_equal(found, aims[aim], err_msg=str(degrees))
         assert sure
 

@@ -36,15 +36,15 @@ BASE = policy_of(jax.jit(missing))
 
 def test_the_spline_ends_where_answers_change_their_sign():
     turns = jnp.linspace(-10, 10, 81)
-    spline = offset.smoothed(turns, jnp.sign(4.0 - turns), jnp.ones(81, bool))
+    spline = offset.fit_spline(turns, jnp.sign(4.0 - turns), jnp.ones(81, bool))
     before, after, beyond = offset.height(spline, jnp.array([3.0, 5.0, 25.0]))
     assert 0 < before < 1
     assert -1 < after < 0
     assert float(beyond) == pytest.approx(float(spline.heights[-1]))  # level where nothing was asked about
     # With half of the answers turned round it says nothing, and of no label it knows nothing.
     contrary = jnp.where(jnp.arange(81) % 2, 1.0, -1.0)
-    assert float(jnp.abs(offset.smoothed(turns, contrary, jnp.ones(81, bool)).heights).max()) < 0.2
-    assert not offset.smoothed(turns, contrary, jnp.zeros(81, bool)).heights.any()
+    assert float(jnp.abs(offset.fit_spline(turns, contrary, jnp.ones(81, bool)).heights).max()) < 0.2
+    assert not offset.fit_spline(turns, contrary, jnp.zeros(81, bool)).heights.any()
 
 
 def test_the_network_counts_as_much_as_held_out_labels_say():
@@ -75,7 +75,7 @@ def test_a_constant_miss_is_known_everywhere_from_forty_answers_a_fifth_of_them_
     # One pass from an action that was turned already is not one from an action of the base's own.
     there = jax.tree.map(lambda leaf: leaf[:4], labels.replace(action=directions.rotate(base, -jnp.deg2rad(60.0))))
     once = dataclasses.replace(SCALARS, k_max=1)
-    back = BUNDLE.moved_on(model, ENV, there, jnp.ones(4, bool), once).actions
+    back = BUNDLE.refine_labelled_actions(model, ENV, there, jnp.ones(4, bool), once).actions
     assert (np.asarray(directions.difference(there.action, back)) > 0).all()
 
 

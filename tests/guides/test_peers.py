@@ -123,7 +123,7 @@ def test_the_loss_has_the_gradient_of_the_papers_divergence():
     rows = guide.contrasts(labels(MIDDLE[None], jnp.array([[1.0, 0.0, UNSAID]])))
     k_pairs, k_sample = jax.random.split(jax.random.fold_in(jax.random.key(0), 0))
     row = jax.tree.map(lambda leaf: leaf[0], rows)
-    actions = guide.sampled(k_sample, row, SCALARS)
+    actions = guide.sample_actions(k_sample, row, SCALARS)
     inside = guide.membership(k_pairs, row, actions, SCALARS)
 
     def divergence(params):
@@ -189,11 +189,11 @@ def test_the_human_model_leads_the_policy_by_eps_at_most_and_along_all_cues():
     params = jax.tree.map(jnp.zeros_like, guide.init(KEY).params.human)
     acted = jnp.tile(MIDDLE, (2, 1))
     rows = guide.lessons(labels(acted, jnp.array([[1.0, UNSAID, 0.0]] * 2)), SCALARS)
-    still = guide.wanted(ENV, params, rows, acted, SCALARS)
+    still = guide.policy_targets(ENV, params, rows, acted, SCALARS)
     np.testing.assert_allclose(still.target, acted, atol=1e-6)  # it says "already right"
     assert still.said.all()
     loud = jax.tree.map(lambda leaf: jnp.full_like(leaf, 9.0) if leaf.shape == (3,) else leaf, params)
-    moved = guide.wanted(ENV, loud, rows, acted, SCALARS)
+    moved = guide.policy_targets(ENV, loud, rows, acted, SCALARS)
     np.testing.assert_allclose(SMALL.log(acted, moved.target), SCALARS.eps_deg, rtol=1e-5)
 
 
@@ -203,7 +203,7 @@ def test_the_human_model_is_taught_answers_and_nothing_of_other_cues():
     params = jax.tree.map(jnp.zeros_like, guide.init(KEY).params.human)
     told = [[1.0, UNSAID, UNSAID], [1.0, 0.0, UNSAID], [1.0, -1.0, 0.0]]
     rows = [guide.lessons(labels(MIDDLE[None], jnp.array([answer])), SCALARS) for answer in told]
-    found = [float(guide.modelled(ENV, params, row, SCALARS)) for row in rows]
+    found = [float(guide.human_loss(ENV, params, row, SCALARS)) for row in rows]
     np.testing.assert_allclose(found, [1.0, 1.0, 2.0], rtol=1e-4)
 
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from cuelearner_jax.guides.refining import refine, untouched
+from cuelearner_jax.guides.refining import no_refinement, refine
 from cuelearner_jax.spaces import DIRECTIONS, directions
 
 DEG = math.pi / 180
@@ -201,6 +201,6 @@ def test_one_row_a_batch_jit_and_vmap_agree():
 
 def test_untouched_made_no_pass():
     first = jnp.asarray(starts(0, 3), jnp.float32)
-    result = untouched(first)
+    result = no_refinement(first)
     np.testing.assert_array_equal(result.actions, first)
     assert result.passes.tolist() == [0, 0, 0]

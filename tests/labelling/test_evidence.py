@@ -8,14 +8,20 @@ import probes
 import pytest
 from sessions import ENV, expert, give, settled
 
-from cuelearner_jax.calibration import declared
+from cuelearner_jax.calibration import declared_distortions
 from cuelearner_jax.labelling.plan import Base
 from cuelearner_jax.policies import Opaque
 
 STRAIGHT = Base(Opaque(lambda obs: obs, on_host=True), "straight")  # the expert means 0.6 rad, 34.4 degrees, beside
 EPS_DEG = 5.0
 CONFIG = dataclasses.replace(probes.CONFIG, scalars=dataclasses.replace(probes.SCALARS, eps_deg=EPS_DEG))
-SETTINGS = {"kind": "calibration", "base": STRAIGHT, "config": CONFIG, "family": declared(ENV), "labels": 30}
+SETTINGS = {
+    "kind": "calibration",
+    "base": STRAIGHT,
+    "config": CONFIG,
+    "family": declared_distortions(ENV),
+    "labels": 30,
+}
 LINE = re.compile(r"direction: turn: (\S+) \[(\S+), (\S+)\] degrees")
 
 

@@ -11,10 +11,10 @@ import probes
 import pytest
 from small_runs import stopping_at
 
-from cuelearner_jax.adaptation import stored
+from cuelearner_jax.adaptation import serialization
 from cuelearner_jax.arbiters import by_value, prior
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.evaluate import episodes, watched
+from cuelearner_jax.evaluate import episodes, rollout_with_progress
 from cuelearner_jax.export import contract, decisions
 from cuelearner_jax.policies import Agent, Arbitrated
 from cuelearner_jax.runs.grid import Grid
@@ -102,7 +102,7 @@ def test_what_is_loaded_acts_as_what_was_evaluated(whole):
     assert int(policy.arm) == last["arm"]
     assert float(policy.steps) == 48 - CONFIG.schedule.learn_after
     env = environment(CONFIG.task, "validation")
-    found = watched(env, policy, episodes(), CONFIG.schedule.eval_envs, CONFIG.schedule.eval_steps).means
+    found = rollout_with_progress(env, policy, episodes(), CONFIG.schedule.eval_envs, CONFIG.schedule.eval_steps).means
     assert float(found["reward"]) == last["reward"]
     assert last["reward"] == 1.0  # twenty answers about aims tell the best
 
@@ -121,7 +121,7 @@ def test_each_arm_is_exported_as_it_acts(whole, tmp_path, format):
 
 def test_a_policy_folder_refuses_it_in_one_line(whole):
     with pytest.raises(UserError, match="a policy of kind arbitrated cannot be kept in a folder") as told:
-        stored.to_json(agent_of(whole))
+        serialization.to_json(agent_of(whole))
     assert "\n" not in str(told.value)
 
 

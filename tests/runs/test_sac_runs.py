@@ -13,9 +13,9 @@ from small_runs import stopping_at
 from walk_task import SMALL, TASK, Walk, WalkConfig
 
 from cuelearner_jax import loop
-from cuelearner_jax.adaptation import stored
+from cuelearner_jax.adaptation import serialization
 from cuelearner_jax.arbiters import by_value
-from cuelearner_jax.evaluate import episodes, watched
+from cuelearner_jax.evaluate import episodes, rollout_with_progress
 from cuelearner_jax.export import contract, decisions
 from cuelearner_jax.guides import registry
 from cuelearner_jax.policies import Arbitrated
@@ -78,7 +78,7 @@ def test_what_is_loaded_acts_as_what_was_evaluated(whole):
     assert isinstance(policy, Arbitrated)
     last = next(row for row in rows(whole) if (row["seed"], row["step"]) == (1, 48))
     assert int(policy.arm) == last["arm"] == int(last["judged_better"] > last["judged_own"])
-    found = watched(ENV, policy, episodes(), CONFIG.schedule.eval_envs, CONFIG.schedule.eval_steps).means
+    found = rollout_with_progress(ENV, policy, episodes(), CONFIG.schedule.eval_envs, CONFIG.schedule.eval_steps).means
     assert float(found["reward"]) == last["reward"]
 
 
@@ -99,7 +99,7 @@ def test_the_agent_and_the_better_of_both_are_exported_as_they_act(whole, tmp_pa
 
 def test_a_policy_folder_can_keep_the_agent(whole):
     agent = policy_of(whole).base
-    again = stored.from_json(stored.to_json(agent), stored.arrays_of(agent), ENV)
+    again = serialization.from_json(serialization.to_json(agent), serialization.arrays_of(agent), ENV)
     obs = jnp.linspace(-1.0, 1.0, 8).reshape(4, 2)
     np.testing.assert_array_equal(*(policy.act(jax.random.key(0), None, obs) for policy in (agent, again)))
 

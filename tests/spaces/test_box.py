@@ -15,12 +15,12 @@ from cuelearner_jax import asking
 from cuelearner_jax.agents import ddqn
 from cuelearner_jax.environment import spaces_of
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.feedback import given
+from cuelearner_jax.feedback import external_labels
 from cuelearner_jax.feedback.answers import (
     DEMONSTRATION,
     RELATIVE,
     SCALAR,
-    demonstrated,
+    demonstrate,
     human_answer,
     relative_feedback,
     scalar_answer,
@@ -160,7 +160,7 @@ def test_good_is_an_action_near_the_goal_along_every_entry_and_a_demonstration_i
         action = SMALL.exp(best, jnp.array(change))
         answer, answered = scalar_answer(KEY, env, teacher, obs, obs, action, SCALARS)
         assert (float(answer[0]), bool(answered)) == (good, True)
-        shown, answered = demonstrated(KEY, env, teacher, obs, obs, action, SCALARS)
+        shown, answered = demonstrate(KEY, env, teacher, obs, obs, action, SCALARS)
         np.testing.assert_allclose(shown, best, atol=1e-6)
         assert bool(answered)
 
@@ -220,10 +220,10 @@ def test_a_label_file_holds_answers_about_a_box(form, tmp_path):
     assert (file.space, file.answers, file.eps) == (SMALL, form.name, eps)
     np.testing.assert_array_equal(file.labels.action, action)
     np.testing.assert_array_equal(file.labels.answer, kinds[form.name])
-    given.check_file(file, None, form, "labels.parquet")
+    external_labels.check_file(file, None, form, "labels.parquet")
     spoilt = file._replace(labels=file.labels.replace(action=file.labels.action + np.float32([5, 0, 0])))
     with pytest.raises(UserError, match="vectors between the bounds"):
-        given.check_file(spoilt, None, form, "labels.parquet")
+        external_labels.check_file(spoilt, None, form, "labels.parquet")
 
 
 @pytest.mark.parametrize(

@@ -155,7 +155,7 @@ def test_the_help_names_the_tables_that_have_a_shipped_teacher():
 def test_what_policies_look_at_needs_no_worlds():
     """Navigation looks at an observation alone: the view sees what the environment sees."""
     task = registry.find("navigation")
-    config = task.configured("rooms", worlds=1)
+    config = task.configure("rooms", worlds=1)
     env, view = task.environment(config), task.view(config)
     assert view.worlds is None
     assert view.observation == env.observation

@@ -7,7 +7,7 @@ import pytest
 from probes import Aimed, Chain, Window, long_but
 
 from cuelearner_jax.guides import registry
-from cuelearner_jax.guides.refining import Refined
+from cuelearner_jax.guides.refining import Refinement
 from cuelearner_jax.testing import check_guidance
 from cuelearner_jax.testing.guidances import SMALL
 
@@ -37,12 +37,12 @@ def in_python(act):
 
 
 def everywhere(act):
-    return lambda self, model, env, obs, actions, active, scalars: Refined(-actions, active.astype(jnp.int32))
+    return lambda self, model, env, obs, actions, active, scalars: Refinement(-actions, active.astype(jnp.int32))
 
 
 def unfitted_too(act):
     def guided(self, model, env, obs, actions, active, scalars):
-        return Refined(jnp.where(active[:, None], -actions, actions), active.astype(jnp.int32))
+        return Refinement(jnp.where(active[:, None], -actions, actions), active.astype(jnp.int32))
 
     return guided
 
@@ -85,7 +85,7 @@ def test_a_broken_law_is_told_in_one_line(law):
 
 
 @pytest.mark.parametrize(
-    "name", long_but(("none", "relative"), [kind.name for kind in registry.known() if not kind.by_evidence])
+    "name", long_but(("none", "relative"), [kind.name for kind in registry.kinds() if not kind.by_evidence])
 )
 def test_our_own_kinds_keep_the_laws(name):
     check_guidance(registry.find(name), Aimed(mirrors=True), SIZES)

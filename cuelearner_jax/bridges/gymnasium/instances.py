@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from cuelearner_jax.bridges.gymnasium.layout import NoVector, action_maker, actions_of, flatten, leaves_of
-from cuelearner_jax.errors import UserError, raised_by
+from cuelearner_jax.errors import UserError, user_code_error
 
 SUCCESS = ("success", "is_success")  # names in `info`
 PLACE_BYTES = 8
@@ -74,7 +74,7 @@ class Running:
         try:
             given, _ = self.env.reset(seed=seed)
         except Exception as error:
-            raise raised_by(f"environment {self.whose}, in its reset with seed {seed},", error) from error
+            raise user_code_error(f"environment {self.whose}, in its reset with seed {seed},", error) from error
         obs = self._vector(given, f"its reset with seed {seed}")
         self.place = hashlib.blake2b(seed.to_bytes(8, "little") + obs.tobytes(), digest_size=PLACE_BYTES).digest()
         return obs
@@ -86,7 +86,7 @@ class Running:
         try:
             given, reward, terminated, truncated, info = self.env.step(self.to_action(action))
         except Exception as error:
-            raise raised_by(f"environment {self.whose}, in {when},", error) from error
+            raise user_code_error(f"environment {self.whose}, in {when},", error) from error
         obs = self._vector(given, when)
         try:
             reward = float(reward)
@@ -212,7 +212,7 @@ class Instances:
             except UserError:
                 raise
             except Exception as error:
-                raise raised_by(f"environment {self.whose}, while it was made,", error) from error
+                raise user_code_error(f"environment {self.whose}, while it was made,", error) from error
             one = Running(env, self.whose)
             size = sum(leaf.size for leaf in one.leaves)
             if self.size and size != self.size:

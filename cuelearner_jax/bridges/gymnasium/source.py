@@ -12,7 +12,7 @@ from functools import partial
 from importlib.util import find_spec
 from typing import Any
 
-from cuelearner_jax.errors import UserError, closest
+from cuelearner_jax.errors import UserError, suggestion
 
 DRAWN = "render_mode"
 MISSING = "Gymnasium is not installed: pip install 'cuelearner-jax[gymnasium]'"
@@ -47,8 +47,8 @@ class Source:
         if self.drawn and (self.factory is None or _takes(self.factory, DRAWN)):
             named[DRAWN] = "rgb_array"
         if self.factory is not None:
-            return partial(made_by, self.factory, named)
-        return partial(made, self.name, named, self.max_steps)
+            return partial(make_from_code, self.factory, named)
+        return partial(make_registered, self.name, named, self.max_steps)
 
     def arguments_of_instances(self) -> tuple[Any, ...]:
         """What `Instances` takes."""
@@ -91,7 +91,7 @@ def check_installed() -> None:
         raise UserError(MISSING)
 
 
-def known(name: str) -> Any:
+def registry_spec(name: str) -> Any:
     """Return the specification that Gymnasium's registry has of an id, without importing what the id names.
 
     Raises UserError for an id that is not there.
@@ -116,22 +116,22 @@ def known(name: str) -> Any:
         if not isinstance(error, gymnasium.error.Error):
             raise
         raise UserError(
-            f"Gymnasium has no environment {name!r}{closest(name, gymnasium.registry)[:300]}"
+            f"Gymnasium has no environment {name!r}{suggestion(name, gymnasium.registry)[:300]}"
             if gymnasium.registry
             else f"Gymnasium has no environment {name!r}"
         ) from error
 
 
-def made(name: str, arguments: dict[str, Any], max_steps: int) -> Any:
+def make_registered(name: str, arguments: dict[str, Any], max_steps: int) -> Any:
     """Return an environment of Gymnasium's registry. Raises UserError for an id that is not there."""
-    spec = known(name)
+    spec = registry_spec(name)
     import gymnasium
 
     limited = {"max_episode_steps": max_steps} if max_steps else {}
     return gymnasium.make(spec, **limited, **arguments)
 
 
-def made_by(factory: Callable[..., Any], arguments: dict[str, Any]) -> Any:
+def make_from_code(factory: Callable[..., Any], arguments: dict[str, Any]) -> Any:
     """Return an environment of the user's code. Raises UserError for what is none."""
     try:
         env = factory(**arguments)

@@ -41,13 +41,15 @@ def main(descriptor: int, parent: int) -> None:
 def _begun(link: Connection) -> Any:
     """The instances of what the pool sends; an error is its answer to every order."""
     from cuelearner_jax.bridges.gymnasium.instances import Instances
-    from cuelearner_jax.errors import UserError, raised_by
+    from cuelearner_jax.errors import UserError, user_code_error
 
     sent = link.recv_bytes()
     try:
         return Instances(*pickle.loads(sent))
     except Exception as caught:
-        error = caught if isinstance(caught, UserError) else raised_by("the environment's code, when loaded,", caught)
+        error = (
+            caught if isinstance(caught, UserError) else user_code_error("the environment's code, when loaded,", caught)
+        )
         words = str(error)
 
     class Failed:

@@ -15,8 +15,8 @@ from cuelearner_envs.arm.config import ArmConfig
 from cuelearner_envs.arm.environment import ACTIONS, Camera
 from cuelearner_envs.arm.places import BASE, HOME
 from cuelearner_envs.arm.scripts import act
-from cuelearner_jax.calibration import declared
-from cuelearner_jax.calibration.families import seen
+from cuelearner_jax.calibration import declared_distortions
+from cuelearner_jax.calibration.families import undo_observation
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.tasks.arm import ARM, observation_of
 from cuelearner_jax.testing import check_task
@@ -81,14 +81,14 @@ def test_a_turned_camera_turns_places_about_the_base():
 
 @pytest.mark.parametrize("skill", ["reach", "push", "pick"])
 def test_a_declared_family_names_the_turn_and_the_offset(skill):
-    config = ARM.configured(skill=skill, camera_turn_deg=10.0, camera_offset=(0.01, -0.02, 0.03))
-    world, plain = ARM.environment(config), ARM.environment(ARM.configured(skill=skill))
+    config = ARM.configure(skill=skill, camera_turn_deg=10.0, camera_offset=(0.01, -0.02, 0.03))
+    world, plain = ARM.environment(config), ARM.environment(ARM.configure(skill=skill))
     state, true = plain.reset(jax.random.key(3))
-    family = declared(world)
+    family = declared_distortions(world)
     names = [one.name for one in family]
     assert [name.rpartition(": ")[2] for name in names] == ["shift", "turn", "change"]
     # The camera turns first, then shifts; a family undoes in the other order.
-    found = seen(family[:2], jnp.array([0.01, -0.02, 0.03, 10.0]), world.observe(state))
+    found = undo_observation(family[:2], jnp.array([0.01, -0.02, 0.03, 10.0]), world.observe(state))
     assert np.abs(world.observe(state) - true).max() > 0.05
     assert np.allclose(found, true, atol=1e-5)
 
@@ -97,7 +97,7 @@ def test_a_declared_family_names_the_turn_and_the_offset(skill):
 def test_observations_have_fetchs_names_and_sizes(skill):
     layout = observation_of(skill)
     assert sum(quantity.size for quantity in layout) == (16 if skill == "reach" else 31)
-    assert ARM.environment(ARM.configured(skill=skill)).obs_size == (16 if skill == "reach" else 31)
+    assert ARM.environment(ARM.configure(skill=skill)).obs_size == (16 if skill == "reach" else 31)
     assert [cue.words for cue in ACTIONS.cues] == [
         ("forward", "backward"),
         ("left", "right"),
@@ -107,7 +107,7 @@ def test_observations_have_fetchs_names_and_sizes(skill):
 
 
 def test_the_teacher_sees_true_places_and_the_heuristic_what_is_seen():
-    config = ARM.configured("turned_camera", skill="reach")
+    config = ARM.configure("turned_camera", skill="reach")
     env = ARM.environment(config)
     state, obs = env.reset(jax.random.key(1))
     teacher = ARM.make_teacher(config, env)
@@ -144,7 +144,7 @@ def test_rotations_are_told_by_fetchs_angles():
 
 
 def test_a_picture_shows_cube_post_and_goal(tmp_path):
-    env = ARM.environment(ARM.configured(skill="push"))
+    env = ARM.environment(ARM.configure(skill="push"))
     state, obs = env.reset(jax.random.key(3))
     recording.question(env, state, obs, jnp.array([0.0, 1.0, 0.0, 0.0]), tmp_path / "question.png")
     picture = np.asarray(Image.open(tmp_path / "question.png")).astype(int)
@@ -167,7 +167,7 @@ def test_a_picture_shows_cube_post_and_goal(tmp_path):
 
 
 def test_a_clip_holds_the_action_for_five_steps():
-    env = ARM.environment(ARM.configured(skill="reach"))
+    env = ARM.environment(ARM.configure(skill="reach"))
     state, _ = env.reset(jax.random.key(3))
     reel = recording.reel(env, state, jnp.array([0.0, 0.0, 1.0, 0.0]))
     assert len(reel.pictures) == 6  # the situation, and where each step leads

@@ -33,9 +33,9 @@ def here(config):
 def fetchs_own(name, seed, actions):
     """What Gymnasium's environment gives for a seed and actions: flattened observations, rewards, success."""
     from cuelearner_jax.bridges.gymnasium.layout import flatten, leaves_of
-    from cuelearner_jax.bridges.gymnasium.source import made
+    from cuelearner_jax.bridges.gymnasium.source import make_registered
 
-    env = made(name, {}, 50)
+    env = make_registered(name, {}, 50)
     leaves, rows, told = leaves_of(name, env.observation_space), [env.reset(seed=seed)[0]], []
     for action in actions:
         obs, reward, _, _, info = env.step(action)

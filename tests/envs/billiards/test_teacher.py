@@ -159,7 +159,7 @@ def test_a_configuration_names_the_search_near_a_networks_proposals():
 @pytest.fixture(scope="module", params=long_but(["turned_strike"], SCENARIOS))
 def near(request, easy):
     """In a changed world: the search near proposals, the search of all directions, what these are worth, the states."""
-    config = SCENARIOS[request.param].applied(BilliardsConfig("easy", teacher="local_search"))
+    config = SCENARIOS[request.param].apply(BilliardsConfig("easy", teacher="local_search"))
     env = make_environment(config)
     local = make_teacher(config, env)
     assert isinstance(local, LocalSearchTeacher)

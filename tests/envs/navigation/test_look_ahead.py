@@ -14,7 +14,7 @@ from cuelearner_envs.navigation.config import NavigationConfig
 from cuelearner_envs.navigation.lidar import BEAMS, scan
 from cuelearner_envs.navigation.look_ahead import LEAST, SHORT
 from cuelearner_envs.navigation.worlds import FARTHEST
-from cuelearner_jax.adaptation import stored
+from cuelearner_jax.adaptation import serialization
 from cuelearner_jax.adaptation.lanes import Lanes
 from cuelearner_jax.config import GuideSizes, to_json
 from cuelearner_jax.environment import spaces_of
@@ -180,7 +180,7 @@ def kept(guidance, look_ahead):
 def test_weights_of_ways_are_kept_with_their_width():
     source = kept("intent", True)
     assert source.adapted is not None
-    shapes = stored.shapes_of(source.adapted.values["policy"], shape_of(source.task, source.config.task))
+    shapes = serialization.shapes_of(source.adapted.values["policy"], shape_of(source.task, source.config.task))
     kernels = [leaf.shape for leaf in jax.tree.leaves(shapes["model"]) if leaf.shape[-1:] == (8,) and leaf.ndim > 1]
     assert kernels == [(PLAINLY + 3, 8)]
 

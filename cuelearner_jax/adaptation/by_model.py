@@ -1,4 +1,4 @@
-"""Adaptation from the first question to the judged policies: what the command, the face and experiments call.
+"""Adaptation by a feedback model, from the first question to the judged policies.
 
 found = adapt(Adaptation(guide, sizes, scalars, env, bases), lanes, Judging(tuning_env), teacher)
 found.judged.used, found.policy(env)
@@ -19,47 +19,47 @@ from jax.sharding import Mesh
 from jaxtyping import Array
 
 from cuelearner_jax import user_code
-from cuelearner_jax.adaptation.judging import Judge, Judged, Judging
+from cuelearner_jax.adaptation.judging import Judge, Judgement, Judging
 from cuelearner_jax.adaptation.lanes import Adaptation, Lanes, LaneState, ask_round, begin, blame, rounds, take_labels
 from cuelearner_jax.calibration import Result
 from cuelearner_jax.config import GuideSizes, Scalars
 from cuelearner_jax.devices import BY_LANE, SHARED, lane_mesh, place
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.evaluate import Tell, untold
-from cuelearner_jax.policies import Policy, named
+from cuelearner_jax.evaluate import Tell, ignore_progress
+from cuelearner_jax.policies import Policy, policy_name
 from cuelearner_jax.spaces import DIRECTIONS, Space
 from cuelearner_jax.types import Label, Teacher
 
 # Seconds a fit on a CPU. The paper's networks are `GuideSizes()`.
 SIZES = GuideSizes(feedback_layers=(128, 128), fit_steps=400, fit_batch_size=64)
-REACH_QUANTILE = 0.95  # of the distances between labelled actions and a policy's own: how far labels reach from it
-BOUND = 1 / 4  # of the space's reach (45 deg): where nobody says how far corrections may lead
-PASSES = 20  # of which one turn by eps: a pass that turns by less has settled
+REACH_QUANTILE = 0.95  # quantile of the distances between labelled actions and the policy's own: how far labels reach
+BOUND = 1 / 4  # default bound, as a share of the space's reach (45 deg)
+PASSES = 20  # threshold tau as a share of eps: a pass that turns an action by less has settled
 
 
 @dataclass(frozen=True)
-class Adapted:
-    """What adaptation has led to. Where a lane's model is not used, its policy is its base."""
+class AdaptationResult:
+    """The adapted lanes, their judgement and learning curve. A lane whose model is not used acts as its base."""
 
     of: Adaptation
     lanes: Lanes
-    block: Any  # `LaneState`, or `calibrated.Evidence`
-    judged: Judged
+    block: Any  # `LaneState`, or `by_calibration.Evidence`
+    judged: Judgement
     curve: list[dict[str, Any]]  # a row a measurement: "asked" (lanes,) labels so far, and metrics (lanes,) by name
-    results: tuple[Result, ...] = ()  # of calibration, a lane each: what changed
+    results: tuple[Result, ...] = ()  # calibration only: each lane's estimates
 
     @property
     def labels(self) -> Label:
-        """All lanes' labels (lanes, slots, ...), as NumPy arrays."""
+        """The labels of all lanes (lanes, slots, ...), as NumPy arrays."""
         return jax.device_get(self.block.labels)
 
     @property
     def failed(self) -> np.ndarray:
-        """Lanes (lanes,) whose model is no longer finite."""
+        """Whether each lane's model is no longer finite: (lanes,) bool."""
         return np.asarray(self.block.failed)
 
     def policy(self, env: Any) -> Any:
-        """The lanes' policies in a world."""
+        """Return the lanes' adapted policies, to act in `env`."""
         return self.of.policy(self.block, env)
 
 
@@ -70,9 +70,9 @@ def adapt(
     teacher: Teacher | None = None,
     labels: Label | None = None,
     mesh: Mesh | None = None,
-    watch: Callable[[str], Tell] = lambda what: untold,
-) -> Adapted:
-    """Asks, fits and judges all lanes.
+    watch: Callable[[str], Tell] = lambda what: ignore_progress,
+) -> AdaptationResult:
+    """Ask for labels, fit a model and judge the corrected policy in every lane.
 
     Args:
         of: what lanes share: the kind of guidance, the world, the base policies.
@@ -87,31 +87,33 @@ def adapt(
         UserError: policies cannot be judged as asked.
     """
     mesh, count = mesh or lane_mesh(), lanes.number
-    filled = np.minimum(np.arange(-(-count // mesh.size) * mesh.size), count - 1)  # the last is repeated, and dropped
+    filled = np.minimum(
+        np.arange(-(-count // mesh.size) * mesh.size), count - 1
+    )  # the block is filled up with repeats of the last lane, which are dropped in the end
     judge = Judge(of, lanes.rows(filled), how, mesh, watch)
     if labels is not None:
         labels = jax.tree.map(lambda leaf: jnp.asarray(leaf)[filled], labels)
-    block = learned(of, lanes.rows(filled), teacher, labels, mesh, watch, judge.measure_if_due)
-    judged, block = judge.judged(block)
-    model = block.guide.model  # one that is not used leaves actions alone
+    block = learn_lanes(of, lanes.rows(filled), teacher, labels, mesh, watch, judge.measure_if_due)
+    judged, block = judge.judge_lanes(block)
+    model = block.guide.model  # a model that is not used leaves actions unchanged
     block = block.replace(
         guide=block.guide.replace(model=model.replace(fitted=model.fitted & jnp.asarray(judged.used)))
     )
     block = jax.tree.map(lambda leaf: leaf[:count], block)
     curve = [{name: values[:count] for name, values in row.items()} for row in judge.curve]
-    return Adapted(of, lanes, block, Judged(judged.by, *(column[:count] for column in judged[1:])), curve)
+    return AdaptationResult(of, lanes, block, Judgement(judged.by, *(column[:count] for column in judged[1:])), curve)
 
 
-def learned(
+def learn_lanes(
     of: Adaptation,
     lanes: Lanes,
     teacher: Teacher | None,
     labels: Label | None = None,
     mesh: Mesh | None = None,
-    watch: Callable[[str], Tell] = lambda what: untold,
+    watch: Callable[[str], Tell] = lambda what: ignore_progress,
     before_round: Callable[[LaneState, int], None] = lambda block, asked: None,
 ) -> LaneState:
-    """Lanes with a model of a teacher's answers, or of given labels; arguments as `adapt` has them.
+    """Return the lanes with models of a teacher's answers, or of given labels; arguments as for `adapt`.
 
     `before_round` gets the lanes and the number of questions so far. Raises UserError if all lanes failed for their
     policy or their teacher.
@@ -134,7 +136,7 @@ def learned(
 
 
 def check_amounts(space: Space, bounds: Sequence[float], scalars: Scalars) -> str:
-    """Return what may be meant otherwise of bounds and the strength of labels, in the space's unit; or nothing.
+    """Return a hint where a bound or a label strength looks like a value in another unit; else an empty string.
 
     Raises UserError for what cannot be, or could teach nothing.
     """
@@ -164,14 +166,16 @@ def check_amounts(space: Space, bounds: Sequence[float], scalars: Scalars) -> st
 
 
 def usual_bound(space: Space) -> float:
-    """How far corrections may lead where nobody says how far, in the space's unit: a quarter of its reach."""
+    """Return the default bound of corrections, in the space's unit: a quarter of the space's reach."""
     return max(BOUND * space.reach, space.grain)
 
 
 def reach(space: Space, policy: Policy, obs: Any, action: Any) -> float:
-    """The distance within which 95% of actions (labels, action) lie from a policy's own, in the space's unit."""
+    """Return the distance within which 95% of labelled actions (labels, action) lie from a policy's own, in the space's
+    unit.
+    """
     away = _distances(space, policy, jnp.asarray(obs), jnp.asarray(action))
-    user_code.check_actions(away, named(policy))
+    user_code.check_actions(away, policy_name(policy))
     return float(space.to_unit(np.quantile(np.asarray(away), REACH_QUANTILE), np))
 
 
@@ -181,7 +185,7 @@ def _distances(space: Space, policy: Any, obs: Array, action: Array) -> Array:
 
 
 def plain_scalars(space: Space) -> Scalars:
-    """Default scalars in a space's unit: as much of its reach as they are of a half turn, eps at least its grain."""
+    """Return default scalars in a space's unit, scaled by the space's reach; eps is at least the space's grain."""
     names = ("eps_deg", "tau_deg", "tau_max_deg", "scalar_within_deg", "nearest_aim_deg")
     share = space.reach / DIRECTIONS.reach
     scalars = replace(Scalars(), **{name: getattr(Scalars, name) * share for name in names})
@@ -189,6 +193,6 @@ def plain_scalars(space: Space) -> Scalars:
 
 
 def settling(scalars: Scalars, eps_deg: float | None) -> Scalars:
-    """Scalars with answers of that strength (None: as they are), and a threshold that is small beside it."""
+    """Return the scalars with answers of strength eps (None: unchanged) and a threshold tau small beside eps."""
     eps = scalars.eps_deg if eps_deg is None else eps_deg
     return replace(scalars, eps_deg=eps, tau_deg=min(scalars.tau_deg, eps / PASSES))

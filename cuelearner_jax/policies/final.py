@@ -65,8 +65,8 @@ def arbiter_of(config: RunConfig) -> Arbiter:
     return make_arbiter(config.arbiter, config.agent, config.bootstraps)
 
 
-def acting(arbiter: Arbiter, params: Params, model: GuidanceModel, state: Any) -> dict[str, Any]:
-    """What of a lane its finished policy acts with: that of a checkpoint which `finished` reads.
+def acting_state(arbiter: Arbiter, params: Params, model: GuidanceModel, state: Any) -> dict[str, Any]:
+    """What of a lane its finished policy acts with: that of a checkpoint which `final_policy` reads.
 
     `state`: the arbiter's, of which one that acts in the finished policy keeps the arm.
     """
@@ -74,7 +74,7 @@ def acting(arbiter: Arbiter, params: Params, model: GuidanceModel, state: Any) -
     return {"params": params, "guidance": model, **arm}
 
 
-def finished(config: RunConfig, guide: Guide, view: Any, step: int, known: Mapping[str, Any]) -> Agent | Arbitrated:
+def final_policy(config: RunConfig, guide: Guide, view: Any, step: int, known: Mapping[str, Any]) -> Agent | Arbitrated:
     """The policy that lanes are trained for, as they stand after so many steps.
 
     Args:
@@ -82,7 +82,7 @@ def finished(config: RunConfig, guide: Guide, view: Any, step: int, known: Mappi
         guide: of their kind of guidance.
         view: of where the policy acts.
         step: environment steps of each lane.
-        known: what they act with (`acting`), leading axis: lanes; an arm may be one for all lanes.
+        known: what they act with (`acting_state`), leading axis: lanes; an arm may be one for all lanes.
     """
     agent = Agent(known["params"], config.agent_in(view), view)
     arbiter = arbiter_of(config)

@@ -1,6 +1,6 @@
-"""Calibration from the first question to the result: which changes explain the answers, how large they are, how sure.
+"""Calibration from the first question to the result: which changes explain the answers, their sizes and intervals.
 
-calibration = Calibration(policy, declared(env), actions_of(env), eps_deg=2.0)
+calibration = Calibration(policy, declared_distortions(env), actions_of(env), eps_deg=2.0)
 while calibration.asked < 100:
     questions = calibration.questions(obs, 10)
     calibration.learn(obs[questions.index], questions.action, answers, doubt=questions.doubt)
@@ -18,67 +18,67 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from cuelearner_jax.calibration.corrected import Calibrated
 from cuelearner_jax.calibration.families import Distortion, check_family, unknowns_of
 from cuelearner_jax.calibration.likelihood import GRID
 from cuelearner_jax.calibration.meaning import Meaning
+from cuelearner_jax.calibration.policy import Calibrated
 from cuelearner_jax.calibration.posterior import HELD_OUT, Answers, Fit
-from cuelearner_jax.calibration.questions import Questions, choose, drawn, ties
+from cuelearner_jax.calibration.questions import Questions, choose, draw_hypotheses, ties
 from cuelearner_jax.calibration.response import Responses
 from cuelearner_jax.calibration.scales import scales_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.policies import in_space, policy_of
-from cuelearner_jax.spaces import Space, said
+from cuelearner_jax.spaces import Space, is_answered
 
 Floats = np.ndarray
 Given = Array | np.ndarray  # what is taken
 BATCH = 10  # questions between two fits
-CHOICE = 6  # situations of which one is asked about
+CHOICE = 6  # situations from which one question is chosen
 LOOKS = 6  # nodes at which the policy is asked in each situation to choose from
 FRESH = 3  # nodes after each batch
 ROUNDS = 4  # of samples, where there were none
-LEAST = 20  # answers that two changes at once are asked of
-DOUBT = 2.0  # what the evidence of each change must exceed [nats]
-SURE = 3.0  # what the evidence of all must exceed, against no change [nats]
-LOOSE = 5.0  # what it must exceed where answers and corrected policy differ so much that evidence means little
-LARGEST = 3  # changes at once
-SETTLED, SETTLING = 10.0, 6  # samples that must count in the end, for each unknown and one; rounds for these at most
-MOSTLY = 0.75  # share of answers about something else, above which the policy does not explain them
-APART = 2.5  # [eps]: a policy from which teachers differ by more, as a rule, is not explained
+LEAST = 20  # answers before two changes at once are considered
+DOUBT = 2.0  # least evidence for each change [nats]
+SURE = 3.0  # least evidence for all changes, against no change [nats]
+LOOSE = 5.0  # least evidence where answers differ much from the corrected policy [nats]
+LARGEST = 3  # most changes at once
+SETTLED, SETTLING = 10.0, 6  # effective samples for each unknown and one in the end; most rounds for these
+MOSTLY = 0.75  # share of answers about something else, above which the verdict is UNEXPLAINED
+APART = 2.5  # [eps]: larger typical distance between teacher and policy gives the verdict UNEXPLAINED
 
 CHANGED, UNCHANGED, UNEXPLAINED = "changed", "nothing changed", "none of these"
 
 
 class Estimate(NamedTuple):
-    """An unknown after all answers, in its unit."""
+    """The estimate of one unknown after all answers, in the unknown's unit."""
 
     name: str
     unit: str
     mean: float
     low: float  # ends of the 95% interval
     high: float
-    changed: bool  # do the answers ask for it? If not, the interval is as if it alone were added
+    changed: bool  # True if the unknown is corrected; else the interval is for this unknown added alone
 
     def words(self) -> str:
-        """One line."""
+        """Describe the estimate in one line."""
         return f"{self.name}: {self.mean:.4g} [{self.low:.4g}, {self.high:.4g}] {self.unit}"
 
 
 class Result(NamedTuple):
-    """What answers tell about the changes of a world."""
+    """The verdict of calibration, the estimates and the corrected policy."""
 
     verdict: str  # CHANGED, UNCHANGED or UNEXPLAINED
     changes: tuple[str, ...]  # names of the distortions that are corrected
-    estimates: tuple[Estimate, ...]  # of every unknown
-    evidence: dict[tuple[str, ...], float]  # of each set of changes, less that of no change [nats]
+    estimates: tuple[Estimate, ...]  # estimates of all unknowns
+    evidence: dict[tuple[str, ...], float]  # evidence of each set of changes, less that of no change [nats]
     held_out: tuple[float, float]  # mean log probability of a held-out answer without and with the changes [nats]
     wrong: float  # share of answers about something else
-    apart: float  # how far teacher and corrected policy differ as a rule, in the space's unit
-    more: int | None  # labels that are probably still needed; None: not known
-    policy: Any  # the corrected policy, or the policy as it was
+    apart: float  # typical distance between teacher and corrected policy, in the space's unit
+    more: int | None  # expected number of labels still needed; None: not known
+    policy: Any  # the corrected policy, or its base where nothing changed
 
     def words(self) -> list[str]:
-        """The result, line by line."""
+        """Describe the result, line by line."""
         if self.verdict == UNEXPLAINED:
             return ["None of these changes explains the answers. The policy stays as it was."]
         if self.verdict == UNCHANGED:
@@ -88,11 +88,11 @@ class Result(NamedTuple):
 
 
 class Calibration:
-    """Answers so far, and what they tell.
+    """The answers so far, and the posterior of the changes.
 
     Args:
         policy: a policy, or any function of a batch of observations.
-        family: what may have changed; see `families.declared`.
+        family: what may have changed; see `families.declared_distortions`.
         space: of the actions.
         eps_deg: strength of an answer, in the space's unit.
         seed: of everything random.
@@ -115,7 +115,7 @@ class Calibration:
         self.ready: list[Responses] = []  # none before the first situations
 
     def copy(self, random: np.random.Generator) -> Calibration:
-        """Return what is known now, to choose questions by while this one goes on; `random`: of these questions."""
+        """Return a copy for choosing questions while the original goes on; `random`: for these questions."""
         other = copy(self)
         other.fits, other.random = {names: copy(fit) for names, fit in self.fits.items()}, random
         other.ready = [copy(one) for one in self.ready]
@@ -127,11 +127,11 @@ class Calibration:
         return 0 if self.answers is None else len(self.answers.obs)
 
     def questions(self, obs: Float[Given, "n obs"], count: int = BATCH) -> Questions:
-        """Return what to ask in some of n situations, n at least `count`; more give better questions."""
+        """Return at least `count` questions for n situations; more situations give better questions."""
         obs = np.asarray(obs, np.float32)
         self._scaled(obs)
         fits = list(self.fits.values()) or [self._new(names) for names in self._singles()]
-        draws = drawn(fits, self._odds(fits), self.random)
+        draws = draw_hypotheses(fits, self._odds(fits), self.random)
         places = np.concatenate([fit.places(thetas) for fit, thetas in draws])
         response = self.responses.of(obs, self.responses.covering(places, LOOKS))
         chosen = choose(draws, response, count, self.random)
@@ -147,12 +147,12 @@ class Calibration:
         answer: Float[Given, "n cues"],
         doubt: Float[Given, " n"] | None = None,
     ) -> None:
-        """Take answers (-1, 0, 1 or `UNSAID`, a cue each) and fit what may have changed to all so far.
+        """Add answers (-1, 0, 1 or `UNSAID` for each cue), and fit the changes to all answers so far.
 
-        An answer that says nothing of any cue is none.
+        An answer with every cue unsaid is dropped.
         """
         obs, action, answer = (np.asarray(rows, np.float32) for rows in (obs, action, answer))
-        there = np.asarray(said(jnp.asarray(answer)) & np.isfinite(answer)).any(-1)
+        there = np.asarray(is_answered(jnp.asarray(answer)) & np.isfinite(answer)).any(-1)
         obs, action, answer = obs[there], action[there], answer[there]
         if not len(obs):
             return
@@ -160,7 +160,7 @@ class Calibration:
         self._scaled(obs)
         if doubt is None:
             doubt = ties(self.meaning, (), np.zeros(0), obs, self.eps)
-        told = np.asarray(said(jnp.asarray(answer)), np.float32) * np.isfinite(answer)
+        told = np.asarray(is_answered(jnp.asarray(answer)), np.float32) * np.isfinite(answer)
         new = Answers(obs, action, answer, told, np.asarray(doubt, np.float32))
         old = self.answers
         self.answers = new if old is None else Answers._make(map(np.concatenate, zip(old, new, strict=True)))
@@ -174,7 +174,7 @@ class Calibration:
 
     @property
     def responses(self) -> Responses:
-        """The policy at nodes, once the first situations were seen."""
+        """The policy's responses at nodes, from the first situations on."""
         return self.ready[0]
 
     def _singles(self) -> list[tuple[str, ...]]:
@@ -186,7 +186,7 @@ class Calibration:
         return Fit(family, self.scales, self.responses, self.seed * 1000 + number)
 
     def _fit(self, names: tuple[str, ...]) -> Fit:
-        """The fit of some changes to all answers so far."""
+        """Return the fit of a set of changes to all answers so far."""
         assert self.answers is not None
         rounds = 1 if names in self.fits else ROUNDS
         fit = self.fits.setdefault(names, self._new(names))
@@ -194,11 +194,11 @@ class Calibration:
         return fit
 
     def _compare(self) -> None:
-        """Fit no change, each change, and what the best asks for beside it."""
+        """Fit no change, each single change, and the best single change with each other one."""
         assert self.answers is not None
         if self.fits:
             fits = list(self.fits.values())
-            draws = drawn(fits, self._odds(fits), self.random)
+            draws = draw_hypotheses(fits, self._odds(fits), self.random)
             places = np.concatenate([fit.places(thetas) for fit, thetas in draws])
             self.responses.drawn(places, FRESH, self.random)
         self.response = self.responses.of(self.answers.obs)
@@ -215,7 +215,7 @@ class Calibration:
         self._choose(max(path, key=lambda names: self._score(self.fits[names])))
 
     def _settle(self) -> None:
-        """Choose anew among what differs from the chosen changes by one, with enough samples of each."""
+        """Choose again among the sets that differ from the chosen one by one change, with enough samples each."""
         near = {self._named({one.name} ^ set(self.chosen)) for one in self.family} | {self.chosen}
         current = self._current()
         for names in near & set(current):
@@ -223,7 +223,7 @@ class Calibration:
         self._choose(max(current, key=lambda names: self._score(self.fits[names])))
 
     def _current(self) -> list[tuple[str, ...]]:
-        """Changes that were fitted to all answers."""
+        """Return the sets of changes that were fitted to all answers."""
         return [names for names, fit in self.fits.items() if fit.answers is self.answers]
 
     def _choose(self, best: tuple[str, ...]) -> None:
@@ -231,14 +231,14 @@ class Calibration:
         self.chosen = best if gain > (SURE if _explains(self.fits[best]) else LOOSE) - DOUBT else ()
 
     def _named(self, names: set[str]) -> tuple[str, ...]:
-        """Names in the order of the family."""
+        """Return names in the order of the family."""
         return tuple(one.name for one in self.family if one.name in names)
 
     def _score(self, fit: Fit) -> float:
         return fit.evidence - DOUBT * len(fit.family)
 
     def _odds(self, fits: list[Fit]) -> Floats:
-        """Of fits that know as many answers as any; before the first answer all are as likely."""
+        """Return the odds of the fits with the most answers; before the first answer all odds are equal."""
         known = [0 if fit.answers is None else len(fit.answers.obs) for fit in fits]
         if not max(known):
             return np.zeros(len(fits))
@@ -250,19 +250,19 @@ class Calibration:
         return self.fits[self.chosen] if self.asked else None
 
     def policy(self) -> Any:
-        """The policy behind what is most likely so far."""
+        """The policy corrected by the most likely changes so far."""
         best = self.best
         if best is None or not [one for one in best.family if not one.of_teacher]:
             return self.base
         return Calibrated(self.base, jnp.asarray(best.interval()[0], jnp.float32), best.family)
 
     def result(self) -> Result:
-        """What all answers tell. Raises UserError for too few."""
+        """Return the result of all answers. Raises UserError for too few answers."""
         if self.asked < HELD_OUT:
             raise UserError(f"{self.asked} answers tell too little: give at least {HELD_OUT}")
         self._settle()
         best, none = self.fits[self.chosen], self.fits[()]
-        before, after = none.predicted(), best.predicted()
+        before, after = none.predict_held_out(), best.predict_held_out()
         gain = after - before
         holds = bool(best.family) and gain.mean() > 0
         if not holds:
@@ -290,7 +290,7 @@ class Calibration:
         ]
 
     def _more(self, fit: Fit) -> int:
-        """Labels until the corrected actions are as sure as an answer can tell: within eps / 2."""
+        """Return the number of labels until corrected actions are known within eps / 2."""
         weight = fit.weight[:, None, None]
         offset = np.clip(fit.offset, -20, 20)
         spread = np.sqrt((weight * np.square(offset - (weight * offset).sum(0))).sum(0))
@@ -319,7 +319,7 @@ def calibrate(
     space: Space,
     eps_deg: float,
 ) -> Result:
-    """Ask a teacher in batches and tell what changed. Held-out answers judge; no reward is seen.
+    """Ask a teacher in batches and estimate the changes. Held-out answers judge; no reward is used.
 
     Args:
         policy: a policy, or any function of a batch of observations.

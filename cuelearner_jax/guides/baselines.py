@@ -1,4 +1,4 @@
-"""The kinds that learn nothing and never ask: the agent alone, and the task's obvious action."""
+"""Baseline kinds without a model or questions: the agent alone, and the task's heuristic."""
 
 from __future__ import annotations
 
@@ -10,26 +10,26 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from cuelearner_jax.config import GuideScalars
 from cuelearner_jax.guides.base import Guide, Kind
-from cuelearner_jax.guides.refining import Refined, untouched
+from cuelearner_jax.guides.refining import Refinement, no_refinement
 from cuelearner_jax.types import GuidanceModel, Label
 
 
 class Untaught(Guide):
-    """A guide with an empty model; by itself no guidance, with which every other kind is compared."""
+    """A guide with an empty model: no guidance, the baseline of every other kind."""
 
     @property
     def moves(self) -> bool:
-        """Whether a class that inherits says how it acts."""
+        """Whether the guide changes actions; False for no guidance, True for subclasses."""
         return type(self).act is not Untaught.act
 
     def init(self, key: PRNGKeyArray) -> GuidanceModel:
-        """Nothing."""
+        """Return an empty model."""
         return GuidanceModel({}, jnp.array(False))
 
     def fit(
         self, key: PRNGKeyArray, env: Any, labels: Label, former: GuidanceModel, scalars: GuideScalars
     ) -> GuidanceModel:
-        """The former model."""
+        """Return the former model."""
         return former
 
     def act(
@@ -40,13 +40,13 @@ class Untaught(Guide):
         actions: Float[Array, "n action"],
         active: Bool[Array, " n"],
         scalars: GuideScalars,
-    ) -> Refined:
-        """Every action as it is."""
-        return untouched(actions)
+    ) -> Refinement:
+        """Return every action unchanged."""
+        return no_refinement(actions)
 
 
 class HeuristicGuide(Untaught):
-    """The environment's own obvious action."""
+    """The environment's heuristic as a guide."""
 
     def act(
         self,
@@ -56,9 +56,9 @@ class HeuristicGuide(Untaught):
         actions: Float[Array, "n action"],
         active: Bool[Array, " n"],
         scalars: GuideScalars,
-    ) -> Refined:
-        """The heuristic's action in active rows."""
-        return Refined(jnp.where(active[:, None], jax.vmap(env.heuristic)(obs), actions), active.astype(jnp.int32))
+    ) -> Refinement:
+        """Return the heuristic's action in active rows."""
+        return Refinement(jnp.where(active[:, None], jax.vmap(env.heuristic)(obs), actions), active.astype(jnp.int32))
 
 
 NONE = Kind("none", "the agent alone", Untaught, title="no guidance", colour="#4d4d4d")

@@ -1,4 +1,4 @@
-"""Labels that were given elsewhere, by a file or as arrays: do they make sense to who is to learn from them?"""
+"""Check labels from a file or from arrays before a model learns from them."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from cuelearner_jax.feedback.forms import AnswerForm
 from cuelearner_jax.storage.label_files import LabelFile
 from cuelearner_jax.types import Label
 
-ACTION_ERROR = 1e-3  # by which an entry of an action may miss it
+ACTION_ERROR = 1e-3  # largest error of an entry of an action
 
 
 def check_file(file: LabelFile, spaces: Spaces | None, form: AnswerForm | None, named: str) -> None:
-    """Whether a file's labels are such as a teacher could have given.
+    """Check that a file's labels fit an environment and a form of answers.
 
     Args:
         file: the labels.
@@ -32,7 +32,7 @@ def check_file(file: LabelFile, spaces: Spaces | None, form: AnswerForm | None, 
 
 
 def check(labels: Label, spaces: Spaces, form: AnswerForm | None, named: str = "the labels") -> None:
-    """Whether labels are such as a teacher could have given.
+    """Check that labels fit an environment and a form of answers.
 
     Args:
         labels: rows (labels, ...) of arrays.
@@ -41,7 +41,7 @@ def check(labels: Label, spaces: Spaces, form: AnswerForm | None, named: str = "
         named: what a message calls them.
 
     Raises:
-        UserError: a shape is another, a number is not finite, an action is none, an answer is none of the form.
+        UserError: a wrong shape, a number that is not finite, an action outside the space, or a value that is not allowed.
     """
     rows = {"observations": labels.obs, "actions": labels.action, "answers": labels.answer}
     width = labels.answer.shape[-1] if form is None else form.width(spaces.actions)
@@ -63,7 +63,7 @@ def check(labels: Label, spaces: Spaces, form: AnswerForm | None, named: str = "
 
 
 def _refuse(wrong: np.ndarray, reason: str, remedy: str) -> None:
-    """Raises UserError if an entry of any label is wrong: (labels, ...)."""
+    """Raise UserError if an entry of any label is wrong: (labels, ...)."""
     found = np.flatnonzero(wrong.reshape(len(wrong), -1).any(axis=1))
     if len(found):
         raise UserError(f"{reason} ({len(found)} of {len(wrong)} labels, the first is number {found[0] + 1}): {remedy}")

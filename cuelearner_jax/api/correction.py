@@ -1,4 +1,4 @@
-"""A policy corrected by labels alone: no simulator, no task; and how many other answers it agrees with."""
+"""Correct a policy by labels alone, without simulator or task; count how many other answers a policy agrees with."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ import numpy as np
 
 from cuelearner_jax import config as configuration
 from cuelearner_jax import user_code
-from cuelearner_jax.adaptation.adapting import plain_scalars
+from cuelearner_jax.adaptation.by_model import plain_scalars
 from cuelearner_jax.adaptation.judging import LABELS
 from cuelearner_jax.api import arguments
-from cuelearner_jax.api.acting import CallablePolicy, as_policy, load_policy
 from cuelearner_jax.api.adaptation import AdaptedPolicy, adapt
 from cuelearner_jax.api.feedback import Labels, label_path, labels_of, rows_of
+from cuelearner_jax.api.policies import CallablePolicy, as_policy, load_policy
 from cuelearner_jax.api.worlds import World
 from cuelearner_jax.config import GuideSizes, Scalars
 from cuelearner_jax.environment import Spaces
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.feedback import given
+from cuelearner_jax.feedback import external_labels
 from cuelearner_jax.feedback.answers import RELATIVE
 from cuelearner_jax.guides.relative import KIND
 from cuelearner_jax.policies import in_space
@@ -39,15 +39,15 @@ from cuelearner_jax.types import Label
 
 
 class GivenLabels(NamedTuple):
-    """Labels, and what they say of themselves."""
+    """Labels with the strength, space and recording that their file names."""
 
     rows: Label
     space: Space
-    eps: float | None  # in the space's unit; None: they do not say
-    config: LogsConfig | None = None  # of the recording they are about; None: they do not say
+    eps: float | None  # strength of an answer in the space's unit; None: not known
+    config: LogsConfig | None = None  # digest of the recording that the labels are about; None: not known
 
 
-@user_code.told
+@user_code.report_user_errors
 def correct(
     policy: Any,
     labels: Labels | str | os.PathLike[str],
@@ -64,19 +64,19 @@ def correct(
     scalars: Scalars | None = None,
     seed: int = 0,
 ) -> AdaptedPolicy:
-    """Corrects a policy by relative labels: what `cuelearner adapt --labels-from` does, without a task.
+    """Correct a policy by relative labels, as `cuelearner adapt --labels-from` does, without a task.
 
     Every fifth answer is held out; a model that predicts fewer of these than "already right" always is not used, with a
     warning.
 
     Args:
-        policy: what is to be corrected: a function of a batch of observations, a module of PyTorch, a model of
+        policy: the policy to correct: a function of a batch of observations, a module of PyTorch, a model of
             Stable-Baselines3, the path of a file in ONNX or of a folder of ours, or a policy.
         labels: `Labels(observations, actions, answers)` as arrays, or a label file.
         bound: how far corrections may lead from the policy's own actions, in the space's unit: shares of the range of
             each entry (default: as far as the labels reach).
         eps: strength of an answer, in the same unit (default: the file's, or 1/36 of the range).
-        guidance: what is made of the answers: "relative", a model of them, or "calibration", a constant change.
+        guidance: how answers are used: "relative" fits a model, "calibration" estimates a constant change.
         cues: words for more and less of each entry of an action, "left,right;up,down" (default: "more,less").
         low, high: bounds of the actions, a number an entry (default: the range of the labels' actions).
         space: instead of these three: the space of the actions, such as `cuelearner_jax.spaces.DIRECTIONS`.
@@ -103,14 +103,16 @@ def correct(
         and not isinstance(labels, str | os.PathLike)
         and not any(map(_is_told, (space, cues, low, high)))
     ):
-        space = logs.space_of(before)  # of a policy that was corrected before
+        space = logs.space_of(before)  # the labels of a policy that was corrected before
     found = _given(labels, space, cues, low, high)
     eps = arguments.optional(arguments.amount, "eps", eps, found.space)
     if found.eps is not None and eps is not None and not np.isclose(eps, found.eps, rtol=1e-6):
         raise UserError(f"{labels} holds answers of {found.eps:g} {found.space.unit}: leave out eps")
     world = world_of(found, before)
     own = as_policy(policy)
-    CallablePolicy(in_space(own, found.space), actions=found.space)(found.rows.obs)  # what is no action is told here
+    CallablePolicy(in_space(own, found.space), actions=found.space)(
+        found.rows.obs
+    )  # raises UserError where the policy returns something else than actions
     return adapt(
         policy if isinstance(policy, CallablePolicy) else own,
         world,
@@ -126,7 +128,7 @@ def correct(
     )
 
 
-@user_code.told
+@user_code.report_user_errors
 def agreement(
     policy: Any,
     labels: Labels | str | os.PathLike[str],
@@ -135,7 +137,7 @@ def agreement(
     eps: float | None = None,
     space: Space | None = None,
 ) -> Agreement:
-    """Returns how many answers a policy agrees with, beside the policy as it was and "always already right".
+    """Return how many answers a policy agrees with, beside its base and "already right" always.
 
     Args:
         policy: what `correct` takes or returns.
@@ -163,7 +165,7 @@ def agreement(
 
 
 def _given(labels: Any, space: Any, cues: Any, low: Any, high: Any) -> GivenLabels:
-    """Checked labels with their space. Raises UserError for what makes no sense."""
+    """Return checked labels with their space. Raises UserError for labels that make no sense."""
     told = [name for name, value in (("cues", cues), ("low", low), ("high", high)) if _is_told(value)]
     if space is not None and told:
         raise UserError(f"{told[0]} is given beside space, which says it already: leave out one of them")
@@ -171,7 +173,7 @@ def _given(labels: Any, space: Any, cues: Any, low: Any, high: Any) -> GivenLabe
     if isinstance(labels, str | os.PathLike):
         if told or space is not None:
             raise UserError(f"{labels} says its own space of actions: leave out {told[0] if told else 'space'}")
-        return of_file(label_path(labels))
+        return labels_from_file(label_path(labels))
     rows = rows_of(labels)
     if space is None:
         size = rows.action.shape[1]
@@ -184,7 +186,7 @@ def _given(labels: Any, space: Any, cues: Any, low: Any, high: Any) -> GivenLabe
                 f"low and high bound {len(low)} and {len(high)} entries, actions have {size}: give one an entry"
             )
         space = Box(tuple(map(float, low)), tuple(map(float, high)), cues_from(cues) if _is_told(cues) else ())
-    given.check(rows, Spaces(rows.obs.shape[1], space), RELATIVE)
+    external_labels.check(rows, Spaces(rows.obs.shape[1], space), RELATIVE)
     return GivenLabels(rows, space, None)
 
 
@@ -196,12 +198,12 @@ def _numbers(name: str, value: Any) -> list[float]:
     return arguments.numbers(name, value).reshape(-1).tolist()
 
 
-def of_file(path: Path) -> GivenLabels:
-    """The labels of a file's first seed. Raises UserError for a file of other answers."""
+def labels_from_file(path: Path) -> GivenLabels:
+    """Return the labels of a file's first seed. Raises UserError for a file of other answers."""
     file = label_files.read(path)
     if file.answers != RELATIVE.name:
         raise UserError(f"{path} holds {file.answers} answers: give a file of {RELATIVE.name} ones")
-    given.check_file(file, None, RELATIVE, str(path))
+    external_labels.check_file(file, None, RELATIVE, str(path))
     own = file.seeds == file.seeds[0]
     rows = jax.tree.map(lambda leaf: np.asarray(leaf)[own], file.labels)
     config = None
@@ -215,13 +217,13 @@ def of_file(path: Path) -> GivenLabels:
 
 
 def _recording_of(policy: Any) -> LogsConfig | None:
-    """The recording about which a policy was corrected before; None: it was not."""
+    """Return the digest of the recording by which a policy was corrected before; None: it was not."""
     config = getattr(getattr(policy, "trained", None), "task", None) if isinstance(policy, CallablePolicy) else None
     return config if isinstance(config, LogsConfig) else None
 
 
 def world_of(found: GivenLabels, before: LogsConfig | None = None) -> World:
-    """The situations of labels as a world of the task `logs`, which names no folder.
+    """Return the situations of labels as a world of the task `logs`, which names no folder.
 
     Networks of a policy that was corrected `before` keep their view. Raises UserError where that cannot be.
     """
@@ -245,7 +247,7 @@ def world_of(found: GivenLabels, before: LogsConfig | None = None) -> World:
 
 
 def _as_values(space: Space) -> dict[str, Any]:
-    """A space as the fields of a configuration."""
+    """Return a space as the fields of a configuration."""
     bounds = {"low": (0.0,) * space.size, "high": (1.0,) * space.size}
     if isinstance(space, Box):
         bounds = {"low": space.low, "high": space.high}

@@ -1,4 +1,4 @@
-"""Where questions come from in a simulated world: situations that the policy meets, and a simulated teacher."""
+"""Situations and answers in a simulated world: states that the policy meets, and a simulated teacher."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from cuelearner_jax.feedback.answers import relative_answer
 from cuelearner_jax.types import EnvState, Teacher
 
 BEFORE = 12  # steps before the first questions
-EACH, APART = 4, 2  # situations of each environment's walk between two batches, and steps between them
+EACH, APART = 4, 2  # situations of each environment between two batches; steps between two situations
 
 
 class Walk:
@@ -35,7 +35,7 @@ class Walk:
         self.obs: Any = None
 
     def situations(self, key: PRNGKeyArray, policy: Any, count: int) -> tuple[EnvState, Float[Array, "count obs"]]:
-        """Walk on with a policy, and return `count` situations on the way."""
+        """Let a policy act on, and return `count` situations on the way."""
         envs, steps = -(-count // EACH), EACH * APART
         k_start, *keys = jax.random.split(key, 1 + steps + (BEFORE if self.states is None else 0))
         if self.states is None or len(self.obs) != envs:
@@ -48,13 +48,13 @@ class Walk:
             self.states, self.obs = _step(self.env, jax.random.split(k_env, envs), self.states, action)
             if (len(keys) - 1 - number) % APART == 0 and len(keys) - number <= steps:
                 met.append((self.states, self.obs))
-        # Those of one environment stand side by side, so that one question comes from few of them.
+        # Situations of one environment are adjacent, so that one question is chosen from few environments.
         return jax.tree.map(lambda *rows: jnp.stack(rows, 1).reshape(-1, *rows[0].shape[1:])[:count], *met)
 
     def answers(
         self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"], actions: Float[Array, "n action"]
     ) -> Float[Array, "n cues"]:
-        """The teacher's answers; NaN where it says nothing."""
+        """Return the teacher's answers; NaN where it says nothing."""
         keys = jax.random.split(key, len(obs))
         return _answers(self.env, self.teacher, self.scalars, keys, states, obs, actions)
 

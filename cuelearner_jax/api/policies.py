@@ -1,4 +1,4 @@
-"""Policies to call: on one observation or on many, from a folder or of one's own making."""
+"""Policies to call, on one observation or on many: read from a folder, or made from the caller's function."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from cuelearner_jax.api.worlds import World, a_world
 from cuelearner_jax.config import LARGEST_FLOAT
 from cuelearner_jax.environment import Quantity, actions_of
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.policies import Policy, acted, in_space, named
+from cuelearner_jax.policies import Policy, call_policy, in_space, policy_name
 from cuelearner_jax.policies.foreign import ONNX
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.runs import trained
@@ -32,7 +32,7 @@ from cuelearner_jax.types import EnvState
 
 @partial(jax.jit, static_argnames="space")
 def _act(policy: Policy, key: PRNGKeyArray, obs: Float[Array, "n obs"], space: Space) -> Float[Array, "n action"]:
-    return acted(policy, key, None, obs, space)
+    return call_policy(policy, key, None, obs, space)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,24 +43,24 @@ class CallablePolicy:
     """
 
     policy: Policy
-    observation: tuple[Quantity, ...] = ()  # what it expects to see; empty: not known
-    asks: bool = False  # does it ask a teacher, who looks at the true state?
-    trained: RunConfig | None = None  # with which configuration; None: no folder says so
-    actions: Space = DIRECTIONS  # in which it acts
-    world: World | None = None  # where it was corrected, or loaded for; None: nothing says so
+    observation: tuple[Quantity, ...] = ()  # slices of the observation; empty: not known
+    asks: bool = False  # True if the policy asks a teacher, who looks at the true state
+    trained: RunConfig | None = None  # configuration of its training; None: not known
+    actions: Space = DIRECTIONS  # space of its actions
+    world: World | None = None  # world in which it was corrected, or loaded for; None: not known
 
     def __post_init__(self) -> None:
-        """Raises UserError for a policy that is none, or a description of observations that is none."""
+        """Raise UserError for an object that does not act, or a bad description of observations."""
         arguments.policy("policy", self.policy)
         if not all(isinstance(part, Quantity) for part in arguments.several("observation", self.observation, "slices")):
-            raise arguments.refused("observation", self.observation, "slices, as a world's observation has them")
+            raise arguments.argument_error("observation", self.observation, "slices, as a world's observation has them")
         arguments.flag("asks", self.asks)
         if self.trained is not None:
             arguments.instance("trained", self.trained, RunConfig, "a RunConfig")
 
-    @user_code.told
+    @user_code.report_user_errors
     def __call__(self, obs: Any, key: PRNGKeyArray | None = None) -> np.ndarray:
-        """Actions for observations.
+        """Return actions for observations.
 
         Args:
             obs: (obs,) or (n, obs), as `observation` orders them.
@@ -79,16 +79,16 @@ class CallablePolicy:
         key = jax.random.key(0) if key is None else arguments.key("key", key)
         # A copy, which the caller may write in.
         chosen = np.array(_act(self.policy, key, jnp.asarray(batch), self.actions))
-        user_code.check_actions(chosen, named(self.policy))
+        user_code.check_actions(chosen, policy_name(self.policy))
         return chosen[0] if rows.ndim == 1 else chosen
 
     def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
-        """As `types.Policy` has it."""
+        """Act as `types.Policy.act`."""
         return self.policy.act(key, states, obs)
 
 
 def as_policy(given: Any, name: str = "policy") -> Policy:
-    """Anything that acts as a policy: a `CallablePolicy`, a folder of ours, or what `policies.policy_of` takes.
+    """Return anything that acts as a policy: a `CallablePolicy`, a policy folder, or what `policies.policy_of` takes.
 
     Raises UserError, which says the argument's name, for what is none of them.
     """
@@ -101,12 +101,12 @@ def as_policy(given: Any, name: str = "policy") -> Policy:
 
 
 def entries_of(policy: Any) -> int:
-    """Entries of the observations that a policy expects, 0 where that is not known."""
+    """Return the number of entries of the observations that a policy expects, 0 where that is not known."""
     return sum(quantity.size for quantity in policy.observation) if isinstance(policy, CallablePolicy) else 0
 
 
 def as_policy_in(given: Any, env: Any) -> Policy:
-    """`as_policy` for a world. Raises UserError for a policy of other observations, or one that cannot act there."""
+    """Return `as_policy` for a world. Raises UserError for a policy that cannot act there."""
     policy, seen = as_policy(given), entries_of(given)
     own = sum(quantity.size for quantity in getattr(env, "observation", ()))
     if seen and own and seen != own:
@@ -117,12 +117,12 @@ def as_policy_in(given: Any, env: Any) -> Policy:
 
 
 def source_of(policy: Any, world: World) -> trained.PolicySource:
-    """Where a policy comes from, for a study in a world: what it was trained with, or is taken to be trained with."""
+    """Return a policy's source for a study in a world: the configuration of its training, or a stand-in."""
     config = getattr(policy, "trained", None) or world.task.start()
     return trained.PolicySource(world.task, dataclasses.replace(config, task=world.config), None, Path(world.task.name))
 
 
-@user_code.told
+@user_code.report_user_errors
 def load_policy(
     folder: str | Path,
     *,
@@ -136,7 +136,7 @@ def load_policy(
     task: Task | str | None = None,
     world: World | None = None,
 ) -> CallablePolicy:
-    """What a lane of a finished run acts with, or of a policy folder (`adapt`).
+    """Load the policy of a lane of a finished run, or of a policy folder (`adapt`).
 
     Args:
         folder: of the run, or of a sweep in pieces; or the policy folder.

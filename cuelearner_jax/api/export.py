@@ -7,18 +7,18 @@ from typing import Any
 
 from cuelearner_jax import user_code
 from cuelearner_jax.api import arguments
-from cuelearner_jax.api.acting import as_policy, as_policy_in
+from cuelearner_jax.api.policies import as_policy, as_policy_in
 from cuelearner_jax.api.worlds import World, a_world
 from cuelearner_jax.config import to_json
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.export import contract, correction, decisions, runner
 
 
-@user_code.told
+@user_code.report_user_errors
 def export_policy(
     policy: Any, out: str | Path, world: World | None = None, format: str = "stablehlo"
 ) -> dict[str, Any]:
-    """Writes a policy's whole decision as a file, with a contract of what goes in and what comes out.
+    """Write a policy's whole decision as a file, with a contract of its inputs and outputs.
 
     Args:
         policy: one that was loaded, adapted or refined, or anything else made of JAX functions that acts.
@@ -28,7 +28,7 @@ def export_policy(
         format: "stablehlo", "onnx" or "numpy".
 
     Returns:
-        The contract, with "difference": the largest one of a golden case in the file that was written.
+        The contract, with "difference": the largest difference of the file's golden cases.
 
     Raises:
         UserError: the folder is in use; the policy acts at random, asks a teacher, holds Python code, or does not fit.
@@ -42,9 +42,9 @@ def export_policy(
     return contract.write(acting, env, drawn, format, out, _about(policy, world))
 
 
-@user_code.told
+@user_code.report_user_errors
 def export_correction(policy: Any, out: str | Path, world: World | None = None, format: str = "onnx") -> dict[str, Any]:
-    """Writes the correction of a corrected policy alone: observation and base action in, action out.
+    """Write the correction of a corrected policy alone: observation and base action in, action out.
 
     It runs beside a base that stays where it is: `decide(observation, base_action)`. In ONNX its inputs are `obs` and
     `base_action`, its output `action`.
@@ -69,7 +69,7 @@ def export_correction(policy: Any, out: str | Path, world: World | None = None, 
 
 
 def _world_of(policy: Any, world: Any) -> World:
-    """Where a policy acts. Raises UserError if nothing says so."""
+    """Return where a policy acts. Raises UserError if it is not known."""
     world = getattr(policy, "world", None) if world is None else world
     if world is None:
         raise UserError("world is not given, and this policy was corrected in none: give one, as cl.make gives it")
@@ -81,7 +81,9 @@ def _about(policy: Any, world: World) -> dict[str, Any]:
 
 
 def load_exported(folder: str | Path) -> runner.Decision:
-    """An exported decision, its golden cases replayed: `decide(obs)` as a policy, `decide.contract`, `decide.check()`.
+    """Return an exported decision whose golden cases were replayed: call it as `decide(obs)`.
+
+    `decide.contract` is its contract, `decide.check()` replays the golden cases again.
 
     Raises:
         UserError: the folder is damaged, or cannot be run here.

@@ -1,4 +1,4 @@
-"""Changes of the physics: what compensates them is found in a simulator that has the unknowns as parameters.
+"""Changes of the physics, whose compensating action is found in a simulator with the unknowns as parameters.
 
 A tilted table changes neither what is seen nor the action that is given, but where an action leads. Whoever has a
 simulator of the world can play actions near the meant one in it, before and after the change. The action to give is
@@ -21,7 +21,7 @@ from cuelearner_jax.spaces import Space
 NARROW = 0.5  # standard deviation of the window in which rewards are compared, in reaches
 
 
-def simulated(
+def simulator_distortion(
     name: str,
     unknowns: tuple[Unknown, ...],
     env_of: Callable[[Float[Array, " unknowns"]], Any],
@@ -30,7 +30,7 @@ def simulated(
     reach: float,
     tried: int = 13,
 ) -> Distortion:
-    """Return a distortion that a simulator explains.
+    """Return a distortion of the physics, as a simulator predicts it.
 
     Args:
         name: of the distortion.
@@ -49,12 +49,12 @@ def simulated(
     if tried < 3 or tried % 2 == 0:
         raise UserError(f"{name!r} tries {tried} actions: give an odd number of at least 3")
     half = tried // 2
-    away = jnp.arange(-2 * half, 2 * half + 1) * (space.from_unit(reach) / half)  # what is tried after the change
+    away = jnp.arange(-2 * half, 2 * half + 1) * (space.from_unit(reach) / half)  # actions tried after the change
     number = jnp.arange(tried)
     window = jnp.exp(-0.5 * jnp.square((number - half) / (NARROW * half)))
 
     def rewards(env: Any, state: Any, action: Array, changes: Array) -> Array:
-        key = jax.random.key(0)  # only what follows an action depends on it
+        key = jax.random.key(0)  # the unknowns affect only the step that follows an action
         play = lambda change: env.step(key, state, space.exp(action, change[None]))[1].reward  # noqa: E731
         return jax.vmap(play)(changes)
 
@@ -64,7 +64,7 @@ def simulated(
         after = rewards(env_of(theta), state, action, away)
         shifted = after[number[:, None] + number[None]]  # (change, action near it)
         unlike = jnp.sum(window[None] * jnp.square(shifted - before[None]), -1)
-        nearest = jnp.abs(number - half) * (1e-4 / tried)  # of equal ones
+        nearest = jnp.abs(number - half) * (1e-4 / tried)  # the middle one of equal actions
         best = jnp.where(before.any(), jnp.argmin(unlike + nearest), half)
         return space.exp(action, away[half + best][None])
 

@@ -1,10 +1,10 @@
-"""Policies as plain values and arrays, and back.
+"""Convert policies to plain values and arrays, and back.
 
 A policy's values are those of its `describe()`. Kept are an `agent` with its `params`; `guided` with its `model` and,
 where there is one, its `bound`; `calibrated` with the `theta` of its unknowns; `uniform`; `heuristic`; and the name of
 `code`, as package.module:NAME.
 
-Code is never loaded because a file names it: whoever opens the policy gives it again.
+Code is never loaded because a file names it: the caller who opens the policy names the code again.
 """
 
 from __future__ import annotations
@@ -28,17 +28,18 @@ from cuelearner_jax.guides.calibration import KIND
 from cuelearner_jax.policies import Agent, Guided, Heuristic, describe, in_space, layers, uniform_in
 from cuelearner_jax.run_config import kind_from_json, part_from_json
 
-CORRECTED = ("guided", "calibrated")  # policies of another one's actions
+CORRECTED = ("guided", "calibrated")  # policies that change another policy's actions
 KINDS = ("agent", "uniform", "heuristic", *CORRECTED, "code")
 PARTS = ((GuideSizes, "sizes"), (Scalars, "scalars"))  # of a guided policy's values
-DERIVED = ("clip_radius_deg", "fitted")  # of a description: the other values and the arrays say them already
-MOST_LAYERS = 16  # of a policy that was adapted again and again
+DERIVED = ("clip_radius_deg", "fitted")  # left out of a description: the other values and the arrays hold them already
+MOST_LAYERS = 16  # most layers of a policy that was adapted again and again
 
 
 def to_json(policy: Any, named: str | None = None) -> dict[str, Any]:
-    """A policy, or a block of policies, as plain values; `named`: how the code in it is named, if there is any.
+    """Return a policy, or a block of policies, as plain values; `named`: the reference of user code in the policy, if
+    any.
 
-    Raises UserError if it asks a teacher, or is refined in a way that cannot be kept.
+    Raises UserError if the policy asks a teacher, or its refinement cannot be stored.
     """
     described = describe(policy)
     for layer in layers(described):
@@ -58,7 +59,7 @@ def to_json(policy: Any, named: str | None = None) -> dict[str, Any]:
 
 
 def check(values: dict[str, Any]) -> None:
-    """Whether plain values from a file say what an adapted policy is made of.
+    """Check that plain values from a file describe an adapted policy.
 
     Raises:
         UserError: a size or scalar that cannot work.
@@ -89,7 +90,7 @@ def check(values: dict[str, Any]) -> None:
 
 
 def arrays_of(policy: Any) -> Any:
-    """The arrays of a policy, or of a block of policies."""
+    """Return the arrays of a policy, or of a block of policies."""
     kind, policy = describe(policy)["policy"], getattr(policy, "policy", policy)  # that `Common` holds
     if kind == "agent":
         return {"params": policy.params}
@@ -102,7 +103,7 @@ def arrays_of(policy: Any) -> Any:
 
 
 def shapes_of(values: dict[str, Any], env: Any, rows: int | None = None) -> Any:
-    """The shapes of a policy's arrays, of its values; of a block of so many `rows` where there are several.
+    """Return the shapes of a policy's arrays from its plain values; `rows`: number of policies in a block.
 
     Shapes in place of arrays will do for `env`. Raises UserError or ValueError if the policy cannot act in it.
     """
@@ -124,7 +125,7 @@ def shapes_of(values: dict[str, Any], env: Any, rows: int | None = None) -> Any:
 
 
 def from_json(values: dict[str, Any], arrays: Any, env: Any, code: Any = None, changes: Any = None) -> Any:
-    """The policy of plain values and arrays, in a world.
+    """Return the policy of plain values and arrays, to act in a world.
 
     Args:
         values, arrays: of the policy.
@@ -163,14 +164,14 @@ def from_json(values: dict[str, Any], arrays: Any, env: Any, code: Any = None, c
 
 
 def _agent(values: dict[str, Any], spaces: Spaces) -> AgentFunctions:
-    """The functions of an agent. Raises UserError if it is not known here."""
+    """Return an agent's functions. Raises UserError if no agent of that name is known."""
     return part_from_json(AGENTS, values["agent"]).make(values["frame"], spaces)
 
 
 def _guidance(values: dict[str, Any], env: Any) -> Guide:
-    """The guide of a guided policy. Raises UserError if its kind is not known here."""
+    """Return the guide of a guided policy. Raises UserError if no kind of that name is known."""
     name = values["guidance"]
-    if guidances.registered(name) is None:
+    if guidances.find_or_none(name) is None:
         raise UserError(
             f"the policy is under a guidance from outside, {name!r}: name its code by --guidance package.module:NAME, "
             "if you trust that code"

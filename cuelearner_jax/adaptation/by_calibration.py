@@ -1,4 +1,4 @@
-"""Adaptation by evidence: what changed in the world, lane after lane, asked and computed outside compiled programs.
+"""Adaptation by calibration: estimate what changed in the world, one lane after another, outside compiled programs.
 
 of = Calibrating(guide, sizes, scalars, env, bases, family)
 found = adapt(of, lanes, Judging(None, by="labels"), teacher)
@@ -17,8 +17,8 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from cuelearner_jax.adaptation.adapting import SIZES, Adapted
-from cuelearner_jax.adaptation.judging import LABELS, Judge, Judged, Judging
+from cuelearner_jax.adaptation.by_model import SIZES, AdaptationResult
+from cuelearner_jax.adaptation.judging import LABELS, Judge, Judgement, Judging
 from cuelearner_jax.adaptation.lanes import Adaptation, Lanes
 from cuelearner_jax.calibration import CHANGED, Calibrated, Calibration, Distortion, Result, Walk, calibrate
 from cuelearner_jax.calibration.families import Family, unknowns_of
@@ -26,40 +26,43 @@ from cuelearner_jax.config import GuideSizes, Scalars, TeacherFaults
 from cuelearner_jax.devices import lane_mesh
 from cuelearner_jax.environment import actions_of
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.evaluate import Tell, untold
+from cuelearner_jax.evaluate import Tell, ignore_progress
 from cuelearner_jax.types import Label, Teacher
 
-USUAL = 100  # labels, where nobody says how many
+USUAL = 100  # default number of labels
 LEAST = 5  # labels: every fifth is held out
-USED = ("eps_deg", *(entry.name for entry in dataclasses.fields(TeacherFaults)))  # of the scalars
+USED = (
+    "eps_deg",
+    *(entry.name for entry in dataclasses.fields(TeacherFaults)),
+)  # fields of the scalars that calibration reads
 Theta = dict[str, float]  # unknowns by name; one that is not there is zero
 
 
 class Calibrating(Adaptation):
-    """What lanes share."""
+    """The guide, world, base policies and family that all lanes of a calibration share."""
 
     family: Family = struct.field(pytree_node=False)  # what may have changed
     named: str = struct.field(pytree_node=False, default="")  # the code of it; empty: the world declares it
 
     def policy(self, block: Any, env: Any = None) -> Calibrated:
-        """Every lane's policy: its base's actions behind the changes."""
+        """Return every lane's policy: its base's actions, corrected for the estimated changes."""
         return Calibrated(self.bases.lane(block.base), block.theta, self.family, self.named)
 
 
 class Evidence(struct.PyTreeNode):
-    """A block of lanes after their answers."""
+    """A block of lanes with their answers and estimates."""
 
     base: Int[Array, " lanes"]
     theta: Float[Array, "lanes unknowns"]  # what is corrected
     labels: Label  # (lanes, slots, ...)
     asked: Int[Array, " lanes"]
     bound: Float[Array, " lanes"]
-    corrects: Bool[Array, " lanes"]  # has anything changed?
+    corrects: Bool[Array, " lanes"]  # True where the answers show a change
     failed: Bool[Array, " lanes"]
 
 
 class _Lane(NamedTuple):
-    """One lane's answers, and what they tell."""
+    """One lane's answers and its `Calibration`."""
 
     result: Result
     rows: Label  # (labels, ...)
@@ -67,13 +70,13 @@ class _Lane(NamedTuple):
 
 
 def settling(scalars: Scalars, eps_deg: float | None) -> Scalars:
-    """Return scalars of a teacher and of answers of that strength (None: theirs); all others are not used."""
+    """Return the scalars of a teacher whose answers have strength `eps_deg` (None: the given scalars' strength)."""
     kept = {name: getattr(scalars, name) for name in USED}
     return dataclasses.replace(Scalars(), **{**kept, **({} if eps_deg is None else {"eps_deg": eps_deg})})
 
 
 def check_unused(sizes: GuideSizes, scalars: Scalars, **others: Any) -> None:
-    """Raises UserError for a setting of models or of refinement: calibration has neither."""
+    """Raise UserError for a setting of feedback models or of refinement, which calibration does not use."""
     groups = {"sizes": (SIZES, ("labels_per_round",)), "scalars": (Scalars(), USED)}
     for name, group in {"sizes": sizes, "scalars": scalars}.items():
         plain, used = groups[name]
@@ -95,9 +98,9 @@ def adapt(
     how: Judging,
     teacher: Teacher | None = None,
     labels: Label | None = None,
-    watch: Callable[[str], Tell] = lambda what: untold,
-) -> Adapted:
-    """Ask, read and judge all lanes.
+    watch: Callable[[str], Tell] = lambda what: ignore_progress,
+) -> AdaptationResult:
+    """Ask for answers, estimate the changes and judge the corrected policy in every lane.
 
     Args:
         of: what lanes share.
@@ -166,7 +169,7 @@ def _theta(policy: Calibrated) -> Theta:
 
 def _judged(
     of: Calibrating, lanes: Lanes, how: Judging, found: list[_Lane], labels: Label | None, watch: Any
-) -> Adapted:
+) -> AdaptationResult:
     results = tuple(lane.result for lane in found)
     thetas = [_theta(one.policy) if one.changes else {} for one in results]
     of = of.replace(family=_used(of.family, [*thetas, *(theta for lane in found for theta in lane.thetas)]))
@@ -190,15 +193,18 @@ def _judged(
             judge.measure(block)
         before, after = (np.array([one.held_out[end] for one in results]) for end in (0, 1))
         unknown, none = np.full((lanes.number, 3), np.nan), np.zeros(lanes.number, int)
-        judged = Judged(LABELS, before, after, corrects, lanes.bound_deg, unknown, none)
+        judged = Judgement(LABELS, before, after, corrects, lanes.bound_deg, unknown, none)
     else:
-        judged, _ = judge.judged(block)
+        judged, _ = judge.judge_lanes(block)
     theta = jnp.where(jnp.asarray(judged.used)[:, None], block.theta, 0.0)
-    return Adapted(of, lanes, block.replace(theta=theta), judged, judge.curve, results)
+    return AdaptationResult(of, lanes, block.replace(theta=theta), judged, judge.curve, results)
 
 
 def _used(family: Family, thetas: list[Theta]) -> Family:
-    """The distortions of which any lane has an unknown; first those that ask anew, as `Fit` has them."""
+    """Return the distortions that any lane has an unknown of.
+
+    Distortions that ask the policy again come first, as in `Fit`.
+    """
     names = {name for theta in thetas for name in theta}
 
     def corrects(one: Distortion) -> bool:
@@ -214,7 +220,7 @@ def _stacked(family: Family, thetas: list[Theta]) -> Float[Array, "lanes unknown
 
 
 def _padded(sets: list[Label]) -> Label:
-    """Labels of lanes with as many rows each."""
+    """Return the labels of all lanes, padded to the same number of rows."""
     most = max(len(rows.obs) for rows in sets)
 
     def padded(leaf: Any) -> np.ndarray:
@@ -224,8 +230,8 @@ def _padded(sets: list[Label]) -> Label:
     return jax.tree.map(lambda *leaves: np.stack([padded(leaf) for leaf in leaves]), *sets)
 
 
-def sentences(found: Adapted) -> list[str]:
-    """What calibration has led to, for each lane: a line an estimate, then what it is worth."""
+def sentences(found: AdaptationResult) -> list[str]:
+    """Describe each lane's result: one line for each estimate, then the judgement."""
     lanes, judged, lines = found.lanes, found.judged, []
     for lane, result in enumerate(found.results):
         several = f", seed {lanes.seed[lane]}" if lanes.number > 1 else ""
@@ -243,7 +249,7 @@ def sentences(found: Adapted) -> list[str]:
 
 
 def to_json(results: tuple[Result, ...]) -> list[dict[str, Any]]:
-    """Results as plain values, without their policies."""
+    """Return the results as JSON values, without their policies."""
     kept = ("verdict", "changes", "held_out", "wrong", "apart", "more")
     return [
         {name: getattr(one, name) for name in kept} | {"estimates": [estimate._asdict() for estimate in one.estimates]}
