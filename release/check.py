@@ -84,7 +84,7 @@ def check(wheel: Path, python: str, folder: Path) -> None:
     versions = "import sys, jax; print('Python', sys.version.split()[0], 'with JAX', jax.__version__)"
     call(["python", "-c", versions], work, environment)
     version = re.match(r"cuelearner_jax-([^-]+)-", wheel.name)
-    told = subprocess.run(["cuelearner", "--version"], cwd=work, env=environment, capture_output=True, text=True)
+    told = output(["cuelearner", "--version"], work, environment)
     if version is None or told.stdout != f"cuelearner {version[1]}\n":
         raise SystemExit(f"cuelearner --version says {told.stdout!r}{told.stderr}, the wheel is {wheel.name}")
     call(["python", "-c", IN_PYTHON], work, environment)
@@ -96,13 +96,18 @@ def check(wheel: Path, python: str, folder: Path) -> None:
 def call(command: list[str], folder: Path, environment: dict[str, str]) -> None:
     """Run a command and print how long it took. Raises SystemExit, with its output, if it fails."""
     began = time.perf_counter()
-    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
+    done = output(command, folder, environment)
     shown = " ".join(word if "\n" not in word else "..." for word in command)
     if done.returncode:
         raise SystemExit(f"{shown}\nended with status {done.returncode}:\n{done.stdout}{done.stderr}")
     print(f"{time.perf_counter() - began:6.1f} s  {shown}", flush=True)
     if done.stdout and command[:2] == ["python", "-c"]:
         print(done.stdout, end="")
+
+
+def output(command: list[str], folder: Path, environment: dict[str, str]) -> subprocess.CompletedProcess[str]:
+    """Return what a command did, printed and ended with."""
+    return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
 
 
 def open_page(folder: Path, environment: dict[str, str]) -> None:
