@@ -6,7 +6,7 @@ UV := $(BIN)/python -m uv
 PYTEST := $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 UV_VERSION := $(shell sed -n 's/^uv==\([0-9.]*\).*/\1/p' constraints.txt)
 
-.PHONY: help setup quickstart smoke test test-all test-quick test-foreign durations fuzz lint format docs bench constraints clean
+.PHONY: help setup quickstart smoke test test-all test-quick test-foreign durations fuzz lint format docs bench release constraints clean
 help:
 	@echo "make quickstart   train, report and film the small billiards example (two to three minutes)"
 	@echo "make test         run the tests (about 8 minutes on 2 cores)"
@@ -20,6 +20,7 @@ help:
 	@echo "make format       what ruff can put right by itself"
 	@echo "make docs         the pages of docs/ as a site, in site/ (under half a minute)"
 	@echo "make bench        the benchmarks of this machine (some minutes)"
+	@echo "make release      build sdist and wheel, and try the wheel in an empty environment: PYTHONS='3.11 3.12 3.13'"
 	@echo "make setup        only the set-up of all of these, in $(VENV)"
 	@echo "make constraints  resolve the pinned versions anew"
 	@echo "make clean        remove $(VENV) and the caches"
@@ -97,6 +98,10 @@ bench: $(VENV)/.tested
 	$(BIN)/python benchmarks/training_speed.py
 	$(BIN)/python benchmarks/guidance_overhead.py
 	$(BIN)/python benchmarks/lidar_parity.py
+
+PYTHONS ?= 3.11 3.12 3.13
+release: $(BIN)/uv
+	$(BIN)/python release/check.py --pythons $(PYTHONS)
 
 constraints: $(BIN)/uv
 	$(UV) pip compile --quiet --upgrade --universal --python-version 3.11 --all-extras --group dev --group docs --no-annotate --no-header \

@@ -4,7 +4,7 @@
 
     world = cl.make("navigation", style="rooms")           # a task in one configuration
     teacher = cl.teacher_of(world)                          # who answers "more to the left", "already right", ...
-    policy = cl.load_policy("docs/data/navigation_agent")   # policy(obs) -> action, of one or many observations
+    policy = cl.load_policy("shipped:navigation")           # policy(obs) -> action, of one or many observations
     better = cl.adapt(policy, world, teacher, labels=300)   # answers in rounds, a model of them, a policy again
     cl.measure(better, world, episodes=200).metrics         # on validation episodes, by name
     better.save("policies/better")                          # a folder that load_policy and every command take
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from cuelearner_jax.errors import UserError
     from cuelearner_jax.spaces import UNSAID
 
-__version__ = "0.1.0"
+__version__ = "1.0.0"
 
 # Where each name lies. They are loaded when they are first used: tasks import the bottom rooms of this package, and the
 # command line needs little of it at a time.

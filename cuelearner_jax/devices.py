@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import compress
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -23,6 +25,30 @@ class Portions(NamedTuple):
     actions: int  # state-action pairs of one agent in one forward pass of an argmax
     agents: int  # evaluated side by side
     states: int  # that a teacher looks at together
+
+
+def release_programs(share: float = 0.5, process: Path = Path("/proc/self"), system: Path = Path("/proc/sys")) -> bool:
+    """Forget all compiled programs if they take much of what the process may map; return whether they were forgotten.
+
+    Each compiled program takes tens to thousands of memory maps, and Linux allows a process 65,530 of them
+    (`vm.max_map_count`). JAX frees none by itself, and ends in a segmentation fault when none is left, mostly while
+    JAX writes its compilation cache (jax-ml/jax issue 27201). What is needed again is compiled again.
+
+    Args:
+        share: of the maps that are allowed, above which programs are forgotten.
+        process, system: folders of Linux with the number of maps and its limit; nothing is done without them.
+    """
+    try:
+        most = int((system / "vm/max_map_count").read_text())
+        with (process / "maps").open("rb") as lines:
+            mapped = sum(1 for _ in lines)
+    except (OSError, ValueError):
+        return False
+    if mapped <= share * most:
+        return False
+    jax.clear_caches()
+    gc.collect()
+    return True
 
 
 def portions() -> Portions:

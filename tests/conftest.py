@@ -86,6 +86,18 @@ def pytest_runtest_setup(item):
     jax.config.update("jax_numpy_rank_promotion", "allow" if lies_in(item.path, LOOSE_RANKS) else "raise")
 
 
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item, nextitem):
+    """Forgets compiled programs between files before the process runs out of memory maps, which ends in a crash."""
+    try:
+        return (yield)
+    finally:
+        if nextitem is None or nextitem.path != item.path:
+            from cuelearner_jax.devices import release_programs
+
+            release_programs()
+
+
 def recorded():
     """Seconds of each file of tests, as `make durations` has last written them."""
     rows = (line.split() for line in (TESTS / "durations.txt").read_text().splitlines() if not line.startswith("#"))

@@ -13,7 +13,15 @@ import many_devices
 import numpy as np
 import pytest
 
-from cuelearner_jax.devices import BY_LANE, SHARED, each_lane, each_lane_in_place, lane_mesh, over_lanes
+from cuelearner_jax.devices import (
+    BY_LANE,
+    SHARED,
+    each_lane,
+    each_lane_in_place,
+    lane_mesh,
+    over_lanes,
+    release_programs,
+)
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.runs.grid import load
 from cuelearner_jax.runs.trained import PolicySource
@@ -131,3 +139,22 @@ def test_a_checkpoint_of_fewer_lanes_is_refused(shared):
     grid = many_devices.Grid(("relative",), tuple(range(9)), (30,))
     with pytest.raises(UserError, match="holds 8 lanes, the run has 9"):
         PolicySource(task, config, grid, shared[0]).load(("relative",))
+
+
+def test_programs_are_forgotten_above_half_of_the_allowed_maps_and_compiled_again(tmp_path):
+    (tmp_path / "vm").mkdir()
+    traces = []
+
+    @jax.jit
+    def double(x):
+        traces.append(x)
+        return 2 * x
+
+    for maps, forgotten in ((5, False), (6, True)):
+        (tmp_path / "maps").write_text("a map\n" * maps)
+        (tmp_path / "vm" / "max_map_count").write_text("10\n")
+        assert double(3) == 6
+        assert release_programs(process=tmp_path, system=tmp_path) == forgotten
+        assert double(3) == 6
+    assert len(traces) == 2
+    assert not release_programs(process=tmp_path / "nowhere", system=tmp_path)  # as on another system than Linux

@@ -26,7 +26,7 @@ from cuelearner_jax.runs import trained
 from cuelearner_jax.spaces import DIRECTIONS, Space
 from cuelearner_jax.storage import whole
 from cuelearner_jax.task import Task, shape_of
-from cuelearner_jax.tasks import registry
+from cuelearner_jax.tasks import registry, shipped
 from cuelearner_jax.types import EnvState
 
 
@@ -94,7 +94,7 @@ def as_policy(given: Any, name: str = "policy") -> Policy:
     """
     if isinstance(given, str | os.PathLike) and not str(given).endswith(ONNX):
         try:
-            given = load_policy(Path(given))
+            given = load_policy(given)
         except UserError as error:
             raise UserError(f"{name}: {error}") from error
     return given.policy if isinstance(given, CallablePolicy) else arguments.policy(name, given)
@@ -139,7 +139,7 @@ def load_policy(
     """Load the policy of a lane of a finished run, or of a policy folder (`adapt`).
 
     Args:
-        folder: of the run, or of a sweep in pieces; or the policy folder.
+        folder: of the run, or of a sweep in pieces; or the policy folder; or a shipped agent, as "shipped:navigation".
         policy: "agent", "guided" or another that `evaluate TASK --help` lists (default: the trained agent, or the
             adapted policy).
         guidance: kind of guidance of the lane (default: the run's last).
@@ -154,7 +154,7 @@ def load_policy(
     Raises:
         UserError: no such folder, lane or policy.
     """
-    path = arguments.path("folder", folder)
+    path = shipped.folder_of(folder) if shipped.is_shipped(folder) else arguments.path("folder", folder)
     arguments.optional(arguments.text, "policy", policy, trained.POLICIES)
     arguments.optional(arguments.text, "guidance", guidance)
     labels = arguments.optional(arguments.budget, "labels", labels, 0)

@@ -20,7 +20,7 @@ from cuelearner_jax.runs.trained import POLICIES, PolicySource
 from cuelearner_jax.storage import policy_folders
 from cuelearner_jax.studies import evaluate
 from cuelearner_jax.studies.evaluate import EvaluateRequest, Measured
-from cuelearner_jax.tasks import registry
+from cuelearner_jax.tasks import registry, shipped
 from cuelearner_jax.terminal import console, progress_bars, watched_by
 
 
@@ -117,7 +117,7 @@ def _print_agreement(named: str, policy: Any, path: Any) -> None:
 def _other(source: PolicySource, asked: Evaluate[Any]) -> tuple[PolicySource, str]:
     """The source and the name of the policy to compare with. Raises UserError if it cannot be had in that world."""
     given = str(asked.compare)
-    folder = Path(given)
+    folder = shipped.folder_of(given)
     if given in POLICIES and not folder.exists():
         other, policy = source, given
     elif folder.exists():
@@ -128,7 +128,9 @@ def _other(source: PolicySource, asked: Evaluate[Any]) -> tuple[PolicySource, st
         other, policy = other.on(asked.robot), other.default_policy
     else:
         known = ", ".join(POLICIES)
-        raise UserError(f"--compare is {given!r}: give a run folder, a policy folder, or one of {known}")
+        raise UserError(
+            f"--compare is {given!r}: give a run folder, a policy folder, a shipped agent, or one of {known}"
+        )
     if policy == asked.policy and other.folder.absolute() == source.folder.absolute():
         raise UserError(f"--compare is {given!r}, the policy that is evaluated: give another one")
     other.check(policy, asked.task)

@@ -36,7 +36,7 @@ from cuelearner_jax.storage import label_files
 from cuelearner_jax.storage.folders import claimed
 from cuelearner_jax.studies.train import preset_kinds
 from cuelearner_jax.task import Task, shape_of
-from cuelearner_jax.tasks import registry
+from cuelearner_jax.tasks import registry, shipped
 from cuelearner_jax.terminal import Interrupted, console, interruptible
 
 UNIFORM, NEAR_AIMS, PROPOSED = "uniform", "near_aims", "proposed"
@@ -255,7 +255,7 @@ def _source(task: Task, named: str | None, changed: str | None) -> PolicySource 
     """
     if named is None or is_code(named):
         return None
-    folder = Path(named)
+    folder = shipped.folder_of(named)
     if not folder.is_dir():
         raise UserError(f"no policy at {named}: give a run folder, a policy folder or package.module:NAME")
     own = None if changed is None else changes.load(changed)
@@ -343,7 +343,7 @@ def _following(task: Task, preset: str, config: RunConfig, asked: Any, policy: s
         for part, kind in parts:
             words += _differing(part, kind, getattr(config, part), getattr(asked, part))
         return shlex.join(["cuelearner", *words, "--out", f"runs/{Path(out).name}"])
-    words = ["adapt", policy, *(["--task", name] if not Path(policy).exists() else [])]
+    words = ["adapt", policy, *([] if shipped.is_shipped(policy) or Path(policy).exists() else ["--task", name])]
     words += [] if asked.scenario is None else ["--scenario", asked.scenario]
     words += [] if asked.robot is None else ["--robot", asked.robot]
     words += ["--guidance", asked.guidance, *([] if asked.changes is None else ["--changes", asked.changes]), *given]

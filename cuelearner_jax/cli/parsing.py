@@ -30,7 +30,7 @@ from cuelearner_jax.run_config import PARTS
 from cuelearner_jax.runs.trained import POLICIES, PolicySource
 from cuelearner_jax.storage import policy_folders, whole
 from cuelearner_jax.task import PAPER, Preset, Task, shape_of
-from cuelearner_jax.tasks import registry
+from cuelearner_jax.tasks import registry, shipped
 from cuelearner_jax.terminal import PLAIN
 
 TASK_OPTIONS = ("--task", "--env")  # two names of one option
@@ -257,7 +257,7 @@ def source_of(arguments: list[str], command: str, kind: type) -> tuple[PolicySou
         raise SystemExit(0 if arguments else 2)
     if rest and (known is None or not rest[0].startswith("-")):
         name, rest = rest[0], rest[1:]
-        folder = Path(name)
+        folder = shipped.folder_of(name)
         whole.check_not_aside(folder)
         holds = (folder / "config.json").exists() or policy_folders.is_one(folder)
         if holds or (folder.exists() and name not in registry.names()):
@@ -268,7 +268,10 @@ def source_of(arguments: list[str], command: str, kind: type) -> tuple[PolicySou
         if known is not None:
             raise UserError(f"{name!r} is no run folder of the task {known.name}: give one, or leave it out")
         if ":" not in name and name not in registry.names():
-            raise UserError(f"{name!r} is neither a run folder nor a task ({', '.join(registry.names())})")
+            raise UserError(
+                f"{name!r} is neither a run folder nor a task ({', '.join(registry.names())}) "
+                f"nor a shipped agent ({', '.join(shipped.names())})"
+            )
         known = registry.resolve(name)
     assert known is not None  # otherwise the first argument was taken for its name
     if code is not None:
@@ -324,6 +327,8 @@ def _taught(task: Task, reference: str | None) -> Task:
 
 def is_code(named: str) -> bool:
     """Return whether a word names a policy that is code: package.module:NAME, or a file in ONNX."""
+    if shipped.is_shipped(named):
+        return False
     return named.endswith(ONNX) or (bool(plugins.REFERENCE.fullmatch(named)) and not Path(named).exists())
 
 

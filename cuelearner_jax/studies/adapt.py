@@ -26,6 +26,7 @@ from cuelearner_jax.adaptation.lanes import Adaptation, begin, one_each, product
 from cuelearner_jax.asking import label_slots
 from cuelearner_jax.calibration import Calibrated, declared_distortions
 from cuelearner_jax.config import GuideSizes, Scalars, check_guide, check_part
+from cuelearner_jax.devices import release_programs
 from cuelearner_jax.environment import Environment, actions_of, spaces_of
 from cuelearner_jax.errors import UserError, suggestion
 from cuelearner_jax.evaluate import Tell, ignore_progress
@@ -215,6 +216,7 @@ def run(
 
     `watch`: by what is being done, who is told how far it is; `note` takes what may be meant otherwise.
     """
+    release_programs()
     task, sizes, scalars = subject.source.task, request.sizes, request.scalars
     check_guide(sizes, scalars)
     kind = guidances.resolve(request.guidance)

@@ -8,6 +8,7 @@ from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 
+from cuelearner_jax.devices import release_programs
 from cuelearner_jax.environment import actions_of, view_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import Tell, episodes, ignore_progress, part_of, rollout_lanes
@@ -103,6 +104,7 @@ def run(
     Raises:
         UserError: what makes no sense, or cannot be had (`PolicySource.check` says more, and sooner).
     """
+    release_programs()
     task, world, name = source.task, asked.task, asked.policy
     num_envs, steps = amount(task, asked)
     engine, key = task.engine(asked.engine), episodes()

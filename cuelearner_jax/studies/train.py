@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pyarrow as pa
 
-from cuelearner_jax.devices import SHARED, lane_mesh, place
+from cuelearner_jax.devices import SHARED, lane_mesh, place, release_programs
 from cuelearner_jax.environment import Environment
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.feedback.answers import check_teacher
@@ -69,6 +69,7 @@ def run(order: Order) -> None:
         Interrupted: Ctrl-C or SIGTERM; everything is saved.
         NotFinite: all is done, but some lanes stopped being finite.
     """
+    release_programs()
     plan = planned(order)
     order = plan.order
     task, config = order.task, order.config
@@ -117,6 +118,7 @@ def in_memory(
     Raises:
         UserError: a configuration that makes no sense, no teacher where one is asked, or too little memory.
     """
+    release_programs()
     request = checked(request)
     labels, mesh = labels_of(request), lane_mesh()
     groups = _groups(request, place(mesh, env, SHARED), lambda told: None)

@@ -34,6 +34,7 @@ ARGUMENTS = [
     (["train", "billiards", "--preset", "quickstart", "--guidance", "all"], "unknown guidance 'all'"),
     (["train", "billiards", "--preset", "quickstart", "--task.teacher", "learned"], "experiments/train_teacher.py"),
     (["evaluate", "nowhere"], "neither a run folder nor a task"),
+    (["evaluate", "shipped:golf"], "no shipped agent 'shipped:golf': give one of shipped:arm, "),
     (["evaluate", "billiards", "--policy", "agent"], "needs a trained run"),
     (["evaluate", "billiards", "--policy", "agnt"], "did you mean 'agent'"),
     (["evaluate", "billiards", "--compare", "nowhere"], "--compare is 'nowhere': give a run folder, a policy folder"),

@@ -42,7 +42,11 @@ def test_what_is_no_json_is_refused_as_damaged(tmp_path):
 
 @pytest.mark.parametrize(
     ("kind", "pattern"),
-    [("config", "docs/data/**/config.json"), ("teacher", "envs/cuelearner_envs/billiards/teachers/*/teacher.json")],
+    [
+        ("config", "docs/data/**/config.json"),
+        ("config", "envs/cuelearner_envs/agents/*/config.json"),
+        ("teacher", "envs/cuelearner_envs/billiards/teachers/*/teacher.json"),
+    ],
 )
 def test_files_that_are_shipped_are_still_read(kind, pattern):
     paths = sorted(ROOT.glob(pattern))
