@@ -44,17 +44,9 @@ def test_the_online_network_chooses_and_the_target_network_values():
     np.testing.assert_allclose(targets(0.5), [1 + 0.5 * 0.2, 1.0])
 
 
-def test_where_nothing_bootstraps_the_target_is_the_reward():
-    np.testing.assert_array_equal(targets(0.0, OPTIONS.make("raw", spaces_of(probes.Window()))), [1.0, 1.0])
-
-
 def test_numbers_of_another_rank_are_refused():
     with pytest.raises((AssertionError, TypeCheckError)):
         ddqn.target(jnp.ones(2), jnp.ones(2), jnp.ones(2))
-
-
-def test_loss_is_the_mean_squared_error_of_the_actions_taken():
-    assert float(ddqn.loss(jnp.array([1.0, 1.0]), jnp.array([0.4, 3.0]))) == pytest.approx((0.36 + 4.0) / 2)
 
 
 def change_by(optimizer, gradient, params) -> Any:

@@ -7,13 +7,11 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
-import probes
 import pytest
 
 from cuelearner_jax.agents.networks import as_function, residual_network
 from cuelearner_jax.config import Scalars, Sizes
 from cuelearner_jax.feedback.answers import human_answer, relative_feedback
-from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.guides.fitting import Lesson, fit_least_squares, lessons
 from cuelearner_jax.spaces import DIRECTIONS, directions
 from cuelearner_jax.types import Label
@@ -78,19 +76,6 @@ def test_feedback_is_the_turn_that_comes_nearest(eps_deg):
     clear = two_best[:, 1] - two_best[:, 0] > 1e-5
     assert clear.mean() > 0.98
     np.testing.assert_array_equal(np.asarray(h)[clear, 0], turns[np.argmin(left, 1)][clear])
-
-
-def target_of(action, h, eps_rad):
-    """What the paper's network is to predict of one answer."""
-    label = Label(jnp.zeros(2), jnp.array(action), jnp.array([h]), jnp.array(True))
-    relative = guidances.make("relative", SIZES, probes.Window())
-    return relative.target(label, Scalars(eps_deg=math.degrees(eps_rad)))
-
-
-def test_the_target_is_the_turned_action_less_the_action():
-    np.testing.assert_allclose(target_of([1.0, 0.0], 1.0, math.pi / 6), [math.sqrt(3) / 2 - 1, 0.5], atol=1e-7)
-    np.testing.assert_allclose(target_of([0.0, 1.0], -1.0, math.pi / 2), [1, -1], atol=1e-6)
-    np.testing.assert_array_equal(target_of([0.6, 0.8], 0.0, 1.0), 0)
 
 
 def test_lessons_are_labels_with_their_targets_in_place_of_the_answers():
@@ -247,9 +232,3 @@ def test_the_key_and_the_learning_rate_matter():
     slow = fit(jax.random.key(0), labels, dataclasses.replace(SCALARS, feedback_learning_rate=1e-6))
     assert abs(jax.tree.leaves(one.params)[1] - jax.tree.leaves(other.params)[1]).max() > 1e-3
     assert mean_error(slow, labels, ~HELD_OUT) > 3 * mean_error(one, labels, ~HELD_OUT)
-
-
-def test_every_fit_starts_from_its_key_and_from_no_earlier_model():
-    still = dataclasses.replace(SCALARS, feedback_learning_rate=0.0)
-    model = fit(jax.random.key(7), label_set(0), still)
-    assert_same(model.params, fresh(jax.random.split(jax.random.key(7))[0]))

@@ -61,15 +61,6 @@ def test_relative_refines_active_rows_once_it_is_fitted():
     np.testing.assert_array_equal(np.asarray(after.passes) > 0, ACTIVE)
 
 
-def test_relative_passes_on_its_bounds():
-    bundle, model = made("relative")
-    model = model.replace(fitted=jnp.array(True))
-    bounded = dataclasses.replace(probes.SCALARS, tau_max_deg=2.0, tau_deg=0.0, k_max=7)
-    result = bundle.act(model, ENV, OBS, BASE, jnp.ones(6, bool), bounded)
-    assert np.abs(directions.difference(BASE, result.actions)).max() <= math.radians(2.0) + 1e-5
-    assert result.passes.tolist() == [7] * 6
-
-
 def test_a_fitted_model_turns_actions_by_what_was_told_whatever_its_strength():
     bundle, former = made("relative")
     rng = np.random.default_rng(0)

@@ -1,0 +1,219 @@
+"""Make the films of docs/gallery.md: each task before labels and after, side by side.
+
+    python experiments/gallery.py --work runs/gallery
+
+The commands of a film are those that a user types (`FILMS` below); policies that lie in the folder of `--work` already
+are not made again. Each film shows the same episodes of both policies, in a GIF of at most 600 kB. All of them take
+about half an hour of processor time.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from PIL import Image, ImageDraw, ImageFont, ImageSequence
+
+from cuelearner_jax.cli import main as cuelearner
+
+FIGURES = Path(__file__).resolve().parents[1] / "docs" / "figures" / "gallery"
+MOST_BYTES = 600_000
+BAR = 26  # height of the line of words over each picture [pixels]
+LIGHT, INK = "#ffffff", "#222222"
+
+
+@dataclass(frozen=True)
+class Film:
+    """Two renderings of the same episodes, and how their policies are made."""
+
+    name: str
+    make: tuple[tuple[str, str], ...]  # (folder that the command writes, arguments of `cuelearner`)
+    before: str  # arguments of `cuelearner render`
+    after: str
+    words: tuple[str, str]  # over the two pictures
+    width: int = 360  # of each picture [pixels]
+    period: int = 80  # from one picture to the next in the renderings [ms]
+    slower: float = 1.0  # by this factor the film is played
+    most: int = 120  # pictures
+    box: tuple[float, float, float, float] = (0.0, 0.0, 1.0, 1.0)  # what is shown of each: left, top, right, low
+
+
+SCRIPTS = "cuelearner_envs.arm.scripts"
+ROOMS = ("rooms", "adapt docs/data/navigation_agent --scenario rooms --labels 250 --judge-episodes 100")
+REACH = (
+    "reach",
+    f"adapt {SCRIPTS}:reach --task arm --task.skill reach --scenario turned_camera --labels 100",
+)
+CAMERA = ("camera moved, no labels", "the same camera, 100 labels")
+
+FILMS = (
+    Film(
+        "billiards",
+        make=(
+            (
+                "billiards",
+                "sweep billiards --preset quickstart --seeds 1 --first-seed 2002 --schedule.total-steps 600",
+            ),
+        ),
+        before="WORK/billiards --guidance none --steps 3",
+        after="WORK/billiards --guidance relative --steps 3",
+        words=("600 shots, no labels", "600 shots, 100 labels"),
+        period=90,
+    ),
+    Film(
+        "navigation",
+        make=(ROOMS,),
+        before="docs/data/navigation_agent --scenario rooms --episode 0 --steps 60",
+        after="WORK/rooms --episode 0 --steps 60",
+        words=("trained in halls, no labels in rooms", "250 labels in rooms"),
+        width=300,
+        period=200,
+        slower=0.5,
+    ),
+    Film(
+        "anymal",
+        make=(ROOMS,),
+        before="docs/data/navigation_agent --robot anymal --scenario rooms --episode 0 --steps 40",
+        after="WORK/rooms --robot anymal --episode 0 --steps 40",
+        words=("no labels in rooms", "250 labels in rooms"),
+        width=400,
+        period=200,
+        slower=0.5,
+    ),
+    Film(
+        "reach",
+        make=(REACH,),
+        before=f"WORK/reach --base {SCRIPTS}:reach --policy base --steps 150",
+        after=f"WORK/reach --base {SCRIPTS}:reach --steps 150",
+        words=CAMERA,
+        width=320,
+        slower=1.5,
+    ),
+    Film(
+        "push",
+        make=(("push", f"adapt {SCRIPTS}:past --task arm --task.skill push --scenario hand_eye --labels 100"),),
+        before=f"WORK/push --base {SCRIPTS}:past --policy base --steps 150",
+        after=f"WORK/push --base {SCRIPTS}:past --steps 150",
+        words=CAMERA,
+        width=320,
+        slower=1.5,
+    ),
+    Film(
+        "pick",
+        make=(("pick", f"adapt {SCRIPTS}:pick --task arm --task.skill pick --scenario hand_eye --labels 100"),),
+        before=f"WORK/pick --base {SCRIPTS}:pick --policy base --steps 150",
+        after=f"WORK/pick --base {SCRIPTS}:pick --steps 150",
+        words=CAMERA,
+        width=320,
+        slower=1.5,
+    ),
+    Film(
+        "fetch",
+        make=(REACH,),
+        before=f"WORK/reach --base {SCRIPTS}:reach --policy base --robot fetch --steps 100",
+        after=f"WORK/reach --base {SCRIPTS}:reach --robot fetch --steps 100",
+        words=CAMERA,
+        width=320,
+        slower=1.5,
+    ),
+)
+
+
+def main() -> int:
+    """Make the films one after the other; stop at the first command that fails."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--work", type=Path, default=Path("runs/gallery"), help="folder for policies and pictures")
+    parser.add_argument(
+        "--out", type=Path, default=FIGURES, help="folder for the films (default: docs/figures/gallery)"
+    )
+    parser.add_argument("--only", nargs="+", choices=[film.name for film in FILMS], help="films (default: all)")
+    asked = parser.parse_args()
+    asked.out.mkdir(parents=True, exist_ok=True)
+    for film in FILMS:
+        if asked.only is None or film.name in asked.only:
+            status = made(film, asked.work, asked.out / f"{film.name}.gif")
+            if status:
+                return status
+    return 0
+
+
+def made(film: Film, work: Path, to: Path) -> int:
+    """Run the commands of one film and join its two renderings; return the first exit status that is not 0."""
+    sides = [work / film.name / side for side in ("before", "after")]
+    commands = [(work / folder, f"{arguments} --out {work / folder}") for folder, arguments in film.make]
+    for side, arguments in zip(sides, (film.before, film.after), strict=True):
+        commands.append((side, f"render {arguments} --out {side}"))
+    for folder, arguments in commands:
+        if not folder.exists():
+            words = shlex.split(arguments.replace("WORK", str(work)))
+            print(f"$ cuelearner {shlex.join(words)}", flush=True)
+            status = cuelearner(words)
+            if status:
+                return status
+    films = [next(side.glob("*.gif")) for side in sides]
+    size = join(films, film, to)
+    print(f"{to}: {size:,} bytes")
+    return 0
+
+
+def join(files: Sequence[Path], film: Film, to: Path) -> int:
+    """Write a film of two films side by side; return its size in bytes.
+
+    Pictures become smaller until the film is small enough.
+    """
+    pairs = _pictures(files, film)
+    for scale in (1.0, 0.9, 0.8, 0.7, 0.6, 0.5):
+        frames = [_beside(pair, film.words, round(film.width * scale)) for pair in pairs]
+        palette = frames[0].quantize(96)
+        small = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
+        durations = [round(film.slower * film.period)] * (len(small) - 1) + [1500]
+        small[0].save(to, save_all=True, append_images=small[1:], duration=durations, loop=0, optimize=True)
+        if to.stat().st_size <= MOST_BYTES:
+            break
+    return to.stat().st_size
+
+
+def _pictures(files: Sequence[Path], film: Film) -> list[tuple[Image.Image, ...]]:
+    """Return pairs of pictures, `film.period` milliseconds apart; a film that has ended stands still."""
+    reels = []
+    for file in files:
+        reel, time = [], 0
+        with Image.open(file) as opened:
+            for frame in ImageSequence.Iterator(opened):
+                time += frame.info["duration"]
+                reel += [_cut(frame.convert("RGB"), film.box)] * max(0, -(-time // film.period) - len(reel))
+        reels.append(reel)
+    length = min(max(map(len, reels)), film.most)
+    return list(zip(*((reel + [reel[-1]] * length)[:length] for reel in reels), strict=True))
+
+
+def _cut(picture: Image.Image, box: tuple[float, float, float, float]) -> Image.Image:
+    """Return the part of a picture that is shown."""
+    left, top, right, low = box
+    return picture.crop(
+        (
+            round(left * picture.width),
+            round(top * picture.height),
+            round(right * picture.width),
+            round(low * picture.height),
+        )
+    )
+
+
+def _beside(pair: Sequence[Image.Image], words: Sequence[str], width: int) -> Image.Image:
+    """Return two pictures side by side, words over each."""
+    height = round(width * pair[0].height / pair[0].width)
+    whole = Image.new("RGB", (2 * width + 8, height + BAR), LIGHT)
+    draw, font = ImageDraw.Draw(whole), ImageFont.load_default(15)
+    for number, (picture, said) in enumerate(zip(pair, words, strict=True)):
+        left = number * (width + 8)
+        draw.text((left + 6, 4), said, fill=INK, font=font)
+        whole.paste(picture.resize((width, height), Image.Resampling.LANCZOS), (left, BAR))
+    return whole
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
