@@ -35,6 +35,9 @@ TASK, POLICY = "gymnasium:FetchReach-v4", "examples.moved_camera:moved"
 WIDTH, HEIGHT, BAR = 720, 470, 44  # of the film and of the bar with words above the pictures [pixels]
 PAPER, INK, BLUE, GREEN = (250, 250, 250), (33, 33, 33), (0, 114, 178), (0, 128, 96)
 SHOWN = (0, 1, 2, 3, 4, 8, 16, 24, 32, 40, 48)  # questions of which the film shows the presses
+KEY = (522, 352, 708, 458)  # where the film shows the key that was pressed [pixels]
+GRIPPER = (120, 100, 400, 380)  # of a picture of the arm, where the gripper moves [pixels]
+EPISODE = "3"
 STEPS = 14  # of an episode that the film shows
 FONT = Path(__import__("matplotlib").get_data_path()) / "fonts/ttf/DejaVuSans-Bold.ttf"
 SYMBOLS = {"ArrowLeft": "←", "ArrowRight": "→", "ArrowUp": "↑", "ArrowDown": "↓", " ": "space"}
@@ -81,7 +84,7 @@ def pressed_keys(address: str, browser: str, labels: int, shots: list[Shot]) -> 
     """Answers all questions on the page, and takes pictures of some."""
     with sync_playwright() as driver:
         chromium = driver.chromium.launch(executable_path=browser, args=["--no-sandbox"])
-        page = chromium.new_page(viewport={"width": 1280, "height": 760}, color_scheme="light")
+        page = chromium.new_page(viewport={"width": 980, "height": 760}, color_scheme="light")
         for _ in range(100):
             with contextlib.suppress(Exception):
                 page.goto(address)
@@ -122,7 +125,17 @@ def picture_of(page: Page) -> Image.Image:
 
 def labelled(folder: Path, browser: str, labels: int) -> tuple[list[str], list[Shot]]:
     """Runs `cuelearner label` to its end; returns its arguments and pictures of the page."""
-    command = [TASK, POLICY, "--guidance", "calibration", "--labels", str(labels), "--no-practice", "--out", str(folder)]
+    command = [
+        TASK,
+        POLICY,
+        "--guidance",
+        "calibration",
+        "--labels",
+        str(labels),
+        "--no-practice",
+        "--out",
+        str(folder),
+    ]
     shots: list[Shot] = []
     answering: list[threading.Thread] = []
 
@@ -156,14 +169,14 @@ def canvas(words: str, colour: tuple[int, int, int] = INK) -> Image.Image:
 
 
 def side_by_side(words: str, colour: tuple[int, int, int], left: Image.Image, right: Image.Image | None) -> Image.Image:
-    """A frame with one film, or two, and their names below."""
+    """A frame with one film, or two, and their names below; each shows the gripper and its goal."""
     frame = canvas(words, colour)
     draw, font = ImageDraw.Draw(frame), ImageFont.truetype(FONT, 15)
-    named = [("before", left)] if right is None else [("before", left), ("after", right)]
+    named = [("before", left)] if right is None else [("before: beside the goal", left), ("after: at the goal", right)]
     room = WIDTH // len(named)
     for number, (name, picture) in enumerate(named):
         size = min(room - 16, HEIGHT - BAR - 40)
-        shown = picture.resize((size, size), Image.Resampling.LANCZOS)
+        shown = picture.crop(GRIPPER).resize((size, size), Image.Resampling.LANCZOS)
         middle = room * number + room // 2
         frame.paste(shown, (middle - size // 2, BAR + 8 + (HEIGHT - BAR - 40 - size) // 2))
         draw.text((middle, HEIGHT - 16), name, INK, font, anchor="mm")
@@ -177,18 +190,20 @@ def with_key(shot: Shot, labels: int) -> Image.Image:
     page = shot.picture.resize((WIDTH, round(shot.picture.height * scale)), Image.Resampling.LANCZOS)
     frame.paste(page.crop((0, 0, WIDTH, HEIGHT - BAR)), (0, BAR))
     if shot.key:
-        draw, font = ImageDraw.Draw(frame), ImageFont.truetype(FONT, 22)
-        text = f"{SYMBOLS.get(shot.key, shot.key.upper())}   {shot.words}"
-        width = draw.textlength(text, font) + 36
-        box = WIDTH - width - 14, HEIGHT - 62, WIDTH - 14, HEIGHT - 14
-        draw.rounded_rectangle(box, 9, fill=(255, 255, 255), outline=INK, width=3)
-        draw.text(((box[0] + box[2]) / 2, (box[1] + box[3]) / 2), text, INK, font, anchor="mm")
+        draw, (left, top, right, bottom) = ImageDraw.Draw(frame), KEY
+        draw.rounded_rectangle(KEY, 12, fill=(255, 255, 255), outline=INK, width=4)
+        for text, size, share in ((SYMBOLS.get(shot.key, shot.key.upper()), 34, 0.36), (shot.words, 17, 0.76)):
+            place = (left + right) / 2, top + share * (bottom - top)
+            draw.text(place, text, INK, ImageFont.truetype(FONT, size), anchor="mm")
     return frame
 
 
 def composed(before: list[Image.Image], shots: list[Shot], after: list[Image.Image], labels: int) -> list[Any]:
     """The frames of the film and how long each is shown [ms]."""
-    first, last = "1  The camera was moved: the arm stops beside its goal", f"3  After {labels} answers the arm reaches its goal"
+    first, last = (
+        "1  The camera was moved: the arm stops beside its goal",
+        f"3  After {labels} answers the arm reaches its goal",
+    )
     told = [(side_by_side(first, INK, picture, None), 130) for picture in before]
     told[-1] = told[-1][0], 1300
     for shot in shots:
@@ -199,11 +214,12 @@ def composed(before: list[Image.Image], shots: list[Shot], after: list[Image.Ima
     return told + pairs
 
 
-def save(frames: list[Any], file: Path, colours: int = 96) -> None:
+def save(frames: list[Any], file: Path, colours: int = 144) -> None:
     """Writes an animated GIF of one palette for all frames."""
     pictures, durations = zip(*frames, strict=True)
-    sample = Image.new("RGB", (WIDTH, HEIGHT * 3))
-    for number, index in enumerate((0, len(pictures) // 2, len(pictures) - 1)):
+    chosen = range(0, len(pictures), max(1, len(pictures) // 8))
+    sample = Image.new("RGB", (WIDTH, HEIGHT * len(chosen)))
+    for number, index in enumerate(chosen):
         sample.paste(pictures[index], (0, HEIGHT * number))
     palette = sample.quantize(colours)
     indexed = [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures]
@@ -212,7 +228,7 @@ def save(frames: list[Any], file: Path, colours: int = 96) -> None:
 
 def rendered(commands: list[list[str]], folder: Path, *more: str) -> list[Image.Image]:
     """Runs `cuelearner render`; returns the frames of its film."""
-    command = ["render", *more, "--episode", "1", "--steps", str(STEPS), "--out", str(folder)]
+    command = ["render", *more, "--episode", EPISODE, "--steps", str(STEPS), "--out", str(folder)]
     commands.append(command)
     if main(command):
         raise SystemExit("cuelearner render failed")
@@ -224,7 +240,9 @@ def film(asked: argparse.Namespace, work: Path) -> None:
     command, shots = labelled(work / "labels", asked.browser, asked.labels)
     commands = [command]
     policy = str(work / "policy")
-    commands.append(["adapt", POLICY, "--task", TASK, "--guidance", "calibration", "--labels-from", str(work / "labels")])
+    commands.append(
+        ["adapt", POLICY, "--task", TASK, "--guidance", "calibration", "--labels-from", str(work / "labels")]
+    )
     commands[-1] += ["--labels", str(asked.labels), "--out", policy]
     if main(commands[-1]):
         raise SystemExit("cuelearner adapt failed")

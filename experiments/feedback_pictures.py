@@ -35,9 +35,10 @@ from cuelearner_jax.types import Step
 
 UP, DOWN, GREY = "#0072B2", "#D55E00", "#808080"  # answers "up" and "down"; what is read on white and on black
 HEIGHTS = Box((-1.0,), (1.0,), (Cue("height", ("up", "down"), ("ArrowUp", "ArrowDown"), "shares"),))
-OFFSET, EPS = 0.4, 0.08  # of the policy, in units of actions; of an answer, a share of the range
-LABELS = 40
-SIZES = GuideSizes(feedback_layers=(32, 32), fit_steps=400, fit_batch_size=32, labels_per_round=10)
+OFFSET = 0.4  # of the policy's actions from the right ones
+EPS, BOUND = 0.08, 0.32  # of an answer, and of corrections: shares of the range, which is 2
+LABELS = 60
+SIZES = GuideSizes(feedback_layers=(32, 32), fit_steps=1000, fit_batch_size=32, labels_per_round=10)
 TEACHERS = {"scalar": {"scalar_within_deg": 0.06}}  # a share of the range: how near an action is called good
 ARBITERS = ("prior",)
 FEEDBACK = ("relative", "intent", "offset", "calibration", "demonstration", "scalar", "dcoach", "bdcoach", "clic")
@@ -106,7 +107,7 @@ def corrected(kind: str) -> tuple[Any, Any]:
     scalars = dataclasses.replace(plain_scalars(HEIGHTS), **TEACHERS.get(kind, {}))
     # Of uniform actions few are good, so good/bad needs more answers than the others do.
     count = 4 * LABELS if kind == "scalar" else LABELS
-    bounded = {} if registry.find(kind).by_evidence else {"sizes": SIZES, "bound_deg": 1.0, "scalars": scalars}
+    bounded = {} if registry.find(kind).by_evidence else {"sizes": SIZES, "bound_deg": BOUND, "scalars": scalars}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # that a model is not used is no matter: its picture is wanted
         better = cl.adapt(before, Line(), teacher, labels=count, guidance=kind, eps_deg=EPS, seed=1, **bounded)
@@ -127,11 +128,12 @@ def drawn(kind: str) -> Drawn:
 
 def prior() -> Drawn:
     """Values that like two heights equally, and labels that choose among them."""
-    better, labels = corrected("relative")
-    adapted = better.outcome.found
-    guide, model = adapted.of.guidance, jax.tree.map(lambda leaf: leaf[0], adapted.models)
-    heights = jnp.asarray(ROWS)[:, None]
-    likely = jax.vmap(lambda obs: guide.log_p(model, Line(), obs, heights, adapted.of.scalars))(SITUATIONS)
+    _, labels = corrected("relative")
+    keep = np.asarray(labels.valid, bool)
+    given = cl.Labels(labels.obs[keep], labels.action[keep], labels.answer[keep])
+    fitted = cl.fit_feedback(given, space=HEIGHTS, eps_deg=EPS, sizes=SIZES, seed=1)
+    heights, guide = jnp.asarray(ROWS)[:, None], fitted.guidance
+    likely = jax.vmap(lambda obs: guide.log_p(fitted.model, Line(), obs, heights, fitted.scalars))(SITUATIONS)
     two = jnp.minimum(jnp.abs(ROWS - right(SITUATIONS)), jnp.abs(ROWS - right(SITUATIONS) + 0.75))
     values = -two + 0.1 * np.asarray(likely)
     return Drawn("relative", labels, ROWS[np.argmax(np.asarray(values), 1)], np.asarray(-two).T)
@@ -154,12 +156,12 @@ def plot(what: Drawn, kind: str) -> Figure:
     axes.plot(SITUATIONS, what.after, color=colour, linewidth=2.4, label="after", zorder=4)
     answers(axes, what)
     axes.set(xlim=(-1, 1), ylim=(-1, 1), xticks=[], yticks=[])
-    axes.set_xlabel("situation", color=GREY)
+    axes.set_xlabel("situation", color=GREY, loc="left")
     axes.set_ylabel("action", color=GREY)
     for spine in axes.spines.values():
         spine.set_color(GREY)
-    legend = axes.legend(loc="lower right", frameon=False, fontsize=8, labelcolor=GREY, ncols=3)
-    legend.set_zorder(5)
+    where = {"loc": "upper right", "bbox_to_anchor": (1.0, -0.03), "borderaxespad": 0.0}
+    axes.legend(**where, frameon=False, fontsize=8.5, labelcolor=GREY, ncols=3)
     return figure
 
 
