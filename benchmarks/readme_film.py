@@ -18,16 +18,17 @@ import tempfile
 import threading
 import time
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 from unittest import mock
 
+import jax.numpy as jnp
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont, ImageSequence
 from playwright.sync_api import Page, sync_playwright  # pyright: ignore[reportMissingImports]
 
 from cuelearner_jax.cli import label, main
 from cuelearner_jax.feedback.answers import relative_feedback
-from cuelearner_jax.labelling import server, session
+from cuelearner_jax.labelling import session
 from cuelearner_jax.storage.provenance import provenance
 from examples.moved_camera import reach
 
@@ -55,7 +56,7 @@ class Shot(NamedTuple):
 class Watched(session.Session):
     """A session that a script can look into: it knows the true goal, as a person at the robot would."""
 
-    opened: list[Watched] = []
+    opened: ClassVar[list[Watched]] = []
 
     def __init__(self, *how: Any, **more: Any) -> None:
         super().__init__(*how, **more)
@@ -68,7 +69,7 @@ def keys_for(page: Page, asked: Watched) -> list[tuple[str, str]]:
     assert item is not None
     best = reach(np.asarray(item.guide.obs)[None])[0]
     eps = float(asked.space.from_unit(asked.plan.eps))
-    said = np.asarray(relative_feedback(asked.space, item.action, best, eps))
+    said = np.asarray(relative_feedback(asked.space, jnp.asarray(item.action), jnp.asarray(best), eps))
     keys: dict[str, str] = {}
     for key, name in page.evaluate("cue.keys").items():
         keys.setdefault(name, key)

@@ -151,7 +151,7 @@ def plot(what: Drawn, kind: str) -> Figure:
     axes.plot(SITUATIONS, before(SITUATIONS), ":", color=GREY, linewidth=1.6, label="before")
     axes.plot(SITUATIONS, right(SITUATIONS), "--", color=GREY, linewidth=1.6, label="right")
     if kind == "intent":
-        others = np.asarray(jax.vmap(Line().aims)(SITUATIONS).actions)[:, 1:, 0]
+        others = np.asarray(jax.vmap(Line().aims)(jnp.asarray(SITUATIONS)).actions)[:, 1:, 0]
         axes.plot(SITUATIONS, others, color=GREY, linewidth=0.7, alpha=0.7)
     axes.plot(SITUATIONS, what.after, color=colour, linewidth=2.4, label="after", zorder=4)
     answers(axes, what)
