@@ -1,0 +1,125 @@
+"""The README is short, its numbers are what docs/data hold, and each kind of feedback has a page."""
+
+import csv
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from cuelearner_jax.arbiters.registry import ARBITERS
+from cuelearner_jax.guides import registry
+from cuelearner_jax.report.statistics import interquartile_mean
+
+ROOT = Path(__file__).resolve().parents[1]
+README, DATA, PAGES = (ROOT / "README.md").read_text(encoding="utf-8"), ROOT / "docs/data", ROOT / "docs/feedback"
+UNTAUGHT = {"none", "heuristic", "any_aim", "rule"}
+PAGE_OF = dict.fromkeys(UNTAUGHT, "no_labels") | {"clic_shown": "clic"}
+
+
+def row(of):
+    """The cells of the README's one row about something."""
+    (line,) = [line for line in README.splitlines() if line.startswith(f"| {of}")]
+    return [cell.strip() for cell in line.strip("|").split("|")]
+
+
+def test_the_readme_is_short():
+    assert len(README.splitlines()) <= 110
+    assert (ROOT / "docs/figures/labels_correct_an_arm.gif").stat().st_size <= 2_000_000
+
+
+def test_links_of_the_readme_lead_somewhere():
+    links = re.findall(r"\]\((?!https?:)([^)#\s]+)", README)
+    assert len(links) > 15
+    assert [link for link in links if not (ROOT / link).exists()] == []
+
+
+def test_success_on_fetch_push():
+    rows = [row for file in DATA.glob("fetch/FetchPush-v4/*/*.json") for row in json.loads(file.read_text())["rows"]]
+
+    def success(what, says, shuffled):
+        """Percent of all episodes of all label seeds."""
+        kind = (what, says, shuffled)
+        found = [np.mean(row["success"]) for row in rows if (row["what"], row["says"], row["shuffled"]) == kind]
+        return 100 * np.mean(found)
+
+    labelled, without = row("success on FetchPush")[1:3]
+    assert labelled == f"100 labels: {success('calibration', 'all', False):.0f}%"
+    shuffled = success("calibration", "all", True)
+    assert without == f"{success('displaced', '', False):.0f}%; shuffled answers: {shuffled:.0f}%"
+
+
+def test_error_left_from_logs():
+    with (DATA / "correct_from_logs.csv").open() as file:
+        rows = [row for row in csv.DictReader(file) if (row["guidance"], row["questions"]) == ("relative", "rounds")]
+    left = {who: np.mean([float(row["left"]) for row in rows if row["answers"] == who]) for who in ("own", "shuffled")}
+    labelled, without = row("error left in logs")[1:3]
+    assert labelled == f"200 labels: {100 * left['own']:.0f}%"
+    assert without == f"100%; shuffled answers: {100 * left['shuffled']:.0f}%"
+
+
+def test_success_in_rooms():
+    def success(piece):
+        """Percent of the four agents on which no setting was chosen."""
+        file = DATA / "adaptation/cpu/navigation/rooms" / piece / "adaptation.parquet"
+        rows = pq.read_table(file, columns=["base", "success"]).to_pylist()
+        held_out = [row["success"] for row in sorted(rows, key=lambda row: row["base"])[4:]]
+        return 100 * float(interquartile_mean(held_out))
+
+    labelled, without = row("success of a walker in rooms")[1:3]
+    assert labelled == f"250 labels, 35,000 rewarded steps: {success('intent-180-look-ahead'):.1f}%"
+    assert without == f"{success('none'):.1f}%"
+
+
+def test_steps_of_navigation_and_labels_worth_as_much():
+    report = DATA / "bootstrapping/clutter/report"
+    with (report / "efficiency.csv").open() as file:
+        found = {(row["guidance"], row["labels"]): row for row in csv.DictReader(file) if row["run"] == "frame"}
+    labelled, without = row("steps to 90% success")[1:3]
+    assert labelled == f"100 labels: {round(float(found['relative', '100']['steps_to_level']), -3):,.0f}"
+    assert without == f"{float(found['none', '0']['steps_to_level_above']):,.0f} are not enough"
+    with (report / "equal_area.csv").open() as file:
+        kind = ("frame", "relative", "100")
+        own = [row for row in csv.DictReader(file) if (row["run"], row["reference"], row["reference_labels"]) == kind]
+    worth = {row["guidance"]: row for row in own}
+    fewer, more = row("labels that are worth 100 relative labels")[1:3]
+    assert fewer == f"demonstrations: fewer than {float(worth['demonstration']['labels_below']):.0f}"
+    assert more == f"good/bad: more than {float(worth['scalar']['labels_above']):.0f}"
+
+
+def test_each_kind_of_feedback_has_a_page():
+    index = (PAGES / "index.md").read_text(encoding="utf-8")
+    for kind in registry._BUILT_IN:
+        page = (PAGES / f"{PAGE_OF.get(kind.name, kind.name)}.md").read_text(encoding="utf-8")
+        assert f"`{kind.name}`" in index or kind.name == "none"
+        assert kind.name in page
+        assert {"## Equation", "## Run", "## When to use it"} <= set(page.splitlines()), kind.name
+        assert re.search(r"!\[.+\]\(\.\./figures/feedback/\w+\.svg\)", page), kind.name
+    arbiters = (PAGES / "arbiters.md").read_text(encoding="utf-8")
+    assert [name for name in (kind.NAME for kind in ARBITERS.known) if f"`{name}`" not in arbiters] == []
+
+
+def test_the_table_says_what_a_kind_serves():
+    lines = (PAGES / "index.md").read_text(encoding="utf-8").splitlines()
+    head = next(line for line in lines if line.startswith("| `--guidance` | you say"))
+    names = [cell.strip() for cell in head.strip("|").split("|")]
+    for kind in registry._BUILT_IN:
+        if kind.name in UNTAUGHT:
+            continue
+        (line,) = [line for line in lines if line.startswith(f"| [`{kind.name}`](")]
+        cells = dict(zip(names, (cell.strip() for cell in line.strip("|").split("|")), strict=True))
+        assert cells["training"] == ("no" if kind.adapts_only else "yes")
+        assert cells["unordered choices"] == ("no" if kind.needs_cues else "yes")
+
+
+@pytest.mark.long
+def test_the_lines_of_the_readme_run(tmp_path, monkeypatch, capsys):
+    """They correct the policy whose camera was moved."""
+    pytest.importorskip("gymnasium_robotics")
+    monkeypatch.chdir(tmp_path)
+    (block,) = re.findall(r"```python\n(.*?)```", README, re.S)
+    exec(compile(block, "README.md", "exec"), {})
+    before, after = [float(line.strip("[]. ")) for line in capsys.readouterr().out.split("\n") if line.startswith("[")]
+    assert (before, after) == (0.0, 1.0)
