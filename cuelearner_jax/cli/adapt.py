@@ -9,7 +9,7 @@ from typing import Annotated, Any, Generic
 from cuelearner_jax.adaptation import changes
 from cuelearner_jax.api import correcting
 from cuelearner_jax.cli.parsing import TASK_OPTIONS, about, code_of, is_code, out, parse, source_of, taken
-from cuelearner_jax.cli.shared_options import Flag, KindsT, TaskT, kinds_type, unprefixed
+from cuelearner_jax.cli.shared_options import Flag, KindsT, TaskT, kinds_type, subject_of, unprefixed
 from cuelearner_jax.errors import NotFinite, UserError
 from cuelearner_jax.runs.trained import PolicySource
 from cuelearner_jax.storage import policy_folders
@@ -20,9 +20,10 @@ from cuelearner_jax.terminal import console, progress_bars, watched_by
 
 @dataclass(frozen=True, kw_only=True)
 class Adapt(AdaptRequest[TaskT, KindsT], Generic[TaskT, KindsT]):
-    """Correct a finished policy (of a run folder or policy folder; or, with --task, package.module:NAME, any function
-    of observations, or a file in ONNX) by labels about what it does in a changed world. With --labels-from of a page
-    about recorded situations, no task is needed."""
+    """Correct a finished policy by labels about what the policy does in a changed world.
+
+    The policy lies in a run folder or a policy folder; or, with --task, it is package.module:NAME, any function of
+    observations, or a file in ONNX. With --labels-from of a page about recorded situations, no task is needed."""
 
     out: Path
     """The policy folder that is written."""
@@ -51,7 +52,9 @@ def run(arguments: list[str]) -> None:
         out=Path("policies") / source.folder.name,
         base=BaseLanes(policy=source.default_policy),
     )
-    asked = parse(kind, rest, f"adapt {source.folder}", default, about(Adapt, source.task, policies=True))
+    subject = subject_of(source)
+    told = about(Adapt, source.task, policies=True)
+    asked = parse(kind, rest, f"adapt {subject.typed}", default, told, subject)
     asked = replace(asked, kinds=vars(asked.kinds))
     subject = Subject(source.on(asked.robot), asked.base, code, named)
     if changed is not None and (adapt.reads_evidence(asked) or source.adapted is None):  # else the folder's code

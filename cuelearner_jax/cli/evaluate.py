@@ -29,16 +29,15 @@ class Evaluate(EvaluateRequest[TaskT], Generic[TaskT]):
     """Validate a run, an adapted policy, or a task's teacher, heuristic or chance; in any changed world."""
 
     robot: str | None = None
-    """Another robot, see above (default: the task's own); with a folder, as anymal:FOLDER, one with your own walking
+    """Another robot, by its name (default: the task's own). With a folder, as anymal:FOLDER: one with your own walking
     policy."""
     scenario: str | None = None
-    """The changed world of this name, see above; options of the task (--task.…) come on top of it."""
+    """A changed world, by its name. Options of the task (--task.…) come on top of it."""
     compare: str | None = None
-    """Another run folder, policy folder or policy, measured on the same episodes; its default policy where that is a
-    folder. The table then shows both and the difference."""
+    """Another run folder, policy folder or policy, on the same episodes: a table with both and the difference."""
     labels_from: Path | None = None
-    """Instead: how many answers of this label file the policy agrees with (package.module:NAME and a file in ONNX too),
-    beside the policy as it was and "already right" always."""
+    """Instead: how many answers of this label file the policy agrees with. Also of package.module:NAME and of a file in
+    ONNX; beside the policy as it was and "already right" always."""
     out: Path | None = None
     """Also write the measurements to this JSON file. (Beside all these: --base and --changes package.module:NAME give
     the code of a policy folder that has some, --agent and --arbiter that of a run's own parts.)"""

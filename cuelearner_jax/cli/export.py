@@ -22,14 +22,14 @@ class Export(Lane, Generic[TaskT]):
 
     task: TaskT
     format: str = "stablehlo"
-    """stablehlo, onnx or numpy, see above."""
+    """stablehlo, onnx or numpy."""
     out: Path = Path("exported")
     """Folder for the decision; it must not be there yet, or be empty."""
     only_correction: Flag[bool] = False
     """The correction alone, of a policy folder: observation and base action in, action out. The base stays where it
     is, and is not needed here."""
     scenario: str | None = None
-    """The changed world of this name, see above, whose observations the golden cases are; options of the task
+    """A changed world, by its name, whose observations the golden cases are. Options of the task
     (--task.…) come on top of it."""
 
 
