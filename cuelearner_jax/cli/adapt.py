@@ -15,7 +15,7 @@ from cuelearner_jax.runs.trained import PolicySource
 from cuelearner_jax.storage import policy_folders
 from cuelearner_jax.studies import adapt
 from cuelearner_jax.studies.adapt import AdaptRequest, BaseLanes, Subject
-from cuelearner_jax.terminal import console, progress_bars, watched_by
+from cuelearner_jax.terminal import progress_bars, watched_by
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,7 +61,7 @@ def run(arguments: list[str]) -> None:
         subject = subject._replace(changes=changes.load(changed), changes_named=changed)
     with (
         policy_folders.place_of(asked.out, asked.overwrite) as place,
-        progress_bars(shown=console.is_terminal) as bars,
+        progress_bars() as bars,
     ):
         outcome = adapt.run(subject, asked, watched_by(bars))
         outcome.write(place)

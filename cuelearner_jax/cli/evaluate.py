@@ -26,7 +26,9 @@ from cuelearner_jax.terminal import console, progress_bars, watched_by
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluate(EvaluateRequest[TaskT], Generic[TaskT]):
-    """Validate a run, an adapted policy, or a task's teacher, heuristic or chance; in any changed world."""
+    """Measure a policy on validation episodes, or compare two; in any changed world.
+
+    The policy is of a run or a policy folder, or a task's teacher, heuristic or chance."""
 
     robot: str | None = None
     """Another robot, by its name (default: the task's own). With a folder, as anymal:FOLDER: one with your own walking
@@ -69,7 +71,7 @@ def run(arguments: list[str]) -> None:
     if asked.out and asked.out.exists():
         raise UserError(f"{asked.out} exists: give another --out")
     other = _other(source, asked) if asked.compare is not None else None
-    with progress_bars(shown=console.is_terminal) as bars:
+    with progress_bars() as bars:
         watch = watched_by(bars)
         found = evaluate.run(source, asked, watch)
         others = evaluate.run(other[0], replace(asked, policy=other[1], guidance=()), watch) if other else []

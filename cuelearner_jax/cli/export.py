@@ -18,7 +18,9 @@ from cuelearner_jax.runs import trained
 
 @dataclass(frozen=True, kw_only=True)
 class Export(Lane, Generic[TaskT]):
-    """A policy as a file for a robot, with a contract of what goes in and comes out; --check FOLDER replays one."""
+    """Write a policy as a file for a robot, with a contract; --check FOLDER replays one.
+
+    The contract tells what goes in and comes out."""
 
     task: TaskT
     format: str = "stablehlo"

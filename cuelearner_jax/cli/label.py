@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import shlex
 import webbrowser
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -314,6 +315,7 @@ def _server() -> Any:
 
 def _served(server: Any, plan: Plan, asked: Label[Any], port: Any, stopping: Any, commands: Any) -> Any:
     """Serves a session until it is finished (returns how, an `Ending`) or stopped (None)."""
+    from cuelearner_jax.labelling.opening import Opening
     from cuelearner_jax.labelling.session import Session
 
     def open_page(address: str) -> None:
@@ -324,8 +326,11 @@ def _served(server: Any, plan: Plan, asked: Label[Any], port: Any, stopping: Any
     def tell(words: str) -> None:
         console.print(f"{words} ...")
 
-    with Session(plan, asked.out, tell, practice=PRACTICE if asked.practice else 0) as session:
-        return server.serve(session, port, stopping, open_page, commands)
+    def make(tell: Callable[[str], None]) -> Session:
+        return Session(plan, asked.out, tell, practice=PRACTICE if asked.practice else 0)
+
+    with Opening(make, stopping.set, tell) as opening:
+        return server.serve(opening, f"label {plan.task.name}", port, stopping, open_page, commands)
 
 
 def _following(task: Task, preset: str, config: RunConfig, asked: Any, policy: str | None, labels: int) -> str:

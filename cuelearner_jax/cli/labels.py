@@ -54,7 +54,7 @@ class Merge:
 
 @dataclass(frozen=True)
 class LabelsExport:
-    """Labels as a plain table: a row a label, a column a number in CSV, lists in Parquet."""
+    """Labels as a table: a row a label; in CSV a column a number, in Parquet lists."""
 
     files: Files
     """One label file, or a folder of a page's."""

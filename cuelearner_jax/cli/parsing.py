@@ -342,7 +342,7 @@ def _taught(task: Task, reference: str | None) -> Task:
     if reference is None:
         return task
     code = plugins.load(reference, object, "a teacher")
-    return dataclasses.replace(task, teacher=lambda config, env: teaching(code, actions_of(env)))
+    return dataclasses.replace(task, teacher=lambda config, env: teaching(code, actions_of(env)), brief_teacher=None)
 
 
 def is_code(named: str) -> bool:

@@ -241,7 +241,7 @@ def run(
     how = _judging(task, request, env)
     teacher = None
     if rows is None:
-        teacher = subject.teacher or task.make_teacher(request.task, env)
+        teacher = subject.teacher or task.make_teacher(request.task, env, questions=int(lanes.budget.sum()))
         check_teacher(teacher, scalars)
     if rows is not None:
         rows = label_files.for_lanes(rows, lanes.seed, lanes.budget, label_slots(int(lanes.budget.max()), sizes))
