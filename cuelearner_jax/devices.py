@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
+from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec, SingleDeviceSharding
 
 LANES = "lanes"
 LIBRARY_LANES = 16  # of a device, from which on the matrix products of NVIDIA's library are the faster ones
@@ -166,6 +166,21 @@ def _lanes(blocks: Any) -> int:
 
 def _lane(blocks: Any, index: Any) -> Any:
     return jax.tree.map(lambda leaf: jax.lax.dynamic_index_in_dim(leaf, index, keepdims=False), blocks)
+
+
+def settled(tree: Any) -> Any:
+    """Return a tree whose arrays of one device are all committed to it alike.
+
+    Arrays that lie on the same device as part of a mesh, as its own, or uncommitted, are of three kinds to `jax.jit`,
+    which compiles once for each. Arrays of several devices stay as they are.
+    """
+
+    def put(leaf: Any) -> Any:
+        if not isinstance(leaf, jax.Array) or isinstance(leaf, jax.core.Tracer) or len(leaf.devices()) > 1:
+            return leaf
+        return jax.device_put(leaf, SingleDeviceSharding(next(iter(leaf.devices()))))
+
+    return jax.tree.map(put, tree)
 
 
 def place(mesh: Mesh, tree: Any, where: PartitionSpec) -> Any:

@@ -16,7 +16,7 @@ from jax.sharding import Mesh
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from cuelearner_jax import user_code
-from cuelearner_jax.devices import BY_LANE, SHARED, over_lanes, portions
+from cuelearner_jax.devices import BY_LANE, SHARED, over_lanes, portions, settled
 from cuelearner_jax.environment import Environment, actions_of
 from cuelearner_jax.policies import Policy, PolicyBlock, call_policy, lanes_in, policy_name
 
@@ -238,7 +238,9 @@ def _in_stretches(
 ) -> Rollout:
     """A roll-out of one policy (`each` is None), or of the lanes of `each` side by side; a lane that fails is NaN."""
     count, lanes = _stretches(steps // num_envs), 0 if each is None else len(jax.tree.leaves(each)[0])
-    walk = _begin(env, key, num_envs=num_envs, lanes=lanes)
+    env, each, shared, key = settled((env, each, shared, key))
+    walk = _begin(env, key, num_envs=num_envs)
+    walk = _repeat(walk, lanes=lanes) if lanes else walk
     for number, indices in enumerate(np.arange(steps // num_envs).reshape(count, -1)):
         tell(number, count)
         walk = jax.block_until_ready(_walk(env, each, shared, key, walk, jnp.asarray(indices)))
@@ -255,10 +257,15 @@ def _stretches(steps: int) -> int:
     return max(count for count in range(1, MOST_STRETCHES + 1) if steps % count == 0 and (count == 1 or steps > count))
 
 
-@partial(jax.jit, static_argnames=("num_envs", "lanes"))
-def _begin(env: Any, key: PRNGKeyArray, *, num_envs: int, lanes: int) -> _Walk:
-    walk = _begun(env, key, num_envs)
-    return jax.tree.map(lambda leaf: jnp.repeat(leaf[None], lanes, axis=0), walk) if lanes else walk
+@partial(jax.jit, static_argnames="num_envs")
+def _begin(env: Any, key: PRNGKeyArray, *, num_envs: int) -> _Walk:
+    return _begun(env, key, num_envs)
+
+
+@partial(jax.jit, static_argnames="lanes")
+def _repeat(walk: _Walk, *, lanes: int) -> _Walk:
+    """The same beginning for each lane: apart, so that lanes and single policies share the program that begins."""
+    return jax.tree.map(lambda leaf: jnp.repeat(leaf[None], lanes, axis=0), walk)
 
 
 @jax.jit

@@ -118,6 +118,8 @@ class Task:
     config: type  # its configuration: a dataclass, one line of help a field
     bodies: tuple[Body, ...]  # its own first
     teacher: Callable[[Any, Any], Teacher] | None = None  # (configuration, environment); None: nobody answers
+    # (configuration, environment, questions): one that answers alike and takes less time for so few; None: there is none
+    brief_teacher: Callable[[Any, Any, int], Teacher | None] | None = None
     # configuration -> digests of the user's own files that it names, by field; raises UserError if one is not there
     files: Callable[[Any], dict[str, str]] = lambda config: {}
     # configuration -> steps of its longest episode, where episodes count (`Step.outcome`); None: steps count
@@ -212,10 +214,17 @@ class Task:
             return self.environment(config)
         return jax.jit(lambda: view_of(make()))()
 
-    def make_teacher(self, config: Any, env: Environment) -> Teacher:
-        """Who answers in a world. Raises UserError if the task has no teacher."""
+    def make_teacher(self, config: Any, env: Environment, questions: int | None = None) -> Teacher:
+        """Return who answers in a world; `questions`: how many there will be, if that is known.
+
+        Raises UserError if the task has no teacher.
+        """
         if self.teacher is None:
             raise UserError(f"{self.name} has no teacher to ask: give --labels-from, or a guidance without labels")
+        if questions is not None and self.brief_teacher is not None:
+            brief = self.brief_teacher(config, env, questions)
+            if brief is not None:
+                return brief
         return self.teacher(config, env)
 
     def check_whole(self, config: Any, envs: int, steps: int, envs_option: str, steps_option: str) -> None:

@@ -5,12 +5,13 @@ from __future__ import annotations
 import contextlib
 import os
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import IO, Any, cast
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
 from cuelearner_jax.signals import Interrupted, interruptible
 
@@ -60,7 +61,14 @@ console = Console(file=cast(IO[str], _StandardError()), **PLAIN)
 
 @contextmanager
 def progress_bars(shown: bool = True, counted: bool = True) -> Iterator[Progress]:
-    """Progress bars on standard error, or none to be seen; with numbers of what is done if `counted`."""
+    """Progress on standard error: bars on a terminal, lines elsewhere; not `shown`: none.
+
+    `counted`: bars show numbers of what is done.
+    """
+    if shown and not console.is_terminal:
+        with ProgressLines() as lines:
+            yield lines
+        return
     columns = (
         TextColumn("{task.description:<12}", markup=False),
         BarColumn(),
@@ -70,6 +78,66 @@ def progress_bars(shown: bool = True, counted: bool = True) -> Iterator[Progress
     )
     with Progress(*columns, console=console, disable=not shown) as bars:
         yield bars
+
+
+EVERY = 5.0  # seconds between two lines of progress
+PATIENCE = 6  # times as long until a line that says nothing new
+
+
+class ProgressLines(Progress):
+    """Progress as lines, for output that goes to a file or a pipe: the first at once, then one in `EVERY` seconds."""
+
+    def __init__(self) -> None:
+        super().__init__(console=console, disable=True, auto_refresh=False)
+        self._newest: TaskID | None = None  # the piece of work that moved last
+        self._told, self._silent, self._ended = "", 0, threading.Event()
+        self._thread = threading.Thread(target=self._tell_on, name="progress", daemon=True)
+
+    def start(self) -> None:
+        """Begin to tell."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End."""
+        self._ended.set()
+        self._thread.join()
+
+    def add_task(self, *arguments: Any, **options: Any) -> TaskID:
+        """Add a piece of work; the first one is told of at once."""
+        self._newest = super().add_task(*arguments, **options)
+        if not self._told:
+            self.tell()
+        return self._newest
+
+    def update(self, task_id: TaskID, **options: Any) -> None:
+        """Note how far a piece of work is."""
+        super().update(task_id, **options)
+        self._newest = task_id
+
+    def advance(self, task_id: TaskID, advance: float = 1) -> None:
+        """Note that a piece of work is farther."""
+        super().advance(task_id, advance)
+        self._newest = task_id
+
+    def tell(self) -> None:
+        """Print a line if there is something new to tell, or nothing was told for long."""
+        if self._newest is None:
+            return
+        task = self._tasks[self._newest]
+        parts = [task.description]
+        if task.total:
+            parts.append(f"{task.completed:,.0f} of {task.total:,.0f}")
+        line = ", ".join([*parts, *([note] if (note := task.fields.get("note")) else [])])
+        self._silent = self._silent + 1 if line == self._told else 0
+        if self._silent % PATIENCE:
+            return
+        self._told = line
+        left = f", about {task.time_remaining:.0f} s left" if task.time_remaining else ""
+        console.print(f"{line}; after {task.elapsed or 0:.0f} s{left}")
+
+    def _tell_on(self) -> None:
+        while not self._ended.wait(EVERY):
+            self.tell()
 
 
 def watched_by(bars: Progress) -> Callable[[str], Callable[[int, int], None]]:

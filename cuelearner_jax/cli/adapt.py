@@ -9,20 +9,21 @@ from typing import Annotated, Any, Generic
 from cuelearner_jax.adaptation import changes
 from cuelearner_jax.api import correction
 from cuelearner_jax.cli.parsing import TASK_OPTIONS, about, code_of, is_code, out, parse, source_of, taken
-from cuelearner_jax.cli.shared_options import Flag, KindsT, TaskT, kinds_type, unprefixed
+from cuelearner_jax.cli.shared_options import Flag, KindsT, TaskT, kinds_type, subject_of, unprefixed
 from cuelearner_jax.errors import NotFinite, UserError
 from cuelearner_jax.runs.trained import PolicySource
 from cuelearner_jax.storage import policy_folders
 from cuelearner_jax.studies import adapt
 from cuelearner_jax.studies.adapt import AdaptRequest, BaseLanes, Subject
-from cuelearner_jax.terminal import console, progress_bars, watched_by
+from cuelearner_jax.terminal import progress_bars, watched_by
 
 
 @dataclass(frozen=True, kw_only=True)
 class Adapt(AdaptRequest[TaskT, KindsT], Generic[TaskT, KindsT]):
-    """Correct a finished policy (of a run folder or policy folder; or, with --task, package.module:NAME, any function
-    of observations, or a file in ONNX) by labels about what it does in a changed world. With --labels-from of a page
-    about recorded situations, no task is needed."""
+    """Correct a finished policy by labels about what the policy does in a changed world.
+
+    The policy lies in a run folder or a policy folder; or, with --task, it is package.module:NAME, any function of
+    observations, or a file in ONNX. With --labels-from of a page about recorded situations, no task is needed."""
 
     out: Path
     """The policy folder that is written."""
@@ -51,14 +52,16 @@ def run(arguments: list[str]) -> None:
         out=Path("policies") / source.folder.name,
         base=BaseLanes(policy=source.default_policy),
     )
-    asked = parse(kind, rest, f"adapt {source.folder}", default, about(Adapt, source.task, policies=True))
+    subject = subject_of(source)
+    told = about(Adapt, source.task, policies=True)
+    asked = parse(kind, rest, f"adapt {subject.typed}", default, told, subject)
     asked = replace(asked, kinds=vars(asked.kinds))
     subject = Subject(source.on(asked.robot), asked.base, code, named)
     if changed is not None and (adapt.reads_evidence(asked) or source.adapted is None):  # else the folder's code
         subject = subject._replace(changes=changes.load(changed), changes_named=changed)
     with (
         policy_folders.place_of(asked.out, asked.overwrite) as place,
-        progress_bars(shown=console.is_terminal) as bars,
+        progress_bars() as bars,
     ):
         outcome = adapt.run(subject, asked, watched_by(bars))
         outcome.write(place)

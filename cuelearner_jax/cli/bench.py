@@ -14,8 +14,9 @@ import jax
 import tyro
 from jax.sharding import Mesh
 
+from cuelearner_jax.cli import pages
 from cuelearner_jax.cli.parsing import out, parse, preset_of, task_of
-from cuelearner_jax.cli.shared_options import RunT, as_kept, parts_of
+from cuelearner_jax.cli.shared_options import RunT, as_kept, parts_of, typed_name
 from cuelearner_jax.devices import lane_mesh
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.run_config import RunConfig, check
@@ -80,7 +81,8 @@ def run(arguments: list[str]) -> None:
         name, preset, rest = preset_of(task, rest)
         config, run_type, rest = parts_of(preset.config, rest, preset_kinds(task, preset))
         kind = BenchTask[run_type]  # pyright: ignore[reportInvalidTypeArguments]
-        given = parse(kind, rest, f"bench {task.name}", kind(config))
+        subject = pages.subject_of(typed_name(task), task.name, task)
+        given = parse(kind, rest, f"bench {subject.typed}", kind(config), subject=subject)
         asked, works = given.measuring, [(task, name, as_kept(given.run))]
     else:
         asked = parse(Bench, arguments, "bench")

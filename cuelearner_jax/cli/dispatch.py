@@ -114,6 +114,7 @@ def summaries(command: str) -> dict[str, str]:
 
 
 def _overview() -> None:
+    from cuelearner_jax.cli import pages
     from cuelearner_jax.tasks import registry
 
     print("usage: cuelearner COMMAND ...\n\nLearning from relative feedback with off-policy deep RL.\n\ncommands:")
@@ -121,5 +122,8 @@ def _overview() -> None:
     width = max(map(len, told)) + 2
     for name, about in told.items():
         print(f"  {name:<{width}}{about}")
-    print(f"\ntasks: {', '.join(registry.names())}; or one of your own, as package.module:NAME")
+    print("\nexamples:")
+    for command in ("sweep", "evaluate", "label"):
+        print(*pages.lines_of(pages.examples_of(command)[:1]), sep="\n")
+    print(f"\ntasks: {', '.join(registry.names())};\n  or one of your own: package.module:NAME")
     print("Each command has --help, for instance: cuelearner sweep billiards --help; cuelearner --version")

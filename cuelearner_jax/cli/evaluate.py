@@ -26,19 +26,20 @@ from cuelearner_jax.terminal import console, progress_bars, watched_by
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluate(EvaluateRequest[TaskT], Generic[TaskT]):
-    """Validate a run, an adapted policy, or a task's teacher, heuristic or chance; in any changed world."""
+    """Measure a policy on validation episodes, or compare two; in any changed world.
+
+    The policy is of a run or a policy folder, or a task's teacher, heuristic or chance."""
 
     robot: str | None = None
-    """Another robot, see above (default: the task's own); with a folder, as anymal:FOLDER, one with your own walking
+    """Another robot, by its name (default: the task's own). With a folder, as anymal:FOLDER: one with your own walking
     policy."""
     scenario: str | None = None
-    """The changed world of this name, see above; options of the task (--task.…) come on top of it."""
+    """A changed world, by its name. Options of the task (--task.…) come on top of it."""
     compare: str | None = None
-    """Another run folder, policy folder or policy, measured on the same episodes; its default policy where that is a
-    folder. The table then shows both and the difference."""
+    """Another run folder, policy folder or policy, on the same episodes: a table with both and the difference."""
     labels_from: Path | None = None
-    """Instead: how many answers of this label file the policy agrees with (package.module:NAME and a file in ONNX too),
-    beside the policy as it was and "already right" always."""
+    """Instead: how many answers of this label file the policy agrees with. Also of package.module:NAME and of a file in
+    ONNX; beside the policy as it was and "already right" always."""
     out: Path | None = None
     """Also write the measurements to this JSON file. (Beside all these: --base and --changes package.module:NAME give
     the code of a policy folder that has some, --agent and --arbiter that of a run's own parts.)"""
@@ -70,7 +71,7 @@ def run(arguments: list[str]) -> None:
     if asked.out and asked.out.exists():
         raise UserError(f"{asked.out} exists: give another --out")
     other = _other(source, asked) if asked.compare is not None else None
-    with progress_bars(shown=console.is_terminal) as bars:
+    with progress_bars() as bars:
         watch = watched_by(bars)
         found = evaluate.run(source, asked, watch)
         others = evaluate.run(other[0], replace(asked, policy=other[1], guidance=()), watch) if other else []

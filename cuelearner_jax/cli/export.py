@@ -18,18 +18,20 @@ from cuelearner_jax.runs import trained
 
 @dataclass(frozen=True, kw_only=True)
 class Export(Lane, Generic[TaskT]):
-    """A policy as a file for a robot, with a contract of what goes in and comes out; --check FOLDER replays one."""
+    """Write a policy as a file for a robot, with a contract; --check FOLDER replays one.
+
+    The contract tells what goes in and comes out."""
 
     task: TaskT
     format: str = "stablehlo"
-    """stablehlo, onnx or numpy, see above."""
+    """stablehlo, onnx or numpy."""
     out: Path = Path("exported")
     """Folder for the decision; it must not be there yet, or be empty."""
     only_correction: Flag[bool] = False
     """The correction alone, of a policy folder: observation and base action in, action out. The base stays where it
     is, and is not needed here."""
     scenario: str | None = None
-    """The changed world of this name, see above, whose observations the golden cases are; options of the task
+    """A changed world, by its name, whose observations the golden cases are. Options of the task
     (--task.…) come on top of it."""
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import shlex
 import webbrowser
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -18,8 +19,9 @@ from cuelearner_jax import config as configuration
 from cuelearner_jax.adaptation import by_calibration, by_model, changes
 from cuelearner_jax.calibration import declared_distortions
 from cuelearner_jax.calibration.families import Family
+from cuelearner_jax.cli import pages
 from cuelearner_jax.cli.parsing import PAPER, about, check_numbers, code_of, is_code, out, parse, preset_of, taken
-from cuelearner_jax.cli.shared_options import Flag, Lane, TaskT, asking_kind
+from cuelearner_jax.cli.shared_options import Flag, Lane, TaskT, asking_kind, typed_name
 from cuelearner_jax.cli.situations import WORDS, task_named, with_cues
 from cuelearner_jax.config import GuideScalars, GuideSizes, Scalars
 from cuelearner_jax.environment import actions_of, offers
@@ -77,9 +79,9 @@ class Label(Generic[TaskT]):
     again: Path | None = None
     """Instead: the questions of this page's file once more, for a second opinion; leave out the policy and --seed."""
     scenario: str | None = None
-    """The changed world of this name, see above; options of the task (--task.…) come on top of it."""
+    """A changed world, by its name. Options of the task (--task.…) come on top of it."""
     robot: str | None = None
-    """Another robot, see above (default: the task's own); with a folder, as anymal:FOLDER, one with your own walking
+    """Another robot, by its name (default: the task's own). With a folder, as anymal:FOLDER: one with your own walking
     policy."""
     questions: Literal["uniform", "near_aims", "proposed"] = UNIFORM
     """Without a policy: any actions, those near what a player may aim at (where the task has aims), or those that a
@@ -137,7 +139,8 @@ def run(arguments: list[str]) -> None:
         labels=max(preset.labels) if named is None else by_calibration.USUAL if by_evidence else Label.labels,
         questions=UNIFORM if named is not None else _usual_questions(task),
     )
-    asked = parse(kind, rest, f"label {task.name}", default, about(Label, task, preset=usual))
+    subject = pages.subject_of(arguments[0] if task.proposed is not None else typed_name(task), task.name, task)
+    asked = parse(kind, rest, f"label {subject.typed}", default, about(Label, task, preset=usual), subject)
     plan = planned(task, preset.config, asked, named, source)
     config = preset.config if source is None else dataclasses.replace(preset.config, task=world)
     again = shlex.join(["cuelearner", "label", *typed])
@@ -312,6 +315,7 @@ def _server() -> Any:
 
 def _served(server: Any, plan: Plan, asked: Label[Any], port: Any, stopping: Any, commands: Any) -> Any:
     """Serves a session until it is finished (returns how, an `Ending`) or stopped (None)."""
+    from cuelearner_jax.labelling.opening import Opening
     from cuelearner_jax.labelling.session import Session
 
     def open_page(address: str) -> None:
@@ -322,8 +326,11 @@ def _served(server: Any, plan: Plan, asked: Label[Any], port: Any, stopping: Any
     def tell(words: str) -> None:
         console.print(f"{words} ...")
 
-    with Session(plan, asked.out, tell, practice=PRACTICE if asked.practice else 0) as session:
-        return server.serve(session, port, stopping, open_page, commands)
+    def make(tell: Callable[[str], None]) -> Session:
+        return Session(plan, asked.out, tell, practice=PRACTICE if asked.practice else 0)
+
+    with Opening(make, stopping.set, tell) as opening:
+        return server.serve(opening, f"label {plan.task.name}", port, stopping, open_page, commands)
 
 
 def _following(task: Task, preset: str, config: RunConfig, asked: Any, policy: str | None, labels: int) -> str:
@@ -331,7 +338,7 @@ def _following(task: Task, preset: str, config: RunConfig, asked: Any, policy: s
 
     `asked` are the options of `cuelearner label` as they were used, `config` the preset's configuration.
     """
-    name, out = task.origin or task.named or task.name, str(asked.out)
+    name, out = typed_name(task), str(asked.out)
     if asked.again is not None:
         return shlex.join(["cuelearner", "labels", "inspect", str(asked.again), out])
     given = ["--labels-from", out, "--labels", str(labels)]

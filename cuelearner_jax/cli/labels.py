@@ -12,6 +12,7 @@ import numpy as np
 import tyro
 from rich.table import Table
 
+from cuelearner_jax.cli import pages
 from cuelearner_jax.cli.dispatch import HELP
 from cuelearner_jax.cli.parsing import out, parse, summary
 from cuelearner_jax.cli.shared_options import Flag
@@ -53,7 +54,7 @@ class Merge:
 
 @dataclass(frozen=True)
 class LabelsExport:
-    """Labels as a plain table: a row a label, a column a number in CSV, lists in Parquet."""
+    """Labels as a table: a row a label; in CSV a column a number, in Parquet lists."""
 
     files: Files
     """One label file, or a folder of a page's."""
@@ -71,6 +72,10 @@ def run(arguments: list[str]) -> None:
         print("usage: cuelearner labels inspect|merge|export FILE ... [OPTIONS]\n")
         for name, kind in KINDS.items():
             print(f"  {name:<9}{summary(kind)}")
+        print("\nexamples:")
+        for name in OPTIONS:
+            print(*pages.lines_of(pages.examples_of(name)[:1]), sep="\n")
+        print("\nEach has --help, for instance: cuelearner labels inspect --help")
         raise SystemExit(0 if arguments else 2)
     name, rest = arguments[0], arguments[1:]
     if name not in KINDS:

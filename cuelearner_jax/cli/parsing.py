@@ -10,8 +10,8 @@ import os
 import re
 import stat
 import tempfile
-import textwrap
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,10 @@ from rich.console import Console
 
 from cuelearner_jax import plugins
 from cuelearner_jax.adaptation import changes
+from cuelearner_jax.cli import pages
 from cuelearner_jax.cli.dispatch import HELP, HELP_ALL
+from cuelearner_jax.cli.pages import Subject
+from cuelearner_jax.config import GuideScalars, GuideSizes
 from cuelearner_jax.environment import actions_of
 from cuelearner_jax.errors import UserError, no_space, suggestion
 from cuelearner_jax.guides import registry as guidances
@@ -52,10 +55,18 @@ def summary(kind: type) -> str:
     return " ".join(inspect.cleandoc(kind.__doc__ or "").split("\n\n")[0].split())
 
 
-def parse(kind: Any, arguments: list[str], program: str, default: Any = None, about: str | None = None) -> Any:
+def parse(
+    kind: Any,
+    arguments: list[str],
+    program: str,
+    default: Any = None,
+    about: str | None = None,
+    subject: Subject | None = None,
+) -> Any:
     """Arguments as a dataclass. Raises UserError with tyro's message in one line, or for an `out` that cannot be.
 
-    `program` is the command as its help shows it, `about` the text above the options (default: the kind's docstring).
+    `program` is the command as its help shows it, `about` the text above the options (default: the kind's docstring),
+    `subject` the task or folder that examples name.
     """
     errors = io.StringIO()
     keywords = {
@@ -67,7 +78,8 @@ def parse(kind: Any, arguments: list[str], program: str, default: Any = None, ab
     helped = [argument for argument in arguments if argument in HELP]
     try:
         if helped and HELP_ALL not in helped:
-            print(_first_page(lambda: tyro.cli(kind, args=["--help"], **keywords), f"cuelearner {program}"))
+            text = _whole(lambda: tyro.cli(kind, args=["--help"], **keywords))
+            print(pages.first_page(text, pages.command_of(program), f"cuelearner {program}", subject))
             raise SystemExit(0)
         with contextlib.redirect_stderr(errors):
             asked = tyro.cli(kind, args=["--help"] if helped else arguments, **keywords)
@@ -105,36 +117,50 @@ def _options(group: Any, prefix: str = "") -> list[str]:
     return found
 
 
-WIDE, NARROW = 118, 99  # columns of a first page, and those within which tyro's help is one column of options
+NARROW = 99  # columns within which tyro's help is one column of options
 
 
-def _first_page(tell: Callable[[], Any], program: str) -> str:
-    """What one needs of the page that `tell` prints: what there is to choose from, and own options, a line each."""
-    whole, before = io.StringIO(), os.environ.get("COLUMNS")
+def _whole(tell: Callable[[], Any]) -> str:
+    """The page of tyro's that `tell` prints, as `pages.read` takes it."""
+    page, before = io.StringIO(), os.environ.get("COLUMNS")
     os.environ["COLUMNS"] = str(NARROW)
     try:
-        with contextlib.redirect_stdout(whole), contextlib.suppress(SystemExit):
+        with contextlib.redirect_stdout(page), contextlib.suppress(SystemExit):
             tell()
     finally:
         os.environ.pop("COLUMNS") if before is None else os.environ.update(COLUMNS=before)
-    # A page that goes nowhere has boxes of plain characters: a title, a rule, and the options below it.
-    head, *boxes = re.split(r"^ (\S.*?) *\n -{9,} *\n", whole.getvalue(), flags=re.MULTILINE)
-    usage, about, *groups = head.strip().split("\n\n")
-    lines = [*usage.splitlines(), "", *textwrap.wrap(" ".join(about.split()), WIDE)]
-    for title, _, rows in (group.partition(":\n") for group in groups):
-        names = re.findall(r"^  (\S+)", rows, re.MULTILINE)
-        lines += textwrap.wrap(f"{title}: {', '.join(names)}", WIDE, subsequent_indent="  ")
-    others = []
-    for title, box in zip(boxes[::2], boxes[1::2], strict=True):
-        options = re.findall(r"^ {2}(\S.*?) *\n((?: {8}.*\n?)*)", box, re.MULTILINE)
-        if title in ("options", "positional arguments"):
-            told = [f"  {name}  {' '.join(text.split())}".rstrip() for name, text in options if "--help" not in name]
-            cut = (line if len(line) <= WIDE else f"{line[: WIDE - 4].rstrip()} ..." for line in told)
-            lines += ["", f"{title}:", *(line.replace("{None}|", "") for line in cut)]
-        else:
-            others.append(f"{title} ({sum(name.startswith('--') for name, _ in options)})")
-    whole_page = f"The whole page, with {', '.join(others) or 'all of each line'}: {program} {HELP_ALL}"
-    return "\n".join([*lines, "", *textwrap.wrap(whole_page, WIDE, break_on_hyphens=False)])
+    return page.getvalue()
+
+
+@dataclass(frozen=True)
+class _Unnamed:
+    """Options of a task that is not named yet."""
+
+
+def explain(command: str, kind: Any, takes: str, whole: bool) -> None:
+    """Prints the help of a command after which nothing is named yet.
+
+    Args:
+        command: its name.
+        kind: its options, generic in what a task decides.
+        takes: what is to be named, as `TASK`.
+        whole: every task with what there is to choose from, in place of a first page.
+    """
+    usage = f"cuelearner {command} {takes} [OPTIONS]"
+    if whole:
+        print(f"usage: {usage}\n\n{summary(kind)}\n\n{_tasks()}\n")
+        print(f"options and their defaults: cuelearner {command} TASK {HELP_ALL}")
+        return
+    usual = {"out": Path("FOLDER"), "sizes": GuideSizes(), "scalars": GuideScalars()}
+    needed = {entry.name for entry in dataclasses.fields(kind) if entry.default is entry.default_factory}
+    default = {name: usual.get(name, _Unnamed()) for name in needed | {"kinds"} & _names(kind)}
+    filled = kind[(_Unnamed,) * len(kind.__parameters__)]
+    text = _whole(lambda: tyro.cli(filled, args=["--help"], prog=usage, default=filled(**default)))
+    print(pages.first_page(text, command, f"cuelearner {command} TASK", tasks=registry.names()))
+
+
+def _names(kind: Any) -> set[str]:
+    return {entry.name for entry in dataclasses.fields(kind)}
 
 
 def check_numbers(asked: Any, **bounds: tuple[int, int]) -> None:
@@ -207,9 +233,7 @@ def task_of(arguments: list[str], command: str, kind: type) -> tuple[Task, list[
     teacher, rest = taken(rest, "--teacher", "package.module:NAME")
     if given is None:
         if not rest or rest[0] in HELP:
-            told = _tasks(HELP_ALL in rest)
-            print(f"usage: cuelearner {command} TASK [--preset NAME] [OPTIONS]\n\n{summary(kind)}\n\n{told}\n")
-            print(f"options and their defaults: cuelearner {command} TASK --help")
+            explain(command, kind, "TASK", HELP_ALL in rest)
             raise SystemExit(0 if arguments else 2)
         given, rest = rest[0], rest[1:]
     elif rest and not rest[0].startswith("-"):
@@ -252,8 +276,7 @@ def source_of(arguments: list[str], command: str, kind: type) -> tuple[PolicySou
         if reference is not None:
             parts.resolve(reference)
     if known is None and (not rest or rest[0] in HELP):
-        print(f"usage: cuelearner {command} FOLDER|TASK [OPTIONS]\n\n{summary(kind)}\n\n{_tasks(HELP_ALL in rest)}\n")
-        print(f"options and their defaults: cuelearner {command} {registry.names()[0]} --help")
+        explain(command, kind, "FOLDER|TASK", HELP_ALL in rest)
         raise SystemExit(0 if arguments else 2)
     if rest and (known is None or not rest[0].startswith("-")):
         name, rest = rest[0], rest[1:]
@@ -322,7 +345,7 @@ def _taught(task: Task, reference: str | None) -> Task:
     if reference is None:
         return task
     code = plugins.load(reference, object, "a teacher")
-    return dataclasses.replace(task, teacher=lambda config, env: teaching(code, actions_of(env)))
+    return dataclasses.replace(task, teacher=lambda config, env: teaching(code, actions_of(env)), brief_teacher=None)
 
 
 def is_code(named: str) -> bool:
@@ -358,8 +381,8 @@ def _of_folder(folder: Path, known: Task | None, code: Any, changed: Any) -> Pol
     return source
 
 
-def _tasks(whole: bool) -> str:
-    """Every task, a line each; the `whole` of it with what there is to choose from."""
+def _tasks() -> str:
+    """Every task with what there is to choose from."""
     told = []
     for name in registry.names():
         try:
@@ -367,7 +390,7 @@ def _tasks(whole: bool) -> str:
         except UserError as error:  # of a package that is damaged: the others can still be named
             told.append(f"task {name}: {error}\n")
             continue
-        told.append(f"task {name}: {task.about}" + (f"\n\n{_choices(task)}\n" if whole else ""))
+        told.append(f"task {name}: {task.about}\n\n{_choices(task)}\n")
     own = "a task of your own: package.module:NAME, also as --task package.module:NAME (--env names a task as well)"
     return "\n".join([*told, own])
 

@@ -24,10 +24,10 @@ class Render(Lane, Generic[TaskT]):
     episode: int = 0
     """Which random start."""
     robot: str | None = None
-    """Another robot, see above (default: the task's own); with a folder, as anymal:FOLDER, one with your own walking
+    """Another robot, by its name (default: the task's own). With a folder, as anymal:FOLDER: one with your own walking
     policy."""
     scenario: str | None = None
-    """The changed world of this name, see above; options of the task (--task.…) come on top of it."""
+    """A changed world, by its name. Options of the task (--task.…) come on top of it."""
     question: Flag[bool] = False
     """Instead: the situation that the episode begins with and the policy's action, as a person is asked about it."""
     film: str = "gif"

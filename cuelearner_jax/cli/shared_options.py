@@ -10,7 +10,10 @@ from typing import Annotated, Any, Generic, TypeVar
 
 import tyro
 
+from cuelearner_jax.cli import pages
+from cuelearner_jax.cli.pages import Subject
 from cuelearner_jax.cli.parsing import about, parse, preset_of, source_of, taken, task_of, world_of
+from cuelearner_jax.environment import offers
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.run_config import PARTS, RunConfig
 from cuelearner_jax.runs import trained
@@ -19,7 +22,7 @@ from cuelearner_jax.runs.order import Order
 from cuelearner_jax.runs.shards import Shard
 from cuelearner_jax.runs.trained import PolicySource
 from cuelearner_jax.studies.train import suggested
-from cuelearner_jax.task import Task
+from cuelearner_jax.task import Task, shape_of
 
 TaskT = TypeVar("TaskT")
 RunT = TypeVar("RunT", bound=RunConfig)
@@ -69,7 +72,8 @@ def asked_of_source(arguments: list[str], command: str, kind: Any, more: str = "
     source, rest = source_of(arguments, command, kind)
     default = kind[source.task.config](task=world_of(source, rest), policy=source.default_policy)
     told = f"{about(kind, source.task, policies=True)}{more}"
-    asked = parse(kind[source.task.config], rest, f"{command} {source.folder}", default, told)
+    subject = subject_of(source)
+    asked = parse(kind[source.task.config], rest, f"{command} {subject.typed}", default, told, subject)
     return source.on(getattr(asked, "robot", None)), asked
 
 
@@ -124,7 +128,22 @@ def asked_of_preset(
     request = suggested(task, preset)
     config, run_type, rest = parts_of(request.config, rest, request.grid.guidance)
     default = kind[run_type](config, out=Path("runs") / f"{task.name}-{name}", **options(request.grid))
-    return task, parse(kind[run_type], rest, f"{command} {task.name}", default, about(kind, task))
+    subject = pages.subject_of(typed_name(task), task.name, task)
+    return task, parse(kind[run_type], rest, f"{command} {subject.typed}", default, about(kind, task), subject)
+
+
+def typed_name(task: Task) -> str:
+    """How a task is named on the command line."""
+    return task.origin or task.named or task.name
+
+
+def subject_of(source: PolicySource) -> Subject:
+    """A task, or a folder with policies, as examples name it."""
+    task, name = source.task, source.folder.name
+    typed = str(source.folder) if source.folder.is_dir() else typed_name(task)
+    world = shape_of(task, source.config.task)
+    needs = trained.POLICIES[source.default_policy].needs
+    return pages.subject_of(typed, name, task, all(offers(world, need) for need in needs))
 
 
 def as_kept(run: RunConfig) -> RunConfig:

@@ -20,7 +20,7 @@ class Sweep(Training[RunT], Generic[RunT]):
     """Train seeds x label budgets x kinds of guidance in one process."""
 
     guidance: tuple[str, ...] = ()
-    """Kinds of guidance, see above."""
+    """Kinds of guidance."""
     labels: tuple[int, ...] = (500,)
     """Label budgets; guidance without labels runs once a seed."""
     seeds: int = 5

@@ -16,7 +16,7 @@ class Train(Training[RunT], Generic[RunT]):
     """Train one seed under one kind of guidance."""
 
     guidance: str = ""
-    """Kind of guidance, see above."""
+    """Kind of guidance."""
     labels: int = 500
     """Labels that the teacher is asked for."""
     seed: int = 0

@@ -49,7 +49,7 @@ class Learner:
     """Fits whenever as many labels as a round has are new; one fit at a time."""
 
     def __init__(self, plan: Plan, env: Any, programs: Programs, blank: GuideState, key: PRNGKeyArray) -> None:
-        """Compiles the fit; `blank` is a guide that knows nothing, `key` the session's."""
+        """Begins to compile the fit; `blank` is a guide that knows nothing, `key` the session's."""
         self._plan, self._env, self._programs, self._blank, self._key = plan, env, programs, blank, key
         self.newest = Fitted(blank.model)
         self.running = False
@@ -58,10 +58,13 @@ class Learner:
         self.prepare()
 
     def prepare(self) -> None:
-        """Compiles the fit."""
+        """Begin to compile the fit, for which the first question need not wait."""
+        self._fit = self._pool.submit(self._compiled)
+
+    def _compiled(self) -> Any:
         given = self._given(self._blank.labels, 0)
         lowered = self._programs.fit.lower(self._env, self._plan.config.scalars, *given)  # pyright: ignore[reportFunctionMemberAccess]
-        self._fit = lowered.compile(compiler_options=ALONE if jax.default_backend() == "cpu" else None)
+        return lowered.compile(compiler_options=ALONE if jax.default_backend() == "cpu" else None)
 
     def _given(self, labels: Label, count: int) -> tuple[GuideState, PRNGKeyArray, jax.Array]:
         guide = self._blank.replace(labels=jax.tree.map(jnp.asarray, labels), model=self.newest.model)
@@ -80,7 +83,7 @@ class Learner:
         if not count:
             return
         scalars = self._plan.config.scalars
-        model = jax.block_until_ready(self._fit(self._env, scalars, *self._given(labels, count)).model)
+        model = jax.block_until_ready(self._fit.result()(self._env, scalars, *self._given(labels, count)).model)
         if not all_finite(model):
             self.newest = self.newest._replace(labels=count, problem="the last fit diverged")
             return

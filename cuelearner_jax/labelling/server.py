@@ -19,6 +19,7 @@ from nicegui import run, ui
 
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.labelling.gate import Gate
+from cuelearner_jax.labelling.opening import Opening, waiting_page
 from cuelearner_jax.labelling.page import Page
 from cuelearner_jax.labelling.session import Session
 
@@ -109,17 +110,22 @@ class _Server(uvicorn.Server):
 class _Last:
     """The end of the work: finishes the session, sends every browser to the last page, and stops once it is shown."""
 
-    def __init__(self, session: Session, pages: set[Page], stopping: threading.Event, commands: Commands) -> None:
+    def __init__(
+        self, session: Session | None, pages: set[Page], stopping: threading.Event, commands: Commands
+    ) -> None:
         self.told: Ending | None = None
-        self._session, self._pages, self._stopping, self._commands = session, pages, stopping, commands
+        self.session = session  # None: it is not there yet
+        self._pages, self._stopping, self._commands = pages, stopping, commands
         self._waited_for = 0
 
     async def finish(self) -> None:
         """Raises UserError if the work cannot be finished; the page then goes on."""
-        file = await run.io_bound(self._session.finish)
+        session = self.session
+        assert session is not None  # its page has the button
+        file = await run.io_bound(session.finish)
         if file is None or self.told is not None:  # the program ends, or another page was first
             return
-        status = self._session.status()
+        status = session.status()
         counts, following = (status.answered, status.unsure, status.labels), self._commands.following(status.answered)
         self.told = Ending(file.resolve(), *counts, following, self._commands.again)
         asyncio.get_running_loop().call_later(SHOWN_WITHIN, self._stopping.set)
@@ -146,25 +152,33 @@ class _Last:
 
 
 def serve(
-    session: Session,
+    opening: Opening,
+    title: str,
     taken: socket.socket,
     stopping: threading.Event,
     tell: Callable[[str], None],
     commands: Commands,
 ) -> Ending | None:
-    """Serves the page on a socket of `bound`; `tell` is given its address, whose token nobody else knows.
+    """Serves the page on a socket of `bound`, at once; `tell` is given its address, whose token nobody else knows.
 
-    Returns how a person finished; None: `stopping` was set before.
+    Returns how a person finished; None: `stopping` was set before. Raises what opening the session raised.
     """
     token, port = secrets.token_urlsafe(18), taken.getsockname()[1]
     pages: set[Page] = set()
     app = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
-    last = _Last(session, pages, stopping, commands)
+    last = _Last(opening.session, pages, stopping, commands)
     last.routes(app)
-    title = f"label {session.plan.task.name}"
+
+    def root() -> None:
+        if opening.session is None:
+            waiting_page(opening)
+            return
+        last.session = opening.session
+        Page(opening.session, pages, last.finish, commands.again)
+
     ui.run_with(
         app,
-        root=lambda: Page(session, pages, last.finish, commands.again) and None,
+        root=root,
         title=title,
         dark=None,
         reconnect_timeout=RECONNECT,
@@ -177,4 +191,5 @@ def serve(
     server.ends = stopping
     tell(f"http://{HOST}:{port}/?token={token}")
     server.run(sockets=[taken])
+    opening.check()
     return last.told

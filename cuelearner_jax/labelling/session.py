@@ -80,7 +80,7 @@ class Session:
     def __init__(
         self, plan: Plan, folder: Path, tell: Callable[[str], None] = lambda words: None, practice: int = 0
     ) -> None:
-        """Opens the file and prepares everything: afterwards nothing is compiled.
+        """Opens the file and prepares the first questions: afterwards nothing is compiled, but by the thread that fits.
 
         Args:
             plan: what it is about.

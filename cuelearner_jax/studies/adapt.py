@@ -58,7 +58,7 @@ class BaseLanes:
     """Which lanes of the folder are adapted."""
 
     policy: str = "agent"
-    """Which of its policies, see above."""
+    """Which of its policies."""
     guidance: str | None = None
     """Kind of guidance of the lanes (default: the run's last)."""
     labels: int | None = None
@@ -77,24 +77,24 @@ class AdaptRequest(Generic[TaskT, KindsT]):
     labels: tuple[int, ...] = (500,)
     """Label budgets (with --labels-from by default all that the file has)."""
     bound_deg: tuple[float, ...] = ()
-    """How far corrections may lead from the policy's own actions, one or more bounds [deg] (default: the scenario's, as
-    far as the labels of a file reach, or else a quarter of the space's reach, 45)."""
+    """How far corrections may lead from the policy's own actions [deg]. One bound or several (default: the scenario's,
+    as far as the labels of a file reach, or else a quarter of the space's reach, 45)."""
     seeds: int = 1
     """Number of seeds; not with several base policies, of which each is adapted with its own."""
     first_seed: int = 0
     """The first seed; the others follow."""
     guidance: str = KIND.name
-    """Kind of guidance: what is asked, and what a model makes of the answers, see above."""
+    """Kind of guidance: what is asked, and what a model makes of the answers."""
     scenario: str | None = None
-    """The changed world of this name, see above; options of the task (--task.…) come on top of it."""
+    """A changed world, by its name. Options of the task (--task.…) come on top of it."""
     robot: str | None = None
-    """Another robot, see above (default: the task's own); with a folder, as anymal:FOLDER, one with your own walking
+    """Another robot, by its name (default: the task's own). With a folder, as anymal:FOLDER: one with your own walking
     policy."""
     labels_from: Path | None = None
     """Use the labels of this file instead of asking the teacher."""
     judge_by: str = "reward"
-    """A model that makes the policy worse than it was is not used: by this metric on tuning episodes of the changed
-    world, or by its prediction of held-out labels (labels)."""
+    """What decides whether the correction is used: a metric on tuning episodes, or held-out answers (labels). A model
+    that makes the policy worse than it was is not used."""
     judge_episodes: int = 100
     """Tuning episodes that policies are judged on; where the task counts steps, each is 100 of them."""
     judge_every: int = 0
@@ -243,7 +243,7 @@ def run(
     how = _judging(task, request, env)
     teacher = None
     if rows is None:
-        teacher = subject.teacher or task.make_teacher(request.task, env)
+        teacher = subject.teacher or task.make_teacher(request.task, env, questions=int(lanes.budget.sum()))
         check_teacher(teacher, scalars)
     if rows is not None:
         rows = label_files.for_lanes(rows, lanes.seed, lanes.budget, label_slots(int(lanes.budget.max()), sizes))

@@ -30,7 +30,7 @@ class EvaluateRequest(Generic[TaskT]):
 
     task: TaskT
     policy: str = "agent"
-    """Who acts, see above."""
+    """Who acts."""
     guidance: tuple[str, ...] = ()
     """Only these kinds of guidance of the run (default: all)."""
     episodes: int | None = None

@@ -8,9 +8,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 
 from cuelearner_envs.navigation.config import SIDES, NavigationConfig, make_environment
+from cuelearner_envs.navigation.roadmap import make_brief_teacher as make_brief_road_map
 from cuelearner_envs.navigation.roadmap import make_sided_teacher
 from cuelearner_envs.navigation.roadmap import make_teacher as make_road_map
 from cuelearner_jax.agents import ddqn
@@ -37,6 +39,12 @@ def make_teacher(config: NavigationConfig, env: Any) -> Teacher:
     """The road map of an environment's worlds; with a preferred side, of worlds whose other side is closed."""
     side = SIDES[config.preferred_side]
     return make_sided_teacher(env, jnp.float32(side)) if side else make_road_map(env)
+
+
+def make_brief_teacher(config: NavigationConfig, env: Any, questions: int) -> Teacher | None:
+    """Return a road map that is made world by world as questions come, where that is less work than all maps at once."""
+    few = questions < config.worlds and jax.default_backend() == "cpu"
+    return make_brief_road_map(env) if few and not SIDES[config.preferred_side] else None
 
 
 def _wants(config: NavigationConfig) -> str:
@@ -154,6 +162,7 @@ NAVIGATION = Task(
     config=NavigationConfig,
     bodies=(SIMPLE, ANYMAL),
     teacher=make_teacher,
+    brief_teacher=make_brief_teacher,
     scenarios=SCENARIOS,
     longest=lambda config: config.max_steps,
     labels_hold=("worlds", "world_seed", "max_steps", "mirrors", "look_ahead"),  # a label is of what one scan shows

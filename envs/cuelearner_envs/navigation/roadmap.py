@@ -14,7 +14,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from flax import struct
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float, Key, PRNGKeyArray
 
 from cuelearner_envs.navigation.environment import AnyWalker, Navigation
 from cuelearner_envs.navigation.geometry import clearance, line_clearance
@@ -149,6 +149,21 @@ class RoadMapTeacher(struct.PyTreeNode):
         return rotate(retract(place - state.pose[:2]), -state.pose[2])
 
 
+class BriefTeacher(struct.PyTreeNode):
+    """A `RoadMapTeacher` that maps a world when it is asked in it: nothing to make, and each answer takes longer."""
+
+    env: Navigation
+    keys: Key[Array, " worlds"]  # of the maps
+
+    def best_action(self, state: AnyWalker, obs: Float[Array, " obs"]) -> Float[Array, "2"]:
+        """The direction of the shortest way to the goal, in the body's frame. Looks at the true state."""
+        world, robot = self.env.world(state.world), self.env.robot
+        roadmap = build(self.keys[state.world], world, robot)
+        to_goal = distances(roadmap, world, robot, state.goal)
+        place, _ = way(roadmap, world, robot, to_goal, state.pose[:2], state.goal)
+        return rotate(retract(place - state.pose[:2]), -state.pose[2])
+
+
 class SidedTeacher(struct.PyTreeNode):
     """Passes every obstacle on one side of it: its maps are of worlds with the other side closed (`types.Teacher`)."""
 
@@ -175,6 +190,11 @@ def make_teacher(env: Navigation) -> RoadMapTeacher:
     return RoadMapTeacher(env, *_each(env, partial(_mapped, env)))
 
 
+def make_brief_teacher(env: Navigation) -> BriefTeacher:
+    """Who answers as `make_teacher`'s does, at once, and more slowly."""
+    return BriefTeacher(env, _keys(env))
+
+
 @jax.jit
 def make_sided_teacher(env: Navigation, side: Float[Array, ""]) -> SidedTeacher:
     """Road maps of all worlds with either side of their obstacles closed; `side`: +1 to pass on the left, -1 right."""
@@ -194,6 +214,9 @@ def _mapped(env: Navigation, key: PRNGKeyArray, world: World) -> tuple[RoadMap, 
 
 def _each(env: Navigation, mapped: Callable[[PRNGKeyArray, World], Any]) -> Any:
     """What `mapped` gives of each world (leading axis: worlds)."""
-    count = env.worlds.starts.shape[0]
-    keys = jax.random.split(jax.random.key(0), count)
-    return jax.lax.map(lambda pair: mapped(*pair), (keys, env.worlds), batch_size=min(count, 16))
+    keys = _keys(env)
+    return jax.lax.map(lambda pair: mapped(*pair), (keys, env.worlds), batch_size=min(len(keys), 16))
+
+
+def _keys(env: Navigation) -> Key[Array, " worlds"]:
+    return jax.random.split(jax.random.key(0), env.worlds.starts.shape[0])

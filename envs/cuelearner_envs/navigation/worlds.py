@@ -11,7 +11,7 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from cuelearner_envs.navigation.geometry import clearance
 from cuelearner_envs.navigation.layouts import STYLES, Layout
@@ -92,6 +92,16 @@ def flood(passable: Bool[Array, "cells cells"], seed: Bool[Array, "cells cells"]
     return jax.lax.while_loop(lambda carry: (carry[0] != carry[1]).any(), more, (start, spread(start)))[1]
 
 
+def any_of(key: PRNGKeyArray, usable: Bool[Array, " all"]) -> Int[Array, ""]:
+    """Draw one of the usable cells; 0 where there are none.
+
+    The draw of `jax.random.categorical` with equal weights, without its two logarithms a cell, which do not change the
+    order of what they are taken of.
+    """
+    drawn = jax.random.uniform(key, usable.shape, minval=jnp.finfo(jnp.float32).tiny)
+    return jnp.argmax(jnp.where(usable, drawn, -1.0))
+
+
 def _with_routes(key: PRNGKeyArray, layout: Layout, routes: int) -> tuple[World, Bool[Array, ""]]:
     """The world of a layout, and whether all its routes are as they should be."""
     nowhere = jnp.zeros((routes, 2))
@@ -101,7 +111,7 @@ def _with_routes(key: PRNGKeyArray, layout: Layout, routes: int) -> tuple[World,
     # Off its middle by `JITTER` a place still keeps the reach, and so does the line to the middle.
     roomy = distance >= Robot().reach + CELL / 2 + JITTER * 2**0.5
     k_seed, k_routes = jax.random.split(key)
-    seed = jax.random.categorical(k_seed, jnp.where(roomy, 0.0, -jnp.inf).ravel())
+    seed = any_of(k_seed, roomy.ravel())
     reached = flood(passable, jnp.zeros(roomy.size, bool).at[seed].set(True).reshape(roomy.shape))
     usable = (roomy & reached).ravel()
     # A seed in a corner that is cut off from the rest makes no world.
@@ -114,10 +124,10 @@ def _route(usable: Bool[Array, " all"], key: PRNGKeyArray) -> tuple[jax.Array, j
     """A random start and goal in usable cells at a distance in bounds, and whether there is one."""
     k_goal, k_start, k_jitter = jax.random.split(key, 3)
     centres = cell_centres().reshape(-1, 2)
-    goal = jax.random.categorical(k_goal, jnp.where(usable, 0.0, -jnp.inf))
+    goal = any_of(k_goal, usable)
     distance = jnp.linalg.norm(centres - centres[goal][None], axis=-1)
     slack = 2 * JITTER * 2**0.5
     partners = usable & (distance >= NEAREST + slack) & (distance <= FARTHEST - slack)
-    start = jax.random.categorical(k_start, jnp.where(partners, 0.0, -jnp.inf))
+    start = any_of(k_start, partners)
     jitter = jax.random.uniform(k_jitter, (2, 2), minval=-JITTER, maxval=JITTER)
     return centres[start] + jitter[0], centres[goal] + jitter[1], partners.any()
