@@ -272,7 +272,7 @@ def lines_of(axes: Axes, run: str, kinds: Sequence[tuple[str, int]], metric: str
         style = {100: ":", 350: "--"}.get(labels, "-") if len(kinds) > 2 else "-"
         axes.fill_between(steps, lower, upper, color=colour, alpha=0.14, linewidth=0)
         axes.plot(steps, estimate, color=colour, linewidth=1.8, linestyle=style)
-        name = NAMES[kind] + (f", {labels} labels" if labels else "")
+        name = NAMES[kind] + (f", {labels} labels" if labels else "") + (" (dotted)" if style == ":" else "")
         ends.append((float(estimate[-1]), name, colour))
     axes.xaxis.set_major_formatter(matplotlib.ticker.EngFormatter(sep=""))
     axes.set_xlim(left=0)
@@ -337,7 +337,7 @@ def draw_quadruped(stem: Path) -> None:
         axes = figure.subplots()
         for shift, (robot, (name, colour)) in enumerate(robots.items()):
             own = {row["style"]: row for row in rows if row["robot"] == robot}
-            heights = [100 * max(row["success"] for row in [own[style]]) for style in styles]
+            heights = [100 * own[style]["success"] for style in styles]
             places = np.arange(len(styles)) + 0.27 * (shift - 1)
             axes.bar(places, heights, width=0.25, color=colour, label=name)
             for place, height in zip(places, heights, strict=True):
