@@ -107,11 +107,6 @@ def percent(values: np.ndarray) -> str:
     return spread(100 * values, 1)
 
 
-def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """As Markdown."""
-    return "\n".join("| " + " | ".join(cells) + " |" for cells in [header, ["---"] * len(header), *rows])
-
-
 def matched(line: Line, other: Line, name: str) -> tuple[np.ndarray, np.ndarray]:
     """A metric of two lines over the bases that both have."""
     _, mine, its = np.intersect1d(line.bases, other.bases, return_indices=True)

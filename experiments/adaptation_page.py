@@ -1,55 +1,92 @@
-"""Writes the tables of docs/results/adaptation.md from recorded pieces, and nothing else of it.
+"""Write the figures and tables of docs/results/adaptation.md from recorded pieces, and nothing else of the page.
 
-    python experiments/adaptation_page.py --data docs/data/adaptation --page docs/results/adaptation.md
+    python experiments/adaptation_page.py [--data docs/data/adaptation] [--page docs/results/adaptation.md]
 
 The data are what `adaptation_billiards.py` and `adaptation_navigation.py` leave in their `--out` (TASK/WORLD/PIECE). A
-table goes between the lines `<!-- NAME -->` and `<!-- end of NAME -->` of the page, in place of what was there; figures
-are written beside the data.
+section goes between the lines `<!-- NAME -->` and `<!-- end of NAME -->` of the page. Figures are written beside the
+data, whole tables as CSV files in the data's folder `tables`.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import os
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
+import _adaptation_overview as overview
 import adaptation_billiards
 import numpy as np
 from _adaptation import UNCHANGED, Study
+from _adaptation_curves import GAIN_HEADER, curve_points, figure, gain_cells
+from _adaptation_overview import on_side
 from _adaptation_tables import (
-    GAIN,
     NAMES,
     Line,
     Row,
     held_out,
     lines,
     matched,
-    named,
     percent,
-    reached,
     read,
     recovered,
     rewarded_steps,
     share,
     spread,
-    table,
     tuned,
 )
+from _pages import fold, image, markdown, rendered, viewer_link, write_csv
 from _trajectories import FILE, draw
 from adaptation_billiards import BOUNDS_DEG, LEAST, PLAYED
 from adaptation_navigation import STUDY
-from bootstrapping_page import rendered
-from matplotlib.figure import Figure
-from matplotlib.ticker import NullFormatter
 
-from cuelearner_jax.report.figures import colour_of, save_figure
-
-CURVES = ("relative", "residual", "dcoach", "finetuning")
 SIDES = ("left", "right")
 WALKED = {"relative": NAMES["relative"], "intent-180": NAMES["intent"]}  # pieces whose ways are drawn
-COLOURS = {"residual": "#E69F00", "finetuning": "#4d4d4d"}
+
+
+BUDGET = overview.BUDGET  # labels of the lines that short tables show
+
+
+class Table(NamedTuple):
+    """A table whose rows are lines of recorded data; the page shows some of its rows and columns."""
+
+    header: list[str]
+    lines: list[Line]
+    cells: list[list[str]]
+
+    def short(self, columns: Sequence[str]) -> str:
+        """Return the page's table: the rows of `few_of`, the first column and those named."""
+        few, at = few_of(self.lines), [0, *(self.header.index(name) for name in columns if name in self.header)]
+        rows = [row for line, row in zip(self.lines, self.cells, strict=True) if any(line is one for one in few)]
+        return markdown([self.header[place] for place in at], [[row[place] for place in at] for row in rows])
+
+
+class Output(NamedTuple):
+    """Where the page and its tables are written."""
+
+    data: Path
+    page: Path
+
+    def link(self, name: str, text: str, header: Sequence[str], cells: Sequence[Sequence[str]]) -> str:
+        """Write a table as a CSV file; return a link to it on the viewer page."""
+        file = self.data / "tables" / f"{name}.csv"
+        write_csv(file, header, cells)
+        return viewer_link(text, file, self.page)
+
+    def links(self, *links: str) -> str:
+        """Return the line of a section that leads to its tables."""
+        return "Tables:\n" + ",\n".join(link for link in links if link) + "."
+
+
+def few_of(known: Sequence[Line]) -> list[Line]:
+    """Return, of each method and variant, the line with the most labels up to `BUDGET`; of fine-tuning the last."""
+    found: dict[tuple[str, str], Line] = {}
+    for line in sorted(known, key=lambda line: line.after):
+        key = line.method, line.variant
+        if key not in found or line.method == "finetuning" or line.after <= BUDGET:
+            found[key] = line
+    return list(found.values())
 
 
 def whole_of(rows: Sequence[Row], least: float) -> Line | None:
@@ -82,111 +119,75 @@ def shown(known: Sequence[Line]) -> list[Line]:
     return [line for line in known if line.method != "finetuning" or line.after in few]
 
 
-def billiards(rows: Sequence[Row], folder: Path, seen: str) -> str:
-    """The three worlds: rewards, shares of the original, and when the gain is made."""
+def billiards(rows: Sequence[Row], folder: Path, out: Output) -> str:
+    """Return the section of the three tables: shares of the original, with the gains and everything else as CSV."""
     whole = whole_of(rows, LEAST)
     if whole is None:
         return ""
-    original = f"The base agents: {len(whole.bases)}, of a reward of {spread(whole.columns['reward'])} unchanged."
-    parts, curves = [original], {}
-    study = adaptation_billiards.STUDY
-    for world, bound in {**BOUNDS_DEG, UNCHANGED: PLAYED[UNCHANGED]}.items():
+    tables, curves, gains = {}, {}, []
+    for world in (*BOUNDS_DEG, UNCHANGED):
         known = lines(rows, world, least=LEAST)
-        if len(known) < (2 if world == UNCHANGED else 1):  # there the other methods are a control
+        if len(known) < (2 if world == UNCHANGED else 1):  # in the unchanged world the other methods are a control
             continue
-        start = next(line for line in known if line.method == "none")
-        chosen_on = tuned(rows, world) & set(start.bases)
-        cells = []
-        for line in shown(known):
-            shares = share(line, whole)
-            others = shares[~np.isin(np.intersect1d(line.bases, whole.bases), list(chosen_on))]
-            own = [spread(line.columns["reward"]), percent(shares), *([percent(others)] if chosen_on else [])]
-            cells.append([line.name, *amounts(line, start, study), *own, _used(line)])
-        held = ["of the original, held-out agents [%]"] if chosen_on else []
-        header = ["", *AMOUNTS, "reward", "of the original [%]", *held, "models used"]
-        parts.append(f"**{world}**, bound {bound:g} degrees:\n\n{table(header, cells)}")
-        if world == UNCHANGED:
-            continue
-        curves[world] = curve_points(known, "reward", whole)
-        parts.append(_gains(curves[world]))
+        tables[world] = world_table(rows, known, whole, world)
+        if world != UNCHANGED:
+            curves[world] = curve_points(known, "reward", whole)
+            gains += [[world, *cells] for cells in gain_cells(curves[world])]
+    parts = []
     if any(curves.values()):
         figure(curves, folder / "shares", "share of the original reward", (1.0, "original"))
-        parts.insert(1, f"![reward as a share of the original]({seen}/shares.png)")
-    return "\n\n".join(part for part in parts if part)
+        parts.append(image("reward as a share of the original", folder / "shares", out.page))
+    worlds = [world for world in tables if world != UNCHANGED]
+    parts.append(side_by_side({world: tables[world] for world in worlds}, "of the original [%]"))
+    header, cells = joined(tables)
+    links = [out.link("billiards", "all rows, rewards and held-out agents", header, cells)]
+    links += [out.link("billiards_gains", "labels or steps to a gain", ["world", *GAIN_HEADER], gains)] if gains else []
+    original = f"{len(whole.bases)} base agents earn {spread(whole.columns['reward'])} a shot in the unchanged world."
+    parts.append(f"{original} {out.links(*links)}")
+    return "\n\n".join(parts)
+
+
+def world_table(rows: Sequence[Row], known: Sequence[Line], whole: Line, world: str) -> Table:
+    """Return what all methods reach on one table."""
+    start, few = next(line for line in known if line.method == "none"), shown(known)
+    chosen_on, cells = tuned(rows, world) & set(start.bases), []
+    for line in few:
+        shares = share(line, whole)
+        others = shares[~np.isin(np.intersect1d(line.bases, whole.bases), list(chosen_on))]
+        own = [spread(line.columns["reward"]), percent(shares), percent(others) if chosen_on else ""]
+        bound = {**BOUNDS_DEG, UNCHANGED: PLAYED[UNCHANGED]}[world]
+        cells.append([line.name, *amounts(line, start, adaptation_billiards.STUDY), *own, _used(line), f"{bound:g}"])
+    header = ["method", *AMOUNTS, "reward", "of the original [%]", "of the original, held-out agents [%]"]
+    return Table([*header, "models used", "bound [degrees]"], few, cells)
+
+
+def joined(tables: dict[str, Table]) -> tuple[list[str], list[list[str]]]:
+    """Return the header and the rows of several tables as one, the first column naming the world."""
+    header = next(iter(tables.values())).header
+    return ["world", *header], [[world, *row] for world, table in tables.items() for row in table.cells]
+
+
+def side_by_side(tables: dict[str, Table], column: str) -> str:
+    """Return a table with a column for each world: one quantity of the methods that short tables show."""
+    rows: dict[str, dict[str, str]] = {}
+    for world, table in tables.items():
+        few = few_of(table.lines)
+        for line, cells in zip(table.lines, table.cells, strict=True):
+            if any(line is one for one in few):
+                name = line.name + (f", {after(line)}" if line.after else "")
+                name = line.name + ", most steps" if line.method == "finetuning" else name
+                rows.setdefault(name, {})[world] = cells[table.header.index(column)]
+    names = [world.replace("_", " ") for world in tables]
+    cells = [[name, *(row.get(world, "") for world in tables)] for name, row in rows.items()]
+    return markdown([column, *names], cells)
 
 
 def _used(line: Line) -> str:
     return f"{100 * line.columns['used'].mean():.0f}%" if "used" in line.columns else ""
 
 
-# method and variant -> labels or steps, values (bases, label seeds, points)
-Points = dict[tuple[str, str], tuple[list[int], np.ndarray]]
-
-
-def curve_points(known: Sequence[Line], metric: str, whole: Line | None = None) -> Points:
-    """What methods reach over labels or steps, from not adapted on, over the bases that all have."""
-    start = [line for line in known if line.method == "none"]
-    if not start:
-        return {}
-    found: Points = {}
-    made = dict.fromkeys((line.method, line.variant) for line in known if line.method in CURVES)
-    for kind in sorted(made, key=lambda kind: CURVES.index(kind[0])):
-        own = [line for line in known if (line.method, line.variant) == kind]
-        own = own if any(line.after == 0 for line in own) else [*start, *own]
-        if len(own) < 2:
-            continue
-        base = whole or start[0]
-        columns = [
-            share(line, whole) if whole else matched(line, base, metric)[0]
-            for line in sorted(own, key=lambda line: line.after)
-        ]
-        if len({len(column) for column in columns}) == 1:
-            found[kind] = sorted(line.after for line in own), np.stack(np.broadcast_arrays(*columns), axis=-1)
-    return found
-
-
-def _gains(points: Points) -> str:
-    """When each method has made its own gain, and that of relative labels."""
-    if (CURVES[0], "") not in points:
-        return ""
-    reference = points[CURVES[0], ""][1][..., [0, -1]]
-    rows = []
-    for (method, variant), (labels, values) in points.items():
-        if len(values) != len(reference):
-            continue
-        mine, theirs = (reached(values, labels, reference, own) for own in (True, False))
-        unit = "steps" if method == "finetuning" else "labels"
-        told = ["never gained" if not np.isfinite(mine.estimate) else f"{mine.told(labels[-1])} {unit}"]
-        rows.append([named(method, variant), *told, f"{theirs.told(labels[-1])} {unit}"])
-    header = ["", f"{GAIN:.0%} of its own gain", f"{GAIN:.0%} of the gain of relative labels"]
-    return table(header, rows)
-
-
-def figure(curves: dict[str, Points], stem: Path, ylabel: str, level: tuple[float, str] | None) -> None:
-    """Curves over labels and steps on one logarithmic axis, a panel a world."""
-    drawn = Figure(figsize=(3.2 * len(curves) + 0.6, 3.2), layout="constrained")
-    for axes, (world, points) in zip(drawn.subplots(1, len(curves), squeeze=False)[0], curves.items(), strict=True):
-        for (method, variant), (labels, values) in points.items():
-            low, middle, high = np.quantile(values.mean(1), [0.25, 0.5, 0.75], axis=0)
-            colour = COLOURS.get(method) or colour_of(method)
-            x = np.maximum(labels, 10)  # the first point, of no labels, at the left end
-            style = {"color": colour, "linestyle": "--" if variant else "-", "marker": "o", "markersize": 3}
-            axes.plot(x, middle, label=named(method, variant), **style)
-            axes.fill_between(x, low, high, color=colour, alpha=0.15, linewidth=0)
-        if level:
-            axes.axhline(level[0], color="#999999", linestyle="--", linewidth=1, label=level[1])
-        axes.set(xscale="log", title=world.replace("_", " "), xlabel="labels, or steps of fine-tuning")
-        axes.xaxis.set_major_formatter(lambda value, _: f"{value / 1_000:g}k" if value >= 1_000 else f"{value:g}")
-        axes.xaxis.set_minor_formatter(NullFormatter())
-    drawn.axes[0].set_ylabel(ylabel)
-    handles, names = drawn.axes[0].get_legend_handles_labels()
-    columns = min(len(names), 5) if len(curves) > 1 else 1
-    drawn.legend(handles, names, loc="outside lower center", ncols=columns, frameon=False)
-    save_figure(drawn, stem)
-
-
-def outcomes(rows: Sequence[Row], world: str, whole: Line | None) -> str:
-    """Success, collisions and time-outs in a world, and how much of what was lost has come back.
+def outcomes(rows: Sequence[Row], world: str, whole: Line | None) -> Table | None:
+    """Return success, collisions and time-outs in a world, and how much of what was lost has come back.
 
     Args:
         rows: of the study.
@@ -196,11 +197,12 @@ def outcomes(rows: Sequence[Row], world: str, whole: Line | None) -> str:
     known = lines(rows, world)
     start = next((line for line in known if line.method == "none"), None)
     if start is None:
-        return ""
+        return None
     teachers = [line for line in known if line.method == "teacher"]
     most = whole or max(teachers, key=lambda line: float(np.mean(line.columns["success"])), default=None)
     chosen_on, cells = tuned(rows, world) & set(start.bases), []
-    for line in ([whole] if whole else []) + shown(known):
+    few = ([whole] if whole else []) + shown(known)
+    for line in few:
         name, back, used = "unchanged world" if line is whole else line.name, "", amounts(line, start, STUDY)
         if most is not None and line is not start and line is not most:
             now, before = matched(line, start, "success")
@@ -210,121 +212,162 @@ def outcomes(rows: Sequence[Row], world: str, whole: Line | None) -> str:
         cells.append([name, *used, *own, *([back] if most else []), _used(line)])
     gained = ["of the loss [%]" if whole else "of the way to the teacher [%]"] if most else []
     held = ["success, held-out agents [%]"] if chosen_on else []
-    header = ["", *AMOUNTS, "success [%]", *held, "collisions [%]", "time-outs [%]", *gained, "models used"]
-    return table(header, cells)
+    header = ["method", *AMOUNTS, "success [%]", *held, "collisions [%]", "time-outs [%]", *gained, "models used"]
+    return Table(header, [line if line is not whole else line._replace(variant="unchanged") for line in few], cells)
 
 
 WAYS_TO_FAIL = ("collision", "timeout")
+SHORT = [*AMOUNTS, "success [%]", "collisions [%]", "of the loss [%]"]
 
 
-def lidar(rows: Sequence[Row], folder: Path, seen: str) -> str:
-    """The turned lidar."""
+def lidar(rows: Sequence[Row], folder: Path, out: Output) -> str:
+    """Return the section of the turned lidar."""
     world = "turned_lidar"
-    text = outcomes(rows, world, whole_of(rows, 0.0))
-    points = curve_points(lines(rows, world), "success")
+    found = outcomes(rows, world, whole_of(rows, 0.0))
+    if found is None:
+        return ""
+    points, links = (
+        curve_points(lines(rows, world), "success"),
+        [out.link("lidar", "all rows", found.header, found.cells)],
+    )
+    text = found.short(SHORT)
     if points:
         figure({world: points}, folder / "lidar", "success", None)
-        text += f"\n\n{_gains(points)}\n\n![success with a turned lidar]({seen}/lidar.png)"
-    if len(lines(rows, UNCHANGED)) > 1:
-        text += f"\n\nThe same methods in the unchanged world:\n\n{outcomes(rows, UNCHANGED, None)}"
-    return text.strip()
+        links.append(out.link("lidar_gains", "labels or steps to a gain", GAIN_HEADER, gain_cells(points)))
+        text = f"{image('success with a turned lidar', folder / 'lidar', out.page)}\n\n{text}"
+    control = outcomes(rows, UNCHANGED, None)
+    if control and len(control.lines) > 1:
+        links.append(
+            out.link("lidar_unchanged", "the same methods in the unchanged world", control.header, control.cells)
+        )
+    return f"{text}\n\n{out.links(*links)}"
 
 
-def rooms(rows: Sequence[Row], folder: Path, seen: str) -> str:
-    """The rooms, where nothing has been lost that could come back; and how well they can be walked at all."""
-    text, file = outcomes(rows, "rooms", None), folder / "rooms" / "ceilings.json"
-    if not text or not file.exists():
-        return text
-    known = json.loads(file.read_text(encoding="utf-8"))
+CEILINGS_HEADER = ["cloned from the road map", "actions", "seeds", "success [%]", "collisions [%]", "time-outs [%]"]
+
+
+def rooms(rows: Sequence[Row], folder: Path, out: Output) -> str:
+    """Return the section of rooms, where nothing was lost that could come back, with its ceilings."""
+    found = outcomes(rows, "rooms", None)
+    if found is None:
+        return ""
+    links = [out.link("rooms", "all rows", found.header, found.cells)]
+    if ceilings := ceiling_cells(folder / "rooms" / "ceilings.json"):
+        links.append(out.link("ceilings", "ceilings: clones of the road map", CEILINGS_HEADER, ceilings))
+    return f"{found.short([*AMOUNTS, 'success [%]', 'time-outs [%]'])}\n\n{out.links(*links)}"
+
+
+def ceiling_cells(file: Path) -> list[list[str]]:
+    """Return how well rooms can be walked at all: clones of the road map after the most actions."""
+    if not file.exists():
+        return []
+    known, cells = json.loads(file.read_text(encoding="utf-8")), []
     last = max(row["actions"] for row in known)
-    cells = []
     for variant in dict.fromkeys(row["variant"] for row in known):
         own = [row for row in known if row["variant"] == variant and row["actions"] in (0, last)]
-        told = (percent(np.array([row[name] for row in own])) for name in ("success", "collision", "timeout"))
-        cells.append([variant, f"{own[0]['actions']:,}", str(len(own)), *told])
-    header = ["cloned from the road map", "actions", "seeds", "success [%]", "collisions [%]", "time-outs [%]"]
-    return f"{text}\n\nCeilings:\n\n{table(header, cells)}"
+        shares = (percent(np.array([row[name] for row in own])) for name in ("success", "collision", "timeout"))
+        cells.append([variant, f"{own[0]['actions']:,}", str(len(own)), *shares])
+    return cells
 
 
-SIDES_HEADER = ["wanted", "", *AMOUNTS, "success [%]", "all on the wanted side [%]", "on both sides [%]"]
+SIDES_HEADER = ["wanted", "method", *AMOUNTS, "success [%]", "all on the wanted side [%]", "on both sides [%]"]
 
 
-def side_cells(rows: Sequence[Row], world: str, side: str) -> list[list[str]]:
-    """A row for each way of adapting in a corridor with a wanted side."""
+def side_table(rows: Sequence[Row], world: str, side: str) -> Table:
+    """Return a row for each way of adapting in a corridor with a wanted side."""
     cells, known = [], lines(rows, world)
     start = next((line for line in known if line.method == "none"), None)
     for line in known:
         used = amounts(line, start, STUDY) if start else ["", ""]
-        each = {name: line.columns[f"passed_{name}"] for name in (*SIDES, "both")}
-        passed = np.maximum(sum(each.values()), 1e-9)
-        wanted, mixed = percent(each[side] / passed), percent(each["both"] / passed)
+        wanted, mixed = percent(on_side(line, side)), percent(on_side(line, "both"))
         cells.append([side, line.name, *used, percent(line.columns["success"]), wanted, mixed])
-    return cells
+    return Table(SIDES_HEADER, known, cells)
 
 
-def quadruped(rows: Sequence[Row]) -> str:
-    """The quadruped in the halls that its agents know, and in the corridor with a wanted side."""
-    halls, corridor = outcomes(rows, "anymal", None), side_cells(rows, "corridor_left_anymal", "left")
-    return "\n\n".join(part for part in (halls, table(SIDES_HEADER, corridor) if corridor else "") if part)
-
-
-def sides(rows: Sequence[Row], folder: Path, seen: str) -> str:
-    """The preferred side: of episodes that passed an obstacle, how many passed all of theirs where it was wanted."""
-    cells, drawn = [], {}
+def sides(rows: Sequence[Row], folder: Path, out: Output, name: str = "sides") -> str:
+    """Return the section of the preferred side: the share of episodes that passed all obstacles on that side."""
+    drawn, tables = {}, [side_table(rows, f"corridor_{side}", side) for side in SIDES]
     for side in SIDES:
-        cells += side_cells(rows, f"corridor_{side}", side)
-        for piece, name in WALKED.items():
+        for piece, title in WALKED.items():
             kept = folder / f"corridor_{side}" / piece / FILE
             if kept.exists():
-                drawn[f"adapted to pass on the {side}: {name}"] = kept
+                drawn[f"adapted to pass on the {side}: {title}"] = kept
+    cells = [row for table in tables for row in table.cells]
     if not cells:
         return ""
-    text = table(SIDES_HEADER, cells)
+    short = [table.short(SHORT_SIDES).split("\n") for table in tables if table.cells]
+    text = "\n".join([*short[0], *(row for rows_of_side in short[1:] for row in rows_of_side[2:])])
     if drawn:
         draw(drawn, folder / "trajectories")
-        text += f"\n\n![ways in a corridor]({seen}/trajectories.png)"
-    return text
+        text = f"{image('ways in a corridor', folder / 'trajectories', out.page)}\n\n{text}"
+    return f"{text}\n\n{out.links(out.link(name, 'all rows', SIDES_HEADER, cells))}"
 
 
-def settings(rows: Sequence[Row], metric: str) -> str:
-    """What was compared on tuning episodes, the best first."""
-    parts = []
+SHORT_SIDES = ["method", "labels", "success [%]", "all on the wanted side [%]"]
+SETTINGS_HEADER = ["scale", "world", "method", "after", "bases", "measured", "value"]
+
+
+def settings(rows: Sequence[Row], metric: str, scale: str) -> list[list[str]]:
+    """Return what was compared on tuning episodes, the best first."""
+    cells = []
     for world in dict.fromkeys(row["world"] for row in rows if row["split"] == "tuning" and row["world"] != UNCHANGED):
         wanted = f"passed_{world.rpartition('_')[2]}" if world.startswith("corridor_") else metric
         known = [line for line in lines(rows, world, "tuning") if np.isfinite(line.columns[wanted]).all()]
         last = max((line.after for line in known if line.method == "finetuning"), default=0)
         known = [line for line in known if line.method != "finetuning" or line.after == last]
         known.sort(key=lambda line: (list(NAMES).index(line.method), -float(np.mean(line.columns[wanted]))))
-        cells = [[line.name, after(line), str(len(line.bases)), spread(line.columns[wanted])] for line in known]
-        parts.append(f"**{world}**:\n\n{table(['', 'after', 'bases', wanted], cells)}")
-    return "\n\n".join(parts)
+        for line in known:
+            value = spread(line.columns[wanted])
+            cells.append([scale, world, line.name, after(line), str(len(line.bases)), wanted, value])
+    return cells
+
+
+def on_two_cores(data: Path, out: Output) -> str:
+    """Return the section of smaller runs: the lidar, rooms with look-ahead, sides, the quadruped."""
+    small, again = read(data / "cpu" / "navigation"), read(data / "retrained" / "navigation")
+    parts = [
+        ("lidar_cpu", "A turned lidar", outcomes(small, "turned_lidar", whole_of(small, 0.0))),
+        ("rooms_cpu", "Rooms, with look-ahead", outcomes(small, "rooms", None)),
+        ("rooms_retrained", "Rooms, seven agents trained anew", outcomes(again, "rooms", None)),
+        ("sides_retrained", "Pass on the left, the same seven", side_table(again, "corridor_left", "left")),
+        ("quadruped", "The quadruped in halls", outcomes(small, "anymal", None)),
+        ("quadruped_sides", "The quadruped, pass on the left", side_table(small, "corridor_left_anymal", "left")),
+    ]
+    shown, links = [], []
+    for name, title, table in parts:
+        if table and table.cells:
+            columns = SHORT_SIDES if table.header == SIDES_HEADER else [*AMOUNTS, "success [%]", "models used"]
+            shown.append(f"**{title}**\n\n{table.short(columns)}")
+            links.append(out.link(name, title, table.header, table.cells))
+    if not shown:
+        return ""
+    return fold("Tables of the runs on two cores", "\n\n".join([*shown, out.links(*links)]))
 
 
 def sections(data: Path, page: Path) -> dict[str, str]:
-    """The text of every part of the page of which there are data."""
-    found = {}
+    """Return every section of the page of which there are data; write their figures and tables."""
+    out, found = Output(data, page), {}
+    scenarios = overview.found_in(data)
+    if scenarios:
+        overview.draw(scenarios, data / "overview")
+        found["overview"] = overview.table(scenarios)
     tasks = {"billiards": {"billiards": billiards}, "navigation": {"lidar": lidar, "rooms": rooms, "sides": sides}}
+    compared = []
     for task, parts in tasks.items():
-        folder = data / task
-        rows = read(folder)
-        seen = Path(os.path.relpath(folder, page.parent)).as_posix()
+        rows = read(data / task)
         for name, part in parts.items():
-            found[name] = part(rows, folder, seen)
-        found[f"{task}-settings"] = settings(rows, "reward" if task == "billiards" else "success")
-    rows = read(data / "cpu" / "navigation")  # of the scale of that name, its base agents among them
-    found["lidar-cpu"] = outcomes(rows, "turned_lidar", whole_of(rows, 0.0))
-    found["rooms-cpu"] = outcomes(rows, "rooms", None)
-    found["quadruped-cpu"] = quadruped(rows)
-    found["navigation-cpu-settings"] = settings(rows, "success")
-    again = data / "retrained" / "navigation"  # at that scale too, of agents trained once more
-    rows = read(again)
-    found["rooms-retrained"] = outcomes(rows, "rooms", None)
-    found["sides-retrained"] = sides(rows, again, Path(os.path.relpath(again, page.parent)).as_posix())
+            found[name] = part(rows, data / task, out)
+        compared += settings(rows, "reward" if task == "billiards" else "success", "paper")
+    compared += settings(read(data / "cpu" / "navigation"), "success", "cpu")
+    found["two-cores"] = on_two_cores(data, out)
+    if compared:
+        link = out.link("settings", "settings compared on tuning episodes", SETTINGS_HEADER, compared)
+        found["settings"] = out.links(link)
     return {name: text for name, text in found.items() if text}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Writes the page; returns the exit status."""
+    """Write the page; return the exit status."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, default=Path("docs/data/adaptation"))
     parser.add_argument("--page", type=Path, default=Path("docs/results/adaptation.md"))

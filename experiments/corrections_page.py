@@ -1,11 +1,12 @@
-"""Writes the table and the figure of docs/results/corrections.md from recorded pieces, and nothing else of it.
+"""Write the table and the figures of docs/results/corrections.md from recorded pieces, and nothing else of the page.
 
-    python experiments/corrections_page.py --data docs/data/corrections_alone --page docs/results/corrections.md
+    python experiments/corrections_page.py [--data docs/data/corrections_alone] [--page docs/results/corrections.md]
 
-The data are what `corrections_alone.py` leaves in its `--out`. The table goes between the lines `<!-- corrections -->`
-and `<!-- end of corrections -->` of the page, in place of what was there; beside the data are written the figure and
-`success.csv`, success of each kind, teacher and budget with its interval over label seeds. How many labels a kind needs
-to match 100 of the reference is read off nondecreasing curves, on straight lines over the logarithm of the labels.
+The data are what `corrections_alone.py` leaves in its `--out`. The short table goes between the lines
+`<!-- corrections -->` and `<!-- end of corrections -->` of the page. Written beside the data: two figures;
+`success.csv`, success of each kind, teacher and budget with its interval over label seeds; and `labels.csv`, success
+with 100 labels and the labels that match 100 of the reference. The latter are read off nondecreasing curves, on
+straight lines over the logarithm of the labels.
 """
 
 from __future__ import annotations
@@ -17,22 +18,23 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import matplotlib
 import numpy as np
 from _efficiency_statistics import Bounds, isotonic, labels_for, percentiles
-from bootstrapping_page import rendered
+from _pages import GREY, Bar, forest, markdown, new_figure, rendered, viewer_link
+from _pages import write_csv as write_text_csv
 from corrections_alone import KINDS, SCALES, whole
 from jaxtyping import Float
 from matplotlib.figure import Figure
 
 from cuelearner_jax.guides import registry
 from cuelearner_jax.report import statistics
-from cuelearner_jax.report.figures import colour_of, save_figure
+from cuelearner_jax.report.figures import STYLE, colour_of, save_figure
 
 REFERENCE = {"halls": "relative", "grasp": "relative", "reach": "offset", "push": "offset"}
 MATCHED = 100  # labels of the reference
 TEACHERS = {"plain": "no fault", "wrong": "20% wrong", "one": "one cue a label"}
 SHUFFLED = "shuffled"
-GREY = "#9a9a9a"
 
 
 class Curve(NamedTuple):
@@ -108,13 +110,13 @@ def title_of(kind: str) -> str:
     return "no labels" if kind == "base" else (known.title or kind if known else kind)
 
 
-def table(curves: Curves) -> str:
-    """The page's table in Markdown."""
-    heads = ["world", "kind"]
-    heads += [f"{MATCHED} labels, {told} [%]" for told in TEACHERS.values()]
-    heads += [f"most labels, answers {SHUFFLED} [%]"]
-    heads += [f"times the labels of the reference, {told}" for told in TEACHERS.values()]
-    rows = [heads, ["---"] * len(heads)]
+def table(curves: Curves) -> tuple[list[str], list[list[str]]]:
+    """Return the header and the rows of `labels.csv`."""
+    header = ["world", "kind"]
+    header += [f"{MATCHED} labels, {told} [%]" for told in TEACHERS.values()]
+    header += [f"most labels, answers {SHUFFLED} [%]"]
+    header += [f"times the labels of the reference, {told}" for told in TEACHERS.values()]
+    rows = []
     for world, kinds in KINDS.items():
         for kind in kinds:
             own = {teacher: curves.get((world, kind, teacher)) for teacher in (*TEACHERS, SHUFFLED)}
@@ -129,7 +131,52 @@ def table(curves: Curves) -> str:
                 said = kind != REFERENCE[world] and curve is not None and reference is not None
                 cells.append(ratio_words(ratio(curve, reference)) if said else "")  # pyright: ignore[reportArgumentType]
             rows.append([world, title_of(kind), *cells])
-    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+    return header, rows
+
+
+def short_table(curves: Curves) -> str:
+    """Return the page's table: success of each kind with 100 labels of a teacher without faults, a column a world."""
+    worlds, rows = worlds_of(curves), {}
+    for world, kinds in KINDS.items():
+        for kind in kinds:
+            if (curve := curves.get((world, kind, "plain"))) is not None:
+                rows.setdefault(kind, {})[world] = percent(curve.at(0 if kind == "base" else MATCHED))
+    cells = [[title_of(kind), *(row.get(world, "") for world in worlds)] for kind, row in rows.items()]
+    return markdown([f"success with {MATCHED} labels [%]", *(f"`{world}`" for world in worlds)], cells)
+
+
+def worlds_of(curves: Curves) -> list[str]:
+    """Return the worlds of which anything is recorded."""
+    return [world for world in KINDS if any(world == key[0] for key in curves)]
+
+
+def section(curves: Curves, data: Path, page: Path) -> str:
+    """Return the page's section: the table and links to the whole tables."""
+    links = [viewer_link("faulty teachers, controls, labels that match the reference", data / "labels.csv", page)]
+    links.append(viewer_link("every kind, teacher and budget", data / "success.csv", page))
+    return f"{short_table(curves)}\n\nTables:\n" + ",\n".join(links) + "."
+
+
+def draw_budget(curves: Curves, stem: Path) -> None:
+    """Draw success with 100 labels of a teacher without faults, a panel a world."""
+    worlds = worlds_of(curves)
+    with matplotlib.rc_context(STYLE):
+        figure = new_figure(3.6 * len(worlds), 3.4)
+        for axes, world in zip(figure.subplots(1, len(worlds), squeeze=False)[0], worlds, strict=True):
+            bars = []
+            for kind in KINDS[world]:
+                curve = curves.get((world, kind, "plain"))
+                found = curve.at(0 if kind == "base" else MATCHED) if curve else None
+                if found is not None:
+                    colour = GREY if kind == "base" else colour_of(kind)
+                    bars.append(
+                        Bar(title_of(kind), statistics.Interval(*(100 * v for v in found)), colour, kind == "base")
+                    )
+            forest(axes, bars, bars[0].found, "{:.0f}")
+            axes.set_xlim(-3, 103)
+            axes.set_title(world, fontweight="bold", fontsize=11)
+            axes.set_xlabel(f"success with {MATCHED} labels [%]")
+        save_figure(figure, stem)
 
 
 def draw(curves: Curves, stem: Path) -> None:
@@ -184,7 +231,7 @@ def write_all(curves: Curves, file: Path) -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Write the page's table, the figure and the CSV."""
+    """Write the page's table, the figures and the CSV files."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, default=Path("docs/data/corrections_alone"))
     parser.add_argument("--page", type=Path, default=Path("docs/results/corrections.md"))
@@ -194,7 +241,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         parser.error(f"{given.data} holds no pieces: give the --out of corrections_alone.py")
     draw(curves, given.data / "success")
     write_all(curves, given.data / "success.csv")
-    page = rendered(given.page.read_text(encoding="utf-8"), {"corrections": table(curves)})
+    draw_budget(curves, given.data / "budget")
+    write_text_csv(given.data / "labels.csv", *table(curves))
+    sections = {"corrections": section(curves, given.data, given.page)}
+    page = rendered(given.page.read_text(encoding="utf-8"), sections)
     given.page.write_text(page, encoding="utf-8")
     return 0
 

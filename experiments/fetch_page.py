@@ -1,9 +1,9 @@
-"""Writes the table and the figure of docs/results/fetch.md from recorded pieces, and nothing else of it.
+"""Write the table and the figure of docs/results/fetch.md from recorded pieces, and nothing else of the page.
 
-    python experiments/fetch_page.py --data docs/data/fetch --page docs/results/fetch.md
+    python experiments/fetch_page.py [--data docs/data/fetch] [--page docs/results/fetch.md]
 
-The data are what `fetch_hand_eye.py` leaves in its `--out`. The table goes between the lines `<!-- fetch -->` and
-`<!-- end of fetch -->` of the page, in place of what was there; the figure is written beside the data.
+The data are what `fetch_hand_eye.py` leaves in its `--out`. The short table goes between the lines `<!-- fetch -->` and
+`<!-- end of fetch -->` of the page; the figure and `success.csv`, the whole table, are written beside the data.
 """
 
 from __future__ import annotations
@@ -14,17 +14,16 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import matplotlib
 import numpy as np
-from bootstrapping_page import rendered
-from matplotlib.figure import Figure
+from _pages import GREY, markdown, new_figure, rendered, viewer_link, write_csv
 
-from cuelearner_jax.report.figures import colour_of, save_figure
+from cuelearner_jax.report.figures import STYLE, colour_of, save_figure
 
 SAYS = {"all": "all cues", "worst": "the worst cue", "one": "one cue at random"}
 ASKED = {"all": 90, "worst": 85, "one": 70}  # percent of the loss that are to come back
 NAMES = {"calibration": "calibration", "relative": "relative", "offset": "offset"}
 DRAWS = 4_000  # of the bootstrap over episodes
-GREY = "#9a9a9a"
 Row = dict[str, Any]
 
 
@@ -96,32 +95,65 @@ def _share(after: np.ndarray, unchanged: np.ndarray, displaced: np.ndarray) -> t
     return 100 * float(gain.mean() / loss.mean()), float(low), float(high)
 
 
-def table(found: Sequence[Line]) -> str:
-    """The lines in Markdown."""
-    rows = ["| environment | policy | label seeds | episodes | success [%] | of the loss [%] | asked [%] |"]
-    rows.append("|---|---|---|---|---|---|---|")
+def table(found: Sequence[Line]) -> tuple[list[str], list[list[str]]]:
+    """Return the header and the rows of `success.csv`."""
+    header = ["environment", "policy", "label seeds", "episodes", "success [%]", "of the loss [%]", "asked [%]"]
+    rows = []
     for line in found:
-        share = "" if line.share is None else "{:.0f} [{:.0f}, {:.0f}]".format(*line.share)
-        wanted = ASKED[line.says] if line.what == "calibration" and not line.shuffled else ""
-        seeds = line.seeds if line.says else ""
-        own = (line.environment, line.called, seeds, line.episodes, f"{line.success:.1f}", share, wanted)
-        rows.append(f"| {' | '.join(map(str, own))} |")
-    return "\n".join(rows)
+        wanted = str(ASKED[line.says]) if line.what == "calibration" and not line.shuffled else ""
+        seeds = str(line.seeds) if line.says else ""
+        rows.append(
+            [line.environment, line.called, seeds, str(line.episodes), f"{line.success:.1f}", back(line), wanted]
+        )
+    return header, rows
+
+
+def back(line: Line) -> str:
+    """Return the share of the loss that comes back, as a cell."""
+    return "" if line.share is None else "{:.0f} [{:.0f}, {:.0f}]".format(*line.share)
+
+
+def short_table(found: Sequence[Line]) -> str:
+    """Return the page's table: labels of all cues and of one cue at random, the environments side by side."""
+    environments = [*dict.fromkeys(line.environment for line in found)]
+    rows: dict[str, dict[str, Line]] = {}
+    for line in found:
+        if line.says != "worst":
+            rows.setdefault(line.called, {})[line.environment] = line
+    header = ["100 labels"]
+    header += [f"{name.partition('-')[0]}: {what} [%]" for name in environments for what in ("success", "of the loss")]
+    cells = []
+    for called, own in rows.items():
+        pairs = [(f"{own[name].success:.1f}", back(own[name])) if name in own else ("", "") for name in environments]
+        cells.append([called, *(cell for pair in pairs for cell in pair)])
+    return markdown(header, cells)
 
 
 def draw(found: Sequence[Line], stem: Path) -> None:
-    """Draw success of each row, a panel for each environment."""
+    """Draw success of each row with its number, a panel for each environment; the names stand on the left alone."""
     environments = [*dict.fromkeys(line.environment for line in found)]
     most = max(sum(line.environment == name for line in found) for name in environments)
-    figure = Figure(figsize=(9, 0.9 + 0.3 * most), layout="constrained")
-    for axes, name in zip(figure.subplots(1, len(environments), squeeze=False)[0], environments, strict=True):
-        own = [line for line in found if line.environment == name][::-1]
-        colours = [GREY if not line.says or line.shuffled else colour_of(line.what) for line in own]
-        axes.barh(range(len(own)), [line.success for line in own], color=colours)
-        axes.set_yticks(range(len(own)), [line.called for line in own], fontsize=7)
-        axes.set(xlim=(0, 100), xlabel="success [%]", title=name)
-        axes.spines[["top", "right"]].set_visible(False)
-    save_figure(figure, stem)
+    with matplotlib.rc_context(STYLE):
+        figure = new_figure(10, 0.9 + 0.3 * most)
+        panels = figure.subplots(1, len(environments), squeeze=False, sharey=True)[0]
+        for axes, name in zip(panels, environments, strict=True):
+            own = [line for line in found if line.environment == name]
+            colours = [GREY if not line.says or line.shuffled else colour_of(line.what) for line in own]
+            axes.barh(range(len(own)), [line.success for line in own], color=colours)
+            for place, line in enumerate(own):
+                axes.text(line.success + 1.5, place, f"{line.success:.3g}", va="center", fontsize=9)
+            axes.set_yticks(range(len(own)), [line.called for line in own])
+            axes.set(xlim=(0, 110), xlabel="success [%]")
+            axes.set_title(name, fontweight="bold", fontsize=11)
+            axes.grid(visible=False, axis="y")
+            axes.tick_params(axis="y", length=0)
+        panels[0].invert_yaxis()
+        save_figure(figure, stem)
+
+
+def section(found: Sequence[Line], data: Path, page: Path) -> str:
+    """Return the page's section: the short table and a link to the whole one."""
+    return f"{short_table(found)}\n\nTable: {viewer_link('all rows', data / 'success.csv', page)}."
 
 
 def main() -> int:
@@ -134,7 +166,8 @@ def main() -> int:
     if not found:
         parser.error(f"{given.data} holds no pieces: give the --out of fetch_hand_eye.py")
     draw(found, given.data / "success")
-    page = rendered(given.page.read_text(encoding="utf-8"), {"fetch": table(found)})
+    write_csv(given.data / "success.csv", *table(found))
+    page = rendered(given.page.read_text(encoding="utf-8"), {"fetch": section(found, given.data, given.page)})
     given.page.write_text(page, encoding="utf-8")
     return 0
 

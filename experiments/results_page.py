@@ -1,0 +1,417 @@
+"""Write the figures and the tables of findings of docs/results.md from recorded data, and nothing else of the page.
+
+    python experiments/results_page.py [--page docs/results.md]
+
+A task has a figure in docs/figures and a table between the lines `<!-- TASK -->` and `<!-- end of TASK -->` of the
+page. Every number is computed from docs/data or benchmarks/results; the tables of the other result pages are read as
+their generators left them, so run those first.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import _adaptation_overview as adaptation
+import fetch_page
+import matplotlib
+import numpy as np
+import pyarrow.compute as pc
+from _pages import DOCS, GREY, Bar, forest, image, interval_of, markdown, name_ends, new_figure, read_csv, rendered
+from matplotlib.axes import Axes
+
+from cuelearner_jax.report.figures import STYLE, colour_of, save_figure
+from cuelearner_jax.report.statistics import Interval, curve, interval
+from cuelearner_jax.storage import results
+
+DATA, FIGURES = DOCS / "data", DOCS / "figures"
+BENCHMARKS = DOCS.parent / "benchmarks" / "results"
+HEADER = ["finding", "with labels", "without labels", "more"]
+LEFT_OUT = ("Tilted table", "Corridor, pass on the right")  # scenarios that say what another one says
+MORE = {
+    "one": "[one ball](results/training.md#one-ball)",
+    "three": "[three balls](results/training.md#three-balls-raw-coordinates)",
+    "navigation": "[navigation](results/training.md#navigation)",
+    "labels": "[how far labels carry](results/bootstrapping.md)",
+    "adaptation": "[what adaptation gains](results/adaptation.md)",
+    "fetch": "[a displaced camera](results/fetch.md)",
+    "corrections": "[corrections alone](results/corrections.md)",
+    "arms": "[arms](results/arms.md)",
+    "anymal": "[the quadruped](anymal.md)",
+    "engines": "[simulators](results/engines.md)",
+    "speed": "[speed](results/engines.md#speed)",
+}
+NAMES = {"none": "no guidance", "heuristic": "heuristic", "relative": "relative"}
+
+
+# --- recorded values -------------------------------------------------------------------------------------------------
+
+
+@cache
+def values(run: str, guidance: str, labels: int, metric: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return the evaluated steps, and a metric of every seed at them, (seeds, steps)."""
+    table = results.read(DATA / run)
+    own = table.filter((pc.field("guidance") == guidance) & (pc.field("labels") == labels))
+    steps = np.unique(own["step"].to_numpy())
+    columns = [own.filter(pc.field("step") == step)[metric].to_pylist() for step in steps]
+    whole = [place for place, column in enumerate(columns) if None not in column and len(column) == len(columns[0])]
+    return steps[whole], np.array([columns[place] for place in whole]).T
+
+
+def at(run: str, guidance: str, labels: int, step: int, metric: str = "success") -> Interval:
+    """Return the interquartile mean over seeds at a step."""
+    steps, seeds = values(run, guidance, labels, metric)
+    return interval(seeds[:, list(steps).index(step)])
+
+
+def efficiency(world: str, run: str, guidance: str, labels: int) -> dict[str, Any]:
+    """Return a row of a world's `efficiency.csv`."""
+    rows = read_csv(DATA / "bootstrapping" / world / "report" / "efficiency.csv")
+    return next(row for row in rows if (row["run"], row["guidance"], row["labels"]) == (run, guidance, labels))
+
+
+def told(name: str) -> dict[str, Any]:
+    """Return a recorded measurement of benchmarks/results."""
+    return json.loads((BENCHMARKS / f"{name}.json").read_text(encoding="utf-8"))
+
+
+def number(found: Interval, digits: int = 2) -> str:
+    """Return an estimate as a cell; intervals stand on the pages of the studies."""
+    return f"{float(found.estimate):.{digits}f}"
+
+
+def percentage(found: Interval) -> str:
+    """Return an estimate of a share as a cell."""
+    return f"{100 * float(found.estimate):.0f}%"
+
+
+# --- tables ----------------------------------------------------------------------------------------------------------
+
+
+def billiards() -> list[list[str]]:
+    """Return the findings in billiards."""
+    one = [at("quickstart", kind, labels, 3_000, "reward") for kind, labels in (("relative", 100), ("none", 0))]
+    three = [
+        at("billiards_easy/plain", kind, labels, 200_000, "reward") for kind, labels in (("relative", 500), ("none", 0))
+    ]
+    seen = read_csv(DATA / "bootstrapping/regulation/report/summary.csv")[0]
+    raw = at("billiards_paper", "none", 0, 3_000_000, "reward")
+    ratio = {
+        name: f"{efficiency('regulation', run, kind, labels)['mean_ratio']:.2f} times"
+        for name, run, kind, labels in (
+            ("intent", "paced", "intent", 500),
+            ("relative", "frame", "relative", 500),
+            ("many", "frame", "relative", 100_000),
+        )
+    }
+    long = efficiency("full", "raw", "relative", 1_000)["steps_ratio"]
+    return [
+        ["One ball, 100 labels: reward a shot after 3,000 steps", number(one[0]), number(one[1]), MORE["one"]],
+        ["Three balls, raw coordinates, 500 labels: reward a shot", number(three[0]), number(three[1]), MORE["three"]],
+        ["Regulation table, 500 labels as `intent`: mean reward", ratio["intent"], "1", MORE["labels"]],
+        ["The same, 500 relative labels: slower", ratio["relative"], "1", MORE["labels"]],
+        ["The same, 100,000 relative labels: still slower", ratio["many"], "1", MORE["labels"]],
+        ["The paper's setting, 1,000 labels: steps to the last level", f"{long:.2f} times", "1", MORE["labels"]],
+        [
+            "No labels, seen from the strike (raw coordinates): reward a shot",
+            "",
+            f"{seen['final']:.2f} ({number(raw)})",
+            MORE["labels"],
+        ],
+    ]
+
+
+def navigation() -> list[list[str]]:
+    """Return the findings in navigation."""
+    run, found = "navigation", []
+    for step in (50_000, 140_000):
+        labels, none = at(run, "relative", 500, step), at(run, "none", 0, step)
+        found.append(
+            [f"500 labels: success after {step:,} steps", percentage(labels), percentage(none), MORE["navigation"]]
+        )
+    heuristic = at(run, "heuristic", 0, 50_000)
+    found.append(
+        [
+            "Walking straight at the goal, no labels: the same after 50,000",
+            "",
+            percentage(heuristic),
+            MORE["navigation"],
+        ]
+    )
+    hundred, none = efficiency("clutter", "frame", "relative", 100), efficiency("clutter", "frame", "none", 0)
+    steps = f"{hundred['steps_to_level']:,.0f}", f"more than {none['steps_to_level_above']:,.0f}"
+    found.append(["100 labels, seen from the action: steps to 90% success", *steps, MORE["labels"]])
+    wrong = interval_of(efficiency("cpu/clutter", "flipped-20", "relative", 500), "mean")
+    right = interval_of(efficiency("cpu/clutter", "frame", "relative", 500), "mean")
+    nothing = interval_of(efficiency("cpu/clutter", "frame", "none", 0), "mean")
+    assert wrong is not None
+    assert right is not None
+    assert nothing is not None
+    cell = f"{number(wrong)} (all right: {number(right)})"
+    found.append(["20% of 500 answers wrong: mean success, two cores", cell, number(nothing), MORE["labels"]])
+    (rooms,) = json.loads((DATA / "navigation/evaluations/relative-500-agent-rooms.json").read_text())["rows"]
+    found.append(
+        [
+            "500 labels: success in rooms, never seen in training",
+            percentage(interval(np.array(rooms["success"]))),
+            "",
+            MORE["navigation"],
+        ]
+    )
+    return found
+
+
+def adapted() -> list[list[str]]:
+    """Return the findings about finished policies in changed worlds."""
+    rows = []
+    for each in adaptation.found_in(DATA / "adaptation"):
+        if each.scenario.title in LEFT_OUT:
+            continue
+        title = each.scenario.title.replace("*", ", two cores")
+        tuned = f"; fine-tuning {each.tuned.estimate:.0f}%" if each.tuned else ""
+        measured = each.scenario.measured.replace(" [%]", "").replace("% of", "share of")
+        cells = [f"{each.labels.estimate:.0f}%{tuned}", f"{each.before.estimate:.0f}%"]
+        rows.append([f"{title}, 250 labels: {measured}", *cells, MORE["adaptation"]])
+    return rows
+
+
+def arms() -> list[list[str]]:
+    """Return the findings about arms."""
+    found = {
+        (line.environment, line.what, line.says, line.shuffled): line
+        for line in fetch_page.lines(fetch_page.read(DATA / "fetch"))
+    }
+    rows = []
+    for environment, what in (
+        ("FetchPush-v4", "calibration"),
+        ("FetchReach-v4", "calibration"),
+        ("FetchPush-v4", "relative"),
+    ):
+        before = found[environment, "displaced", "", False].success
+        after = found[environment, what, "all", False].success
+        title = f"{environment.partition('-')[0]}, camera 3 cm off, 100 labels of `{what}`: success"
+        rows.append([title, f"{after:g}%", f"{before:g}%", MORE["fetch"]])
+    success = {
+        (row["world"], row["kind"], row["teacher"], row["labels"]): row["success"]
+        for row in read_csv(DATA / "corrections_alone/success.csv")
+    }
+    base = success["reach", "base", "plain", 0]
+    for kind, name in (("offset", "`offset`"), ("dcoach", "deep COACH")):
+        title = f"FetchReach, 20% of 100 answers wrong, {name}: success"
+        rows.append(
+            [title, f"{100 * success['reach', kind, 'wrong', 100]:.0f}%", f"{100 * base:.0f}%", MORE["corrections"]]
+        )
+    turned = [
+        json.loads((DATA / f"arms/reach_fetch_turned{end}.json").read_text())["rows"][0]["success"][0]
+        for end in ("_calibrated", "")
+    ]
+    title = "An MJX agent in Fetch, camera turned by 10 degrees, 200 labels: success"
+    rows.append([title, *(f"{100 * value:.0f}%" for value in turned), MORE["arms"]])
+    return rows
+
+
+def quadruped() -> list[list[str]]:
+    """Return the findings about the quadruped."""
+    rows = json.loads((DATA / "anymal_navigation.json").read_text())["rows"]
+    found = {(row["style"], row["robot"], row["episodes"]): row["success"] for row in rows}
+    cells = []
+    for style in ("clutter", "corridor", "rooms"):
+        values = (f"{100 * found[style, robot, 500]:.1f}%" for robot in ("anymal", "simple"))
+        cells.append([f"Unchanged agent in `{style}`: success", *values, MORE["anymal"]])
+    return cells
+
+
+def simulators() -> list[list[str]]:
+    """Return the findings about simulators and speed, each beside what was asked for."""
+    parity, beams = told("billiards_parity")["rows"], told("lidar_parity")["rows"]
+    coarse = next(row for row in told("aimed_parity")["rows"] if (row["table"], row["step_s"]) == ("regulation", 0.02))
+    walked = [row for row in told("roadmap_paths")["episodes"] if row["policy"] == "road map"]
+    pymunk = told("billiards_speed")["times_pymunk"]["playing"]["simulate_many"]
+    shots = max(row["shots_a_second"] for row in told("billiards_shots_h200")["rows"])
+    jaxnav = next(row for row in told("navigation_speed")["rows"] if (row["envs"], row["system"]) == (256, "ours"))
+    devices = told("device_scaling")["rows"]
+    same, equal = min(row["same_pocketed"] for row in parity), min(row["equal"] for row in beams)
+    success = min(row["success"] for row in walked)
+    gain = devices[-1]["steps_per_second"] / devices[0]["steps_per_second"]
+    there = f"{coarse['reward_in_chipmunk']:.2f} (here {coarse['reward']:.2f})"
+    return [
+        [
+            "Shots that pocket the same balls as Chipmunk at 0.2 ms",
+            f"{100 * same:.0f}% or more",
+            "98%",
+            MORE["engines"],
+        ],
+        ["Reward of an aimed shot in Chipmunk at the public code's 20 ms", there, "", MORE["engines"]],
+        ["Lidar beams within 1 mm of MuJoCo's rays", f"{100 * equal:.0f}%", "99.9%", MORE["engines"]],
+        ["Success of the road-map teacher", f"{100 * success:.1f}% or more", "", MORE["engines"]],
+        ["Billiards shots a second over pymunk's, 2 cores", f"{pymunk:.0f} times", "20 times", MORE["speed"]],
+        ["Billiards shots a second, one H200", f"{shots / 1e6:.0f} million", "10 million", MORE["speed"]],
+        [
+            "Navigation steps a second over JaxNav's, 2 cores",
+            f"{jaxnav['times_jaxnav']:.0f} times",
+            "8 times",
+            MORE["speed"],
+        ],
+        ["Training on four H200s over one", f"{gain:.2f} times", "3.6 times", MORE["speed"]],
+    ]
+
+
+# --- figures ---------------------------------------------------------------------------------------------------------
+
+
+def lines_of(axes: Axes, run: str, kinds: Sequence[tuple[str, int]], metric: str) -> None:
+    """Draw learning curves with their intervals, each named at its end."""
+    ends = []
+    for kind, labels in kinds:
+        steps, estimate, lower, upper = curve(*values(run, kind, labels, metric))
+        colour = GREY if kind == "none" else colour_of(kind)
+        style = {100: ":", 350: "--"}.get(labels, "-") if len(kinds) > 2 else "-"
+        axes.fill_between(steps, lower, upper, color=colour, alpha=0.14, linewidth=0)
+        axes.plot(steps, estimate, color=colour, linewidth=1.8, linestyle=style)
+        name = NAMES[kind] + (f", {labels} labels" if labels else "") + (" (dotted)" if style == ":" else "")
+        ends.append((float(estimate[-1]), name, colour))
+    axes.xaxis.set_major_formatter(matplotlib.ticker.EngFormatter(sep=""))
+    axes.set_xlim(left=0)
+    axes.set_ylim(0, 1.02)
+    axes.set_xlabel("environment steps of a seed")
+    axes.figure.draw_without_rendering()
+    name_ends(axes, ends)
+
+
+def draw_billiards(stem: Path) -> None:
+    """Draw the one-ball curves beside the mean rewards on the regulation table."""
+    bars = []
+    for name, run, kind, labels in (
+        ("teacher's own shots", "frame", "perfect-regulation", 0),
+        ("intent, 500, paced", "paced", "intent", 500),
+        ("intent, 500", "frame", "intent", 500),
+        ("relative, 500, paced", "paced", "relative", 500),
+        ("relative, 100,000", "frame", "relative", 100_000),
+        ("relative, 500", "frame", "relative", 500),
+        ("demonstration, 500", "frame", "demonstration", 500),
+    ):
+        found = interval_of(efficiency("regulation", run, kind, labels), "mean_ratio")
+        assert found is not None
+        bars.append(Bar(name, found, colour_of("rule" if kind.startswith("perfect") else kind)))
+    with matplotlib.rc_context(STYLE):
+        figure = new_figure(11, 3.8)
+        left, right = figure.subplots(1, 2)
+        lines_of(left, "quickstart", [("relative", 100), ("none", 0)], "reward")
+        left.set_ylabel("reward a shot")
+        left.set_title("One ball, from scratch", fontweight="bold", fontsize=11)
+        forest(right, bars, Interval(np.array(1.0), np.array(np.nan), np.array(np.nan)))
+        right.set_xlim(0, 1.6)
+        right.set_xlabel("mean reward over 550,000 steps, no guidance = 1")
+        right.set_title("Regulation table, from scratch", fontweight="bold", fontsize=11)
+        save_figure(figure, stem)
+
+
+def draw_navigation(stem: Path) -> None:
+    """Draw success over steps in cluttered halls."""
+    with matplotlib.rc_context(STYLE):
+        figure = new_figure(9, 4)
+        axes = figure.subplots()
+        axes.set_ylabel("success")
+        lines_of(axes, "navigation", [("relative", 500), ("relative", 100), ("heuristic", 0), ("none", 0)], "success")
+        save_figure(figure, stem)
+
+
+def draw_arms(stem: Path) -> None:
+    """Draw success of scripted arms with a displaced camera, a panel an environment."""
+    found = [line for line in fetch_page.lines(fetch_page.read(DATA / "fetch")) if line.says in ("", "all")]
+    fetch_page.draw(found, stem)
+
+
+def draw_quadruped(stem: Path) -> None:
+    """Draw success of one agent on the simple robot, on legs in MJX and in C MuJoCo."""
+    rows = json.loads((DATA / "anymal_navigation.json").read_text())["rows"]
+    robots = {"simple": ("simple robot", GREY), "anymal": ("quadruped, MJX", "#0072B2")}
+    robots["anymal, C MuJoCo"] = ("quadruped, C MuJoCo (50 episodes)", "#E69F00")
+    styles = ("clutter", "corridor", "rooms")
+    with matplotlib.rc_context(STYLE):
+        figure = new_figure(9, 3.2)
+        axes = figure.subplots()
+        for shift, (robot, (name, colour)) in enumerate(robots.items()):
+            own = {row["style"]: row for row in rows if row["robot"] == robot}
+            heights = [100 * own[style]["success"] for style in styles]
+            places = np.arange(len(styles)) + 0.27 * (shift - 1)
+            axes.bar(places, heights, width=0.25, color=colour, label=name)
+            for place, height in zip(places, heights, strict=True):
+                axes.text(place, height + 1.5, f"{height:.0f}", ha="center", fontsize=9)
+        axes.set_xticks(range(len(styles)), styles)
+        axes.set(ylim=(0, 112), ylabel="success [%]")
+        axes.grid(visible=False, axis="x")
+        axes.legend(loc="upper right", fontsize=9)
+        save_figure(figure, stem)
+
+
+def draw_engines(stem: Path) -> None:
+    """Draw the reward of aimed shots here and in Chipmunk at two steps."""
+    rows = told("aimed_parity")["rows"]
+    with matplotlib.rc_context(STYLE):
+        figure = new_figure(8, 2.6)
+        axes = figure.subplots()
+        names, place = [], 0.0
+        for table in dict.fromkeys(row["table"] for row in rows):
+            own = [row for row in rows if row["table"] == table]
+            bars = [("here", own[0]["reward"], "#0072B2")]
+            bars += [(f"Chipmunk, step {1e3 * row['step_s']:g} ms", row["reward_in_chipmunk"], GREY) for row in own]
+            for name, reward, colour in bars:
+                axes.barh(place, reward, color=colour, height=0.8)
+                axes.text(reward + 0.006, place, f"{reward:.2f}", va="center", fontsize=9)
+                names.append((place, f"{table}: {name}"))
+                place += 1
+            place += 0.6
+        axes.set_yticks([at for at, _ in names], [name for _, name in names])
+        axes.invert_yaxis()
+        axes.grid(visible=False, axis="y")
+        axes.tick_params(axis="y", length=0)
+        axes.set_xlabel("reward a shot at random possible aims, 1,000 shots")
+        save_figure(figure, stem)
+
+
+# --- the page --------------------------------------------------------------------------------------------------------
+
+TASKS = {
+    "billiards": (billiards, draw_billiards, "learning billiards with labels and without"),
+    "navigation": (navigation, draw_navigation, "success in navigation over steps"),
+    "arms": (arms, draw_arms, "success of arms with a displaced camera"),
+    "quadruped": (quadruped, draw_quadruped, "success of an agent on the quadruped"),
+}
+OTHER_HEADERS = {
+    "adaptation": ["scenario", "adapted", "not adapted", "more"],
+    "quadruped": ["finding", "on legs", "simple robot", "more"],
+    "simulators": ["measured", "here", "asked for", "more"],
+}
+
+
+def sections(page: Path) -> dict[str, str]:
+    """Return the sections of the page; their figures are there."""
+    found = {}
+    for task, (rows, _, alt) in TASKS.items():
+        table = markdown(OTHER_HEADERS.get(task, HEADER), rows())
+        found[task] = f"{image(alt, FIGURES / f'results_{task}', page)}\n\n{table}"
+    picture = image("every scenario before and after 250 labels", DATA / "adaptation" / "overview", page)
+    found["adaptation"] = f"{picture}\n\n{markdown(OTHER_HEADERS['adaptation'], adapted())}"
+    found["simulators"] = markdown(OTHER_HEADERS["simulators"], simulators())
+    return found
+
+
+def main() -> int:
+    """Write the figures and the page."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--page", type=Path, default=DOCS / "results.md")
+    given = parser.parse_args()
+    for task, (_, draw, _) in TASKS.items():
+        draw(FIGURES / f"results_{task}")
+    draw_engines(FIGURES / "results_engines")
+    given.page.write_text(rendered(given.page.read_text(encoding="utf-8"), sections(given.page)), encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
