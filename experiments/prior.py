@@ -69,7 +69,6 @@ PRIOR_OF_WAYS: Options = {
     "arbiter.beta": 1.0,
     "arbiter.trust-after": 20_000,
     "arbiter.near-deg": 5.0,
-    "arbiter.judge-steps": 4_000,
 }
 CAGE: Options = {"arbiter.own-share": 0.0, "arbiter.near-share": 0.0}
 # Chosen on seeds 0 to 3: of 100 labels one model in long fits forgets the rule (0.634 a shot; so: 0.651).
