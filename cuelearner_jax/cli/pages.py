@@ -112,7 +112,7 @@ PAGES: dict[str, Page] = {
             Example("the same in a changed world", f"evaluate {WALKER} --scenario corridor --episodes 50"),
             Example(
                 "two policies on the same episodes, with the difference",
-                "evaluate billiards --policy heuristic --compare uniform",
+                f"evaluate --compare {WALKER} uniform --scenario rooms --episodes 50",
             ),
         ),
         (
