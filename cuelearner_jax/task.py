@@ -118,7 +118,7 @@ class Task:
     config: type  # its configuration: a dataclass, one line of help a field
     bodies: tuple[Body, ...]  # its own first
     teacher: Callable[[Any, Any], Teacher] | None = None  # (configuration, environment); None: nobody answers
-    # (configuration, environment, questions): one that answers alike and takes less time for so few; None: there is none
+    # (configuration, environment, questions): one that answers alike, in less time for so few; None: there is none
     brief_teacher: Callable[[Any, Any, int], Teacher | None] | None = None
     # configuration -> digests of the user's own files that it names, by field; raises UserError if one is not there
     files: Callable[[Any], dict[str, str]] = lambda config: {}

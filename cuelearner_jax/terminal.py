@@ -80,12 +80,12 @@ def progress_bars(shown: bool = True, counted: bool = True) -> Iterator[Progress
         yield bars
 
 
-EVERY = 5.0  # seconds between two lines of progress
+FIRST, EVERY = 1.0, 5.0  # seconds until the first line of progress, and between two
 PATIENCE = 6  # times as long until a line that says nothing new
 
 
 class ProgressLines(Progress):
-    """Progress as lines, for output that goes to a file or a pipe: the first at once, then one in `EVERY` seconds."""
+    """Progress as lines, for a file or a pipe: the first after `FIRST`, then one in `EVERY` seconds."""
 
     def __init__(self) -> None:
         super().__init__(console=console, disable=True, auto_refresh=False)
@@ -103,11 +103,14 @@ class ProgressLines(Progress):
         self._thread.join()
 
     def add_task(self, *arguments: Any, **options: Any) -> TaskID:
-        """Add a piece of work; the first one is told of at once."""
+        """Add a piece of work."""
         self._newest = super().add_task(*arguments, **options)
-        if not self._told:
-            self.tell()
         return self._newest
+
+    def remove_task(self, task_id: TaskID) -> None:
+        """Drop a piece of work."""
+        self._newest = None if self._newest == task_id else self._newest
+        super().remove_task(task_id)
 
     def update(self, task_id: TaskID, **options: Any) -> None:
         """Note how far a piece of work is."""
@@ -121,9 +124,9 @@ class ProgressLines(Progress):
 
     def tell(self) -> None:
         """Print a line if there is something new to tell, or nothing was told for long."""
-        if self._newest is None:
+        task = self._tasks.get(self._newest) if self._newest is not None else None
+        if task is None:
             return
-        task = self._tasks[self._newest]
         parts = [task.description]
         if task.total:
             parts.append(f"{task.completed:,.0f} of {task.total:,.0f}")
@@ -136,8 +139,10 @@ class ProgressLines(Progress):
         console.print(f"{line}; after {task.elapsed or 0:.0f} s{left}")
 
     def _tell_on(self) -> None:
-        while not self._ended.wait(EVERY):
+        wait = FIRST
+        while not self._ended.wait(wait):
             self.tell()
+            wait = EVERY
 
 
 def watched_by(bars: Progress) -> Callable[[str], Callable[[int, int], None]]:

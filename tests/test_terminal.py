@@ -2,9 +2,11 @@
 
 import io
 import sys
+import time
 
 from rich.table import Table
 
+from cuelearner_jax import terminal
 from cuelearner_jax.cli.parsing import out
 from cuelearner_jax.terminal import console, progress_bars
 
@@ -22,6 +24,7 @@ def test_what_looks_like_markup_is_printed_as_it_is(capsys):
     assert capsys.readouterr().out.count(TEXT) == 3
     with progress_bars() as bars:
         bars.add_task(TEXT, total=1, note="[/bold]")
+        bars.tell()
     told = capsys.readouterr().err
     assert TEXT in told
     assert "[/bold]" in told
@@ -36,3 +39,29 @@ def test_work_goes_on_where_nobody_reads_its_messages(monkeypatch):
     console.print("told to nobody")
     with progress_bars() as bars:
         bars.add_task("work", total=1, note="")
+
+
+def test_progress_that_is_piped_is_lines_few_and_without_carriage_returns(capsys, monkeypatch):
+    monkeypatch.setattr(terminal, "FIRST", 0.02)
+    monkeypatch.setattr(terminal, "EVERY", 0.2)
+    started = time.monotonic()
+    with progress_bars() as bars:
+        work = bars.add_task("work", total=1000, note="")
+        while time.monotonic() - started < 0.5:
+            bars.update(work, advance=1, note=f"reward {bars.tasks[0].completed:g}")
+    told = capsys.readouterr().err
+    lines = told.splitlines()
+    assert 2 <= len(lines) <= 4  # of hundreds of updates
+    assert "\r" not in told
+    assert all(line.startswith("work, ") and " of 1,000, reward " in line for line in lines)
+    with progress_bars(shown=False) as bars:
+        bars.add_task("work", total=1, note="")
+    assert capsys.readouterr().err == ""
+
+
+def test_work_that_stands_still_is_told_of_now_and_then(capsys):
+    lines = terminal.ProgressLines()
+    lines.add_task("compiling", total=None, note="")
+    for _ in range(2 * terminal.PATIENCE + 1):
+        lines.tell()
+    assert capsys.readouterr().err.count("compiling; after 0 s\n") == 3

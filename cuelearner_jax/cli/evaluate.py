@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import takewhile
 from pathlib import Path
 from typing import Any, Generic
 
@@ -36,7 +37,8 @@ class Evaluate(EvaluateRequest[TaskT], Generic[TaskT]):
     scenario: str | None = None
     """A changed world, by its name. Options of the task (--task.…) come on top of it."""
     compare: str | None = None
-    """Another run folder, policy folder or policy, on the same episodes: a table with both and the difference."""
+    """Another run folder, policy folder or policy, on the same episodes: a table with both and the difference. Two may
+    stand here with nothing named before: evaluate --compare A B."""
     labels_from: Path | None = None
     """Instead: how many answers of this label file the policy agrees with. Also of package.module:NAME and of a file in
     ONNX; beside the policy as it was and "already right" always."""
@@ -46,6 +48,7 @@ class Evaluate(EvaluateRequest[TaskT], Generic[TaskT]):
 
 
 OPTIONS = {"evaluate": Evaluate}
+COMPARE = "--compare"
 
 
 def run(arguments: list[str]) -> None:
@@ -55,7 +58,7 @@ def run(arguments: list[str]) -> None:
             raise UserError(f"the answers of a label file need the policy alone: leave out {file[1][1]}")
         _print_agreement(arguments[0], code_of(arguments[0]), file[0])
         return
-    source, asked = asked_of_source(arguments, "evaluate", Evaluate)
+    source, asked = asked_of_source(_named_first(arguments), "evaluate", Evaluate)
     if asked.labels_from is not None:
         source.check(asked.policy, asked.task, guidance=asked.guidance)
         if trained.POLICIES[asked.policy].taught:
@@ -95,6 +98,18 @@ def run(arguments: list[str]) -> None:
         console.print("not every first episode has ended, so outcomes have no mean: give more --steps")
     if asked.out:
         out.print(f"wrote {asked.out}")
+
+
+def _named_first(arguments: list[str]) -> list[str]:
+    """Arguments in which `--compare A B`, with nothing named before, is `A --compare B`."""
+    if COMPARE not in arguments or not arguments[0].startswith("-"):
+        return arguments
+    place = arguments.index(COMPARE) + 1
+    both = list(takewhile(lambda word: not word.startswith("-"), arguments[place:]))
+    if len(both) != 2:
+        return arguments
+    first, second = both
+    return [first, *arguments[: place - 1], COMPARE, second, *arguments[place + 2 :]]
 
 
 def _print_agreement(named: str, policy: Any, path: Any) -> None:

@@ -112,7 +112,7 @@ PAGES: dict[str, Page] = {
             Example("the same in a changed world", f"evaluate {WALKER} --scenario corridor --episodes 50"),
             Example(
                 "two policies on the same episodes, with the difference",
-                "evaluate billiards --policy heuristic --compare uniform",
+                f"evaluate --compare {WALKER} uniform --scenario rooms --episodes 50",
             ),
         ),
         (
@@ -144,7 +144,7 @@ PAGES: dict[str, Page] = {
         ),
         (
             Example("a film and a still", "render {subject}{acting} --out pictures"),
-            Example("a longer film, from another start", "render {subject}{acting} --steps 20 --episode 1 --out pictures"),
+            Example("a longer film, another start", "render {subject}{acting} --steps 20 --episode 1 --out pictures"),
             Example("what a person is asked", "render {subject}{acting} --question --out pictures"),
         ),
     ),
@@ -280,9 +280,9 @@ def read(text: str) -> tuple[str, str, list[Choice], dict[str, Option], dict[str
         if title not in ("options", "positional arguments"):
             others[title] = sum(name.startswith("--") for name, _ in found)
             continue
-        for name, told in found:
+        for line, told in found:
             # A short description stands on the line of its option.
-            name, _, beside = re.sub(r" {2,}", "\0", name).partition("\0")
+            name, _, beside = re.sub(r" {2,}", "\0", line).partition("\0")
             option = Option(_plain(name), _plain(f"{beside} {told}"))
             if "--help" not in name:
                 own[_key(option.name)] = option
@@ -292,7 +292,7 @@ def read(text: str) -> tuple[str, str, list[Choice], dict[str, Option], dict[str
 def _key(name: str) -> str:
     """An option's long name without its dashes; of a positional argument, its first word."""
     long = re.findall(r"--(?:no-)?([\w-]+)", name)
-    return long[-1] if long else name.split()[0]
+    return long[-1] if long else name.split(maxsplit=1)[0]
 
 
 def _plain(text: str) -> str:
@@ -308,9 +308,7 @@ def command_of(program: str) -> str:
     return next(name for name in PAGES if f"{program} ".startswith(f"{name} "))
 
 
-def first_page(
-    text: str, command: str, program: str, subject: Subject | None = None, tasks: Sequence[str] = ()
-) -> str:
+def first_page(text: str, command: str, program: str, subject: Subject | None = None, tasks: Sequence[str] = ()) -> str:
     """The first page of a command, from the whole page that tyro printed.
 
     Args:
@@ -379,13 +377,16 @@ def _cut(lines: list[str], most: int) -> list[str]:
 
 
 def _footer(program: str, more: int, others: dict[str, int]) -> list[str]:
-    parts = [*([f"{more} more option{'s' * (more > 1)}"] if more > 0 else []), *(f"{title} ({n})" for title, n in others.items())]
+    parts = [
+        *([f"{more} more option{'s' * (more > 1)}"] if more > 0 else []),
+        *(f"{title} ({n})" for title, n in others.items()),
+    ]
     text = f"Everything, with {', '.join(parts)}" if parts else "Everything, with the whole text of each line"
     return textwrap.wrap(f"{text}: {program} {HELP_ALL}", COLUMNS, break_on_hyphens=False)
 
 
 def subject_of(typed: str, name: str, task: Any, has_usual: bool = True) -> Subject:
-    """A task, or a folder with policies of a task, as examples name it; `has_usual`: the policy that acts by default."""
+    """A task, or a folder with policies of a task, as examples name it; `has_usual`: the usual policy."""
     preset = "quickstart" if "quickstart" in task.presets else next(iter(task.presets), "")
     policy = "" if has_usual else CHANCE if task.teacher is None else "teacher"
     return Subject(typed, name, preset, next(iter(task.scenarios), ""), policy)

@@ -18,6 +18,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend import core
 
+from cuelearner_jax.devices import written_out
+
 KINDS = {"float32": "float32", "int32": "int32", "uint32": "int32", "bool": "bool", "bfloat16": "float32"}
 
 
@@ -61,7 +63,8 @@ RULES: dict[str, Rule] = {}
 def trace(function: Callable[[Any, Any], Any], obs_size: int) -> Traced:
     """A function (key, observation (obs_size,)) -> action (action,) as a graph of the observation."""
     key, obs = jax.random.key(0), jax.ShapeDtypeStruct((obs_size,), jnp.float32)
-    closed = jax.make_jaxpr(function)(key, obs)
+    with written_out():
+        closed = jax.make_jaxpr(function)(key, obs)
     builder = Builder()
     drawn, given = Value("key", (), "key"), Value("obs", (obs_size,), "float32")
     (result,) = builder.inlined(closed.jaxpr, closed.consts, [drawn, given])

@@ -1,7 +1,8 @@
 """Figures and tables from recorded results: what `cuelearner report` writes.
 
-A report is a folder: `report.md` (table, figures, what is missing, where the numbers come from), `summary.csv` (the
-table), `curves.csv` (what the curves show), `curves.png/.svg` and, where there are several label budgets,
+A report is a folder: `report.html` (one file: figures that tell their values under the pointer, the table, what is
+missing, where the numbers come from), `report.md` (the same for other documents), `summary.csv` (the table),
+`curves.csv` (what the curves show), `curves.png/.svg` and, where there are several label budgets,
 `label_efficiency.png/.svg`. A study may add tables, figures and a section (`experiments/label_efficiency.py`). The same
 results always give the same bytes.
 """
@@ -19,10 +20,12 @@ from matplotlib.figure import Figure
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.report import escaping, extent, tables
 from cuelearner_jax.report.figures import draw_curves, draw_label_efficiency, save_figure
+from cuelearner_jax.report.page import page
 from cuelearner_jax.report.variants import Group, PathLike, Variant, read_groups, variants_of
 from cuelearner_jax.storage.folders import in_use
 
 FIGURES = ("curves", "label_efficiency", "labels_to_quality", "steps_saved")
+UNKNOWN = "not recorded"
 PERMISSIVE: dict[str, Any] = {"promote_options": "permissive"}  # runs may differ in their metrics
 TABLES = ("summary", "curves", "efficiency", "labels_to_level", "equal_area")
 
@@ -90,6 +93,8 @@ def report(
     missing = _missing(folders, groups, variants, metric, split)
     text = _markdown(title, written["summary"], list(figures), added.lines, missing, _provenance(groups, command))
     (out / "report.md").write_text(text, encoding="utf-8")
+    whole = page(title, variants, written["summary"], metric, missing, _origins(groups, command))
+    (out / "report.html").write_text(whole, encoding="utf-8")
     return out / "report.md"
 
 
@@ -131,15 +136,23 @@ def _missing(
 
 def _provenance(groups: Sequence[Group], command: str) -> list[str]:
     """Lines of Markdown."""
+    lines = []
+    for name, value in _origins(groups, command):
+        plain = name in ("versions", "hardware") or value == UNKNOWN
+        lines.append(f"{name}: {escaping.markdown(value) if plain else escaping.code(value)}")
+    return lines
+
+
+def _origins(groups: Sequence[Group], command: str) -> list[tuple[str, str]]:
+    """Where the numbers come from: what, and its value."""
     table = pa.concat_tables([group.all_rows for group in groups], **PERMISSIVE)
-    lines = [f"report made by: {escaping.code(command)}"] if command else []
+    found = [("report made by", command)] if command else []
     names = {"command": "runs made by", "config_hash": "configuration", "commit": "commit"}
     for column, name in (names | {"versions": "versions", "hardware": "hardware"}).items():
         values = set(table[column].to_pylist()) if column in table.column_names else set()
         known = sorted(value for value in values if value)
-        escape = escaping.code if column in ("command", "config_hash", "commit") else escaping.markdown
-        lines += [f"{name}: {escape(value)}" for value in known] or [f"{name}: not recorded"]
-    return lines
+        found += [(name, str(value)) for value in known] or [(name, UNKNOWN)]
+    return found
 
 
 def _markdown(

@@ -44,7 +44,7 @@ def draw_curves(variants: Sequence[Variant], title: str, metric: str) -> Figure:
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(8, 4.5), layout="constrained")
         axes = figure.add_subplot()
-        colours = _colours(variants)
+        colours = colours_of(variants)
         for variant, colour in zip(variants, colours, strict=True):
             steps, estimate, lower, upper = variant.curve
             marker = "o" if len(steps) == 1 else ""
@@ -132,7 +132,7 @@ def colour_of(guidance: str) -> str:
     return kind.colour if kind and kind.colour else OTHER_COLOURS[sum(guidance.encode()) % len(OTHER_COLOURS)]
 
 
-def _colours(variants: Sequence[Variant]) -> list[tuple[float, ...]]:
+def colours_of(variants: Sequence[Variant]) -> list[tuple[float, ...]]:
     """The hue of the guidance, the paler the smaller the label budget is among those of its guidance."""
     colours = []
     for variant in variants:

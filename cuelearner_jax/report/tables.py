@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -103,17 +103,23 @@ def markdown_table(header: Sequence[str], rows: Iterable[Sequence[object]]) -> l
 
 def summary_lines(rows: Sequence[Row]) -> list[str]:
     """The summary as a table in Markdown."""
+    header, cells = summary_table(rows, escaping.markdown)
+    return markdown_table(header, cells)
+
+
+def summary_table(rows: Sequence[Row], escape: Callable[[object], str] = str) -> tuple[list[str], list[list[object]]]:
+    """The summary's header and cells; `escape`: what is made of names. A row of failed lanes alone is short."""
     header = ["guidance", "labels", "seeds", "last step", "final", "mean over the curve", "best (at step)"]
     header += ["reaches the unguided final", "interval above the unguided", "interval below the unguided"]
     by_run = "run" in rows[0]
-    return markdown_table(["run"] * by_run + header, [_summary_cells(row, by_run) for row in rows])
+    return ["run"] * by_run + header, [_summary_cells(row, by_run, escape) for row in rows]
 
 
-def _summary_cells(row: Row, by_run: bool) -> list[object]:
+def _summary_cells(row: Row, by_run: bool, escape: Callable[[object], str]) -> list[object]:
     reached, failed = row["reaches_unguided_final"], int(row["failed"])
     seeds = f"{row['seeds']} of {int(row['seeds']) + failed}, {failed} failed" if failed else row["seeds"]
-    cells: list[object] = [escaping.markdown(row["run"])] if by_run else []
-    cells += [escaping.markdown(row["guidance"]), f"{row['labels']:,}", seeds]
+    cells: list[object] = [escape(row["run"])] if by_run else []
+    cells += [escape(row["guidance"]), f"{row['labels']:,}", seeds]
     if not row["seeds"]:
         return cells
     cells.append(f"{row['last_step']:,}")

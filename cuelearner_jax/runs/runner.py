@@ -61,6 +61,7 @@ class Runner:
             console.print(f"{self.name}: finished before, left as it is")
             return
         asks = self.group.guidance.asks
+        self._bar = self.bars.add_task(self.name, total=self.group.config.schedule.total_steps, note="preparing")
         with checkpoints(self.folder / "checkpoints") as saved:
             self._restore(saved)
             constants = self._constants()
@@ -181,7 +182,7 @@ class Runner:
 
     def _train(self, saved: Checkpoints, writer: TableWriter, tracker: tracking.Tracker | None) -> None:
         now, schedule = self.training, self.group.config.schedule
-        bar = self.bars.add_task(self.name, total=schedule.total_steps, note="", completed=now.step)
+        self.bars.update(self._bar, completed=now.step)
         for row in self._evaluated(saved):
             writer.append(**row)
             if tracker is not None:
@@ -189,7 +190,7 @@ class Runner:
             self._tell_failed(f"at step {now.step:,}")
             if now.step == 0:
                 continue
-            self.bars.update(bar, completed=now.step, note=f"reward {mean_of_finite(row['reward'])}")
+            self.bars.update(self._bar, completed=now.step, note=f"reward {mean_of_finite(row['reward'])}")
             if now.step % schedule.checkpoint_every == 0 or now.step >= schedule.total_steps:
                 self._save(saved)
             self._stop_if_asked(saved)

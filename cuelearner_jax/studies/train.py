@@ -26,7 +26,7 @@ from cuelearner_jax.runs.judging import judges_world
 from cuelearner_jax.runs.lane_checkpoints import check_standing
 from cuelearner_jax.runs.lanes import LaneGroup
 from cuelearner_jax.runs.memory_report import memory_report
-from cuelearner_jax.runs.order import Order, TrainRequest, checked, labels_of, planned
+from cuelearner_jax.runs.order import Order, Plan, TrainRequest, checked, labels_of, planned
 from cuelearner_jax.runs.runner import Runner
 from cuelearner_jax.runs.training import Training, mean_of_finite
 from cuelearner_jax.storage import formats
@@ -72,9 +72,38 @@ def run(order: Order) -> None:
     release_programs()
     plan = planned(order)
     order = plan.order
-    task, config = order.task, order.config
-    _groups(order, shape_of(task, config.task), console.print)  # before anything is made that has a size
-    mesh = lane_mesh()
+    _groups(order, shape_of(order.task, order.config.task), console.print)  # before anything that has a size is made
+    with progress_bars() as bars:
+        waiting = bars.add_task("preparing", total=None, note="")
+        made = _made(order, plan)
+        with claimed(order.out), interruptible() as stopping:
+            # Nobody else can change it any more.
+            check_folder(order.out, plan.described, order.resume, order.overwrite, defaults(order.task))
+            for group in made.groups if order.resume else ():
+                check_standing(group, order.out / group.guidance.name, given=plan.labels is not None)
+            prepare_folder(order.out, plan.described, order.overwrite and not order.resume)
+            # Rows of what was begun earlier and of what comes now are of one configuration, as config.json tells it.
+            described = formats.read("config", order.out / CONFIG)
+            bars.remove_task(waiting)
+            for group in made.groups:
+                runner = Runner(group, made.examined, made.judged, order, described, stopping, bars)
+                runner.run(made.teacher, plan.labels)
+    groups = made.groups
+    failures.check(order.out, [order.out / group.guidance.name for group in groups])
+
+
+class _Made(NamedTuple):
+    """What a training needs before its first step."""
+
+    groups: list[LaneGroup]
+    teacher: Teacher | None
+    examined: Environment
+    judged: Environment | None
+
+
+def _made(order: Order, plan: Plan) -> _Made:
+    """Return the worlds and the teacher. Raises UserError for a teacher that cannot be asked."""
+    task, config, mesh = order.task, order.config, lane_mesh()
     env = place(mesh, task.environment(config.task), SHARED)
     groups = _groups(order, env, lambda told: None)
     asked = any(group.guidance.asks for group in groups) and plan.labels is None
@@ -83,17 +112,7 @@ def run(order: Order) -> None:
         check_teacher(teacher, config.scalars)
     examined = task.environment(config.task, order.split)
     judged = judges_world(config, lambda split: task.environment(config.task, split))
-    with claimed(order.out), interruptible() as stopping, progress_bars() as bars:
-        # Nobody else can change it any more.
-        check_folder(order.out, plan.described, order.resume, order.overwrite, defaults(task))
-        for group in groups if order.resume else ():
-            check_standing(group, order.out / group.guidance.name, given=plan.labels is not None)
-        prepare_folder(order.out, plan.described, order.overwrite and not order.resume)
-        # Rows of what was begun earlier and of what comes now are of one configuration, as config.json tells it.
-        described = formats.read("config", order.out / CONFIG)
-        for group in groups:
-            Runner(group, examined, judged, order, described, stopping, bars).run(teacher, plan.labels)
-    failures.check(order.out, [order.out / group.guidance.name for group in groups])
+    return _Made(groups, teacher, examined, judged)
 
 
 class Trained(NamedTuple):

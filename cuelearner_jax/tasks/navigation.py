@@ -42,7 +42,7 @@ def make_teacher(config: NavigationConfig, env: Any) -> Teacher:
 
 
 def make_brief_teacher(config: NavigationConfig, env: Any, questions: int) -> Teacher | None:
-    """Return a road map that is made world by world as questions come, where that is less work than all maps at once."""
+    """Return a road map that is made world by world as questions come, where that is less work than all at once."""
     few = questions < config.worlds and jax.default_backend() == "cpu"
     return make_brief_road_map(env) if few and not SIDES[config.preferred_side] else None
 

@@ -88,7 +88,7 @@ def test_two_policies_are_compared_on_the_same_episodes(run_folder, tmp_path, ca
     assert (recorded["compared"]["with"], found["over"]) == ("uniform", "episodes")
     less = recorded["rows"][0]["reward"][0] - found["less"]["reward"][0]
     assert found["difference"]["reward"][0] == pytest.approx(less)
-    assert main([*command, "--compare", "heuristic"]) == 0
+    assert main(["evaluate", "--compare", str(run_folder), "heuristic", *few]) == 0
     assert capsys.readouterr().out.count("difference over seeds") == 3  # a table for each kind and budget
 
 

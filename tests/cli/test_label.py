@@ -4,8 +4,8 @@ import csv
 import dataclasses
 import shlex
 import signal
-import time
 import socket
+import time
 import urllib.error
 import urllib.request
 from pathlib import Path

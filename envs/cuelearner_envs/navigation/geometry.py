@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from cuelearner_envs.navigation.world import World
+from cuelearner_jax.devices import goes_through
 
 
 def in_frame(boxes: Float[Array, "boxes 5"], point: Float[Array, "2"]) -> Float[Array, "boxes 2"]:
@@ -53,6 +54,28 @@ def free_path(
     chord = radius**2 - jnp.square(across)
     stop = along - jnp.sqrt(jnp.maximum(chord, 0.0))
     return jnp.clip(jnp.where((chord > 0) & (along > 0), stop, most).min(-1), 0.0, most)
+
+
+def free_paths(
+    directions: Float[Array, "*n 2"],
+    places: Float[Array, "*n 2"],
+    points: Float[Array, "points 2"],
+    radius: float,
+    most: float,
+) -> Float[Array, "*n"]:
+    """How far a disc can walk in directions from places, see `free_path` [m]."""
+    (x, y), here = jnp.moveaxis(directions, -1, 0), jnp.sum(directions * places, -1)
+    aside = x * places[..., 1] - y * places[..., 0]
+    if not goes_through():
+        x, y, here, aside = (part[..., None] for part in (x, y, here, aside))
+        px, py = points[:, 0], points[:, 1]
+        return free_path(x * px + y * py - here, x * py - y * px - aside, radius, most)
+
+    def nearer(best: Float[Array, "*n"], point: Float[Array, "2"]) -> tuple[Float[Array, "*n"], None]:
+        along, across = x * point[0] + y * point[1] - here, x * point[1] - y * point[0] - aside
+        return jnp.minimum(best, free_path(along[..., None], across[..., None], radius, most)), None
+
+    return jax.lax.scan(nearer, jnp.full(x.shape, most), points)[0]
 
 
 def _point_to_line(point: Float[Array, "2"], start: Float[Array, "2"], end: Float[Array, "2"]) -> Float[Array, ""]:

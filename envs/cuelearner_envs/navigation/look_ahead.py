@@ -17,8 +17,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from cuelearner_envs.navigation.geometry import free_path
+from cuelearner_envs.navigation.geometry import free_paths
 from cuelearner_envs.navigation.lidar import MAX_RANGE
+from cuelearner_jax.devices import goes_through
 from cuelearner_jax.spaces.directions import rotate
 
 EVERY = 2  # of the beams: second legs look at every second point, 0.17 m apart at 5 m
@@ -55,8 +56,9 @@ def look_ahead(
         distance from here, infinity, 0.
     """
     legs = _stations(ways, free, goal)
-    # One station after the other: side by side they take three times the memory, and no less time.
-    plans = jax.lax.map(lambda leg: _second_legs(points, ways, leg, goal, radius), legs)
+    second_legs = lambda leg: _second_legs(points, ways, leg, goal, radius)  # noqa: E731
+    # Reductions take one station after the other: side by side they need three times the memory, and no less time.
+    plans = jax.vmap(second_legs)(legs) if goes_through() else jax.lax.map(second_legs, legs)
     cost, left, walked, leg = (values.reshape(-1, ways.shape[0]) for values in plans)
     chosen = cost <= cost.min(0, keepdims=True)  # more than one only where they are worth the same
 
@@ -94,23 +96,13 @@ def _second_legs(
     offset = goal[None] - places
     away = jnp.sqrt(jnp.maximum(jnp.sum(jnp.square(offset), -1), 1e-12))
     ahead = offset / away[:, None]
-    found = []
-    for turn in map(math.radians, TURNS_DEG):
-        cos, sin, turned = math.cos(turn), math.sin(turn), rotate(ahead, turn)
-        along = _product(turned, points, places)
-        across = _product(jnp.stack([-turned[:, 1], turned[:, 0]], -1), points, places)
-        second = free_path(along, across, radius, MAX_RANGE)
-        second = jnp.minimum(second, cos * away)
+    found, turns = [], [math.radians(turn) for turn in TURNS_DEG]
+    turned = jnp.stack([rotate(ahead, turn) for turn in turns])
+    free = free_paths(turned, jnp.broadcast_to(places, turned.shape), points, radius, MAX_RANGE)
+    for turn, length in zip(turns, free, strict=True):
+        cos, sin = math.cos(turn), math.sin(turn)
+        second = jnp.minimum(length, cos * away)
         left = jnp.sqrt(jnp.square(away - second * cos) + jnp.square(second * sin))
         walked = leg + second
         found.append((left + SHORTER * walked, left, walked, leg))
     return tuple(jnp.stack(column) for column in zip(*found, strict=True))
-
-
-def _product(
-    directions: Float[Array, "ways 2"], points: Float[Array, "points 2"], places: Float[Array, "ways 2"]
-) -> Float[Array, "ways points"]:
-    """How far points lie from places in a direction [m]: written so that no array of their differences is kept."""
-    x, y = directions[:, :1], directions[:, 1:]
-    here = x * places[:, :1] + y * places[:, 1:]
-    return x * points[None, :, 0] + y * points[None, :, 1] - here
