@@ -31,10 +31,8 @@ from cuelearner_jax.types import Label, Teacher
 
 USUAL = 100  # default number of labels
 LEAST = 5  # labels: every fifth is held out
-USED = (
-    "eps_deg",
-    *(entry.name for entry in dataclasses.fields(TeacherFaults)),
-)  # fields of the scalars that calibration reads
+# fields of the scalars that calibration reads
+USED = ("eps_deg", *(entry.name for entry in dataclasses.fields(TeacherFaults)))
 Theta = dict[str, float]  # unknowns by name; one that is not there is zero
 
 

@@ -199,9 +199,8 @@ def _predicted(of: Adaptation, block: LaneState) -> tuple[Array, Array]:
         model = guidance.fit(key, env, others, guidance.init(key), of.scalars)
         moved = guidance.refine_labelled_actions(model, env, labels, held, one_pass).actions
         moves = space.log(labels.action, moved) / space.from_unit(of.scalars.eps_deg)
-        told = (
-            is_answered(labels.answer) & held[:, None]
-        )  # words about one cue each; of the other cues nothing is compared
+        # words about one cue each; of the other cues nothing is compared
+        told = is_answered(labels.answer) & held[:, None]
         count = jnp.maximum(told.sum(), 1)
         share = lambda flags: jnp.sum(flags, where=told) / count  # noqa: E731
         right = share(jnp.round(jnp.clip(moves, -1, 1)) == labels.answer)

@@ -206,9 +206,7 @@ def _take(of: Adaptation, labels: Label, block: LaneState, *, mesh: Mesh) -> Lan
             ):  # files do not keep the base policy's actions: the base policy is asked again
                 labels = labels.replace(base=of.bases.lane(lane.base).act(lane.key, None, labels.obs))
             guide = lane.guide.replace(labels=labels, asked=lane.guide.budget)
-            last = (
-                lane.guide.budget - 1
-            ) // of.sizes.labels_per_round  # the key of the fit that follows the last round
+            last = (lane.guide.budget - 1) // of.sizes.labels_per_round  # number of the last round
             return asking.with_guide(lane, asking.fit(of.guidance, of.env, of.scalars, guide, lane.key, last))
 
         return each_lane(one)(labels, block)

@@ -189,9 +189,8 @@ def policy(name: str, value: Any) -> Policy:
 def teacher(name: str, value: Any, space: Space) -> Teacher:
     """Return a teacher: the given one, or one that shows what a given policy does itself."""
     answers, acts = (callable(getattr(value, verb, None)) for verb in ("best_action", "act"))
-    leaf = answers and any(
-        leaf is value for leaf in jax.tree.leaves(value)
-    )  # not a pytree, so no compiled program could take it
+    # not a pytree, so no compiled program could take it
+    leaf = answers and any(leaf is value for leaf in jax.tree.leaves(value))
     if isinstance(value, type) or leaf or not (answers or acts or callable(value)):
         raise argument_error(name, value, "a teacher, for instance teacher_of(world), or a function of observations")
     if acts and not answers:

@@ -110,9 +110,8 @@ def correct(
         raise UserError(f"{labels} holds answers of {found.eps:g} {found.space.unit}: leave out eps")
     world = world_of(found, before)
     own = as_policy(policy)
-    CallablePolicy(in_space(own, found.space), actions=found.space)(
-        found.rows.obs
-    )  # raises UserError where the policy returns something else than actions
+    # raises UserError where the policy returns something else than actions
+    CallablePolicy(in_space(own, found.space), actions=found.space)(found.rows.obs)
     return adapt(
         policy if isinstance(policy, CallablePolicy) else own,
         world,

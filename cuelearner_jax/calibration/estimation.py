@@ -238,7 +238,7 @@ class Calibration:
         return fit.evidence - DOUBT * len(fit.family)
 
     def _odds(self, fits: list[Fit]) -> Floats:
-        """Return the odds of the fits with the most answers; before the first answer all odds are equal."""
+        """Return the log odds of the fits with the most answers; before the first answer all odds are equal."""
         known = [0 if fit.answers is None else len(fit.answers.obs) for fit in fits]
         if not max(known):
             return np.zeros(len(fits))
@@ -299,7 +299,7 @@ class Calibration:
 
 
 def _explains(fit: Fit) -> bool:
-    """Return whether most answers are about what the fit says, and near it."""
+    """Return whether most answers are about the fit's actions, and near them."""
     rho, width = (fit.nuisance @ GRID)[:2]
     return bool(rho <= MOSTLY and width <= APART)
 

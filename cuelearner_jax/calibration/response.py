@@ -136,7 +136,7 @@ def _covariance(nodes: Floats, length: float, nugget: float) -> Floats:
 
 
 def _smoothness(nodes: Floats, rows: Float[Floats, "nodes rows"]) -> tuple[float, float]:
-    """Length and nugget under which the rows are likeliest, each with its own size."""
+    """Return the maximum-likelihood length and nugget, with each row's own size."""
 
     def log_likelihood(length: float, nugget: float) -> float:
         covariance = _covariance(nodes, length, nugget)

@@ -139,7 +139,7 @@ class Schedule:
     """Labels between two evaluations of the guide alone (0: after the last label alone)."""
 
     def learned_from(self, step: Any) -> Any:
-        """Return of so many steps those after which gradient steps followed; numbers, or traced ones."""
+        """Return the number of environment steps, of the first `step`, that gradient steps followed; traced or not."""
         return jnp.maximum(step - self.learn_after, 0)
 
 

@@ -41,7 +41,8 @@ def check(labels: Label, spaces: Spaces, form: AnswerForm | None, named: str = "
         named: what a message calls them.
 
     Raises:
-        UserError: a wrong shape, a number that is not finite, an action outside the space, or a value that is not allowed.
+        UserError: a wrong shape, a number that is not finite, an action outside the space, or an answer that is not
+            allowed.
     """
     rows = {"observations": labels.obs, "actions": labels.action, "answers": labels.answer}
     width = labels.answer.shape[-1] if form is None else form.width(spaces.actions)

@@ -25,9 +25,8 @@ from cuelearner_jax.guides.model import GuideModel, guide_model
 from cuelearner_jax.guides.refining import Refinement, bounded_scalars, refine
 from cuelearner_jax.types import GuidanceModel, Label, Params
 
-NAME = re.compile(
-    r"[a-z][a-z0-9_-]*"
-)  # pattern of names of kinds, also in files: neither a path nor a reference to code
+# pattern of names of kinds, also in files: neither a path nor a reference to code
+NAME = re.compile(r"[a-z][a-z0-9_-]*")
 
 
 @dataclass(frozen=True)
@@ -44,9 +43,8 @@ class Kind:
     config: type | None = None  # a frozen dataclass of the options that this kind alone has; None: it has none
     sees_base: bool = False  # True if it needs a finished policy's actions; it then serves adaptation only
     by_cues: bool = False  # True if its model measures along cues, whatever its answers say
-    by_evidence: bool = (
-        False  # True if `calibration` reads its answers; it then has no model and serves adaptation only
-    )
+    # True if `calibration` reads its answers; it then has no model and serves adaptation only
+    by_evidence: bool = False
 
     def __post_init__(self) -> None:
         if not NAME.fullmatch(self.name):
@@ -186,7 +184,7 @@ class Guide:
     def fit(
         self, key: PRNGKeyArray, env: Any, labels: Label, former: GuidanceModel, scalars: GuideScalars
     ) -> GuidanceModel:
-        """Return the model of labels (slots, ...); `former` is the previous model, which fitting from scratch ignores."""
+        """Return the model of labels (slots, ...); fitting from scratch ignores `former`, the previous model."""
         rows, predict = self.lessons(labels, scalars), partial(self.predict, env)
         return fit_least_squares(
             key, rows, scalars, init=self.network.init, apply=predict, sizes=self.sizes, redrawn=self.redrawn
@@ -222,8 +220,8 @@ class Guide:
     ) -> Float[Array, " m"]:
         """Return log p(action | labels) of each action in one situation, up to a constant.
 
-        Here an action is likelier, the less one pass of `act` changes it: a Laplace distribution of scale eps. All actions
-        are equally likely where a guide changes none, for example without a fitted model.
+        Here an action is likelier, the less one pass of `act` changes it: a Laplace distribution of scale eps. All
+        actions are equally likely where a guide changes none, for example without a fitted model.
         """
         space, rows = self.spaces.actions, len(actions)
         once = dataclasses.replace(scalars, k_max=1)

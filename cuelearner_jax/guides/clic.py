@@ -246,7 +246,7 @@ class Clic(Guide):
             return actions[jnp.argmin(self.energy(env, params, obs, actions, base, scalars))]
 
         def box(center: Array, half: Array, count: int) -> Float[Array, "count action"]:
-            """Actions spread evenly around one, up to `half` away along each cue."""
+            """Return actions spread evenly around one, up to `half` away along each cue."""
             offsets = Box((-1.0,) * cues, (1.0,) * cues).spread(count)
             return space.exp(jnp.broadcast_to(center, (count, space.size)), half * offsets)
 

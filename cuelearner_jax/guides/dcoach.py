@@ -100,7 +100,7 @@ class DeepCoach(Demonstration):
             return coached.replace(policy=optax.apply_updates(coached.policy, updates), optimizer=state)
 
         def corrected(key: PRNGKeyArray, number: Int[Array, ""], coached: Coached) -> Coached:
-            """By label `number` of those that count, and by a replay of the newest up to it."""
+            """Return the policy after label `number` of the valid ones, and after a replay of the newest labels."""
             oldest = jnp.maximum(number + 1 - self.options.correction_replay, 0)
 
             def replay(coached: Coached, key: PRNGKeyArray) -> tuple[Coached, None]:

@@ -101,8 +101,8 @@ def fit_least_squares(
 ) -> GuidanceModel:
     """Fit by least squares (paper, Eq. 3), as `fit_model`.
 
-    Lessons are never augmented by an environment's symmetries. Where several actions are equally good, a teacher's answer
-    in the mirror image is mostly not the mirror image of its answer.
+    Lessons are never augmented by an environment's symmetries. Where several actions are equally good, a teacher's
+    answer in the mirror image is mostly not the mirror image of its answer.
 
     Args:
         key, rows, scalars, init, sizes, redrawn: as `fit_model` has them.

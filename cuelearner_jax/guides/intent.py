@@ -172,7 +172,7 @@ class Intent(Guide):
         )
 
         def surprise(params: Params, rows: Evidence) -> Float[Array, " rows"]:
-            """-log of the probability of each answer."""
+            """Return -log of the probability of each answer."""
             share = self.network.predict(None, params, rows.features, rows.possible)
             return -jnp.log((1.0 - SLIPS) * (share * rows.likelihood).sum(-1) + SLIPS / WORDS)
 
@@ -215,9 +215,7 @@ class Intent(Guide):
         actions: Float[Array, "m action"],
         scalars: GuideScalars,
     ) -> Float[Array, " m"]:
-        """Return the log density of actions around the aims (`log_density`); before the first fit by the rule, or
-        uniform.
-        """
+        """Return the log density of actions around the aims (`log_density`); before the first fit the rule's, or 0."""
         aims = jax.vmap(partial(self.aims, env))(obs[None])
         share = self.shares(model, env, aims)[0]
         return log_density(self.spaces.actions, aims.actions[0], share, actions)

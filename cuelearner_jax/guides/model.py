@@ -72,7 +72,7 @@ def guide_model(sizes: GuideSizes, spaces: Spaces, outputs: int | None = None, b
     def predict(
         env: Any, params: Params, obs: Float[Array, "*n obs"], actions: Float[Array, "m action"]
     ) -> Float[Array, "m outputs"]:
-        """Of m situations with an action each, or of one with m actions."""
+        """Return predictions for m situations with an action each, or for one situation with m actions."""
         bare, known = jnp.split(actions, [size], -1)
         of_obs, of_action = view.network_inputs(sizes.frame, env, obs, bare)
         return as_function(network)(params, of_obs, jnp.concatenate([of_action, known], -1) if beside else of_action)

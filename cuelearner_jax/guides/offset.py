@@ -112,7 +112,7 @@ def vectors(
 def share_of(
     left: Float[Array, "n action"], predicted: Float[Array, "n action"], valid: Bool[Array, " n"]
 ) -> Float[Array, ""]:
-    """Return the weight in [0, 1] that scales predictions nearest to the residuals, by least squares over valid rows."""
+    """Return the weight in [0, 1] that scales predictions nearest to the residuals, by least squares."""
     product = jnp.sum(jnp.sum(left * predicted, -1), where=valid)
     size = jnp.sum(jnp.sum(jnp.square(predicted), -1), where=valid)
     return jnp.clip(product / jnp.where(size > 0, size, 1.0), 0, 1)

@@ -1,4 +1,4 @@
-"""Spaces of actions: directions in the plane, boxes, choices."""
+"""Action spaces: directions in the plane, boxes, choices."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ __all__ = [
 def from_json(about: Any) -> Space:
     """Return the space that a file describes (`Space.to_json`), of a class that has been imported.
 
-    Raises ValueError for a description of none.
+    Raises ValueError for a description of no known space.
     """
     try:
         cues = tuple(Cue(cue["name"], tuple(cue["words"]), tuple(cue["keys"]), cue["unit"]) for cue in about["cues"])

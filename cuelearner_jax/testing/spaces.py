@@ -1,4 +1,4 @@
-"""The laws of a space of actions (`cuelearner_jax.spaces.Space`), held against actions that it draws."""
+"""Check the laws of an action space (`cuelearner_jax.spaces.Space`) on actions that it draws."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ DRAWN = 64  # actions
 
 
 def check_space(space: Space, tolerance: float = 1e-5) -> None:
-    """Holds a space against its laws.
+    """Check that a space keeps its laws.
 
     Raises:
         AssertionError: the first law that is broken.

@@ -1,4 +1,4 @@
-"""What gymnasium_robotics 1.4.2 lacks beside MuJoCo 3.17. The only file that knows it.
+"""Make gymnasium_robotics 1.4.2 work with MuJoCo 3.17. The only module that knows its internals.
 
 `gymnasium_robotics.utils.mujoco_utils` asks whether a joint's type, a NumPy integer, is in a list of members of
 `mujoco.mjtJoint`. MuJoCo 3.17's members equal no NumPy integer, and every reset fails with an AssertionError.
