@@ -69,7 +69,7 @@ class PartRegistry(Generic[T]):
         """Make a class known under its name. Raises UserError if another one has the name."""
         name = kind.NAME  # pyright: ignore[reportAttributeAccessIssue]
         if self._found.setdefault(name, kind) is not kind:
-            raise UserError(f"there is another {self._sort} called {name!r}: give yours another name")
+            raise UserError(f"another {self._sort} is already called {name!r}: give yours another name")
         return kind
 
     def find(self, name: str) -> type[T]:
@@ -88,5 +88,5 @@ class PartRegistry(Generic[T]):
             return self.find(text)
         kind: Any = load(text, type, f"options of the {self._sort}")
         if not hasattr(kind, "NAME") or not callable(getattr(kind, "make", None)):
-            raise UserError(f"{text} is no {self._sort}: give a class of options with NAME, ABOUT and make")
+            raise UserError(f"{text} is not an {self._sort}: give a class of options with NAME, ABOUT and make")
         return self.register(kind)

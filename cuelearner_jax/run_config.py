@@ -141,7 +141,7 @@ def kind_from_json(name: str, values: dict[str, Any] | None) -> Any:
     Raises as `from_json`, and UserError for a value out of bounds or a kind without options.
     """
     if not isinstance(values, dict | None):
-        raise TypeError(f"options of a kind are told by name, not as {values!r}")
+        raise TypeError(f"options of a kind of guidance must be an object of names and values, not {values!r}")
     kind = guidances.find_or_none(name)
     if values is None or kind is None:
         return values

@@ -152,7 +152,7 @@ def world_of(folder: Path, task: str, config: Any, apart: Collection[str]) -> An
     for field, value in before.items():
         if value != now[field]:
             raise UserError(
-                f"the teacher in {folder} learned with {_typed({field: value})} and knows nothing of this world's "
+                f"the teacher in {folder} learned with {_typed({field: value})} and does not know this world's "
                 f"{_typed({field: now[field]})}: use the search teacher (--task.teacher search), or train one for this "
                 f"world ({TRAIN} {task} {_typed(now)} --out FOLDER) and give --task.teacher FOLDER"
             )

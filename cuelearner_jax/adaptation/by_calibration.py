@@ -87,7 +87,9 @@ def check_unused(sizes: GuideSizes, scalars: Scalars, **others: Any) -> None:
             given = " ".join(map(str, value)) if isinstance(value, tuple) else value
             raise UserError(f"{name} is {given}, but calibration fits no model and has no bound: leave {name} out")
     if scalars.answer == "shuffled":
-        raise UserError("scalars.answer is shuffled, a control of models: give best or nearest to calibration")
+        raise UserError(
+            "scalars.answer is shuffled, which is a control of feedback models: give --scalars.answer best or nearest"
+        )
 
 
 def adapt(

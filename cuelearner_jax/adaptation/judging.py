@@ -78,7 +78,7 @@ def check_bounds(shares: tuple[float, ...], by: str) -> None:
         given = " ".join(f"{share:g}" for share in shares)
         raise UserError(f"judge_bounds is {given}: give shares of the bound above 0 and below 1, each once")
     if shares and by == LABELS:
-        raise UserError("judge_bounds needs episodes to try them on: judge by a metric of the task")
+        raise UserError("judge_bounds needs episodes to be tried on: give --judge-by a metric of the task")
 
 
 class Judge:
@@ -178,7 +178,7 @@ def judged_by_labels(of: Adaptation, block: LaneState) -> Judgement:
         told = form.name if form else "no"
         raise UserError(f"{told} answers cannot be judged by held-out labels: give --judge-by a metric of the task")
     if int(np.asarray(block.guide.labels.valid).sum(-1).min()) < HELD_OUT:
-        raise UserError(f"fewer than {HELD_OUT} labels cannot be judged by: give more, or --judge-by a metric")
+        raise UserError(f"fewer than {HELD_OUT} labels cannot judge a model: give more, or --judge-by a metric")
     zero, right = jax.device_get(_predicted(of, block))
     used = ~np.asarray(block.failed) & (right >= zero)
     unknown, none = np.full((len(used), 3), np.nan), np.zeros(len(used), int)

@@ -44,11 +44,15 @@ def to_json(policy: Any, named: str | None = None) -> dict[str, Any]:
     described = describe(policy)
     for layer in layers(described):
         if layer.get("asks"):
-            raise UserError("a policy that asks a teacher cannot be kept in a folder: give one that acts by itself")
+            raise UserError(
+                "a policy that asks a teacher cannot be stored in a folder: give one that acts without a teacher"
+            )
         if layer["policy"] not in KINDS:
-            raise UserError(f"a policy of kind {layer['policy']} cannot be kept in a folder: give another")
+            raise UserError(
+                f"a policy of kind {layer['policy']} cannot be stored in a folder: give a policy of another kind"
+            )
         if layer["policy"] == "guided" and layer["sizes"] is None:
-            raise UserError("a policy under a guidance of unknown sizes cannot be kept in a folder: give them as sizes")
+            raise UserError("a policy under a guidance of unknown sizes cannot be stored in a folder: give its sizes")
         if layer["policy"] == "code":
             layer["named"] = named or "code"
         for change in layer.get("changes", ()):
@@ -68,13 +72,13 @@ def check(values: dict[str, Any]) -> None:
     for depth, layer in enumerate(layers(values)):
         kind = layer["policy"]
         if kind not in (KINDS if depth else CORRECTED) or depth >= MOST_LAYERS:
-            raise ValueError(f"{kind!r} is no policy here")
+            raise ValueError(f"{kind!r} is not a kind of policy that a folder holds")
         if (kind in CORRECTED) != isinstance(layer.get("base"), dict):
-            raise ValueError(f"a policy of kind {kind} has a base, or one that corrects has none")
+            raise ValueError(f"a policy of kind {kind} has a base that it must not have, or lacks its base")
         if kind == "agent":
             check_part(part_from_json(AGENTS, layer["agent"]), "agent")
             if set(layer) != {"policy", "agent", "frame"} or layer["frame"] not in get_args(Frame):
-                raise ValueError(f"an agent is told by {sorted(layer)}, in the frame {layer.get('frame')!r}")
+                raise ValueError(f"an agent is described by {sorted(layer)}, in the frame {layer.get('frame')!r}")
         if kind == "code" and not isinstance(layer["named"], str):
             raise TypeError(f"code is named {layer['named']!r}")
         if kind == "guided":
@@ -86,7 +90,7 @@ def check(values: dict[str, Any]) -> None:
         if kind == "calibrated":
             told = [*layer["distortions"], *(change[part] for change in layer["changes"] for part in ("name", "unit"))]
             if layer["guidance"] != KIND.name or not all(isinstance(name, str) for name in (layer["code"], *told)):
-                raise TypeError("changes are told by names and units")
+                raise TypeError("changes are not described by names and units")
 
 
 def arrays_of(policy: Any) -> Any:

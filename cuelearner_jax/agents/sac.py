@@ -90,7 +90,7 @@ class Config:
             )
         if frame != "raw":
             raise UserError(
-                f"sizes.frame is {frame!r}, but the actor of 'sac' is given no action: give --sizes.frame raw"
+                f"sizes.frame is {frame!r}, but the actor of 'sac' has no action as input: give --sizes.frame raw"
             )
         return SoftActorCritic(self, frame, spaces, bootstraps)
 

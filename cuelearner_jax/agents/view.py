@@ -40,7 +40,7 @@ def widths(frame: Frame, spaces: Spaces) -> tuple[int, int]:
         return spaces.obs_size, spaces.actions.size
     if spaces.features is None:
         raise UserError(
-            "sizes.frame is 'action', but this task does not say how an observation looks from an action "
+            "sizes.frame is 'action', but this task does not define an observation as seen from an action "
             "(`features`): give --sizes.frame raw"
         )
     return spaces.features

@@ -93,10 +93,11 @@ class AdaptedPolicy(CallablePolicy):
         folder = arguments.path("folder", folder)
         arguments.flag("overwrite", overwrite)
         if folder.exists() and not folder.is_dir():
-            raise UserError(f"folder {folder} is a file: give another")
+            raise UserError(f"folder {folder} is a file: give the path of a folder")
         if self.named is None:
             raise UserError(
-                "a policy folder says in which world its policy acts: adapt in a world, as cl.make gives it"
+                "a policy folder names the world of its policy, and this policy was adapted in a "
+                "bare environment: adapt in a world from cl.make"
             )
         with policy_folders.place_of(folder, overwrite) as place:
             self.outcome._replace(origin={"code": self.named}).write(place)
@@ -180,7 +181,9 @@ def adapt(
         teacher = arguments.teacher("teacher", teacher, space)
         user_code.answers_in("teacher", teacher, env)
     elif file is None and rows is None:
-        raise UserError("labels are asked of a teacher: give one, for instance teacher_of(world), or labels")
+        raise UserError(
+            "teacher is None: give one, for instance teacher=cl.teacher_of(world), or labels as arrays or a file"
+        )
     subject = Subject(source, BaseLanes(source.default_policy), own, teacher=teacher, rows=rows, changes=changes)
     outcome = study.run(subject, request, note=partial(warnings.warn, stacklevel=5))
     if outcome.found.failed.any():

@@ -113,7 +113,7 @@ def path(name: str, value: Any) -> Path:
         Path(given).exists()
     except (OSError, UnicodeError) as error:
         why = getattr(error, "strerror", None) or "its name is not UTF-8"
-        raise UserError(f"{name} can be no path ({why}): give another") from error
+        raise UserError(f"{name} cannot be a path ({why}): give another path") from error
     return Path(given)
 
 

@@ -89,8 +89,8 @@ def correct(
     """
     if policy is None:
         raise UserError(
-            "policy is None: give the policy whose actions the labels are about; of the answers alone, without a base, "
-            "cl.fit_feedback makes a model"
+            "policy is None: give the policy whose actions the labels are about; without a base policy, "
+            "cl.fit_feedback fits a model to the answers"
         )
     policy = (
         load_policy(Path(policy))
@@ -152,7 +152,7 @@ def agreement(
     if space is None and isinstance(policy, CallablePolicy) and not isinstance(labels, str | os.PathLike):
         space = policy.actions
     if space is None and not isinstance(labels, str | os.PathLike):
-        raise UserError("space is not known: give the space of the actions, or a label file")
+        raise UserError("space is None, and arrays of labels name none: give space=, or a label file")
     found = _given(labels, space, "", None, None)
     strength = arguments.optional(arguments.amount, "eps", eps, found.space) or found.eps
     if strength is None:
@@ -211,7 +211,7 @@ def labels_from_file(path: Path) -> GivenLabels:
         try:
             config = configuration.from_json(LogsConfig, values)
         except (TypeError, UserError) as error:
-            raise UserError(f"{path} does not say of which situations its labels are: write it anew") from error
+            raise UserError(f"{path} does not name the situations of its labels: write the file again") from error
     return GivenLabels(rows, file.space, file.eps, config)
 
 
@@ -240,7 +240,9 @@ def world_of(found: GivenLabels, before: LogsConfig | None = None) -> World:
     plain = {"path": "", "digest": "", "order": "recorded", "rows": len(found.rows.obs)}
     config = dataclasses.replace(config, **plain, **values)
     if logs.space_of(config).to_json() != found.space.to_json():
-        raise UserError(f"the space {found.space.name!r} is none that a recording can have: give a box with plain cues")
+        raise UserError(
+            f"the space {found.space.name!r} is not one that a recording can have: give a box with plain cues"
+        )
     filled = lambda config, split: logs.filled(config, found.rows.obs, found.rows.action)  # noqa: E731
     return World(logs.configured(config, dataclasses.replace(logs.BODY, environment=filled)), config)
 

@@ -72,7 +72,7 @@ def _world_of(policy: Any, world: Any) -> World:
     """Return where a policy acts. Raises UserError if it is not known."""
     world = getattr(policy, "world", None) if world is None else world
     if world is None:
-        raise UserError("world is not given, and this policy was corrected in none: give one, as cl.make gives it")
+        raise UserError("world is None, and this policy names none: give world=cl.make(...)")
     return a_world("world", world)
 
 

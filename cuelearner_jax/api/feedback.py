@@ -100,7 +100,7 @@ def fit_feedback(
         labels = labels_of(jax.tree.map(lambda leaf: np.asarray(leaf)[own], file.labels))
     rows = rows_of(labels)
     if len(rows.obs) < 2:
-        raise UserError(f"{len(rows.obs)} labels teach nothing: give more")
+        raise UserError(f"{len(rows.obs)} labels are too few to fit a model: give more labels")
     spaces = Spaces(rows.obs.shape[1], space)
     external_labels.check(rows, spaces, RELATIVE)
     sizes, scalars = settings(space, sizes, scalars, eps_deg)
@@ -193,7 +193,10 @@ def refine(policy: Any, model: FeedbackModel, bound_deg: float | None = None) ->
     labels = _checked_model(model).labels
     width, seen = labels.obs.shape[1], entries_of(policy)
     if seen not in (0, width):
-        raise UserError(f"model is of observations with {width} entries, the policy's have {seen}: give one of its own")
+        raise UserError(
+            f"model takes observations with {width} entries, the policy's have {seen}: give a model "
+            "fitted for this policy"
+        )
     reach = max(by_model.reach(space, base, labels.obs, labels.action), model.scalars.eps_deg)
     if bound_deg is not None and bound_deg > reach * 1.05 and bound_deg > model.scalars.eps_deg:
         warnings.warn(
@@ -229,7 +232,7 @@ def label_path(labels: Any) -> Path:
     """Return the path of a label file. Raises UserError if no file lies there."""
     path = arguments.path("labels", labels)
     if not path.exists():
-        raise UserError(f"labels: there is no label file at {path}: give one that a run or a person wrote, or arrays")
+        raise UserError(f"labels: there is no label file at {path}: give the path of a label file, or arrays")
     return path
 
 

@@ -110,7 +110,10 @@ def as_policy_in(given: Any, env: Any) -> Policy:
     policy, seen = as_policy(given), entries_of(given)
     own = sum(quantity.size for quantity in getattr(env, "observation", ()))
     if seen and own and seen != own:
-        raise UserError(f"the policy's observations have {seen} entries, this world's {own}: keep its structure")
+        raise UserError(
+            f"the policy's observations have {seen} entries, this world's {own}: give a world with "
+            f"observations of {seen} entries"
+        )
     policy = in_space(policy, actions_of(env))
     user_code.acts_in("policy", policy, env)
     return policy

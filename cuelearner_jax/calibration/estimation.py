@@ -259,7 +259,7 @@ class Calibration:
     def result(self) -> Result:
         """Return the result of all answers. Raises UserError for too few answers."""
         if self.asked < HELD_OUT:
-            raise UserError(f"{self.asked} answers tell too little: give at least {HELD_OUT}")
+            raise UserError(f"{self.asked} answers are too few for calibration: give at least {HELD_OUT}")
         self._settle()
         best, none = self.fits[self.chosen], self.fits[()]
         before, after = none.predict_held_out(), best.predict_held_out()

@@ -106,7 +106,7 @@ def _parts(family: Family, theta: Float[Array, " unknowns"]) -> list[tuple[Disto
 def check_family(family: Sequence[Distortion]) -> Family:
     """Return a family as a tuple. Raises UserError for no distortion, one without unknowns, or two of one name."""
     if not family:
-        raise UserError("there is nothing that could have changed: give at least one distortion")
+        raise UserError("changes is empty: give at least one distortion")
     names = [unknown.name for unknown in unknowns_of(tuple(family))]
     for distortion in family:
         if not distortion.unknowns:
@@ -115,7 +115,7 @@ def check_family(family: Sequence[Distortion]) -> Family:
             raise UserError(f"distortion {distortion.name!r} changes nothing: give `sees`, `acts` or `plans`")
     for taken in (names, [distortion.name for distortion in family]):
         if twice := sorted({name for name in taken if taken.count(name) > 1}):
-            raise UserError(f"{twice[0]!r} stands twice in a family: give each name once")
+            raise UserError(f"{twice[0]!r} is the name of two distortions or unknowns: give each name once")
     return tuple(family)
 
 
@@ -233,10 +233,13 @@ def _turned_places(places: list[tuple[Quantity, int]]) -> list[Distortion]:
     groups: dict[tuple[float, float], list[tuple[Quantity, int]]] = {}
     for quantity, start in places:
         if quantity.follows and quantity.follows not in starts:
-            raise UserError(f"slice {quantity.name!r} follows {quantity.follows!r}, which is no slice: name one")
+            raise UserError(
+                f"slice {quantity.name!r} follows {quantity.follows!r}, which is not a slice of the "
+                "observation: name one"
+            )
         if quantity.origin is not None:
             if quantity.unit != "m" or quantity.size < 2:
-                raise UserError(f"slice {quantity.name!r} has an origin and is no place: give x and y in metres")
+                raise UserError(f"slice {quantity.name!r} has an origin but is not a place: give x and y in metres")
             groups.setdefault(quantity.origin, []).append((quantity, start))
     found = []
     for origin, slices in groups.items():

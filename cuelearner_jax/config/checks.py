@@ -22,7 +22,9 @@ def check_guide(sizes: GuideSizes, scalars: GuideScalars) -> None:
 def _check_choice(sizes: GuideSizes) -> None:
     """Check the options that choose among several situations for a question."""
     if sizes.ask_all and sizes.candidates == 1:
-        raise UserError("sizes.ask_all asks about every candidate: give sizes.candidates above 1 too, or leave it out")
+        raise UserError(
+            "sizes.ask_all asks about every candidate: give sizes.candidates above 1 too, or leave out sizes.ask_all"
+        )
     if sizes.ask_all:
         check_multiple(sizes.labels_per_round, sizes.candidates, "sizes.labels_per_round", "sizes.candidates")
     elif sizes.candidates > 1 and sizes.ensemble == 1:

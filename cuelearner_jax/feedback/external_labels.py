@@ -27,7 +27,7 @@ def check_file(file: LabelFile, spaces: Spaces | None, form: AnswerForm | None, 
         UserError: as `check`, or the file does not say how strong its answers are.
     """
     if form is not None and form.by_eps and file.eps is None:
-        raise UserError(f"{named} does not say how strong its {form.name} answers are: write it anew")
+        raise UserError(f"{named} does not name the strength (eps) of its {form.name} answers: write the file again")
     check(file.labels, spaces or Spaces(file.labels.obs.shape[1], file.space), form, named)
 
 
@@ -49,7 +49,7 @@ def check(labels: Label, spaces: Spaces, form: AnswerForm | None, named: str = "
     widths = {"observations": spaces.obs_size, "actions": spaces.actions.size, "answers": width}
     for name, values in rows.items():
         if values.ndim != 2 or values.shape[1] != widths[name]:
-            raise UserError(f"{named}: {name} have the shape {values.shape}, (labels, {widths[name]}) is needed")
+            raise UserError(f"{named}: {name} have the shape {values.shape}: give (labels, {widths[name]})")
         _refuse(~np.isfinite(values), f"{named}: {name} hold numbers that are not finite", "leave these labels out")
     for name in ("actions", "answers") if form is not None and form.is_action else ("actions",):
         action = np.asarray(rows[name])

@@ -105,7 +105,7 @@ class Guide:
         if self.kind.needs_cues and not self.spaces.actions.cues:
             told = "measures" if self.kind.by_cues else "asks"
             raise UserError(
-                f"guidance {self.name!r} {told} which way to change an action, and the {self.spaces.actions.name} have "
+                f"guidance {self.name!r} {told} which way to change an action, but the {self.spaces.actions.name} have "
                 "no order: give them one (`Choices(count, order)`), or guidance demonstration or scalar"
             )
 

@@ -151,7 +151,7 @@ class _Onnx(Foreign):
             self._session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
         except Exception as error:  # onnxruntime's own kinds
             why = " ".join(str(error).split())[:160]
-            raise UserError(f"{path} cannot be run by onnxruntime ({why}): export the policy anew") from error
+            raise UserError(f"{path} cannot be run by onnxruntime ({why}): export the policy again") from error
         inputs, outputs = self._session.get_inputs(), self._session.get_outputs()
         if len(inputs) != 1 or inputs[0].type not in REAL or len(inputs[0].shape) != 2:
             told = ", ".join(f"{one.name} {one.type} {one.shape}" for one in inputs)
@@ -180,11 +180,13 @@ class _Onnx(Foreign):
         if fixed in (0, len(rows)):
             return self._run(rows)
         if fixed != 1:
-            raise UserError(f"{self.reference} takes batches of {fixed} alone: export it with batches of any size")
+            raise UserError(f"{self.reference} takes batches of {fixed} only: export it with batches of any size")
         return np.concatenate([self._run(rows[number : number + 1]) for number in range(len(rows))])
 
     def _run(self, rows: np.ndarray) -> np.ndarray:
         found = self._session.run([self._output], {self._name: rows})[0]
         if not isinstance(found, np.ndarray):
-            raise UserError(f"{self.reference} gives {format_value(found)} in place of actions: export the policy anew")
+            raise UserError(
+                f"{self.reference} gives {format_value(found)} in place of actions: export the policy again"
+            )
         return found

@@ -152,7 +152,7 @@ def policy_of(given: Any) -> Any:
         if any(leaf is given for leaf in jax.tree.leaves(given)):
             kind = type(given).__name__
             raise UserError(
-                f"a {kind} has `act` but is no pytree: make it a flax.struct.PyTreeNode, or give a function"
+                f"a {kind} has `act` but is not a pytree: make it a flax.struct.PyTreeNode, or give a function"
             )
         return given
     if isinstance(given, jax.stages.Wrapped):

@@ -39,5 +39,5 @@ def from_json(about: Any) -> Space:
     except (KeyError, TypeError, AttributeError, UserError) as error:
         raise ValueError("the description of its space of actions makes no sense, or is of unknown code") from error
     if not same:
-        raise ValueError("its space of actions is none that this program knows")
+        raise ValueError("its space of actions is unknown to this program")
     return space

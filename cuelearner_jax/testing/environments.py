@@ -266,12 +266,12 @@ def _check_features(laws: Laws, together: Any, each: Any) -> None:
     """Check that features of many actions are those of each, and that `own` does not depend on the action."""
     laws.hold(
         len(together) == len(each) == 2,
-        "`features` are no `environment.Features`: give what hangs on no action, and the rest",
+        "`features` are no `environment.Features`: give the part that does not depend on the action, and the rest",
     )
     (own, turned), (owns, singly) = together, each
     laws.hold(
         np.ndim(own) == 1 and laws.same(np.broadcast_to(own, np.shape(owns)), owns),
-        "`features` hold in `own` what hangs on the action: move it to `turned`",
+        "`features` hold values in `own` that depend on the action: move them to `turned`",
     )
     fits = np.shape(turned) == np.shape(singly) and np.ndim(turned) == 2
     laws.hold(

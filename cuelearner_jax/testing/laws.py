@@ -54,7 +54,7 @@ class Laws:
         self.hold(np.isfinite(actions).all(), f"{called} is not finite everywhere: give an action in every situation")
         self.hold(
             self.same(space.retract(jnp.asarray(actions)), actions),
-            f"{called} is no action of the space: pass it through the space's `retract` (directions: unit length)",
+            f"{called} is not an action of the space: pass it through the space's `retract` (directions: unit length)",
         )
 
 
@@ -81,7 +81,7 @@ def pytree(laws: Laws, subject: Any, called: str) -> None:
     leaves, tree = jax.tree.flatten(subject)
     laws.hold(
         not (len(leaves) == 1 and leaves[0] is subject),
-        f"{called} is no pytree: derive its class from flax.struct.PyTreeNode",
+        f"{called} is not a pytree: derive its class from flax.struct.PyTreeNode",
     )
     for path, leaf in jax.tree_util.tree_leaves_with_path(subject):
         laws.hold(
