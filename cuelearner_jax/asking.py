@@ -209,11 +209,11 @@ def ask(
     """Ask a simulated teacher question number `position`, record the answer, and step on.
 
     Args:
-        of: who asks about what.
-        teacher: who answers.
-        guide: where it stands.
-        lane_key: of all questions.
-        position: of this one, from 0.
+        of: the guide, environment and base policy of the questions.
+        teacher: the teacher who answers.
+        guide: the current guide state.
+        lane_key: random key of all questions.
+        position: number of this question, from 0.
         every: ask about every candidate, as many questions at once, the first of them number `position`.
 
     Raises:

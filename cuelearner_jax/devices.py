@@ -21,7 +21,7 @@ class Portions(NamedTuple):
     """Sizes of one computation: what a core's cache holds, or what keeps an accelerator busy within its memory."""
 
     actions: int  # state-action pairs of one agent in one forward pass of an argmax
-    agents: int  # evaluated side by side
+    agents: int  # agents evaluated side by side
     states: int  # situations in one call of a teacher
 
 
@@ -54,8 +54,8 @@ def over_lanes(mesh: Mesh, function: Callable[..., Any], takes: tuple[Any, ...],
     """Return `function` mapped over each device's lanes, in one program without communication between devices.
 
     Args:
-        mesh: from `lane_mesh`.
-        function: of a block of lanes (leading axis) and of what they share.
+        mesh: a mesh from `lane_mesh`.
+        function: takes a block of lanes (leading axis) and the arrays that they share.
         takes: `SHARED` or `BY_LANE` for each argument.
         gives: `SHARED` or `BY_LANE` for each result.
     """
@@ -90,7 +90,7 @@ def each_lane(function: Callable[..., Any]) -> Callable[..., Any]:
     one: no bit of a lane's result depends on the number of lanes, and a core is not slower.
 
     Args:
-        function: of one lane's trees of arrays.
+        function: takes one lane's trees of arrays.
 
     Returns:
         The function of blocks: every leaf with a leading axis of lanes.
@@ -110,10 +110,10 @@ def each_lane_in_place(function: Callable[[Any], tuple[Any, Any, Any]]) -> Calla
     """Like `each_lane`, updating the block in place.
 
     Args:
-        function: of a lane -> (the lane after it, what all lanes have in common, what each has).
+        function: lane -> (updated lane, results common to all lanes, results of each lane).
 
     Returns:
-        The function of a block -> (the block after it, what all lanes have in common, what each has).
+        A function: block -> (updated block, results common to all lanes, results of each lane).
     """
 
     def mapped(block: Any) -> tuple[Any, Any, Any]:

@@ -23,7 +23,7 @@ class Quantity(NamedTuple):
     """One slice of an observation."""
 
     name: str
-    size: int  # entries
+    size: int  # number of entries
     unit: str  # unit of an entry, as "m", "rad" or "1" for a pure number
     about: str = ""  # meaning, source and order of the entries, in a few words
     # "beams" at equal angles, counterclockwise, or "directions", unit vectors: what a sensor turns with; "own": what a

@@ -95,8 +95,8 @@ def user_code_error(named: str, error: Exception) -> UserError:
     """Return the UserError for an exception of the user's own code: the code's name and the exception.
 
     Args:
-        named: what the code is, for instance "policy my_policy".
-        error: what it raised.
+        named: name of the code, for instance "policy my_policy".
+        error: the exception that the code raised.
     """
     try:
         words = " ".join(str(error).split())[:200]

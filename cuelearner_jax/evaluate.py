@@ -198,8 +198,8 @@ def rollout_lanes(
     Args:
         env: the environment.
         policy: leaves that are `BY_LANE` in its `axes` have a leading axis of lanes.
-        key: of the episodes.
-        num_envs, steps: as `rollout` has them.
+        key: random key of the episodes.
+        num_envs, steps: as for `rollout`.
         tell: the progress callback.
         mesh: devices that share the lanes, in one stretch without progress.
 

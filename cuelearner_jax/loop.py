@@ -1,11 +1,11 @@
 """The training loop of every guidance: policy -> guidance.act -> environment -> replay -> update.
 
-`Lane` has its three parts as pure functions: `act` chooses, `absorb` stores what the actions led to, `learn` takes the
-gradient steps. `iterate` is the three with an environment of JAX between the first two; any other can be stepped there.
+`Lane` has three pure functions: `act` chooses actions, `absorb` stores their results, `learn` makes the gradient steps.
+`iterate` runs all three with a JAX environment between the first two; any other environment can be stepped there.
 
-Written for one lane (one seed with one label budget); lanes are put side by side once, in `make_program`. Random
-numbers come from the lane's own key folded with the shared counters, so a lane's result does not depend on its
-neighbours: not by a bit on a CPU, on an accelerator up to the order in which sums of matrix products are taken.
+The code is written for one lane (one seed with one label budget); `make_program` maps it over lanes. Random numbers
+come from the lane's own key folded with the shared counters, so a lane's result does not depend on the other lanes. On
+a CPU the result is the same bit by bit, on an accelerator up to the order in which matrix products are summed.
 """
 
 from __future__ import annotations
@@ -123,7 +123,7 @@ def make_program(
     Another run of the same sizes, guidance and shapes in this process is given the same program, compiled already.
 
     Args:
-        config: what shapes the program is taken from here; its `settings` are passed at each call.
+        config: the configuration that shapes the program; its `settings` are passed at each call.
         env: gives shapes; any environment of the same structure may be passed at the calls.
         largest_budget: labels that the largest lane may use.
         mesh: devices that share the lanes, whose number they must divide into (default: the first device alone).

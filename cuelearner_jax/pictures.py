@@ -49,7 +49,7 @@ def clip(frames: Sequence[Source], period: float, words: str = "") -> Reel:
     Args:
         frames: pictures as `sketch` takes them, all of one size.
         period: between two of them [s].
-        words: how the film ends.
+        words: words for the film's end.
 
     Raises:
         UserError: there is no frame, one is no picture, their sizes differ, or the period is not positive.

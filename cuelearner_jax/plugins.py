@@ -20,8 +20,8 @@ def load(reference: str, kind: type[T], called: str) -> T:
 
     Args:
         reference: `package.module:NAME`.
-        kind: what it must be an instance of.
-        called: what a message calls such an object, for instance "a task".
+        kind: class that the object must be an instance of.
+        called: name of such an object in messages, for instance "a task".
 
     Raises:
         UserError: no such module or name, the module does not import, or the object is something else.

@@ -131,7 +131,7 @@ def world_of(folder: Path, task: str, config: Any, apart: Collection[str]) -> An
     """Return the configuration of the world that a teacher learned in.
 
     Args:
-        folder: of the teacher.
+        folder: folder of the teacher.
         task: name of the task in which it is to be asked.
         config: the configuration in which it is to be asked.
         apart: fields in which the two may differ, because they change nothing or the task handles them.

@@ -1,9 +1,9 @@
 """Errors of the user's own policies, teachers and environments: exceptions, and invalid actions.
 
-Such code runs inside compiled programs, from which no exception finds its way out in one line. A function that is
-called back on the host leaves its exception here and returns NaN. NaN spreads, and code that reads a program's results
-on the host asks here first. What raises while JAX traces is told apart by the frames of its traceback. Threads may call
-policies at the same time: each is then told of its own policy alone.
+User code runs inside compiled programs, whose exceptions are long and unclear. A function that is called back on the
+host leaves its exception here and returns NaN. NaN spreads, and code that reads a program's results on the host asks
+here first. Exceptions while JAX traces are recognised by the frames of their traceback. Threads may call policies at
+the same time: each thread then gets only its own policy's error.
 """
 
 from __future__ import annotations

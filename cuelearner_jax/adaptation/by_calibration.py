@@ -103,12 +103,12 @@ def adapt(
     """Ask for answers, estimate the changes and judge the corrected policy in every lane.
 
     Args:
-        of: what lanes share.
-        lanes: what is adapted.
-        how: policies are judged; by labels: by calibration's own rule, held-out answers.
-        teacher: who answers; None where labels are given.
+        of: settings that all lanes share.
+        lanes: the lanes to adapt.
+        how: settings of the judgement; "labels" means calibration's own rule on held-out answers.
+        teacher: the teacher who answers; None where labels are given.
         labels: rows (lanes, slots, ...) in place of questions.
-        watch: by what is being done, who is told how far it is.
+        watch: takes the name of a piece of work, returns its progress callback.
 
     Raises:
         UserError: too few answers, or policies cannot be judged as asked.

@@ -75,13 +75,13 @@ def adapt(
     """Ask for labels, fit a model and judge the corrected policy in every lane.
 
     Args:
-        of: what lanes share: the kind of guidance, the world, the base policies.
-        lanes: what is adapted.
-        how: policies are judged.
-        teacher: who answers in rounds; None where labels are given.
+        of: settings that all lanes share: the kind of guidance, the world, the base policies.
+        lanes: the lanes to adapt.
+        how: settings of the judgement.
+        teacher: the teacher who answers in rounds; None where labels are given.
         labels: rows (lanes, slots, ...) in place of questions, fitted at once.
         mesh: devices that share the lanes (default: all of this process's).
-        watch: by what is being done, who is told how far it is.
+        watch: takes the name of a piece of work, returns its progress callback.
 
     Raises:
         UserError: policies cannot be judged as asked.

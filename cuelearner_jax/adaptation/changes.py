@@ -80,8 +80,8 @@ def rebuilt(layer: dict[str, Any], env: Any, changes: Any = None) -> Family:
     """Return the distortions of a policy that was read from a file.
 
     Args:
-        layer: what the file says of the policy.
-        env: where it acts.
+        layer: the policy's plain values from the file.
+        env: the world that the policy acts in.
         changes: code of the user's own distortions, as `family_of` takes it; None: none was named.
 
     Raises:

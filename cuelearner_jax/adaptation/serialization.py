@@ -1,8 +1,8 @@
 """Convert policies to plain values and arrays, and back.
 
-A policy's values are those of its `describe()`. Kept are an `agent` with its `params`; `guided` with its `model` and,
-where there is one, its `bound`; `calibrated` with the `theta` of its unknowns; `uniform`; `heuristic`; and the name of
-`code`, as package.module:NAME.
+A policy's values are those of its `describe()`. The stored kinds are `agent` with its `params`; `guided` with its
+`model` and, where there is one, its `bound`; `calibrated` with the `theta` of its unknowns; `uniform`; `heuristic`; and
+the name of `code`, as package.module:NAME.
 
 Code is never loaded because a file names it: the caller who opens the policy names the code again.
 """
@@ -132,7 +132,7 @@ def from_json(values: dict[str, Any], arrays: Any, env: Any, code: Any = None, c
     """Return the policy of plain values and arrays, to act in a world.
 
     Args:
-        values, arrays: of the policy.
+        values, arrays: the policy's plain values and arrays.
         env: the world.
         code: the policy that stands for code in it; None: none was given.
         changes: the user's own distortions in it, as `changes.family_of` takes them; None: none were given.

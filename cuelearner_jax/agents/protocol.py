@@ -81,13 +81,13 @@ class AgentFunctions(Protocol):
         """Make one gradient step.
 
         Args:
-            env: see `act`; its `recall` has made the memory's observations.
+            env: as for `act`; its `recall` rebuilds the memory's observations.
             options: those that the agent was made from, their floats traced.
-            scalars: what all parts share, such as the discount factor.
+            scalars: settings that all parts share, such as the discount factor.
             count: gradient steps, this one included.
-            params, rest: as `init` gives them.
+            params, rest: as `init` returns them.
             memory: the steps to learn from.
-            key: of this step.
+            key: random key of this step.
 
         Returns:
             Parameters; the rest; the loss; the norm of the gradient.

@@ -1,8 +1,8 @@
 """The inputs of networks: observation and action as they are, or the observation as it looks from the action.
 
-Seen from the action (`frame` "action"), situations that differ by a turn look alike, and what a network says of one
-holds for all of them: a way to equivariance by the input (Wang, Walters, Platt, "SO(2)-equivariant reinforcement
-learning", ICLR 2022; van der Pol et al., "MDP homomorphic networks", NeurIPS 2020).
+In the action's frame (`frame` "action"), situations that differ by a rotation have the same inputs, and a network's
+output for one holds for all of them. This is equivariance by the input (Wang, Walters, Platt, "SO(2)-equivariant
+reinforcement learning", ICLR 2022; van der Pol et al., "MDP homomorphic networks", NeurIPS 2020).
 """
 
 from __future__ import annotations

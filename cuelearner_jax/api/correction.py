@@ -79,10 +79,10 @@ def correct(
         guidance: how answers are used: "relative" fits a model, "calibration" estimates a constant change.
         cues: words for more and less of each entry of an action, "left,right;up,down" (default: "more,less").
         low, high: bounds of the actions, a number an entry (default: the range of the labels' actions).
-        space: instead of these three: the space of the actions, such as `cuelearner_jax.spaces.DIRECTIONS`.
-        changes: of guidance "calibration": what may have changed, as for `adapt`.
-        sizes, scalars: of the model and its fitting.
-        seed: of everything random.
+        space: the space of the actions, such as `cuelearner_jax.spaces.DIRECTIONS`, in place of cues, low and high.
+        changes: for guidance "calibration", the possible changes, as for `adapt`.
+        sizes, scalars: settings of the model and its fitting.
+        seed: seed of all random numbers.
 
     Raises:
         UserError: labels or settings that make no sense, or with which the fit diverges.
@@ -139,11 +139,11 @@ def agreement(
     """Return how many answers a policy agrees with, beside its base and "already right" always.
 
     Args:
-        policy: what `correct` takes or returns.
+        policy: any policy that `correct` takes or returns.
         labels: answers that the policy was not corrected by, as `correct` takes them.
         base: the policy as it was (default: what a corrected policy corrects).
         eps: strength of an answer (default: the file's, the corrected policy's, or 1/36 of the range).
-        space: of the actions (default: the file's, or that of the corrected policy).
+        space: space of the actions (default: the file's, or that of the corrected policy).
 
     Raises:
         UserError: labels that do not fit the policy, or no space.

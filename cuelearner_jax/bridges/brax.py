@@ -134,10 +134,10 @@ def to_brax(env: Environment) -> BraxView:
     Of directions in the plane n is 2, and only the direction counts. Of a box n is its size: -1 is each entry's lower
     bound, 1 its upper bound, and what lies beyond is brought back.
 
-    Episodes that our environment truncates arrive at brax's agents as truncated, under brax's own wrappers too; but
-    `AutoResetWrapper` begins every episode of a lane at the same cached first state, and brax's evaluator then calls
-    the length of a truncated episode infinite. `wrap_for_training` does neither:
-    `ppo.train(to_brax(env), wrap_env_fn=wrap_for_training, ...)`.
+    Episodes that our environment truncates arrive at brax's agents as truncated, under brax's own wrappers too. But
+    `AutoResetWrapper` begins every episode of a lane at the same cached first state, and brax's evaluator then reports
+    an infinite length for a truncated episode. `wrap_for_training` avoids both: `ppo.train(to_brax(env),
+    wrap_env_fn=wrap_for_training, ...)`.
 
     `metrics` are `Step.metrics` and, where an episode ends, `Step.outcome` (elsewhere 0), so that brax's sum over an
     episode is the outcome. A brax `randomization_fn` gets our environment and returns a batch of it with its axes.
@@ -161,7 +161,7 @@ def wrap_for_training(
     `brax.envs.training.wrap`.
 
     Args:
-        env: from `to_brax`.
+        env: an environment from `to_brax`.
         episode_length: episodes are truncated after this many steps, if not before by the environment itself.
         action_repeat: how often each action is executed.
         randomization_fn: our environment -> a batch of it and the axes to map over.

@@ -92,10 +92,10 @@ class Calibration:
 
     Args:
         policy: a policy, or any function of a batch of observations.
-        family: what may have changed; see `families.declared_distortions`.
-        space: of the actions.
+        family: the possible changes; see `families.declared_distortions`.
+        space: space of the actions.
         eps_deg: strength of an answer, in the space's unit.
-        seed: of everything random.
+        seed: seed of all random numbers.
 
     Raises:
         UserError: a family that makes no sense, or actions without cues.
@@ -323,12 +323,12 @@ def calibrate(
 
     Args:
         policy: a policy, or any function of a batch of observations.
-        family: what may have changed.
+        family: the possible changes.
         situations: gives states and observations (count, obs) that a policy meets.
         teacher: gives answers (n, cues), -1, 0, 1 or `UNSAID`; NaN where it did not answer.
         labels: number of questions.
-        key: of everything random.
-        space: of the actions.
+        key: key of all random numbers.
+        space: space of the actions.
         eps_deg: strength of an answer, in the space's unit.
 
     Raises:

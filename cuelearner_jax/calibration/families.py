@@ -1,8 +1,9 @@
 """Families of possible changes between a policy and its world, in named unknowns, and how each change is undone.
 
 A distortion says how observations or actions may have changed: balls are seen shifted, a lidar is mounted turned, every
-strike is turned. `sees` gives the observation as it was before the change, `acts` the action that leads there to what
-the policy meant. Several distortions together are a family; with all unknowns at zero a family changes nothing.
+strike is turned. `sees` returns the observation as it would be without the change. `acts` returns the action that,
+after the change, does what the policy meant. Several distortions together are a family; with all unknowns at zero a
+family changes nothing.
 """
 
 from __future__ import annotations

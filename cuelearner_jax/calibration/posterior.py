@@ -113,10 +113,10 @@ class Fit:
     """Weighted samples of the posterior of a family's unknowns.
 
     Args:
-        family: what may have changed; empty: nothing.
-        scales: of its unknowns, in their units.
+        family: the possible changes; empty: no change.
+        scales: prior scales of the unknowns, in their units.
         responses: the policy.
-        seed: of the samples.
+        seed: seed of the samples.
     """
 
     def __init__(self, family: Family, scales: dict[str, float], responses: Responses, seed: int) -> None:

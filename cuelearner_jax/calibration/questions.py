@@ -69,7 +69,7 @@ def choose(
     """Return `count` questions: from each share of the situations the most informative one.
 
     Args:
-        draws: what may have changed.
+        draws: draws of the unknowns.
         response: the policy's responses in the situations to choose from, at least `count`.
         count: number of questions.
         random: source of the simulated answers.

@@ -1,8 +1,9 @@
 """A policy's response to changed observations: asked at few nodes, interpolated between them by kriging.
 
-A policy is expensive and jumps, and every family asks about the same changes of what is seen. So it is asked at few
-nodes in the unknowns of all families. Between these a Gaussian process with a linear trend and a nugget (Rasmussen and
-Williams, 2006, chapter 2) gives the mean and how sure that is. Rows share length and nugget; each has its own size.
+A policy is expensive to call, its actions jump, and every family needs it for the same changes of the observation. So
+the policy is called at few nodes in the unknowns of all families. Between the nodes a Gaussian process with a linear
+trend and a nugget (Rasmussen and Williams, 2006, chapter 2) gives mean and variance. Rows share length and nugget; each
+row has its own size.
 """
 
 from __future__ import annotations
@@ -57,7 +58,7 @@ class Responses:
     Args:
         meaning: the policy.
         asks: all distortions that change what is seen, or what an action leads to.
-        scales: of their unknowns.
+        scales: prior scales of their unknowns.
         eps: strength of an answer, as `space.log` counts.
     """
 

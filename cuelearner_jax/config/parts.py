@@ -82,7 +82,7 @@ def check_types(group: Any, prefix: str, **changes: Any) -> dict[str, Any]:
 
     Args:
         group: a configuration, or its class.
-        prefix: what messages call it.
+        prefix: name of the group in messages.
         changes: the values by field (default: those that the configuration holds).
 
     Raises:

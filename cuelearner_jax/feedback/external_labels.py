@@ -19,9 +19,9 @@ def check_file(file: LabelFile, spaces: Spaces | None, form: AnswerForm | None, 
 
     Args:
         file: the labels.
-        spaces: of the environment; None: observations of any size, the file's own space of actions.
-        form: of the answers; None: it is not known, and answers are only finite.
-        named: what a message calls the file.
+        spaces: the environment's spaces; None: observations of any size, the file's own space of actions.
+        form: form of the answers; None: unknown, then answers are only checked to be finite.
+        named: name of the file in messages.
 
     Raises:
         UserError: as `check`, or the file does not say how strong its answers are.
@@ -36,9 +36,9 @@ def check(labels: Label, spaces: Spaces, form: AnswerForm | None, named: str = "
 
     Args:
         labels: rows (labels, ...) of arrays.
-        spaces: of the environment.
-        form: of their answers; None: it is not known, and they are only finite.
-        named: what a message calls them.
+        spaces: the environment's spaces.
+        form: form of the answers; None: unknown, then answers are only checked to be finite.
+        named: name of the labels in messages.
 
     Raises:
         UserError: a wrong shape, a number that is not finite, an action outside the space, or an answer that is not

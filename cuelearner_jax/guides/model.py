@@ -54,9 +54,9 @@ def guide_model(sizes: GuideSizes, spaces: Spaces, outputs: int | None = None, b
     """Return the networks of these sizes.
 
     Args:
-        sizes: of the networks.
+        sizes: sizes of the networks.
         spaces: the environment's.
-        outputs: how many numbers they predict, such as the value of an action; None: a vector to be added to the
+        outputs: number of outputs, such as the value of an action; None: a vector to be added to the
             action, whichever frame it is seen in.
         beside: numbers that they see beside observation and action: actions then have so many entries more, at the end.
 
@@ -93,7 +93,7 @@ def for_each(members: int, function: Callable[..., Any], key: PRNGKeyArray, *par
     Args:
         members: their number.
         function: (key, *parameters of one member) -> a tree.
-        key: of all of them; of one member, its own.
+        key: the members' common key; a single member uses it directly.
         parameters: the members', with the leading axis that several have.
     """
     if members == 1:
@@ -112,8 +112,8 @@ def fitted_members(
     Args:
         members: their number.
         fit: the model of one member from a key and its `init`.
-        key: of all of them.
-        init: of the ensemble. A member is fitted as an ensemble of one, whose mean is its own prediction.
+        key: the members' common key.
+        init: the ensemble's initialiser. A member is fitted as an ensemble of one, whose mean is its own prediction.
     """
     if members == 1:
         return fit(key, init)

@@ -98,9 +98,9 @@ def make(name: str, sizes: GuideSizes, env: Any, options: Any = None) -> Guide:
     """Return a kind's guide for an environment (shapes in place of arrays will do).
 
     Args:
-        name: of the kind.
-        sizes: of its model.
-        env: whose spaces are looked at.
+        name: name of the kind.
+        sizes: sizes of its model.
+        env: the environment, of which only the spaces are used.
         options: the kind's own, a `Kind.config`; None: its defaults.
 
     Raises:

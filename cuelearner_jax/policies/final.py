@@ -78,9 +78,9 @@ def final_policy(config: RunConfig, guide: Guide, view: Any, step: int, known: M
     """Return the lanes' policies as they stand after so many steps.
 
     Args:
-        config: of the run.
-        guide: of their kind of guidance.
-        view: of where the policy acts.
+        config: the run's configuration.
+        guide: the guide of the lanes' kind of guidance.
+        view: view of the world that the policy acts in.
         step: environment steps of each lane.
         known: the lanes' `acting_state` with a leading axis of lanes; one arm may serve all lanes.
     """

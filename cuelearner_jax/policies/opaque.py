@@ -137,7 +137,7 @@ def policy_of(given: Any) -> Any:
             policy of another library, see `foreign.function_of`.
 
     Raises:
-        UserError: it is none of these, or a policy that is no pytree.
+        UserError: the object is none of these, or a policy that is not a pytree.
     """
     if (function := foreign.function_of(given)) is not None:
         return Opaque(function, on_host=True)

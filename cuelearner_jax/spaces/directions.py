@@ -178,7 +178,7 @@ def nearest_direction(
     Args:
         values: value of each direction.
         spread: standard deviation of the aim [rad], over which values are averaged; 0: perfect aim.
-        share: of the best expected value.
+        share: least share of the best expected value.
         action: the action from which the nearest one is searched.
     """
     expected = expected_values(values, spread)

@@ -22,8 +22,8 @@ def cues_from(words: Any, names: Sequence[str] = (), unit: str = SHARE) -> tuple
     Args:
         words: "left,right;up,down", or pairs of words; the first of a pair asks for more of an entry, the second for
             less.
-        names: of the cues; none given: "left or right" and so on.
-        unit: of a change.
+        names: names of the cues (default: "left or right" and so on).
+        unit: unit of a change.
 
     Raises:
         UserError: the words are no pairs, or not as many as there are names.

@@ -36,8 +36,8 @@ def check_environment(env: Any, steps: int = 64, key: PRNGKeyArray | None = None
 
     Args:
         env: the environment to check; it should be small, since it is compiled once with a batch of a few steps.
-        steps: of the roll-out; enough for an episode to end.
-        key: of the roll-out (default: always the same).
+        steps: steps of the roll-out; enough for an episode to end.
+        key: random key of the roll-out (default: always the same).
         tolerance: relative and absolute, of numbers that are computed in two ways (a recalled observation, a batch).
 
     Raises:

@@ -39,7 +39,7 @@ def check_guidance(kind: Kind, env: Environment, sizes: GuideSizes = SMALL, tole
     Args:
         kind: the kind.
         env: an environment that it can be had in.
-        sizes: of its model, small.
+        sizes: small sizes of its model.
         tolerance: relative and absolute, of actions.
 
     Raises:

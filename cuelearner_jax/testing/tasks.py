@@ -31,9 +31,9 @@ def check_task(
     Args:
         task: the task.
         small: a configuration of it that compiles quickly: its environment is checked, its teacher asked.
-        steps: of that environment's roll-out.
+        steps: steps of that environment's roll-out.
         pictures: an empty folder, for pictures of the small world (default: none are drawn).
-        tolerance: as `check_environment` has it.
+        tolerance: as for `check_environment`.
 
     Raises:
         AssertionError: the first law that is broken.

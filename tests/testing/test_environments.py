@@ -196,11 +196,11 @@ BROKEN = {
     "neighbours": (Looking(), "steps under vmap differ"),
     "no action": (Astray(), "what `heuristic` gives is not an action of the space"),
     "features": (Narrow(), "`features` of 8 actions"),
-    "features of an action": (Confused(), "`features` hold in `own` what hangs on the action"),
+    "features of an action": (Confused(), "`features` hold values in `own` that depend on the action"),
     "aims": (Unequal(), "give a row of each, and a bool, for every aim"),
     "rule": (Unruly(), "give a finite one for each"),
     "possible aims": (Pointless(), "no aim was possible in any step"),
-    "sample": (Loose(), "what its actions' `sample` draws is no action of the space"),
+    "sample": (Loose(), "what its actions' `sample` draws is not an action of the space"),
     "shape of samples": (Short(), "`sample` gives shape (3,) for 3 actions of 2"),
     "both ends": (altered(truncated=lambda step, _: step.terminated), "is terminated and truncated"),
     "an integer": (

@@ -26,13 +26,13 @@ PLACE_BYTES = 8
 class Order(NamedTuple):
     """An instruction to one instance."""
 
-    slot: int  # which instance
-    seed: int  # of the episode
-    place: bytes  # where it is to stand before the action; empty: the episode begins
+    slot: int  # number of the instance
+    seed: int  # seed of the episode
+    place: bytes  # place before the action; empty: the episode begins
     action: np.ndarray | None  # (action,); None: begin the episode
-    next_seed: int = 0  # of the next episode, where this one ends
+    next_seed: int = 0  # seed of the next episode, where this one ends
     replay: np.ndarray | None = None  # (steps, action): go there first; None: it stands there
-    steps: int = 0  # taken so far in the episode
+    steps: int = 0  # number of steps so far in the episode
 
 
 class Went(NamedTuple):
@@ -45,14 +45,14 @@ class Went(NamedTuple):
     truncated: bool
     success: float
     total: float  # the rewards of the episode so far
-    place: bytes  # where the instance stands now
+    place: bytes  # the instance's place now
 
 
 class Shot(NamedTuple):
     """A request for pictures of an episode."""
 
     slot: int
-    seed: int  # of the episode
+    seed: int  # seed of the episode
     actions: np.ndarray  # (steps, action) from its beginning
     first: int  # number of the first step that is filmed
 
