@@ -176,7 +176,7 @@ def fit(
     lane_key: PRNGKeyArray,
     times: Int[Array, ""] | None = None,
 ) -> GuideState:
-    """The guide with a model of its labels. `times`: fits before this one, where it is one of several."""
+    """Return the guide with a model of its labels. `times`: number of fits before this one."""
     key = jax.random.fold_in(lane_key, Stream.FIT)
     key = key if times is None else jax.random.fold_in(key, times)
     labels = fitted_labels(key, guide.labels, scalars)
@@ -192,7 +192,7 @@ def fitted_labels(key: PRNGKeyArray, labels: Label, scalars: GuideScalars) -> La
     if getattr(scalars, "answer", "best") != "shuffled":
         return labels
     drawn = jax.random.uniform(jax.random.fold_in(key, Stream.SHUFFLE), labels.valid.shape)
-    order = jnp.argsort(jnp.where(labels.valid, drawn, jnp.inf))  # those that count first
+    order = jnp.argsort(jnp.where(labels.valid, drawn, jnp.inf))  # valid labels first
     place, count = jnp.arange(len(order)), labels.valid.sum()
     after = jnp.where(place < count, (place + 1) % jnp.maximum(count, 1), place)
     return labels.replace(answer=labels.answer.at[order].set(labels.answer[order[after]]))

@@ -29,9 +29,9 @@ class Quantity(NamedTuple):
     # "beams" at equal angles, counterclockwise, or "directions", unit vectors: what a sensor turns with; "own": what a
     # robot measures of itself, which no displaced sensor shifts
     kind: str = ""
-    step_deg: float = 0.0  # of beams: the angle between two neighbours
+    step_deg: float = 0.0  # angle between neighbouring beams
     # Of a place in metres (x, y, perhaps z): the point about which a sensor that is turned turns the place; None: no
-    # sensor turns, or nobody says about which point
+    # sensor turns it, or the point is not known
     origin: tuple[float, float] | None = None
     follows: str = ""  # name of the place from which this difference is taken, and with which it is displaced
 

@@ -64,9 +64,9 @@ class _Walk(NamedTuple):
     state: Any
     obs: Array
     first: Array  # True during the first episode
-    episode_steps: Array  # of the first episode so far
-    sums: dict[str, Array]  # of rewards and metrics, over the steps so far
-    outcomes: dict[str, Array]  # of the first episode, nan until it ends
+    episode_steps: Array  # steps of the first episode so far
+    sums: dict[str, Array]  # sums of rewards and metrics over the steps so far
+    outcomes: dict[str, Array]  # outcomes of the first episode, NaN until it ends
     acts: Array  # True while all actions were finite
 
 
@@ -77,7 +77,7 @@ def _begun(env: Environment, key: PRNGKeyArray, num_envs: int) -> _Walk:
     _, step = jax.eval_shape(jax.vmap(env.step), keys, state, jnp.zeros((num_envs, actions_of(env).size)))
     names: list[str] = ["reward", *step.metrics]
     sums = dict.fromkeys(names, jnp.zeros(num_envs))
-    # of the dtypes that steps have, so that one program serves both
+    # NaN of the dtypes that steps have, so that one program serves both
     outcomes = dict.fromkeys(step.outcome, jnp.full(num_envs, jnp.nan, jnp.float32))
     yes = jnp.ones(num_envs, bool)
     return _Walk(state, obs, yes, jnp.zeros(num_envs, jnp.int32), sums, outcomes, yes)
@@ -158,7 +158,7 @@ def mean_interval(
     return np.stack([mean, *np.quantile(np.stack(list(drawn)), [0.025, 0.975], axis=0)])
 
 
-MOST_STRETCHES = 25  # of a roll-out with progress
+MOST_STRETCHES = 25  # most stretches of a roll-out with progress
 
 Tell = Callable[[int, int], None]  # (done, of how many): called between stretches; what it raises ends the evaluation
 

@@ -95,7 +95,7 @@ def animate(frames: Sequence[Source], file: str | os.PathLike[str], fps: float =
     def even(rate: float) -> Iterator[Picture]:
         for number in range(max(1, round(len(frames) * rate / fps))):
             frame = pixels(frames[min(int(number * fps / rate), len(frames) - 1)])
-            yield frame[: len(frame) // 2 * 2, : frame.shape[1] // 2 * 2]  # as codecs want them
+            yield frame[: len(frame) // 2 * 2, : frame.shape[1] // 2 * 2]  # even sides, as codecs need
 
     specimen = np.concatenate([pixels(frames[number]) for number in (0, len(frames) // 2, -1)])
     write_film(file, fps, even, palette_of(specimen, 256))
@@ -120,7 +120,7 @@ def _opened(image: Any) -> tuple[Image.Image, str]:
             found = Image.open(io.BytesIO(image), formats=tuple(SHOWN))
             kind = found.format or ""
             if found.getexif().get(TURNED, 1) != 1:
-                found, kind = ImageOps.exif_transpose(found), ""  # not as it is stored
+                found, kind = ImageOps.exif_transpose(found), ""  # rotated, so the stored bytes are not reused
             found.load()
     except Exception as error:  # Pillow raises many kinds for damaged files
         raise UserError(f"a picture cannot be read ({error}): give the bytes of a PNG or JPEG file") from error

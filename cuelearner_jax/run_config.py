@@ -111,14 +111,14 @@ def check(config: RunConfig) -> None:
 
 
 def to_json(config: RunConfig) -> dict[str, Any]:
-    """The options as plain JSON values, without the task's: a part's beside the name of the part."""
+    """Return the options as JSON values without the task's; a part's options stand beside the part's name."""
     shared = {name: configuration.to_json(getattr(config, name)) for name in GROUPS}
     parts = {name: part_to_json(getattr(config, name)) for name in PARTS}
     return {**shared, **parts, "kinds": {name: kind_to_json(own) for name, own in config.kinds.items()}}
 
 
 def from_json(task: Any, values: Mapping[str, Any]) -> RunConfig:
-    """The inverse of `to_json`; code that a file names is never loaded.
+    """Return the configuration of JSON values; code that a file names is never loaded.
 
     Raises:
         UserError: an unknown field, or a part that is not known here.

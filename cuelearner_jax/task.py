@@ -53,7 +53,7 @@ class Pictures(NamedTuple):
     # (environment, state, observation (obs,), action (action,), file): the situation as a person is asked about it,
     # with the action in question as an arrow; a PNG
     question: Callable[[Any, EnvState, Float[Array, " obs"], Float[Array, " action"], Path], None]
-    # (environment, state): the situation as a person labels it in a browser; None: nobody can
+    # (environment, state): the situation as a person labels it in a browser; None: not possible
     sketch: Callable[[Any, EnvState], Sketch] | None = None
     # (environment, state, action (action,)): what the action leads to, to be seen in the sketch of the state
     # None, or no reel: there is none
@@ -63,8 +63,9 @@ class Pictures(NamedTuple):
     trails: Callable[[Any, EnvState, Float[Array, "n action"]], list[str]] | None = None
     # (environment): raises UserError if it cannot be drawn, which for some only trying tells; None: all can
     check: Callable[[Any], None] | None = None
-    legend: str = ""  # what the trails mean, for a person
-    simulates: bool = True  # is a reel what the action would lead to? False: what was recorded, whatever the action is
+    legend: str = ""  # meaning of the trails, for a person
+    # True if a reel shows the action's consequence; False: the recorded one, whatever the action
+    simulates: bool = True
 
 
 @dataclass(frozen=True)
@@ -103,7 +104,8 @@ class Scenario:
     judge_bounds: tuple[float, ...] = ()  # shares of the bound that are tried as well
     sizes: dict[str, Any] = field(default_factory=dict)  # fields of `GuideSizes`
     scalars: dict[str, Any] = field(default_factory=dict)  # fields of `Scalars`
-    options: dict[str, Any] = field(default_factory=dict)  # of the kind of guidance: fields of its `Kind.config`
+    # options of the kind of guidance: fields of its `Kind.config`
+    options: dict[str, Any] = field(default_factory=dict)
 
     def apply(self, config: Any) -> Any:
         """Return the configuration with the scenario's changes."""
@@ -131,8 +133,8 @@ class Task:
     presets: dict[str, Preset] = field(default_factory=dict)
     scenarios: dict[str, Scenario] = field(default_factory=dict)
     labels_hold: tuple[str, ...] = ()  # fields of the configuration that labels of another world may differ in
-    named: str = ""  # how a command names it, where not by its name alone: "gymnasium:FetchReach-v4"
-    origin: str = ""  # "package.module:name" where it was taken from outside, by whoever resolved that
+    named: str = ""  # its name in commands, if other than `name`: "gymnasium:FetchReach-v4"
+    origin: str = ""  # "package.module:name" of a task from outside, set by the code that resolved it
     default: Any = None  # the default configuration; None: `config()`
     # configuration -> default metric that judges adapted policies
     judge_by: Callable[[Any], str] = lambda config: "reward"

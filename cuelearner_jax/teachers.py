@@ -117,7 +117,8 @@ def load(folder: Path, env: Any, aim_error: Any, habit: Any) -> LearnedTeacher:
     ):
         raise formats.damaged("teacher", folder / ABOUT, "layers or directions that no teacher has")
     told = f"{folder / ABOUT} has {shape.directions:,} directions"
-    check_room(told, 8 * max(shape.layers) * shape.directions, "restore the file")  # as of a run's (`grid.load`)
+    # the same remedy as for a run (`grid.load`)
+    check_room(told, 8 * max(shape.layers) * shape.directions, "restore the file")
     template = jax.eval_shape(lambda key: initial_params(shape.layers, env, key), jax.random.key(0))
     halves = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, jnp.float16), template)
     with checkpoints(folder / "network", read_only=True) as saved:

@@ -19,7 +19,7 @@ EnvState = Any  # the pytree that an environment carries from step to step
 class Step(struct.PyTreeNode):
     """The result of one environment step."""
 
-    obs: Float[Array, " obs"]  # to act on next: after the automatic reset where the episode ended
+    obs: Float[Array, " obs"]  # the next observation: after the automatic reset where the episode ended
     final_obs: Float[Array, " obs"]  # the action's result: before the automatic reset
     aftermath: Float[Array, " aftermath"]  # what replay stores of `final_obs`, see `Environment.recall_next`
     reward: Float[Array, ""]
@@ -96,7 +96,7 @@ class Sketch(NamedTuple):
     movers: dict[str, str]  # SVG elements that move, by name, drawn around (0, 0) and heading along +x
     places: dict[str, tuple[float, float, float]]  # place of each: x, y [m], turn on the screen, clockwise [deg]
     foot: tuple[float, float]  # where the arrow of an action begins [m]
-    reach: tuple[float, float]  # from there: beginning and end of that arrow [m]
+    reach: tuple[float, float]  # distances of the arrow's beginning and end from there [m]
     turn: float  # counterclockwise angle on the screen of an action of angle 0 [deg]
     aim: float = 0.0  # length of a thin line that goes on from the arrow [m]
     words: str = ""  # about the situation, in a few words
@@ -110,5 +110,5 @@ class Reel(NamedTuple):
 
     period: float  # between two frames [s]
     frames: list[dict[str, tuple[float, float, float] | None]]  # place of each mover, as `Sketch.places`; None: hidden
-    words: str = ""  # how it ended
+    words: str = ""  # how the film ended
     pictures: Sequence[str] = ()  # one a frame, as data URIs; see `pictures.clip`

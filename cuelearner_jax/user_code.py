@@ -34,7 +34,9 @@ _PACKAGE = Path(__file__).parent
 _OURS = (_PACKAGE, *(_PACKAGE.parent / place / "cuelearner_envs" for place in ("", "envs")))
 _LIBRARIES = tuple(Path(sysconfig.get_path(name)) for name in ("stdlib", "purelib", "platlib"))
 
-_left: dict[str, UserError] = {}  # by functions on the host, which other threads call; by what messages call them
+_left: dict[
+    str, UserError
+] = {}  # errors left by functions on the host, which other threads call; by their names in messages
 _working: Counter[int] = Counter()  # calls of `report_user_errors` functions at work, by thread
 _counting = threading.Lock()
 

@@ -39,7 +39,7 @@ Theta = dict[str, float]  # unknowns by name; one that is not there is zero
 class Calibrating(Adaptation):
     """The guide, world, base policies and family that all lanes of a calibration share."""
 
-    family: Family = struct.field(pytree_node=False)  # what may have changed
+    family: Family = struct.field(pytree_node=False)  # possible changes
     named: str = struct.field(pytree_node=False, default="")  # the code of it; empty: the world declares it
 
     def policy(self, block: Any, env: Any = None) -> Calibrated:
@@ -51,7 +51,7 @@ class Evidence(struct.PyTreeNode):
     """A block of lanes with their answers and estimates."""
 
     base: Int[Array, " lanes"]
-    theta: Float[Array, "lanes unknowns"]  # what is corrected
+    theta: Float[Array, "lanes unknowns"]  # corrected values of the unknowns
     labels: Label  # (lanes, slots, ...)
     asked: Int[Array, " lanes"]
     bound: Float[Array, " lanes"]

@@ -30,7 +30,7 @@ from cuelearner_jax.run_config import kind_from_json, part_from_json
 
 CORRECTED = ("guided", "calibrated")  # policies that change another policy's actions
 KINDS = ("agent", "uniform", "heuristic", *CORRECTED, "code")
-PARTS = ((GuideSizes, "sizes"), (Scalars, "scalars"))  # of a guided policy's values
+PARTS = ((GuideSizes, "sizes"), (Scalars, "scalars"))  # groups in a guided policy's values
 DERIVED = ("clip_radius_deg", "fitted")  # left out of a description: the other values and the arrays hold them already
 MOST_LAYERS = 16  # most layers of a policy that was adapted again and again
 
@@ -95,7 +95,7 @@ def check(values: dict[str, Any]) -> None:
 
 def arrays_of(policy: Any) -> Any:
     """Return the arrays of a policy, or of a block of policies."""
-    kind, policy = describe(policy)["policy"], getattr(policy, "policy", policy)  # that `Common` holds
+    kind, policy = describe(policy)["policy"], getattr(policy, "policy", policy)  # `Common` holds it as `policy`
     if kind == "agent":
         return {"params": policy.params}
     if kind == "guided":

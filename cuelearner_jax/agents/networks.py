@@ -42,7 +42,7 @@ class MLP(nn.Module):
 
     layers: Sequence[int]
     outputs: int
-    dtype: DTypeLike = jnp.float32  # of the hidden layers' arithmetic; parameters and outputs are float32
+    dtype: DTypeLike = jnp.float32  # dtype of the hidden layers' arithmetic; parameters and outputs are float32
     layer_norm: bool = False  # whether hidden layers are normalised before their ReLU
 
     @nn.compact

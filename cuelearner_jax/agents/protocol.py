@@ -124,8 +124,10 @@ class AgentOptions(Protocol):
 class OptionalFacts(Protocol):
     """Optional members of a class of options, beside `AgentOptions`; read them by the functions below."""
 
-    ACTOR: ClassVar[bool]  # does an actor choose, not the argmax of `value`? `update` then takes an `Offer`, `other`
-    SORTS: ClassVar[bool]  # does `update` draw guided and own steps apart? Replay then counts the guided ones
+    ACTOR: ClassVar[
+        bool
+    ]  # True if an actor chooses, not the argmax of `value`; `update` then takes an `Offer`, `other`
+    SORTS: ClassVar[bool]  # True if `update` draws guided and own steps separately; replay then counts guided steps
     ACTS_IN: ClassVar[Space]  # one of the spaces in which it acts, where these are not all
 
 

@@ -38,7 +38,9 @@ class Transition(struct.PyTreeNode):
     obs: Float[Array, " obs"]
     action: Float[Array, " action"]  # as executed
     reward: Float[Array, ""]
-    discount: Float[Array, ""]  # of `next_obs`: 0 at termination, never at truncation; 1 after one step
+    discount: Float[
+        Array, ""
+    ]  # discount of the value of `next_obs`: 0 at termination, never at truncation; 1 after one step
     next_obs: Float[Array, " obs_or_0"]
 
 

@@ -194,7 +194,7 @@ def teacher(name: str, value: Any, space: Space) -> Teacher:
     if isinstance(value, type) or leaf or not (answers or acts or callable(value)):
         raise argument_error(name, value, "a teacher, for instance teacher_of(world), or a function of observations")
     if acts and not answers:
-        value = getattr(value, "policy", value)  # of a `CallablePolicy`, which stands above this file
+        value = getattr(value, "policy", value)  # for a `CallablePolicy`, which is above this module
     try:
         return teaching(value, space)
     except UserError as error:

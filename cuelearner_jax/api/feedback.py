@@ -58,7 +58,7 @@ class FeedbackModel:
     scalars: Scalars  # eps of the labels, and how actions are refined
     labels: Labels
     sizes: GuideSizes  # sizes that the guide was made with
-    space: Space = DIRECTIONS  # of the actions
+    space: Space = DIRECTIONS  # space of the actions
     env: Any = None  # provides `features`, which the raw frame does not use
 
 

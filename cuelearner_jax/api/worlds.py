@@ -166,6 +166,6 @@ def teacher_of(source: World | Policy) -> Teacher:
     """
     if isinstance(source, World):
         return source.task.make_teacher(source.config, source.env)
-    if not hasattr(source, "policy"):  # of a `CallablePolicy`, which stands above this file
+    if not hasattr(source, "policy"):  # `CallablePolicy` is above this module, so its `policy` is looked up by name
         source = arguments.policy("source", source)
     return Teaching(source)

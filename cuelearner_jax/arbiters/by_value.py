@@ -116,7 +116,7 @@ class Comparing:
     def follow(
         self, state: Compared, options: Config, scalars: Scalars, outcome: Outcome, key: PRNGKeyArray
     ) -> Compared:
-        """Draw anew whether to arbitrate each episode that begins."""
+        """Draw whether to arbitrate each episode that begins."""
         return state.replace(arbitrated=redrawn(key, state.arbitrated, outcome.done, options.probability))
 
     def compares(self, state: Compared, known: Known) -> Params:

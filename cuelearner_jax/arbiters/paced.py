@@ -72,8 +72,8 @@ class Pace(struct.PyTreeNode):
     """The returns of guided and own episodes so far, and the running episodes' sums."""
 
     guided: Bool[Array, " num_envs"]  # True where the running episode is guided
-    gain: Float[Array, " num_envs"]  # of the running episode so far
-    steps: Float[Array, " num_envs"]  # of the running episode so far
+    gain: Float[Array, " num_envs"]  # gain of the running episode so far
+    steps: Float[Array, " num_envs"]  # steps of the running episode so far
     whole: Bool[Array, " num_envs"]  # True where the running episode belonged to its arm from its first step on
     sums: ArmSums
 
@@ -81,7 +81,7 @@ class Pace(struct.PyTreeNode):
 class Paced(NamedTuple):
     """The arbiter's functions (`protocol.Arbiter`)."""
 
-    bootstraps: bool  # do targets look at the next observation?
+    bootstraps: bool  # whether targets use the next observation (discount above 0)
 
     def init(self, num_envs: int) -> Pace:
         """Return the state before the first episode."""

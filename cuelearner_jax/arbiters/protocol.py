@@ -57,11 +57,11 @@ class Known(NamedTuple):
 
     env: Any  # or its view
     agent: AgentFunctions
-    params: Params  # of the agent
+    params: Params  # parameters of the agent
     guide: Guide
     model: GuidanceModel
     scalars: GuideScalars
-    steps: Float[Array, ""]  # that the agent has learned from
+    steps: Float[Array, ""]  # environment steps that the agent has learned from
 
 
 @runtime_checkable

@@ -55,7 +55,7 @@ class Episode(struct.PyTreeNode):
     """The state of our environment, which resets automatically, within `State.pipeline_state` of `BraxView`."""
 
     env: EnvState
-    obs: Float[Array, " obs"]  # to act on next: after the automatic reset where the episode ended
+    obs: Float[Array, " obs"]  # the next observation: after the automatic reset where the episode ended
     ended: Bool[Array, ""]  # True once `env` began a new episode that brax has not seen yet
 
 

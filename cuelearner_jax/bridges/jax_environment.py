@@ -22,7 +22,7 @@ from cuelearner_jax.errors import UserError
 from cuelearner_jax.spaces import DIRECTIONS, Box, Cue, Space, box
 from cuelearner_jax.types import Step
 
-State = Any  # of the simulator: a pytree with the members that this file's docstring names
+State = Any  # a simulator's state: a pytree with the members that this module's docstring names
 UNIT = "as the simulator has it"
 WORDS = ("more", "less")
 # Keys of cues, enough for the 21 entries of a humanoid: those of any box, letters and digits that are left, signs.
@@ -32,7 +32,7 @@ KEYS = (*box.KEYS, "zx", "cv", "bn", "mp", "12", "34", "56", "78", "90", ",.", "
 class Running(struct.PyTreeNode):
     """State of a `JaxEnvironment` between steps."""
 
-    state: State  # of the simulator
+    state: State  # the simulator's state
     steps: Int[Array, ""]  # taken in this episode
 
 

@@ -49,7 +49,7 @@ def make(name: str) -> Any:
     try:
         with jax.ensure_compile_time_eval():  # a task holds arrays, and may be asked for while something is traced
             return known.load(name, config_overrides={"impl": "jax"})
-    except AttributeError as error:  # of MuJoCo's own interface, which has changed since
+    except AttributeError as error:  # MuJoCo's own interface has changed
         raise UserError(
             f"playground:{name} does not work with the installed MuJoCo ({error}): choose another task"
         ) from error

@@ -31,12 +31,12 @@ from cuelearner_jax.policies import in_space, policy_of
 from cuelearner_jax.spaces import Space, is_answered
 
 Floats = np.ndarray
-Given = Array | np.ndarray  # what is taken
+Given = Array | np.ndarray  # accepted arrays
 BATCH = 10  # questions between two fits
 CHOICE = 6  # situations from which one question is chosen
 LOOKS = 6  # nodes at which the policy is asked in each situation to choose from
 FRESH = 3  # nodes after each batch
-ROUNDS = 4  # of samples, where there were none
+ROUNDS = 4  # rounds of samples for a set without samples
 LEAST = 20  # answers before two changes at once are considered
 DOUBT = 2.0  # least evidence for each change [nats]
 SURE = 3.0  # least evidence for all changes, against no change [nats]

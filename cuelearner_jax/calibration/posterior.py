@@ -106,7 +106,7 @@ class Round(NamedTuple):
     proposal: Kernels | Prior
     theta: Float[Floats, "samples unknowns"]
     offset: Float[Floats, "samples n cues"]  # from asked actions to the ones that the teacher would call right [eps]
-    log_likelihood: Float[Floats, "samples grid"]  # with the prior of the grid
+    log_likelihood: Float[Floats, "samples grid"]  # including the prior of the grid
 
 
 class Fit:

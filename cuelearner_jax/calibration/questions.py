@@ -114,7 +114,8 @@ def _told_most(
         worth.append(told[..., best].max(1).sum())
         for cue in range(cues):
             said = chance[cue, :, :, turn[-1][cue], share[best]]  # (answers, draws)
-            answer = (said.cumsum(0) < random.random(draws)[None]).sum(0).clip(max=2)  # of each truth
+            # simulated answer of each draw as truth
+            answer = (said.cumsum(0) < random.random(draws)[None]).sum(0).clip(max=2)
             weight = weight * said[answer]
         weight /= weight.sum(1, keepdims=True)
     return np.array(index), np.array(turn), np.array(worth)

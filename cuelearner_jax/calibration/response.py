@@ -22,7 +22,7 @@ AXIS = (0.35, 1.2)  # distances of the first nodes from no change, in prior scal
 MOST = 28  # nodes
 CLIP = 10.0  # [eps]: larger offsets are clipped
 TREND = 100.0  # variance of the trend, relative to the residual variance
-LENGTHS, NUGGETS = (0.15, 0.5, 2.0), (1e-3, 0.1, 0.6)  # in prior scales; as shares of the variance
+LENGTHS, NUGGETS = (0.15, 0.5, 2.0), (1e-3, 0.1, 0.6)  # lengths in prior scales; nuggets as shares of the variance
 LEAST = 0.05  # [eps]: least standard deviation of a row
 RELEVANT = 0.02  # weight of nodes that are unlikely given the answers
 

@@ -51,7 +51,7 @@ class Bounds(NamedTuple):
         return f"a number from {self.least:g} to {self.most:g}"
 
 
-POSITIVE = Bounds(1)  # of whole numbers
+POSITIVE = Bounds(1)  # bounds of whole numbers
 SHARE = Bounds(0, 1)
 Layers = Annotated[tuple[int, ...], POSITIVE]  # hidden widths of a network
 

@@ -33,13 +33,13 @@ NAME = re.compile(r"[a-z][a-z0-9_-]*")
 class Kind:
     """A kind of guidance, before sizes and an environment are known."""
 
-    name: str  # in options, folders and columns
-    about: str  # in a few words
+    name: str  # name in options, folders and columns
+    about: str  # description in a few words
     guide: type[Guide]
     form: AnswerForm | None = None  # form of the answers that it asks for; None: it never asks
     needs: tuple[str, ...] = ()  # optional members of an environment that it needs
-    title: str = ""  # in figures, if other than the name
-    colour: str | None = None  # in figures
+    title: str = ""  # title in figures, if other than the name
+    colour: str | None = None  # colour in figures
     config: type | None = None  # a frozen dataclass of the options that this kind alone has; None: it has none
     sees_base: bool = False  # True if it needs a finished policy's actions; it then serves adaptation only
     by_cues: bool = False  # True if its model measures along cues, whatever its answers say

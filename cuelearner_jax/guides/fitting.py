@@ -43,7 +43,7 @@ def lessons(
     A label that names no cue is not valid.
     """
     targets = jax.vmap(lambda label: target(label, scalars))(labels)
-    # Rounded here, whatever is computed of them next: fused with that, their last bits would hang on the compiler.
+    # Rounded here: fused with later operations, the targets' last bits would depend on the compiler.
     rows = Lesson(labels.obs, labels.action, jax.lax.optimization_barrier(targets), labels.valid)
     if space is None or len(space.cues) == 1:
         return rows

@@ -28,7 +28,7 @@ class GuideModel(NamedTuple):
 
     init: Callable[[PRNGKeyArray], Params]
     predict: Predict  # the members' mean; of parameters with any number of members
-    disagreement: Predict  # of several members: their variance, summed over outputs (n,)
+    disagreement: Predict  # the variance of several members, summed over outputs (n,)
 
 
 def ensemble(members: int, init: Callable[[PRNGKeyArray], Params], predict: Predict) -> GuideModel:

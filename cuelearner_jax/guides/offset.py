@@ -43,7 +43,7 @@ RIDGE = 0.3  # penalty on its squared heights, which keeps unlabelled offsets un
 class Spline(struct.PyTreeNode):
     """A function of the turn: straight lines between knots, level beyond them. Of several cues each has its own."""
 
-    heights: Float[Array, "*cues knots"]  # in units of eps; of directions counterclockwise
+    heights: Float[Array, "*cues knots"]  # corrections in units of eps; for directions counterclockwise
     reach: Float[Array, "*cues"]  # offset of the outermost knots, in units of eps
 
 

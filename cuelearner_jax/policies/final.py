@@ -25,7 +25,7 @@ class Arbitrated(PolicyNode):
     base: Agent
     model: GuidanceModel
     scalars: Scalars
-    options: Any  # of the arbiter
+    options: Any  # options of the arbiter
     arm: Int[Array, "*lanes"]
     steps: Float[Array, ""]  # environment steps that the agent has learned from
     arbiter: Finishes = struct.field(pytree_node=False)

@@ -54,7 +54,7 @@ class Uniform(PolicyNode):
     actions: Space = struct.field(pytree_node=False, default=DIRECTIONS)
 
     def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
-        """Return actions drawn anew at each call (paper, Eq. 6)."""
+        """Return new uniform draws at each call (paper, Eq. 6)."""
         return self.actions.sample(key, (obs.shape[0],))
 
     def describe(self) -> dict[str, Any]:
@@ -69,7 +69,7 @@ class NearAims(PolicyNode):
     reach: Float[Array, ""] | float  # largest distance from the aim, in the unit of the space's `log`
 
     def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
-        """Return actions drawn anew at each call."""
+        """Return new draws at each call."""
         return jax.vmap(self._one)(jax.random.split(key, len(obs)), obs)
 
     def _one(self, key: PRNGKeyArray, obs: Float[Array, " obs"]) -> Float[Array, " action"]:

@@ -74,7 +74,7 @@ def lanes_in(policy: PolicyBlock) -> int | None:
 
 
 def describe(policy: Any) -> dict[str, Any]:
-    """What a policy is, as `PolicyBlock.describe` says it; one that does not say so is code."""
+    """Return a policy's description (`PolicyBlock.describe`); a policy without one is described as code."""
     return policy.describe() if hasattr(policy, "describe") else PolicyNode.describe(policy)
 
 

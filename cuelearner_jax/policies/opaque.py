@@ -169,7 +169,7 @@ def _takes_nothing(given: Callable[..., Any]) -> bool:
     """Return whether an object can be called without arguments."""
     try:
         parameters = inspect.signature(given).parameters.values()
-    except (TypeError, ValueError):  # of code that is not Python's
+    except (TypeError, ValueError):  # compiled code has no signature
         return False
     variable = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
     return all(one.default is not one.empty for one in parameters if one.kind not in variable) and not any(

@@ -25,7 +25,7 @@ class Choices(Space):
     """
 
     count: int
-    order: Cue | None = None  # whose unit is "steps"
+    order: Cue | None = None  # the cue of the order, whose unit is "steps"
 
     name = "choices"
     grain = 1.0

@@ -51,9 +51,9 @@ def difference(start: DirectionLike, end: DirectionLike) -> Float[Array, "..."]:
 
 
 def retract(vector: DirectionLike) -> Direction:
-    """The direction nearest to a vector (the vector divided by its length), however long or short the vector is.
+    """Return the direction nearest to a vector of any length: the vector divided by its length.
 
-    The zero vector gives the x axis, which networks need; a vector that is not finite gives NaN, which shows.
+    The zero vector gives the x axis, as networks need a direction; a vector that is not finite gives NaN.
     """
     largest = jnp.max(jnp.abs(vector), axis=-1, keepdims=True)
     # Scaling by powers of two, mostly 1.0, changes no bit of a usual vector.
@@ -65,7 +65,7 @@ def retract(vector: DirectionLike) -> Direction:
 
 
 def outward(vector: DirectionLike, action: DirectionLike) -> Float[Array, "... 2"]:
-    """A vector given along and across (counterclockwise) a direction, in the frame in which the direction is given."""
+    """Return a vector, given along and across (counterclockwise) a direction, in the frame of the direction."""
     along, across = vector[..., 0], vector[..., 1]
     x, y = action[..., 0], action[..., 1]
     return jnp.stack([x * along - y * across, y * along + x * across], axis=-1)

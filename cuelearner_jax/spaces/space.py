@@ -31,7 +31,7 @@ class Cue:
     unit: str  # unit of a change in options and files: "degrees", "shares" (of the cue's range), "steps"
 
 
-KNOWN: dict[str, type[Space]] = {}  # by the names that files hold
+KNOWN: dict[str, type[Space]] = {}  # registered spaces by their names in files
 
 
 class Space:
@@ -40,8 +40,8 @@ class Space:
     Every method works on any leading axes. An action has `size` entries on the last axis, a change `len(cues)`.
     """
 
-    name: str  # in files
-    about: str  # what its actions are, in a few words
+    name: str  # name in files
+    about: str  # description of its actions, in a few words
     size: int  # entries of an action
     cues: tuple[Cue, ...]  # empty: no relative answer is possible
     reach: float  # the largest meaningful change along a cue, in `unit`

@@ -143,7 +143,7 @@ class Instances:
     """The instances of one process."""
 
     def __init__(self, make: Callable[[], Any], whose: str, max_steps: int, size: int) -> None:
-        """`make` gives an environment; `size`: entries of an observation, as the task has them (0: whatever it is)."""
+        """`make` returns an environment; `size`: entries of an observation by the task (0: unknown)."""
         self.make, self.whose, self.max_steps, self.size = make, whose, max_steps, size
         self.running: dict[int, Running] = {}
         self.filmed: dict[int, np.ndarray] = {}  # actions (steps, action) of the episodes that are filmed

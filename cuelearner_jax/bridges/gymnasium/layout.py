@@ -21,8 +21,8 @@ class Leaf(NamedTuple):
     path: tuple[Any, ...]  # keys and places that lead to it
     kind: str  # "box", "bits" or "one of"
     shape: tuple[int, ...]  # shape of the environment's value
-    choices: tuple[int, ...] = ()  # of "one of": the number of values of each entry
-    start: tuple[int, ...] = ()  # of "one of": the first value of each entry
+    choices: tuple[int, ...] = ()  # for "one of": the number of values of each entry
+    start: tuple[int, ...] = ()  # for "one of": the first value of each entry
 
     @property
     def size(self) -> int:

@@ -23,7 +23,7 @@ class Source:
     """A maker of instances and the number of their processes. Hashable, since compiled programs hold it."""
 
     name: str  # an id of Gymnasium's registry, or what the user's code is called
-    arguments: str  # of the environment, by name, as JSON
+    arguments: str  # arguments of the environment, by name, as JSON
     max_steps: int  # an episode is truncated after so many
     processes: int  # 0: one for each processor; 1: this one
     size: int = 0  # entries of an observation; 0: not known yet
@@ -103,7 +103,8 @@ def registry_spec(name: str) -> Any:
         )
     import gymnasium
 
-    imported_before = "gymnasium_robotics" in sys.modules  # by the caller: its environments are registered, and fail
+    # imported by the caller: its environments are registered, and fail
+    imported_before = "gymnasium_robotics" in sys.modules
     if imported_before or (name not in gymnasium.registry and find_spec("gymnasium_robotics") is not None):
         from cuelearner_jax.bridges.gymnasium.robotics import register
 

@@ -15,7 +15,7 @@ import time
 from multiprocessing.connection import Connection
 from typing import Any
 
-LOOKED = 1.0  # from one look at the parent to the next [s]
+LOOKED = 1.0  # time between two checks of the parent [s]
 
 
 def main(descriptor: int, parent: int) -> None:
