@@ -48,7 +48,7 @@ class Config:
     ABOUT: ClassVar[str] = "values and labels choose together: argmax of Q + beta log p(action | labels)"
 
     beta: Annotated[float, Bounds(0)] = 0.1
-    """What a unit of log p(action | labels) counts for after `trust_after` steps of learning, in units of reward."""
+    """Weight of log p(action | labels) after `trust_after` steps of learning, in units of reward."""
     trust_after: Annotated[float, Bounds(0, above=True)] = 100_000.0
     """Steps of learning after which beta is `beta`; beta falls in inverse proportion to these steps."""
     own_share: Annotated[float, SHARE] = 0.5
@@ -58,7 +58,7 @@ class Config:
     near_deg: Annotated[float, Bounds(0)] = 1.5
     """How far near actions lie from the chosen one at most [deg]."""
     near_actions: Annotated[int, POSITIVE] = 16
-    """Actions near the chosen one, along each cue."""
+    """Number of actions near the chosen one, along each cue."""
     directions: Annotated[int, POSITIVE] = 720
     """Evenly spaced actions among which to choose where the guide names none (`intent` names the task's aims)."""
     judge_steps: Annotated[int, POSITIVE] = 2_000

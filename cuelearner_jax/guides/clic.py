@@ -60,7 +60,7 @@ class Searching:
     sampled_actions: Annotated[int, Bounds(4)] = 32
     """Actions between which the energy is compared in a step of a fit, for each label."""
     searched_actions: Annotated[int, Bounds(2)] = 256
-    """Actions among which the least energy is looked for at first."""
+    """Actions among which the search for the least energy begins."""
 
 
 @part

@@ -40,7 +40,7 @@ class Config:
     guide_directions: Annotated[int, POSITIVE] = 360
     """Directions over which the guide takes its argmax."""
     explored_fraction: Annotated[float, SHARE] = 0.25
-    """Share of the questions that are about base actions even so, to find good ones."""
+    """Share of questions about base actions after the first fit, to find good actions."""
 
 
 class Scalar(Guide):
